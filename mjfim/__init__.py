@@ -1,0 +1,28 @@
+"""mjfim: system identification on MuJoCo that designs the experiment.
+
+`design` finds the excitation that reveals most about uncertain parameters, `simulate` plays it, `identify` estimates the
+parameters from recordings, `monte_carlo` holds the estimator against the Cramer-Rao bound.
+"""
+
+from mjfim.designer import design, evaluate_trajectory
+from mjfim.errors import MjfimError
+from mjfim.estimate import identify
+from mjfim.experiment import Experiment
+from mjfim.montecarlo import monte_carlo, simulate
+from mjfim.trajectory import Design, Estimate, Recording, Study, Trajectory
+
+__all__ = [
+    "Design",
+    "Estimate",
+    "Experiment",
+    "MjfimError",
+    "Recording",
+    "Study",
+    "Trajectory",
+    "design",
+    "evaluate_trajectory",
+    "identify",
+    "monte_carlo",
+    "simulate",
+]
+__version__ = "0.1.0"

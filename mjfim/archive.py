@@ -1,0 +1,230 @@
+"""Results on disk: design.json/npz/csv, estimate.json, montecarlo.json, recordings as CSV, identified.xml. No pickles."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pyarrow
+import pyarrow.csv
+
+from mjfim.errors import RecordingError, unknown
+from mjfim.files import replacing
+from mjfim.parameters import write_spec
+from mjfim.setup import Setup
+from mjfim.signals import read_table
+from mjfim.trajectory import Array, Design, Estimate, Evaluation, Recording, Study, Trajectory
+
+ARRAYS = ("t", "qpos", "qvel", "act", "ctrl", "gain", "sensitivity")
+
+
+def as_json(values: Mapping[str, Any]) -> str:
+    """Readable JSON; non-finite numbers become null, as JSON has no name for them."""
+    return json.dumps(_plain(values), indent=2, allow_nan=False) + "\n"
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """A JSON file."""
+    with replacing(path) as temporary:
+        temporary.write_text(as_json(values), encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
+
+
+def design_summary(design: Design) -> dict[str, Any]:
+    """Contents of design.json."""
+    return {
+        "status": design.status.name.lower(),
+        "message": design.status.value,
+        "iterations": design.history[-1].iteration if design.history else 0,
+        "seconds": design.seconds,
+        "slope": design.slope,
+        "steps": design.steps,
+        "parameters": list(design.parameters),
+        "theta": design.theta,
+        "initial": _evaluation(design.initial),
+        "final": _evaluation(design.final),
+        "limits": {"margins": design.limits, "satisfied": all(m >= 0.0 for m in design.limits.values())},
+        "found_by": design.found_by,
+        "starts": [
+            {"name": s.name, "cost": s.cost, "status": s.status.name.lower(), "iterations": s.iterations}
+            for s in design.starts
+        ],
+        "warnings": list(design.warnings),
+    }
+
+
+def _evaluation(e: Evaluation) -> dict[str, Any]:
+    return {
+        "cost": e.cost,
+        "criterion": e.criterion,
+        "information": e.information,
+        "eigenvalues": e.eigenvalues,
+        "std": e.std,
+    }
+
+
+def write_design(folder: Path, design: Design, setup: Setup) -> None:
+    """design.json, design.npz and design.csv."""
+    arrays: dict[str, Array] = {}
+    for prefix, e in (("", design.final), ("initial_", design.initial)):
+        own = {**{n: getattr(e.trajectory, n) for n in ARRAYS[:5]}, "gain": e.gain, "sensitivity": e.sensitivity}
+        arrays.update({prefix + name: value for name, value in own.items()})
+    with replacing(folder / "design.npz") as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays)
+    write_table(folder / "design.csv", _playback(design.trajectory, setup))
+    experiment = os.path.relpath(setup.experiment.source, folder)
+    write_json(folder / "design.json", {"experiment": experiment, **design_summary(design)})
+
+
+def _playback(trajectory: Trajectory, setup: Setup) -> dict[str, Array]:
+    columns = {"t": trajectory.t}
+    columns.update({f"qpos:{c.name}": trajectory.qpos[:, c.q] for c in setup.coordinates})
+    columns.update({f"qvel:{c.name}": trajectory.qvel[:, c.v] for c in setup.coordinates})
+    columns.update(_controls(trajectory.ctrl, setup.controls))
+    return columns
+
+
+def _controls(ctrl: Array, names: tuple[str, ...]) -> dict[str, Array]:
+    """One column per actuator; the last sample has no control."""
+    padded = np.concatenate([ctrl, np.full((1, ctrl.shape[1]), np.nan)])
+    return {f"ctrl:{name}": padded[:, i] for i, name in enumerate(names)}
+
+
+def write_table(path: Path, columns: Mapping[str, Array]) -> None:
+    """CSV with full precision; NaN is an empty field."""
+    arrays = {name: pyarrow.array(np.asarray(v), from_pandas=True) for name, v in columns.items()}
+    with replacing(path) as temporary:
+        options = pyarrow.csv.WriteOptions(quoting_style="none")
+        pyarrow.csv.write_csv(pyarrow.table(arrays), temporary, options)
+
+
+def read_design(path: Path) -> dict[str, Trajectory]:
+    """Trajectories of a design.npz by name, `initial` and `final`. Raises RecordingError; never unpickles."""
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such design file")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        raise RecordingError(f"{path}: not a design archive (npz without pickles): {error}") from None
+    found = {}
+    for name, prefix in (("initial", "initial_"), ("final", "")):
+        missing = [prefix + key for key in ARRAYS[:5] if prefix + key not in arrays]
+        if not missing:
+            found[name] = Trajectory(*(arrays[prefix + key] for key in ARRAYS[:5]))
+        elif name == "final":
+            raise RecordingError(f"{path}: array {missing[0]!r} is missing; a design holds {', '.join(ARRAYS)}")
+    return found
+
+
+def check_fits(path: Path, trajectory: Trajectory, setup: Setup) -> None:
+    """Raise RecordingError where a design belongs to another model or rate."""
+    wanted = (setup.model.nq, setup.model.nv, len(setup.controls))
+    got = (trajectory.qpos.shape[1], trajectory.qvel.shape[1], trajectory.ctrl.shape[1])
+    if got != wanted:
+        raise RecordingError(f"{path}: made for (nq, nv, nu) = {got}, the experiment's model has {wanted}")
+    if abs(trajectory.dt - setup.dt) > 1e-6 * setup.dt:
+        raise RecordingError(f"{path}: sampled at {1 / trajectory.dt:g} Hz, the experiment at {1 / setup.dt:g} Hz")
+
+
+def write_recording(path: Path, recording: Recording, setup: Setup) -> None:
+    """A recording as CSV: t, ctrl:<actuator>, and its outputs (empty where not measured)."""
+    columns = {"t": recording.t, **_controls(recording.ctrl, setup.controls)}
+    columns.update({name: recording.y[:, i] for i, name in enumerate(recording.outputs)})
+    write_table(path, columns)
+
+
+def read_recording(path: Path, setup: Setup) -> Recording:
+    """A recording from CSV. Raises RecordingError naming file and column."""
+    columns = read_table(path)
+    controls = [f"ctrl:{name}" for name in setup.controls]
+    for key in ("t", *controls):
+        if key not in columns:
+            raise RecordingError(f"{path}: column {key!r} is missing; found: {', '.join(columns)}")
+    measured = [name for name in setup.outputs.names if name in columns]
+    if not measured:
+        strays = ", ".join(c for c in columns if c != "t" and c not in controls) or "none"
+        raise RecordingError(f"{path}: no measured column; {unknown('column', strays, setup.outputs.names)}")
+    t = columns["t"]
+    if len(t) < 3:
+        raise RecordingError(f"{path}: too few rows ({len(t)}); an identification needs at least 3")
+    if not np.isfinite(t).all():
+        raise RecordingError(f"{path}: column 't' holds NaN in data row {int(np.argmax(~np.isfinite(t))) + 1}")
+    ctrl = np.column_stack([columns[key] for key in controls])[:-1]
+    return Recording(t, ctrl, np.column_stack([columns[n] for n in measured]), tuple(measured), str(path))
+
+
+def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
+    """Contents of estimate.json."""
+    return {
+        "parameters": list(estimate.parameters),
+        "units": list(setup.units),
+        "theta": estimate.theta,
+        "std": estimate.std,
+        "covariance": estimate.covariance,
+        "initial_theta": estimate.initial_theta,
+        "chi2": estimate.chi2,
+        "dof": estimate.dof,
+        "status": estimate.status,
+        "success": estimate.success,
+        "iterations": estimate.iterations,
+        "residual_rms": estimate.residual_rms,
+        "misfit": estimate.misfit,
+        "at_bound": list(estimate.at_bound),
+        "recordings": [r.name for r in estimate.recordings],
+        "warnings": list(estimate.warnings),
+    }
+
+
+def write_identified(path: Path, setup: Setup, theta: Array) -> None:
+    """The user's MJCF with the identified values written in; asset folders are re-pointed so that it loads from `path`."""
+    spec = setup.spec.copy()
+    write_spec(spec, setup.model, setup.parameters, theta)
+    source = setup.model_path.resolve().parent
+    for folder in ("meshdir", "texturedir"):
+        old = getattr(spec, folder)
+        setattr(spec, folder, os.path.relpath(source / old, path.resolve().parent))
+    with replacing(path) as temporary:
+        temporary.write_text(spec.to_xml(), encoding="utf-8")
+        mujoco.MjModel.from_xml_path(str(temporary))
+
+
+def study_summary(study: Study) -> dict[str, Any]:
+    """Contents of montecarlo.json."""
+    summary: dict[str, Any] = {
+        "parameters": list(study.parameters),
+        "theta": study.theta,
+        "measure_rate": study.measure_rate,
+    }
+    for name, s in study.sets.items():
+        summary[name] = {
+            "mean": s.mean,
+            "covariance": s.covariance,
+            "crlb": s.crlb,
+            "efficiency": s.efficiency,
+            "efficiency_interval": s.efficiency_interval,
+            "information": study.information[name],
+            "trials": s.trials,
+            "failed": s.failed,
+            "seconds": s.seconds,
+        }
+    return summary

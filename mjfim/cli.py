@@ -1,0 +1,303 @@
+"""The command line: one function per verb. Exit codes: 0 done, 1 ran but did not reach its goal, 2 misuse."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+import mjfim
+from mjfim import archive, report
+from mjfim.errors import ExperimentError, MjfimError, RecordingError
+from mjfim.estimate import measured_trajectory
+from mjfim.files import replacing
+from mjfim.labels import Labels
+from mjfim.setup import Setup
+from mjfim.trajectory import Design, Estimate, HistoryRow, Study
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Design the experiment that identifies a MuJoCo model's parameters, then identify them.",
+)
+errors = Console(stderr=True, highlight=False, soft_wrap=True)
+out = Console(highlight=False)
+
+ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")]
+DesignFile = Annotated[Path, typer.Argument(metavar="DESIGN.npz", help="design.npz that `mjfim design` left.")]
+Folder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results, made if absent.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the summary to stdout as JSON.")]
+Threads = Annotated[int | None, typer.Option(min=1, help="Threads for MuJoCo; default: all cores.")]
+
+
+def verb(function: Callable[..., None]) -> Callable[..., None]:
+    """Turn misuse into one message and exit code 2, and Ctrl-C before any result into exit code 1."""
+
+    @functools.wraps(function)
+    def wrapped(*args: Any, **kwargs: Any) -> None:
+        try:
+            function(*args, **kwargs)
+        except MjfimError as error:
+            errors.print(f"mjfim: {error}", markup=False)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            errors.print("mjfim: interrupted before there was a result; nothing was written")
+            raise typer.Exit(1) from None
+
+    app.command()(wrapped)
+    return wrapped
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """A transient progress display on stderr; silent where stderr is not a terminal."""
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
+        yield bar
+
+
+@verb
+def design(
+    experiment: ExperimentFile,
+    output: Folder,
+    as_json: AsJson = False,
+    starts: Annotated[int | None, typer.Option(min=1, help="Number of starts; overrides [descent] starts.")] = None,
+    threads: Threads = None,
+) -> None:
+    """Design the excitation that reveals most about the parameters."""
+    stated = mjfim.Experiment.from_file(experiment)
+    if starts is not None:
+        stated = stated.replace(descent={"starts": starts})
+    setup = Setup(stated, threads)
+    _check_folder(output)
+    with progress() as bar:
+        task = bar.add_task("designing", total=None)
+
+        def monitor(row: HistoryRow) -> None:
+            text = (
+                f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}  slope {row.slope:.1e}"
+            )
+            bar.update(task, description=text)
+            if not errors.is_terminal and row.iteration % 10 == 0:
+                errors.print(text)
+
+        result = mjfim.design(setup, monitor)
+    _leave_design(output, result, setup)
+    _say(as_json, archive.design_summary(result), report.design_report(result, setup.units))
+    errors.print(f"wrote {output}/ (see it move: mjfim replay {output})")
+    raise typer.Exit(0 if result.success else 1)
+
+
+@verb
+def simulate(
+    experiment: ExperimentFile,
+    design_file: DesignFile,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.csv", help="Recording to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+) -> None:
+    """Play a design on the model at its `true` values, with noise: a synthetic recording."""
+    setup = Setup(mjfim.Experiment.from_file(experiment))
+    trajectory = archive.read_design(design_file)["final"]
+    archive.check_fits(design_file, trajectory, setup)
+    archive.write_recording(output, mjfim.simulate(setup, trajectory, seed), setup)
+    errors.print(f"wrote {output}")
+
+
+@verb
+def identify(
+    experiment: ExperimentFile,
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Recordings (CSV).")],
+    output: Folder,
+    method: Annotated[str, typer.Option(help="least_squares (with bounds) or newton (the paper's).")] = "least_squares",
+    as_json: AsJson = False,
+) -> None:
+    """Estimate the parameters from recordings."""
+    if method not in ("least_squares", "newton"):
+        raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
+    setup = Setup(mjfim.Experiment.from_file(experiment))
+    loaded = [archive.read_recording(path, setup) for path in recordings]
+    _check_folder(output)
+    with progress() as bar:
+        bar.add_task("fitting", total=None)
+        result = mjfim.identify(setup, loaded, "newton" if method == "newton" else "least_squares")
+    _leave_estimate(output, result, setup)
+    _say(as_json, archive.estimate_summary(result, setup), report.estimate_report(result, setup.units))
+    errors.print(f"wrote {output}/")
+    raise typer.Exit(0 if result.success and not result.misfit else 1)
+
+
+@verb
+def montecarlo(
+    experiment: ExperimentFile,
+    design_file: DesignFile,
+    output: Folder,
+    trials: Annotated[int, typer.Option(min=2, help="Trials per trajectory.")] = 1500,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+    measure_rate: Annotated[
+        float | None, typer.Option(min=0.0, help="Measurement rate [Hz]; divides the rate.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Hold the estimator against the Cramér-Rao bound, on the initial and the designed trajectory."""
+    stated = mjfim.Experiment.from_file(experiment)
+    setup = Setup(stated if measure_rate is None else stated.replace(measure_rate=measure_rate))
+    named = archive.read_design(design_file)
+    for trajectory in named.values():
+        archive.check_fits(design_file, trajectory, setup)
+    _check_folder(output)
+    with progress() as bar:
+        tasks = {name: bar.add_task(f"{trials} trials, {name}", total=1.0) for name in named}
+        study = mjfim.monte_carlo(
+            setup, named, trials, seed, progress=lambda name, share: bar.update(tasks[name], completed=share)
+        )
+    _leave_study(output, study, setup)
+    _say(as_json, archive.study_summary(study), report.study_report(study, setup.units))
+    errors.print(f"wrote {output}/")
+    raise typer.Exit(0 if all(s.failed == 0 for s in study.sets.values()) else 1)
+
+
+@verb
+def replay(
+    source: Annotated[Path, typer.Argument(metavar="DIR | FILE.rrd | DESIGN.npz", help="What to show.")],
+    save: Annotated[
+        Path | None, typer.Option(metavar="FILE.rrd", help="Write a file instead of opening the viewer.")
+    ] = None,
+    experiment: Annotated[
+        Path | None, typer.Option(help="Experiment of a DESIGN.npz that has no design.json beside it.")
+    ] = None,
+) -> None:
+    """Show a result in the Rerun viewer."""
+    from mjfim import rerun_log
+
+    target = save or source.with_suffix(".rrd")
+    if source.suffix == ".npz":
+        setup = Setup(mjfim.Experiment.from_file(experiment or _experiment_beside(source)))
+        named = archive.read_design(source)
+        for trajectory in named.values():
+            archive.check_fits(source, trajectory, setup)
+        _make_parent(target)
+        rerun_log.log_trajectories(target, setup.model_at(setup.theta), named, Labels.of(setup))
+    else:
+        found = _recording_of(source)
+        if save is not None:
+            _make_parent(save)
+            with replacing(save) as temporary:
+                shutil.copyfile(found, temporary)
+        target = save or found
+    if save is None:
+        rerun_log.show(target)
+    else:
+        errors.print(f"wrote {target}")
+
+
+def _recording_of(source: Path) -> Path:
+    """The .rrd that a folder or file names."""
+    if source.is_dir():
+        for name in ("design.rrd", "estimate.rrd"):
+            if (source / name).is_file():
+                return source / name
+        raise RecordingError(f"{source}: no design.rrd or estimate.rrd in this folder")
+    if source.suffix != ".rrd":
+        raise RecordingError(f"{source}: give a folder of results, an .rrd file or a design .npz")
+    if not source.is_file():
+        raise RecordingError(f"{source}: no such file")
+    return source
+
+
+def _experiment_beside(source: Path) -> Path:
+    """Experiment file that the design.json beside an npz names."""
+    beside = source.parent / "design.json"
+    try:
+        return (source.parent / str(json.loads(beside.read_text(encoding="utf-8"))["experiment"])).resolve()
+    except (OSError, ValueError, KeyError, TypeError):
+        raise RecordingError(
+            f"{source}: no usable design.json beside it; name the experiment with --experiment"
+        ) from None
+
+
+def _check_folder(folder: Path) -> None:
+    """Fail before the work, not after it, where results cannot be written."""
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    if not existing.is_dir():
+        raise RecordingError(f"{existing}: is a file; -o needs a folder")
+    if not os.access(existing, os.W_OK):
+        raise RecordingError(f"{existing}: no permission to write here")
+
+
+def _make_parent(path: Path) -> None:
+    _check_folder(path.parent)
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _say(as_json: bool, summary: dict[str, Any], text: Any) -> None:
+    if as_json:
+        typer.echo(archive.as_json(summary), nl=False)
+    else:
+        out.print(text)
+
+
+def _leave_design(folder: Path, result: Design, setup: Setup) -> None:
+    from mjfim import plots, rerun_log
+
+    folder.mkdir(parents=True, exist_ok=True)
+    archive.write_design(folder, result, setup)
+    labels = Labels.of(setup)
+    for name, figure in (
+        ("trajectories", plots.trajectories(result, labels)),
+        ("sensitivity_phase", plots.sensitivity_phase(result, labels)),
+        ("convergence", plots.convergence(result)),
+        ("standard_deviations", plots.std_bars(result, labels)),
+        ("table_eigenvalues", plots.design_table(result, labels)),
+    ):
+        plots.save(figure, folder / f"{name}.png")
+    rerun_log.log_design(folder / "design.rrd", setup.model_at(setup.theta), result, Labels.of(setup))
+
+
+def _leave_estimate(folder: Path, result: Estimate, setup: Setup) -> None:
+    from mjfim import plots, rerun_log
+
+    folder.mkdir(parents=True, exist_ok=True)
+    archive.write_json(folder / "estimate.json", archive.estimate_summary(result, setup))
+    archive.write_identified(folder / "identified.xml", setup, result.theta)
+    labels = Labels.of(setup)
+    for i in range(len(result.recordings)):
+        name = "fit.png" if len(result.recordings) == 1 else f"fit_{i + 1}.png"
+        plots.save(plots.fit(result, i, labels, setup.outputs.sigma), folder / name)
+    plots.save(plots.parameter_intervals(result, labels), folder / "parameters.png")
+    predicted = setup.plant.simulate(result.theta, result.recordings[0].ctrl)
+    rerun_log.log_estimate(
+        folder / "estimate.rrd",
+        setup.model_at(result.theta),
+        result,
+        measured_trajectory(setup, result.recordings[0]),
+        predicted,
+        Labels.of(setup),
+    )
+
+
+def _leave_study(folder: Path, study: Study, setup: Setup) -> None:
+    from mjfim import plots
+
+    folder.mkdir(parents=True, exist_ok=True)
+    archive.write_json(folder / "montecarlo.json", archive.study_summary(study))
+    labels = Labels.of(setup)
+    for i, name in enumerate(study.parameters):
+        plots.save(plots.histogram(study, i, labels), folder / f"histogram_{name}.png")
+    plots.save(plots.study_table(study, labels), folder / "table_covariance.png")
+
+
+def main() -> NoReturn:
+    """Entry point."""
+    app(prog_name="mjfim")
+    sys.exit(0)

@@ -1,0 +1,175 @@
+"""The batch: many MuJoCo simulations in one call, Python never in the inner loop. Counts every step it takes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from mjfim.tangent import StateSpace
+from mjfim.trajectory import Array
+
+RECORD = int(
+    mujoco.mjtState.mjSTATE_TIME
+    | mujoco.mjtState.mjSTATE_QPOS
+    | mujoco.mjtState.mjSTATE_QVEL
+    | mujoco.mjtState.mjSTATE_ACT
+)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep MuJoCo's own warnings off the console and out of log files: divergence is reported by value here."""
+    before, config = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    config.logto_console = config.logto_file = False
+    mujoco.MjLogConfig.set(config)
+    try:
+        yield
+    finally:
+        mujoco.MjLogConfig.set(before)
+
+
+def state_space(model: Any) -> StateSpace:
+    """Layout of a model's state."""
+    scalar_q, scalar_v, quaternions = [], [], []
+    for j in range(model.njnt):
+        q, v, kind = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), int(model.jnt_type[j])
+        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
+            scalar_q += [q, q + 1, q + 2]
+            scalar_v += [v, v + 1, v + 2]
+            quaternions.append((q + 3, v + 3))
+        elif kind == int(mujoco.mjtJoint.mjJNT_BALL):
+            quaternions.append((q, v))
+        else:
+            scalar_q.append(q)
+            scalar_v.append(v)
+    return StateSpace(
+        model.nq, model.nv, model.na, np.array(scalar_q, np.intp), np.array(scalar_v, np.intp), tuple(quaternions)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Rollouts:
+    """Many simulated curves. states: (m, N+1, ns); sensors: (m, N+1, nsensordata) or None; finite: (m,) False = diverged."""
+
+    states: Array
+    sensors: Array | None
+    finite: np.ndarray
+
+
+class Engine:
+    """Steps many simulations of models that share one layout.
+
+    model: the caller's private copy;  substeps: `mj_step` calls per sample;  sensors: whether sensor data is wanted
+    steps: `mj_step` calls so far
+    """
+
+    def __init__(self, model: Any, substeps: int = 1, sensors: bool = False, threads: int | None = None) -> None:
+        self.model = model
+        self.space = state_space(model)
+        self.substeps = substeps
+        self.sensors = sensors
+        self.threads = threads or len(os.sched_getaffinity(0))
+        self.steps = 0
+        self._batches: dict[int, Batch] = {}
+        self._data = mujoco.MjData(model)
+
+    def _batch(self, models: Sequence[Any], count: int) -> Batch:
+        """A batch of `count` simulations, of one model or of one each."""
+        if count not in self._batches:
+            self._batches[count] = Batch(self.model, count, min(self.threads, count))
+        batch = self._batches[count]
+        batch.set_models(models[0] if len(models) == 1 else models)
+        return batch
+
+    def _load(self, batch: Batch, states: Array) -> None:
+        qpos, qvel, act = self.space.split(states)
+        batch.bind("qpos")[:] = qpos
+        batch.bind("qvel")[:] = qvel
+        if self.space.na:
+            batch.bind("act")[:] = act
+        batch.bind("qacc_warmstart")[:] = 0.0
+        batch.bind("time")[:] = 0.0
+
+    def step(self, models: Sequence[Any], states: Array, ctrl: Array) -> tuple[Array, Array | None]:
+        """One sample of every simulation: next states (n, ns), and the sensors at the given states or None.
+
+        states: (n, ns);  ctrl: (n, nu), held. Each model steps its equal, contiguous share. Diverged simulations are NaN.
+        """
+        share = len(states) // len(models)
+        parts = [
+            self._share(model, states[i * share : (i + 1) * share], ctrl[i * share : (i + 1) * share])
+            for i, model in enumerate(models)
+        ]
+        sensed = np.concatenate([s for _, s in parts if s is not None]) if self.sensors else None
+        return np.concatenate([x for x, _ in parts]), sensed
+
+    def _share(self, model: Any, states: Array, ctrl: Array) -> tuple[Array, Array | None]:
+        count = len(states)
+        batch = self._batch([model], count)
+        self._load(batch, states)
+        batch.bind("ctrl")[:] = ctrl
+        sensed, remaining = None, self.substeps
+        with quiet():
+            if self.sensors:
+                batch.bind("sensordata")
+                batch.step(nstep=1)
+                sensed, remaining = np.array(batch.bind("sensordata")), remaining - 1
+            if remaining:
+                batch.step(nstep=remaining)
+        self.steps += self.substeps * count
+        names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
+        out = np.concatenate([batch.bind(name) for name in names], axis=1)
+        timestep = float(self.model.opt.timestep)
+        out[np.abs(batch.bind("time").reshape(count) - self.substeps * timestep) > 0.5 * timestep] = np.nan
+        return out, sensed
+
+    def rollout(self, models: Sequence[Any], start: Array, ctrl: Array) -> Rollouts:
+        """Open-loop simulations from start: (m, ns) under ctrl: (m, N, nu), each sample held over its substeps."""
+        count, N, _ = ctrl.shape
+        batch = self._batch(models, count)
+        self._load(batch, start)
+        held = np.repeat(ctrl, self.substeps, axis=1)
+        record: tuple[Any, ...] = (RECORD,)
+        if self.sensors:  # one more step: sensor data belongs to the state before a step
+            held, record = np.concatenate([held, held[:, -1:]], axis=1), (RECORD, "sensordata")
+        with quiet():
+            out = batch.rollout(held.shape[1], np.ascontiguousarray(held), record=record)
+        self.steps += count * held.shape[1]
+        last = N * self.substeps
+        rows = out[RECORD][:, self.substeps - 1 : last : self.substeps]
+        states = np.concatenate([start[:, None], rows[:, :, 1:]], axis=1)
+        on_time = np.abs(rows[:, -1, 0] - last * self.model.opt.timestep) < 0.5 * self.model.opt.timestep
+        finite = on_time & np.isfinite(states).all(axis=(1, 2))
+        sensed = np.array(out["sensordata"][:, :: self.substeps]) if self.sensors else None
+        return Rollouts(states, sensed, finite)
+
+    def closed_loop(self, model: Any, reference: Array, mu: Array, K: Array) -> tuple[Array, Array, bool]:
+        """Projection: `u = mu + K (alpha - x)`. Returns states (N+1, ns), ctrl (N, nu), and False if it diverged.
+
+        reference: alpha, (N+1, ns);  mu: (N, nu);  K: (N, nu, nx)
+        """
+        space, N, substeps = self.space, len(mu), self.substeps
+        nq, nv, scalar = space.nq, space.nv, not space.quaternions
+        data = self._data
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.act[:] = space.split(reference[0])
+        states, used = np.empty((N + 1, nq + nv + space.na)), np.empty_like(mu)
+        states[0] = reference[0]
+        ctrl, qpos, qvel, act = data.ctrl, data.qpos, data.qvel, data.act
+        with np.errstate(over="ignore", invalid="ignore"), quiet():
+            for k in range(N):
+                now, after = states[k], states[k + 1]
+                error = reference[k] - now if scalar else space.minus(reference[k], now)
+                ctrl[:] = used[k] = mu[k] + K[k].dot(error)
+                mujoco.mj_step(model, data, substeps)
+                after[:nq], after[nq : nq + nv], after[nq + nv :] = qpos, qvel, act
+        self.steps += N * substeps
+        on_time = abs(data.time - N * substeps * model.opt.timestep) < 0.5 * model.opt.timestep
+        return states, used, bool(on_time and np.isfinite(states).all() and np.isfinite(used).all())

@@ -1,0 +1,39 @@
+"""What can go wrong through misuse. Each message names the place, the fault and what would be right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class MjfimError(Exception):
+    """Root of every error that mjfim raises on purpose; the command line turns it into exit code 2."""
+
+
+class ExperimentError(MjfimError):
+    """The experiment file (or its Python equivalent) asks for something impossible or unknown."""
+
+
+class ModelError(MjfimError):
+    """MuJoCo does not load or compile the model, or the model lacks what the experiment names."""
+
+
+class RecordingError(MjfimError):
+    """A recording, a control table or a design archive cannot be used."""
+
+
+class UnidentifiableError(MjfimError):
+    """The starting trajectory carries no information about some direction of the parameters."""
+
+
+class SimulationDiverged(MjfimError):
+    """MuJoCo reported a numerical warning (or a non-finite state) along a rollout that must not fail."""
+
+
+def unknown(kind: str, name: str, valid: Iterable[str]) -> str:
+    """Sentence for a name that does not exist: says so, proposes the nearest one, lists all valid ones."""
+    names = sorted(str(v) for v in valid)
+    near = get_close_matches(str(name), names, n=1)
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    listing = ", ".join(names) if names else "none"
+    return f"unknown {kind} {name!r}{hint}; valid: {listing}"

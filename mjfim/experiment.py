@@ -1,0 +1,218 @@
+"""What the user states about an experiment, in TOML or in Python, by the same names. Checked here, resolved in `setup`."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mjfim.errors import ExperimentError, unknown
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Range = tuple[float, float]
+
+
+class Section(BaseModel):
+    """A table of the experiment file: immutable, no unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Signal(Section):
+    """A generated initial control. Amplitudes and offsets in the actuator's unit, one number or one per actuator by name."""
+
+    kind: Literal["constant", "sine", "chirp", "multisine"]
+    amplitude: Finite | dict[str, Finite] = 1.0
+    offset: Finite | dict[str, Finite] = 0.0
+    frequency: Positive = 0.5
+    frequency_end: Positive | None = None
+    harmonics: Annotated[int, Field(ge=1)] = 5
+    seed: int = 0
+
+
+class Initial(Section):
+    """Where the experiment starts: a keyframe or qpos/qvel/act, and the control from which the design starts."""
+
+    keyframe: str | None = None
+    qpos: tuple[Finite, ...] | None = None
+    qvel: tuple[Finite, ...] | None = None
+    act: tuple[Finite, ...] | None = None
+    control: str | Signal
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Initial:
+        if self.keyframe is not None and (self.qpos or self.qvel or self.act):
+            raise ValueError("give either keyframe or qpos/qvel/act, not both")
+        return self
+
+
+class TargetSpec(Section):
+    """One number inside the model, `scale * theta + offset`."""
+
+    path: str
+    scale: Finite = 1.0
+    offset: Finite = 0.0
+
+
+class ParameterSpec(Section):
+    """One unknown parameter."""
+
+    target: str | None = None
+    targets: tuple[TargetSpec, ...] = ()
+    guess: Finite | None = None
+    true: Finite | None = None
+    bounds: Range | None = None
+    scale: Positive | Literal["guess"] = "guess"
+    prior: Positive | None = None
+    unit: str = ""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ParameterSpec:
+        if (self.target is None) == (not self.targets):
+            raise ValueError("give exactly one of target and targets")
+        if self.bounds is not None:
+            low, high = self.bounds
+            if not low < high:
+                raise ValueError(f"bounds are inverted: [{low}, {high}] needs lower < upper")
+            for key, value in (("guess", self.guess), ("true", self.true)):
+                if value is not None and not low <= value <= high:
+                    raise ValueError(f"{key} {value} is outside bounds [{low}, {high}]")
+        return self
+
+    @property
+    def all_targets(self) -> tuple[TargetSpec, ...]:
+        """The targets, however they were written."""
+        return self.targets or (TargetSpec(path=self.target or ""),)
+
+
+class Cost(Section):
+    """Weights of eq. 3 and where it is evaluated. control: R_tau; tracking, tracking_velocity: Q_tau by joint name."""
+
+    criterion: Literal["E", "A", "D"] = "E"
+    information: Positive = 1.0
+    control: Positive | dict[str, Positive] = 1e-3
+    tracking: dict[str, NonNegative] = {}
+    tracking_velocity: dict[str, NonNegative] = {}
+    linearize_at: Literal["guess", "true"] = "guess"
+
+
+class Descent(Section):
+    """How the cost is minimised. tolerance: stop at `|DJ.zeta| <= tolerance * J`; psi_weight: metric weight on psi.
+
+    starts: 1 = from the initial control only; more adds random multisines, the best result is kept
+    coarse: descend first at a sample period that many times longer, where it is cheap; 1 = never; auto = 4 where the model
+    allows it
+    """
+
+    method: Literal["lbfgs", "metric"] = "lbfgs"
+    tolerance: Positive = 1e-7
+    max_iterations: Annotated[int, Field(ge=0)] = 200
+    psi_weight: NonNegative = 0.0
+    starts: Annotated[int, Field(ge=1)] = 1
+    coarse: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    seed: int = 0
+
+
+class Limits(Section):
+    """Ranges by joint or actuator name. Checked and reported at every sample."""
+
+    position: dict[str, Range] = {}
+    velocity: dict[str, Positive | Range] = {}
+    control: dict[str, Range] = {}
+
+
+class Experiment(Section):
+    """An experiment. Relative paths inside are relative to `directory`, the folder of the experiment file."""
+
+    model: str
+    rate: Positive
+    measure_rate: Positive | None = None
+    horizon: Positive
+    initial: Initial
+    parameters: Annotated[dict[str, ParameterSpec], Field(min_length=1)]
+    noise: dict[str, Positive] = {}
+    cost: Cost = Cost()
+    descent: Descent = Descent()
+    limits: Limits = Limits()
+    directory: Path = Field(default=Path("."), exclude=True)
+    source: str = Field(default="experiment", exclude=True)
+
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise ExperimentError(explain(error, str(values.get("source", "experiment")))) from None
+
+    @staticmethod
+    def from_file(path: str | Path) -> Experiment:
+        """Read a TOML experiment file. Raises ExperimentError naming the file and the key."""
+        path = Path(path)
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ExperimentError(f"{path}: cannot read the experiment file: {error.strerror}") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ExperimentError(f"{path}: not valid TOML: {error}") from None
+        for reserved in ("directory", "source"):
+            if reserved in values:
+                raise ExperimentError(f"{path}: {unknown('key', reserved, file_keys())}")
+        return Experiment(**values, directory=path.parent, source=str(path))
+
+    def replace(self, **tables: Any) -> Experiment:
+        """A checked copy with changes; tables merge into the old ones: `e.replace(cost={"control": 1e-2})`."""
+        values = self.model_dump(exclude_unset=True)
+        for key, value in tables.items():
+            old = values.get(key)
+            values[key] = {**old, **value} if isinstance(old, dict) and isinstance(value, Mapping) else value
+        return Experiment(**{"directory": self.directory, "source": self.source, **values})
+
+
+def file_keys() -> list[str]:
+    """Top-level keys of the experiment file."""
+    return [key for key in Experiment.model_fields if key not in ("directory", "source")]
+
+
+def explain(error: ValidationError, source: str) -> str:
+    """One line per fault: file, key, what was wrong, what would be right."""
+    lines = []
+    for fault in error.errors(include_url=False):
+        location = [part for part in fault["loc"] if not _is_branch(part)]
+        key = ".".join(str(part) for part in location)
+        if fault["type"] == "extra_forbidden":
+            lines.append(f"{source}: {key}: {unknown('key', str(location[-1]), _valid_keys(location[:-1]))}")
+        else:
+            message = fault["msg"].removeprefix("Value error, ")
+            given = fault.get("input")
+            shown = f" (got {given!r})" if isinstance(given, (str, int, float, bool)) else ""
+            lines.append(f"{source}: {key or 'experiment'}: {message}{shown}")
+    return "\n".join(dict.fromkeys(lines))
+
+
+def _is_branch(part: object) -> bool:
+    """pydantic names the branch of a union inside the location; the user never wrote that."""
+    text = str(part)
+    return "[" in text or text in ("Signal", "str", "float", "constrained-float", "tuple")
+
+
+def _valid_keys(location: list[Any]) -> list[str]:
+    """Keys that the table at this location may have."""
+    if not location:
+        return file_keys()
+    tables: dict[str, type[Section]] = {
+        "initial": Initial,
+        "cost": Cost,
+        "descent": Descent,
+        "limits": Limits,
+        "parameters": ParameterSpec,
+    }
+    table = tables.get(str(location[0]))
+    if "control" in [str(p) for p in location[1:]] and table is Initial:
+        table = Signal
+    if "targets" in [str(p) for p in location]:
+        table = TargetSpec
+    return list(table.model_fields) if table else []

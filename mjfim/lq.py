@@ -1,0 +1,100 @@
+"""Time-varying linear-quadratic problems on arrays: recursions, regulator, descent. Knows no plant and no cost.
+
+The linear recursions are unit-triangular banded systems; one BLAS call solves each, no Python loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg.blas import dtbsv
+from scipy.linalg.lapack import dposv
+
+from mjfim.trajectory import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Recursion:
+    """The linear recursion `z_{k+1} = A_k z_k + c_k`, z_0 given, and its adjoint, for one A: (N, n, n)."""
+
+    A: Array
+
+    @cached_property
+    def _band(self) -> Array:
+        N, n, _ = self.A.shape
+        band = np.zeros((2 * n, (N + 1) * n), order="F")
+        band[0] = 1.0
+        i, j = np.indices((n, n))
+        columns = (np.arange(N) * n)[:, None, None] + j
+        band[np.broadcast_to(n + i - j, columns.shape), columns] = -self.A
+        return band
+
+    def forward(self, z0: Array, c: Array) -> Array:
+        """z: (N+1, n) from z0: (n,) and c: (N, n)."""
+        rhs = np.concatenate([z0[None], c])
+        return self._solve(rhs, transposed=False)
+
+    def adjoint(self, a: Array) -> Array:
+        """l: (N+1, n) with `l_k = A_k' l_{k+1} + a_k`, `l_N = a_N`, from a: (N+1, n)."""
+        return self._solve(a, transposed=True)
+
+    def _solve(self, rhs: Array, transposed: bool) -> Array:
+        n = self.A.shape[1]
+        flat = np.array(rhs, dtype=np.float64).reshape(-1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            solution = dtbsv(2 * n - 1, self._band, flat, lower=1, trans=int(transposed), diag=1, overwrite_x=1)
+        return np.asarray(solution).reshape(rhs.shape)
+
+
+def _solve(S: Array, rhs: Array) -> Array:
+    """S^-1 rhs for a small symmetric positive definite S, without the overhead of NumPy's checks."""
+    _, x, info = dposv(S, rhs)
+    if info != 0:
+        raise np.linalg.LinAlgError("the Riccati recursion lost positive definiteness; its weights must be positive")
+    return np.asarray(x)
+
+
+def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
+    """Gain K: (N, nu, nx) minimising `sum z'Qz + v'Rv` plus `z_N' terminal z_N` with `v = -K z`.
+
+    A: (N, nx, nx);  B: (N, nx, nu);  Q, terminal: (nx, nx);  R: (nu, nu)
+    """
+    K = np.empty((len(A), B.shape[2], A.shape[1]))
+    P = terminal
+    for k in range(len(A) - 1, -1, -1):
+        BP = B[k].T @ P
+        K[k] = _solve(R + BP @ B[k], BP @ A[k])
+        P = Q + A[k].T @ P @ (A[k] - B[k] @ K[k])
+        P = 0.5 * (P + P.T)  # symmetrise: round-off grows backwards in time otherwise
+    return K
+
+
+@dataclass(frozen=True, eq=False)
+class TangentCurve:
+    """A tangent vector zeta = (z, v) of the trajectory manifold. z: (N+1, nx), v: (N, nu)."""
+
+    z: Array
+    v: Array
+
+
+def descent(A: Array, B: Array, a: Array, b: Array, Q: Array, R: Array, terminal: Array) -> TangentCurve:
+    """Minimiser of `sum a'z + b'v + 1/2 z'Qz + 1/2 v'Rv` subject to `z_{k+1} = A z_k + B v_k`, `z_0 = 0`.
+
+    a: (N+1, nx);  b: (N, nu);  Q, terminal: (nx, nx), the metric on z_k for k < N and on z_N;  R: (nu, nu)
+    The paper's problem (8), solved by its Riccati equations.
+    """
+    N, nx, nu = len(A), A.shape[1], B.shape[2]
+    K, feedforward = np.empty((N, nu, nx)), np.empty((N, nu))
+    P, r = terminal, a[N]
+    for k in range(N - 1, -1, -1):
+        BP = B[k].T @ P
+        both = _solve(R + BP @ B[k], np.column_stack([BP @ A[k], b[k] + B[k].T @ r]))
+        K[k], feedforward[k] = both[:, :nx], both[:, nx]
+        closed = A[k] - B[k] @ K[k]
+        r = a[k] + closed.T @ r - K[k].T @ b[k]
+        P = Q + A[k].T @ P @ closed
+        P = 0.5 * (P + P.T)
+    z = Recursion(A - B @ K).forward(np.zeros(nx), -np.einsum("kiu,ku->ki", B, feedforward))
+    return TangentCurve(z, -np.einsum("kui,ki->ku", K, z[:-1]) - feedforward)

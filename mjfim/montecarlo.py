@@ -1,0 +1,229 @@
+"""Monte-Carlo studies of the estimator against the Cramer-Rao bound, all trials stepped together.
+
+Every trial minimises its own squared residual. The way there is shared: a fit of the mean measurement leads from the
+guess to the neighbourhood of all minima, Gauss-Newton steps with the Jacobian expanded to second order about that point
+bring each trial close, and a step with the trial's own Jacobian finishes it. A trial counts as converged when its last
+own step is small against its standard deviation; the few others go one by one through the trust-region solver of
+`identify`, and what that does not solve is a failed trial.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.estimate import Fit, newton_raphson, trust_region
+from mjfim.experiment import Experiment
+from mjfim.setup import Setup
+from mjfim.trajectory import Array, Recording, Study, Trajectory, TrialSet
+
+CONVERGED = 0.03
+SHARED_STEPS = 3
+OWN_STEPS = 3
+CHUNK = 4000
+
+Progress = Callable[[str, float], None]
+
+
+def simulate(experiment: Experiment | Setup, trajectory: Trajectory, seed: int | np.random.Generator = 0) -> Recording:
+    """A synthetic recording at the `true` values: the trajectory's control played open loop, noise on measured samples."""
+    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
+    rng = np.random.default_rng(seed)
+    y, finite = setup.plant.measure(setup.parameters.true[None], trajectory.ctrl)
+    if not finite[0]:
+        raise SimulationDiverged("the simulation diverges at the true parameters under this control")
+    noisy = y[0] + setup.outputs.sigma * rng.standard_normal(y[0].shape)
+    unmeasured = np.ones(len(noisy), dtype=bool)
+    unmeasured[:: setup.stride] = False
+    noisy[unmeasured] = np.nan
+    return Recording(
+        np.arange(len(noisy), dtype=np.float64) * setup.dt, trajectory.ctrl, noisy, setup.outputs.names, "simulated"
+    )
+
+
+def monte_carlo(
+    experiment: Experiment | Setup,
+    trajectory: Trajectory | Mapping[str, Trajectory],
+    trials: int = 1500,
+    seed: int = 0,
+    measure_rate: float | None = None,
+    progress: Progress | None = None,
+) -> Study:
+    """Estimate the parameters from many noisy repetitions of one or several trajectories (name -> trajectory).
+
+    Parameters are searched without bounds. Raises ExperimentError for fewer than two trials.
+    """
+    if trials < 2:
+        raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
+    if measure_rate is not None:
+        base = experiment.experiment if isinstance(experiment, Setup) else experiment
+        experiment = base.replace(measure_rate=measure_rate)
+    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
+    named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
+    sets, information = {}, {}
+    for rng, (name, curve) in zip(np.random.default_rng(seed).spawn(len(named)), named.items(), strict=True):
+        tell = None if progress is None else (lambda share, name=name: progress(name, share))
+        sets[name], information[name] = _trial_set(setup, curve, trials, rng, tell)
+    return Study(setup.parameters.names, setup.parameters.true, setup.measure_rate, sets, information)
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """What all trials share, at the fit of the mean measurement.
+
+    theta: (p,);  J: (n, p) whitened Jacobian;  bend: (p, n, p) its derivative by theta;  std: (p,)
+    """
+
+    theta: Array
+    J: Array
+    bend: Array
+    std: Array
+
+    def jacobian(self, theta: Array) -> Array:
+        """(m, n, p) second-order Jacobians at theta: (m, p)."""
+        return np.asarray(self.J + np.tensordot(theta - self.theta, self.bend, axes=(1, 0)))
+
+
+class Trials:
+    """Many repetitions of one control with their own noise. measured: (m, n) whitened measurements of all trials."""
+
+    def __init__(self, setup: Setup, ctrl: Array, measured: Array, rows: np.ndarray) -> None:
+        self.setup, self.ctrl, self.measured, self.rows = setup, ctrl, measured, rows
+
+    def outputs(self, theta: Array) -> tuple[Array, np.ndarray]:
+        """Whitened predictions (m, n) at theta: (m, p), and which of them are finite."""
+        y, finite = self.setup.plant.measure(theta, self.ctrl)
+        return (y[:, self.rows] / self.setup.outputs.sigma).reshape(len(theta), -1), finite
+
+    def recording(self, measured: Array) -> Recording:
+        """One trial, (n,) whitened, as a recording."""
+        sigma = self.setup.outputs.sigma
+        y = np.full((len(self.ctrl) + 1, len(sigma)), np.nan)
+        y[self.rows] = measured.reshape(len(self.rows), -1) * sigma
+        return Recording(
+            np.arange(len(y), dtype=np.float64) * self.setup.dt, self.ctrl, y, self.setup.outputs.names, "trial"
+        )
+
+    def jacobian(self, theta: Array, predicted: Array, relative: float = 1e-6) -> Array:
+        """(m, n, p) by one-sided differences about predictions already made."""
+        steps = relative * self.setup.parameters.step
+        columns = []
+        for j, h in enumerate(steps):
+            moved = np.array(theta)
+            moved[:, j] += h
+            columns.append((self.outputs(moved)[0] - predicted) / h)
+        return np.stack(columns, axis=2)
+
+
+def _trial_set(
+    setup: Setup, curve: Trajectory, count: int, rng: np.random.Generator, tell: Callable[[float], None] | None
+) -> tuple[TrialSet, Array]:
+    clock = time.perf_counter()
+    truth, sigma = setup.parameters.true, setup.outputs.sigma
+    rows = np.arange(setup.stride, curve.samples + 1, setup.stride)
+    exact = setup.plant.predict(truth, curve.ctrl)
+    if exact is None:
+        raise SimulationDiverged("the simulation diverges at the true parameters under this control")
+    y, G = exact
+    J = (G[rows] / sigma[:, None]).reshape(-1, len(truth))
+    information = J.T @ J + setup.parameters.prior_information
+    estimates = []
+    for first in range(0, count, CHUNK):
+        m = min(CHUNK, count - first)
+        whitened = (y[rows] / sigma).reshape(-1) + rng.standard_normal((m, J.shape[0]))
+        trials = Trials(setup, curve.ctrl, whitened, rows)
+        estimates.append(_solve(trials, _shared(setup, trials), tell))
+    every = np.concatenate(estimates)
+    return _statistics(every, np.asarray(np.linalg.inv(J.T @ J)), time.perf_counter() - clock), information
+
+
+def _shared(setup: Setup, trials: Trials) -> Shared:
+    """Fit of the mean measurement from the guess, with its Jacobian and the Jacobian's derivative."""
+    fit = Fit(setup, [trials.recording(trials.measured.mean(axis=0))])
+    theta = newton_raphson(fit, setup.parameters.guess).theta
+    sigma, h = setup.outputs.sigma, 1e-3 * setup.parameters.step
+
+    def jacobian(at: Array) -> Array:
+        predicted = setup.plant.predict(at, trials.ctrl)
+        if predicted is None:
+            raise SimulationDiverged("the simulation diverges near the fit of the mean measurement")
+        return np.asarray((predicted[1][trials.rows] / sigma[:, None]).reshape(-1, len(at)))
+
+    J = jacobian(theta)
+    bend = np.stack([(jacobian(theta + e) - jacobian(theta - e)) / (2 * e.max()) for e in np.diag(h)])
+    return Shared(theta, J, bend, np.sqrt(np.diag(np.linalg.inv(J.T @ J))))
+
+
+def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None) -> Array:
+    """(m, p) estimates; NaN where a trial failed."""
+    m = len(trials.measured)
+    theta = shared.theta + (trials.measured - trials.outputs(shared.theta[None])[0]) @ np.linalg.pinv(shared.J).T
+    for k in range(SHARED_STEPS - 1):
+        predicted, finite = trials.outputs(theta)
+        step = _gauss_newton(shared.jacobian(theta), trials.measured - predicted)
+        theta = np.where(finite[:, None], theta + step, shared.theta)
+        if tell is not None:
+            tell((k + 1) / (SHARED_STEPS + 3))
+    active = np.arange(m)
+    for k in range(OWN_STEPS):
+        own = Trials(trials.setup, trials.ctrl, trials.measured[active], trials.rows)
+        predicted, finite = own.outputs(theta[active])
+        step = _gauss_newton(own.jacobian(theta[active], predicted), own.measured - predicted)
+        step[~finite] = np.nan
+        theta[active] += step
+        small = np.nan_to_num(np.abs(step) / shared.std, nan=np.inf).max(axis=1) < CONVERGED
+        active = active[~small & finite]
+        if tell is not None:
+            tell(1.0 if not len(active) else (SHARED_STEPS + k + 1) / (SHARED_STEPS + k + 2))
+        if not len(active):
+            break
+    for i in active:
+        solution = trust_region(Fit(trials.setup, [trials.recording(trials.measured[i])]), shared.theta)
+        theta[i] = solution.theta if solution.success else np.nan
+    return theta
+
+
+def _gauss_newton(J: Array, r: Array) -> Array:
+    """(m, p) steps `(J'J)^-1 J'r`; J: (m, n, p), r: (m, n)."""
+    JT = np.swapaxes(J, 1, 2)
+    try:
+        return np.asarray(np.linalg.solve(JT @ J, JT @ r[:, :, None])[:, :, 0])
+    except np.linalg.LinAlgError:
+        return np.full((len(J), J.shape[2]), np.nan)
+
+
+def _statistics(estimates: Array, crlb: Array, seconds: float) -> TrialSet:
+    good = estimates[np.isfinite(estimates).all(axis=1)]
+    n, p = len(good), estimates.shape[1]
+    if n < 2:
+        blank = np.full(p, np.nan)
+        return TrialSet(
+            estimates,
+            blank,
+            np.full((p, p), np.nan),
+            crlb,
+            blank,
+            np.full((p, 2), np.nan),
+            len(estimates),
+            len(estimates) - n,
+            seconds,
+        )
+    covariance = np.atleast_2d(np.cov(good, rowvar=False))
+    efficiency = np.diag(crlb) / np.diag(covariance)
+    interval = efficiency[:, None] * chi2_distribution.ppf([0.025, 0.975], n - 1) / (n - 1)
+    return TrialSet(
+        estimates,
+        good.mean(axis=0),
+        covariance,
+        crlb,
+        efficiency,
+        interval,
+        len(estimates),
+        len(estimates) - n,
+        seconds,
+    )

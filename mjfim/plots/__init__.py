@@ -1,0 +1,25 @@
+"""Every figure of the package, each a function from records to a matplotlib Figure; `save` writes it as PNG.
+
+This package is the only importer of matplotlib.
+"""
+
+from __future__ import annotations
+
+from mjfim.plots.design import convergence, sensitivity_phase, trajectories
+from mjfim.plots.estimates import fit, histogram
+from mjfim.plots.parameters import parameter_intervals, std_bars
+from mjfim.plots.style import save
+from mjfim.plots.tables import design_table, study_table
+
+__all__ = [
+    "convergence",
+    "design_table",
+    "fit",
+    "histogram",
+    "parameter_intervals",
+    "save",
+    "sensitivity_phase",
+    "std_bars",
+    "study_table",
+    "trajectories",
+]

@@ -1,0 +1,294 @@
+"""Algorithm 1 of Wilson & Murphey: descend over the trajectory manifold through the projection operator.
+
+Knows arrays and one protocol, neither MuJoCo nor Fisher information. The loop is a generator of iterates; progress
+bars, logs, checkpoints and early stops consume it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+from mjfim.lq import Recursion, TangentCurve, descent, regulator
+from mjfim.trajectory import Array, Status
+
+P = TypeVar("P")
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """First-order model of the cost on the tangent space, `DJ.zeta = sum a'z + b'v` with `z_{k+1} = A z_k + B v_k`.
+
+    A: (N, nx, nx);  B: (N, nx, nu);  a: (N+1, nx) [1 / x-unit];  b: (N, nu) [1 / u-unit]
+    extended: the same with psi among the states (nx (1+p) of them), where a metric with weight on psi wants it
+    """
+
+    A: Array
+    B: Array
+    a: Array
+    b: Array
+    extended: Expansion | None = None
+
+    def slope(self, zeta: TangentCurve) -> float:
+        """DJ.zeta."""
+        return float(np.sum(self.a * zeta.z) + np.sum(self.b * zeta.v))
+
+    def gradient(self, K: Array) -> Array:
+        """(N, nu) derivative of the cost by the curve coordinate `c = u + K x`, i.e. through the projection."""
+        closed = Recursion(self.A - self.B @ K)
+        a = np.array(self.a)
+        a[:-1] -= np.einsum("kui,ku->ki", K, self.b)
+        costate = closed.adjoint(a)
+        return np.asarray(self.b + np.einsum("kiu,ki->ku", self.B, costate[1:]))
+
+    def lift(self, K: Array, c: Array) -> TangentCurve:
+        """Tangent vector whose curve coordinate moves by c: (N, nu)."""
+        closed = Recursion(self.A - self.B @ K)
+        z = closed.forward(np.zeros(self.A.shape[1]), np.einsum("kiu,ku->ki", self.B, c))
+        return TangentCurve(z, c - np.einsum("kui,ki->ku", K, z[:-1]))
+
+
+class Problem(Protocol[P]):
+    """What Algorithm 1 needs to know. A point P is a trajectory with whatever was computed along it."""
+
+    def value(self, point: P) -> float:
+        """J at a point; infinite where the trial diverged."""
+        ...
+
+    def expand(self, point: P) -> Expansion:
+        """First-order expansion at a point."""
+        ...
+
+    def project(self, point: P, zeta: TangentCurve, gamma: float, K: Array) -> P:
+        """The trajectory P(xi + gamma zeta) under the regulator K."""
+        ...
+
+    def difference(self, new: P, old: P) -> TangentCurve:
+        """Tangent-space difference of two trajectories, (x_new - x_old, u_new - u_old)."""
+        ...
+
+    def refine(self, point: P) -> P | None:
+        """The same point with more accurate differences, or None where they are already the most accurate."""
+        ...
+
+
+class Direction(Protocol):
+    """Chooses zeta from the expansion; told of each accepted step."""
+
+    def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
+        """A descent direction."""
+        ...
+
+    def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
+        """Called with the expansion at the new point and the difference to the old one."""
+        ...
+
+    def reset(self) -> bool:
+        """Forget what was learnt; True if there was something to forget."""
+        ...
+
+
+@dataclass
+class MetricDescent:
+    """The paper's direction: minimise `DJ.zeta + 1/2 <zeta, zeta>` over the tangent space (problem 8), no weight on psi.
+
+    Q, terminal: (nx, nx) and R: (nu, nu), already multiplied by dt.
+    """
+
+    Q: Array
+    R: Array
+    terminal: Array
+
+    def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
+        """zeta by the Riccati equations."""
+        return descent(expansion.A, expansion.B, expansion.a, expansion.b, self.Q, self.R, self.terminal)
+
+    def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
+        """Nothing is learnt."""
+
+    def reset(self) -> bool:
+        """Nothing to forget."""
+        return False
+
+
+@dataclass
+class ExtendedMetricDescent:
+    """Problem (8) as the paper states it: the metric also weighs the psi-part of zeta.
+
+    Q, terminal: (nx(1+p), nx(1+p)) over (x, psi stacked by parameter);  R: (nu, nu), already multiplied by dt
+    """
+
+    Q: Array
+    R: Array
+    terminal: Array
+
+    def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
+        """zeta by the Riccati equations of the extended system, its psi-part dropped (P recomputes it)."""
+        e, nx = expansion.extended, expansion.A.shape[1]
+        if e is None:
+            raise ValueError("the problem must provide extended expansions for a metric with weight on psi")
+        zeta = descent(e.A, e.B, e.a, e.b, self.Q, self.R, self.terminal)
+        return TangentCurve(zeta.z[:, :nx], zeta.v)
+
+    def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
+        """Nothing is learnt."""
+
+    def reset(self) -> bool:
+        """Nothing to forget."""
+        return False
+
+
+@dataclass
+class LBFGS:
+    """Limited-memory BFGS in the curve coordinate `c = u + K x`, where P(xi + gamma zeta) is affine in gamma.
+
+    The inner product is the control metric `v' R v` (R: (nu, nu), multiplied by dt), so that the iteration count does not
+    depend on the sample period. Nocedal & Wright, algorithm 7.4.
+    """
+
+    R: Array
+    memory: int = 20
+    _s: list[Array] = field(default_factory=list)
+    _y: list[Array] = field(default_factory=list)
+    _gradient: Array | None = None
+
+    def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
+        """zeta = -H DJ by the two-loop recursion."""
+        g = expansion.gradient(K)
+        self._gradient = g
+        q, alphas = np.array(g), []
+        for s, y in zip(reversed(self._s), reversed(self._y), strict=True):
+            alpha = np.sum(s * q) / np.sum(s * y)
+            q -= alpha * y
+            alphas.append(alpha)
+        q = np.asarray(np.linalg.solve(self.R, q.T).T, dtype=np.float64)
+        if self._s:
+            s, y = self._s[-1], self._y[-1]
+            q *= np.sum(s * y) / np.sum(y * np.linalg.solve(self.R, y.T).T)
+        for s, y, alpha in zip(self._s, self._y, reversed(alphas), strict=True):
+            q += s * (alpha - np.sum(y * q) / np.sum(s * y))
+        return expansion.lift(K, -q)
+
+    def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
+        """Store the pair (s, y) if it has positive curvature."""
+        if self._gradient is None:
+            return
+        s = moved.v + np.einsum("kui,ki->ku", K, moved.z[:-1])
+        y = expansion.gradient(K) - self._gradient
+        if np.sum(s * y) > 1e-10 * np.linalg.norm(s) * np.linalg.norm(y):
+            self._s, self._y = [*self._s, s][-self.memory :], [*self._y, y][-self.memory :]
+
+    def refined(self, R: Array, factor: int) -> LBFGS:
+        """The same memory on a grid that is `factor` times finer: s is held, y (an integral over a sample) is shared out."""
+        s = [np.repeat(v, factor, axis=0) for v in self._s]
+        y = [np.repeat(v, factor, axis=0) / factor for v in self._y]
+        return LBFGS(R, self.memory, s, y)
+
+    def reset(self) -> bool:
+        """Drop all pairs."""
+        had = bool(self._s)
+        self._s, self._y = [], []
+        return had
+
+
+@dataclass(frozen=True)
+class Armijo:
+    """Backtracking: the largest gamma in {1, beta, beta^2, ...} with `J(gamma) <= J(0) + sigma gamma DJ.zeta`."""
+
+    sigma: float = 1e-4
+    beta: float = 0.5
+    trials: int = 30
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.sigma < 0.5 and 0.0 < self.beta < 1.0 and self.trials > 0):
+            raise ValueError("Armijo needs 0 < sigma < 0.5, 0 < beta < 1 and trials > 0")
+
+    def search(
+        self, problem: Problem[P], point: P, zeta: TangentCurve, slope: float, K: Array, first: float = 1.0
+    ) -> tuple[P, float] | None:
+        """The accepted point and its gamma, or None. Steps shorten by the parabola through J(0), slope, J(gamma)."""
+        value, gamma = problem.value(point), first
+        for _ in range(self.trials):
+            trial = problem.project(point, zeta, gamma, K)
+            new = problem.value(trial)
+            if new <= value + self.sigma * gamma * slope:
+                return trial, gamma
+            bend = new - value - gamma * slope
+            shorter = -0.5 * slope * gamma**2 / bend if np.isfinite(new) and bend > 0.0 else 0.0
+            gamma = float(np.clip(shorter, 0.1 * gamma, self.beta * gamma))
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class Iterate(Generic[P]):
+    """One iterate of Algorithm 1. slope: |DJ.zeta| at this point; gamma: the step that led here; status: set on the last."""
+
+    index: int
+    point: P
+    value: float
+    slope: float
+    gamma: float
+    status: Status | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Regulator:
+    """How K is made: weights Q, R, terminal (times dt) of the LQR along the trajectory, renewed every `period` iterates."""
+
+    Q: Array
+    R: Array
+    terminal: Array
+    period: int = 10
+
+    def gain(self, expansion: Expansion) -> Array:
+        """K: (N, nu, nx) about the expansion's trajectory."""
+        return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
+
+
+def optimize(
+    problem: Problem[P],
+    start: P,
+    direction: Direction,
+    regulate: Regulator,
+    armijo: Armijo,
+    tolerance: float,
+    max_iterations: int,
+) -> Iterator[Iterate[P]]:
+    """Algorithm 1. Yields every iterate; the last one carries a status. Stops at `|DJ.zeta| <= tolerance * |J|`."""
+    point, gamma, index = start, 0.0, 0
+    expansion = problem.expand(point)
+    K = regulate.gain(expansion)
+    while True:
+        zeta = direction(expansion, K)
+        slope = expansion.slope(zeta)
+        value = problem.value(point)
+        if -slope <= tolerance * abs(value):
+            better = problem.refine(point)
+            if better is None:
+                yield Iterate(index, point, value, abs(slope), gamma, Status.CONVERGED)
+                return
+            point, expansion = better, problem.expand(better)
+            continue
+        if index >= max_iterations:
+            yield Iterate(index, point, value, abs(slope), gamma, Status.MAX_ITERATIONS)
+            return
+        yield Iterate(index, point, value, abs(slope), gamma)
+        found = armijo.search(problem, point, zeta, slope, K, min(1.0, -2.0 * abs(value) / slope))
+        if found is None:
+            better = problem.refine(point)
+            if better is not None:
+                point, expansion = better, problem.expand(better)
+                continue
+            if direction.reset():
+                continue
+            yield Iterate(index, point, value, abs(slope), gamma, Status.STALLED)
+            return
+        old, (point, gamma) = point, found
+        expansion = problem.expand(point)
+        direction.accept(expansion, K, problem.difference(point, old))
+        index += 1
+        if index % regulate.period == 0:
+            K = regulate.gain(expansion)

@@ -1,0 +1,105 @@
+"""Control signals to start from: generated ones and tables read from CSV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pyarrow.csv
+from scipy.signal import chirp
+
+from mjfim.errors import ExperimentError, RecordingError, unknown
+from mjfim.experiment import Signal
+from mjfim.trajectory import Array
+
+
+def generate(signal: Signal, t: Array, names: tuple[str, ...]) -> Array:
+    """(N, nu) from a `Signal` at times t: (N,) [s]; every actuator gets its own phase so that they do not coincide."""
+    amplitude, offset = (
+        _per_actuator(v, names, key) for v, key in ((signal.amplitude, "amplitude"), (signal.offset, "offset"))
+    )
+    shape = np.zeros((len(t), len(names)))
+    if signal.kind == "sine":
+        shape = np.sin(2 * np.pi * signal.frequency * t[:, None] + np.pi / 4 * np.arange(len(names)))
+    elif signal.kind == "chirp":
+        end = signal.frequency_end or 5.0 * signal.frequency
+        phases = 45.0 * np.arange(len(names)) - 90.0
+        shape = np.stack([chirp(t, signal.frequency, t[-1], end, phi=phase) for phase in phases], axis=1)
+    elif signal.kind == "multisine":
+        shape = multisine(t, len(names), signal.frequency, signal.harmonics, np.random.default_rng(signal.seed))
+    elif signal.kind == "constant":
+        shape = np.ones_like(shape)
+    return np.asarray(offset + amplitude * shape)
+
+
+def multisine(t: Array, nu: int, frequency: float, harmonics: int, rng: np.random.Generator) -> Array:
+    """(N, nu) sums of harmonics of a base frequency [Hz] with random phases and weights, peak 1."""
+    order = np.arange(1, harmonics + 1)
+    phases = rng.uniform(0.0, 2 * np.pi, (nu, harmonics))
+    weights = rng.uniform(0.2, 1.0, (nu, harmonics))
+    waves = np.sin(2 * np.pi * frequency * t[:, None, None] * order + phases) * weights
+    total = waves.sum(axis=2)
+    return np.asarray(total / np.abs(total).max(axis=0))
+
+
+def _per_actuator(value: float | dict[str, float], names: tuple[str, ...], key: str) -> Array:
+    if not isinstance(value, dict):
+        return np.full(len(names), float(value))
+    for name in value:
+        if name not in names:
+            raise ExperimentError(f"initial.control.{key}: {unknown('actuator', name, names)}")
+    return np.array([value.get(name, 0.0) for name in names])
+
+
+def read_table(path: Path) -> dict[str, Array]:
+    """Columns of a numeric CSV file (gzip by its ending). Raises RecordingError naming file, column and row."""
+    try:
+        table = pyarrow.csv.read_csv(path)
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: no such file") from None
+    except (pyarrow.ArrowInvalid, OSError) as error:
+        raise RecordingError(f"{path}: not a readable CSV table: {error}") from None
+    columns = {}
+    for name in table.column_names:
+        try:
+            columns[name] = table[name].cast(pyarrow.float64()).to_numpy(zero_copy_only=False)
+        except (pyarrow.ArrowInvalid, pyarrow.ArrowNotImplementedError):
+            raise RecordingError(f"{path}: column {name!r} is not numeric") from None
+    return columns
+
+
+def read_control(path: Path, t: Array, dt: float, names: tuple[str, ...]) -> Array:
+    """(N, nu) control at times t: (N,), held between rows. Columns: t and each actuator's name (`ctrl:` optional)."""
+    columns = read_table(path)
+    if "t" not in columns:
+        raise RecordingError(f"{path}: column 't' is missing; found: {', '.join(columns)}")
+    chosen = []
+    for name in names:
+        key = name if name in columns else f"ctrl:{name}"
+        if key not in columns:
+            raise RecordingError(
+                f"{path}: no column for actuator {name!r}; wanted columns: t, {', '.join(names)}; found: {', '.join(columns)}"
+            )
+        chosen.append(columns[key])
+    stamps, values = columns["t"], np.column_stack(chosen)
+    if "ctrl:" + names[0] in columns:  # a design: its last row has no control
+        while len(values) and np.isnan(values[-1]).all():
+            stamps, values = stamps[:-1], values[:-1]
+    known = {"t", *names, *(f"ctrl:{n}" for n in names)}
+    strays = [c for c in columns if c not in known and not c.startswith(("qpos:", "qvel:"))]
+    if strays:
+        raise RecordingError(f"{path}: {unknown('column', strays[0], ['t', *names])}")
+    if not np.isfinite(values).all() or not np.isfinite(stamps).all():
+        bad = int(np.argmax(~np.isfinite(np.column_stack([stamps, values])).all(axis=1)))
+        raise RecordingError(f"{path}: NaN or infinite value in data row {bad + 1}; every row must be finite")
+    if len(stamps) < 2 or np.any(np.diff(stamps) <= 0):
+        raise RecordingError(f"{path}: column 't' must increase from row to row and have at least two rows")
+    period = float(np.median(np.diff(stamps)))
+    if stamps[0] > t[0] + 1e-9 or stamps[-1] + period < t[-1] + dt - 1e-9:
+        raise RecordingError(
+            f"{path}: too few rows: the table covers t = {stamps[0]:g} ... {stamps[-1] + period:g} s with {len(stamps)} rows, "
+            f"the experiment needs 0 ... {t[-1] + dt:g} s ({len(t)} samples)"
+        )
+    row = np.clip(np.searchsorted(stamps, t + 1e-6 * dt, side="right") - 1, 0, len(stamps) - 1)
+    return np.asarray(values[row])

@@ -1,0 +1,290 @@
+"""Records that travel through the package. Arrays are read-only; shapes and units stand in each docstring.
+
+Letters are the paper's: `x` state, `u` control, `theta` parameters, `psi` sensitivity dx/dtheta, `I` Fisher
+information. Sizes: N samples, nq/nv/na MuJoCo's, `nx = 2 nv + na` (tangent space), nu controls, ny outputs, p parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def freeze(record: object, *names: str) -> None:
+    """Replace each named field of a frozen record by a read-only float64 array."""
+    for name in names:
+        array = np.array(getattr(record, name), dtype=np.float64)
+        array.setflags(write=False)
+        object.__setattr__(record, name, array)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A feasible curve (x, u) of the plant: `x_{k+1} = F(x_k, u_k, theta)`.
+
+    t: (N+1,) [s]
+    qpos: (N+1, nq) [m or rad, unit quaternions for ball and free joints]
+    qvel: (N+1, nv) [m/s or rad/s]
+    act: (N+1, na) [actuator's own unit]
+    ctrl: (N, nu) [actuator's own unit], held over each sample
+    """
+
+    t: Array
+    qpos: Array
+    qvel: Array
+    act: Array
+    ctrl: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, "t", "qpos", "qvel", "act", "ctrl")
+
+    @property
+    def samples(self) -> int:
+        """N, the number of control samples."""
+        return len(self.ctrl)
+
+    @property
+    def dt(self) -> float:
+        """Sample period [s]."""
+        return float(self.t[-1] - self.t[0]) / self.samples
+
+    @property
+    def state(self) -> Array:
+        """(N+1, nq+nv+na): qpos, qvel and act side by side."""
+        return np.concatenate([self.qpos, self.qvel, self.act], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """First derivatives along a trajectory, in the tangent space of the state.
+
+    A: (N, nx, nx) F_x;  B: (N, nx, nu) F_u [x-unit / u-unit];  E: (N, nx, p) F_theta [x-unit / theta-unit]
+    C: (N+1, ny, nx) h_x;  D: (N+1, ny, nu) h_u;  H: (N+1, ny, p) h_theta
+    """
+
+    A: Array
+    B: Array
+    E: Array
+    C: Array
+    D: Array
+    H: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, "A", "B", "E", "C", "D", "H")
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """What the parameters do to a trajectory at fixed control.
+
+    psi: (N+1, nx, p) dx/dtheta [x-unit / theta-unit], zero at the start
+    G: (N+1, ny, p) dy/dtheta [y-unit / theta-unit], `G_k = C_k psi_k + H_k`
+    """
+
+    psi: Array
+    G: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, "psi", "G")
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A trajectory and what it tells about the parameters.
+
+    gain: (N, nu, nx) regulator K about the trajectory
+    sensitivity: psi, (N+1, nx, p)
+    information: (p, p) Fisher information, summed over the measured samples [1 / (theta_i theta_j unit)]
+    eigenvalues: (p,) ascending, of the information per second that the cost sees (`I / measure_rate`)
+    std: (p,) Cramer-Rao standard deviations, infinite where the information is singular
+    min_eigenvalue: (N+1,) smallest eigenvalue of the information (per second) accumulated up to each sample
+    criterion: phi, the information term of the cost;  cost: J
+    """
+
+    trajectory: Trajectory
+    gain: Array
+    sensitivity: Array
+    information: Array
+    eigenvalues: Array
+    std: Array
+    min_eigenvalue: Array
+    criterion: float
+    cost: float
+
+    def __post_init__(self) -> None:
+        freeze(self, "gain", "sensitivity", "information", "eigenvalues", "std", "min_eigenvalue")
+
+
+class Status(Enum):
+    """How an optimisation ended; the value is a sentence for the user."""
+
+    CONVERGED = "converged: the slope fell below tolerance x cost (a local optimum)"
+    STALLED = "stalled: no step along the descent lowers the cost any more, at the accuracy of the differences"
+    MAX_ITERATIONS = "stopped at max_iterations before convergence; raise it, or start from the result"
+    INTERRUPTED = "interrupted by the user; this is the best trajectory so far"
+
+    @property
+    def success(self) -> bool:
+        """True where the result is a (local) optimum to the wanted tolerance."""
+        return self is Status.CONVERGED
+
+
+@dataclass(frozen=True)
+class HistoryRow:
+    """One iterate of a design: cost J, criterion phi, smallest eigenvalue, slope |DJ.zeta|, step length gamma.
+
+    seconds, steps: wall time and MuJoCo steps since the start;  rate: sample rate of this level [Hz] (coarse-to-fine)
+    """
+
+    iteration: int
+    cost: float
+    criterion: float
+    min_eigenvalue: float
+    slope: float
+    gamma: float
+    seconds: float
+    steps: int
+    rate: float = 0.0
+
+
+@dataclass(frozen=True)
+class StartResult:
+    """One start of a multi-start design: its name, the cost it reached, how it ended."""
+
+    name: str
+    cost: float
+    status: Status
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Result of `mjfim.design`: the designed trajectory beside the one it started from.
+
+    parameters: p names;  units: p units or empty strings;  theta: (p,) where the design was made
+    slope: last |DJ.zeta|;  steps: MuJoCo steps taken;  seconds: wall time
+    limits: worst margin per kind of limit (positive = inside), by kind;  warnings: sentences for the user
+    found_by: name of the start that led here;  starts: all of them
+    """
+
+    status: Status
+    parameters: tuple[str, ...]
+    theta: Array
+    initial: Evaluation
+    final: Evaluation
+    history: tuple[HistoryRow, ...]
+    slope: float
+    steps: int
+    seconds: float
+    limits: dict[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    found_by: str = "initial control"
+    starts: tuple[StartResult, ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze(self, "theta")
+
+    @property
+    def success(self) -> bool:
+        """Converged and inside all limits."""
+        return self.status.success and all(margin >= 0.0 for margin in self.limits.values())
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The designed trajectory."""
+        return self.final.trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Measured (or simulated) outputs under a known control.
+
+    t: (N+1,) [s];  ctrl: (N, nu) held over each sample
+    y: (N+1, ny) measured outputs in the order of `outputs`, NaN where an output was not measured at that sample
+    outputs: ny column names (`qpos:<joint>`, `qvel:<joint>` or a sensor's name);  name: for messages
+    """
+
+    t: Array
+    ctrl: Array
+    y: Array
+    outputs: tuple[str, ...]
+    name: str = "recording"
+
+    def __post_init__(self) -> None:
+        freeze(self, "t", "ctrl", "y")
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Parameters from recordings.
+
+    theta, std: (p,);  covariance: (p, p) formal (Cramer-Rao at the estimate)
+    chi2: whitened squared residual sum;  dof: its degrees of freedom;  residual_rms: per output, in its unit
+    misfit: True where chi2 is improbable (< 1e-3) for noise of the stated sigma: the formal std is then not accuracy
+    predicted, measured: per recording, (N+1, ny);  initial_theta: the start
+    """
+
+    parameters: tuple[str, ...]
+    theta: Array
+    std: Array
+    covariance: Array
+    initial_theta: Array
+    chi2: float
+    dof: int
+    status: str
+    success: bool
+    misfit: bool
+    iterations: int
+    residual_rms: dict[str, float]
+    at_bound: tuple[str, ...]
+    predicted: tuple[Array, ...]
+    recordings: tuple[Recording, ...]
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze(self, "theta", "std", "covariance", "initial_theta")
+
+
+@dataclass(frozen=True, eq=False)
+class TrialSet:
+    """Monte-Carlo estimates along one trajectory, against theory.
+
+    estimates: (trials, p), NaN rows for failed trials;  mean: (p,);  covariance, crlb: (p, p)
+    efficiency: (p,) CRLB variance over observed variance (1 = the bound is reached)
+    efficiency_interval: (p, 2) 95 % confidence interval of each efficiency (chi-square on the variance)
+    """
+
+    estimates: Array
+    mean: Array
+    covariance: Array
+    crlb: Array
+    efficiency: Array
+    efficiency_interval: Array
+    trials: int
+    failed: int
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        freeze(self, "estimates", "mean", "covariance", "crlb", "efficiency", "efficiency_interval")
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Monte-Carlo studies of trajectories by name (`initial`, `final`).
+
+    theta: (p,) the true values; information: (p, p) by the same names
+    """
+
+    parameters: tuple[str, ...]
+    theta: Array
+    measure_rate: float
+    sets: dict[str, TrialSet]
+    information: dict[str, Array]
+
+    def __post_init__(self) -> None:
+        freeze(self, "theta")

@@ -1,0 +1,46 @@
+"""Identify parameters from a recording file, without the command line of mjfim: a template to copy and change.
+
+    python scripts/identify_offline.py models/cart_pendulum.toml recording.csv
+
+The recording has a column `t`, one `ctrl:<actuator>` per actuator, and the measured columns (`qpos:<joint>`,
+`qvel:<joint>` or a sensor's name). `mjfim simulate` writes one to try with.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import mjfim
+from mjfim.archive import read_recording, write_identified
+from mjfim.setup import Setup
+
+
+def main() -> int:
+    """Fit, print, and write the identified model beside the recording."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("experiment", type=Path)
+    parser.add_argument("recordings", type=Path, nargs="+")
+    args = parser.parse_args()
+
+    # The experiment file says what is unknown, where to start, and how noisy each output is.
+    setup = Setup(mjfim.Experiment.from_file(args.experiment))
+    recordings = [read_recording(path, setup) for path in args.recordings]
+
+    # Weighted least squares in MuJoCo over all recordings at once.
+    estimate = mjfim.identify(setup, recordings)
+
+    for name, value, std, unit in zip(estimate.parameters, estimate.theta, estimate.std, setup.units, strict=True):
+        print(f"{name:>12s} = {value:.5g} ± {1.96 * std:.2g} {unit} (95 %)")
+    print(f"chi2 / dof = {estimate.chi2 / estimate.dof:.3f}; {estimate.status}")
+    for warning in estimate.warnings:
+        print(f"warning: {warning}")
+
+    target = args.recordings[0].with_name("identified.xml")
+    write_identified(target, setup, estimate.theta)
+    print(f"wrote {target}")
+    return 0 if estimate.success and not estimate.misfit else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
