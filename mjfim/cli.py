@@ -32,7 +32,7 @@ app = typer.Typer(
     help="Design the experiment that identifies a MuJoCo model's parameters, then identify them.",
 )
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
-out = Console(highlight=False)
+out = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
 
 ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")]
 DesignFile = Annotated[Path, typer.Argument(metavar="DESIGN.npz", help="design.npz that `mjfim design` left.")]

@@ -63,14 +63,18 @@ def design(
 
 @dataclass
 class Run:
-    """One start on its way. trajectory, cost: of the last iterate at the stated sample rate."""
+    """One start on its way. point: the last iterate at the stated sample rate."""
 
     name: str
-    trajectory: Trajectory | None = None
-    cost: float = np.inf
+    point: Point | None = None
     status: Status = Status.STALLED
     slope: float = np.inf
     history: tuple[HistoryRow, ...] = ()
+
+    @property
+    def cost(self) -> float:
+        """J reached."""
+        return np.inf if self.point is None else self.point.cost
 
 
 def _starts(setup: Setup, given: Array | None) -> Iterator[tuple[str, Array]]:
@@ -86,10 +90,10 @@ def _starts(setup: Setup, given: Array | None) -> Iterator[tuple[str, Array]]:
 
 def direction_for(setup: Setup) -> tuple[Direction, DesignProblem]:
     """The descent direction that the experiment asks for, and the problem that feeds it."""
-    d, dt = setup.experiment.descent, setup.dt
+    d, dt, coarse = setup.experiment.descent, setup.dt, setup.coarsen > 1
     R, Q = np.diag(setup.control_weight) * dt, np.diag(setup.tracking) * dt
     if d.method == "lbfgs":
-        return LBFGS(R), setup.problem
+        return LBFGS(R), replace(setup.problem, draft=coarse)
     if d.psi_weight == 0.0:
         return MetricDescent(Q, R, Q), setup.problem
     nx, p = len(Q), len(setup.parameters)
@@ -145,7 +149,7 @@ def _descend(levels: tuple[Setup, ...], control: Array, run: Run) -> Iterator[Hi
             control = np.repeat(trajectory.ctrl, factor, axis=0)
             run.slope, run.status = iterate.slope, iterate.status or Status.INTERRUPTED
             if fine:
-                run.trajectory, run.cost = trajectory, iterate.value
+                run.point = iterate.point
             last = run.history[-1] if run.history else None
             if last is None or last.iteration != done + iterate.index or last.rate != 1.0 / level.dt:
                 yield _row(iterate, done, 1.0 / level.dt)
@@ -161,10 +165,9 @@ def _row(iterate: Iterate[Point], done: int, rate: float) -> HistoryRow:
 def _conclude(setup: Setup, first: Point, runs: list[Run], seconds: float, steps: int) -> Design:
     best = min(runs, key=lambda run: run.cost)
     interrupted = any(run.status is Status.INTERRUPTED for run in runs)
-    if best.trajectory is None and not interrupted:
+    if best.point is None and not interrupted:
         raise SimulationDiverged("the simulation diverges from every start")
-    trajectory = setup.initial if best.trajectory is None else best.trajectory
-    final = evaluate(setup, setup.problem.point(trajectory, CENTRAL))
+    final = evaluate(setup, best.point or first)
     limits = margins(setup.limits, final.trajectory)
     return Design(
         status=Status.INTERRUPTED if interrupted else best.status,
@@ -187,11 +190,11 @@ def evaluate(setup: Setup, point: Point) -> Evaluation:
     """Everything that a trajectory tells, with the regulator about it."""
     if point.trajectory is None or point.sensitivity is None or point.information is None or point.criterion is None:
         raise SimulationDiverged("the trajectory diverges")
-    linear = setup.plant.linearize(setup.theta, point.trajectory)
+    A, B, _, _ = setup.plant.jacobians(setup.theta, point.trajectory)
     r = regulator_for(setup)
     return Evaluation(
         trajectory=point.trajectory,
-        gain=regulator(linear.A, linear.B, r.Q, r.R, r.terminal),
+        gain=regulator(A, B, r.Q, r.R, r.terminal),
         sensitivity=point.sensitivity.psi,
         information=point.information,
         eigenvalues=point.criterion.eigenvalues,

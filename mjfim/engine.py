@@ -22,6 +22,8 @@ RECORD = int(
     | mujoco.mjtState.mjSTATE_ACT
 )
 
+FEW = 64  # rollouts of a handful of models keep their own batch beside those of a Monte-Carlo study
+
 
 @contextmanager
 def quiet() -> Iterator[None]:
@@ -77,25 +79,27 @@ class Engine:
         self.sensors = sensors
         self.threads = threads or len(os.sched_getaffinity(0))
         self.steps = 0
-        self._batches: dict[int, Batch] = {}
+        self._batches: dict[str, Batch] = {}
         self._data = mujoco.MjData(model)
 
-    def _batch(self, models: Sequence[Any], count: int) -> Batch:
-        """A batch of `count` simulations, of one model or of one each."""
-        if count not in self._batches:
-            self._batches[count] = Batch(self.model, count, min(self.threads, count))
-        batch = self._batches[count]
-        batch.set_models(models[0] if len(models) == 1 else models)
+    def _batch(self, kind: str, count: int) -> Batch:
+        """A batch of at least `count` simulations; making one costs milliseconds, so it grows and is kept."""
+        batch = self._batches.get(kind)
+        if batch is None or batch.nsim < count:
+            batch = self._batches[kind] = Batch(self.model, count, min(self.threads, count))
         return batch
 
-    def _load(self, batch: Batch, states: Array) -> None:
+    def _load(self, batch: Batch, states: Array) -> np.ndarray | None:
+        """Write states into the first simulations of a batch; returns their ids, None for all of them."""
+        n = len(states)
         qpos, qvel, act = self.space.split(states)
-        batch.bind("qpos")[:] = qpos
-        batch.bind("qvel")[:] = qvel
+        batch.bind("qpos")[:n] = qpos
+        batch.bind("qvel")[:n] = qvel
         if self.space.na:
-            batch.bind("act")[:] = act
-        batch.bind("qacc_warmstart")[:] = 0.0
-        batch.bind("time")[:] = 0.0
+            batch.bind("act")[:n] = act
+        batch.bind("qacc_warmstart")[:n] = 0.0
+        batch.bind("time")[:n] = 0.0
+        return None if n == batch.nsim else np.arange(n)
 
     def step(self, models: Sequence[Any], states: Array, ctrl: Array) -> tuple[Array, Array | None]:
         """One sample of every simulation: next states (n, ns), and the sensors at the given states or None.
@@ -112,35 +116,37 @@ class Engine:
 
     def _share(self, model: Any, states: Array, ctrl: Array) -> tuple[Array, Array | None]:
         count = len(states)
-        batch = self._batch([model], count)
-        self._load(batch, states)
-        batch.bind("ctrl")[:] = ctrl
+        batch = self._batch("step", count)
+        batch.set_models(model)
+        ids = self._load(batch, states)
+        batch.bind("ctrl")[:count] = ctrl
         sensed, remaining = None, self.substeps
         with quiet():
             if self.sensors:
                 batch.bind("sensordata")
-                batch.step(nstep=1)
-                sensed, remaining = np.array(batch.bind("sensordata")), remaining - 1
+                batch.step(ids, nstep=1)
+                sensed, remaining = np.array(batch.bind("sensordata")[:count]), remaining - 1
             if remaining:
-                batch.step(nstep=remaining)
+                batch.step(ids, nstep=remaining)
         self.steps += self.substeps * count
         names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
-        out = np.concatenate([batch.bind(name) for name in names], axis=1)
+        out = np.concatenate([batch.bind(name)[:count] for name in names], axis=1)
         timestep = float(self.model.opt.timestep)
-        out[np.abs(batch.bind("time").reshape(count) - self.substeps * timestep) > 0.5 * timestep] = np.nan
+        out[np.abs(batch.bind("time").reshape(-1)[:count] - self.substeps * timestep) > 0.5 * timestep] = np.nan
         return out, sensed
 
     def rollout(self, models: Sequence[Any], start: Array, ctrl: Array) -> Rollouts:
         """Open-loop simulations from start: (m, ns) under ctrl: (m, N, nu), each sample held over its substeps."""
         count, N, _ = ctrl.shape
-        batch = self._batch(models, count)
-        self._load(batch, start)
+        batch = self._batch("rollout" if count <= FEW else "rollouts", count)
+        batch.set_models(models[0] if len(models) == 1 else [*models, *[models[-1]] * (batch.nsim - count)])
+        ids = self._load(batch, start)
         held = np.repeat(ctrl, self.substeps, axis=1)
         record: tuple[Any, ...] = (RECORD,)
         if self.sensors:  # one more step: sensor data belongs to the state before a step
             held, record = np.concatenate([held, held[:, -1:]], axis=1), (RECORD, "sensordata")
         with quiet():
-            out = batch.rollout(held.shape[1], np.ascontiguousarray(held), record=record)
+            out = batch.rollout(held.shape[1], np.ascontiguousarray(held), record=record, ids=ids)
         self.steps += count * held.shape[1]
         last = N * self.substeps
         rows = out[RECORD][:, self.substeps - 1 : last : self.substeps]

@@ -160,7 +160,7 @@ def trust_region(fit: Fit, theta0: Array) -> Solution:
     return Solution(result.x, int(result.nfev), bool(result.success), str(result.message))
 
 
-def newton_raphson(fit: Fit, theta0: Array, iterations: int = 50, tolerance: float = 1e-7) -> Solution:
+def newton_raphson(fit: Fit, theta0: Array, iterations: int = 50, tolerance: float = 1e-5) -> Solution:
     """The paper's iterator `theta - (J'J)^-1 J'r`, its step halved while the residual would grow.
 
     Stops when a step is below tolerance standard deviations in every direction. Bounds are not used.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,17 +57,21 @@ DIVERGED = Point(None, None, None, None, np.inf, FAST)
 
 @dataclass(frozen=True, eq=False)
 class DesignProblem:
-    """J(theta fixed) as Algorithm 1 wants it: a `pronto.Problem` over `Point`s."""
+    """J(theta fixed) as Algorithm 1 wants it: a `pronto.Problem` over `Point`s.
+
+    extended: expansions also carry psi as a state;  draft: never refine the differences (coarse levels)
+    """
 
     plant: Plant
     theta: Array
     information: Information
     running: RunningCost
     extended: bool = False
+    draft: bool = False
 
     def point(self, trajectory: Trajectory, accuracy: Accuracy = FAST) -> Point:
         """Evaluate J along a trajectory."""
-        sensitivity = self.plant.sensitivity(self.theta, trajectory, accuracy.theta)
+        sensitivity = self.plant.sensitivity(self.theta, trajectory)
         if sensitivity is None:
             return DIVERGED
         information = self.information.matrix(sensitivity)
@@ -103,8 +107,8 @@ class DesignProblem:
         return self.plant.difference(_computed(new)[0], _computed(old)[0])
 
     def refine(self, point: Point) -> Point | None:
-        """The same trajectory with central differences."""
-        return None if point.accuracy is CENTRAL else self.point(_computed(point)[0], CENTRAL)
+        """The same point, to be expanded with central differences."""
+        return None if self.draft or point.accuracy is CENTRAL else replace(point, accuracy=CENTRAL)
 
 
 def _computed(point: Point) -> tuple[Trajectory, Sensitivity, Criterion]:

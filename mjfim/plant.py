@@ -24,19 +24,19 @@ from mjfim.trajectory import Array, Linearization, Sensitivity, Trajectory
 class Accuracy:
     """Steps of the differences, relative to the size of what is perturbed.
 
-    central: two-sided in state and control, else one-sided;  theta: parameter step of the sensitivity rollouts
+    central: two-sided in state and control, else one-sided
     delta: state and control step of mixed differences;  epsilon: step along (psi w, w)
     """
 
     central: bool
-    theta: float
     delta: float
     epsilon: float
 
 
-FAST = Accuracy(central=False, theta=1e-5, delta=1e-6, epsilon=3e-3)
-CENTRAL = Accuracy(central=True, theta=1e-5, delta=1e-4, epsilon=1e-3)
+FAST = Accuracy(central=False, delta=1e-6, epsilon=3e-3)
+CENTRAL = Accuracy(central=True, delta=1e-4, epsilon=1e-3)
 FIRST_DERIVATIVE_STEP = 1e-6
+SENSITIVITY_STEP = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ class Plant:
             self.parameters.write(model, row)
         return self._pool[: len(theta)]
 
-    def predict(self, theta: Array, ctrl: Array, step: float = 1e-5) -> tuple[Array, Array] | None:
+    def predict(self, theta: Array, ctrl: Array, step: float = SENSITIVITY_STEP) -> tuple[Array, Array] | None:
         """Outputs y: (N+1, ny) and their derivative G: (N+1, ny, p) by central differences; None if one diverged."""
         p, h = len(self.parameters), step * self.parameters.step
         y, finite = self.measure(np.concatenate([theta[None], theta + np.diag(h), theta - np.diag(h)]), ctrl)
@@ -152,7 +152,7 @@ class Plant:
         ctrl = np.abs(trajectory.ctrl).max(axis=0)
         return np.concatenate([dq, speed, act, np.where(ctrl > 1e-3, ctrl, 1.0)])
 
-    def sensitivity(self, theta: Array, trajectory: Trajectory, step: float = 1e-5) -> Sensitivity | None:
+    def sensitivity(self, theta: Array, trajectory: Trajectory, step: float = SENSITIVITY_STEP) -> Sensitivity | None:
         """psi and G by central differences of 2p whole rollouts under the same control; None if one diverged."""
         p = len(self.parameters)
         h = step * self.parameters.step
@@ -169,26 +169,37 @@ class Plant:
 
     def linearize(self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP) -> Linearization:
         """A, B, E, C, D, H by central differences in one batch per model. Raises SimulationDiverged."""
-        N, nx, nu, p = trajectory.samples, self.space.nx, self.nu, len(self.parameters)
-        z_step, theta_step = step * self.steps_of(trajectory), step * self.parameters.step
+        nx, p = self.space.nx, len(self.parameters)
         states, ctrl = self._ends(trajectory)
-        xs, us = self._perturbed(states, ctrl, np.concatenate([np.diag(z_step), -np.diag(z_step)]))
-        model = self.model(theta)
+        A, B, C, D = self.jacobians(theta, trajectory, step)
+        theta_step = step * self.parameters.step
         thetas = np.concatenate([theta + np.diag(theta_step), theta - np.diag(theta_step)])
         same = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
-        held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, nu)
-        dz, hz = self._halves([model], xs, us, nx + nu, z_step)
+        held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.nu)
         dp, hp = self._halves(self._many(thetas), same, held, p, theta_step)
-        if not (np.isfinite(dz[:, :N]).all() and np.isfinite(dp[:, :N]).all()):
-            raise SimulationDiverged("a perturbed step diverged while linearising")
-        z_h = np.zeros((nx + nu, N + 1, nx))
-        z_h[:nx] = np.eye(nx)[:, None, :]
-        dy = np.moveaxis(self.outputs.tangent(z_h, hz), 0, 2)
-        dyp = np.moveaxis(self.outputs.tangent(np.zeros((p, N + 1, nx)), hp), 0, 2)
-        dx = np.moveaxis(dz[:, :N], 0, 2)
-        return Linearization(
-            dx[:, :, :nx], dx[:, :, nx:], np.moveaxis(dp[:, :N], 0, 2), dy[..., :nx], dy[..., nx:], dyp
-        )
+        E = np.moveaxis(_finite(dp[:, :-1]), 0, 2)
+        H = np.moveaxis(self.outputs.tangent(np.zeros((p, len(states), nx)), hp), 0, 2)
+        return Linearization(A, B, E, C, D, H)
+
+    def jacobians(
+        self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
+    ) -> tuple[Array, Array, Array, Array]:
+        """A, B, C, D of `linearize` alone."""
+        nx = self.space.nx
+        z_step = step * self.steps_of(trajectory)
+        count = len(z_step)
+        xs, us = self._perturbed(*self._ends(trajectory), np.concatenate([np.diag(z_step), -np.diag(z_step)]))
+        dz, hz = self._halves([self.model(theta)], xs, us, count, z_step)
+        dx = np.moveaxis(_finite(dz[:, :-1]), 0, 2)
+        dy = np.moveaxis(self.outputs.tangent(self._identity(dz.shape[1]), hz), 0, 2)
+        return dx[..., :nx], dx[..., nx:], dy[..., :nx], dy[..., nx:]
+
+    def _identity(self, samples: int) -> Array:
+        """(nx+nu, samples, nx) tangent step of the state per unit of (x, u)."""
+        nx = self.space.nx
+        step = np.zeros((nx + self.nu, samples, nx))
+        step[:nx] = np.eye(nx)[:, None, :]
+        return step
 
     def _ends(self, trajectory: Trajectory) -> tuple[Array, Array]:
         """States and controls at all N+1 samples; the last control is held for the outputs of the last sample."""
@@ -252,9 +263,7 @@ class Plant:
         nx, count = self.space.nx, self.space.nx + self.nu
         first = np.mean(firsts, axis=0)
         n = first.shape[1]
-        z_h = np.zeros((count, n, nx))
-        z_h[:nx] = np.eye(nx)[:, None, :]
-        dy = self.outputs.tangent(z_h, np.mean(h_firsts, axis=0) if h_firsts else None)
+        dy = self.outputs.tangent(self._identity(n), np.mean(h_firsts, axis=0) if h_firsts else None)
         second = None
         if h_mixed:
             tangents = [self.outputs.tangent(np.zeros((count, n, nx)), h) for h in h_mixed]
@@ -263,3 +272,9 @@ class Plant:
         CD = np.moveaxis(dy, 0, 2)
         F_mixed = np.moveaxis(np.array(mixed)[:, :, :-1], 1, 2)
         return Bilinear(AB[..., :nx], AB[..., nx:], CD[..., :nx], CD[..., nx:], F_mixed, second)
+
+
+def _finite(derivative: Array) -> Array:
+    if not np.isfinite(derivative).all():
+        raise SimulationDiverged("a perturbed step diverged while linearising")
+    return derivative

@@ -15,13 +15,13 @@ BEST_CASE = "sigma is the Cramér-Rao bound: a best case, true if model and nois
 def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
     """Predicted standard deviations before and after, then how it ended."""
     table = Table(title="What one experiment will tell", title_justify="left")
-    for heading in ("parameter", "unit", "value", "σ initial", "σ designed", "relative", "smaller by"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    for heading in ("parameter", "value", "σ initial", "σ designed", "relative", "smaller by"):
+        table.add_column(heading, justify="left" if heading == "parameter" else "right")
     rows = zip(design.parameters, units, design.theta, design.initial.std, design.final.std, strict=True)
     for name, unit, value, before, after in rows:
         relative = f"{100 * after / abs(value):.2g} %" if value else "-"
         gain = f"{before / after:.1f} ×" if np.isfinite(before) and after > 0 else "-"
-        table.add_row(name, unit, f"{value:.4g}", f"{before:.3g}", f"{after:.3g}", relative, gain)
+        table.add_row(_named(name, unit), f"{value:.4g}", f"{before:.3g}", f"{after:.3g}", relative, gain)
     last = design.history[-1] if design.history else None
     before, after = design.initial.eigenvalues[0], design.final.eigenvalues[0]
     lines = [
@@ -36,12 +36,12 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
 def estimate_report(estimate: Estimate, units: tuple[str, ...]) -> RenderableType:
     """Estimates with 95 % intervals, residuals against the stated noise."""
     table = Table(title="Estimated parameters", title_justify="left")
-    for heading in ("parameter", "unit", "start", "estimate", "formal σ", "95 % interval"):
-        table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+    for heading in ("parameter", "start", "estimate", "formal σ", "95 % interval"):
+        table.add_column(heading, justify="left" if heading == "parameter" else "right")
     rows = zip(estimate.parameters, units, estimate.initial_theta, estimate.theta, estimate.std, strict=True)
     for name, unit, start, value, std in rows:
         low, high = value - 1.96 * std, value + 1.96 * std
-        table.add_row(name, unit, f"{start:.5g}", f"{value:.5g}", f"{std:.2g}", f"{low:.5g} … {high:.5g}")
+        table.add_row(_named(name, unit), f"{start:.5g}", f"{value:.5g}", f"{std:.2g}", f"{low:.5g} … {high:.5g}")
     rms = ", ".join(f"{name} {value:.3g}" for name, value in estimate.residual_rms.items())
     lines = [
         f"χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof} degrees of freedom; residual rms: {rms}",
@@ -58,13 +58,12 @@ def study_report(study: Study, units: tuple[str, ...]) -> RenderableType:
         table = Table(
             title=f"{name}: {s.trials} trials, {s.failed} failed, {study.measure_rate:g} Hz", title_justify="left"
         )
-        for heading in ("parameter", "unit", "true", "mean", "variance", "bound", "efficiency", "95 % interval"):
-            table.add_column(heading, justify="left" if heading in ("parameter", "unit") else "right")
+        for heading in ("parameter", "true", "mean", "variance", "bound", "efficiency", "95 % interval"):
+            table.add_column(heading, justify="left" if heading == "parameter" else "right")
         for i, parameter in enumerate(study.parameters):
             low, high = s.efficiency_interval[i]
             table.add_row(
-                parameter,
-                units[i],
+                _named(parameter, units[i]),
                 f"{study.theta[i]:.4g}",
                 f"{s.mean[i]:.5g}",
                 f"{s.covariance[i, i]:.3e}",
@@ -75,6 +74,10 @@ def study_report(study: Study, units: tuple[str, ...]) -> RenderableType:
         parts.append(table)
     note = "efficiency = Cramér-Rao bound / observed variance; 1 means the bound is reached."
     return Group(*parts, Text(note, style="dim"))
+
+
+def _named(name: str, unit: str) -> str:
+    return f"{name} ({unit})" if unit else name
 
 
 def _warnings(sentences: tuple[str, ...]) -> list[RenderableType]:

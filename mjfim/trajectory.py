@@ -123,7 +123,7 @@ class Evaluation:
 class Status(Enum):
     """How an optimisation ended; the value is a sentence for the user."""
 
-    CONVERGED = "converged: the slope fell below tolerance x cost (a local optimum)"
+    CONVERGED = "converged: the slope fell below tolerance × cost (a local optimum)"
     STALLED = "stalled: no step along the descent lowers the cost any more, at the accuracy of the differences"
     MAX_ITERATIONS = "stopped at max_iterations before convergence; raise it, or start from the result"
     INTERRUPTED = "interrupted by the user; this is the best trajectory so far"

@@ -1,0 +1,257 @@
+"""Where the time goes, as ratios inside one run: mjfim against the engine, against CasADi, against its own metric descent.
+
+    python scripts/benchmark.py                  # all tables, some minutes
+    python scripts/benchmark.py --quick          # case a only, few trials
+    python scripts/benchmark.py --markdown FILE  # the same tables for the README
+
+(a) wall time of a design over MuJoCo steps taken x time of one `mj_step` in C / threads
+(b) time until J is within 1e-6 (relative) of the best J of all solvers, beside CasADi on the hand-derived model
+(c) iterations and time beside the paper's metric descent, to the same J
+(d) 1500 Monte-Carlo trials at 100 Hz
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import mjfim
+from mjfim.experiment import Experiment
+from mjfim.setup import Setup
+from mjfim.trajectory import Design
+
+ROOT = Path(__file__).resolve().parents[1]
+EXPERIMENT = ROOT / "models" / "cart_pendulum.toml"
+CLOSE = 1e-6
+CASES: dict[str, dict[str, Any]] = {
+    "a": {"control": 6e-3, "tracking": {}},
+    "b": {"control": 1e-3, "tracking": {"slide": 0.05}},
+    "c": {"control": 1e-4, "tracking": {}},
+    "f": {"control": 1e-6, "tracking": {}},
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One solver on one case. history: (seconds, J) of every iterate; setup: seconds before the first of them."""
+
+    case: str
+    solver: str
+    cost: float
+    iterations: int
+    seconds: float
+    setup: float
+    history: tuple[tuple[float, float], ...]
+
+    def time_to(self, cost: float) -> float:
+        """Seconds until J <= cost, infinite if never."""
+        return next((t for t, J in self.history if cost >= J), np.inf)
+
+    def iterations_to(self, cost: float) -> float:
+        """Iterates until J <= cost, infinite if never."""
+        return next((float(i) for i, (_, J) in enumerate(self.history) if cost >= J), np.inf)
+
+
+def experiment(case: str, **descent: Any) -> Experiment:
+    """The cart-pendulum at a case's weights."""
+    return Experiment.from_file(EXPERIMENT).replace(cost=CASES[case], descent=descent)
+
+
+def step_seconds(setup: Setup, trajectory: mjfim.Trajectory) -> float:
+    """Seconds of one `mj_step` in C: the user's model, stepped many times per call along the designed motion."""
+    model, data = setup.model_at(setup.theta), mujoco.MjData(setup.model)
+    best = np.inf
+    for k in range(0, trajectory.samples, 20):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = trajectory.qpos[k], trajectory.qvel[k], trajectory.ctrl[k]
+        clock = time.perf_counter()
+        mujoco.mj_step(model, data, 500)
+        best = min(best, (time.perf_counter() - clock) / 500)
+    return float(best)
+
+
+def fastest(repeats: int, case: str, name: str, **descent: Any) -> tuple[Run, Design]:
+    """The quickest of several identical designs."""
+    return min((mjfim_run(case, name, **descent) for _ in range(repeats)), key=lambda pair: pair[0].seconds)
+
+
+def mjfim_run(case: str, name: str, **descent: Any) -> tuple[Run, Design]:
+    """One design."""
+    clock = time.perf_counter()
+    setup = Setup(experiment(case, **descent))
+    prepared = time.perf_counter() - clock
+    design = mjfim.design(setup)
+    fine = design.history[-1].rate
+    history = tuple((row.seconds, row.cost if row.rate == fine else np.inf) for row in design.history)
+    run = Run(case, name, design.final.cost, design.history[-1].iteration, design.seconds, prepared, history)
+    return run, design
+
+
+def peer_runs(cases: Iterable[str], repeats: int) -> list[Run]:
+    """CasADi in a process of its own, where its BLAS is single-threaded from the start."""
+    code = (
+        "import sys, json; sys.path.insert(0, sys.argv[1]); import casadi_peer as p\n"
+        "out = []\n"
+        "for use_c in (True, False):\n"
+        "    built = p.problem(use_c)\n"
+        "    if use_c and not built.compiled: continue\n"
+        "    for case in sys.argv[3]:\n"
+        "        for solve in (p.ipopt, p.lbfgs):\n"
+        "            runs = [solve(p.CASES[case], use_c) for _ in range(int(sys.argv[2]))]\n"
+        "            r = min(runs, key=lambda r: r.seconds)\n"
+        "            out.append(dict(case=case, solver=r.name + ('' if use_c else ' (VM)'), cost=r.J, seconds=r.seconds,\n"
+        "                iterations=r.iterations, setup=r.setup_seconds + built.build_seconds, history=r.history))\n"
+        "print('RUNS ' + json.dumps(out))\n"
+    )
+    command = [sys.executable, "-c", code, str(ROOT / "scripts"), str(repeats), "".join(cases)]
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if done.returncode != 0:
+        print(f"peers are left out: {done.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
+        return []
+    line = next(text for text in done.stdout.splitlines() if text.startswith("RUNS "))
+    return [Run(**{**row, "history": tuple((t, J) for t, J in row["history"])}) for row in json.loads(line[5:])]
+
+
+def table(title: str, *headings: str) -> Table:
+    """An empty table."""
+    new = Table(title=title, title_justify="left")
+    for i, heading in enumerate(headings):
+        new.add_column(heading, justify="left" if i < 2 else "right")
+    return new
+
+
+def engine_table(designs: list[tuple[Run, Design]], threads: int) -> Table:
+    """(a)"""
+    rows = table(
+        "(a) design over bare engine time (target 1.3)",
+        "case",
+        "descent",
+        "steps",
+        "mj_step",
+        "engine",
+        "wall",
+        "ratio",
+    )
+    for run, design in designs:
+        step = step_seconds(Setup(experiment(run.case)), design.trajectory)
+        engine = design.steps * step / threads
+        rows.add_row(
+            run.case,
+            run.solver,
+            f"{design.steps:,}",
+            f"{1e6 * step:.2f} µs",
+            f"{engine:.3f} s",
+            f"{run.seconds:.3f} s",
+            f"{run.seconds / engine:.2f}",
+        )
+    return rows
+
+
+def peer_table(runs: list[Run]) -> Table:
+    """(b)"""
+    rows = table(
+        "(b) seconds until J is within 1e-6 of the best J found from this start",
+        "case",
+        "solver",
+        "J",
+        "iterations",
+        "to 1e-6",
+        "mjfim is",
+        "before the first iterate",
+    )
+    for case in dict.fromkeys(run.case for run in runs):
+        own = [run for run in runs if run.case == case]
+        goal = min(run.cost for run in own) * (1 + CLOSE)
+        mine = next(run for run in own if run.solver == "mjfim").time_to(goal)
+        for run in own:
+            taken = run.time_to(goal)
+            ratio = "" if run.solver == "mjfim" else comparison(mine, taken)
+            seconds = f"{taken:.3f} s" if np.isfinite(taken) else "never"
+            rows.add_row(case, run.solver, f"{run.cost:.9g}", str(run.iterations), seconds, ratio, f"{run.setup:.2f} s")
+    return rows
+
+
+def comparison(mine: float, theirs: float) -> str:
+    """How mine compares."""
+    if not np.isfinite(mine):
+        return "never there"
+    return f"{theirs / mine:.1f} × faster" if theirs >= mine else f"{mine / theirs:.1f} × slower"
+
+
+def metric_table(pairs: list[tuple[Run, Run]]) -> Table:
+    """(c)"""
+    rows = table(
+        "(c) beside the paper's metric descent, to the same J", "case", "descent", "iterations", "seconds", "J"
+    )
+    for mine, metric in pairs:
+        goal = min(mine.cost, metric.cost) * (1 + CLOSE)
+        for run in (mine, metric):
+            count, seconds = run.iterations_to(goal), run.time_to(goal)
+            text = (f"{count:.0f}", f"{seconds:.2f} s") if np.isfinite(count) else ("never", f"> {run.seconds:.1f} s")
+            rows.add_row(run.case, run.solver, *text, f"{run.cost:.9g}")
+    return rows
+
+
+def monte_carlo_table(design: Design, trials: int) -> Table:
+    """(d)"""
+    rows = table(f"(d) {trials} Monte-Carlo trials at 100 Hz (target 15 s)", "trajectory", "failed", "seconds")
+    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+    study = mjfim.monte_carlo(experiment("b"), curves, trials, seed=0)
+    for name, s in study.sets.items():
+        rows.add_row(name, str(s.failed), f"{s.seconds:.1f} s")
+    return rows
+
+
+def markdown(tables: list[Table], cores: int) -> str:
+    """The tables for the README; the machine is named by its cores alone."""
+    parts = [f"Measured on {cores} cores."]
+    for t in tables:
+        cells = [list(column.cells) for column in t.columns]
+        header = " | ".join(str(column.header) for column in t.columns)
+        lines = [f"**{t.title}**", "", f"| {header} |", "|" + "---|" * len(t.columns)]
+        lines += ["| " + " | ".join(str(c[i]) for c in cells) + " |" for i in range(t.row_count)]
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="case a only, 100 trials, one repeat")
+    parser.add_argument("--markdown", type=Path, help="also write the tables as Markdown")
+    args = parser.parse_args()
+    console, cores = Console(highlight=False, width=130), len(os.sched_getaffinity(0))
+    cases, repeats, trials = (["a"], 1, 100) if args.quick else (list(CASES), 3, 1500)
+    mjfim_run(cases[0], "warm-up")
+    default = [fastest(repeats, case, "mjfim") for case in cases]
+    flat = [fastest(repeats, case, "mjfim, one level", coarse=1) for case in cases]
+    tables = [engine_table([*default, *flat], cores)]
+    console.print(tables[-1])
+    tables.append(peer_table([*(run for run, _ in default), *peer_runs(cases, repeats)]))
+    console.print(tables[-1])
+    metric = [mjfim_run(case, "metric (the paper's)", method="metric", max_iterations=400)[0] for case in cases]
+    named = [dataclasses.replace(run, solver="L-BFGS on the manifold") for run, _ in flat]
+    tables.append(metric_table(list(zip(named, metric, strict=True))))
+    console.print(tables[-1])
+    tables.append(monte_carlo_table(default[-1][1] if args.quick else default[1][1], trials))
+    console.print(tables[-1])
+    if args.markdown:
+        args.markdown.write_text(markdown(tables, cores), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

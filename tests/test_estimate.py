@@ -1,0 +1,157 @@
+"""Least squares against theory and against a brute-force minimiser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+import mjfim
+from mjfim.errors import RecordingError, SimulationDiverged
+from mjfim.estimate import Fit, aligned, identify, newton_raphson, trust_region
+from mjfim.experiment import Experiment
+from mjfim.montecarlo import simulate
+from mjfim.setup import Setup
+from mjfim.trajectory import Recording
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    return Setup(Experiment.from_file(ROOT / "models" / "cart_pendulum.toml"))
+
+
+@pytest.fixture(scope="module")
+def design(setup: Setup) -> mjfim.Design:
+    return mjfim.design(setup)
+
+
+@pytest.fixture(scope="module")
+def recording(setup: Setup, design: mjfim.Design) -> Recording:
+    return simulate(setup, design.trajectory, seed=3)
+
+
+def noiseless(setup: Setup, recording: Recording) -> Recording:
+    y, _ = setup.plant.measure(setup.parameters.true[None], recording.ctrl)
+    return Recording(recording.t, recording.ctrl, y[0], recording.outputs)
+
+
+@pytest.mark.parametrize("method", ["least_squares", "newton"])
+def test_noise_free_data_give_the_true_parameters(setup: Setup, recording: Recording, method: str) -> None:
+    estimate = identify(setup, [noiseless(setup, recording)], method)
+    np.testing.assert_allclose(estimate.theta, setup.parameters.true, rtol=1e-7)
+    assert estimate.success
+
+
+def test_both_methods_find_the_minimum_of_the_weighted_squares(setup: Setup, recording: Recording) -> None:
+    fit = Fit(setup, [recording])
+
+    def cost(theta: np.ndarray) -> float:
+        y, _ = setup.plant.measure(theta[None], recording.ctrl)
+        return float(np.sum(((y[0, 1:] - recording.y[1:]) / 0.05) ** 2))
+
+    start = setup.parameters.true
+    slow = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-10, "maxiter": 400})
+    for solve in (trust_region, newton_raphson):
+        solution = solve(fit, setup.parameters.guess)
+        assert solution.success
+        assert cost(solution.theta) <= slow.fun + 1e-5
+        np.testing.assert_allclose(solution.theta, slow.x, atol=1e-5)
+
+
+def test_jacobian_agrees_with_independent_differences(setup: Setup, recording: Recording) -> None:
+    fit, theta = Fit(setup, [recording]), np.array([2.2, 1.1, 1.2])
+    value = fit.at(theta)
+    assert value is not None
+    for j in range(3):
+        h = np.zeros(3)
+        h[j] = 3e-4
+        plus, minus = Fit(setup, [recording]).at(theta + h), Fit(setup, [recording]).at(theta - h)
+        assert plus is not None
+        assert minus is not None
+        numeric = (plus.r - minus.r) / 6e-4
+        assert np.linalg.norm(value.J[:, j] - numeric) < 1e-5 * np.linalg.norm(numeric)
+        assert np.linalg.norm(1.001 * value.J[:, j] - numeric) > 5e-4 * np.linalg.norm(numeric)
+
+
+def test_covariance_is_the_cramer_rao_bound_at_the_estimate(
+    setup: Setup, design: mjfim.Design, recording: Recording
+) -> None:
+    estimate = identify(setup, [recording])
+    np.testing.assert_allclose(estimate.std, design.final.std, rtol=0.05)
+    np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), estimate.std, rtol=1e-8)
+
+
+def test_chi_square_and_misfit(setup: Setup, recording: Recording) -> None:
+    right = identify(setup, [recording])
+    assert right.dof == 400 * 4 - 3
+    assert 0.001 < chi2.sf(right.chi2, right.dof) < 0.999
+    assert not right.misfit
+    drag = np.array(recording.y)
+    drag[:, 0] += 0.1 * np.sin(3 * recording.t)  # a structured error that no parameter explains
+    wrong = identify(setup, [Recording(recording.t, recording.ctrl, drag, recording.outputs)])
+    assert wrong.misfit
+    assert any("not accuracy" in sentence for sentence in wrong.warnings)
+
+
+def test_overstated_noise_is_said(setup: Setup, recording: Recording) -> None:
+    estimate = identify(setup, [noiseless(setup, recording)])
+    assert any("overstated" in sentence for sentence in estimate.warnings)
+
+
+def test_two_recordings_carry_twice_the_information(setup: Setup, design: mjfim.Design, recording: Recording) -> None:
+    again = simulate(setup, design.trajectory, seed=4)
+    one, two = identify(setup, [recording]), identify(setup, [recording, again])
+    np.testing.assert_allclose(two.std, one.std / np.sqrt(2), rtol=0.03)
+    assert len(two.predicted) == 2
+
+
+def test_bounds_are_kept_and_named(design: mjfim.Design, recording: Recording) -> None:
+    base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    tight = {**base.model_dump(exclude_unset=True)["parameters"]}
+    tight["m"] = {**tight["m"], "bounds": [2.2, 3.0], "true": 2.4}
+    estimate = identify(base.replace(parameters=tight), [recording])
+    assert estimate.theta[0] == pytest.approx(2.2, abs=1e-4)
+    assert estimate.at_bound == ("m",)
+
+
+def test_prior_pulls_the_estimate_and_shrinks_its_deviation(design: mjfim.Design, recording: Recording) -> None:
+    base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    parameters = base.model_dump(exclude_unset=True)["parameters"]
+    parameters["m"] = {**parameters["m"], "prior": 1e-4}
+    estimate = identify(base.replace(parameters=parameters), [recording])
+    assert estimate.theta[0] == pytest.approx(2.5, abs=1e-3)
+    assert estimate.std[0] < 1.01e-4
+
+
+def test_recording_with_fewer_outputs_and_gaps_still_fits(setup: Setup, recording: Recording) -> None:
+    y = np.array(recording.y[:, :2])
+    y[50:80, 1] = np.nan
+    estimate = identify(setup, [Recording(recording.t, recording.ctrl, y, recording.outputs[:2])])
+    assert estimate.dof == 2 * 400 - 30 - 3
+    assert np.all(np.abs(estimate.theta - setup.parameters.true) < 5 * estimate.std)
+
+
+def test_unusable_recordings_are_named(setup: Setup, recording: Recording) -> None:
+    t, ctrl, y, names = recording.t, recording.ctrl, recording.y, recording.outputs
+    with pytest.raises(RecordingError, match="too few rows"):
+        aligned(setup, Recording(t[:2], ctrl[:1], y[:2], names, "x.csv"))
+    with pytest.raises(RecordingError, match=r"x\.csv.*grid of 100 Hz"):
+        aligned(setup, Recording(2 * t, ctrl, y, names, "x.csv"))
+    bad = np.array(ctrl)
+    bad[7] = np.nan
+    with pytest.raises(RecordingError, match="data row 8"):
+        aligned(setup, Recording(t, bad, y, names, "x.csv"))
+    with pytest.raises(RecordingError, match="qpos:slide"):
+        aligned(setup, Recording(t, ctrl, y, ("a", "b", "c", "d"), "x.csv"))
+    with pytest.raises(RecordingError, match="at least one"):
+        identify(setup, [])
+
+
+def test_divergence_at_the_start_is_an_error(setup: Setup, recording: Recording) -> None:
+    with pytest.raises(SimulationDiverged, match="diverges at the start"):
+        identify(setup, [recording], start=np.array([2.0, 1.0, -1e6]))

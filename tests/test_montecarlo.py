@@ -1,0 +1,113 @@
+"""The Monte-Carlo study against theory and against one-by-one estimation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest, norm
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.estimate import identify
+from mjfim.experiment import Experiment
+from mjfim.montecarlo import _statistics, monte_carlo, simulate
+from mjfim.setup import Setup
+from mjfim.trajectory import Recording
+
+ROOT = Path(__file__).resolve().parents[1]
+# Table III of the paper, diagonal, initial trajectory, 25 Hz
+PAPER_BOUND = np.array([1.04e-3, 2.26e-3, 4.57e-2])
+
+
+@pytest.fixture(scope="module")
+def experiment() -> Experiment:
+    return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+
+
+@pytest.fixture(scope="module")
+def design(experiment: Experiment) -> mjfim.Design:
+    return mjfim.design(experiment)
+
+
+def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Design) -> None:
+    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+    study = monte_carlo(experiment, curves, trials=1500, seed=0, measure_rate=25.0)
+    for s in study.sets.values():
+        assert s.failed == 0
+        assert s.trials == 1500
+        np.testing.assert_allclose(np.diag(s.covariance) / np.diag(s.crlb), 1.0, atol=0.10)
+        assert np.all(s.efficiency_interval[:, 0] < s.efficiency)
+        assert np.all(s.efficiency < s.efficiency_interval[:, 1])
+    np.testing.assert_allclose(np.diag(study.sets["initial"].covariance), PAPER_BOUND, rtol=0.15)
+    np.testing.assert_allclose(study.information["initial"][0, 0], 961, rtol=0.01)
+
+
+def test_each_trial_is_its_own_least_squares_estimate(experiment: Experiment, design: mjfim.Design) -> None:
+    study = monte_carlo(experiment, {"initial": design.initial.trajectory}, trials=20, seed=5, measure_rate=25.0)
+    setup = Setup(experiment.replace(measure_rate=25.0))
+    rng = np.random.default_rng(5).spawn(1)[0]
+    ctrl, rows = design.initial.trajectory.ctrl, np.arange(4, 401, 4)
+    exact, _ = setup.plant.measure(setup.parameters.true[None], ctrl)
+    noise = rng.standard_normal((20, 400)).reshape(20, 100, 4)
+    std = np.sqrt(np.diag(study.sets["initial"].crlb))
+    for i in range(5):
+        y = np.full((401, 4), np.nan)
+        y[rows] = exact[0, rows] + 0.05 * noise[i]
+        alone = identify(setup, [Recording(np.arange(401) * 0.01, ctrl, y, setup.outputs.names)])
+        np.testing.assert_array_less(np.abs(study.sets["initial"].estimates[i] - alone.theta), 0.01 * std)
+
+
+def test_seed_decides_the_result(experiment: Experiment, design: mjfim.Design) -> None:
+    runs = [
+        monte_carlo(experiment, design.trajectory, trials=8, seed=seed).sets["final"].estimates for seed in (1, 1, 2)
+    ]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert not np.array_equal(runs[0], runs[2])
+
+
+def test_statistics_know_an_efficient_and_an_inefficient_estimator() -> None:
+    rng, bound = np.random.default_rng(0), np.diag([4.0, 0.25])
+    good = rng.standard_normal((4000, 2)) * [2.0, 0.5]
+    efficient = _statistics(good, bound, 0.0)
+    assert np.all(efficient.efficiency_interval[:, 0] < 1.0)
+    assert np.all(efficient.efficiency_interval[:, 1] > 1.0)
+    wasteful = _statistics(1.2 * good, bound, 0.0)
+    assert np.all(wasteful.efficiency_interval[:, 1] < 1.0)
+
+
+def test_interval_of_the_efficiency_covers_as_promised() -> None:
+    rng, bound = np.random.default_rng(1), np.eye(1)
+    hits = 0
+    for _ in range(400):
+        low, high = _statistics(rng.standard_normal((50, 1)), bound, 0.0).efficiency_interval[0]
+        hits += low <= 1.0 <= high
+    assert abs(hits / 400 - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 400)
+
+
+def test_failed_trials_are_counted_not_averaged() -> None:
+    estimates = np.random.default_rng(2).standard_normal((100, 2))
+    estimates[3] = np.nan
+    s = _statistics(estimates, np.eye(2), 0.0)
+    assert (s.failed, s.trials) == (1, 100)
+    assert np.isfinite(s.covariance).all()
+
+
+def test_simulated_noise_is_white_gaussian_of_the_stated_size(experiment: Experiment, design: mjfim.Design) -> None:
+    setup = Setup(experiment)
+    exact, _ = setup.plant.measure(setup.parameters.true[None], design.trajectory.ctrl)
+    residual = ((simulate(setup, design.trajectory, seed=9).y - exact[0]) / 0.05).ravel()
+    assert 0.001 < chi2.cdf(residual @ residual, residual.size) < 0.999
+    assert kstest(residual, norm.cdf).pvalue > 1e-3
+
+
+def test_simulation_measures_at_the_measurement_rate(experiment: Experiment, design: mjfim.Design) -> None:
+    y = mjfim.simulate(experiment.replace(measure_rate=25.0), design.trajectory, seed=0).y
+    measured = np.isfinite(y).all(axis=1)
+    assert np.array_equal(np.flatnonzero(measured), np.arange(0, 401, 4))
+
+
+def test_too_few_trials_are_refused(experiment: Experiment, design: mjfim.Design) -> None:
+    with pytest.raises(ExperimentError, match="at least 2"):
+        monte_carlo(experiment, design.trajectory, trials=1)

@@ -1,0 +1,503 @@
+"""The plant in discrete time: derivatives against MuJoCo's and plain loops, sensors, projection, divergence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numerics import (
+    CART_PARAMETERS,
+    CART_PENDULUM,
+    Array,
+    Loop,
+    body_setup,
+    cart_setup,
+    filtered_setup,
+    make_setup,
+    relative_error,
+    shared_model,
+)
+
+from mjfim.errors import SimulationDiverged
+from mjfim.lq import Recursion, TangentCurve, regulator
+from mjfim.models import compile_spec, load_spec, private_model, unconstrained
+from mjfim.parameters import write_spec
+from mjfim.plant import CENTRAL, FAST
+from mjfim.setup import Setup
+from mjfim.trajectory import Linearization
+
+SENSED = {"angle": 0.01, "rate": 0.05, "acc": 0.3, "drive": 0.1}
+SAMPLES = (0, 7, 23, 49)
+
+
+def linear(setup: Setup) -> Linearization:
+    """Derivatives along the initial trajectory."""
+    return setup.plant.linearize(setup.theta, setup.initial)
+
+
+def furuta(folder: Path) -> Setup:
+    """The Qube, RK4 with 20 steps per sample; a torque that swings the pole without limits or contacts (it has none)."""
+    parameters = {"stiff": {"target": "joint/theta:damping"}, "weak": {"target": "joint/alpha:damping"}}
+    control = {"kind": "sine", "amplitude": 2e-3, "frequency": 1.5}
+    model = shared_model("qube_furuta/furuta_pendulum.xml")
+    initial = {"qpos": (0.1, 0.3), "control": control}
+    return make_setup(model, folder, initial=initial, parameters=parameters, noise={"state": 0.01})
+
+
+def acrobot_without_rk4(folder: Path, integrator: str) -> Setup:
+    """dm_control's acrobot under another integrator; its constraints are off and |u| stays below its range of 1."""
+    source = shared_model("dmc_acrobot/acrobot.xml")
+    spec = mujoco.MjSpec.from_file(str(source))
+    for kind in ("textures", "materials"):  # pictures are not needed and not copied
+        for element in getattr(spec, kind):
+            spec.delete(element)
+    for geom in spec.geoms:
+        geom.material = ""
+    for site in spec.sites:
+        site.material = ""
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    spec.compile()
+    parameters = {"m": {"target": "body/lower_arm:mass"}, "c": {"target": "joint/elbow:damping"}}
+    control = {"kind": "sine", "amplitude": 0.8, "frequency": 1.0}
+    initial = {"qpos": (2.5, 0.4), "control": control}
+    return make_setup(spec.to_xml(), folder, initial=initial, parameters=parameters, noise={"state": 0.05})
+
+
+def transition(setup: Setup, k: int) -> tuple[Array, Array, Array, Array]:
+    """A, B, C, D of sample k by `mjd_transitionFD`."""
+    model, curve = setup.plant.model(setup.theta), setup.initial
+    loop = Loop(model, 1)
+    loop.load(curve.state[k], curve.ctrl[k])
+    nx, nu = setup.space.nx, model.nu
+    A, B = np.zeros((nx, nx)), np.zeros((nx, nu))
+    C, D = np.zeros((model.nsensordata, nx)), np.zeros((model.nsensordata, nu))
+    mujoco.mjd_transitionFD(model, loop.data, 1e-6, True, A, B, C, D)
+    return A, B, C, D
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("make", [cart_setup, body_setup, acrobot_without_rk4], ids=["cart", "body", "acrobot"])
+def test_A_and_B_are_those_of_mjd_transitionFD(make, integrator: str, tmp_path) -> None:
+    setup = make(tmp_path, integrator)
+    assert setup.substeps == 1
+    found = linear(setup)
+    for k in SAMPLES:
+        A, B, _, _ = transition(setup, k)
+        assert relative_error(found.A[k], A) < 1e-8
+        assert relative_error(found.B[k], B) < 1e-7
+
+
+@pytest.mark.parametrize("make", [body_setup, lambda f, i: cart_setup(f, i, noise=SENSED)], ids=["body", "cart"])
+def test_C_and_D_of_sensors_are_those_of_mjd_transitionFD(make, tmp_path) -> None:
+    setup = make(tmp_path, "implicitfast")
+    found = linear(setup)
+    for k in SAMPLES:
+        _, _, C, D = transition(setup, k)
+        assert relative_error(found.C[k], C) < 1e-7
+        assert relative_error(found.D[k], D) < 1e-7
+    assert np.abs(found.D).max() > 0.1  # accelerations and forces depend on the control at once
+
+
+@pytest.mark.parametrize(
+    "make",
+    [cart_setup, body_setup, lambda f: filtered_setup(f, "RK4"), filtered_setup, furuta],
+    ids=["cart", "body", "activation", "activation-implicitfast", "furuta"],
+)
+def test_A_and_B_are_those_of_a_plain_loop_for_any_integrator_and_substeps(make, tmp_path) -> None:
+    setup = make(tmp_path)
+    found, curve = linear(setup), setup.initial
+    loop = Loop(setup.plant.model(setup.theta), setup.substeps)
+    for k in SAMPLES:
+        A, B, _, _ = loop.jacobians(curve.state[k], curve.ctrl[k])
+        assert relative_error(found.A[k], A) < 1e-7
+        assert relative_error(found.B[k], B) < 1e-6
+
+
+def test_these_setups_hold_one_and_several_steps_per_sample(tmp_path) -> None:
+    (tmp_path / "b").mkdir()
+    assert cart_setup(tmp_path).substeps == 1
+    assert filtered_setup(tmp_path / "b").substeps == 2
+    assert furuta(tmp_path).substeps == 20
+
+
+def test_a_wrong_jacobian_would_be_noticed(tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    A, _, _, _ = Loop(setup.plant.model(setup.theta), 2).jacobians(setup.initial.state[7], setup.initial.ctrl[7])
+    assert relative_error(linear(setup).A[7], A) > 1e-3  # two steps instead of one
+    assert relative_error(1.001 * linear(setup).A[7], linear(setup).A[7]) > 1e-7
+
+
+def rebuilt(setup: Setup, theta: Array) -> Any:
+    """The model compiled anew at theta, sensors and solver as in the plant."""
+    spec = setup.spec.copy()
+    write_spec(spec, setup.model, setup.parameters, theta)
+    for body in spec.bodies:
+        body.simple = 0
+    return spec.compile()
+
+
+@pytest.mark.parametrize(
+    ("make", "tolerance"), [(cart_setup, 1e-6), (body_setup, 1e-6), (filtered_setup, 1e-6)], ids=["cart", "body", "act"]
+)
+def test_E_and_H_are_differences_of_rebuilt_models(make, tolerance: float, tmp_path) -> None:
+    setup = make(tmp_path)
+    found, curve, theta = linear(setup), setup.initial, setup.theta
+    rows = setup.outputs.sensor_rows
+    for j, h in enumerate(1e-5 * np.abs(theta)):
+        step = h * np.eye(len(theta))[j]
+        up, down = (Loop(rebuilt(setup, theta + s), setup.substeps) for s in (step, -step))
+        F, H = np.zeros((len(SAMPLES), setup.space.nx)), np.zeros((len(SAMPLES), len(rows)))
+        for i, k in enumerate(SAMPLES):
+            x, u = curve.state[k], curve.ctrl[k]
+            F[i] = up.minus(up.F(x, u), down.F(x, u)) / (2 * h)
+            H[i] = ((up.h(x, u) - down.h(x, u)) / (2 * h))[setup.outputs.sensor_address]
+        assert relative_error(found.E[list(SAMPLES), :, j], F) < tolerance
+        if len(rows) and np.abs(H).max() > 1e-9:
+            assert relative_error(found.H[list(SAMPLES)][:, rows, j], H) < tolerance
+
+
+def test_H_of_sensors_is_not_zero_here(tmp_path) -> None:
+    assert np.abs(linear(body_setup(tmp_path)).H).max() > 0.1
+    assert np.abs(linear(cart_setup(tmp_path)).H).max() == 0.0  # states are measured as they are
+
+
+@pytest.mark.parametrize(
+    "make",
+    [cart_setup, body_setup, filtered_setup, lambda f: cart_setup(f, noise={**SENSED, "state": 0.1}), furuta],
+    ids=["cart", "body", "activation", "cart-sensors", "furuta"],
+)
+def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
+    setup = make(tmp_path)
+    tolerance = 1e-5 if make is furuta else 1e-6  # its dampings are 1e-6, hardly above the round-off of a step
+    L, S = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial)
+    psi = np.zeros((setup.space.nx, len(setup.theta)))
+    for k in range(setup.samples):
+        psi = L.A[k] @ psi + L.E[k]
+    np.testing.assert_array_equal(S.psi[0], 0.0)
+    scale = np.abs(S.psi).max(axis=(0, 1))
+    assert (scale > 0).all()
+    assert np.abs((S.psi[-1] - psi) / scale).max() < tolerance
+    every = np.stack(
+        [Recursion(L.A).forward(np.zeros(setup.space.nx), L.E[:, :, j]) for j in range(len(scale))], axis=2
+    )
+    assert np.abs((S.psi - every) / scale).max() < tolerance
+    G = np.einsum("kyx,kxp->kyp", L.C, S.psi) + L.H
+    assert np.abs((S.G - G) / np.abs(G).max(axis=(0, 1))).max() < tolerance
+    assert S.G.shape == (setup.samples + 1, len(setup.outputs.outputs), len(setup.theta))
+
+
+def test_prediction_gives_the_same_outputs_and_derivative_as_the_sensitivity(tmp_path) -> None:
+    setup = body_setup(tmp_path)
+    y, G = setup.plant.predict(setup.theta, setup.initial.ctrl)
+    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    assert relative_error(G, S.G) < 1e-6
+    measured, finite = setup.plant.measure(setup.theta[None], setup.initial.ctrl)
+    assert finite.all()
+    np.testing.assert_array_equal(measured[0], y)
+
+
+@pytest.mark.parametrize("make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"])
+@pytest.mark.parametrize("accuracy", [CENTRAL, FAST], ids=["central", "fast"])
+def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> None:
+    setup = make(tmp_path)
+    L, psi = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial).psi
+    w = np.abs(setup.theta)[None] * np.linspace(0.5, 1.0, len(setup.theta))
+    found = setup.plant.bilinear(setup.theta, setup.initial, psi, w, accuracy)
+    tolerance = 1e-5 if accuracy.central else 1e-3
+    for name in ("A", "B", "C", "D"):
+        if np.abs(getattr(L, name)).max() > 0:
+            assert relative_error(getattr(found, name), getattr(L, name)) < tolerance
+
+
+@pytest.mark.parametrize("make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"])
+def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, tmp_path) -> None:
+    setup = make(tmp_path)
+    theta, curve, nx = setup.theta, setup.initial, setup.space.nx
+    psi = setup.plant.sensitivity(theta, curve).psi
+    w = np.abs(theta) * np.linspace(1.0, 0.5, len(theta))
+    found = setup.plant.bilinear(theta, curve, psi, w[None], CENTRAL)
+    e, d = 3e-4, 3e-4
+    plus, minus = (Loop(rebuilt(setup, theta + s * e * w), setup.substeps) for s in (1, -1))
+    for k in (7, 23):
+        x, u, push = curve.state[k], curve.ctrl[k], psi[k] @ w
+
+        def DF(x: Array, u: Array, push: Array = push) -> tuple[Array, Array]:
+            up, down = plus.plus(x, e * push), plus.plus(x, -e * push)
+            dh = (plus.h(up, u) - minus.h(down, u)) / (2 * e)
+            return plus.minus(plus.F(up, u), minus.F(down, u)) / (2 * e), dh
+
+        F, H = [], []
+        for i in range(nx + setup.plant.nu):
+            step = d * np.eye(nx + setup.plant.nu)[i]
+            ahead, back = DF(plus.plus(x, step[:nx]), u + step[nx:]), DF(plus.plus(x, -step[:nx]), u - step[nx:])
+            F.append((ahead[0] - back[0]) / (2 * d))
+            H.append((ahead[1] - back[1])[setup.outputs.sensor_address] / (2 * d))
+        assert relative_error(found.F_mixed[0, k], np.array(F)) < 1e-4
+        if setup.outputs.needs_sensors:
+            rows = setup.outputs.sensor_rows
+            assert relative_error(found.h_mixed[0, k][:, rows], np.array(H)) < 1e-4
+
+
+def test_outputs_belong_to_the_state_and_control_of_their_own_sample(tmp_path) -> None:
+    noise = {"state": 0.1, **SENSED}
+    setup = cart_setup(tmp_path, noise=noise)
+    y, _ = setup.plant.measure(setup.theta[None], setup.initial.ctrl)
+    columns = {name: y[0][:, i] for i, name in enumerate(setup.outputs.names)}
+    np.testing.assert_array_equal(columns["angle"], columns["qpos:hinge"])  # no lag between sensor and state
+    np.testing.assert_array_equal(columns["rate"], columns["qvel:hinge"])
+    assert np.abs(np.diff(columns["angle"])).max() > 1e-3
+    np.testing.assert_array_equal(columns["drive"][:-1], setup.initial.ctrl[:, 0])
+    assert columns["drive"][-1] == setup.initial.ctrl[-1, 0]  # the last control is held
+
+
+@pytest.mark.parametrize("make", [filtered_setup, body_setup], ids=["two steps a sample", "one"])
+def test_rollout_and_sensors_are_those_of_a_plain_loop(make, tmp_path) -> None:
+    noise = {"noise": {"angle": 0.1, "torque": 0.1}} if make is filtered_setup else {}
+    setup = make(tmp_path, "RK4", **noise)
+    curve, loop = setup.initial, Loop(setup.plant.model(setup.theta), setup.substeps)
+    y, _ = setup.plant.measure(setup.theta[None], curve.ctrl)
+    for k in range(setup.samples):
+        expected = loop.F(curve.state[k], curve.ctrl[k])
+        np.testing.assert_allclose(curve.state[k + 1], expected, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(y[0, k], loop.h(curve.state[k], curve.ctrl[k]), rtol=0, atol=1e-11)
+    last = loop.h(curve.state[-1], curve.ctrl[-1])
+    np.testing.assert_allclose(y[0, -1], last, rtol=0, atol=1e-11)
+    assert curve.t[-1] == pytest.approx(setup.samples * setup.substeps * setup.model.opt.timestep)
+
+
+def gain(setup: Setup) -> Array:
+    """Regulator with unit weights along the initial trajectory."""
+    L, dt = linear(setup), setup.dt
+    nx, nu = setup.space.nx, setup.plant.nu
+    return regulator(L.A, L.B, np.eye(nx) * dt, np.eye(nu) * dt, np.eye(nx))
+
+
+def tangent(setup: Setup, K: Array, size: float = 1.0) -> TangentCurve:
+    """A smooth tangent vector along the initial trajectory."""
+    L, t = linear(setup), setup.t[:, None]
+    c = size * np.sin(7.0 * t + 1.0 + np.arange(setup.plant.nu))
+    z = Recursion(L.A - L.B @ K).forward(np.zeros(setup.space.nx), np.einsum("kiu,ku->ki", L.B, c))
+    return TangentCurve(z, c - np.einsum("kui,ki->ku", K, z[:-1]))
+
+
+STILL = pytest.mark.parametrize("make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"])
+
+
+@STILL
+@pytest.mark.parametrize("open_loop", [True, False])
+def test_projecting_a_trajectory_onto_itself_changes_nothing(make, open_loop: bool, tmp_path) -> None:
+    setup = make(tmp_path)
+    K = gain(setup) * (not open_loop)
+    still = TangentCurve(np.zeros((setup.samples + 1, setup.space.nx)), np.zeros((setup.samples, setup.plant.nu)))
+    same = setup.plant.project(setup.theta, setup.initial, still, 1.0, K)
+    np.testing.assert_allclose(same.state, setup.initial.state, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(same.ctrl, setup.initial.ctrl, rtol=0, atol=1e-12)
+
+
+@STILL
+def test_projection_is_idempotent_and_feasible(make, tmp_path) -> None:
+    setup = make(tmp_path)
+    K, plant, theta = gain(setup), setup.plant, setup.theta
+    zeta = tangent(setup, K)
+    once = plant.project(theta, setup.initial, zeta, 0.5, K)
+    moved = plant.difference(once, setup.initial)
+    assert np.abs(moved.z).max() > 1e-3
+    # P(xi) is a trajectory: its own control in open loop gives it back
+    np.testing.assert_allclose(plant.simulate(theta, once.ctrl).state, once.state, rtol=0, atol=1e-9)
+    # P(P(xi)) = P(xi), by asking again for where it has arrived
+    twice = plant.project(theta, setup.initial, moved, 1.0, K)
+    np.testing.assert_allclose(twice.state, once.state, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(twice.ctrl, once.ctrl, rtol=0, atol=1e-9)
+
+
+@STILL
+@pytest.mark.parametrize("open_loop", [True, False])
+def test_projection_moves_along_its_tangent_vector_to_first_order(make, open_loop: bool, tmp_path) -> None:
+    setup = make(tmp_path)
+    K = gain(setup) * (not open_loop)
+    zeta, errors = tangent(setup, K), []
+    for gamma in (1e-2, 5e-3):
+        moved = setup.plant.difference(setup.plant.project(setup.theta, setup.initial, zeta, gamma, K), setup.initial)
+        errors.append(np.abs(moved.z / gamma - zeta.z).max() + np.abs(moved.v / gamma - zeta.v).max())
+    assert errors[0] < 0.05 * np.abs(zeta.z).max()
+    assert errors[1] < 0.6 * errors[0] or errors[1] < 1e-9  # the remainder is of second order
+
+
+def test_feedback_is_that_of_the_projection_operator(tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    K, curve, zeta = gain(setup), setup.initial, tangent(setup, gain(setup), 3.0)
+    new = setup.plant.project(setup.theta, curve, zeta, 1.0, K)
+    alpha, mu = curve.state + zeta.z, curve.ctrl + zeta.v
+    expected = mu + np.einsum("kui,ki->ku", K, alpha[:-1] - new.state[:-1])
+    np.testing.assert_allclose(new.ctrl, expected, rtol=0, atol=1e-12)
+
+
+def test_feedback_holds_an_upright_pendulum_that_open_loop_loses(tmp_path) -> None:
+    start = {"qpos": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
+    light = CART_PENDULUM.format(integrator="RK4").replace('damping="0.4"', 'damping="0.01"')
+    setup = make_setup(light, tmp_path, initial=start, horizon=4.0, parameters=CART_PARAMETERS, noise={"state": 0.1})
+    K, kick = gain(setup), np.zeros((setup.samples, 1))
+    kick[:20] = 0.5
+    zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), kick)
+    lost = setup.plant.project(setup.theta, setup.initial, zeta, 1.0, 0.0 * K)
+    held = setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K)
+    assert np.abs(lost.qpos[:, 1]).max() > 2.0
+    assert np.abs(held.qpos[:, 1]).max() < 0.1
+    assert np.abs(held.state[-1]).max() < 0.05
+
+
+def test_a_control_that_diverges_is_an_outcome_without_noise(tmp_path, monkeypatch, capfd) -> None:
+    monkeypatch.chdir(tmp_path)
+    setup = cart_setup(tmp_path)
+    before, K = sorted(p.name for p in tmp_path.iterdir()), gain(setup)
+    wild = TangentCurve(np.zeros((setup.samples + 1, 4)), np.full((setup.samples, 1), 9e9))
+    assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, 0.0 * K) is None
+    assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, K) is None
+    with pytest.raises(SimulationDiverged, match="diverged"):
+        setup.plant.simulate(setup.theta, wild.v)
+    ctrl = setup.plant.trajectory(setup.initial.state, wild.v)
+    assert setup.plant.sensitivity(setup.theta, ctrl) is None
+    assert setup.plant.predict(setup.theta, wild.v) is None
+    with pytest.raises(SimulationDiverged, match="linearising"):
+        setup.plant.linearize(setup.theta, setup.plant.trajectory(1e12 * setup.initial.state, setup.initial.ctrl))
+    assert capfd.readouterr() == ("", "")
+    assert sorted(p.name for p in tmp_path.iterdir()) == before  # no MUJOCO_LOG.TXT
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e12])
+def test_a_control_that_mujoco_would_silently_replace_by_zero_is_not_simulated(bad: float, tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    control = np.full((setup.samples, 1), bad)
+    with pytest.raises(SimulationDiverged):
+        setup.plant.simulate(setup.theta, control)
+
+
+def test_mujoco_itself_would_have_made_that_noise(tmp_path, monkeypatch, capfd) -> None:
+    monkeypatch.chdir(tmp_path)
+    setup = cart_setup(tmp_path)
+    setup.initial  # noqa: B018  (quiet work first: afterwards MuJoCo's own settings must be back)
+    loop = Loop(setup.plant.model(setup.theta), 5)
+    loop.F(setup.start, np.array([9e9]))
+    out = "".join(capfd.readouterr())
+    assert "WARNING" in out or (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_after_a_diverged_trial_the_plant_works_as_before(tmp_path) -> None:
+    setup = cart_setup(tmp_path, noise=SENSED)
+    first = setup.plant.sensitivity(setup.theta, setup.initial)
+    L = linear(setup)
+    wild = setup.plant.trajectory(setup.initial.state, np.full((setup.samples, 1), 9e9))
+    assert setup.plant.sensitivity(setup.theta, wild) is None
+    with pytest.raises(SimulationDiverged):
+        setup.plant.linearize(setup.theta, setup.plant.trajectory(1e12 * setup.initial.state, setup.initial.ctrl))
+    np.testing.assert_array_equal(setup.plant.sensitivity(setup.theta, setup.initial).G, first.G)
+    np.testing.assert_array_equal(linear(setup).A, L.A)
+
+
+def test_results_do_not_depend_on_what_was_simulated_before_or_on_threads(tmp_path) -> None:
+    (tmp_path / "b").mkdir()
+    setup, other = body_setup(tmp_path), body_setup(tmp_path / "b")
+    other.plant.engine.threads = 2
+    other.plant.measure(1.3 * other.theta[None], -other.control)
+    other.plant.linearize(0.8 * other.theta, other.initial)
+    np.testing.assert_array_equal(
+        setup.plant.sensitivity(setup.theta, setup.initial).G, other.plant.sensitivity(other.theta, other.initial).G
+    )
+
+
+def test_every_mj_step_is_counted(tmp_path) -> None:
+    setup = filtered_setup(tmp_path)
+    engine, N, n = setup.plant.engine, setup.samples, setup.substeps
+    curve, count = setup.initial, engine.steps
+    setup.plant.linearize(setup.theta, curve)
+    assert engine.steps - count == (N + 1) * n * (2 * (3 + 1) + 2 * 2)
+    count = engine.steps
+    setup.plant.sensitivity(setup.theta, curve)
+    assert engine.steps - count == 2 * 2 * (N * n + 1)  # one more for the sensors of the last sample
+    count = engine.steps
+    zero = TangentCurve(np.zeros((N + 1, 3)), np.zeros((N, 1)))
+    setup.plant.project(setup.theta, curve, zero, 1.0, np.ones((N, 1, 3)))
+    assert engine.steps - count == N * n
+
+
+def bits(model: Any) -> tuple[bool, bool]:
+    """(solver is off, sensors are off)."""
+    flags = model.opt.disableflags
+    return (
+        bool(flags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)),
+        bool(flags & int(mujoco.mjtDisableBit.mjDSBL_SENSOR)),
+    )
+
+
+def written(folder: Path, xml: str) -> tuple[Any, Path]:
+    """(spec, path) of an MJCF string."""
+    path = folder / "model.xml"
+    path.write_text(xml, encoding="utf-8")
+    return load_spec(path), path
+
+
+@pytest.mark.parametrize("integrator", ["RK4", "Euler", "implicitfast"])
+def test_switching_off_solver_and_sensors_of_an_unconstrained_model_changes_no_bit(integrator: str, tmp_path) -> None:
+    spec, path = written(tmp_path, CART_PENDULUM.format(integrator=integrator))
+    plain, lean = compile_spec(spec, path), private_model(spec, path, ["bob"], sensors=False, friction=False)
+    assert (bits(plain), bits(lean)) == ((False, False), (True, True))
+    states = []
+    for model in (plain, lean):
+        data, rows = mujoco.MjData(model), []
+        data.qpos[:] = 0.1, 2.0
+        for k in range(200):
+            data.ctrl[:] = 5.0 * np.sin(0.1 * k)
+            mujoco.mj_step(model, data)
+            rows.append(np.concatenate([data.qpos, data.qvel]))
+        states.append(rows)
+    np.testing.assert_array_equal(states[0], states[1])
+
+
+FREE_OF_CONSTRAINTS = CART_PENDULUM.format(integrator="Euler")
+CONSTRAINED = {
+    "joint limit": ('<joint name="slide"', '<joint name="slide" limited="true" range="-1 1"'),
+    "dry friction": ('damping="0.4"', 'damping="0.4" frictionloss="0.1"'),
+    "equality": ("<actuator>", '<equality><joint joint1="slide" joint2="hinge"/></equality><actuator>'),
+    "tendon limit": (
+        "<actuator>",
+        '<tendon><fixed limited="true" range="-1 1"><joint joint="slide" coef="1"/></fixed></tendon><actuator>',
+    ),
+    "tendon friction": (
+        "<actuator>",
+        '<tendon><fixed frictionloss="1"><joint joint="slide" coef="1"/></fixed></tendon><actuator>',
+    ),
+    "contact": (
+        '<flag contact="disable"/></option>\n  <default><geom mass="0" contype="0" conaffinity="0"/></default>\n  <worldbody>',
+        '</option><worldbody><geom size="1 1 1" type="plane" pos="0 0 -2"/><geom size="0.1"/>',
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CONSTRAINED)
+def test_the_solver_stays_on_where_a_constraint_can_act(case: str, tmp_path) -> None:
+    old, new = CONSTRAINED[case]
+    assert old in FREE_OF_CONSTRAINTS
+    spec, path = written(tmp_path, FREE_OF_CONSTRAINTS.replace(old, new))
+    assert not unconstrained(compile_spec(spec, path))
+    assert bits(private_model(spec, path, [], sensors=True, friction=False)) == (False, False)
+
+
+def test_the_solver_stays_on_where_friction_is_to_be_identified(tmp_path) -> None:
+    spec, path = written(tmp_path, FREE_OF_CONSTRAINTS)
+    assert bits(private_model(spec, path, [], sensors=True, friction=True)) == (False, False)
+    loss = {"loss": {"target": "joint/slide:frictionloss", "guess": 0.2}}
+    setup = cart_setup(tmp_path, parameters=loss)
+    assert bits(setup.plant.base)[0] is False
+    assert np.abs(setup.plant.sensitivity(setup.theta, setup.initial).psi).max() > 1e-3
+
+
+def test_private_copies_leave_the_users_spec_and_model_alone(tmp_path) -> None:
+    setup = body_setup(tmp_path)
+    before = setup.spec.to_xml()
+    setup.plant.linearize(1.5 * setup.theta, setup.initial)
+    assert setup.spec.to_xml() == before
+    assert setup.model.body("arm").mass[0] == pytest.approx(0.4)
+    assert bits(setup.model) == (False, False)

@@ -1,0 +1,71 @@
+"""Everything the README shows runs: its Python blocks, its command lines, its experiment file; and CI uses its commands."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from mjfim.experiment import Experiment
+from mjfim.setup import Setup
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    """Fenced code blocks of one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A folder with the models, where results may be written."""
+    shutil.copytree(ROOT / "models", tmp_path / "models")
+    return tmp_path
+
+
+def run(command: list[str], folder: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error"}
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("block", blocks("python"))
+def test_python_blocks_run(block: str, checkout: Path) -> None:
+    run([sys.executable, "-c", block], checkout)
+
+
+def test_command_lines_run(checkout: Path) -> None:
+    lines = [line for block in blocks("sh") for line in block.splitlines() if line.startswith("mjfim ")]
+    assert {line.split()[1] for line in lines} == {"design", "simulate", "identify", "montecarlo", "replay"}
+    for line in lines:
+        run([sys.executable, "-m", *line.split()], checkout)
+    assert (checkout / "out" / "replay.rrd").is_file()
+
+
+def test_experiment_block_is_a_valid_experiment() -> None:
+    (block,) = blocks("toml")
+    setup = Setup(Experiment(**tomllib.loads(block), directory=ROOT / "models"))
+    assert setup.parameters.names == ("m", "c")
+
+
+def test_two_install_commands_stand_alone_and_ci_takes_them_from_here() -> None:
+    commands = [block.strip() for block in blocks("sh") if block.startswith("python3 -m venv")]
+    assert len(commands) == 2
+    assert all("\n" not in command for command in commands)
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert "README.md" in script
+    assert "-m pytest" not in script.replace("'-m pytest'", "")
+
+
+def test_links_point_to_files() -> None:
+    targets = re.findall(r"\]\((?!http)([^)#]+)", README)
+    assert targets
+    assert all((ROOT / target).exists() for target in targets), targets
