@@ -1,4 +1,4 @@
-"""Results on disk: design.json/npz/csv, estimate.json, montecarlo.json, recordings as CSV, identified.xml. No pickles."""
+"""Results on disk: design.json/npz/csv, estimate.json, montecarlo.json, recordings as CSV. No pickles."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pyarrow
 import pyarrow.csv
 
 from mjfim.errors import RecordingError, unknown
 from mjfim.files import replacing
-from mjfim.parameters import write_spec
 from mjfim.setup import Setup
 from mjfim.signals import read_table
 from mjfim.trajectory import Array, Design, Estimate, Evaluation, Recording, Study, Trajectory
@@ -193,19 +191,6 @@ def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
         "recordings": [r.name for r in estimate.recordings],
         "warnings": list(estimate.warnings),
     }
-
-
-def write_identified(path: Path, setup: Setup, theta: Array) -> None:
-    """The user's MJCF with the identified values written in; asset folders are re-pointed so that it loads from `path`."""
-    spec = setup.spec.copy()
-    write_spec(spec, setup.model, setup.parameters, theta)
-    source = setup.model_path.resolve().parent
-    for folder in ("meshdir", "texturedir"):
-        old = getattr(spec, folder)
-        setattr(spec, folder, os.path.relpath(source / old, path.resolve().parent))
-    with replacing(path) as temporary:
-        temporary.write_text(spec.to_xml(), encoding="utf-8")
-        mujoco.MjModel.from_xml_path(str(temporary))
 
 
 def study_summary(study: Study) -> dict[str, Any]:

@@ -18,9 +18,10 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 import mjfim
 from mjfim import archive, report
-from mjfim.errors import ExperimentError, MjfimError, RecordingError
+from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
 from mjfim.estimate import measured_trajectory
 from mjfim.files import replacing
+from mjfim.identified import write_identified
 from mjfim.labels import Labels
 from mjfim.setup import Setup
 from mjfim.trajectory import Design, Estimate, HistoryRow, Study
@@ -269,7 +270,10 @@ def _leave_estimate(folder: Path, result: Estimate, setup: Setup) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     archive.write_json(folder / "estimate.json", archive.estimate_summary(result, setup))
-    archive.write_identified(folder / "identified.xml", setup, result.theta)
+    try:
+        write_identified(folder / "identified.xml", setup, result.theta)
+    except ModelError as error:
+        errors.print(f"warning: {error}", markup=False)
     labels = Labels.of(setup)
     for i in range(len(result.recordings)):
         name = "fit.png" if len(result.recordings) == 1 else f"fit_{i + 1}.png"

@@ -40,7 +40,7 @@ def design(
     first = problem.point(setup.initial, CENTRAL)
     if first.information is None:
         raise SimulationDiverged("the simulation diverges when the parameters move a little along the initial control")
-    setup.information.require_identifiable(first.information, setup.parameters.names)
+    setup.information.require_identifiable(first.information, setup.parameters.names, setup.parameters.step)
     coarse = _coarse_level(setup, first)
     levels = (setup,) if coarse is None else (coarse, setup)
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from mjfim.quiet import quiet
 from mjfim.tangent import StateSpace
 from mjfim.trajectory import Array
 
@@ -22,19 +22,11 @@ RECORD = int(
     | mujoco.mjtState.mjSTATE_ACT
 )
 
+# MuJoCo resets a state it finds bad, time included: starting late makes that visible at any sample.
+START = 1.0
+# Larger controls MuJoCo replaces by zero.
+MAX_CONTROL = float(mujoco.mjMAXVAL)
 FEW = 64  # rollouts of a handful of models keep their own batch beside those of a Monte-Carlo study
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep MuJoCo's own warnings off the console and out of log files: divergence is reported by value here."""
-    before, config = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-    config.logto_console = config.logto_file = False
-    mujoco.MjLogConfig.set(config)
-    try:
-        yield
-    finally:
-        mujoco.MjLogConfig.set(before)
 
 
 def state_space(model: Any) -> StateSpace:
@@ -98,7 +90,7 @@ class Engine:
         if self.space.na:
             batch.bind("act")[:n] = act
         batch.bind("qacc_warmstart")[:n] = 0.0
-        batch.bind("time")[:n] = 0.0
+        batch.bind("time")[:n] = START
         return None if n == batch.nsim else np.arange(n)
 
     def step(self, models: Sequence[Any], states: Array, ctrl: Array) -> tuple[Array, Array | None]:
@@ -132,7 +124,9 @@ class Engine:
         names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
         out = np.concatenate([batch.bind(name)[:count] for name in names], axis=1)
         timestep = float(self.model.opt.timestep)
-        out[np.abs(batch.bind("time").reshape(-1)[:count] - self.substeps * timestep) > 0.5 * timestep] = np.nan
+        elapsed = batch.bind("time").reshape(-1)[:count] - START
+        bad = np.abs(elapsed - self.substeps * timestep) > 0.5 * timestep
+        out[bad | ~_acceptable(ctrl).all(axis=1)] = np.nan
         return out, sensed
 
     def rollout(self, models: Sequence[Any], start: Array, ctrl: Array) -> Rollouts:
@@ -151,8 +145,8 @@ class Engine:
         last = N * self.substeps
         rows = out[RECORD][:, self.substeps - 1 : last : self.substeps]
         states = np.concatenate([start[:, None], rows[:, :, 1:]], axis=1)
-        on_time = np.abs(rows[:, -1, 0] - last * self.model.opt.timestep) < 0.5 * self.model.opt.timestep
-        finite = on_time & np.isfinite(states).all(axis=(1, 2))
+        on_time = np.abs(rows[:, -1, 0] - START - last * self.model.opt.timestep) < 0.5 * self.model.opt.timestep
+        finite = on_time & np.isfinite(states).all(axis=(1, 2)) & _acceptable(ctrl).all(axis=(1, 2))
         sensed = np.array(out["sensordata"][:, :: self.substeps]) if self.sensors else None
         return Rollouts(states, sensed, finite)
 
@@ -162,20 +156,28 @@ class Engine:
         reference: alpha, (N+1, ns);  mu: (N, nu);  K: (N, nu, nx)
         """
         space, N, substeps = self.space, len(mu), self.substeps
-        nq, nv, scalar = space.nq, space.nv, not space.quaternions
+        scalar = not space.quaternions
         data = self._data
         mujoco.mj_resetData(model, data)
+        data.time = START
         data.qpos[:], data.qvel[:], data.act[:] = space.split(reference[0])
-        states, used = np.empty((N + 1, nq + nv + space.na)), np.empty_like(mu)
+        states, used = np.empty((N + 1, reference.shape[1])), np.empty_like(mu)
         states[0] = reference[0]
         ctrl, qpos, qvel, act = data.ctrl, data.qpos, data.qvel, data.act
         with np.errstate(over="ignore", invalid="ignore"), quiet():
-            for k in range(N):
-                now, after = states[k], states[k + 1]
-                error = reference[k] - now if scalar else space.minus(reference[k], now)
-                ctrl[:] = used[k] = mu[k] + K[k].dot(error)
+            for now, q, v, a, alpha, u, open_loop, gain in zip(
+                states, *space.split(states[1:]), reference, used, mu, K, strict=False
+            ):
+                u[:] = gain.dot(alpha - now if scalar else space.minus(alpha, now))
+                u += open_loop
+                ctrl[:] = u
                 mujoco.mj_step(model, data, substeps)
-                after[:nq], after[nq : nq + nv], after[nq + nv :] = qpos, qvel, act
+                q[:], v[:], a[:] = qpos, qvel, act
         self.steps += N * substeps
-        on_time = abs(data.time - N * substeps * model.opt.timestep) < 0.5 * model.opt.timestep
-        return states, used, bool(on_time and np.isfinite(states).all() and np.isfinite(used).all())
+        on_time = abs(data.time - START - N * substeps * model.opt.timestep) < 0.5 * model.opt.timestep
+        return states, used, bool(on_time and np.isfinite(states).all() and _acceptable(used).all())
+
+
+def _acceptable(ctrl: Array) -> np.ndarray:
+    """Which controls MuJoCo takes as they are."""
+    return np.asarray(np.abs(ctrl) <= MAX_CONTROL)

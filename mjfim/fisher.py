@@ -21,6 +21,8 @@ from mjfim.plant import Bilinear
 from mjfim.trajectory import Array, Sensitivity
 
 SINGULAR = 1e-12
+# A direction known worse than this many times the parameters' own size is told as not excited at all.
+BLIND = 1e4
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,17 +112,21 @@ class Information:
             self.weight * raw.value, self.weight * raw.weights, raw.directions * self.scale, raw.eigenvalues
         )
 
-    def require_identifiable(self, information: Array, names: tuple[str, ...]) -> None:
-        """Raise UnidentifiableError naming the direction of theta that the trajectory cannot see."""
-        values, vectors = np.linalg.eigh(self.scaled(information))
-        if values[0] > SINGULAR * max(values[-1], np.finfo(float).tiny):
+    def require_identifiable(self, information: Array, names: tuple[str, ...], size: Array) -> None:
+        """Raise UnidentifiableError naming the direction of theta that the trajectory cannot see.
+
+        size: (p,) magnitudes of the parameters
+        """
+        values, vectors = np.linalg.eigh(information * np.outer(size, size))
+        if values[0] > max(SINGULAR * values[-1], BLIND**-2):
             return
-        direction = vectors[:, 0] * self.scale
+        direction = vectors[:, 0] * size
         direction = direction / np.abs(direction).max()
         terms = [f"{value:+.3g} {name}" for name, value in zip(names, direction, strict=True) if abs(value) > 1e-3]
+        smallest = max(float(np.linalg.eigvalsh(self.scaled(information))[0]), 0.0)
         raise UnidentifiableError(
             f"the start excites nothing along the parameter direction {' '.join(terms)} "
-            f"(lambda_min = {max(values[0], 0.0):.3g}); start from a control that moves those parameters' joints"
+            f"(lambda_min = {smallest:.3g}); start from a control that moves those parameters' joints"
         )
 
     def _rays(self, criterion: Criterion, sensitivity: Sensitivity) -> Array:

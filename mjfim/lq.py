@@ -41,7 +41,9 @@ class Recursion:
         return self._solve(a, transposed=True)
 
     def _solve(self, rhs: Array, transposed: bool) -> Array:
-        n = self.A.shape[1]
+        N, n, _ = self.A.shape
+        if rhs.shape != (N + 1, n):
+            raise ValueError(f"a recursion over {N} samples of {n} needs {(N + 1, n)} numbers, got {rhs.shape}")
         flat = np.array(rhs, dtype=np.float64).reshape(-1)
         with np.errstate(over="ignore", invalid="ignore"):
             solution = dtbsv(2 * n - 1, self._band, flat, lower=1, trans=int(transposed), diag=1, overwrite_x=1)

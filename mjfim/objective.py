@@ -83,6 +83,13 @@ class DesignProblem:
         """J; infinite for a diverged trial."""
         return point.cost
 
+    def size(self, point: Point) -> float:
+        """J; for D-optimality, whose J has no natural zero, one nat per parameter and the running cost."""
+        if self.information.criterion != "D":
+            return point.cost
+        trajectory, _, _ = _computed(point)
+        return self.information.weight * len(self.theta) + self.running.value(trajectory)
+
     def expand(self, point: Point) -> Expansion:
         """Expansion of J about a point: mixed differences for the information, closed form for the rest."""
         trajectory, sensitivity, criterion = _computed(point)

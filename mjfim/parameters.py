@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
+from mjfim.quiet import quiet
 from mjfim.trajectory import Array
 
 PATH = re.compile(r"^(?P<kind>\w+)(?:/(?P<name>[^:]+))?:(?P<field>\w+)(?:\[(?P<index>\d+)\])?$")
@@ -232,7 +233,8 @@ class ParameterSet:
                 slot.write(model, target.scale * float(value) + target.offset)
                 if slot.array == "body_ipos":
                     model.body_sameframe[slot.rows[0]] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-        mujoco.mj_setConst(model, self._scratch(model))
+        with quiet():
+            mujoco.mj_setConst(model, self._scratch(model))
 
     def _scratch(self, model: Any) -> Any:
         """Scratch data for `mj_setConst`, shared by all copies of one model."""
@@ -245,31 +247,3 @@ class ParameterSet:
         own = copy.copy(base)
         self.write(own, theta)
         return own
-
-
-def write_spec(spec: Any, compiled: Any, parameters: ParameterSet, theta: Array) -> None:
-    """Write theta: (p,) into an MjSpec that the caller owns.
-
-    compiled: the model of the same spec; bodies whose inertia came from geoms get it spelled out before it is changed.
-    """
-    for parameter, value in zip(parameters.parameters, theta, strict=True):
-        for target in parameter.targets:
-            _write_element(spec, compiled, target.path, target.scale * float(value) + target.offset)
-
-
-def _write_element(spec: Any, compiled: Any, path: str, value: float) -> None:
-    match = PATH.match(path)
-    if match is None:
-        raise ExperimentError(f"parameter path {path!r} is not of the form kind/name:field[index]")
-    kind, name, field_name, index = match["kind"], match["name"], match["field"], int(match["index"] or 0)
-    element = spec.option if kind == "option" else getattr(spec, kind)(name)
-    if kind == "body" and field_name in ("mass", "ipos", "inertia") and not element.explicitinertial:
-        body = compiled.body(name)
-        element.mass, element.ipos, element.iquat = float(body.mass[0]), body.ipos, body.iquat
-        element.inertia, element.explicitinertial = body.inertia, True
-    old = np.array(getattr(element, field_name), dtype=np.float64)
-    if old.ndim:
-        old[index] = value
-        setattr(element, field_name, old)
-    else:
-        setattr(element, field_name, value)

@@ -7,7 +7,7 @@ bars, logs, checkpoints and early stops consume it.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -16,6 +16,7 @@ from mjfim.lq import Recursion, TangentCurve, descent, regulator
 from mjfim.trajectory import Array, Status
 
 P = TypeVar("P")
+ROUND_OFF = 1e-12  # relative; a promised decrease below it says nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,10 @@ class Problem(Protocol[P]):
 
     def value(self, point: P) -> float:
         """J at a point; infinite where the trial diverged."""
+        ...
+
+    def size(self, point: P) -> float:
+        """What a change of J is compared with, > 0: J itself where J is positive."""
         ...
 
     def expand(self, point: P) -> Expansion:
@@ -141,6 +146,15 @@ class ExtendedMetricDescent:
         return False
 
 
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A step s and the change y of the gradient along it, both (N, nu);  curvature: s'y > 0."""
+
+    s: Array
+    y: Array
+    curvature: float
+
+
 @dataclass
 class LBFGS:
     """Limited-memory BFGS in the curve coordinate `c = u + K x`, where P(xi + gamma zeta) is affine in gamma.
@@ -150,53 +164,63 @@ class LBFGS:
     """
 
     R: Array
-    memory: int = 20
-    _s: list[Array] = field(default_factory=list)
-    _y: list[Array] = field(default_factory=list)
-    _gradient: Array | None = None
+    memory: int = 40
+    _pairs: tuple[Pair, ...] = ()
+    _last: tuple[Expansion, Array, Array] | None = None
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
         """zeta = -H DJ by the two-loop recursion."""
-        g = expansion.gradient(K)
-        self._gradient = g
-        q, alphas = np.array(g), []
-        for s, y in zip(reversed(self._s), reversed(self._y), strict=True):
-            alpha = np.sum(s * q) / np.sum(s * y)
-            q -= alpha * y
-            alphas.append(alpha)
-        q = np.asarray(np.linalg.solve(self.R, q.T).T, dtype=np.float64)
-        if self._s:
-            s, y = self._s[-1], self._y[-1]
-            q *= np.sum(s * y) / np.sum(y * np.linalg.solve(self.R, y.T).T)
-        for s, y, alpha in zip(self._s, self._y, reversed(alphas), strict=True):
-            q += s * (alpha - np.sum(y * q) / np.sum(s * y))
+        q, alphas = np.array(self._gradient(expansion, K)), []
+        for pair in reversed(self._pairs):
+            alphas.append(np.vdot(pair.s, q) / pair.curvature)
+            q -= alphas[-1] * pair.y
+        q = self._raise(q)
+        if self._pairs:
+            newest = self._pairs[-1]
+            q *= newest.curvature / np.vdot(newest.y, self._raise(newest.y))
+        for pair, alpha in zip(self._pairs, reversed(alphas), strict=True):
+            q += pair.s * (alpha - np.vdot(pair.y, q) / pair.curvature)
         return expansion.lift(K, -q)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
         """Store the pair (s, y) if it has positive curvature."""
-        if self._gradient is None:
+        if self._last is None:
             return
+        old = self._last[2]
         s = moved.v + np.einsum("kui,ki->ku", K, moved.z[:-1])
-        y = expansion.gradient(K) - self._gradient
-        if np.sum(s * y) > 1e-10 * np.linalg.norm(s) * np.linalg.norm(y):
-            self._s, self._y = [*self._s, s][-self.memory :], [*self._y, y][-self.memory :]
+        y = self._gradient(expansion, K) - old
+        curvature = float(np.vdot(s, y))
+        if curvature > 1e-10 * np.linalg.norm(s) * np.linalg.norm(y):
+            self._pairs = (*self._pairs, Pair(s, y, curvature))[-self.memory :]
+
+    def _gradient(self, expansion: Expansion, K: Array) -> Array:
+        """Gradient in the curve coordinate, computed once per expansion and regulator."""
+        if self._last is None or self._last[0] is not expansion or self._last[1] is not K:
+            self._last = (expansion, K, expansion.gradient(K))
+        return self._last[2]
+
+    def _raise(self, g: Array) -> Array:
+        """R^-1 g at every sample."""
+        return np.asarray(np.linalg.solve(self.R, g.T).T, dtype=np.float64)
 
     def refined(self, R: Array, factor: int) -> LBFGS:
         """The same memory on a grid that is `factor` times finer: s is held, y (an integral over a sample) is shared out."""
-        s = [np.repeat(v, factor, axis=0) for v in self._s]
-        y = [np.repeat(v, factor, axis=0) / factor for v in self._y]
-        return LBFGS(R, self.memory, s, y)
+        held = ((np.repeat(p.s, factor, axis=0), np.repeat(p.y, factor, axis=0) / factor) for p in self._pairs)
+        return LBFGS(R, self.memory, tuple(Pair(s, y, float(np.vdot(s, y))) for s, y in held))
 
     def reset(self) -> bool:
         """Drop all pairs."""
-        had = bool(self._s)
-        self._s, self._y = [], []
+        had = bool(self._pairs)
+        self._pairs = ()
         return had
 
 
 @dataclass(frozen=True)
 class Armijo:
-    """Backtracking: the largest gamma in {1, beta, beta^2, ...} with `J(gamma) <= J(0) + sigma gamma DJ.zeta`."""
+    """Backtracking to `J(gamma) <= J(0) + sigma gamma DJ.zeta`.
+
+    A rejected gamma shortens to the minimum of the parabola through J(0), slope and J(gamma), within [0.1, beta] gamma.
+    """
 
     sigma: float = 1e-4
     beta: float = 0.5
@@ -209,9 +233,11 @@ class Armijo:
     def search(
         self, problem: Problem[P], point: P, zeta: TangentCurve, slope: float, K: Array, first: float = 1.0
     ) -> tuple[P, float] | None:
-        """The accepted point and its gamma, or None. Steps shorten by the parabola through J(0), slope, J(gamma)."""
+        """The accepted point and its gamma, or None where even the shortest step does not lower J."""
         value, gamma = problem.value(point), first
         for _ in range(self.trials):
+            if gamma * abs(slope) <= ROUND_OFF * abs(value):
+                return None
             trial = problem.project(point, zeta, gamma, K)
             new = problem.value(trial)
             if new <= value + self.sigma * gamma * slope:
@@ -257,15 +283,15 @@ def optimize(
     tolerance: float,
     max_iterations: int,
 ) -> Iterator[Iterate[P]]:
-    """Algorithm 1. Yields every iterate; the last one carries a status. Stops at `|DJ.zeta| <= tolerance * |J|`."""
+    """Algorithm 1. Yields every iterate; the last one carries a status. Stops at `|DJ.zeta| <= tolerance * size`."""
     point, gamma, index = start, 0.0, 0
     expansion = problem.expand(point)
     K = regulate.gain(expansion)
     while True:
         zeta = direction(expansion, K)
         slope = expansion.slope(zeta)
-        value = problem.value(point)
-        if -slope <= tolerance * abs(value):
+        value, size = problem.value(point), problem.size(point)
+        if abs(slope) <= tolerance * size:
             better = problem.refine(point)
             if better is None:
                 yield Iterate(index, point, value, abs(slope), gamma, Status.CONVERGED)
@@ -276,7 +302,8 @@ def optimize(
             yield Iterate(index, point, value, abs(slope), gamma, Status.MAX_ITERATIONS)
             return
         yield Iterate(index, point, value, abs(slope), gamma)
-        found = armijo.search(problem, point, zeta, slope, K, min(1.0, -2.0 * abs(value) / slope))
+        first = min(1.0, -2.0 * size / slope)  # a step that promises to lose more than twice J is too long to try
+        found = armijo.search(problem, point, zeta, slope, K, first) if slope < 0.0 else None
         if found is None:
             better = problem.refine(point)
             if better is not None:

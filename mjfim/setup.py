@@ -91,7 +91,12 @@ class Setup:
 
     def model_at(self, theta: Array) -> Any:
         """The user's model, everything on, with theta: (p,) written into it."""
-        return self.parameters.model(self.model, theta)
+        return self.parameters.model(self._whole, theta)
+
+    @cached_property
+    def _whole(self) -> Any:
+        """The user's model, its moving bodies not compiled as 'simple'."""
+        return private_model(self.spec, self.model_path, moved_bodies(self.parameters.parameters), True, True)
 
     @property
     def information(self) -> Information:
@@ -209,6 +214,8 @@ class Setup:
                 for i in range(width[name]):
                     label = name if width[name] == 1 else f"{name}[{i}]"
                     chosen.append(Output(label, float(stated[name]), sensor=adr + i))
+        if not chosen:
+            raise ExperimentError("noise.state: the model has no scalar joint to measure; name sensors instead")
         addresses = {c.v: c.q for c in self.coordinates}
         nv, nq = self.model.nv, self.model.nq
         addresses.update({nv + c.v: nq + c.v for c in self.coordinates})

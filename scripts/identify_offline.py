@@ -12,7 +12,8 @@ import argparse
 from pathlib import Path
 
 import mjfim
-from mjfim.archive import read_recording, write_identified
+from mjfim.archive import read_recording
+from mjfim.identified import write_identified
 from mjfim.setup import Setup
 
 

@@ -16,6 +16,7 @@ ORDER = (
     "errors",
     "trajectory",
     "files",
+    "quiet",
     "tangent",
     "lq",
     "pronto",

@@ -22,9 +22,9 @@ from numerics import (
 )
 
 from mjfim.errors import SimulationDiverged
+from mjfim.identified import write_spec
 from mjfim.lq import Recursion, TangentCurve, regulator
 from mjfim.models import compile_spec, load_spec, private_model, unconstrained
-from mjfim.parameters import write_spec
 from mjfim.plant import CENTRAL, FAST
 from mjfim.setup import Setup
 from mjfim.trajectory import Linearization
@@ -361,18 +361,42 @@ def test_a_control_that_diverges_is_an_outcome_without_noise(tmp_path, monkeypat
     ctrl = setup.plant.trajectory(setup.initial.state, wild.v)
     assert setup.plant.sensitivity(setup.theta, ctrl) is None
     assert setup.plant.predict(setup.theta, wild.v) is None
-    with pytest.raises(SimulationDiverged, match="linearising"):
-        setup.plant.linearize(setup.theta, setup.plant.trajectory(1e12 * setup.initial.state, setup.initial.ctrl))
     assert capfd.readouterr() == ("", "")
     assert sorted(p.name for p in tmp_path.iterdir()) == before  # no MUJOCO_LOG.TXT
 
 
+@pytest.mark.parametrize("open_loop", [True, False])
 @pytest.mark.parametrize("bad", [np.nan, 1e12])
-def test_a_control_that_mujoco_would_silently_replace_by_zero_is_not_simulated(bad: float, tmp_path) -> None:
+def test_a_control_that_mujoco_would_silently_replace_by_zero_is_not_simulated(
+    bad: float, open_loop: bool, tmp_path
+) -> None:
     setup = cart_setup(tmp_path)
-    control = np.full((setup.samples, 1), bad)
-    with pytest.raises(SimulationDiverged):
-        setup.plant.simulate(setup.theta, control)
+    K, wild = gain(setup) * (not open_loop), np.zeros((setup.samples, 1))
+    wild[20] = bad
+    zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), wild)
+    assert setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K) is None
+
+
+@pytest.mark.parametrize("open_loop", [True, False])
+@pytest.mark.parametrize("sample", [0, 1, 30])
+def test_an_acceleration_that_makes_mujoco_reset_is_noticed_at_any_sample(
+    sample: int, open_loop: bool, tmp_path
+) -> None:
+    light = CART_PENDULUM.format(integrator="RK4").replace('mass="1"', 'mass="0.01"').replace("1.5", "0.01")
+    setup = make_setup(light, tmp_path, parameters=CART_PARAMETERS, noise={"state": 0.1})
+    K, wild = gain(setup) * (not open_loop), np.zeros((setup.samples, 1))
+    wild[sample] = 9e9
+    zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), wild)
+    assert setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K) is None
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e12])
+def test_linearising_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    states = np.array(setup.initial.state)
+    states[20, 2] = bad
+    with pytest.raises(SimulationDiverged, match="linearising"):
+        setup.plant.linearize(setup.theta, setup.plant.trajectory(states, setup.initial.ctrl))
 
 
 def test_mujoco_itself_would_have_made_that_noise(tmp_path, monkeypatch, capfd) -> None:
@@ -392,7 +416,7 @@ def test_after_a_diverged_trial_the_plant_works_as_before(tmp_path) -> None:
     wild = setup.plant.trajectory(setup.initial.state, np.full((setup.samples, 1), 9e9))
     assert setup.plant.sensitivity(setup.theta, wild) is None
     with pytest.raises(SimulationDiverged):
-        setup.plant.linearize(setup.theta, setup.plant.trajectory(1e12 * setup.initial.state, setup.initial.ctrl))
+        setup.plant.simulate(setup.theta, wild.ctrl)
     np.testing.assert_array_equal(setup.plant.sensitivity(setup.theta, setup.initial).G, first.G)
     np.testing.assert_array_equal(linear(setup).A, L.A)
 
@@ -406,6 +430,26 @@ def test_results_do_not_depend_on_what_was_simulated_before_or_on_threads(tmp_pa
     np.testing.assert_array_equal(
         setup.plant.sensitivity(setup.theta, setup.initial).G, other.plant.sensitivity(other.theta, other.initial).G
     )
+
+
+def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None:
+    (tmp_path / "b").mkdir()
+    setup, rng = filtered_setup(tmp_path), np.random.default_rng(5)
+    thetas = setup.theta * rng.uniform(0.8, 1.2, (70, 2))
+    alone = np.stack([filtered_setup(tmp_path / "b").plant.measure(t[None], setup.control)[0][0] for t in thetas[:6]])
+    for count in (2, 6, 1, 70, 3, 5):
+        y, finite = setup.plant.measure(thetas[:count], setup.control)
+        assert finite.shape == (count,)
+        assert finite.all()
+        np.testing.assert_array_equal(y[:6], alone[:count])
+    wild = thetas.copy()
+    wild[1] *= -1.0  # a negative mass: this one may do as it likes, its neighbours may not
+    y, _ = setup.plant.measure(wild[:4], setup.control)
+    np.testing.assert_array_equal(y[[0, 2, 3]], alone[[0, 2, 3]])
+    states, ctrl = setup.initial.state, np.repeat(setup.control, 1, axis=0)
+    for count in (5, 50, 1, 12):
+        out, _ = setup.plant.engine.step([setup.plant.model(setup.theta)], states[:count], ctrl[:count])
+        np.testing.assert_array_equal(out, states[1 : count + 1])
 
 
 def test_every_mj_step_is_counted(tmp_path) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mjfim.labels import Labels, split_unit
 from mjfim.plots.style import (
+    FAINT,
     INITIAL,
     INK,
     MUTED,
@@ -201,6 +202,19 @@ def convergence(design: Design) -> Figure:
     draw_history(top[0], iterations, cost)
     draw_history(top[1], iterations, slope, slope / np.where(cost == 0.0, np.nan, np.abs(cost)))
     draw_history(top[2], iterations, smallest)
+    rates = np.array([row.rate for row in history])
+    for k in np.flatnonzero(np.diff(rates)):
+        for axes in top:
+            axes.axvline(iterations[k + 1], color=FAINT, linewidth=2.0, zorder=0)
+        top[0].annotate(
+            f" {rates[k]:g} Hz | {rates[k + 1]:g} Hz",
+            (iterations[k + 1], 0.97),
+            xycoords=("data", "axes fraction"),
+            ha="center",
+            va="top",
+            fontsize=SMALL,
+            color=MUTED,
+        )
     names = ("cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]")
     for axes, name in zip(top, names, strict=True):
         dress(axes, "iteration [–]", name)

@@ -34,6 +34,7 @@ def design_text(design: Design, summary: str = "") -> str:
         *_warnings(design.warnings),
         "#### Predicted standard deviation σ of each parameter",
         table,
+        "σ is the Cramér-Rao bound: a best case, true if the model and the stated noise are right.",
         f"Smallest eigenvalue of the information: {low:.4g} → {high:.4g}{ratio}."
         f" Cost: {first.cost:.4g} → {last.cost:.4g}."
         f" {iterations} iterations, {design.steps} MuJoCo steps, {design.seconds:.1f} s.",

@@ -1,0 +1,122 @@
+"""Limits: the model's ranges, replaced by the file's where it names them, and the worst margin of a trajectory."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjfim.errors import ExperimentError
+from mjfim.experiment import Limits
+from mjfim.limits import Limit, limits_of, margins
+from mjfim.models import control_names, coordinates
+from mjfim.trajectory import Trajectory
+
+# A ball joint first, so that addresses of positions, velocities and joints all differ.
+XML = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <worldbody>
+    <body><joint name="ball" type="ball"/><geom size=".1"/>
+      <body pos="0 0 1"><joint name="lift" type="slide" range="-0.5 0.25"/><geom size=".1"/>
+        <body pos="0 0 1"><joint name="turn" type="hinge"/><geom size=".1"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push" joint="lift" ctrlrange="-2 3"/>
+    <motor name="twist" joint="turn"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    """Ball, slide with a range, hinge without; one actuator of two with a range."""
+    return mujoco.MjModel.from_xml_string(XML)
+
+
+def limits(model: mujoco.MjModel, **tables: object) -> tuple[Limit, ...]:
+    """Limits of the model with tables of the file."""
+    return limits_of(model, coordinates(model), control_names(model), Limits(**tables))
+
+
+def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajectory:
+    """Three samples at rest but for the named columns."""
+    arrays = {"qpos": np.zeros((3, model.nq)), "qvel": np.zeros((3, model.nv)), "ctrl": np.zeros((2, model.nu))}
+    for name, (index, values) in columns.items():
+        arrays[name][:, index] = values
+    return Trajectory(np.arange(3) * 0.1, arrays["qpos"], arrays["qvel"], np.zeros((3, 0)), arrays["ctrl"])
+
+
+def test_model_ranges_are_the_default(model: mujoco.MjModel) -> None:
+    """Ranges of joints and controls; what has none is free. Columns skip the ball joint."""
+    assert limits(model) == (Limit("position", "lift", 4, -0.5, 0.25), Limit("control", "push", 0, -2.0, 3.0))
+
+
+def test_file_replaces_and_adds(model: mujoco.MjModel) -> None:
+    """A single velocity is a symmetric range."""
+    found = limits(
+        model,
+        position={"lift": (-0.1, 0.1), "turn": (-1, 2)},
+        velocity={"lift": 2.0, "turn": (-1.0, 4.0)},
+        control={"twist": (-5, 5)},
+    )
+    assert set(found) == {
+        Limit("position", "lift", 4, -0.1, 0.1),
+        Limit("position", "turn", 5, -1.0, 2.0),
+        Limit("velocity", "lift", 3, -2.0, 2.0),
+        Limit("velocity", "turn", 4, -1.0, 4.0),
+        Limit("control", "push", 0, -2.0, 3.0),
+        Limit("control", "twist", 1, -5.0, 5.0),
+    }
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"position": {"ball": (-1, 1)}}, r"limits\.position: unknown joint 'ball'.*; valid: lift, turn"),
+        ({"velocity": {"turm": 1.0}}, r"limits\.velocity: unknown joint 'turm' \(did you mean 'turn'\?\)"),
+        ({"control": {"lift": (-1, 1)}}, r"limits\.control: unknown actuator 'lift'; valid: push, twist"),
+        ({"position": {"lift": (1, -1)}}, r"limits\.position\.lift: \[1, -1\] is inverted; needs lower < upper"),
+        ({"velocity": {"turn": (1.0, 1.0)}}, r"limits\.velocity\.turn: \[1, 1\]"),
+        ({"control": {"push": (0.0, float("nan"))}}, r"limits\.control\.push: \[0, nan\]"),
+    ],
+)
+def test_misuse(model: mujoco.MjModel, tables: dict[str, object], message: str) -> None:
+    """Key, fault and what would be right."""
+    with pytest.raises(ExperimentError, match=message):
+        limits(model, **tables)
+
+
+def test_no_limits_no_margins(model: mujoco.MjModel) -> None:
+    """Nothing stated, nothing reported."""
+    assert margins((), curve(model)) == {}
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        ({}, {"position": 0.25, "control": 2.0}),
+        ({"qpos": (4, [0.0, 0.2, 0.1])}, {"position": 0.05, "control": 2.0}),
+        ({"qpos": (4, [0.0, 0.3, 0.0])}, {"position": -0.05, "control": 2.0}),
+        ({"qpos": (4, [0.0, 0.0, -0.75])}, {"position": -0.25, "control": 2.0}),
+        ({"qpos": (5, [9.0, 9.0, 9.0])}, {"position": 0.25, "control": 2.0}),
+        ({"ctrl": (0, [-2.0, 2.5])}, {"position": 0.25, "control": 0.0}),
+        ({"ctrl": (0, [0.0, 3.5])}, {"position": 0.25, "control": -0.5}),
+    ],
+)
+def test_margins(
+    model: mujoco.MjModel, columns: dict[str, tuple[int, list[float]]], expected: dict[str, float]
+) -> None:
+    """The worst distance over samples and over both ends, negative outside; zero on the limit."""
+    assert margins(limits(model), curve(model, **columns)) == pytest.approx(expected)
+
+
+def test_margin_is_the_worst_of_its_kind(model: mujoco.MjModel) -> None:
+    """Two joints, the tighter one counts whichever comes first."""
+    for tight, loose in (("lift", "turn"), ("turn", "lift")):
+        found = limits(model, velocity={tight: 1.0, loose: 10.0})
+        moving = curve(model, qvel=({"lift": 3, "turn": 4}[tight], [0.0, 1.5, 0.0]))
+        assert margins(found, moving)["velocity"] == pytest.approx(-0.5)
