@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -122,16 +123,31 @@ def read_design(path: Path) -> dict[str, Trajectory]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
+    except (ValueError, OSError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
         raise RecordingError(f"{path}: not a design archive (npz without pickles): {error}") from None
     found = {}
     for name, prefix in (("initial", "initial_"), ("final", "")):
         missing = [prefix + key for key in ARRAYS[:5] if prefix + key not in arrays]
         if not missing:
-            found[name] = Trajectory(*(arrays[prefix + key] for key in ARRAYS[:5]))
+            found[name] = _trajectory(path, prefix, arrays)
         elif name == "final":
             raise RecordingError(f"{path}: array {missing[0]!r} is missing; a design holds {', '.join(ARRAYS)}")
     return found
+
+
+def _trajectory(path: Path, prefix: str, arrays: Mapping[str, Array]) -> Trajectory:
+    """A trajectory whose arrays are numbers and fit each other."""
+    rows = len(arrays[prefix + "t"]) if arrays[prefix + "t"].ndim == 1 else 0
+    if rows < 3:
+        raise RecordingError(f"{path}: array '{prefix}t' must be a row of at least 3 times")
+    for key in ARRAYS[:5]:
+        array, wanted = arrays[prefix + key], rows - 1 if key == "ctrl" else rows
+        if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+            raise RecordingError(f"{path}: array '{prefix}{key}' must hold finite numbers only")
+        if array.ndim != (1 if key == "t" else 2) or len(array) != wanted:
+            shape = f"({wanted},)" if key == "t" else f"({wanted}, columns)"
+            raise RecordingError(f"{path}: array '{prefix}{key}' has shape {array.shape}, wanted {shape}")
+    return Trajectory(*(arrays[prefix + key] for key in ARRAYS[:5]))
 
 
 def check_fits(path: Path, trajectory: Trajectory, setup: Setup) -> None:
@@ -158,6 +174,10 @@ def read_recording(path: Path, setup: Setup) -> Recording:
     for key in ("t", *controls):
         if key not in columns:
             raise RecordingError(f"{path}: column {key!r} is missing; found: {', '.join(columns)}")
+    known = {*controls, *setup.measurable}
+    for name in columns:
+        if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
+            raise RecordingError(f"{path}: {unknown('column', name, ['t', *sorted(known)])}")
     measured = [name for name in setup.outputs.names if name in columns]
     if not measured:
         strays = ", ".join(c for c in columns if c != "t" and c not in controls) or "none"

@@ -42,6 +42,20 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the summary to stdou
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads for MuJoCo; default: all cores.")]
 
 
+class Unfinished(Exception):
+    """Ctrl-C while results were being written; says where."""
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Make the folder; tell an interruption in here from one that came before any result."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Unfinished(str(folder)) from None
+
+
 def verb(function: Callable[..., None]) -> Callable[..., None]:
     """Turn misuse into one message and exit code 2, and Ctrl-C before any result into exit code 1."""
 
@@ -52,6 +66,14 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
         except MjfimError as error:
             errors.print(f"mjfim: {error}", markup=False)
             raise typer.Exit(2) from None
+        except OSError as error:
+            errors.print(f"mjfim: {error.filename or 'cannot write'}: {error.strerror or error}", markup=False)
+            raise typer.Exit(1) from None
+        except Unfinished as unfinished:
+            errors.print(
+                f"mjfim: interrupted; {unfinished}/ holds some of the results, each file complete", markup=False
+            )
+            raise typer.Exit(1) from None
         except KeyboardInterrupt:
             errors.print("mjfim: interrupted before there was a result; nothing was written")
             raise typer.Exit(1) from None
@@ -94,7 +116,8 @@ def design(
                 errors.print(text)
 
         result = mjfim.design(setup, monitor)
-    _leave_design(output, result, setup)
+    with writing(output):
+        _leave_design(output, result, setup)
     _say(as_json, archive.design_summary(result), report.design_report(result, setup.units))
     errors.print(f"wrote {output}/ (see it move: mjfim replay {output})")
     raise typer.Exit(0 if result.success else 1)
@@ -109,6 +132,7 @@ def simulate(
 ) -> None:
     """Play a design on the model at its `true` values, with noise: a synthetic recording."""
     setup = Setup(mjfim.Experiment.from_file(experiment))
+    _check_file(output)
     trajectory = archive.read_design(design_file)["final"]
     archive.check_fits(design_file, trajectory, setup)
     archive.write_recording(output, mjfim.simulate(setup, trajectory, seed), setup)
@@ -132,7 +156,8 @@ def identify(
     with progress() as bar:
         bar.add_task("fitting", total=None)
         result = mjfim.identify(setup, loaded, "newton" if method == "newton" else "least_squares")
-    _leave_estimate(output, result, setup)
+    with writing(output):
+        _leave_estimate(output, result, setup)
     _say(as_json, archive.estimate_summary(result, setup), report.estimate_report(result, setup.units))
     errors.print(f"wrote {output}/")
     raise typer.Exit(0 if result.success and not result.misfit else 1)
@@ -162,7 +187,8 @@ def montecarlo(
         study = mjfim.monte_carlo(
             setup, named, trials, seed, progress=lambda name, share: bar.update(tasks[name], completed=share)
         )
-    _leave_study(output, study, setup)
+    with writing(output):
+        _leave_study(output, study, setup)
     _say(as_json, archive.study_summary(study), report.study_report(study, setup.units))
     errors.print(f"wrote {output}/")
     raise typer.Exit(0 if all(s.failed == 0 for s in study.sets.values()) else 1)
@@ -182,17 +208,18 @@ def replay(
     from mjfim import rerun_log
 
     target = save or source.with_suffix(".rrd")
+    if save is not None:
+        _check_file(save)
     if source.suffix == ".npz":
         setup = Setup(mjfim.Experiment.from_file(experiment or _experiment_beside(source)))
         named = archive.read_design(source)
         for trajectory in named.values():
             archive.check_fits(source, trajectory, setup)
-        _make_parent(target)
+        _check_file(target)
         rerun_log.log_trajectories(target, setup.model_at(setup.theta), named, Labels.of(setup))
     else:
         found = _recording_of(source)
         if save is not None:
-            _make_parent(save)
             with replacing(save) as temporary:
                 shutil.copyfile(found, temporary)
         target = save or found
@@ -236,9 +263,10 @@ def _check_folder(folder: Path) -> None:
         raise RecordingError(f"{existing}: no permission to write here")
 
 
-def _make_parent(path: Path) -> None:
+def _check_file(path: Path) -> None:
+    if path.is_dir():
+        raise RecordingError(f"{path}: is a folder; -o and --save need a file here")
     _check_folder(path.parent)
-    path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def _say(as_json: bool, summary: dict[str, Any], text: Any) -> None:
@@ -251,7 +279,6 @@ def _say(as_json: bool, summary: dict[str, Any], text: Any) -> None:
 def _leave_design(folder: Path, result: Design, setup: Setup) -> None:
     from mjfim import plots, rerun_log
 
-    folder.mkdir(parents=True, exist_ok=True)
     archive.write_design(folder, result, setup)
     labels = Labels.of(setup)
     for name, figure in (
@@ -268,7 +295,6 @@ def _leave_design(folder: Path, result: Design, setup: Setup) -> None:
 def _leave_estimate(folder: Path, result: Estimate, setup: Setup) -> None:
     from mjfim import plots, rerun_log
 
-    folder.mkdir(parents=True, exist_ok=True)
     archive.write_json(folder / "estimate.json", archive.estimate_summary(result, setup))
     try:
         write_identified(folder / "identified.xml", setup, result.theta)
@@ -293,7 +319,6 @@ def _leave_estimate(folder: Path, result: Estimate, setup: Setup) -> None:
 def _leave_study(folder: Path, study: Study, setup: Setup) -> None:
     from mjfim import plots
 
-    folder.mkdir(parents=True, exist_ok=True)
     archive.write_json(folder / "montecarlo.json", archive.study_summary(study))
     labels = Labels.of(setup)
     for i, name in enumerate(study.parameters):

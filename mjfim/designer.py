@@ -63,10 +63,11 @@ def design(
 
 @dataclass
 class Run:
-    """One start on its way. point: the last iterate at the stated sample rate."""
+    """One start on its way. point: the last iterate at the stated sample rate;  control: (N, nu) the last of any level."""
 
     name: str
     point: Point | None = None
+    control: Array | None = None
     status: Status = Status.STALLED
     slope: float = np.inf
     history: tuple[HistoryRow, ...] = ()
@@ -146,7 +147,7 @@ def _descend(levels: tuple[Setup, ...], control: Array, run: Run) -> Iterator[Hi
             trajectory = iterate.point.trajectory
             if trajectory is None:
                 raise AssertionError("an iterate of Algorithm 1 is always a trajectory")
-            control = np.repeat(trajectory.ctrl, factor, axis=0)
+            control = run.control = np.repeat(trajectory.ctrl, factor, axis=0)
             run.slope, run.status = iterate.slope, iterate.status or Status.INTERRUPTED
             if fine:
                 run.point = iterate.point
@@ -163,11 +164,13 @@ def _row(iterate: Iterate[Point], done: int, rate: float) -> HistoryRow:
 
 
 def _conclude(setup: Setup, first: Point, runs: list[Run], seconds: float, steps: int) -> Design:
+    if runs[-1].point is None and runs[-1].control is not None:  # interrupted on the coarse level
+        runs[-1].point = _fine_point(setup, runs[-1].control)
     best = min(runs, key=lambda run: run.cost)
     interrupted = any(run.status is Status.INTERRUPTED for run in runs)
     if best.point is None and not interrupted:
         raise SimulationDiverged("the simulation diverges from every start")
-    final = evaluate(setup, best.point or first)
+    final = evaluate(setup, first if best.point is None or best.cost > first.cost else best.point)
     limits = margins(setup.limits, final.trajectory)
     return Design(
         status=Status.INTERRUPTED if interrupted else best.status,
@@ -184,6 +187,14 @@ def _conclude(setup: Setup, first: Point, runs: list[Run], seconds: float, steps
         found_by=best.name,
         starts=tuple(StartResult(r.name, r.cost, r.status, r.history[-1].iteration if r.history else 0) for r in runs),
     )
+
+
+def _fine_point(setup: Setup, control: Array) -> Point | None:
+    """A coarse level's control at the stated rate; None where it diverges."""
+    try:
+        return setup.problem.point(setup.plant.simulate(setup.theta, control))
+    except SimulationDiverged:
+        return None
 
 
 def evaluate(setup: Setup, point: Point) -> Evaluation:

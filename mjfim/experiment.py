@@ -32,7 +32,7 @@ class Signal(Section):
     frequency: Positive = 0.5
     frequency_end: Positive | None = None
     harmonics: Annotated[int, Field(ge=1)] = 5
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0)] = 0
 
 
 class Initial(Section):
@@ -57,6 +57,12 @@ class TargetSpec(Section):
     path: str
     scale: Finite = 1.0
     offset: Finite = 0.0
+
+    @model_validator(mode="after")
+    def _moves(self) -> TargetSpec:
+        if self.scale == 0.0:
+            raise ValueError("a target with scale 0 never changes")
+        return self
 
 
 class ParameterSpec(Section):
@@ -115,7 +121,7 @@ class Descent(Section):
     psi_weight: NonNegative = 0.0
     starts: Annotated[int, Field(ge=1)] = 1
     coarse: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    seed: int = 0
+    seed: Annotated[int, Field(ge=0)] = 0
 
 
 class Limits(Section):
@@ -179,18 +185,26 @@ def file_keys() -> list[str]:
 
 def explain(error: ValidationError, source: str) -> str:
     """One line per fault: file, key, what was wrong, what would be right."""
-    lines = []
+    found: dict[str, list[Any]] = {}
     for fault in error.errors(include_url=False):
-        location = [part for part in fault["loc"] if not _is_branch(part)]
-        key = ".".join(str(part) for part in location)
-        if fault["type"] == "extra_forbidden":
-            lines.append(f"{source}: {key}: {unknown('key', str(location[-1]), _valid_keys(location[:-1]))}")
-        else:
-            message = fault["msg"].removeprefix("Value error, ")
-            given = fault.get("input")
-            shown = f" (got {given!r})" if isinstance(given, (str, int, float, bool)) else ""
-            lines.append(f"{source}: {key or 'experiment'}: {message}{shown}")
-    return "\n".join(dict.fromkeys(lines))
+        key = ".".join(str(part) for part in fault["loc"] if not _is_branch(part))
+        found.setdefault(key, []).append(fault)
+    deepest = [key for key in found if not any(other.startswith(f"{key}.") for other in found)]
+    return "\n".join(f"{source}: {key or 'experiment'}: {_sentence(found[key])}" for key in deepest)
+
+
+def _sentence(faults: list[Any]) -> str:
+    """What is wrong with one key. Each branch of a union complains: a wrong value says more than a wrong type."""
+    fault = next((f for f in faults if not f["type"].endswith(("_type", "literal_error"))), faults[0])
+    location = [part for part in fault["loc"] if not _is_branch(part)]
+    if fault["type"] == "extra_forbidden":
+        return unknown("key", str(location[-1]), _valid_keys(location[:-1]))
+    messages = [
+        f["msg"].removeprefix("Value error, ") for f in faults if f["type"] == fault["type"] or fault in faults[:1]
+    ]
+    given = fault.get("input")
+    shown = f" (got {given!r})" if isinstance(given, (str, int, float, bool)) else ""
+    return " or ".join(dict.fromkeys(messages)) + shown
 
 
 def _is_branch(part: object) -> bool:

@@ -57,9 +57,10 @@ def write_identified(path: Path, setup: Setup, theta: Array) -> None:
 
 
 def _save(path: Path, spec: Any, model_path: Path) -> None:
-    source = model_path.resolve().parent
+    source, target = model_path.resolve().parent, path.resolve().parent
     for folder in ("meshdir", "texturedir"):
-        setattr(spec, folder, os.path.relpath(source / getattr(spec, folder), path.resolve().parent))
+        setattr(spec, folder, os.path.relpath(source / getattr(spec, folder), target))
+    spec.modelfiledir = str(target)
     with replacing(path) as temporary:
         temporary.write_text(spec.to_xml(), encoding="utf-8")
         mujoco.MjModel.from_xml_path(str(temporary))

@@ -172,12 +172,18 @@ class ParameterSet:
     @staticmethod
     def build(parameters: Sequence[Parameter], model: Any) -> ParameterSet:
         """Resolve every target. Raises ExperimentError naming the parameter and the path."""
-        slots = []
+        slots: list[tuple[Slot, ...]] = []
+        owner: dict[Slot, str] = {}
         for parameter in parameters:
             try:
                 slots.append(tuple(resolve(model, t.path) for t in parameter.targets))
             except ExperimentError as error:
                 raise ExperimentError(f"parameters.{parameter.name}: {error}") from None
+            for target, slot in zip(parameter.targets, slots[-1], strict=True):
+                if slot in owner:
+                    taken = f"target {target.path!r} already belongs to parameters.{owner[slot]}"
+                    raise ExperimentError(f"parameters.{parameter.name}: {taken}; one number takes one parameter")
+                owner[slot] = parameter.name
         return ParameterSet(tuple(parameters), tuple(slots))
 
     def __len__(self) -> int:

@@ -174,8 +174,6 @@ class Setup:
             value = resolve(self.model, target.path).read(self.model)
         except ExperimentError as error:
             raise ExperimentError(f"parameters.{name}: {error}") from None
-        if target.scale == 0.0:
-            raise ExperimentError(f"parameters.{name}: a target with scale 0 never changes")
         return (value - target.offset) / target.scale
 
     def _private(self) -> Any:
@@ -187,9 +185,9 @@ class Setup:
         return model
 
     def _outputs(self) -> OutputMap:
-        names = names_of(self.model, "sensor") if self.model.nsensor else []
+        names = names_of(self.model, "sensor")
         width = {n: int(self.model.sensor(n).dim[0]) for n in names}
-        valid = ["state", *self._state_outputs(), *names]
+        valid = ["state", *self.measurable]
         stated = dict(self.experiment.noise)
         for key in stated:
             if key not in valid:
@@ -220,6 +218,11 @@ class Setup:
         nv, nq = self.model.nv, self.model.nq
         addresses.update({nv + c.v: nq + c.v for c in self.coordinates})
         return OutputMap.build(chosen, addresses)
+
+    @property
+    def measurable(self) -> tuple[str, ...]:
+        """Everything that `noise` may name one by one: state components and sensors."""
+        return (*self._state_outputs(), *names_of(self.model, "sensor"))
 
     def _state_outputs(self) -> dict[str, tuple[int, str]]:
         nv = self.model.nv

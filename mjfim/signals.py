@@ -56,12 +56,16 @@ def read_table(path: Path) -> dict[str, Array]:
     """Columns of a numeric CSV file (gzip by its ending). Raises RecordingError naming file, column and row."""
     try:
         table = pyarrow.csv.read_csv(path)
+        names = list(table.column_names)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file") from None
-    except (pyarrow.ArrowInvalid, OSError) as error:
+    except (pyarrow.ArrowInvalid, OSError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: not a readable CSV table: {error}") from None
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise RecordingError(f"{path}: column {twice!r} stands there more than once")
     columns = {}
-    for name in table.column_names:
+    for name in names:
         try:
             columns[name] = table[name].cast(pyarrow.float64()).to_numpy(zero_copy_only=False)
         except (pyarrow.ArrowInvalid, pyarrow.ArrowNotImplementedError):

@@ -392,7 +392,6 @@ def test_really_unwritable_folder(study: Path, tmp_path: Path) -> None:
         tmp_path.chmod(0o700)
 
 
-@pytest.mark.xfail(strict=True, reason="simulate does not look at -o before it writes; OSError is a traceback")
 @pytest.mark.parametrize("place", ["folder", "file/below.csv"])
 def test_recording_cannot_be_written(place: str, study: Path, archived: Path, tmp_path: Path) -> None:
     """A folder, a path below a file."""
@@ -402,13 +401,11 @@ def test_recording_cannot_be_written(place: str, study: Path, archived: Path, tm
     assert names(tmp_path) == {"folder", "file"}
 
 
-@pytest.mark.xfail(strict=True, reason="replay --save of a folder ends in IsADirectoryError")
 def test_replay_into_a_folder(home: Path, designed: Result, tmp_path: Path) -> None:
     """--save needs a file."""
     misused(run("replay", home / "out", "--save", tmp_path), str(tmp_path))
 
 
-@pytest.mark.xfail(strict=True, reason="OSError while writing is a traceback")
 def test_disk_full(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the system says, in one message."""
 
@@ -551,7 +548,6 @@ def test_interrupted_before_a_result(
     assert names(tmp_path) == set()
 
 
-@pytest.mark.xfail(strict=True, reason="the message does not know that files are being written")
 def test_interrupted_while_writing(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The message must not deny files that are there."""
     monkeypatch.setattr(plots, "save", interrupt)
@@ -560,7 +556,6 @@ def test_interrupted_while_writing(study: Path, tmp_path: Path, monkeypatch: pyt
     assert "nothing was written" not in result.stderr
 
 
-@pytest.mark.xfail(strict=True, reason="iterates of the coarse level are dropped, the initial control comes back")
 def test_interrupted_on_the_coarse_level() -> None:
     """The best so far is better than the start, also before the stated sample rate is reached."""
     rates = []
@@ -588,12 +583,6 @@ def test_help() -> None:
     assert (done.returncode, done.stderr) == (0, "")
     for verb in ("design", "simulate", "identify", "montecarlo", "replay"):
         assert re.search(rf"^\W*{verb}\s+[A-Z]", done.stdout, re.MULTILINE), verb
-
-
-@pytest.mark.xfail(strict=True, reason="not written yet")
-def test_check_exists() -> None:
-    """DESIGN.md promises the verb `check`."""
-    assert run("check", "--help").exit_code == 0
 
 
 def test_misuse_as_a_process(tmp_path: Path) -> None:

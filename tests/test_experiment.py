@@ -570,7 +570,6 @@ ONE_LINE: dict[str, str] = {
 }
 
 
-@pytest.mark.xfail(strict=True, reason="explain() prints one line per branch of a pydantic union")
 @pytest.mark.parametrize("name", ONE_LINE)
 def test_one_fault_one_line(name: str, resolve: Callable[[str], Setup]) -> None:
     """The branches of a union are the program's business, not the user's."""
@@ -595,7 +594,6 @@ MISUSE: dict[str, tuple[str, list[str]]] = {
 }
 
 
-@pytest.mark.xfail(strict=True, reason="accepted, or a traceback from a library")
 @pytest.mark.parametrize("name", MISUSE)
 def test_misuse_is_not_accepted(name: str, resolve: Callable[[str], Setup]) -> None:
     """Mistakes that would otherwise pass silently or end in a traceback."""

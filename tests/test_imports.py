@@ -36,6 +36,7 @@ ORDER = (
     "estimate",
     "montecarlo",
     "archive",
+    "identified",
     "labels",
     "rerun_log",
     "plots",

@@ -14,10 +14,9 @@ import pytest
 pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
 
-from mjfim import rerun_log
 from mjfim.errors import MjfimError, RecordingError
 from mjfim.labels import Labels, output_label
-from mjfim.rerun_log import log_design, log_estimate, log_trajectories, show
+from mjfim.rerun_log import documents, log_design, log_estimate, log_trajectories, show
 from mjfim.rerun_log.panels import dof_positions, history_series
 from mjfim.rerun_log.scene import camera, entity, motion
 from mjfim.trajectory import Array, Design, Estimate, Evaluation, HistoryRow, Recording, StartResult, Status, Trajectory
@@ -286,7 +285,7 @@ class TestDesign:
         def fail(*_: object) -> None:
             raise RuntimeError("disk full")
 
-        monkeypatch.setattr(rerun_log, "log_history", fail)
+        monkeypatch.setattr(documents, "log_history", fail)
         with pytest.raises(RuntimeError, match="disk full"):
             log_design(path, cart, design, Labels.of_model(cart))
         assert path.read_text() == "old"
