@@ -121,10 +121,11 @@ def read_design(path: Path) -> dict[str, Trajectory]:
     if not path.is_file():
         raise RecordingError(f"{path}: no such design file")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
     except (ValueError, OSError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise RecordingError(f"{path}: not a design archive (npz without pickles): {error}") from None
+        reason = "it is not NumPy's, or holds pickles, which are refused" if "pickle" in str(error) else str(error)
+        raise RecordingError(f"{path}: not a design archive (npz without pickles): {reason}") from None
     found = {}
     for name, prefix in (("initial", "initial_"), ("final", "")):
         missing = [prefix + key for key in ARRAYS[:5] if prefix + key not in arrays]

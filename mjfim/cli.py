@@ -120,6 +120,8 @@ def design(
         _leave_design(output, result, setup)
     _say(as_json, archive.design_summary(result), report.design_report(result, setup.units))
     errors.print(f"wrote {output}/ (see it move: mjfim replay {output})")
+    if not result.success:
+        errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
     raise typer.Exit(0 if result.success else 1)
 
 

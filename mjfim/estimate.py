@@ -201,8 +201,8 @@ def _report(setup: Setup, fit: Fit, theta0: Array, solution: Solution) -> Estima
     data = final.r[: fit.count]
     chi2, dof = float(data @ data), max(fit.count - len(p), 1)
     predicted = tuple(_predict(setup, solution.theta, r) for r in fit.recordings)
-    span = np.where(np.isfinite(p.upper - p.lower), p.upper - p.lower, np.inf)
-    touch = (solution.theta - p.lower < 1e-6 * span) | (p.upper - solution.theta < 1e-6 * span)
+    near = 1e-6 * p.step
+    touch = (solution.theta - p.lower < near) | (p.upper - solution.theta < near)
     at_bound = tuple(n for n, hit in zip(p.names, touch, strict=True) if hit)
     misfit = bool(chi2_distribution.sf(chi2, dof) < MISFIT)
     return Estimate(

@@ -1,4 +1,4 @@
-"""Limits of an experiment: the MJCF's ranges, tightened by the file, and how closely a trajectory keeps them."""
+"""Limits of an experiment: the MJCF's ranges unless the file states others, and how closely a trajectory keeps them."""
 
 from __future__ import annotations
 

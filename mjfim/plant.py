@@ -101,7 +101,7 @@ class Plant:
         out = self.engine.rollout([self.model(theta)], self.start[None], np.asarray(ctrl)[None])
         if not out.finite[0]:
             raise SimulationDiverged(
-                "the simulation diverged under the given control: MuJoCo reports a numerical warning"
+                "the simulation diverges under this control; a smaller amplitude or timestep may help"
             )
         return self.trajectory(out.states[0], ctrl)
 

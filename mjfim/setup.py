@@ -23,6 +23,8 @@ from mjfim.signals import generate, read_control
 from mjfim.tangent import StateSpace
 from mjfim.trajectory import Array, Trajectory
 
+MAX_SAMPLES = 10_000_000
+
 
 class Setup:
     """Everything an experiment needs to run. Building it checks all names, files and numbers.
@@ -150,7 +152,14 @@ class Setup:
         exact = self.experiment.horizon * self.experiment.rate
         N = round(exact)
         if N < 2 or abs(exact - N) > 1e-6 * N:
-            raise ExperimentError(f"horizon: {self.experiment.horizon:g} s is not a whole number (>= 2) of samples")
+            period = 1.0 / self.experiment.rate
+            near = f"{max(N, 2) * period:g} s, {(max(N, 2) + 1) * period:g} s"
+            raise ExperimentError(
+                f"horizon: {self.experiment.horizon:g} s is not a whole number (>= 2) of samples of {period:g} s; "
+                f"valid for example: {near}"
+            )
+        if N > MAX_SAMPLES:
+            raise ExperimentError(f"horizon: {N:g} samples are too many; at most {MAX_SAMPLES:g}")
         return N
 
     def _parameters(self) -> list[Parameter]:

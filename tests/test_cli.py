@@ -485,7 +485,7 @@ def test_start_that_diverges(
     """One message of ours, none of MuJoCo's, and no log file."""
     monkeypatch.chdir(tmp_path)
     path = write_experiment(tmp_path, start='{ kind = "sine", amplitude = 1e12 }')
-    misused(run("design", path, "-o", tmp_path / "out"), "diverged under the given control")
+    misused(run("design", path, "-o", tmp_path / "out"), "diverges under this control")
     assert capfd.readouterr() == ("", "")
     assert names(tmp_path) == {"study.toml", "cart_pendulum.xml", "cart_pendulum.csv"}
 
