@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -18,13 +19,11 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 import mjfim
 from mjfim import archive, report
-from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
-from mjfim.estimate import measured_trajectory
+from mjfim.errors import ExperimentError, MjfimError, RecordingError
 from mjfim.files import replacing
-from mjfim.identified import write_identified
 from mjfim.labels import Labels
 from mjfim.setup import Setup
-from mjfim.trajectory import Design, Estimate, HistoryRow, Study
+from mjfim.trajectory import HistoryRow
 
 app = typer.Typer(
     add_completion=False,
@@ -47,11 +46,13 @@ class Unfinished(Exception):
 
 
 @contextmanager
-def writing(folder: Path) -> Iterator[None]:
-    """Make the folder; tell an interruption in here from one that came before any result."""
+def writing(folder: Path) -> Iterator[ModuleType]:
+    """Make the folder and bring what writes into it; an interruption in here is not one before any result."""
+    from mjfim import results  # brings matplotlib and rerun
+
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        yield
+        yield results
     except KeyboardInterrupt:
         raise Unfinished(str(folder)) from None
 
@@ -116,8 +117,8 @@ def design(
                 errors.print(text)
 
         result = mjfim.design(setup, monitor)
-    with writing(output):
-        _leave_design(output, result, setup)
+    with writing(output) as results:
+        results.leave_design(output, result, setup)
     _say(as_json, archive.design_summary(result), report.design_report(result, setup.units))
     errors.print(f"wrote {output}/ (see it move: mjfim replay {output})")
     if not result.success:
@@ -158,8 +159,9 @@ def identify(
     with progress() as bar:
         bar.add_task("fitting", total=None)
         result = mjfim.identify(setup, loaded, "newton" if method == "newton" else "least_squares")
-    with writing(output):
-        _leave_estimate(output, result, setup)
+    with writing(output) as results:
+        for sentence in results.leave_estimate(output, result, setup):
+            errors.print(f"warning: {sentence}", markup=False)
     _say(as_json, archive.estimate_summary(result, setup), report.estimate_report(result, setup.units))
     errors.print(f"wrote {output}/")
     raise typer.Exit(0 if result.success and not result.misfit else 1)
@@ -189,8 +191,8 @@ def montecarlo(
         study = mjfim.monte_carlo(
             setup, named, trials, seed, progress=lambda name, share: bar.update(tasks[name], completed=share)
         )
-    with writing(output):
-        _leave_study(output, study, setup)
+    with writing(output) as results:
+        results.leave_study(output, study, setup)
     _say(as_json, archive.study_summary(study), report.study_report(study, setup.units))
     errors.print(f"wrote {output}/")
     raise typer.Exit(0 if all(s.failed == 0 for s in study.sets.values()) else 1)
@@ -276,56 +278,6 @@ def _say(as_json: bool, summary: dict[str, Any], text: Any) -> None:
         typer.echo(archive.as_json(summary), nl=False)
     else:
         out.print(text)
-
-
-def _leave_design(folder: Path, result: Design, setup: Setup) -> None:
-    from mjfim import plots, rerun_log
-
-    archive.write_design(folder, result, setup)
-    labels = Labels.of(setup)
-    for name, figure in (
-        ("trajectories", plots.trajectories(result, labels)),
-        ("sensitivity_phase", plots.sensitivity_phase(result, labels)),
-        ("convergence", plots.convergence(result)),
-        ("standard_deviations", plots.std_bars(result, labels)),
-        ("table_eigenvalues", plots.design_table(result, labels)),
-    ):
-        plots.save(figure, folder / f"{name}.png")
-    rerun_log.log_design(folder / "design.rrd", setup.model_at(setup.theta), result, Labels.of(setup))
-
-
-def _leave_estimate(folder: Path, result: Estimate, setup: Setup) -> None:
-    from mjfim import plots, rerun_log
-
-    archive.write_json(folder / "estimate.json", archive.estimate_summary(result, setup))
-    try:
-        write_identified(folder / "identified.xml", setup, result.theta)
-    except ModelError as error:
-        errors.print(f"warning: {error}", markup=False)
-    labels = Labels.of(setup)
-    for i in range(len(result.recordings)):
-        name = "fit.png" if len(result.recordings) == 1 else f"fit_{i + 1}.png"
-        plots.save(plots.fit(result, i, labels, setup.outputs.sigma), folder / name)
-    plots.save(plots.parameter_intervals(result, labels), folder / "parameters.png")
-    predicted = setup.plant.simulate(result.theta, result.recordings[0].ctrl)
-    rerun_log.log_estimate(
-        folder / "estimate.rrd",
-        setup.model_at(result.theta),
-        result,
-        measured_trajectory(setup, result.recordings[0]),
-        predicted,
-        Labels.of(setup),
-    )
-
-
-def _leave_study(folder: Path, study: Study, setup: Setup) -> None:
-    from mjfim import plots
-
-    archive.write_json(folder / "montecarlo.json", archive.study_summary(study))
-    labels = Labels.of(setup)
-    for i, name in enumerate(study.parameters):
-        plots.save(plots.histogram(study, i, labels), folder / f"histogram_{name}.png")
-    plots.save(plots.study_table(study, labels), folder / "table_covariance.png")
 
 
 def main() -> NoReturn:

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mjfim.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.errors import SimulationDiverged
 from mjfim.experiment import Experiment
 from mjfim.limits import margins
 from mjfim.lq import regulator
 from mjfim.objective import DesignProblem, Point
 from mjfim.plant import CENTRAL
-from mjfim.pronto import LBFGS, Armijo, Direction, ExtendedMetricDescent, Iterate, MetricDescent, Regulator, optimize
+from mjfim.pronto import Armijo, Direction, Iterate, Regulator, optimize
 from mjfim.setup import Setup
 from mjfim.signals import multisine
 from mjfim.trajectory import Array, Design, Evaluation, HistoryRow, StartResult, Status, Trajectory

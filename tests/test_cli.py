@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import mjfim
-from mjfim import archive, cli, plots
+from mjfim import archive, cli, plots, results
 from mjfim.setup import Setup
 
 MODELS = Path(__file__).parents[1] / "models"
@@ -232,8 +232,8 @@ def test_reports_name_the_parameters(
     study: Path, recorded: Path, archived: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without --json stdout is for people: every number in full, whatever the terminal."""
-    for name in ("_leave_design", "_leave_estimate", "_leave_study"):
-        monkeypatch.setattr(cli, name, lambda *_: None)
+    for name in ("leave_design", "leave_estimate", "leave_study"):
+        monkeypatch.setattr(results, name, lambda *_: [])
     for words in (
         ("design", study),
         ("identify", study, recorded),
@@ -252,8 +252,8 @@ def test_reports_name_the_parameters(
 @pytest.fixture
 def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where files are not the question, drawing them would only take time."""
-    for name in ("_leave_design", "_leave_estimate", "_leave_study"):
-        monkeypatch.setattr(cli, name, lambda *_: None)
+    for name in ("leave_design", "leave_estimate", "leave_study"):
+        monkeypatch.setattr(results, name, lambda *_: [])
 
 
 @pytest.mark.usefixtures("no_files")

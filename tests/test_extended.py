@@ -10,11 +10,12 @@ import pytest
 from numerics import Array, Loop, body_setup, cart_setup, relative_error
 
 from mjfim.designer import design, direction_for
+from mjfim.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.extended import extend
 from mjfim.fisher import Information
 from mjfim.lq import Recursion, TangentCurve
 from mjfim.plant import CENTRAL, Bilinear
-from mjfim.pronto import Expansion, ExtendedMetricDescent, MetricDescent
+from mjfim.pronto import Expansion
 from mjfim.setup import Setup
 from mjfim.trajectory import Sensitivity
 

@@ -20,6 +20,7 @@ ORDER = (
     "tangent",
     "lq",
     "pronto",
+    "directions",
     "outputs",
     "parameters",
     "engine",
@@ -42,6 +43,7 @@ ORDER = (
     "plots",
     "report",
     "__init__",
+    "results",
     "cli",
     "__main__",
 )
@@ -63,7 +65,7 @@ FORBIDDEN = {
     "experiment": {"mujoco"},
 }
 
-HEAVY = {"mjfim.rerun_log", "mjfim.plots"}  # cli imports these where they are needed
+HEAVY = {"mjfim.rerun_log", "mjfim.results"}  # cli imports these where they are needed
 UNSAFE = {"pickle", "cPickle", "dill", "marshal", "shelve", "joblib", "cloudpickle"}
 
 

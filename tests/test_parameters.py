@@ -248,11 +248,11 @@ def test_several_targets_follow_one_parameter_by_scale_and_offset() -> None:
     np.testing.assert_array_equal(rollout(own), rollout(other.compile()))
 
 
-def test_parameters_are_written_in_their_order_so_that_a_later_one_wins() -> None:
+def test_one_number_takes_one_parameter() -> None:
     parameters = [one("body/a:mass"), one("body/a:mass")]
-    _, base = compiled(ARM, parameters)
-    own = ParameterSet.build(parameters, base).model(base, np.array([2.0, 3.0]))
-    assert own.body("a").mass[0] == 3.0
+    _, base = compiled(ARM, [])
+    with pytest.raises(ExperimentError, match=r"body/a:mass.*already belongs"):
+        ParameterSet.build(parameters, base)
 
 
 def test_spelling_out_inertia_from_geoms_changes_nothing_but_the_target() -> None:

@@ -12,8 +12,9 @@ import pytest
 from numerics import Array, directional_check
 from scipy.optimize import minimize
 
+from mjfim.directions import LBFGS, MetricDescent
 from mjfim.lq import TangentCurve
-from mjfim.pronto import LBFGS, Armijo, Direction, Expansion, Iterate, MetricDescent, Regulator, optimize
+from mjfim.pronto import Armijo, Direction, Expansion, Iterate, Regulator, optimize
 from mjfim.trajectory import Status
 
 DT, N = 0.05, 60

@@ -1,0 +1,59 @@
+"""What each verb leaves in its folder: numbers, pictures, Rerun files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from mjfim import archive, plots, rerun_log
+from mjfim.errors import ModelError
+from mjfim.estimate import measured_trajectory
+from mjfim.identified import write_identified
+from mjfim.labels import Labels
+from mjfim.setup import Setup
+from mjfim.trajectory import Design, Estimate, Study
+
+
+def leave_design(folder: Path, design: Design, setup: Setup) -> None:
+    """design.json, design.npz, design.csv, design.rrd and five pictures."""
+    archive.write_design(folder, design, setup)
+    labels = Labels.of(setup)
+    for name, figure in (
+        ("trajectories", plots.trajectories(design, labels)),
+        ("sensitivity_phase", plots.sensitivity_phase(design, labels)),
+        ("convergence", plots.convergence(design)),
+        ("standard_deviations", plots.std_bars(design, labels)),
+        ("table_eigenvalues", plots.design_table(design, labels)),
+    ):
+        plots.save(figure, folder / f"{name}.png")
+    rerun_log.log_design(folder / "design.rrd", setup.model_at(setup.theta), design, labels)
+
+
+def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
+    """estimate.json, identified.xml, estimate.rrd and pictures; returns sentences about what could not be written."""
+    archive.write_json(folder / "estimate.json", archive.estimate_summary(estimate, setup))
+    missing = []
+    try:
+        write_identified(folder / "identified.xml", setup, estimate.theta)
+    except ModelError as error:
+        missing.append(str(error))
+    labels = Labels.of(setup)
+    for i in range(len(estimate.recordings)):
+        name = "fit.png" if len(estimate.recordings) == 1 else f"fit_{i + 1}.png"
+        plots.save(plots.fit(estimate, i, labels, setup.outputs.sigma), folder / name)
+    plots.save(plots.parameter_intervals(estimate, labels), folder / "parameters.png")
+    first = estimate.recordings[0]
+    predicted, measured = setup.plant.simulate(estimate.theta, first.ctrl), measured_trajectory(setup, first)
+    model = setup.model_at(estimate.theta)
+    rerun_log.log_estimate(folder / "estimate.rrd", model, estimate, measured, predicted, labels)
+    return missing
+
+
+def leave_study(folder: Path, study: Study, setup: Setup) -> None:
+    """montecarlo.json, a histogram per parameter, the tables."""
+    archive.write_json(folder / "montecarlo.json", archive.study_summary(study))
+    labels = Labels.of(setup)
+    for i, name in enumerate(study.parameters):
+        safe = re.sub(r"[^\w.-]", "_", name)
+        plots.save(plots.histogram(study, i, labels), folder / f"histogram_{safe}.png")
+    plots.save(plots.study_table(study, labels), folder / "table_covariance.png")
