@@ -75,6 +75,7 @@ def _evaluation(e: Evaluation) -> dict[str, Any]:
     return {
         "cost": e.cost,
         "criterion": e.criterion,
+        "growth": e.growth,
         "information": e.information,
         "eigenvalues": e.eigenvalues,
         "std": e.std,

@@ -12,7 +12,7 @@ from mjfim.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.errors import SimulationDiverged
 from mjfim.experiment import Experiment
 from mjfim.limits import margins
-from mjfim.lq import regulator
+from mjfim.lq import growth, regulator
 from mjfim.objective import DesignProblem, Point
 from mjfim.plant import CENTRAL
 from mjfim.pronto import Armijo, Direction, Iterate, Regulator, optimize
@@ -120,7 +120,7 @@ def _coarse_level(setup: Setup, first: Point) -> Setup | None:
         cost = coarse.problem.point(coarse.initial).cost
     except SimulationDiverged:
         return None
-    return coarse if abs(cost - first.cost) <= 0.05 * abs(first.cost) else None
+    return coarse if abs(cost - first.cost) <= 0.05 * setup.problem.size(first) else None
 
 
 COARSE_TOLERANCE = 1e-5
@@ -214,6 +214,7 @@ def evaluate(setup: Setup, point: Point) -> Evaluation:
         min_eigenvalue=setup.information.accumulated(point.sensitivity),
         criterion=point.criterion.value,
         cost=point.cost,
+        growth=growth(A),
     )
 
 
@@ -226,7 +227,16 @@ def standard_deviations(information: Array) -> Array:
     return np.asarray(np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)
 
 
+UNSTABLE = 1e3
+
+
 def _warnings(final: Evaluation, limits: dict[str, float]) -> Iterator[str]:
+    if final.growth > UNSTABLE:
+        yield (
+            f"a small disturbance grows up to {final.growth:.1e}-fold along this trajectory when its control is played "
+            "open loop; the predicted sigma assumes that there is none. Play it with the gains of design.npz, or raise "
+            "cost.control"
+        )
     values = final.eigenvalues
     if len(values) > 1 and values[1] < 1.01 * values[0]:
         yield (

@@ -50,6 +50,19 @@ class Recursion:
         return np.asarray(solution).reshape(rhs.shape)
 
 
+def growth(A: Array) -> float:
+    """Largest amplification of a unit deviation, from the start to any sample or from any sample to the end.
+
+    A: (N, nx, nx)
+    """
+    N, nx, _ = A.shape
+    recursion, zero = Recursion(A), np.zeros((N, nx))
+    unit = np.eye(nx)
+    onward = np.stack([recursion.forward(e, zero) for e in unit], axis=2)
+    back = np.stack([recursion.adjoint(np.concatenate([zero, e[None]])) for e in unit], axis=1)
+    return float(max(np.linalg.norm(onward, 2, axis=(1, 2)).max(), np.linalg.norm(back, 2, axis=(1, 2)).max()))
+
+
 def _solve(S: Array, rhs: Array) -> Array:
     """S^-1 rhs for a small symmetric positive definite S, without the overhead of NumPy's checks."""
     _, x, info = dposv(S, rhs)

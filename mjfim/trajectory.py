@@ -104,6 +104,7 @@ class Evaluation:
     std: (p,) Cramer-Rao standard deviations, infinite where the information is singular
     min_eigenvalue: (N+1,) smallest eigenvalue of the information (per second) accumulated up to each sample
     criterion: phi, the information term of the cost;  cost: J
+    growth: largest open-loop amplification of a small deviation along the trajectory (NaN: not computed)
     """
 
     trajectory: Trajectory
@@ -115,6 +116,7 @@ class Evaluation:
     min_eigenvalue: Array
     criterion: float
     cost: float
+    growth: float = float("nan")
 
     def __post_init__(self) -> None:
         freeze(self, "gain", "sensitivity", "information", "eigenvalues", "std", "min_eigenvalue")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from mjfim.lq import Recursion, descent, regulator
+from mjfim.lq import Recursion, descent, growth, regulator
 
 
 def random_system(rng: np.random.Generator, N: int, nx: int, nu: int) -> tuple[np.ndarray, np.ndarray]:
@@ -205,3 +205,15 @@ def test_recursion_refuses_arrays_of_the_wrong_length(rows: int, rhs: str) -> No
     solve = recursion.adjoint if rhs == "a" else partial(recursion.forward, np.ones(2))
     with pytest.raises(ValueError, match="needs"):
         solve(wrong)
+
+
+def test_growth_is_the_largest_amplification_from_the_start_or_to_the_end() -> None:
+    rng = np.random.default_rng(11)
+    A = 1.1 * np.linalg.qr(rng.standard_normal((12, 3, 3)))[0]
+    product, largest = np.eye(3), 1.0
+    for step in A:
+        product = step @ product
+        largest = max(largest, np.linalg.norm(product, 2))
+    assert growth(A) == pytest.approx(largest)
+    late = np.concatenate([0.01 * A, 3.0 * A])  # forgets the start, then explodes
+    assert growth(late) == pytest.approx(3.3**12)
