@@ -91,7 +91,8 @@ def write_design(folder: Path, design: Design, setup: Setup) -> None:
     with replacing(folder / "design.npz") as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
     write_table(folder / "design.csv", _playback(design.trajectory, setup))
-    experiment = os.path.relpath(setup.experiment.source, folder)
+    source = Path(setup.experiment.source)
+    experiment = os.path.relpath(source.resolve(), folder.resolve()) if source.is_file() else None
     write_json(folder / "design.json", {"experiment": experiment, **design_summary(design)})
 
 

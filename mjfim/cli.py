@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,6 +56,21 @@ def writing(folder: Path) -> Iterator[ModuleType]:
         yield results
     except KeyboardInterrupt:
         raise Unfinished(str(folder)) from None
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(mjfim.__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Design the experiment that identifies a MuJoCo model's parameters, then identify them."""
 
 
 def verb(function: Callable[..., None]) -> Callable[..., None]:
@@ -188,14 +204,20 @@ def montecarlo(
     _check_folder(output)
     with progress() as bar:
         tasks = {name: bar.add_task(f"{trials} trials, {name}", total=1.0) for name in named}
-        study = mjfim.monte_carlo(
-            setup, named, trials, seed, progress=lambda name, share: bar.update(tasks[name], completed=share)
-        )
+
+        def tell(name: str, share: float) -> None:
+            bar.update(tasks[name], completed=share)
+            if not errors.is_terminal:
+                errors.print(f"{name}: {100 * share:.0f} %")
+
+        study = mjfim.monte_carlo(setup, named, trials, seed, progress=tell)
     with writing(output) as results:
         results.leave_study(output, study, setup)
     _say(as_json, archive.study_summary(study), report.study_report(study, setup.units))
     errors.print(f"wrote {output}/")
-    raise typer.Exit(0 if all(s.failed == 0 for s in study.sets.values()) else 1)
+    if len(study.sets) < len(named):
+        errors.print(f"mjfim: interrupted; only {', '.join(study.sets)} is finished")
+    raise typer.Exit(0 if len(study.sets) == len(named) and all(s.failed == 0 for s in study.sets.values()) else 1)
 
 
 @verb
@@ -211,7 +233,9 @@ def replay(
     """Show a result in the Rerun viewer."""
     from mjfim import rerun_log
 
-    target = save or source.with_suffix(".rrd")
+    if save is not None and save.suffix != ".rrd":
+        raise RecordingError(f"--save {save}: a Rerun file ends in .rrd")
+    target = save or Path(tempfile.mkdtemp(prefix="mjfim-")) / "replay.rrd"
     if save is not None:
         _check_file(save)
     if source.suffix == ".npz":
@@ -219,7 +243,6 @@ def replay(
         named = archive.read_design(source)
         for trajectory in named.values():
             archive.check_fits(source, trajectory, setup)
-        _check_file(target)
         rerun_log.log_trajectories(target, setup.model_at(setup.theta), named, Labels.of(setup))
     else:
         found = _recording_of(source)
@@ -235,6 +258,8 @@ def replay(
 
 def _recording_of(source: Path) -> Path:
     """The .rrd that a folder or file names."""
+    if not source.exists():
+        raise RecordingError(f"{source}: no such file or folder")
     if source.is_dir():
         for name in ("design.rrd", "estimate.rrd"):
             if (source / name).is_file():
@@ -242,8 +267,6 @@ def _recording_of(source: Path) -> Path:
         raise RecordingError(f"{source}: no design.rrd or estimate.rrd in this folder")
     if source.suffix != ".rrd":
         raise RecordingError(f"{source}: give a folder of results, an .rrd file or a design .npz")
-    if not source.is_file():
-        raise RecordingError(f"{source}: no such file")
     return source
 
 
@@ -251,7 +274,8 @@ def _experiment_beside(source: Path) -> Path:
     """Experiment file that the design.json beside an npz names."""
     beside = source.parent / "design.json"
     try:
-        return (source.parent / str(json.loads(beside.read_text(encoding="utf-8"))["experiment"])).resolve()
+        named = json.loads(beside.read_text(encoding="utf-8"))["experiment"]
+        return source.parent.resolve() / str(Path(named))
     except (OSError, ValueError, KeyError, TypeError):
         raise RecordingError(
             f"{source}: no usable design.json beside it; name the experiment with --experiment"

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.directions import LBFGS, ExtendedMetricDescent, MetricDescent
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.experiment import Experiment
-from mjfim.limits import margins
+from mjfim.fisher import standard_deviations
+from mjfim.limits import margins, saturated
 from mjfim.lq import growth, regulator
 from mjfim.objective import DesignProblem, Point
 from mjfim.plant import CENTRAL
@@ -39,9 +40,14 @@ def design(
     clock, steps = time.perf_counter(), setup.plant.engine.steps
     problem = setup.problem
     first = problem.point(setup.initial, CENTRAL)
-    if first.information is None:
+    if start is not None:
+        start = np.asarray(start, dtype=np.float64)
+        if start.shape != setup.control.shape:
+            raise ExperimentError(f"start: shape {start.shape}, wanted (samples, actuators) = {setup.control.shape}")
+    begin = first if start is None else problem.point(setup.plant.simulate(setup.theta, start), CENTRAL)
+    if first.information is None or begin.information is None:
         raise SimulationDiverged("the simulation diverges when the parameters move a little along the initial control")
-    setup.information.require_identifiable(first.information, setup.parameters.names, setup.parameters.step)
+    setup.information.require_identifiable(begin.information, setup.parameters.names, setup.parameters.step)
     coarse = _coarse_level(setup, first)
     levels = (setup,) if coarse is None else (coarse, setup)
 
@@ -58,7 +64,8 @@ def design(
                 if monitor is not None:
                     monitor(told)
     except KeyboardInterrupt:
-        runs[-1].status = Status.INTERRUPTED
+        for run in runs[-1:]:
+            run.status = Status.INTERRUPTED
     return _conclude(setup, first, runs, time.perf_counter() - clock, spent())
 
 
@@ -82,7 +89,7 @@ class Run:
 def _starts(setup: Setup, given: Array | None) -> Iterator[tuple[str, Array]]:
     """Controls to start from: the given or initial one, then random multisines of growing amplitude."""
     d = setup.experiment.descent
-    yield ("given control", np.asarray(given)) if given is not None else ("initial control", setup.control)
+    yield ("initial control", setup.control) if given is None else ("given control", given)
     rng = np.random.default_rng(d.seed)
     peak = np.abs(setup.control).max(axis=0)
     for i in range(1, d.starts):
@@ -142,12 +149,12 @@ def _descend(levels: tuple[Setup, ...], control: Array, run: Run) -> Iterator[Hi
         if not np.isfinite(start.cost):
             return
         tolerance = d.tolerance if fine else max(d.tolerance, COARSE_TOLERANCE)
-        done = run.history[-1].iteration if run.history else 0
+        done = run.history[-1].iteration + 1 if run.history else 0
         budget = max(d.max_iterations - done, 0)
         for iterate in optimize(problem, start, direction, regulator_for(level), Armijo(), tolerance, budget):
             trajectory = iterate.point.trajectory
             if trajectory is None:
-                raise AssertionError("an iterate of Algorithm 1 is always a trajectory")
+                raise SimulationDiverged("an iterate of Algorithm 1 diverged")
             control = run.control = np.repeat(trajectory.ctrl, factor, axis=0)
             run.slope, run.status = iterate.slope, iterate.status or Status.INTERRUPTED
             if fine:
@@ -165,6 +172,8 @@ def _row(iterate: Iterate[Point], done: int, rate: float) -> HistoryRow:
 
 
 def _conclude(setup: Setup, first: Point, runs: list[Run], seconds: float, steps: int) -> Design:
+    if not runs:
+        runs = [Run("initial control", status=Status.INTERRUPTED)]
     if runs[-1].point is None and runs[-1].control is not None:  # interrupted on the coarse level
         runs[-1].point = _fine_point(setup, runs[-1].control)
     best = min(runs, key=lambda run: run.cost)
@@ -184,7 +193,7 @@ def _conclude(setup: Setup, first: Point, runs: list[Run], seconds: float, steps
         steps=steps,
         seconds=seconds,
         limits=limits,
-        warnings=tuple(_warnings(final, limits)),
+        warnings=tuple(_warnings(final, limits, saturated(setup.model_at(setup.theta), final.trajectory))),
         found_by=best.name,
         starts=tuple(StartResult(r.name, r.cost, r.status, r.history[-1].iteration if r.history else 0) for r in runs),
     )
@@ -218,19 +227,15 @@ def evaluate(setup: Setup, point: Point) -> Evaluation:
     )
 
 
-def standard_deviations(information: Array) -> Array:
-    """(p,) Cramer-Rao standard deviations; infinite where the information is singular."""
-    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    if values[0] <= 1e-14 * values[-1]:
-        return np.full(len(scale), np.inf)
-    return np.asarray(np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)
-
-
 UNSTABLE = 1e3
 
 
-def _warnings(final: Evaluation, limits: dict[str, float]) -> Iterator[str]:
+def _warnings(final: Evaluation, limits: dict[str, float], clamped: tuple[str, ...]) -> Iterator[str]:
+    if clamped:
+        yield (
+            f"forcerange clamps {', '.join(clamped)} during the design: the derivatives do not hold there, and the descent "
+            "may have stopped early; raise cost.control"
+        )
     if final.growth > UNSTABLE:
         yield (
             f"a small disturbance grows up to {final.growth:.1e}-fold along this trajectory when its control is played "

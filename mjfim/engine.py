@@ -29,6 +29,13 @@ MAX_CONTROL = float(mujoco.mjMAXVAL)
 FEW = 64  # rollouts of a handful of models keep their own batch beside those of a Monte-Carlo study
 
 
+def cores() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def state_space(model: Any) -> StateSpace:
     """Layout of a model's state."""
     scalar_q, scalar_v, quaternions = [], [], []
@@ -69,7 +76,7 @@ class Engine:
         self.space = state_space(model)
         self.substeps = substeps
         self.sensors = sensors
-        self.threads = threads or len(os.sched_getaffinity(0))
+        self.threads = threads or cores()
         self.steps = 0
         self._batches: dict[str, Batch] = {}
         self._data = mujoco.MjData(model)

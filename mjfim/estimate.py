@@ -8,19 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
-from mjfim.designer import standard_deviations
-from mjfim.errors import RecordingError, SimulationDiverged, unknown
+from mjfim.errors import ExperimentError, RecordingError, SimulationDiverged, unknown
 from mjfim.experiment import Experiment
+from mjfim.fisher import standard_deviations
 from mjfim.setup import Setup
 from mjfim.trajectory import Array, Estimate, Recording, Trajectory
 
 MISFIT = 1e-3
+# of scipy.optimize.least_squares, by status
+OUTCOMES = {
+    0: "not converged: the limit of evaluations was reached",
+    1: "converged: the gradient vanished",
+    2: "converged: the residual stopped falling",
+    3: "converged: the step vanished",
+    4: "converged: neither step nor residual changed any more",
+}
 Method = Literal["least_squares", "newton"]
 
 
@@ -33,10 +41,14 @@ class Residuals:
 
 
 class Fit:
-    """Residuals of an experiment against recordings, as functions of theta. Evaluates each theta once."""
+    """Residuals of an experiment against recordings, as functions of theta. Evaluates each theta once.
 
-    def __init__(self, setup: Setup, recordings: Sequence[Recording]) -> None:
+    data_only: leave priors and bounds out
+    """
+
+    def __init__(self, setup: Setup, recordings: Sequence[Recording], data_only: bool = False) -> None:
         self.setup = setup
+        self.data_only = data_only
         self.recordings = [aligned(setup, r) for r in recordings]
         if not self.recordings:
             raise RecordingError("identify needs at least one recording")
@@ -68,7 +80,7 @@ class Fit:
             y, G = predicted
             rows.append(((y - recording.y) / sigma)[mask])
             slopes.append((G / sigma[:, None])[mask])
-        weight = np.sqrt(np.diag(p.prior_information))
+        weight = np.sqrt(np.diag(p.prior_information)) * (not self.data_only)
         rows.append((weight * (theta - p.guess))[weight > 0])
         slopes.append(np.diag(weight)[weight > 0])
         return Residuals(np.concatenate(rows), np.concatenate(slopes))
@@ -126,9 +138,15 @@ def identify(
     The stated std is formal: it is accuracy only if the model and the noise are right; `misfit` says when they are not.
     Raises RecordingError for unusable recordings, SimulationDiverged where the model diverges at the start.
     """
+    if method not in get_args(Method):
+        raise ExperimentError(unknown("method", method, get_args(Method)))
     setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
     fit = Fit(setup, recordings)
     theta0 = setup.parameters.guess if start is None else np.asarray(start, dtype=np.float64)
+    if theta0.shape != setup.parameters.guess.shape:
+        raise ExperimentError(
+            f"start: {theta0.shape} numbers, wanted one per parameter: {', '.join(setup.parameters.names)}"
+        )
     if fit.at(theta0) is None:
         raise SimulationDiverged(
             f"the simulation diverges at the start {dict(zip(setup.parameters.names, theta0, strict=True))}"
@@ -141,23 +159,24 @@ def trust_region(fit: Fit, theta0: Array) -> Solution:
     """SciPy's `least_squares` (trust-region reflective) inside the bounds."""
     p = fit.setup.parameters
     size = len(_at(fit, theta0).r)
+    lower, upper = (-np.inf, np.inf) if fit.data_only else (p.lower, p.upper)
 
     def residual(theta: Array) -> Array:
         value = fit.at(theta)
         return np.full(size, np.inf) if value is None else value.r
 
-    inside = np.clip(theta0, np.nextafter(p.lower, np.inf), np.nextafter(p.upper, -np.inf))
+    inside = np.clip(theta0, np.nextafter(lower, np.inf), np.nextafter(upper, -np.inf))
     result = least_squares(
         residual,
         inside,
         lambda theta: _at(fit, theta).J,
-        (p.lower, p.upper),
+        (lower, upper),
         x_scale="jac",
         ftol=1e-12,
         xtol=1e-10,
         gtol=1e-10,
     )
-    return Solution(result.x, int(result.nfev), bool(result.success), str(result.message))
+    return Solution(result.x, int(result.nfev), bool(result.success), OUTCOMES.get(result.status, str(result.message)))
 
 
 def newton_raphson(fit: Fit, theta0: Array, iterations: int = 50, tolerance: float = 1e-5) -> Solution:
@@ -204,6 +223,7 @@ def _report(setup: Setup, fit: Fit, theta0: Array, solution: Solution) -> Estima
     near = 1e-6 * p.step
     touch = (solution.theta - p.lower < near) | (p.upper - solution.theta < near)
     at_bound = tuple(n for n, hit in zip(p.names, touch, strict=True) if hit)
+    outside = (solution.theta < p.lower - near) | (solution.theta > p.upper + near)
     misfit = bool(chi2_distribution.sf(chi2, dof) < MISFIT)
     return Estimate(
         parameters=p.names,
@@ -214,14 +234,14 @@ def _report(setup: Setup, fit: Fit, theta0: Array, solution: Solution) -> Estima
         chi2=chi2,
         dof=dof,
         status=solution.status,
-        success=solution.success and not singular,
+        success=solution.success and not singular and not outside.any(),
         misfit=misfit,
         iterations=solution.iterations,
         residual_rms=_rms(setup, fit, predicted),
         at_bound=at_bound,
         predicted=predicted,
         recordings=tuple(fit.recordings),
-        warnings=tuple(_warnings(chi2, dof, misfit, at_bound, singular)),
+        warnings=tuple(_warnings(chi2, dof, misfit, at_bound, singular, bool(outside.any()))),
     )
 
 
@@ -259,7 +279,9 @@ def _rms(setup: Setup, fit: Fit, predicted: tuple[Array, ...]) -> dict[str, floa
     return values
 
 
-def _warnings(chi2: float, dof: int, misfit: bool, at_bound: tuple[str, ...], singular: bool) -> list[str]:
+def _warnings(
+    chi2: float, dof: int, misfit: bool, at_bound: tuple[str, ...], singular: bool, outside: bool
+) -> list[str]:
     found = []
     if singular:
         found.append("the recordings do not determine all parameters: the information is singular")
@@ -270,6 +292,8 @@ def _warnings(chi2: float, dof: int, misfit: bool, at_bound: tuple[str, ...], si
         )
     elif chi2_distribution.cdf(chi2, dof) < MISFIT:
         found.append(f"residuals are only {np.sqrt(chi2 / dof):.2f} x the stated noise: sigma is overstated")
-    if at_bound:
+    if outside:
+        found.append(f"outside its bounds, which newton does not keep: {', '.join(at_bound)}; use least_squares")
+    elif at_bound:
         found.append(f"at a bound: {', '.join(at_bound)}; the formal standard errors do not hold there")
     return found

@@ -14,7 +14,7 @@ from mjfim.errors import ExperimentError, unknown
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Range = tuple[float, float]
+Range = tuple[Annotated[float, Field(strict=True)], Annotated[float, Field(strict=True)]]
 
 
 class Section(BaseModel):
@@ -123,6 +123,12 @@ class Descent(Section):
     coarse: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     seed: Annotated[int, Field(ge=0)] = 0
 
+    @model_validator(mode="after")
+    def _metric(self) -> Descent:
+        if self.psi_weight and self.method != "metric":
+            raise ValueError('psi_weight belongs to method = "metric"')
+        return self
+
 
 class Limits(Section):
     """Ranges by joint or actuator name. Checked and reported at every sample."""
@@ -174,7 +180,10 @@ class Experiment(Section):
         values = self.model_dump(exclude_unset=True)
         for key, value in tables.items():
             old = values.get(key)
-            values[key] = {**old, **value} if isinstance(old, dict) and isinstance(value, Mapping) else value
+            if key == "parameters":
+                values[key] = {**values[key], **{n: {**values[key].get(n, {}), **t} for n, t in value.items()}}
+            else:
+                values[key] = {**old, **value} if isinstance(old, dict) and isinstance(value, Mapping) else value
         return Experiment(**{"directory": self.directory, "source": self.source, **values})
 
 

@@ -65,6 +65,15 @@ def d_optimality(information: Array) -> Criterion:
 CRITERIA: dict[str, Callable[[Array], Criterion]] = {"E": e_optimality, "A": a_optimality, "D": d_optimality}
 
 
+def standard_deviations(information: Array) -> Array:
+    """(p,) Cramer-Rao standard deviations; infinite where the information is singular."""
+    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if values[0] <= 1e-14 * values[-1]:
+        return np.full(len(scale), np.inf)
+    return np.asarray(np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)
+
+
 @dataclass(frozen=True, eq=False)
 class Information:
     """Turns sensitivities into Fisher information and the criterion into its gradient.
@@ -124,9 +133,12 @@ class Information:
         direction = direction / np.abs(direction).max()
         terms = [f"{value:+.3g} {name}" for name, value in zip(names, direction, strict=True) if abs(value) > 1e-3]
         smallest = max(float(np.linalg.eigvalsh(self.scaled(information))[0]), 0.0)
+        blind = values <= max(SINGULAR * values[-1], BLIND**-2)
+        others = f", nor along any other of {', '.join(names)}" if blind.all() and len(names) > 1 else ""
         raise UnidentifiableError(
-            f"the start excites nothing along the parameter direction {' '.join(terms)} "
-            f"(lambda_min = {smallest:.3g}); start from a control that moves those parameters' joints"
+            f"the start excites nothing along the parameter direction {' '.join(terms)}{others} "
+            f"(lambda_min = {smallest:.3g}); start from a control "
+            "that moves those parameters' joints, and check that the targets matter"
         )
 
     def _rays(self, criterion: Criterion, sensitivity: Sensitivity) -> Array:

@@ -81,7 +81,7 @@ class Labels:
 
     def parameter(self, j: int) -> str:
         """`name [unit]` of parameter j."""
-        return f"{self.parameters[j]} [{self.parameter_units[j] or '1'}]"
+        return f"{self.parameters[j]} [{self.parameter_units[j] or 'model unit'}]"
 
     def output(self, column: str) -> str:
         """`name [unit]` of an output column."""

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
+import numpy as np
+
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment import Limits
 from mjfim.models import Coordinate
@@ -61,6 +64,23 @@ def limits_of(
 
 def _rows(kind: str, table: Mapping[str, Range], index: Mapping[str, int]) -> list[Limit]:
     return [Limit(kind, name, index[name], float(low), float(high)) for name, (low, high) in table.items()]
+
+
+def saturated(model: Any, trajectory: Trajectory) -> tuple[str, ...]:
+    """Names of actuators whose force is clamped by forcerange at some sample. model: at the design's theta."""
+    limited = np.flatnonzero(model.actuator_forcelimited)
+    if not len(limited):
+        return ()
+    data, hit = mujoco.MjData(model), np.zeros(model.nactuator, dtype=bool)
+    low, high = model.actuator_forcerange.T
+    for k in range(trajectory.samples):
+        data.qpos[:], data.qvel[:], data.act[:] = trajectory.qpos[k], trajectory.qvel[k], trajectory.act[k]
+        data.ctrl[:] = trajectory.ctrl[k]
+        mujoco.mj_forward(model, data)
+        hit[limited] |= ((data.actuator_force <= low) | (data.actuator_force >= high))[limited]
+    return tuple(
+        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator{i}" for i in np.flatnonzero(hit)
+    )
 
 
 def margins(limits: tuple[Limit, ...], trajectory: Trajectory) -> dict[str, float]:

@@ -24,8 +24,8 @@ from mjfim.trajectory import Array, Recording, Study, Trajectory, TrialSet
 
 CONVERGED = 0.03
 SHARED_STEPS = 3
-OWN_STEPS = 3
-CHUNK = 4000
+OWN_STEPS = 12
+CHUNK_BYTES = 1e8  # of one Jacobian of all trials of a chunk
 
 Progress = Callable[[str, float], None]
 
@@ -56,7 +56,9 @@ def monte_carlo(
 ) -> Study:
     """Estimate the parameters from many noisy repetitions of one or several trajectories (name -> trajectory).
 
-    Parameters are searched without bounds. Raises ExperimentError for fewer than two trials.
+    Parameters are searched without bounds and priors: the study holds the data's information alone. Ctrl-C returns the
+    sets that are finished. Raises ExperimentError for fewer than two trials, UnidentifiableError where a parameter does
+    not show in the data.
     """
     if trials < 2:
         raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
@@ -65,10 +67,16 @@ def monte_carlo(
         experiment = base.replace(measure_rate=measure_rate)
     setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
     named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
+    for curve in named.values():
+        _exact(setup, curve)
     sets, information = {}, {}
-    for rng, (name, curve) in zip(np.random.default_rng(seed).spawn(len(named)), named.items(), strict=True):
-        tell = None if progress is None else (lambda share, name=name: progress(name, share))
-        sets[name], information[name] = _trial_set(setup, curve, trials, rng, tell)
+    try:
+        for rng, (name, curve) in zip(np.random.default_rng(seed).spawn(len(named)), named.items(), strict=True):
+            tell = None if progress is None else (lambda share, name=name: progress(name, share))
+            sets[name], information[name] = _trial_set(setup, curve, trials, rng, tell)
+    except KeyboardInterrupt:
+        if not sets:
+            raise
     return Study(setup.parameters.names, setup.parameters.true, setup.measure_rate, sets, information)
 
 
@@ -126,25 +134,32 @@ def _trial_set(
     clock = time.perf_counter()
     truth, sigma = setup.parameters.true, setup.outputs.sigma
     rows = np.arange(setup.stride, curve.samples + 1, setup.stride)
-    exact = setup.plant.predict(truth, curve.ctrl)
-    if exact is None:
-        raise SimulationDiverged("the simulation diverges at the true parameters under this control")
-    y, G = exact
+    y, G = _exact(setup, curve)
     J = (G[rows] / sigma[:, None]).reshape(-1, len(truth))
-    information = J.T @ J + setup.parameters.prior_information
+    information = np.asarray(J.T @ J)
+    setup.information.require_identifiable(information, setup.parameters.names, setup.parameters.step)
     estimates = []
-    for first in range(0, count, CHUNK):
-        m = min(CHUNK, count - first)
+    chunk = max(64, int(CHUNK_BYTES / (8 * J.size)))
+    for first in range(0, count, chunk):
+        m = min(chunk, count - first)
         whitened = (y[rows] / sigma).reshape(-1) + rng.standard_normal((m, J.shape[0]))
         trials = Trials(setup, curve.ctrl, whitened, rows)
         estimates.append(_solve(trials, _shared(setup, trials), tell))
     every = np.concatenate(estimates)
-    return _statistics(every, np.asarray(np.linalg.inv(J.T @ J)), time.perf_counter() - clock), information
+    return _statistics(every, np.asarray(np.linalg.inv(information)), time.perf_counter() - clock), information
+
+
+def _exact(setup: Setup, curve: Trajectory) -> tuple[Array, Array]:
+    """Noise-free outputs (N+1, ny) at the true values and their derivative (N+1, ny, p)."""
+    exact = setup.plant.predict(setup.parameters.true, curve.ctrl)
+    if exact is None:
+        raise SimulationDiverged("the simulation diverges at the true parameters under this control")
+    return exact
 
 
 def _shared(setup: Setup, trials: Trials) -> Shared:
     """Fit of the mean measurement from the guess, with its Jacobian and the Jacobian's derivative."""
-    fit = Fit(setup, [trials.recording(trials.measured.mean(axis=0))])
+    fit = Fit(setup, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
     theta = newton_raphson(fit, setup.parameters.guess).theta
     sigma, h = setup.outputs.sigma, 1e-3 * setup.parameters.step
 
@@ -175,15 +190,16 @@ def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None)
         predicted, finite = own.outputs(theta[active])
         step = _gauss_newton(own.jacobian(theta[active], predicted), own.measured - predicted)
         step[~finite] = np.nan
-        theta[active] += step
+        theta[active] = np.where(np.isfinite(step), theta[active] + step, shared.theta)
         small = np.nan_to_num(np.abs(step) / shared.std, nan=np.inf).max(axis=1) < CONVERGED
-        active = active[~small & finite]
+        active = active[~small]
         if tell is not None:
             tell(1.0 if not len(active) else (SHARED_STEPS + k + 1) / (SHARED_STEPS + k + 2))
         if not len(active):
             break
     for i in active:
-        solution = trust_region(Fit(trials.setup, [trials.recording(trials.measured[i])]), shared.theta)
+        fit = Fit(trials.setup, [trials.recording(trials.measured[i])], data_only=True)
+        solution = trust_region(fit, shared.theta)
         theta[i] = solution.theta if solution.success else np.nan
     return theta
 
@@ -191,10 +207,11 @@ def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None)
 def _gauss_newton(J: Array, r: Array) -> Array:
     """(m, p) steps `(J'J)^-1 J'r`; J: (m, n, p), r: (m, n)."""
     JT = np.swapaxes(J, 1, 2)
-    try:
-        return np.asarray(np.linalg.solve(JT @ J, JT @ r[:, :, None])[:, :, 0])
-    except np.linalg.LinAlgError:
-        return np.full((len(J), J.shape[2]), np.nan)
+    gram, rhs = JT @ J, JT @ r[:, :, None]
+    usable = np.isfinite(gram).all(axis=(1, 2)) & np.isfinite(rhs).all(axis=(1, 2))
+    step = np.full((len(J), J.shape[2]), np.nan)
+    step[usable] = (np.linalg.pinv(gram[usable], hermitian=True) @ rhs[usable])[:, :, 0]
+    return step
 
 
 def _statistics(estimates: Array, crlb: Array, seconds: float) -> TrialSet:

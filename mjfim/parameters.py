@@ -137,6 +137,32 @@ def resolve(model: Any, path: str) -> Slot:
     return Slot(array, _rows(model, array, ident, path), column)
 
 
+UNITS = {"mass": "kg", "pos": "m", "ipos": "m", "inertia": "kg m²", "size": "m", "gravity": "m/s²"}
+# per coordinate of a slide and of any other joint
+JOINT_UNITS = {
+    "damping": ("N s/m", "N m s/rad"),
+    "frictionloss": ("N", "N m"),
+    "armature": ("kg", "kg m²"),
+    "stiffness": ("N/m", "N m/rad"),
+    "springref": ("m", "rad"),
+}
+
+
+def unit_of(model: Any, path: str) -> str:
+    """Unit of what a valid path names, empty where it depends on the model (gains, gears, tendons) or has none."""
+    match = PATH.match(path)
+    if match is None:
+        return ""
+    kind, field_name = match["kind"], match["field"]
+    if kind != "joint":
+        return UNITS.get(field_name, "")
+    ident = mujoco.mj_name2id(model, OBJECTS["joint"], match["name"] or "")
+    if ident < 0:
+        return ""
+    slide = int(model.jnt_type[ident]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+    return JOINT_UNITS[field_name][0 if slide else 1] if field_name in JOINT_UNITS else ""
+
+
 def _checked(path: str, index: int, width: int) -> int:
     if index >= width:
         raise ExperimentError(f"in parameter path {path!r}: index {index} is out of range; valid: 0 to {width - 1}")
@@ -225,7 +251,7 @@ class ParameterSet:
     @property
     def step(self) -> Array:
         """(p,) magnitude to which finite-difference steps are relative."""
-        return np.maximum(np.abs(self.guess), np.abs(self.scale))
+        return np.where(self.guess != 0.0, np.abs(self.guess), self.scale)
 
     @property
     def prior_information(self) -> Array:

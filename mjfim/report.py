@@ -20,7 +20,7 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
     rows = zip(design.parameters, units, design.theta, design.initial.std, design.final.std, strict=True)
     for name, unit, value, before, after in rows:
         relative = f"{100 * after / abs(value):.2g} %" if value else "-"
-        gain = f"{before / after:.1f} ×" if np.isfinite(before) and after > 0 else "-"
+        gain = _ratio(before, after)
         table.add_row(_named(name, unit), f"{value:.4g}", f"{before:.3g}", f"{after:.3g}", relative, gain)
     last = design.history[-1] if design.history else None
     before, after = design.initial.eigenvalues[0], design.final.eigenvalues[0]
@@ -74,6 +74,13 @@ def study_report(study: Study, units: tuple[str, ...]) -> RenderableType:
         parts.append(table)
     note = "efficiency = Cramér-Rao bound / observed variance; 1 means the bound is reached."
     return Group(*parts, Text(note, style="dim"))
+
+
+def _ratio(before: float, after: float) -> str:
+    """How much smaller a standard deviation became."""
+    if not (np.isfinite(before) and np.isfinite(after) and after > 0 and before > 0):
+        return "-"
+    return f"{before / after:.1f} ×" if before >= after else f"{after / before:.1f} × larger"
 
 
 def _named(name: str, unit: str) -> str:

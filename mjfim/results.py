@@ -31,6 +31,8 @@ def leave_design(folder: Path, design: Design, setup: Setup) -> None:
 
 def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
     """estimate.json, identified.xml, estimate.rrd and pictures; returns sentences about what could not be written."""
+    for stale in (*folder.glob("fit*.png"), folder / "identified.xml"):
+        stale.unlink(missing_ok=True)
     archive.write_json(folder / "estimate.json", archive.estimate_summary(estimate, setup))
     missing = []
     try:

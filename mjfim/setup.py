@@ -17,7 +17,7 @@ from mjfim.limits import limits_of
 from mjfim.models import compile_spec, control_names, coordinates, load_spec, private_model
 from mjfim.objective import DesignProblem, RunningCost
 from mjfim.outputs import Output, OutputMap
-from mjfim.parameters import Parameter, ParameterSet, Target, moved_bodies, names_of, resolve
+from mjfim.parameters import Parameter, ParameterSet, Target, moved_bodies, names_of, resolve, unit_of
 from mjfim.plant import Plant
 from mjfim.signals import generate, read_control
 from mjfim.tangent import StateSpace
@@ -47,11 +47,18 @@ class Setup:
         self.model = compile_spec(self.spec, self.model_path)
         if self.model.nu == 0:
             raise ModelError(f"{self.model_path}: the model has no actuator; a design needs at least one")
+        if self.model.nhistory or self.model.nplugin:
+            what = "delays or interval sensors" if self.model.nhistory else "engine plugins"
+            raise ModelError(
+                f"{self.model_path}: {what} keep a state that mjfim does not see; take them out of the model"
+            )
         self.coordinates = coordinates(self.model)
         self.controls = control_names(self.model)
         self.substeps = self._substeps()
         self.stride = self._stride() if self.coarsen == 1 else 1
         self.samples = self._samples() // self.coarsen
+        if self.stride > self.samples:
+            raise ExperimentError(f"measure_rate: {e.measure_rate:g} Hz measures nothing within {e.horizon:g} s")
         self.dt = self.substeps * float(self.model.opt.timestep) * self.coarsen
         self.t = np.arange(self.samples, dtype=np.float64) * self.dt
         self.parameters = ParameterSet.build(self._parameters(), self.model)
@@ -109,7 +116,8 @@ class Setup:
             self.stride,
             self.measure_rate,
             p.scale,
-            p.prior_information,
+            p.prior_information
+            * (self.measure_rate / (e.measure_rate or e.rate)),  # the same per second on every level
             e.cost.criterion,
             e.cost.information,
         )
@@ -175,7 +183,8 @@ class Setup:
             scale = abs(guess) if p.scale == "guess" else p.scale
             if scale == 0.0:
                 raise ExperimentError(f"parameters.{name}.scale: the guess is 0, state a scale in the parameter's unit")
-            built.append(Parameter(name, targets, guess, p.true, bounds, scale, p.prior, p.unit))
+            unit = p.unit or (unit_of(self.model, targets[0].path) if targets[0].scale == 1.0 else "")
+            built.append(Parameter(name, targets, guess, p.true, bounds, scale, p.prior, unit))
         return built
 
     def _nominal(self, name: str, target: Target) -> float:

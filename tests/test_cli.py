@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import mjfim
-from mjfim import archive, cli, plots, results
+from mjfim import archive, cli, plots, rerun_log, results
 from mjfim.setup import Setup
 
 MODELS = Path(__file__).parents[1] / "models"
@@ -328,7 +328,13 @@ def test_missing_inputs(study: Path, archived: Path, tmp_path: Path) -> None:
     misused(run("simulate", study, tmp_path / "gone.npz", "-o", out / "r.csv"), "gone.npz: no such design file")
     misused(run("montecarlo", study, tmp_path / "gone.npz", "-o", out), "gone.npz: no such design file")
     misused(run("identify", study, tmp_path / "gone.csv", "-o", out), "gone.csv: no such file")
-    misused(run("replay", tmp_path / "gone", "--save", out / "x.rrd"), "folder of results, an .rrd file or a design")
+    misused(run("replay", tmp_path / "gone", "--save", out / "x.rrd"), "no such file or folder")
+    (tmp_path / "notes.txt").touch()
+    misused(
+        run("replay", tmp_path / "notes.txt", "--save", out / "x.rrd"), "folder of results, an .rrd file or a design"
+    )
+    misused(run("replay", tmp_path / "notes.txt", "--save", out / "x.txt"), "ends in .rrd")
+    (tmp_path / "notes.txt").unlink()
     misused(run("replay", tmp_path / "gone.rrd", "--save", out / "x.rrd"), "gone.rrd: no such file")
     misused(run("replay", tmp_path, "--save", out / "x.rrd"), "no design.rrd or estimate.rrd")
     misused(run("identify", study, archived, "-o", out, "--method", "magic"), "'magic'", "least_squares, newton")
@@ -622,3 +628,28 @@ def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
     assert mjfim.evaluate_trajectory(setup, curves["final"]).cost == pytest.approx(data["final"]["cost"], rel=1e-6)
     assert all(file.read_bytes()[:4] == b"\x89PNG" for file in out.glob("*.png"))
     assert (out / "design.rrd").read_bytes()[:4] == b"RRF2"
+
+
+def test_replay_of_an_archive_leaves_the_full_picture_alone(home: Path, designed: Result, monkeypatch) -> None:
+    """design.rrd holds more than the archive beside it."""
+    shown: list[Path] = []
+    monkeypatch.setattr(rerun_log, "show", shown.append)
+    before = (home / "out" / "design.rrd").read_bytes()
+    assert run("replay", home / "out" / "design.npz").exit_code == 0
+    assert (home / "out" / "design.rrd").read_bytes() == before
+    assert shown[0].is_file()
+    assert shown[0].parent != home / "out"
+
+
+def test_version() -> None:
+    """As the package says."""
+    result = run("--version")
+    assert (result.exit_code, result.stdout) == (0, f"{mjfim.__version__}\n")
+
+
+def test_stale_pictures_of_an_older_estimate_are_removed(study: Path, recorded: Path, tmp_path: Path) -> None:
+    """Two recordings, then one, into the same folder."""
+    run("identify", study, recorded, recorded, "-o", tmp_path / "e")
+    assert {"fit_1.png", "fit_2.png"} <= names(tmp_path / "e")
+    run("identify", study, recorded, "-o", tmp_path / "e")
+    assert {n for n in names(tmp_path / "e") if n.startswith("fit")} == {"fit.png"}

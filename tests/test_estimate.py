@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 import mjfim
-from mjfim.errors import RecordingError, SimulationDiverged
+from mjfim.errors import ExperimentError, RecordingError, SimulationDiverged
 from mjfim.estimate import Fit, aligned, identify, newton_raphson, trust_region
 from mjfim.experiment import Experiment
 from mjfim.montecarlo import simulate
@@ -155,3 +155,18 @@ def test_unusable_recordings_are_named(setup: Setup, recording: Recording) -> No
 def test_divergence_at_the_start_is_an_error(setup: Setup, recording: Recording) -> None:
     with pytest.raises(SimulationDiverged, match="diverges at the start"):
         identify(setup, [recording], start=np.array([2.0, 1.0, -1e6]))
+
+
+def test_newton_outside_the_bounds_is_no_success(recording: Recording) -> None:
+    base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    tight = base.replace(parameters={"c": {"bounds": [1.2, 10.0], "true": 1.3}})
+    estimate = identify(tight, [recording], "newton")
+    assert not estimate.success
+    assert any("outside its bounds" in sentence for sentence in estimate.warnings)
+
+
+def test_unknown_method_and_wrong_start_are_refused(setup: Setup, recording: Recording) -> None:
+    with pytest.raises(ExperimentError, match="least_squares"):
+        identify(setup, [recording], "lm")  # type: ignore[arg-type]
+    with pytest.raises(ExperimentError, match="m, l, c"):
+        identify(setup, [recording], start=np.ones(2))

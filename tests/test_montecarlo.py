@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2, kstest, norm
 
 import mjfim
-from mjfim.errors import ExperimentError
+from mjfim.errors import ExperimentError, UnidentifiableError
 from mjfim.estimate import identify
 from mjfim.experiment import Experiment
 from mjfim.montecarlo import _statistics, monte_carlo, simulate
@@ -111,3 +111,27 @@ def test_simulation_measures_at_the_measurement_rate(experiment: Experiment, des
 def test_too_few_trials_are_refused(experiment: Experiment, design: mjfim.Design) -> None:
     with pytest.raises(ExperimentError, match="at least 2"):
         monte_carlo(experiment, design.trajectory, trials=1)
+
+
+def test_a_parameter_known_by_its_prior_alone_is_named(design: mjfim.Design, experiment: Experiment) -> None:
+    blind = {"target": "body/cart:inertia[0]", "guess": 0.01, "prior": 1e-4}
+    with pytest.raises(UnidentifiableError, match=r"\+1 blind"):
+        monte_carlo(experiment.replace(parameters={"blind": blind}), design.trajectory, trials=4)
+
+
+def test_priors_do_not_enter_the_study(design: mjfim.Design, experiment: Experiment) -> None:
+    sure = experiment.replace(parameters={"m": {"prior": 1e-6}})
+    plain, prior = (monte_carlo(e, design.trajectory, trials=6, seed=1) for e in (experiment, sure))
+    np.testing.assert_allclose(plain.sets["final"].estimates, prior.sets["final"].estimates, rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.inv(prior.information["final"]), prior.sets["final"].crlb)
+
+
+def test_interruption_keeps_the_finished_sets(design: mjfim.Design, experiment: Experiment) -> None:
+    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+
+    def stop(name: str, share: float) -> None:
+        if name == "final":
+            raise KeyboardInterrupt
+
+    study = monte_carlo(experiment, curves, trials=6, progress=stop)
+    assert set(study.sets) == {"initial"}
