@@ -110,10 +110,13 @@ def direction_for(setup: Setup) -> tuple[Direction, DesignProblem]:
     return ExtendedMetricDescent(wide, R, wide), replace(setup.problem, extended=True)
 
 
+CALM = 10.0
+
+
 def regulator_for(setup: Setup) -> Regulator:
-    """Unit weights on state and control along the trajectory."""
+    """Unit weights on state and control along the trajectory; no feedback where the plant is calm without."""
     Q, R = np.eye(setup.space.nx) * setup.dt, np.eye(len(setup.controls)) * setup.dt
-    return Regulator(Q, R, Q / setup.dt)
+    return Regulator(Q, R, Q / setup.dt, calm=CALM)
 
 
 def _coarse_level(setup: Setup, first: Point) -> Setup | None:

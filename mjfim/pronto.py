@@ -12,7 +12,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from mjfim.lq import Recursion, TangentCurve, regulator
+from mjfim.lq import Recursion, TangentCurve, growth, regulator
 from mjfim.trajectory import Array, Status
 
 P = TypeVar("P")
@@ -143,15 +143,22 @@ class Iterate(Generic[P]):
 
 @dataclass(frozen=True, eq=False)
 class Regulator:
-    """How K is made: weights Q, R, terminal (times dt) of the LQR along the trajectory, renewed every `period` iterates."""
+    """How K is made: weights Q, R, terminal (times dt) of the LQR along the trajectory, renewed every `period` iterates.
+
+    calm: where no deviation grows more than this along the open-loop trajectory, K is zero: P needs no feedback there
+    """
 
     Q: Array
     R: Array
     terminal: Array
     period: int = 10
+    calm: float = 0.0
 
     def gain(self, expansion: Expansion) -> Array:
         """K: (N, nu, nx) about the expansion's trajectory."""
+        if self.calm and growth(expansion.A) <= self.calm:
+            N, nx, nu = expansion.B.shape
+            return np.zeros((N, nu, nx))
         return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
 
 

@@ -13,7 +13,7 @@ from numerics import Array, directional_check
 from scipy.optimize import minimize
 
 from mjfim.directions import LBFGS, MetricDescent
-from mjfim.lq import TangentCurve
+from mjfim.lq import TangentCurve, growth
 from mjfim.pronto import Armijo, Direction, Expansion, Iterate, Regulator, optimize
 from mjfim.trajectory import Status
 
@@ -461,3 +461,12 @@ def test_lbfgs_carried_to_a_finer_grid_keeps_its_curvature_and_its_direction() -
     coarse = direction(still, np.zeros((N, 1, 1))).v
     np.testing.assert_allclose(fine(dense, np.zeros((4 * N, 1, 1))).v, np.repeat(coarse, 4, axis=0), rtol=1e-9)
     assert direction._pairs[0].s.shape == (N, 1)  # the coarse memory is left alone
+
+
+def test_feedback_only_where_the_plant_is_not_calm() -> None:
+    expansion = Pendulum().expand(start(Pendulum()))
+    amplification = growth(expansion.A)
+    assert not replace(REGULATOR, calm=1.01 * amplification).gain(expansion).any()
+    np.testing.assert_array_equal(
+        replace(REGULATOR, calm=0.99 * amplification).gain(expansion), REGULATOR.gain(expansion)
+    )
