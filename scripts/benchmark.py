@@ -225,7 +225,7 @@ def engine_verdict(designs: list[tuple[Run, Design]], threads: int) -> str:
         ratios.setdefault(run.solver, []).append(run.seconds * threads / (design.steps * step))
     told = [f"{name} {min(r):.2f} to {max(r):.2f}, {judged(max(r), 1.3)}" for name, r in ratios.items()]
     return (
-        f"Ratios: {'; '.join(told)}. What is over 1: the projection runs on one thread, sample by sample; Riccati and L-BFGS "
+        f"Ratios: {'; '.join(told)}. What is over 1: the projection runs on one thread; Riccati and L-BFGS "
         "run in Python; a coarse level has few steps to spread that over."
     )
 
