@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
-import os
 import shutil
 import sys
 import tempfile
@@ -23,6 +21,7 @@ from mjfim import archive, report
 from mjfim.errors import ExperimentError, MjfimError, RecordingError
 from mjfim.files import replacing
 from mjfim.labels import Labels
+from mjfim.places import check_file, check_folder, experiment_beside, recording_of
 from mjfim.setup import Setup
 from mjfim.trajectory import HistoryRow
 
@@ -120,7 +119,7 @@ def design(
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})
     setup = Setup(stated, threads)
-    _check_folder(output)
+    check_folder(output)
     with progress() as bar:
         task = bar.add_task("designing", total=None)
 
@@ -151,7 +150,7 @@ def simulate(
 ) -> None:
     """Play a design on the model at its `true` values, with noise: a synthetic recording."""
     setup = Setup(mjfim.Experiment.from_file(experiment))
-    _check_file(output)
+    check_file(output)
     trajectory = archive.read_design(design_file)["final"]
     archive.check_fits(design_file, trajectory, setup)
     archive.write_recording(output, mjfim.simulate(setup, trajectory, seed), setup)
@@ -171,7 +170,7 @@ def identify(
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
     setup = Setup(mjfim.Experiment.from_file(experiment))
     loaded = [archive.read_recording(path, setup) for path in recordings]
-    _check_folder(output)
+    check_folder(output)
     with progress() as bar:
         bar.add_task("fitting", total=None)
         result = mjfim.identify(setup, loaded, "newton" if method == "newton" else "least_squares")
@@ -201,7 +200,7 @@ def montecarlo(
     named = archive.read_design(design_file)
     for trajectory in named.values():
         archive.check_fits(design_file, trajectory, setup)
-    _check_folder(output)
+    check_folder(output)
     with progress() as bar:
         tasks = {name: bar.add_task(f"{trials} trials, {name}", total=1.0) for name in named}
 
@@ -237,15 +236,15 @@ def replay(
         raise RecordingError(f"--save {save}: a Rerun file ends in .rrd")
     target = save or Path(tempfile.mkdtemp(prefix="mjfim-")) / "replay.rrd"
     if save is not None:
-        _check_file(save)
+        check_file(save)
     if source.suffix == ".npz":
-        setup = Setup(mjfim.Experiment.from_file(experiment or _experiment_beside(source)))
+        setup = Setup(mjfim.Experiment.from_file(experiment or experiment_beside(source)))
         named = archive.read_design(source)
         for trajectory in named.values():
             archive.check_fits(source, trajectory, setup)
         rerun_log.log_trajectories(target, setup.model_at(setup.theta), named, Labels.of(setup))
     else:
-        found = _recording_of(source)
+        found = recording_of(source)
         if save is not None:
             with replacing(save) as temporary:
                 shutil.copyfile(found, temporary)
@@ -254,47 +253,6 @@ def replay(
         rerun_log.show(target)
     else:
         errors.print(f"wrote {target}")
-
-
-def _recording_of(source: Path) -> Path:
-    """The .rrd that a folder or file names."""
-    if not source.exists():
-        raise RecordingError(f"{source}: no such file or folder")
-    if source.is_dir():
-        for name in ("design.rrd", "estimate.rrd"):
-            if (source / name).is_file():
-                return source / name
-        raise RecordingError(f"{source}: no design.rrd or estimate.rrd in this folder")
-    if source.suffix != ".rrd":
-        raise RecordingError(f"{source}: give a folder of results, an .rrd file or a design .npz")
-    return source
-
-
-def _experiment_beside(source: Path) -> Path:
-    """Experiment file that the design.json beside an npz names."""
-    beside = source.parent / "design.json"
-    try:
-        named = json.loads(beside.read_text(encoding="utf-8"))["experiment"]
-        return source.parent.resolve() / str(Path(named))
-    except (OSError, ValueError, KeyError, TypeError):
-        raise RecordingError(
-            f"{source}: no usable design.json beside it; name the experiment with --experiment"
-        ) from None
-
-
-def _check_folder(folder: Path) -> None:
-    """Fail before the work, not after it, where results cannot be written."""
-    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-    if not existing.is_dir():
-        raise RecordingError(f"{existing}: is a file; -o needs a folder")
-    if not os.access(existing, os.W_OK):
-        raise RecordingError(f"{existing}: no permission to write here")
-
-
-def _check_file(path: Path) -> None:
-    if path.is_dir():
-        raise RecordingError(f"{path}: is a folder; -o and --save need a file here")
-    _check_folder(path.parent)
 
 
 def _say(as_json: bool, summary: dict[str, Any], text: Any) -> None:

@@ -7,9 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mjfim.errors import ExperimentError, unknown
+from mjfim.trajectory import Array
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
@@ -185,6 +187,16 @@ class Experiment(Section):
             else:
                 values[key] = {**old, **value} if isinstance(old, dict) and isinstance(value, Mapping) else value
         return Experiment(**{"directory": self.directory, "source": self.source, **values})
+
+
+def by_name(key: str, value: float | Mapping[str, float], names: tuple[str, ...], kind: str) -> Array:
+    """(n,) from one number for all names or a table by name, 0 where it is silent. Raises ExperimentError."""
+    if not isinstance(value, Mapping):
+        return np.full(len(names), float(value))
+    for name in value:
+        if name not in names:
+            raise ExperimentError(f"{key}: {unknown(kind, name, names)}")
+    return np.array([float(value.get(name, 0.0)) for name in names])
 
 
 def file_keys() -> list[str]:

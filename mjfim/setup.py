@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, ModelError, unknown
-from mjfim.experiment import Experiment, Signal
+from mjfim.experiment import Experiment, Signal, by_name
 from mjfim.fisher import Information
 from mjfim.limits import limits_of
 from mjfim.models import compile_spec, control_names, coordinates, load_spec, private_model
@@ -66,7 +65,7 @@ class Setup:
         self.start = self._start()
         self.plant = Plant(self._private(), self.parameters, self.outputs, self.start, self.substeps, threads)
         self.tracking = self._weights()
-        self.control_weight = self._per_name("cost.control", e.cost.control, self.controls, "actuator", 0.0)
+        self.control_weight = by_name("cost.control", e.cost.control, self.controls, "actuator")
         if np.any(self.control_weight <= 0):
             missing = self.controls[int(np.argmin(self.control_weight))]
             raise ExperimentError(f"cost.control: actuator {missing!r} has no weight; every actuator needs one > 0")
@@ -273,19 +272,9 @@ class Setup:
         cost, names = self.experiment.cost, tuple(c.name for c in self.coordinates)
         dofs = np.array([c.v for c in self.coordinates], dtype=np.intp)
         Q, nv = np.zeros(self.space.nx), self.model.nv
-        Q[dofs] = self._per_name("cost.tracking", cost.tracking, names, "joint", 0.0)
-        Q[nv + dofs] = self._per_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint", 0.0)
+        Q[dofs] = by_name("cost.tracking", cost.tracking, names, "joint")
+        Q[nv + dofs] = by_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint")
         return Q
-
-    def _per_name(
-        self, key: str, value: float | Mapping[str, float], names: tuple[str, ...], kind: str, default: float
-    ) -> Array:
-        if not isinstance(value, Mapping):
-            return np.full(len(names), float(value))
-        for name in value:
-            if name not in names:
-                raise ExperimentError(f"{key}: {unknown(kind, name, names)}")
-        return np.array([float(value.get(name, default)) for name in names])
 
     def _control(self) -> Array:
         source = self.experiment.initial.control

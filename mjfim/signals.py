@@ -9,16 +9,15 @@ import pyarrow
 import pyarrow.csv
 from scipy.signal import chirp
 
-from mjfim.errors import ExperimentError, RecordingError, unknown
-from mjfim.experiment import Signal
+from mjfim.errors import RecordingError, unknown
+from mjfim.experiment import Signal, by_name
 from mjfim.trajectory import Array
 
 
 def generate(signal: Signal, t: Array, names: tuple[str, ...]) -> Array:
     """(N, nu) from a `Signal` at times t: (N,) [s]; every actuator gets its own phase so that they do not coincide."""
-    amplitude, offset = (
-        _per_actuator(v, names, key) for v, key in ((signal.amplitude, "amplitude"), (signal.offset, "offset"))
-    )
+    amplitude = by_name("initial.control.amplitude", signal.amplitude, names, "actuator")
+    offset = by_name("initial.control.offset", signal.offset, names, "actuator")
     shape = np.zeros((len(t), len(names)))
     if signal.kind == "sine":
         shape = np.sin(2 * np.pi * signal.frequency * t[:, None] + np.pi / 4 * np.arange(len(names)))
@@ -41,15 +40,6 @@ def multisine(t: Array, nu: int, frequency: float, harmonics: int, rng: np.rando
     waves = np.sin(2 * np.pi * frequency * t[:, None, None] * order + phases) * weights
     total = waves.sum(axis=2)
     return np.asarray(total / np.abs(total).max(axis=0))
-
-
-def _per_actuator(value: float | dict[str, float], names: tuple[str, ...], key: str) -> Array:
-    if not isinstance(value, dict):
-        return np.full(len(names), float(value))
-    for name in value:
-        if name not in names:
-            raise ExperimentError(f"initial.control.{key}: {unknown('actuator', name, names)}")
-    return np.array([value.get(name, 0.0) for name in names])
 
 
 def read_table(path: Path) -> dict[str, Array]:

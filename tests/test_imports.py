@@ -39,6 +39,7 @@ ORDER = (
     "archive",
     "identified",
     "labels",
+    "places",
     "rerun_log",
     "plots",
     "report",
