@@ -31,8 +31,9 @@ def leave_design(folder: Path, design: Design, setup: Setup) -> None:
 
 def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
     """estimate.json, identified.xml, estimate.rrd and pictures; returns sentences about what could not be written."""
-    for stale in (*folder.glob("fit*.png"), folder / "identified.xml"):
-        stale.unlink(missing_ok=True)
+    for stale in list(folder.iterdir()):  # of an earlier run, by the exact names it could have left
+        if re.fullmatch(r"fit(_\d+)?\.png|identified\.xml", stale.name):
+            stale.unlink()
     archive.write_json(folder / "estimate.json", archive.estimate_summary(estimate, setup))
     missing = []
     try:

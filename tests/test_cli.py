@@ -650,6 +650,7 @@ def test_version() -> None:
 def test_stale_pictures_of_an_older_estimate_are_removed(study: Path, recorded: Path, tmp_path: Path) -> None:
     """Two recordings, then one, into the same folder."""
     run("identify", study, recorded, recorded, "-o", tmp_path / "e")
+    (tmp_path / "e" / "fitness.png").touch()  # the user's own
     assert {"fit_1.png", "fit_2.png"} <= names(tmp_path / "e")
     run("identify", study, recorded, "-o", tmp_path / "e")
-    assert {n for n in names(tmp_path / "e") if n.startswith("fit")} == {"fit.png"}
+    assert {n for n in names(tmp_path / "e") if n.startswith("fit")} == {"fit.png", "fitness.png"}

@@ -6,7 +6,6 @@ Only Figure and Agg objects are used: pyplot and its global state stay untouched
 from __future__ import annotations
 
 import os
-import secrets
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 from mjfim.errors import MjfimError
+from mjfim.files import replacing
 from mjfim.labels import split_unit
 
 INITIAL = "#0077bb"
@@ -153,17 +153,10 @@ def pair_handles() -> list[Line2D]:
 
 
 def save(figure: Figure, path: str | os.PathLike[str], dpi: float = 200.0) -> Path:
-    """Write the figure as PNG in one step: readers see the old file or the new one, never half of it.
-
-    The temporary file lies in the target's folder, which must exist; it is removed when drawing fails.
-    """
+    """Write the figure as PNG in one step: readers see the old file or the new one, never half of it."""
     target = Path(path)
     if target.suffix.lower() != ".png":
         raise MjfimError(f"figures are saved as PNG: {target.name!r} should end in .png")
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
-    try:
+    with replacing(target) as temporary:
         figure.savefig(temporary, format="png", dpi=dpi)
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
     return target

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mjfim.errors import MjfimError, RecordingError
+from mjfim.files import replacing
 from mjfim.labels import Labels, output_label
 from mjfim.rerun_log.panels import (
     Block,
@@ -165,21 +165,14 @@ def _document(path: Path, model: mujoco.MjModel, kind: str, layout: rrb.Containe
 
     The application id carries the model's name, so that the viewer keeps the layouts of different models apart.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
     name = model.names.split(b"\0", 1)[0].decode()
     time = rrb.TimePanel(state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all")
     panels = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time)
     blueprint = rrb.Blueprint(layout, *panels, auto_layout=False, auto_views=False)
-    try:
-        with rr.RecordingStream(f"mjfim {kind} {name}".strip()) as rec:
-            rec.set_log_time_enabled(False)
-            rec.save(partial, default_blueprint=blueprint)
-            yield rec
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with replacing(path) as partial, rr.RecordingStream(f"mjfim {kind} {name}".strip()) as rec:
+        rec.set_log_time_enabled(False)
+        rec.save(partial, default_blueprint=blueprint)
+        yield rec
 
 
 def _layout(views: Sequence[rrb.View], eye: Camera, panels: Sequence[Block], text: bool = True) -> rrb.Horizontal:
