@@ -4,14 +4,17 @@
 parameters from recordings, `monte_carlo` holds the estimator against the Cramer-Rao bound.
 """
 
+from mjfim.checker import Check, check
 from mjfim.designer import design, evaluate_trajectory
 from mjfim.errors import MjfimError
 from mjfim.estimate import identify
 from mjfim.experiment import Experiment
 from mjfim.montecarlo import monte_carlo, simulate
+from mjfim.together import design_together
 from mjfim.trajectory import Design, Estimate, Recording, Study, Trajectory
 
 __all__ = [
+    "Check",
     "Design",
     "Estimate",
     "Experiment",
@@ -19,7 +22,9 @@ __all__ = [
     "Recording",
     "Study",
     "Trajectory",
+    "check",
     "design",
+    "design_together",
     "evaluate_trajectory",
     "identify",
     "monte_carlo",

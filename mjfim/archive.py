@@ -14,8 +14,11 @@ import numpy as np
 import pyarrow
 import pyarrow.csv
 
+from mjfim.checker import Check
 from mjfim.errors import RecordingError, unknown
 from mjfim.files import replacing
+from mjfim.identifiability import Group
+from mjfim.sensing import components
 from mjfim.setup import Setup
 from mjfim.signals import read_table
 from mjfim.trajectory import Array, Design, Estimate, Evaluation, Recording, Study, Trajectory
@@ -68,6 +71,9 @@ def design_summary(design: Design) -> dict[str, Any]:
             for s in design.starts
         ],
         "warnings": list(design.warnings),
+        "nuisance": list(design.nuisance),
+        "combinations": list(design.combinations),
+        "prior": design.prior,
     }
 
 
@@ -98,8 +104,7 @@ def write_design(folder: Path, design: Design, setup: Setup) -> None:
 
 def _playback(trajectory: Trajectory, setup: Setup) -> dict[str, Array]:
     columns = {"t": trajectory.t}
-    columns.update({f"qpos:{c.name}": trajectory.qpos[:, c.q] for c in setup.coordinates})
-    columns.update({f"qvel:{c.name}": trajectory.qvel[:, c.v] for c in setup.coordinates})
+    columns.update({c.name: trajectory.state[:, c.state] for c in components(setup.model)})
     columns.update(_controls(trajectory.ctrl, setup.controls))
     return columns
 
@@ -213,6 +218,7 @@ def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
         "at_bound": list(estimate.at_bound),
         "recordings": [r.name for r in estimate.recordings],
         "warnings": list(estimate.warnings),
+        "prior": setup.parameters.prior_information,
     }
 
 
@@ -236,3 +242,59 @@ def study_summary(study: Study) -> dict[str, Any]:
             "seconds": s.seconds,
         }
     return summary
+
+
+def check_summary(check: Check) -> dict[str, Any]:
+    """Contents of check.json."""
+    rough = check.self_test.rough
+    return {
+        "ok": check.ok,
+        "verdict": list(check.verdict),
+        "source": check.source,
+        "horizon": check.horizon,
+        "parameters": [
+            {
+                "name": row.name,
+                "unit": row.unit,
+                "value": row.value,
+                "size": row.size,
+                "nuisance": row.nuisance,
+                "std": row.std,
+                "relative": row.relative,
+                "wanted": row.wanted,
+                "repetitions": row.repetitions,
+                "seconds": row.seconds,
+            }
+            for row in check.rows
+        ],
+        "eigenvalues": check.eigenvalues,
+        "condition": check.condition,
+        "information": check.information,
+        "wanted": list(check.wanted),
+        "correlation": check.correlation,
+        "confounded": [{"a": p.first, "b": p.second, "correlation": p.correlation} for p in check.confounded],
+        "combinations": [_group(g) for g in check.never],
+        "not_excited": [_group(g) for g in check.not_here],
+        "self_test": {
+            "passed": check.self_test.passed,
+            "recursion": check.self_test.recursion,
+            "slope": check.self_test.slope,
+            "rough": None
+            if rough is None
+            else {
+                "error": rough.error,
+                "parameter": rough.parameter,
+                "sample": rough.sample,
+                "time": rough.time,
+                "causes": list(rough.causes),
+            },
+        },
+    }
+
+
+def _group(group: Group) -> dict[str, Any]:
+    return {
+        "members": list(group.members),
+        "identifiable": [dict(zip(c.members, c.coefficients, strict=True)) for c in group.combinations],
+        "words": str(group),
+    }

@@ -17,6 +17,7 @@ from scipy.stats import chi2 as chi2_distribution
 from mjfim.errors import ExperimentError, RecordingError, SimulationDiverged, unknown
 from mjfim.experiment import Experiment
 from mjfim.fisher import standard_deviations
+from mjfim.sensing import components
 from mjfim.setup import Setup
 from mjfim.trajectory import Array, Estimate, Recording, Trajectory
 
@@ -41,8 +42,10 @@ class Residuals:
 
 
 class Fit:
-    """Residuals of an experiment against recordings, as functions of theta. Evaluates each theta once.
+    """Residuals of an experiment against recordings, as functions of the unknowns. Evaluates each of them once.
 
+    The unknowns are theta, whose start deviations are those of the first recording, then the start deviations of every
+    further recording.
     data_only: leave priors and bounds out
     """
 
@@ -55,6 +58,8 @@ class Fit:
         self.masks = [_used(r) for r in self.recordings]
         if not any(mask.any() for mask in self.masks):
             raise RecordingError("the recordings hold no measured value after t = 0")
+        p = setup.parameters
+        self.starts = np.flatnonzero(p.start(setup.space.nx).any(axis=0))
         self._key: bytes = b""
         self._value: Residuals | None = None
 
@@ -63,25 +68,45 @@ class Fit:
         """Number of measured values."""
         return int(sum(mask.sum() for mask in self.masks))
 
+    def whole(self, theta: Array) -> Array:
+        """Unknowns from theta: (p,), every recording starting as the first."""
+        return np.concatenate([theta, np.tile(theta[self.starts], len(self.recordings) - 1)])
+
+    def of(self, unknowns: Array, recording: int) -> Array:
+        """(p,) theta of one recording."""
+        theta, further = np.array(unknowns[: len(self.setup.parameters)]), unknowns[len(self.setup.parameters) :]
+        if recording and len(self.starts):
+            theta[self.starts] = further.reshape(-1, len(self.starts))[recording - 1]
+        return theta
+
+    def _columns(self, recording: int) -> np.ndarray:
+        """(p,) places of one recording's theta among the unknowns."""
+        places = np.arange(len(self.setup.parameters))
+        if recording:
+            places[self.starts] = len(places) + (recording - 1) * len(self.starts) + np.arange(len(self.starts))
+        return places
+
     def at(self, theta: Array) -> Residuals | None:
-        """Residuals and Jacobian at theta: (p,); None where the simulation diverges."""
+        """Residuals and Jacobian at the unknowns; None where the simulation diverges."""
         key = np.asarray(theta).tobytes()
         if key != self._key:
             self._key, self._value = key, self._evaluate(np.asarray(theta))
         return self._value
 
     def _evaluate(self, theta: Array) -> Residuals | None:
-        sigma, p = self.setup.outputs.sigma, self.setup.parameters
+        noise, p = self.setup.noise, self.setup.parameters
         rows, slopes = [], []
-        for recording, mask in zip(self.recordings, self.masks, strict=True):
-            predicted = self.setup.plant.predict(theta, recording.ctrl)
+        for i, (recording, mask) in enumerate(zip(self.recordings, self.masks, strict=True)):
+            predicted = self.setup.plant.predict(self.of(theta, i), recording.ctrl)
             if predicted is None:
                 return None
             y, G = predicted
-            rows.append(((y - recording.y) / sigma)[mask])
-            slopes.append((G / sigma[:, None])[mask])
-        weight = np.sqrt(np.diag(p.prior_information)) * (not self.data_only)
-        rows.append((weight * (theta - p.guess))[weight > 0])
+            rows.append(noise.whiten_present(np.where(mask, y - recording.y, 0.0), mask))
+            own = noise.whiten_present(G, mask)
+            slopes.append(np.zeros((len(own), len(theta))))
+            slopes[-1][:, self._columns(i)] = own
+        weight = self.whole(np.sqrt(np.diag(p.prior_information)) * (not self.data_only))
+        rows.append((weight * (theta - self.whole(p.guess)))[weight > 0])
         slopes.append(np.diag(weight)[weight > 0])
         return Residuals(np.concatenate(rows), np.concatenate(slopes))
 
@@ -107,7 +132,21 @@ def aligned(setup: Setup, recording: Recording) -> Recording:
     y = np.full((len(t), len(names)), np.nan)
     for name in shared:
         y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
-    return Recording(t, ctrl, y, names, where)
+    return Recording(t, ctrl, _continuous(setup, y), names, where)
+
+
+def _continuous(setup: Setup, y: Array) -> Array:
+    """Measured quaternions with the sign that follows from the start: q and -q are one orientation."""
+    start = setup.plant.nominal_start
+    for q, _ in setup.space.quaternions:
+        found = [(i, o.state) for i, o in enumerate(setup.outputs.outputs) if o.state is not None]
+        at, states = [i for i, s in found if q <= s < q + 4], [s for _, s in found if q <= s < q + 4]
+        last = start[states]
+        for row in y:
+            if at and np.isfinite(row[at]).all():
+                row[at] *= 1.0 if last @ row[at] >= 0.0 else -1.0
+                last = np.array(row[at])
+    return y
 
 
 def _used(recording: Recording) -> np.ndarray:
@@ -147,11 +186,12 @@ def identify(
         raise ExperimentError(
             f"start: {theta0.shape} numbers, wanted one per parameter: {', '.join(setup.parameters.names)}"
         )
-    if fit.at(theta0) is None:
+    if fit.at(fit.whole(theta0)) is None:
         raise SimulationDiverged(
             f"the simulation diverges at the start {dict(zip(setup.parameters.names, theta0, strict=True))}"
         )
-    solution = newton_raphson(fit, theta0) if method == "newton" else trust_region(fit, theta0)
+    solve = newton_raphson if method == "newton" else trust_region
+    solution = solve(fit, fit.whole(theta0))
     return _report(setup, fit, theta0, solution)
 
 
@@ -159,7 +199,7 @@ def trust_region(fit: Fit, theta0: Array) -> Solution:
     """SciPy's `least_squares` (trust-region reflective) inside the bounds."""
     p = fit.setup.parameters
     size = len(_at(fit, theta0).r)
-    lower, upper = (-np.inf, np.inf) if fit.data_only else (p.lower, p.upper)
+    lower, upper = (-np.inf, np.inf) if fit.data_only else (fit.whole(p.lower), fit.whole(p.upper))
 
     def residual(theta: Array) -> Array:
         value = fit.at(theta)
@@ -212,22 +252,23 @@ def _at(fit: Fit, theta: Array) -> Residuals:
 
 def _report(setup: Setup, fit: Fit, theta0: Array, solution: Solution) -> Estimate:
     p = setup.parameters
-    final = _at(fit, solution.theta)
+    final, theta = _at(fit, solution.theta), solution.theta[: len(p)]
     information = final.J.T @ final.J
-    std = standard_deviations(information)
+    std = standard_deviations(information)[: len(p)]
     singular = not np.isfinite(std).all()
-    covariance = np.full((len(p), len(p)), np.inf) if singular else np.asarray(np.linalg.inv(information))
+    blank = np.full((len(p), len(p)), np.inf)
+    covariance = blank if singular else np.asarray(np.linalg.inv(information))[: len(p), : len(p)]
     data = final.r[: fit.count]
-    chi2, dof = float(data @ data), max(fit.count - len(p), 1)
-    predicted = tuple(_predict(setup, solution.theta, r) for r in fit.recordings)
+    chi2, dof = float(data @ data), max(fit.count - len(solution.theta), 1)
+    predicted = tuple(_predict(setup, fit.of(solution.theta, i), r) for i, r in enumerate(fit.recordings))
     near = 1e-6 * p.step
-    touch = (solution.theta - p.lower < near) | (p.upper - solution.theta < near)
+    touch = (theta - p.lower < near) | (p.upper - theta < near)
     at_bound = tuple(n for n, hit in zip(p.names, touch, strict=True) if hit)
-    outside = (solution.theta < p.lower - near) | (solution.theta > p.upper + near)
+    outside = (theta < p.lower - near) | (theta > p.upper + near)
     misfit = bool(chi2_distribution.sf(chi2, dof) < MISFIT)
     return Estimate(
         parameters=p.names,
-        theta=solution.theta,
+        theta=theta,
         std=std,
         covariance=covariance,
         initial_theta=theta0,
@@ -251,20 +292,22 @@ def _predict(setup: Setup, theta: Array, recording: Recording) -> Array:
 
 
 def measured_trajectory(setup: Setup, recording: Recording) -> Trajectory | None:
-    """The recorded motion as a trajectory, where every scalar position was measured at most samples; else None.
+    """The recorded motion as a trajectory, where every position was measured at most samples; else None.
 
     Gaps are bridged linearly; unmeasured velocities are zero. For pictures, not for estimation.
     """
-    names = [f"qpos:{c.name}" for c in setup.coordinates]
-    if setup.model.nq != len(names) or any(name not in recording.outputs for name in names):
+    positions = [c for c in components(setup.model) if c.state < setup.model.nq]
+    if any(c.name not in recording.outputs for c in positions):
         return None
-    qpos = np.empty((len(recording.t), len(names)))
-    for coordinate, name in zip(setup.coordinates, names, strict=True):
-        column = recording.y[:, recording.outputs.index(name)]
+    qpos = np.empty((len(recording.t), setup.model.nq))
+    for component in positions:
+        column = recording.y[:, recording.outputs.index(component.name)]
         seen = np.isfinite(column)
         if not seen.any():
             return None
-        qpos[:, coordinate.q] = np.interp(recording.t, recording.t[seen], column[seen])
+        qpos[:, component.state] = np.interp(recording.t, recording.t[seen], column[seen])
+    for q, _ in setup.space.quaternions:
+        qpos[:, q : q + 4] /= np.maximum(np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True), 1e-12)
     n = len(qpos)
     return Trajectory(recording.t, qpos, np.zeros((n, setup.model.nv)), np.zeros((n, setup.model.na)), recording.ctrl)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, SkipValidation, ValidationError, model_validator
 
 from mjfim.errors import ExperimentError, unknown
 from mjfim.trajectory import Array
@@ -16,6 +16,7 @@ from mjfim.trajectory import Array
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Unknown = Positive | Literal[True]
 Range = tuple[Annotated[float, Field(strict=True)], Annotated[float, Field(strict=True)]]
 
 
@@ -26,11 +27,14 @@ class Section(BaseModel):
 
 
 class Signal(Section):
-    """A generated initial control. Amplitudes and offsets in the actuator's unit, one number or one per actuator by name."""
+    """A generated initial control. Amplitudes and offsets in the actuator's unit, one number or one per actuator by name.
+
+    offset: default: the keyframe's control, else 0
+    """
 
     kind: Literal["constant", "sine", "chirp", "multisine"]
     amplitude: Finite | dict[str, Finite] = 1.0
-    offset: Finite | dict[str, Finite] = 0.0
+    offset: Finite | dict[str, Finite] | None = None
     frequency: Positive = 0.5
     frequency_end: Positive | None = None
     harmonics: Annotated[int, Field(ge=1)] = 5
@@ -68,21 +72,42 @@ class TargetSpec(Section):
 
 
 class ParameterSpec(Section):
-    """One unknown parameter."""
+    """One unknown parameter, or with `inertial` the ten of a body's inertia.
+
+    target, targets: what it drives;  function: `f(spec, value)` that edits an MjSpec instead (in Python only)
+    inertial: name of a body, whose ten coordinates become parameters `<this name>.<coordinate>`
+    coordinates: of an inertial, logcholesky (default, always physical) or barycentric (the dynamics are linear in them)
+    nuisance: unknown, but the design need not find it out;  wanted: standard deviation aimed at, in the parameter's unit
+    """
 
     target: str | None = None
     targets: tuple[TargetSpec, ...] = ()
+    function: SkipValidation[Callable[[Any, float], None]] | None = None
+    inertial: str | None = None
+    coordinates: Literal["logcholesky", "barycentric"] | None = None
     guess: Finite | None = None
     true: Finite | None = None
     bounds: Range | None = None
-    scale: Positive | Literal["guess"] = "guess"
+    scale: Positive | Literal["guess"] | None = None
     prior: Positive | None = None
     unit: str = ""
+    nuisance: bool = False
+    wanted: Positive | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> ParameterSpec:
-        if (self.target is None) == (not self.targets):
-            raise ValueError("give exactly one of target and targets")
+        sources = (self.target is not None, bool(self.targets), self.function is not None, self.inertial is not None)
+        if sum(sources) != 1:
+            raise ValueError("give exactly one of target and targets, or inertial (in Python also function)")
+        if self.function is not None and (not callable(self.function) or self.guess is None):
+            raise ValueError("function must be callable, f(spec, value), and needs a guess")
+        if self.inertial is not None:
+            one = [key for key in ("guess", "true", "bounds", "wanted") if getattr(self, key) is not None]
+            one += [key for key in ("unit", "scale") if getattr(self, key) not in ("", None, "guess")]
+            if one:
+                raise ValueError(f"inertial stands for ten parameters; {', '.join(one)} would fit only one")
+        elif self.coordinates is not None:
+            raise ValueError("coordinates belongs to inertial")
         if self.bounds is not None:
             low, high = self.bounds
             if not low < high:
@@ -95,18 +120,84 @@ class ParameterSpec(Section):
     @property
     def all_targets(self) -> tuple[TargetSpec, ...]:
         """The targets, however they were written."""
-        return self.targets or (TargetSpec(path=self.target or ""),)
+        return self.targets or (() if self.target is None else (TargetSpec(path=self.target),))
+
+
+Matrix = tuple[tuple[Finite, ...], ...]
+
+
+class NoiseSpec(Section):
+    """Noise of one output or of a sensor's components: 1 sigma (one number or one per component) or a full covariance.
+
+    rate: [Hz] at which it is measured, divides the experiment's rate; default: measure_rate
+    """
+
+    sigma: Positive | tuple[Positive, ...] | None = None
+    covariance: Matrix | None = None
+    rate: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> NoiseSpec:
+        if (self.sigma is None) == (self.covariance is None):
+            raise ValueError("give exactly one of sigma and covariance")
+        return self
+
+
+class Correlated(Section):
+    """Full covariance of several outputs that are measured together; it replaces their sigma."""
+
+    outputs: Annotated[tuple[str, ...], Field(min_length=2)]
+    covariance: Matrix
+
+
+class Nuisance(Section):
+    """Unknowns that every experiment has and nobody asks for. Values: prior standard deviation, or true where unknown.
+
+    initial: deviation of the start, of all of qpos and qvel or by `qpos:<joint>`, `qvel:<joint>`
+    bias: constant bias, of all outputs or by name;  delay: [s] by which all outputs lag
+    """
+
+    initial: Unknown | dict[str, Unknown] | None = None
+    bias: Unknown | dict[str, Unknown] | None = None
+    delay: Unknown | None = None
+
+
+class Robust(Section):
+    """Design for a wrong guess: pool the criterion over samples of the parameters (priors, else bounds)."""
+
+    over: Literal["mean", "worst"] = "mean"
+    samples: Annotated[int, Field(ge=2)] = 6
+    seed: Annotated[int, Field(ge=0)] = 0
 
 
 class Cost(Section):
-    """Weights of eq. 3 and where it is evaluated. control: R_tau; tracking, tracking_velocity: Q_tau by joint name."""
+    """Weights of eq. 3 and where it is evaluated. control: R_tau; tracking, tracking_velocity: Q_tau by joint name.
 
-    criterion: Literal["E", "A", "D"] = "E"
+    control_about: control that costs nothing, one number or by actuator; default: the keyframe's control, else 0
+    combination: for criterion c, coefficients by parameter: the variance of their sum is minimised
+    subset: for criterion c, parameters whose relative variances (in units of their scales) are summed
+    """
+
+    criterion: Literal["E", "A", "D", "c"] = "E"
+    combination: dict[str, Finite] | None = None
+    subset: tuple[str, ...] | None = None
     information: Positive = 1.0
     control: Positive | dict[str, Positive] = 1e-3
+    control_about: Finite | dict[str, Finite] | None = None
     tracking: dict[str, NonNegative] = {}
     tracking_velocity: dict[str, NonNegative] = {}
     linearize_at: Literal["guess", "true"] = "guess"
+
+    @model_validator(mode="after")
+    def _contrast(self) -> Cost:
+        given = (self.combination is not None) + (self.subset is not None)
+        if given != (self.criterion == "c"):
+            raise ValueError(
+                'criterion = "c" takes exactly one of combination and subset, no other criterion takes one'
+            )
+        if self.combination is not None and not any(self.combination.values()):
+            raise ValueError("combination has no coefficient other than 0")
+        return self
 
 
 class Descent(Section):
@@ -141,7 +232,10 @@ class Limits(Section):
 
 
 class Experiment(Section):
-    """An experiment. Relative paths inside are relative to `directory`, the folder of the experiment file."""
+    """An experiment. Relative paths inside are relative to `directory`, the folder of the experiment file.
+
+    earlier: design.json or estimate.json files of experiments whose information adds to this one's
+    """
 
     model: str
     rate: Positive
@@ -149,8 +243,12 @@ class Experiment(Section):
     horizon: Positive
     initial: Initial
     parameters: Annotated[dict[str, ParameterSpec], Field(min_length=1)]
-    noise: dict[str, Positive] = {}
+    noise: dict[str, Positive | NoiseSpec] = {}
+    correlated: tuple[Correlated, ...] = ()
+    nuisance: Nuisance = Nuisance()
+    earlier: tuple[str, ...] = ()
     cost: Cost = Cost()
+    robust: Robust | None = None
     descent: Descent = Descent()
     limits: Limits = Limits()
     directory: Path = Field(default=Path("."), exclude=True)
@@ -175,6 +273,12 @@ class Experiment(Section):
         for reserved in ("directory", "source"):
             if reserved in values:
                 raise ExperimentError(f"{path}: {unknown('key', reserved, file_keys())}")
+        tables = values.get("parameters")
+        for name, table in (tables if isinstance(tables, dict) else {}).items():
+            if isinstance(table, dict) and "function" in table:
+                raise ExperimentError(
+                    f"{path}: parameters.{name}.function: a function is given in Python, not in a file"
+                )
         return Experiment(**values, directory=path.parent, source=str(path))
 
     def replace(self, **tables: Any) -> Experiment:
@@ -231,7 +335,15 @@ def _sentence(faults: list[Any]) -> str:
 def _is_branch(part: object) -> bool:
     """pydantic names the branch of a union inside the location; the user never wrote that."""
     text = str(part)
-    return "[" in text or text in ("Signal", "str", "float", "constrained-float", "tuple")
+    return "[" in text or text in (
+        "Signal",
+        "NoiseSpec",
+        "str",
+        "float",
+        "constrained-float",
+        "constrained-int",
+        "tuple",
+    )
 
 
 def _valid_keys(location: list[Any]) -> list[str]:
@@ -244,10 +356,14 @@ def _valid_keys(location: list[Any]) -> list[str]:
         "descent": Descent,
         "limits": Limits,
         "parameters": ParameterSpec,
+        "noise": NoiseSpec,
+        "correlated": Correlated,
+        "nuisance": Nuisance,
+        "robust": Robust,
     }
     table = tables.get(str(location[0]))
     if "control" in [str(p) for p in location[1:]] and table is Initial:
         table = Signal
     if "targets" in [str(p) for p in location]:
         table = TargetSpec
-    return list(table.model_fields) if table else []
+    return [key for key in table.model_fields if key != "function"] if table else []

@@ -1,152 +1,137 @@
-"""Fisher information of the measured samples, its optimality criteria, and the gradient by one adjoint sweep.
+"""Fisher information of the measured samples, what of it the criterion sees, and the gradient by one adjoint sweep.
 
-    I = I_prior + sum_k G_k' Sigma^-1 G_k        (measured samples)
-    phi = Q_p / lambda_min(S I S / f_m)          E-optimality; S = diag(scale), f_m the measurement rate
+    I   = I_prior + sum_k G_k' Sigma^-1 G_k            (measured samples)
+    I~  = S I S / f_m                                  S = diag(scale), f_m the measurement rate
+    R   = T' (I~_tt - I~_tn I~_nn^+ I~_nt) T           t wanted, n nuisance parameters, T the identifiable combinations
+    phi = Q_p / lambda_min(R)                          E-optimality
 
-With `M = dphi/dI = sum_r m_r w_r w_r'` the variation of phi is `sum_k tr V_k' dG_k`, `V_k = 2 Sigma^-1 G_k M`. psi is
+With `P = T' [1, -I~_tn I~_nn^+]`, `dR = P dI~ P'`, so a derivative `sum_r m_r w_r w_r'` by R is one by I~ with directions P'w.
+The variation of phi is then `sum_k tr V_k' dG_k`, `V_k = 2 Sigma^-1 G_k M`. psi is
 eliminated by the adjoint `Lambda_k = A_k' Lambda_{k+1} + C_k' V_k = sum_r l^r_k w_r'`; what is left is the derivative of
 `l' DF[psi w, w] + v' Dh[psi w, w]` by (x, u): r directions, not p.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.errors import UnidentifiableError
+from mjfim.criteria import CRITERIA, SINGULAR, Criterion, c_optimality, smooth_e_optimality
 from mjfim.lq import Recursion
+from mjfim.noise import Noise
 from mjfim.plant import Bilinear
 from mjfim.trajectory import Array, Sensitivity
 
-SINGULAR = 1e-12
-# A direction known worse than this many times the parameters' own size is told as not excited at all.
-BLIND = 1e4
-
-
-@dataclass(frozen=True, eq=False)
-class Criterion:
-    """Value of phi and its derivative `M = sum_r weights_r directions_r directions_r'`.
-
-    weights: (r,);  directions: (r, p);  eigenvalues: (p,) ascending
-    """
-
-    value: float
-    weights: Array
-    directions: Array
-    eigenvalues: Array
-
-
-def e_optimality(information: Array) -> Criterion:
-    """`1 / lambda_min`, by Nelson's formula. information: (p, p)."""
-    values, vectors = np.linalg.eigh(information)
-    if not values[0] > SINGULAR * values[-1]:
-        return Criterion(np.inf, np.zeros(1), vectors[:, :1].T, values)
-    return Criterion(float(1.0 / values[0]), np.array([-(values[0] ** -2)]), vectors[:, :1].T, values)
-
-
-def a_optimality(information: Array) -> Criterion:
-    """`trace I^-1`."""
-    values, vectors = np.linalg.eigh(information)
-    if not values[0] > SINGULAR * values[-1]:
-        return Criterion(np.inf, np.zeros(len(values)), vectors.T, values)
-    return Criterion(float(np.sum(1.0 / values)), -(values**-2), vectors.T, values)
-
-
-def d_optimality(information: Array) -> Criterion:
-    """`-log det I`."""
-    values, vectors = np.linalg.eigh(information)
-    if not values[0] > SINGULAR * values[-1]:
-        return Criterion(np.inf, np.zeros(len(values)), vectors.T, values)
-    return Criterion(float(-np.sum(np.log(values))), -1.0 / values, vectors.T, values)
-
-
-CRITERIA: dict[str, Callable[[Array], Criterion]] = {"E": e_optimality, "A": a_optimality, "D": d_optimality}
-
-
-def standard_deviations(information: Array) -> Array:
-    """(p,) Cramer-Rao standard deviations; infinite where the information is singular."""
-    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    if values[0] <= 1e-14 * values[-1]:
-        return np.full(len(scale), np.inf)
-    return np.asarray(np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)
+ESTIMABLE = 1e-6  # squared share of a parameter outside the identifiable combinations that still counts as round-off
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
     """Turns sensitivities into Fisher information and the criterion into its gradient.
 
-    sigma: (ny,) noise;  stride: every stride-th sample is measured (k = 0, the known start, is not)
-    measure_rate: [Hz];  scale: (p,);  prior: (p, p);  weight: Q_p
+    noise: of the outputs;  measure_rate: [Hz];  scale: (p,);  prior: (p, p);  weight: Q_p
+    interest: indices of the t wanted parameters (None: all); the others are nuisance, removed by the Schur complement
+    basis: (t, s) orthonormal, the identifiable combinations of the scaled wanted parameters (None: all of them)
+    contrast: (t, c) combinations of the scaled wanted parameters whose variance criterion "c" sums
+    power: of the smooth E-criterion, infinite for 1/lambda_min itself
     """
 
-    sigma: Array
-    stride: int
+    noise: Noise
     measure_rate: float
     scale: Array
     prior: Array
     criterion: str = "E"
     weight: float = 1.0
-
-    def measured(self, N: int) -> Array:
-        """(N+1,) 1 where a sample is measured, else 0."""
-        mask = np.zeros(N + 1)
-        mask[self.stride :: self.stride] = 1.0
-        return mask
+    interest: np.ndarray | None = None
+    basis: Array | None = None
+    contrast: Array | None = None
+    power: float = np.inf
 
     def matrix(self, sensitivity: Sensitivity) -> Array:
         """(p, p) sum over the measured samples, prior included [1 / (theta_i theta_j unit)]."""
-        G = sensitivity.G[self.stride :: self.stride] / self.sigma[:, None]
-        flat = G.reshape(-1, G.shape[-1])
+        flat = self.noise.rows(sensitivity.G)
         return np.asarray(flat.T @ flat + self.prior)
 
     def accumulated(self, sensitivity: Sensitivity) -> Array:
-        """(N+1,) smallest eigenvalue of the scaled information per second, accumulated up to each sample."""
-        N = len(sensitivity.G) - 1
-        G = sensitivity.G / self.sigma[:, None] * self.scale
-        blocks = np.einsum("kyi,kyj->kij", G, G) * self.measured(N)[:, None, None]
-        total = np.cumsum(blocks, axis=0) + self.prior * np.outer(self.scale, self.scale)
-        return np.asarray(np.maximum(np.linalg.eigvalsh(total / self.measure_rate)[:, 0], 0.0))
+        """(N+1,) smallest eigenvalue of what the criterion sees, accumulated up to each sample."""
+        G = self.noise.whiten(sensitivity.G) * self.noise.measured(len(sensitivity.G) - 1)[..., None]
+        total = np.cumsum(np.swapaxes(G, 1, 2) @ G, axis=0) + self.prior
+        return np.array([max(float(np.linalg.eigvalsh(self.reduced(each)[0])[0]), 0.0) for each in total])
 
     def scaled(self, information: Array) -> Array:
-        """`S I S / f_m`, what the cost sees."""
+        """`S I S / f_m`."""
         return np.asarray(information * np.outer(self.scale, self.scale) / self.measure_rate)
+
+    def reduced(self, information: Array) -> tuple[Array, Array]:
+        """R: (s, s), what the criterion sees of an information matrix, and P: (s, p) with `dR = P dI~ P'`."""
+        scaled = self.scaled(information)
+        p = len(scaled)
+        t = np.arange(p) if self.interest is None else self.interest
+        n = np.setdiff1d(np.arange(p), t)
+        P = np.eye(p)[t]
+        if len(n):
+            P[:, n] = -scaled[np.ix_(t, n)] @ np.linalg.pinv(scaled[np.ix_(n, n)], rcond=1e-13, hermitian=True)
+        if self.basis is not None:
+            P = self.basis.T @ P
+        R = P @ scaled @ P.T
+        return 0.5 * (R + R.T), P
 
     def evaluate(self, information: Array) -> Criterion:
         """Criterion of an information matrix, times Q_p; directions w are in raw parameter units."""
-        raw = CRITERIA[self.criterion](self.scaled(information))
-        return Criterion(
-            self.weight * raw.value, self.weight * raw.weights, raw.directions * self.scale, raw.eigenvalues
-        )
+        R, P = self.reduced(information)
+        raw = self._criterion(R)
+        directions = raw.directions @ P * self.scale
+        return Criterion(self.weight * raw.value, self.weight * raw.weights, directions, raw.eigenvalues)
 
-    def require_identifiable(self, information: Array, names: tuple[str, ...], size: Array) -> None:
-        """Raise UnidentifiableError naming the direction of theta that the trajectory cannot see.
+    def _criterion(self, R: Array) -> Criterion:
+        if self.criterion == "E" and np.isfinite(self.power):
+            return smooth_e_optimality(R, self.power)
+        if self.criterion == "c":
+            if self.contrast is None:
+                raise ValueError("criterion c needs a contrast")
+            return c_optimality(R, self.contrast if self.basis is None else self.basis.T @ self.contrast)
+        return CRITERIA[self.criterion](R)
 
-        size: (p,) magnitudes of the parameters
-        """
-        values, vectors = np.linalg.eigh(information * np.outer(size, size))
-        if values[0] > max(SINGULAR * values[-1], BLIND**-2):
-            return
-        direction = vectors[:, 0] * size
-        direction = direction / np.abs(direction).max()
-        terms = [f"{value:+.3g} {name}" for name, value in zip(names, direction, strict=True) if abs(value) > 1e-3]
-        smallest = max(float(np.linalg.eigvalsh(self.scaled(information))[0]), 0.0)
-        blind = values <= max(SINGULAR * values[-1], BLIND**-2)
-        others = f", nor along any other of {', '.join(names)}" if blind.all() and len(names) > 1 else ""
-        raise UnidentifiableError(
-            f"the start excites nothing along the parameter direction {' '.join(terms)}{others} "
-            f"(lambda_min = {smallest:.3g}); start from a control "
-            "that moves those parameters' joints, and check that the targets matter"
-        )
+    def covariance(self, information: Array) -> Array:
+        """(t, t) Cramer-Rao covariance of the wanted parameters; NaN where one is no identifiable combination by itself."""
+        t = np.arange(len(information)) if self.interest is None else self.interest
+        basis = np.eye(len(t)) if self.basis is None else self._with_prior(self.basis, t)
+        if not basis.shape[1]:
+            return np.full((len(t), len(t)), np.nan)
+        R, _ = replace(self, basis=basis).reduced(information)
+        size = np.sqrt(np.maximum(np.diag(R), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(R / np.outer(size, size))
+        if values[0] <= SINGULAR * values[-1]:
+            return np.full((len(t), len(t)), np.nan)
+        known = basis @ (vectors / size[:, None])
+        covariance = (known / values) @ known.T * np.outer(self.scale[t], self.scale[t]) / self.measure_rate
+        alone = 1.0 - np.sum(basis**2, axis=1) < ESTIMABLE
+        return np.where(np.outer(alone, alone), covariance, np.nan)
+
+    def std(self, information: Array) -> Array:
+        """(p,) Cramer-Rao standard deviations; infinite for parameters that are no identifiable combination by themselves."""
+        if self.basis is None:
+            return standard_deviations(information)
+        std = np.full(len(information), np.inf)
+        t = np.arange(len(information)) if self.interest is None else self.interest
+        std[t] = np.nan_to_num(np.sqrt(np.diag(self.covariance(information))), nan=np.inf)
+        return std
+
+    def _with_prior(self, basis: Array, t: np.ndarray) -> Array:
+        """The identifiable combinations and those that the prior tells."""
+        rest = np.linalg.qr(basis, mode="complete")[0][:, basis.shape[1] :]
+        told, vectors = np.linalg.eigh(rest.T @ self.scaled(self.prior)[np.ix_(t, t)] @ rest)
+        return np.concatenate([basis, rest @ vectors[:, told > ESTIMABLE * told.max(initial=0.0)]], axis=1)
 
     def _rays(self, criterion: Criterion, sensitivity: Sensitivity) -> Array:
         """v: (r, N+1, ny) with `V_k = sum_r v^r_k w_r'`, zero where nothing is measured."""
-        mask = self.measured(len(sensitivity.G) - 1)[:, None]
+        mask = self.noise.measured(len(sensitivity.G) - 1)
         scale = 2.0 * criterion.weights / self.measure_rate
         Gw = np.einsum("kyp,rp->rky", sensitivity.G, criterion.directions)
-        return np.asarray(scale[:, None, None] * Gw / self.sigma**2 * mask)
+        if self.noise.correlated:
+            return np.asarray(scale[:, None, None] * ((Gw * mask) @ self.noise.precision))
+        return np.asarray(scale[:, None, None] * Gw / self.noise.sigma**2 * mask)
 
     def gradient(self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear) -> tuple[Array, Array]:
         """(a, b): derivative of phi by x_k (N+1, nx) and u_k (N, nu), psi eliminated by the adjoint."""
@@ -154,10 +139,13 @@ class Information:
         recursion = Recursion(bilinear.A)
         total = np.zeros((len(bilinear.A) + 1, nx + bilinear.B.shape[2]))
         for r, v in enumerate(self._rays(criterion, sensitivity)):
-            costate = recursion.adjoint(np.einsum("kyx,ky->kx", bilinear.C, v))
+            own = v if bilinear.lag is None else bilinear.lag.apply_transposed(v)
+            costate = recursion.adjoint(np.einsum("kyx,ky->kx", bilinear.C, own))
             total[:-1] += np.einsum("kzx,kx->kz", bilinear.F_mixed[r], costate[1:])
             if bilinear.h_mixed is not None:
-                total += np.einsum("kzy,ky->kz", bilinear.h_mixed[r], v)
+                total += np.einsum("kzy,ky->kz", bilinear.h_mixed[r], own)
+            if bilinear.lag is not None and bilinear.delay is not None:
+                total += _delayed(bilinear, v * float(bilinear.delay @ criterion.directions[r]))
         total[-2, nx:] += total[-1, nx:]  # the last control is held for the outputs of the last sample
         return total[:, :nx], total[:-1, nx:]
 
@@ -168,8 +156,28 @@ class Information:
         """
         V = np.einsum("rky,rp->kyp", self._rays(criterion, sensitivity), criterion.directions)
         nx = full.A.shape[1]
+        own = V if full.lag is None else full.lag.apply_transposed(V)
         direct = np.zeros((len(V), nx + full.B.shape[2]))
         if full.h_mixed is not None:
-            direct = np.einsum("pkzy,kyp->kz", full.h_mixed, V)
-            direct[-2, nx:] += direct[-1, nx:]
-        return np.einsum("kyx,kyp->kxp", full.C, V), direct[:, :nx], direct[:-1, nx:]
+            direct = np.einsum("pkzy,kyp->kz", full.h_mixed, own)
+        if full.lag is not None and full.delay is not None:
+            direct += _delayed(full, V @ full.delay)
+        direct[-2, nx:] += direct[-1, nx:]
+        return np.einsum("kyx,kyp->kxp", full.C, own), direct[:, :nx], direct[:-1, nx:]
+
+
+def _delayed(bilinear: Bilinear, v: Array) -> Array:
+    """Derivative by (x, u): (N+1, nx+nu) of `sum_k v_k' dy_k/d(delay)`, linear in the outputs themselves."""
+    if bilinear.lag is None:
+        raise ValueError("nothing delays the outputs")
+    e = bilinear.lag.rate_transposed(v)
+    return np.concatenate([np.einsum("kyx,ky->kx", bilinear.C, e), np.einsum("kyu,ky->ku", bilinear.D, e)], axis=1)
+
+
+def standard_deviations(information: Array) -> Array:
+    """(p,) Cramer-Rao standard deviations; infinite where the information is singular."""
+    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if values[0] <= 1e-14 * values[-1]:
+        return np.full(len(scale), np.inf)
+    return np.asarray(np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)

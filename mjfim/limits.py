@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,14 +66,17 @@ def _rows(kind: str, table: Mapping[str, Range], index: Mapping[str, int]) -> li
     return [Limit(kind, name, index[name], float(low), float(high)) for name, (low, high) in table.items()]
 
 
-def saturated(model: Any, trajectory: Trajectory) -> tuple[str, ...]:
-    """Names of actuators whose force is clamped by forcerange at some sample. model: at the design's theta."""
+def saturated(model: Any, trajectory: Trajectory, samples: Iterable[int] | None = None) -> tuple[str, ...]:
+    """Names of actuators whose force is clamped by forcerange at some sample (of those given).
+
+    model: at the design's theta
+    """
     limited = np.flatnonzero(model.actuator_forcelimited)
     if not len(limited):
         return ()
     data, hit = mujoco.MjData(model), np.zeros(model.nactuator, dtype=bool)
     low, high = model.actuator_forcerange.T
-    for k in range(trajectory.samples):
+    for k in range(trajectory.samples) if samples is None else samples:
         data.qpos[:], data.qvel[:], data.act[:] = trajectory.qpos[k], trajectory.qvel[k], trajectory.act[k]
         data.ctrl[:] = trajectory.ctrl[k]
         mujoco.mj_forward(model, data)

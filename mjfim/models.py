@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ModelError
+
+KEPT = 512  # compiled variants
 
 
 def load_spec(path: Path) -> Any:
@@ -63,21 +65,66 @@ def control_names(model: Any) -> tuple[str, ...]:
     return tuple(names)
 
 
-def private_model(spec: Any, path: Path, moved: Iterable[str], sensors: bool, friction: bool) -> Any:
-    """A compiled copy for stepping: work that cannot matter is off, bodies that move inside are not 'simple'.
+def decoration(spec: Any, model: Any) -> frozenset[str]:
+    """Names of geoms that neither collide nor give their body its inertia: their size and place move nothing else."""
+    forced = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    return frozenset(
+        geom.name
+        for geom in spec.geoms
+        if geom.name
+        and geom.name not in paired
+        and not (model.geom_contype[geom.id] or model.geom_conaffinity[geom.id])
+        and not geom.fluid_ellipsoid
+        and (geom.mass == 0.0 or (geom.parent.explicitinertial and not forced))
+        and not geom.meshname
+    )
 
-    moved: bodies whose inertial frame parameters change;  sensors: whether sensor data is wanted
+
+class Source:
+    """Where the private copies of a model come from: work that cannot matter is off, bodies that move inside are not 'simple'.
+
+    moved: bodies whose inertial frame parameters change, None: any of them may;  sensors: whether sensor data is wanted
     friction: whether a parameter is a frictionloss (the constraint solver must then stay on)
+    coarsen: how many times longer than stated the timestep is
     """
-    own = spec.copy()
-    for name in moved:
-        own.body(name).simple = 0
-    model = compile_spec(own, path)
-    if not sensors:
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
-    if not friction and unconstrained(model):
-        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    return model
+
+    def __init__(
+        self, spec: Any, path: Path, moved: Collection[str] | None, sensors: bool, friction: bool, coarsen: int = 1
+    ) -> None:
+        self._spec, self._path = spec.copy(), path
+        for body in self._spec.bodies[1:]:
+            if moved is None or body.name in moved:
+                body.simple = 0
+        self._sensors, self._friction, self._coarsen = sensors, friction, coarsen
+        self.model = self._compile(self._spec)
+        self._edited: dict[bytes, Any] = {}
+
+    def edited(self, key: bytes, edit: Callable[[Any], None]) -> Any:
+        """The model of an edited spec, kept under a key. Raises ModelError where it no longer compiles or fits."""
+        if key not in self._edited:
+            if len(self._edited) > KEPT:
+                self._edited.clear()
+            own = self._spec.copy()
+            edit(own)
+            model = self._compile(own)
+            for size in ("nq", "nv", "na", "nu", "nbody", "nsensordata"):
+                if getattr(model, size) != getattr(self.model, size):
+                    raise ModelError(
+                        f"{self._path}: a parameter changes {size} of the model from {getattr(self.model, size)} to "
+                        f"{getattr(model, size)}; it may change numbers only"
+                    )
+            self._edited[key] = model
+        return self._edited[key]
+
+    def _compile(self, spec: Any) -> Any:
+        model = compile_spec(spec, self._path)
+        if not self._sensors:
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        if not self._friction and unconstrained(model):
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        model.opt.timestep *= self._coarsen
+        return model
 
 
 def unconstrained(model: Any) -> bool:

@@ -20,6 +20,7 @@ from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.estimate import Fit, newton_raphson, trust_region
 from mjfim.experiment import Experiment
 from mjfim.setup import Setup
+from mjfim.survey import require_visible
 from mjfim.trajectory import Array, Recording, Study, Trajectory, TrialSet
 
 CONVERGED = 0.03
@@ -37,10 +38,10 @@ def simulate(experiment: Experiment | Setup, trajectory: Trajectory, seed: int |
     y, finite = setup.plant.measure(setup.parameters.true[None], trajectory.ctrl)
     if not finite[0]:
         raise SimulationDiverged("the simulation diverges at the true parameters under this control")
-    noisy = y[0] + setup.outputs.sigma * rng.standard_normal(y[0].shape)
-    unmeasured = np.ones(len(noisy), dtype=bool)
-    unmeasured[:: setup.stride] = False
-    noisy[unmeasured] = np.nan
+    noisy = y[0] + setup.noise.sample(len(y[0]), rng)
+    measured = setup.noise.measured(trajectory.samples)
+    measured[0] = 1.0
+    noisy[measured == 0.0] = np.nan
     return Recording(
         np.arange(len(noisy), dtype=np.float64) * setup.dt, trajectory.ctrl, noisy, setup.outputs.names, "simulated"
     )
@@ -100,19 +101,21 @@ class Shared:
 class Trials:
     """Many repetitions of one control with their own noise. measured: (m, n) whitened measurements of all trials."""
 
-    def __init__(self, setup: Setup, ctrl: Array, measured: Array, rows: np.ndarray) -> None:
-        self.setup, self.ctrl, self.measured, self.rows = setup, ctrl, measured, rows
+    def __init__(self, setup: Setup, ctrl: Array, measured: Array) -> None:
+        self.setup, self.ctrl, self.measured = setup, ctrl, measured
 
     def outputs(self, theta: Array) -> tuple[Array, np.ndarray]:
         """Whitened predictions (m, n) at theta: (m, p), and which of them are finite."""
         y, finite = self.setup.plant.measure(theta, self.ctrl)
-        return (y[:, self.rows] / self.setup.outputs.sigma).reshape(len(theta), -1), finite
+        return self.setup.noise.rows(np.moveaxis(y, 0, -1)).T, finite
 
     def recording(self, measured: Array) -> Recording:
         """One trial, (n,) whitened, as a recording."""
-        sigma = self.setup.outputs.sigma
-        y = np.full((len(self.ctrl) + 1, len(sigma)), np.nan)
-        y[self.rows] = measured.reshape(len(self.rows), -1) * sigma
+        noise = self.setup.noise
+        mask = noise.measured(len(self.ctrl)) > 0
+        y = np.zeros(mask.shape)
+        y[mask] = measured
+        y = np.where(mask, y @ noise.factor.T, np.nan)
         return Recording(
             np.arange(len(y), dtype=np.float64) * self.setup.dt, self.ctrl, y, self.setup.outputs.names, "trial"
         )
@@ -132,18 +135,16 @@ def _trial_set(
     setup: Setup, curve: Trajectory, count: int, rng: np.random.Generator, tell: Callable[[float], None] | None
 ) -> tuple[TrialSet, Array]:
     clock = time.perf_counter()
-    truth, sigma = setup.parameters.true, setup.outputs.sigma
-    rows = np.arange(setup.stride, curve.samples + 1, setup.stride)
     y, G = _exact(setup, curve)
-    J = (G[rows] / sigma[:, None]).reshape(-1, len(truth))
+    J = setup.noise.rows(G)
     information = np.asarray(J.T @ J)
-    setup.information.require_identifiable(information, setup.parameters.names, setup.parameters.step)
+    require_visible(setup, J)
     estimates = []
     chunk = max(64, int(CHUNK_BYTES / (8 * J.size)))
     for first in range(0, count, chunk):
         m = min(chunk, count - first)
-        whitened = (y[rows] / sigma).reshape(-1) + rng.standard_normal((m, J.shape[0]))
-        trials = Trials(setup, curve.ctrl, whitened, rows)
+        whitened = setup.noise.rows(y) + rng.standard_normal((m, J.shape[0]))
+        trials = Trials(setup, curve.ctrl, whitened)
         estimates.append(_solve(trials, _shared(setup, trials), tell))
     every = np.concatenate(estimates)
     return _statistics(every, np.asarray(np.linalg.inv(information)), time.perf_counter() - clock), information
@@ -161,13 +162,13 @@ def _shared(setup: Setup, trials: Trials) -> Shared:
     """Fit of the mean measurement from the guess, with its Jacobian and the Jacobian's derivative."""
     fit = Fit(setup, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
     theta = newton_raphson(fit, setup.parameters.guess).theta
-    sigma, h = setup.outputs.sigma, 1e-3 * setup.parameters.step
+    h = 1e-3 * setup.parameters.step
 
     def jacobian(at: Array) -> Array:
         predicted = setup.plant.predict(at, trials.ctrl)
         if predicted is None:
             raise SimulationDiverged("the simulation diverges near the fit of the mean measurement")
-        return np.asarray((predicted[1][trials.rows] / sigma[:, None]).reshape(-1, len(at)))
+        return setup.noise.rows(predicted[1])
 
     J = jacobian(theta)
     bend = np.stack([(jacobian(theta + e) - jacobian(theta - e)) / (2 * e.max()) for e in np.diag(h)])
@@ -186,7 +187,7 @@ def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None)
             tell((k + 1) / (SHARED_STEPS + 3))
     active = np.arange(m)
     for k in range(OWN_STEPS):
-        own = Trials(trials.setup, trials.ctrl, trials.measured[active], trials.rows)
+        own = Trials(trials.setup, trials.ctrl, trials.measured[active])
         predicted, finite = own.outputs(theta[active])
         step = _gauss_newton(own.jacobian(theta[active], predicted), own.measured - predicted)
         step[~finite] = np.nan

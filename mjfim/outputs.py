@@ -1,12 +1,14 @@
-"""Measured outputs: which components of the state and which sensors are recorded, and with what noise."""
+"""Measured outputs: which components of the state and which sensors are recorded."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from mjfim.tangent import StateSpace, quaternion_product
 from mjfim.trajectory import Array
 
 
@@ -15,7 +17,8 @@ class Output:
     """One measured scalar.
 
     name: column name in recordings;  sigma: 1-sigma noise in its unit
-    state: tangent-space index of a measured state component, or None;  sensor: address in sensordata, or None
+    state: address in the state vector (qpos, qvel, act) of a measured component, or None
+    sensor: address in sensordata, or None
     """
 
     name: str
@@ -27,28 +30,45 @@ class Output:
 
 @dataclass(frozen=True, eq=False)
 class OutputMap:
-    """The vector `y = h(x, u, theta)`: (ny,) in the order of `outputs`. States here are scalar coordinates, so h is exact."""
+    """The vector `y = h(x, u, theta)`: (ny,) in the order of `outputs`.
+
+    States are scalar coordinates or components of quaternions, for which h and its derivatives are known exactly.
+    """
 
     outputs: tuple[Output, ...]
-    state_rows: np.ndarray
-    state_columns: np.ndarray
-    state_address: np.ndarray
-    sensor_rows: np.ndarray
-    sensor_address: np.ndarray
+    space: StateSpace
 
     @staticmethod
-    def build(outputs: Sequence[Output], address: dict[int, int]) -> OutputMap:
-        """address: tangent index -> index into the state vector (qpos, qvel, act)."""
-        states = [(i, o.state) for i, o in enumerate(outputs) if o.state is not None]
-        sensors = [(i, o.sensor) for i, o in enumerate(outputs) if o.sensor is not None]
-        return OutputMap(
-            tuple(outputs),
-            np.array([i for i, _ in states], np.intp),
-            np.array([s for _, s in states], np.intp),
-            np.array([address[s] for _, s in states], np.intp),
-            np.array([i for i, _ in sensors], np.intp),
-            np.array([s for _, s in sensors], np.intp),
-        )
+    def build(outputs: Sequence[Output], space: StateSpace) -> OutputMap:
+        """Outputs of states laid out by space."""
+        return OutputMap(tuple(outputs), space)
+
+    @cached_property
+    def _states(self) -> np.ndarray:
+        """Rows: output, address in the state vector."""
+        return _table([(i, o.state) for i, o in enumerate(self.outputs) if o.state is not None], 2)
+
+    @cached_property
+    def _sensors(self) -> np.ndarray:
+        """Rows: output, address in sensordata."""
+        return _table([(i, o.sensor) for i, o in enumerate(self.outputs) if o.sensor is not None], 2)
+
+    @cached_property
+    def _scalar(self) -> np.ndarray:
+        """Rows: output, tangent index, of state components that are no quaternion's."""
+        tangent = dict(zip(self.space.scalar_q.tolist(), self.space.scalar_v.tolist(), strict=True))
+        nq, shift = self.space.nq, self.space.nv - self.space.nq
+        plain = [(i, s) for i, s in self._states.T.tolist() if s in tangent or s >= nq]
+        return _table([(i, tangent[s] if s < nq else s + shift) for i, s in plain], 2)
+
+    @cached_property
+    def _turned(self) -> np.ndarray:
+        """Rows: output, component, qpos and dof address of its quaternion."""
+        joints = self.space.quaternions
+        return _table([(i, s - q, q, v) for i, s in self._states.T.tolist() for q, v in joints if q <= s < q + 4], 4)
+
+    def __len__(self) -> int:
+        return len(self.outputs)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -56,27 +76,50 @@ class OutputMap:
         return tuple(o.name for o in self.outputs)
 
     @property
-    def sigma(self) -> Array:
-        """(ny,) standard deviations."""
-        return np.array([o.sigma for o in self.outputs])
-
-    @property
     def needs_sensors(self) -> bool:
         """True where a MuJoCo sensor is among the outputs."""
-        return len(self.sensor_rows) > 0
+        return any(o.sensor is not None for o in self.outputs)
+
+    @property
+    def curved(self) -> bool:
+        """True where components of quaternions are measured, whose second derivative is not zero."""
+        return bool(self._turned.shape[1])
 
     def __call__(self, states: Array, sensors: Array | None) -> Array:
         """(..., ny) from states (..., ns) and sensordata (..., nsensordata)."""
         y = np.empty((*states.shape[:-1], len(self.outputs)))
-        y[..., self.state_rows] = states[..., self.state_address]
+        y[..., self._states[0]] = states[..., self._states[1]]
         if sensors is not None:
-            y[..., self.sensor_rows] = sensors[..., self.sensor_address]
+            y[..., self._sensors[0]] = sensors[..., self._sensors[1]]
         return y
 
-    def tangent(self, dx: Array, dsensors: Array | None) -> Array:
-        """(..., ny) change of the outputs from a tangent step dx (..., nx) and the change of sensordata."""
-        dy = np.empty((*dx.shape[:-1], len(self.outputs)))
-        dy[..., self.state_rows] = dx[..., self.state_columns]
+    def tangent(self, states: Array, dx: Array, dsensors: Array | None) -> Array:
+        """(..., ny) change of the outputs from a tangent step dx (..., nx) at states (..., ns), and that of sensordata."""
+        dy = np.zeros((*dx.shape[:-1], len(self.outputs)))
+        dy[..., self._scalar[0]] = dx[..., self._scalar[1]]
+        for output, component, q, v in self._turned.T:
+            rate = quaternion_product(states[..., q : q + 4], _pure(0.5 * dx[..., v : v + 3]))
+            dy[..., output] = rate[..., component]
         if dsensors is not None:
-            dy[..., self.sensor_rows] = dsensors[..., self.sensor_address]
+            dy[..., self._sensors[0]] = dsensors[..., self._sensors[1]]
         return dy
+
+    def bend(self, states: Array, first: Array, second: Array, dsensors: Array | None) -> Array:
+        """(..., ny) mixed second change of the outputs: along `first`, then `second` from there, both (..., nx)."""
+        dy = np.zeros((*np.broadcast_shapes(first.shape, second.shape)[:-1], len(self.outputs)))
+        for output, component, q, v in self._turned.T:
+            moved = quaternion_product(states[..., q : q + 4], _pure(0.5 * first[..., v : v + 3]))
+            dy[..., output] = quaternion_product(moved, _pure(0.5 * second[..., v : v + 3]))[..., component]
+        if dsensors is not None:
+            dy[..., self._sensors[0]] = dsensors[..., self._sensors[1]]
+        return dy
+
+
+def _table(rows: list[tuple[int, ...]], width: int) -> np.ndarray:
+    """Integer columns of a list of rows that may be empty."""
+    return np.array(rows, np.intp).reshape(-1, width).T
+
+
+def _pure(v: Array) -> Array:
+    """Quaternion without a real part."""
+    return np.concatenate([np.zeros((*v.shape[:-1], 1)), v], axis=-1)

@@ -1,54 +1,49 @@
-"""What can be identified: parameter paths, bounds, scale, prior, and the only writer into a model.
+"""What can be identified: guess, bounds, scale, prior of each unknown, and the only writer into a model.
 
-A path is `kind/name:field[index]` (or `option:field[index]`) with MuJoCo's own field names. Values are written into
-private copies in place, followed by `mj_setConst`; tests hold the result against a recompile.
+Values go into private copies in place, followed by `mj_setConst`; what only a compile can follow (sizes of geoms, functions
+of an MjSpec) is compiled anew. Tests hold one against the other.
 """
 
 from __future__ import annotations
 
 import copy
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError, ModelError
+from mjfim.inertia import CHARTS
+from mjfim.mjcf import write_element
+from mjfim.models import Source
+from mjfim.paths import INERTIAL_FIELDS, PATH, resolve
 from mjfim.quiet import quiet
+from mjfim.slots import AnySlot, BiasSlot, DelaySlot, InertiaSlot, RotationSlot, Slot, SpecSlot, StartSlot, inertial
 from mjfim.trajectory import Array
 
-PATH = re.compile(r"^(?P<kind>\w+)(?:/(?P<name>[^:]+))?:(?P<field>\w+)(?:\[(?P<index>\d+)\])?$")
-
-OBJECTS = {
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "joint": mujoco.mjtObj.mjOBJ_JOINT,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "site": mujoco.mjtObj.mjOBJ_SITE,
-    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
-    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
-}
-COUNTS = {"joint": "njnt", "actuator": "nactuator"}
-
-# Path field -> array of MjModel. A joint's dof fields are written to each of its degrees of freedom.
-FIELDS: dict[str, dict[str, str]] = {
-    "body": {"mass": "body_mass", "pos": "body_pos", "ipos": "body_ipos", "inertia": "body_inertia"},
-    "joint": {
-        "damping": "dof_damping",
-        "frictionloss": "dof_frictionloss",
-        "armature": "dof_armature",
-        "stiffness": "jnt_stiffness",
-        "springref": "qpos_spring",
-    },
-    "actuator": {"gear": "actuator_gear", "gainprm": "actuator_gainprm", "biasprm": "actuator_biasprm"},
-    "geom": {"friction": "geom_friction", "size": "geom_size", "pos": "geom_pos"},
-    "site": {"pos": "site_pos"},
-    "tendon": {"stiffness": "tendon_stiffness", "damping": "tendon_damping", "frictionloss": "tendon_frictionloss"},
-    "option": {"gravity": "gravity"},
-}
-GEOMETRIC = {"pos", "ipos", "inertia", "mass"}
+INERTIAL = {"pos", "ipos", "inertia", "mass", "rot", *INERTIAL_FIELDS}
+Function = Callable[[Any, float], None]
+LAYOUT = (
+    "ngeom",
+    "nsite",
+    "ncam",
+    "nlight",
+    "njnt",
+    "ntendon",
+    "nwrap",
+    "neq",
+    "nmocap",
+    "nM",
+    "nC",
+    "nJmom",
+    "nbvh",
+    "nflex",
+    "nskin",
+)
 
 
 @dataclass(frozen=True)
@@ -66,6 +61,10 @@ class Parameter:
 
     guess: where the design is made;  true: for simulated studies, or None;  bounds: (lower, upper)
     scale: the unit in which information about it is compared with the others;  prior: standard deviation, or None
+    size: its own order of magnitude, to which difference steps are relative; 0 = the guess's, else the scale
+    function: edits an MjSpec in place, `function(spec, theta_j)`, instead of targets
+    nuisance: unknown but not wanted: the design does not spend effort on it;  wanted: standard deviation aimed at, or None
+    group: name of the group that it was declared with, or empty
     """
 
     name: str
@@ -76,141 +75,68 @@ class Parameter:
     scale: float = 1.0
     prior: float | None = None
     unit: str = ""
-
-
-@dataclass(frozen=True)
-class Slot:
-    """A resolved target: rows of one MjModel array, and the column (None for one-dimensional arrays)."""
-
-    array: str
-    rows: tuple[int, ...]
-    column: int | None
-    in_options: bool = False
-
-    def _holder(self, model: Any) -> Any:
-        return getattr(model.opt if self.in_options else model, self.array)
-
-    def read(self, model: Any) -> float:
-        """Current value."""
-        holder = self._holder(model)
-        return float(holder[self.rows[0]] if self.column is None else holder[self.rows[0], self.column])
-
-    def write(self, model: Any, value: float) -> None:
-        """Set the value in place."""
-        holder = self._holder(model)
-        for row in self.rows:
-            if self.column is None:
-                holder[row] = value
-            else:
-                holder[row, self.column] = value
-
-
-def names_of(model: Any, kind: str) -> list[str]:
-    """Names of all objects of a kind that have one."""
-    count = getattr(model, COUNTS.get(kind, f"n{kind}"))
-    names = (mujoco.mj_id2name(model, OBJECTS[kind], i) for i in range(count))
-    return [n for n in names if n]
-
-
-def resolve(model: Any, path: str) -> Slot:
-    """Slot of a path. Raises ExperimentError listing the valid kinds, names, fields or indices."""
-    match = PATH.match(path)
-    if match is None:
-        raise ExperimentError(f"parameter path {path!r} is not of the form kind/name:field[index]")
-    kind, name, field = match["kind"], match["name"], match["field"]
-    index = int(match["index"]) if match["index"] else 0
-    if kind not in FIELDS:
-        raise ExperimentError(f"in parameter path {path!r}: {unknown('kind', kind, FIELDS)}")
-    if field not in FIELDS[kind]:
-        raise ExperimentError(f"in parameter path {path!r}: {unknown(f'{kind} field', field, FIELDS[kind])}")
-    array = FIELDS[kind][field]
-    if kind == "option":
-        return Slot(array, (_checked(path, index, 3),), None, in_options=True)
-    ident = mujoco.mj_name2id(model, OBJECTS[kind], name or "")
-    if ident < 0:
-        raise ExperimentError(f"in parameter path {path!r}: {unknown(kind, name or '', names_of(model, kind))}")
-    holder = getattr(model, array)
-    width = holder.shape[1] if holder.ndim == 2 else 1
-    column = _checked(path, index, width) if holder.ndim == 2 else None
-    if holder.ndim == 1:
-        _checked(path, index, 1)
-    return Slot(array, _rows(model, array, ident, path), column)
-
-
-UNITS = {"mass": "kg", "pos": "m", "ipos": "m", "inertia": "kg m²", "size": "m", "gravity": "m/s²"}
-# per coordinate of a slide and of any other joint
-JOINT_UNITS = {
-    "damping": ("N s/m", "N m s/rad"),
-    "frictionloss": ("N", "N m"),
-    "armature": ("kg", "kg m²"),
-    "stiffness": ("N/m", "N m/rad"),
-    "springref": ("m", "rad"),
-}
-
-
-def unit_of(model: Any, path: str) -> str:
-    """Unit of what a valid path names, empty where it depends on the model (gains, gears, tendons) or has none."""
-    match = PATH.match(path)
-    if match is None:
-        return ""
-    kind, field_name = match["kind"], match["field"]
-    if kind != "joint":
-        return UNITS.get(field_name, "")
-    ident = mujoco.mj_name2id(model, OBJECTS["joint"], match["name"] or "")
-    if ident < 0:
-        return ""
-    slide = int(model.jnt_type[ident]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
-    return JOINT_UNITS[field_name][0 if slide else 1] if field_name in JOINT_UNITS else ""
-
-
-def _checked(path: str, index: int, width: int) -> int:
-    if index >= width:
-        raise ExperimentError(f"in parameter path {path!r}: index {index} is out of range; valid: 0 to {width - 1}")
-    return index
-
-
-def _rows(model: Any, array: str, ident: int, path: str) -> tuple[int, ...]:
-    if array.startswith("dof_"):
-        first = int(model.jnt_dofadr[ident])
-        width = {0: 6, 1: 3}.get(int(model.jnt_type[ident]), 1)
-        return tuple(range(first, first + width))
-    if array == "qpos_spring":
-        if int(model.jnt_type[ident]) < 2:
-            raise ExperimentError(f"in parameter path {path!r}: springref exists on slide and hinge joints only")
-        return (int(model.jnt_qposadr[ident]),)
-    return (ident,)
+    size: float = 0.0
+    function: Function | None = None
+    nuisance: bool = False
+    wanted: float | None = None
+    group: str = ""
 
 
 def moved_bodies(parameters: Sequence[Parameter]) -> set[str]:
     """Names of bodies whose inertial frame a parameter may move (they must not be compiled as 'simple')."""
     matches = [PATH.match(t.path) for p in parameters for t in p.targets]
-    return {m["name"] for m in matches if m and m["kind"] == "body" and m["field"] in GEOMETRIC and m["name"]}
+    return {m["name"] for m in matches if m and m["kind"] == "body" and m["field"] in INERTIAL and m["name"]}
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterSet:
-    """All parameters of an experiment, in the order of theta, resolved against a model."""
+    """All parameters of an experiment, in the order of theta, resolved against a model.
+
+    nominal: (10,) coordinates of every inertia that is written in a chart, by (body, chart), and quaternions by (array, row)
+    """
 
     parameters: tuple[Parameter, ...]
-    slots: tuple[tuple[Slot, ...], ...]
+    slots: tuple[tuple[AnySlot, ...], ...]
+    nominal: dict[tuple[str, int], Array] = field(default_factory=dict)
     _cache: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @staticmethod
-    def build(parameters: Sequence[Parameter], model: Any) -> ParameterSet:
-        """Resolve every target. Raises ExperimentError naming the parameter and the path."""
-        slots: list[tuple[Slot, ...]] = []
-        owner: dict[Slot, str] = {}
+    def build(
+        parameters: Sequence[Parameter],
+        model: Any,
+        outputs: Sequence[str] = (),
+        decoration: Collection[str] = frozenset(),
+    ) -> ParameterSet:
+        """Resolve every target (`paths.resolve`). Raises ExperimentError naming the parameter and the path."""
+        slots: list[tuple[AnySlot, ...]] = []
         for parameter in parameters:
             try:
-                slots.append(tuple(resolve(model, t.path) for t in parameter.targets))
+                slots.append(tuple(resolve(model, t.path, outputs, decoration) for t in parameter.targets))
             except ExperimentError as error:
                 raise ExperimentError(f"parameters.{parameter.name}: {error}") from None
-            for target, slot in zip(parameter.targets, slots[-1], strict=True):
-                if slot in owner:
-                    taken = f"target {target.path!r} already belongs to parameters.{owner[slot]}"
+        slots = _in_charts(parameters, slots)
+        owner: dict[AnySlot, str] = {}
+        written: dict[tuple[str, int, int], str] = {}
+        for parameter, row in zip(parameters, slots, strict=True):
+            for target, slot in zip(parameter.targets, row, strict=True):
+                numbers = slot.numbers if isinstance(slot, Slot) else set()
+                other = owner.get(slot) or next((written[n] for n in numbers if n in written), None)
+                if other is not None:
+                    taken = f"target {target.path!r} already belongs to parameters.{other}"
                     raise ExperimentError(f"parameters.{parameter.name}: {taken}; one number takes one parameter")
                 owner[slot] = parameter.name
-        return ParameterSet(tuple(parameters), tuple(slots))
+                written |= dict.fromkeys(numbers, parameter.name)
+        nominal: dict[tuple[str, int], Array] = {}
+        for slot, name in owner.items():
+            if isinstance(slot, InertiaSlot):
+                try:
+                    slot.read(model)
+                except ExperimentError as error:
+                    raise ExperimentError(f"parameters.{name}: {error}") from None
+                nominal[slot.chart, slot.body] = CHARTS[slot.chart].of(inertial(model, slot.body))
+            elif isinstance(slot, RotationSlot):
+                nominal[slot.array, slot.row] = np.array(getattr(model, slot.array)[slot.row])
+        return ParameterSet(tuple(parameters), tuple(slots), nominal)
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -248,23 +174,97 @@ class ParameterSet:
         """(p,) units of comparison."""
         return self._column(lambda p: p.scale)
 
-    @property
+    @cached_property
     def step(self) -> Array:
         """(p,) magnitude to which finite-difference steps are relative."""
-        return np.where(self.guess != 0.0, np.abs(self.guess), self.scale)
+        return self._column(lambda p: p.size or abs(p.guess) or p.scale)
 
     @property
     def prior_information(self) -> Array:
         """(p, p) information of the stated priors."""
         return np.diag(self._column(lambda p: 0.0 if p.prior is None else p.prior**-2))
 
+    @property
+    def interest(self) -> np.ndarray:
+        """Indices of the parameters that are wanted, i.e. no nuisance."""
+        return np.array([j for j, p in enumerate(self.parameters) if not p.nuisance], dtype=np.intp)
+
+    def _linear(self, rows: int, pick: Callable[[AnySlot], int | None]) -> Array:
+        """(rows, p) matrix of targets that act linearly outside the model."""
+        matrix = np.zeros((rows, len(self)))
+        for j, (parameter, slots) in enumerate(zip(self.parameters, self.slots, strict=True)):
+            for target, slot in zip(parameter.targets, slots, strict=True):
+                row = pick(slot)
+                if row is not None:
+                    matrix[row, j] += target.scale
+        return matrix
+
+    def start(self, nx: int) -> Array:
+        """(nx, p) derivative of the initial state."""
+        return self._linear(nx, lambda slot: slot.tangent if isinstance(slot, StartSlot) else None)
+
+    def bias(self, ny: int) -> Array:
+        """(ny, p) derivative of every output by constant biases."""
+        return self._linear(ny, lambda slot: slot.output if isinstance(slot, BiasSlot) else None)
+
+    @cached_property
+    def delay(self) -> Array:
+        """(p,) derivative of the time by which outputs lag."""
+        return np.asarray(self._linear(1, lambda slot: 0 if isinstance(slot, DelaySlot) else None)[0])
+
+    @cached_property
+    def in_model(self) -> np.ndarray:
+        """(p,) True where a parameter changes the model."""
+        outside = (StartSlot, BiasSlot, DelaySlot)
+        return np.array(
+            [
+                p.function is not None or any(not isinstance(s, outside) for s in slots)
+                for p, slots in zip(self.parameters, self.slots, strict=True)
+            ],
+            dtype=bool,
+        )
+
+    @cached_property
+    def moving(self) -> np.ndarray:
+        """(p,) True where a parameter changes the motion: through the model or the start."""
+        starts = [any(isinstance(s, StartSlot) for s in slots) for slots in self.slots]
+        return np.asarray(self.in_model | np.array(starts, dtype=bool))
+
+    @cached_property
+    def compiled(self) -> np.ndarray:
+        """(p,) True where a change needs a compile."""
+        return np.array(
+            [
+                p.function is not None or any(isinstance(s, SpecSlot) for s in slots)
+                for p, slots in zip(self.parameters, self.slots, strict=True)
+            ],
+            dtype=bool,
+        )
+
     def write(self, model: Any, theta: Array) -> None:
-        """Write theta: (p,) into a model that the caller owns, then recompute MuJoCo's derived constants."""
+        """Write theta: (p,) into a model that the caller owns, in place, then recompute MuJoCo's derived constants.
+
+        What needs a compile is not written here; see `model`.
+        """
+        whole: dict[tuple[str, int], Array] = {}
         for parameter, slots, value in zip(self.parameters, self.slots, theta, strict=True):
             for target, slot in zip(parameter.targets, slots, strict=True):
-                slot.write(model, target.scale * float(value) + target.offset)
-                if slot.array == "body_ipos":
-                    model.body_sameframe[slot.rows[0]] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+                number = target.scale * float(value) + target.offset
+                if isinstance(slot, Slot):
+                    slot.write(model, number)
+                elif isinstance(slot, InertiaSlot):
+                    key = (slot.chart, slot.body)
+                    whole.setdefault(key, np.array(self.nominal[key]))[slot.component] = number
+                elif isinstance(slot, RotationSlot):
+                    whole.setdefault((slot.array, slot.row), np.zeros(3))[slot.component] = number
+        for (kind, row), values in whole.items():
+            if kind in CHARTS:
+                _write_inertia(model, row, kind, values)
+            else:
+                turned = Rotation.from_quat(self.nominal[kind, row], scalar_first=True) * Rotation.from_rotvec(values)
+                getattr(model, kind)[row] = turned.as_quat(scalar_first=True)
+                if kind == "site_quat":
+                    model.site_sameframe[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
         with quiet():
             mujoco.mj_setConst(model, self._scratch(model))
 
@@ -274,8 +274,80 @@ class ParameterSet:
             self._cache["data"] = mujoco.MjData(model)
         return self._cache["data"]
 
-    def model(self, base: Any, theta: Array) -> Any:
-        """A private copy of the base model with theta written into it."""
-        own = copy.copy(base)
+    def model(self, base: Source | Any, theta: Array) -> Any:
+        """A private copy of the base model with theta written into it.
+
+        base: a `Source`, or an MjModel where nothing needs a compile. Raises ExperimentError where a function of the MjSpec
+        changes the layout of the state.
+        """
+        own = copy.copy(self.base(base, theta))
         self.write(own, theta)
         return own
+
+    def base(self, source: Source | Any, theta: Array) -> Any:
+        """The model into which theta is written in place: compiled anew where theta needs it, then kept."""
+        if not isinstance(source, Source):
+            return source
+        if not self.compiled.any():
+            return source.model
+        model = source.edited(np.asarray(theta)[self.compiled].tobytes(), lambda spec: self._edit(spec, source, theta))
+        for size in LAYOUT:  # MjData of another layout would be written past its end
+            if getattr(model, size) != getattr(source.model, size):
+                raise ModelError(f"a parameter changes {size} of the model; it may change numbers only")
+        return model
+
+    def _edit(self, spec: Any, source: Source, theta: Array) -> None:
+        for j in np.flatnonzero(self.compiled):
+            parameter = self.parameters[j]
+            if parameter.function is not None:
+                try:
+                    parameter.function(spec, float(theta[j]))
+                except Exception as error:
+                    raise ExperimentError(f"parameters.{parameter.name}: its function failed: {error}") from error
+            for target, slot in zip(parameter.targets, self.slots[j], strict=True):
+                if isinstance(slot, SpecSlot):
+                    number = target.scale * float(theta[j]) + target.offset
+                    write_element(spec, source.model, source.model, target.path, number)
+
+
+def _write_inertia(model: Any, body: int, chart: str, values: Array) -> None:
+    """Set what the chart covers: the central one leaves mass and centre of mass to their own slots."""
+    new = CHARTS[chart].back(values)
+    moments, quaternion = new.axes()
+    model.body_inertia[body], model.body_iquat[body] = moments, quaternion
+    if chart != "central":
+        model.body_mass[body], model.body_ipos[body] = new.mass, new.com
+    model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+
+
+def _in_charts(parameters: Sequence[Parameter], slots: list[tuple[AnySlot, ...]]) -> list[tuple[AnySlot, ...]]:
+    """Give every body one chart: `mass` beside first moments is the barycentric mass. Raises where charts would mix."""
+    charts: dict[int, set[str]] = {}
+    plain: dict[int, set[str]] = {}
+    for row in slots:
+        for slot in row:
+            if isinstance(slot, InertiaSlot):
+                charts.setdefault(slot.body, set()).add(slot.chart)
+            elif isinstance(slot, Slot) and slot.array in ("body_mass", "body_ipos", "body_inertia"):
+                plain.setdefault(slot.rows[0], set()).add(slot.array)
+    allowed = {"central": {"body_mass", "body_ipos"}, "barycentric": {"body_mass"}, "logcholesky": set[str]()}
+
+    def settled(parameter: Parameter, slot: AnySlot) -> AnySlot:
+        body = slot.rows[0] if isinstance(slot, Slot) and slot.array.startswith("body_") else None
+        body = slot.body if isinstance(slot, InertiaSlot) else body
+        own = charts.get(-1 if body is None else body, set())
+        if body is None or not own:
+            return slot
+        chart = next(iter(own))
+        if len(own) > 1 or plain.get(body, set()) - allowed[chart]:
+            mixed = sorted({*own, *(a.removeprefix("body_") for a in plain.get(body, set()))})
+            raise ExperimentError(
+                f"parameters.{parameter.name}: the inertia of one body is varied in several coordinates at once "
+                f"({', '.join(mixed)}); valid together: mass, ipos and inertia; mass, ipos and fullinertia; mass, firstmoment "
+                "and origininertia; logcholesky alone"
+            )
+        if isinstance(slot, Slot) and slot.array == "body_mass" and chart == "barycentric":
+            return InertiaSlot(body, "barycentric", 0)
+        return slot
+
+    return [tuple(settled(p, s) for s in row) for p, row in zip(parameters, slots, strict=True)]

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from mjfim.engine import Engine
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import ModelError, SimulationDiverged
+from mjfim.lag import Lag
 from mjfim.lq import TangentCurve
+from mjfim.models import Source
 from mjfim.outputs import OutputMap
 from mjfim.parameters import ParameterSet
 from mjfim.trajectory import Array, Linearization, Sensitivity, Trajectory
@@ -37,6 +39,8 @@ FAST = Accuracy(central=False, delta=1e-6, epsilon=3e-3)
 CENTRAL = Accuracy(central=True, delta=1e-4, epsilon=1e-3)
 FIRST_DERIVATIVE_STEP = 1e-6
 SENSITIVITY_STEP = 1e-5
+FAINT = 1e-2  # relative effect of a parameter below which its difference steps are lengthened
+LONGEST = 100.0  # times at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,7 @@ class Bilinear:
     A: (N, nx, nx);  B: (N, nx, nu)
     F_mixed: (r, N, nx+nu, nx) d/dz_i of `DF[psi w, w]`;  h_mixed: (r, N+1, nx+nu, ny) likewise for h, or None where zero
     C: (N+1, ny, nx);  D: (N+1, ny, nu)
+    lag: of the outputs, or None;  delay: (p,) its derivative by theta
     """
 
     A: Array
@@ -54,17 +59,19 @@ class Bilinear:
     D: Array
     F_mixed: Array
     h_mixed: Array | None
+    lag: Lag | None = None
+    delay: Array | None = None
 
 
 class Plant:
     """A model, its parameters and its measured outputs.
 
-    model: compiled at any theta (a private copy is made);  start: (ns,) initial state;  rate: samples per second [Hz]
+    source: of the private copies that are stepped;  start: (ns,) nominal initial state;  substeps: `mj_step` per sample
     """
 
     def __init__(
         self,
-        model: Any,
+        source: Source,
         parameters: ParameterSet,
         outputs: OutputMap,
         start: Array,
@@ -73,22 +80,50 @@ class Plant:
     ) -> None:
         self.parameters = parameters
         self.outputs = outputs
-        self.start = np.array(start, dtype=np.float64)
-        self.base = model
-        self.engine = Engine(model, substeps, outputs.needs_sensors, threads)
+        self.source = source
+        self.engine = Engine(source.model, substeps, outputs.needs_sensors, threads)
         self.space = self.engine.space
-        self.nu = int(model.nu)
-        self.dt = substeps * float(model.opt.timestep)
+        self.nominal_start = np.array(start, dtype=np.float64)
+        self.nu = int(source.model.nu)
+        self.dt = substeps * float(source.model.opt.timestep)
+        self._start_matrix = parameters.start(self.space.nx)
+        self._bias = parameters.bias(len(outputs))
+        self._reach = np.ones(len(parameters))
         self._models: dict[bytes, Any] = {}
         self._pool: list[Any] = []
+
+    def calibrate(self, theta: Array, trajectory: Trajectory) -> None:
+        """Lengthen the differences of parameters that hardly move this trajectory, so that they stand out of round-off."""
+        found = self.sensitivity(theta, trajectory)
+        if found is None:
+            return
+        size = np.concatenate([self.steps_of(trajectory)[: self.space.nx], np.ones(len(self.outputs))])
+        both = np.concatenate([found.psi, found.G], axis=1) * self.parameters.step
+        effect = (np.abs(both).max(axis=0) / size[:, None]).max(axis=0)
+        self._reach = np.clip(FAINT / np.maximum(effect, 1e-300), 1.0, LONGEST)
+
+    @property
+    def span(self) -> Array:
+        """(p,) change of each parameter that moves the trajectory noticeably; differences are relative to it."""
+        return np.asarray(self.parameters.step * self._reach)
+
+    def start(self, theta: Array) -> Array:
+        """(..., ns) initial states at theta: (..., p)."""
+        return self.space.plus(self.nominal_start, np.asarray(theta) @ self._start_matrix.T)
+
+    def lag(self, theta: Array, samples: int) -> Lag | None:
+        """The lag of the outputs at theta: (p,) over N+1 samples; None where nothing delays."""
+        if not self.parameters.delay.any():
+            return None
+        return Lag.of(samples, float(self.parameters.delay @ theta), self.dt)
 
     def model(self, theta: Array) -> Any:
         """The model at theta: (p,); kept for the few values in use."""
         key = np.asarray(theta, dtype=np.float64).tobytes()
         if key not in self._models:
-            if len(self._models) > 8:
+            if len(self._models) > 64:
                 self._models.clear()
-            self._models[key] = self.parameters.model(self.base, np.asarray(theta))
+            self._models[key] = self.parameters.model(self.source, np.asarray(theta))
         return self._models[key]
 
     def trajectory(self, states: Array, ctrl: Array) -> Trajectory:
@@ -98,7 +133,7 @@ class Plant:
 
     def simulate(self, theta: Array, ctrl: Array) -> Trajectory:
         """Open-loop trajectory from the start under ctrl: (N, nu). Raises SimulationDiverged."""
-        out = self.engine.rollout([self.model(theta)], self.start[None], np.asarray(ctrl)[None])
+        out = self.engine.rollout([self.model(theta)], self.start(theta)[None], np.asarray(ctrl)[None])
         if not out.finite[0]:
             raise SimulationDiverged(
                 "the simulation diverges under this control; a smaller amplitude or timestep may help"
@@ -107,26 +142,40 @@ class Plant:
 
     def measure(self, theta: Array, ctrl: Array) -> tuple[Array, np.ndarray]:
         """Outputs of many simulations under one control. theta: (m, p), ctrl: (N, nu) -> y (m, N+1, ny), finite (m,)."""
-        start = np.broadcast_to(self.start, (len(theta), len(self.start)))
         held = np.broadcast_to(ctrl, (len(theta), *np.shape(ctrl)))
-        out = self.engine.rollout(self._many(theta), start, held)
-        return self.outputs(out.states, out.sensors), out.finite
+        models, sound = self._many(theta)
+        out = self.engine.rollout(models, self.start(theta), held)
+        y = self.outputs(out.states, out.sensors) + (theta @ self._bias.T)[:, None]
+        if self.parameters.delay.any():
+            lags = (self.lag(row, y.shape[1]) for row in theta)
+            y = np.stack([own if lag is None else lag.apply(own) for lag, own in zip(lags, y, strict=True)])
+        return y, out.finite & sound
 
-    def _many(self, theta: Array) -> list[Any]:
-        """A reusable pool of models, one per row of theta."""
+    def _many(self, theta: Array) -> tuple[list[Any], np.ndarray]:
+        """A reusable pool of models, one per row of theta, and which of them could be compiled."""
+        if self.parameters.compiled.any():
+            return self._compiled(theta)
+        sound = np.ones(len(theta), dtype=bool)
         while len(self._pool) < len(theta):
-            self._pool.append(copy.copy(self.base))
+            self._pool.append(copy.copy(self.source.model))
         for model, row in zip(self._pool, theta, strict=False):
             self.parameters.write(model, row)
-        return self._pool[: len(theta)]
+        return self._pool[: len(theta)], sound
+
+    def _compiled(self, theta: Array) -> tuple[list[Any], np.ndarray]:
+        models, sound = [], np.ones(len(theta), dtype=bool)
+        for i, row in enumerate(theta):
+            try:
+                models.append(self.parameters.model(self.source, row))
+            except ModelError:
+                models.append(self.source.model)
+                sound[i] = False
+        return models, sound
 
     def predict(self, theta: Array, ctrl: Array, step: float = SENSITIVITY_STEP) -> tuple[Array, Array] | None:
         """Outputs y: (N+1, ny) and their derivative G: (N+1, ny, p) by central differences; None if one diverged."""
-        p, h = len(self.parameters), step * self.parameters.step
-        y, finite = self.measure(np.concatenate([theta[None], theta + np.diag(h), theta - np.diag(h)]), ctrl)
-        if not finite.all():
-            return None
-        return y[0], np.moveaxis((y[1 : p + 1] - y[p + 1 :]) / (2.0 * h[:, None, None]), 0, 2)
+        found = self._differences(theta, self.start(theta), ctrl, step, None)
+        return None if found is None else (found[0], found[1].G)
 
     def project(self, theta: Array, base: Trajectory, zeta: TangentCurve, gamma: float, K: Array) -> Trajectory | None:
         """P(xi + gamma zeta) about the base trajectory; None if it diverged. K: (N, nu, nx), all zero = open loop."""
@@ -153,33 +202,81 @@ class Plant:
         return np.concatenate([dq, speed, act, np.where(ctrl > 1e-3, ctrl, 1.0)])
 
     def sensitivity(self, theta: Array, trajectory: Trajectory, step: float = SENSITIVITY_STEP) -> Sensitivity | None:
-        """psi and G by central differences of 2p whole rollouts under the same control; None if one diverged."""
-        p = len(self.parameters)
-        h = step * self.parameters.step
-        thetas = np.concatenate([theta + np.diag(h), theta - np.diag(h)])
-        start = np.broadcast_to(trajectory.state[0], (2 * p, trajectory.state.shape[1]))
-        ctrl = np.broadcast_to(trajectory.ctrl, (2 * p, *trajectory.ctrl.shape))
-        out = self.engine.rollout(self._many(thetas), start, ctrl)
-        if not out.finite.all():
-            return None
-        width = 2.0 * h[:, None, None]
-        dx = self.space.minus(out.states[:p], out.states[p:]) / width
-        ds = None if out.sensors is None else (out.sensors[:p] - out.sensors[p:]) / width
-        return Sensitivity(np.moveaxis(dx, 0, 2), np.moveaxis(self.outputs.tangent(dx, ds), 0, 2))
+        """psi and G by central differences of whole rollouts under the same control; None if one diverged."""
+        found = self._differences(theta, trajectory.state[0], trajectory.ctrl, step, trajectory.state)
+        return None if found is None else found[1]
+
+    def _differences(
+        self, theta: Array, start: Array, ctrl: Array, step: float, states: Array | None
+    ) -> tuple[Array, Sensitivity] | None:
+        """Outputs (N+1, ny) and sensitivity from rollouts at theta +- h, one pair per parameter that moves anything.
+
+        states: (N+1, ns) at theta where they are known already; else, and where sensors lag, one more rollout
+        """
+        moving = np.flatnonzero(self.parameters.moving)
+        m, p, N = len(moving), len(theta), len(ctrl)
+        lag = self.lag(theta, N + 1)
+        own = states is None or (lag is not None and self.outputs.needs_sensors)
+        h = step * self.span[moving]
+        moves = np.zeros((m, p))
+        moves[np.arange(m), moving] = h
+        moves = np.concatenate([moves, -moves, np.zeros((int(own), p))])
+        psi, G = np.zeros((N + 1, self.space.nx, p)), np.zeros((N + 1, len(self.outputs), p))
+        sensors, here = None, np.zeros((N + 1, 0)) if states is None else states
+        if len(moves):
+            starts = self.space.plus(start, moves @ self._start_matrix.T)
+            held = np.broadcast_to(ctrl, (len(moves), *ctrl.shape))
+            models, sound = self._many(theta + moves)
+            out = self.engine.rollout(models, starts, held)
+            if not (out.finite & sound).all():
+                return None
+            if own:
+                here, sensors = out.states[-1], None if out.sensors is None else out.sensors[-1]
+            width = 2.0 * h[:, None, None]
+            dx = self.space.minus(out.states[:m], out.states[m : 2 * m]) / width
+            ds = None if out.sensors is None else (out.sensors[:m] - out.sensors[m : 2 * m]) / width
+            psi[..., moving] = np.moveaxis(dx, 0, 2)
+            G[..., moving] = np.moveaxis(self.outputs.tangent(here, dx, ds), 0, 2)
+        G += self._bias
+        y = self.outputs(here, sensors) + self._bias @ theta
+        if lag is not None:
+            G = lag.apply(G) + lag.rate(y)[..., None] * self.parameters.delay
+            y = lag.apply(y)
+        return y, Sensitivity(psi, G)
 
     def linearize(self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP) -> Linearization:
         """A, B, E, C, D, H by central differences in one batch per model. Raises SimulationDiverged."""
-        nx, p = self.space.nx, len(self.parameters)
+        p = len(self.parameters)
         states, ctrl = self._ends(trajectory)
         A, B, C, D = self.jacobians(theta, trajectory, step)
-        theta_step = step * self.parameters.step
+        theta_step = step * self.span
         thetas = np.concatenate([theta + np.diag(theta_step), theta - np.diag(theta_step)])
         same = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
         held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.nu)
-        dp, hp = self._halves(self._many(thetas), same, held, p, theta_step)
+        dp, hp = self._halves(self._many(thetas)[0], same, held, p, theta_step)
         E = np.moveaxis(_finite(dp[:, :-1]), 0, 2)
-        H = np.moveaxis(self.outputs.tangent(np.zeros((p, len(states), nx)), hp), 0, 2)
+        H = np.moveaxis(self.outputs.tangent(states, np.zeros((p, len(states), self.space.nx)), hp), 0, 2)
+        H = H + self._bias
         return Linearization(A, B, E, C, D, H)
+
+    def one_step(self, theta: Array, trajectory: Trajectory, samples: np.ndarray, step: float) -> Array:
+        """(n, p) effects of each parameter on the next state and on the sensors, at some samples, in natural units.
+
+        Rows are relative to the sizes of states and to the largest effect on each sensor. Raises SimulationDiverged.
+        """
+        p, h = len(self.parameters), step * self.span
+        states, ctrl = trajectory.state[samples], trajectory.ctrl[samples]
+        moves = np.diag(h)
+        models, _ = self._many(np.concatenate([theta + moves, theta - moves]))
+        same = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
+        held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.nu)
+        dx, ds = self._halves(models, same, held, p, h)
+        parts = [_finite(dx) / (self.dt * self.steps_of(trajectory)[: self.space.nx])]
+        if ds is not None:
+            dy = self.outputs.tangent(states, np.zeros_like(dx), ds)
+            size = np.abs(dy * self.parameters.step[:, None, None]).max(axis=(0, 1))
+            parts.append(dy / np.where(size > 0.0, size, 1.0))
+        return np.concatenate([part.reshape(p, -1) for part in parts], axis=1).T
 
     def jacobians(
         self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
@@ -191,7 +288,7 @@ class Plant:
         xs, us = self._perturbed(*self._ends(trajectory), np.concatenate([np.diag(z_step), -np.diag(z_step)]))
         dz, hz = self._halves([self.model(theta)], xs, us, count, z_step)
         dx = np.moveaxis(_finite(dz[:, :-1]), 0, 2)
-        dy = np.moveaxis(self.outputs.tangent(self._identity(dz.shape[1]), hz), 0, 2)
+        dy = np.moveaxis(self.outputs.tangent(trajectory.state, self._identity(dz.shape[1]), hz), 0, 2)
         return dx[..., :nx], dx[..., nx:], dy[..., :nx], dy[..., nx:]
 
     def _identity(self, samples: int) -> Array:
@@ -240,10 +337,10 @@ class Plant:
         firsts, mixed, h_firsts, h_mixed = [], [], [], []
         for w in directions:
             push = psi @ w
-            epsilon = accuracy.epsilon / max(np.abs(push).max(), np.abs(w / self.parameters.step).max())
+            epsilon = self._epsilon(accuracy, push, w)
             shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
             both = np.concatenate([self.space.plus(xs, shift), self.space.plus(xs, -shift)])
-            models = self._many(np.stack([theta + epsilon * w, theta - epsilon * w]))
+            models, _ = self._many(np.stack([theta + epsilon * w, theta - epsilon * w]))
             out, sensed = self.engine.step(models, both, np.concatenate([us, us]))
             pair = out.reshape(2, *shape)
             widths = (2.0 if accuracy.central else 1.0) * delta[:, None, None]
@@ -255,23 +352,33 @@ class Plant:
                 tilt = (s[0] - s[1]) / (2.0 * epsilon)
                 h_mixed.append((tilt[:count] - tilt[count:]) / widths)
                 h_firsts.append(np.mean(s[:, :count] - s[:, count:], axis=0) / widths)
-        return self._bilinear(firsts, mixed, h_firsts, h_mixed)
-
-    def _bilinear(
-        self, firsts: list[Array], mixed: list[Array], h_firsts: list[Array], h_mixed: list[Array]
-    ) -> Bilinear:
-        nx, count = self.space.nx, self.space.nx + self.nu
-        first = np.mean(firsts, axis=0)
-        n = first.shape[1]
-        dy = self.outputs.tangent(self._identity(n), np.mean(h_firsts, axis=0) if h_firsts else None)
+        nx, unit = self.space.nx, self._identity(len(states))
+        dy = self.outputs.tangent(states, unit, np.mean(h_firsts, axis=0) if h_firsts else None)
         second = None
-        if h_mixed:
-            tangents = [self.outputs.tangent(np.zeros((count, n, nx)), h) for h in h_mixed]
-            second = np.moveaxis(np.array(tangents), 1, 2)
-        AB = np.moveaxis(first[:, :-1], 0, 2)
+        if h_mixed or self.outputs.curved:
+            bends = [
+                self.outputs.bend(states, unit, psi @ w, h_mixed[r] if h_mixed else None)
+                for r, w in enumerate(directions)
+            ]
+            second = np.moveaxis(np.array(bends), 1, 2)
+        AB = np.moveaxis(np.mean(firsts, axis=0)[:, :-1], 0, 2)
         CD = np.moveaxis(dy, 0, 2)
         F_mixed = np.moveaxis(np.array(mixed)[:, :, :-1], 1, 2)
-        return Bilinear(AB[..., :nx], AB[..., nx:], CD[..., :nx], CD[..., nx:], F_mixed, second)
+        return Bilinear(
+            AB[..., :nx],
+            AB[..., nx:],
+            CD[..., :nx],
+            CD[..., nx:],
+            F_mixed,
+            second,
+            self.lag(theta, len(states)),
+            self.parameters.delay,
+        )
+
+    def _epsilon(self, accuracy: Accuracy, push: Array, w: Array) -> float:
+        """Step along (psi w, w): relative to the larger of its two parts."""
+        inside = np.where(self.parameters.in_model, np.abs(w / self.span), 0.0).max(initial=0.0)
+        return float(accuracy.epsilon / max(np.abs(push).max(initial=0.0), inside, 1e-300))
 
 
 def _finite(derivative: Array) -> Array:

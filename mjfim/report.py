@@ -7,6 +7,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from mjfim.checker import Check
+from mjfim.identifiability import Group as Combinations
 from mjfim.trajectory import Design, Estimate, Study
 
 BEST_CASE = "sigma is the Cramér-Rao bound: a best case, true if model and noise are right."
@@ -30,7 +32,10 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
         f"{design.status.value}; {last.iteration if last else 0} iterations, {design.seconds:.2f} s, "
         f"{design.steps / 1e6:.2f} million MuJoCo steps",
     ]
-    return Group(table, *lines, Text(BEST_CASE, style="dim"), *_warnings(design.warnings))
+    if design.nuisance:
+        lines.append(f"nuisance, not designed for: {', '.join(design.nuisance)}")
+    together: list[RenderableType] = [Text(f"only in combination: {words}") for words in design.combinations]
+    return Group(table, *lines, *together, Text(BEST_CASE, style="dim"), *_warnings(design.warnings))
 
 
 def estimate_report(estimate: Estimate, units: tuple[str, ...]) -> RenderableType:
@@ -74,6 +79,56 @@ def study_report(study: Study, units: tuple[str, ...]) -> RenderableType:
         parts.append(table)
     note = "efficiency = Cramér-Rao bound / observed variance; 1 means the bound is reached."
     return Group(*parts, Text(note, style="dim"))
+
+
+def check_report(check: Check) -> RenderableType:
+    """Verdict, predicted standard deviations, what is known in combination only."""
+    table = Table(title=f"What {check.source} ({check.horizon:g} s) can tell", title_justify="left")
+    for heading in ("parameter", "value", "σ", "relative σ", "wanted σ", "repetitions", "time"):
+        table.add_column(heading, justify="left" if heading == "parameter" else "right")
+    for row in check.rows:
+        if row.nuisance:
+            table.add_row(_named(row.name, row.unit), f"{row.value:.4g}", "nuisance", "", "", "", "", style="dim")
+            continue
+        alone = np.isfinite(row.std)
+        relative = f"{100 * row.relative:.3g} %" if alone and np.isfinite(row.relative) else "-"
+        table.add_row(
+            _named(row.name, row.unit),
+            f"{row.value:.4g}",
+            f"{row.std:.3g}" if alone else "not alone",
+            relative,
+            f"{row.wanted:.3g}{'' if row.stated else ' (5 %)'}",
+            f"{row.repetitions:,}" if row.repetitions else "-",
+            f"{row.seconds:,.0f} s" if row.repetitions else "-",
+            style="" if alone else "yellow",
+        )
+    parts: list[RenderableType] = [table]
+    for title, groups in (
+        ("Identifiable in combination only, by any experiment with these outputs", check.never),
+        ("Not excited here; another control would show", check.not_here),
+    ):
+        if groups:
+            parts.append(Text(f"{title}:", style="bold"))
+            parts += [Text(line) for group in groups for line in _lines(group)]
+    few = check.eigenvalues
+    shown = ", ".join(f"{v:.3g}" for v in (few if len(few) <= 8 else np.concatenate([few[:4], few[-2:]])))
+    tested = check.self_test
+    parts += [
+        f"eigenvalues{' (smallest four, largest two)' if len(few) > 8 else ''}: {shown}; condition {check.condition:.3g}",
+        f"derivative self-test {'passed' if tested.passed else 'FAILED'}: psi recursion {tested.recursion:.1e}, slope "
+        f"{tested.slope:.1e}, two steps {'agree' if tested.rough is None else 'disagree'}",
+        Text("Verdict", style="bold"),
+        *(Text(f"• {sentence}", style="" if check.ok else "yellow") for sentence in check.verdict),
+        Text(BEST_CASE, style="dim"),
+    ]
+    return Group(*parts)
+
+
+def _lines(group: Combinations) -> list[str]:
+    """A group of parameters: its members, then one combination a line."""
+    if not group.combinations:
+        return [f"  {group}"]
+    return [f"  {', '.join(group.members)} only as", *(f"    {c}" for c in group.combinations)]
 
 
 def _ratio(before: float, after: float) -> str:

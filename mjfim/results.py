@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from mjfim import archive, plots, rerun_log
+from mjfim.checker import Check
 from mjfim.errors import ModelError
 from mjfim.estimate import measured_trajectory
 from mjfim.identified import write_identified
@@ -29,6 +30,12 @@ def leave_design(folder: Path, design: Design, setup: Setup) -> None:
     rerun_log.log_design(folder / "design.rrd", setup.model_at(setup.theta), design, labels)
 
 
+def leave_check(folder: Path, check: Check) -> None:
+    """check.json and a picture: accuracies and correlations."""
+    archive.write_json(folder / "check.json", archive.check_summary(check))
+    plots.save(plots.check_figure(check), folder / "check.png")
+
+
 def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
     """estimate.json, identified.xml, estimate.rrd and pictures; returns sentences about what could not be written."""
     for stale in list(folder.iterdir()):  # of an earlier run, by the exact names it could have left
@@ -43,7 +50,7 @@ def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
     labels = Labels.of(setup)
     for i in range(len(estimate.recordings)):
         name = "fit.png" if len(estimate.recordings) == 1 else f"fit_{i + 1}.png"
-        plots.save(plots.fit(estimate, i, labels, setup.outputs.sigma), folder / name)
+        plots.save(plots.fit(estimate, i, labels, setup.noise.sigma), folder / name)
     plots.save(plots.parameter_intervals(estimate, labels), folder / "parameters.png")
     first = estimate.recordings[0]
     predicted, measured = setup.plant.simulate(estimate.theta, first.ctrl), measured_trajectory(setup, first)

@@ -9,18 +9,23 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.errors import ExperimentError, ModelError, unknown
+from mjfim.earlier import information_of
+from mjfim.engine import state_space
+from mjfim.errors import ExperimentError, ModelError, SimulationDiverged, unknown
 from mjfim.experiment import Experiment, Signal, by_name
 from mjfim.fisher import Information
 from mjfim.limits import limits_of
-from mjfim.models import compile_spec, control_names, coordinates, load_spec, private_model
+from mjfim.models import Source, compile_spec, control_names, coordinates, decoration, load_spec
 from mjfim.objective import DesignProblem, RunningCost
-from mjfim.outputs import Output, OutputMap
-from mjfim.parameters import Parameter, ParameterSet, Target, moved_bodies, names_of, resolve, unit_of
+from mjfim.parameters import ParameterSet, moved_bodies
+from mjfim.paths import joint_width
 from mjfim.plant import Plant
+from mjfim.robust import Pool, sampled
+from mjfim.sensing import joint_names, measurable, outputs_of, stride_of
 from mjfim.signals import generate, read_control
 from mjfim.tangent import StateSpace
 from mjfim.trajectory import Array, Trajectory
+from mjfim.unknowns import parameters_of
 
 MAX_SAMPLES = 10_000_000
 
@@ -29,18 +34,23 @@ class Setup:
     """Everything an experiment needs to run. Building it checks all names, files and numbers.
 
     spec, model: the user's model, untouched by parameters;  plant: at any theta;  t: (N,) sample times [s]
+    added: (p, p) information of other experiments, or None;  earlier: that and what the experiment's `earlier` files hold
+    prior: (p, p) earlier information and that of the parameters' priors
     coarsen: 1, or how many times longer timestep and sample period are than stated (coarse-to-fine descent)
     """
 
-    def __init__(self, experiment: Experiment, threads: int | None = None, coarsen: int = 1) -> None:
+    def __init__(
+        self, experiment: Experiment, threads: int | None = None, coarsen: int = 1, added: Array | None = None
+    ) -> None:
         self.experiment = experiment
         self.coarsen = coarsen
+        self.added = added
         try:
-            self._build(threads)
+            self._build(threads, added)
         except ExperimentError as error:
             raise ExperimentError(f"{experiment.source}: {error}") from None
 
-    def _build(self, threads: int | None) -> None:
+    def _build(self, threads: int | None, added: Array | None) -> None:
         e = self.experiment
         self.spec = load_spec(self.model_path)
         self.model = compile_spec(self.spec, self.model_path)
@@ -54,23 +64,40 @@ class Setup:
         self.coordinates = coordinates(self.model)
         self.controls = control_names(self.model)
         self.substeps = self._substeps()
-        self.stride = self._stride() if self.coarsen == 1 else 1
+        measured_every = stride_of(e)
+        self.stride = measured_every if self.coarsen == 1 else 1
         self.samples = self._samples() // self.coarsen
         if self.stride > self.samples:
             raise ExperimentError(f"measure_rate: {e.measure_rate:g} Hz measures nothing within {e.horizon:g} s")
         self.dt = self.substeps * float(self.model.opt.timestep) * self.coarsen
         self.t = np.arange(self.samples, dtype=np.float64) * self.dt
-        self.parameters = ParameterSet.build(self._parameters(), self.model)
-        self.outputs = self._outputs()
-        self.start = self._start()
-        self.plant = Plant(self._private(), self.parameters, self.outputs, self.start, self.substeps, threads)
+        self.outputs, noise = outputs_of(e, self.model, state_space(self.model), measured_every)
+        self.noise = noise if self.coarsen == 1 else noise.every_sample(measured_every)
+        self.parameters = ParameterSet.build(
+            parameters_of(e, self.model, self.outputs.names),
+            self.model,
+            self.outputs.names,
+            decoration(self.spec, self.model),
+        )
+        self.plant = Plant(self._private(), self.parameters, self.outputs, self._start(), self.substeps, threads)
         self.tracking = self._weights()
         self.control_weight = by_name("cost.control", e.cost.control, self.controls, "actuator")
         if np.any(self.control_weight <= 0):
             missing = self.controls[int(np.argmin(self.control_weight))]
             raise ExperimentError(f"cost.control: actuator {missing!r} has no weight; every actuator needs one > 0")
+        self.control_about = self.rest
+        if e.cost.control_about is not None:
+            self.control_about = by_name("cost.control_about", e.cost.control_about, self.controls, "actuator")
         self.control = self._control()
         self.limits = limits_of(self.model, self.coordinates, self.controls, e.limits)
+        self.contrast = self._contrast()
+        files = [e.directory / path for path in e.earlier]
+        self.earlier = information_of(files, self.parameters.names)
+        if added is not None:
+            self.earlier = self.earlier + added
+        self.prior = self.parameters.prior_information + self.earlier
+        self.pool = self._pool()
+        self._calibrate()
 
     @property
     def model_path(self) -> Path:
@@ -97,29 +124,40 @@ class Setup:
         """p units, empty where not stated."""
         return tuple(p.unit for p in self.parameters.parameters)
 
+    @property
+    def measurable(self) -> tuple[str, ...]:
+        """Everything that a recording may hold column by column: state components and sensors."""
+        return measurable(self.model)
+
     def model_at(self, theta: Array) -> Any:
         """The user's model, everything on, with theta: (p,) written into it."""
         return self.parameters.model(self._whole, theta)
 
     @cached_property
-    def _whole(self) -> Any:
+    def _whole(self) -> Source:
         """The user's model, its moving bodies not compiled as 'simple'."""
-        return private_model(self.spec, self.model_path, moved_bodies(self.parameters.parameters), True, True)
+        return self._source(sensors=True, friction=True, coarsen=1)
 
     @property
     def information(self) -> Information:
         """Fisher information of the measured samples and the criterion."""
         e, p = self.experiment, self.parameters
         return Information(
-            self.outputs.sigma,
-            self.stride,
+            self.noise,
             self.measure_rate,
             p.scale,
-            p.prior_information
-            * (self.measure_rate / (e.measure_rate or e.rate)),  # the same per second on every level
+            self.prior * (self.measure_rate / (e.measure_rate or e.rate)),  # the same per second on every level
             e.cost.criterion,
             e.cost.information,
+            p.interest if len(p.interest) < len(p) else None,
+            contrast=self.contrast,
         )
+
+    @property
+    def rest(self) -> Array:
+        """(nu,) control of the initial keyframe, zero without one."""
+        name = self.experiment.initial.keyframe
+        return np.zeros(len(self.controls)) if name is None else np.array(self.model.key(name).ctrl)
 
     @cached_property
     def initial(self) -> Trajectory:
@@ -129,8 +167,10 @@ class Setup:
     @cached_property
     def problem(self) -> DesignProblem:
         """The cost as Algorithm 1 wants it."""
-        running = RunningCost(self.space, self.dt, self.initial.state, self.tracking, self.control_weight)
-        return DesignProblem(self.plant, self.theta, self.information, running)
+        running = RunningCost(
+            self.space, self.dt, self.initial.state, self.tracking, self.control_weight, self.control_about
+        )
+        return DesignProblem(self.plant, self.theta, self.information, running, pool=self.pool)
 
     def _substeps(self) -> int:
         timestep, rate = float(self.model.opt.timestep), self.experiment.rate
@@ -143,17 +183,6 @@ class Setup:
                 f"valid for example: {valid} Hz"
             )
         return n
-
-    def _stride(self) -> int:
-        e = self.experiment
-        ratio = e.rate / (e.measure_rate or e.rate)
-        stride = round(ratio)
-        if stride < 1 or abs(ratio - stride) > 1e-6 * stride:
-            valid = ", ".join(f"{e.rate / k:g}" for k in (1, 2, 4, 5, 10))
-            raise ExperimentError(
-                f"measure_rate: {e.measure_rate:g} Hz does not divide rate {e.rate:g} Hz; valid: {valid}"
-            )
-        return stride
 
     def _samples(self) -> int:
         exact = self.experiment.horizon * self.experiment.rate
@@ -169,82 +198,14 @@ class Setup:
             raise ExperimentError(f"horizon: {N:g} samples are too many; at most {MAX_SAMPLES:g}")
         return N
 
-    def _parameters(self) -> list[Parameter]:
-        built = []
-        for name, p in self.experiment.parameters.items():
-            targets = tuple(Target(t.path, t.scale, t.offset) for t in p.all_targets)
-            guess = self._nominal(name, targets[0]) if p.guess is None else p.guess
-            bounds = p.bounds or (-np.inf, np.inf)
-            if not bounds[0] <= guess <= bounds[1]:
-                raise ExperimentError(
-                    f"parameters.{name}.guess: the model's own value {guess:g} is outside bounds {list(bounds)}"
-                )
-            scale = abs(guess) if p.scale == "guess" else p.scale
-            if scale == 0.0:
-                raise ExperimentError(f"parameters.{name}.scale: the guess is 0, state a scale in the parameter's unit")
-            unit = p.unit or (unit_of(self.model, targets[0].path) if targets[0].scale == 1.0 else "")
-            built.append(Parameter(name, targets, guess, p.true, bounds, scale, p.prior, unit))
-        return built
+    def _source(self, sensors: bool, friction: bool, coarsen: int) -> Source:
+        moved = None if self.parameters.compiled.any() else moved_bodies(self.parameters.parameters)
+        return Source(self.spec, self.model_path, moved, sensors, friction, coarsen)
 
-    def _nominal(self, name: str, target: Target) -> float:
-        try:
-            value = resolve(self.model, target.path).read(self.model)
-        except ExperimentError as error:
-            raise ExperimentError(f"parameters.{name}: {error}") from None
-        return (value - target.offset) / target.scale
-
-    def _private(self) -> Any:
-        parameters = self.parameters.parameters
-        friction = any("frictionloss" in t.path for p in parameters for t in p.targets)
-        moved, sensors = moved_bodies(parameters), self.outputs.needs_sensors
-        model = private_model(self.spec, self.model_path, moved, sensors, friction)
-        model.opt.timestep *= self.coarsen
-        return model
-
-    def _outputs(self) -> OutputMap:
-        names = names_of(self.model, "sensor")
-        width = {n: int(self.model.sensor(n).dim[0]) for n in names}
-        valid = ["state", *self.measurable]
-        stated = dict(self.experiment.noise)
-        for key in stated:
-            if key not in valid:
-                raise ExperimentError(f"noise: {unknown('sensor', key, valid)}")
-        if not stated:
-            stated = {n: float(self.model.sensor(n).noise[0]) for n in names if self.model.sensor(n).noise[0] > 0}
-            if not stated:
-                raise ExperimentError(
-                    "noise: nothing is measured: give `state`, or sensors by name, or `noise` in the MJCF; valid: "
-                    + ", ".join(valid)
-                )
-        everything = stated.pop("state", None)
-        components = self._state_outputs()
-        chosen: list[Output] = []
-        for name, (index, unit) in components.items():
-            sigma = stated.get(name, everything)
-            if sigma is not None:
-                chosen.append(Output(name, float(sigma), unit, state=index))
-        for name in names:
-            if name in stated:
-                adr = int(self.model.sensor(name).adr[0])
-                for i in range(width[name]):
-                    label = name if width[name] == 1 else f"{name}[{i}]"
-                    chosen.append(Output(label, float(stated[name]), sensor=adr + i))
-        if not chosen:
-            raise ExperimentError("noise.state: the model has no scalar joint to measure; name sensors instead")
-        addresses = {c.v: c.q for c in self.coordinates}
-        nv, nq = self.model.nv, self.model.nq
-        addresses.update({nv + c.v: nq + c.v for c in self.coordinates})
-        return OutputMap.build(chosen, addresses)
-
-    @property
-    def measurable(self) -> tuple[str, ...]:
-        """Everything that `noise` may name one by one: state components and sensors."""
-        return (*self._state_outputs(), *names_of(self.model, "sensor"))
-
-    def _state_outputs(self) -> dict[str, tuple[int, str]]:
-        nv = self.model.nv
-        positions = {f"qpos:{c.name}": (c.v, c.unit) for c in self.coordinates}
-        return positions | {f"qvel:{c.name}": (nv + c.v, f"{c.unit}/s") for c in self.coordinates}
+    def _private(self) -> Source:
+        friction = any("frictionloss" in t.path for p in self.parameters.parameters for t in p.targets)
+        anything = friction or any(p.function is not None for p in self.parameters.parameters)
+        return self._source(self.outputs.needs_sensors, anything, self.coarsen)
 
     def _start(self) -> Array:
         initial, model = self.experiment.initial, self.model
@@ -269,19 +230,51 @@ class Setup:
         return np.concatenate([qpos, qvel, act])
 
     def _weights(self) -> Array:
-        cost, names = self.experiment.cost, tuple(c.name for c in self.coordinates)
-        dofs = np.array([c.v for c in self.coordinates], dtype=np.intp)
-        Q, nv = np.zeros(self.space.nx), self.model.nv
-        Q[dofs] = by_name("cost.tracking", cost.tracking, names, "joint")
-        Q[nv + dofs] = by_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint")
-        return Q
+        """(nx,) diagonal of Q_tau: a joint's weight holds for each of its degrees of freedom."""
+        cost, names = self.experiment.cost, joint_names(self.model)
+        widths = [joint_width(self.model, j) for j in range(self.model.njnt)]
+        position = np.repeat(by_name("cost.tracking", cost.tracking, names, "joint"), widths)
+        velocity = np.repeat(by_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint"), widths)
+        return np.concatenate([position, velocity, np.zeros(self.model.na)])
+
+    def _contrast(self) -> Array | None:
+        """(t, c) combinations of the scaled wanted parameters whose variance criterion "c" sums."""
+        cost, p = self.experiment.cost, self.parameters
+        if cost.criterion != "c":
+            return None
+        wanted = tuple(p.names[j] for j in p.interest)
+        scale = p.scale[p.interest]
+        key, chosen = ("combination", cost.combination) if cost.combination else ("subset", cost.subset or ())
+        for name in chosen:
+            if name not in wanted:
+                raise ExperimentError(f"cost.{key}: {unknown('wanted parameter', name, wanted)}")
+        if cost.combination:
+            return np.asarray([[cost.combination.get(n, 0.0) * s] for n, s in zip(wanted, scale, strict=True)])
+        if not chosen:
+            raise ExperimentError(f"cost.subset: it is empty; valid: {', '.join(wanted)}")
+        return np.asarray(np.eye(len(wanted))[:, [wanted.index(name) for name in chosen]])
+
+    def _pool(self) -> Pool | None:
+        robust = self.experiment.robust
+        if robust is None:
+            return None
+        if self.experiment.descent.psi_weight:
+            raise ExperimentError("robust: descent.psi_weight belongs to a design at one parameter value")
+        thetas = sampled(self.parameters, self.theta, robust.samples, robust.seed)
+        return Pool(thetas, robust.over, self.experiment.cost.criterion == "D")
+
+    def _calibrate(self) -> None:
+        try:
+            self.plant.calibrate(self.theta, self.initial)
+        except SimulationDiverged:
+            return  # whoever needs the initial trajectory will say so
 
     def _control(self) -> Array:
         source = self.experiment.initial.control
         dt = self.dt / self.coarsen
         t = np.arange(self.samples * self.coarsen, dtype=np.float64) * dt
         if isinstance(source, Signal):
-            return self.averaged(generate(source, t, self.controls))
+            return self.averaged(generate(source, t, self.controls, self.rest))
         return self.averaged(read_control(self.experiment.directory / source, t, dt, self.controls))
 
     def averaged(self, control: Array) -> Array:
@@ -290,4 +283,4 @@ class Setup:
 
     def coarser(self, factor: int) -> Setup:
         """The same experiment at a timestep and sample period that are `factor` times longer."""
-        return Setup(self.experiment, self.plant.engine.threads, factor)
+        return Setup(self.experiment, self.plant.engine.threads, factor, self.added)

@@ -13,18 +13,26 @@ from mjfim.errors import RecordingError, unknown
 from mjfim.experiment import Signal, by_name
 from mjfim.trajectory import Array
 
+SPREAD = 0.17  # frequency of an actuator over that of the one before, less 1
 
-def generate(signal: Signal, t: Array, names: tuple[str, ...]) -> Array:
-    """(N, nu) from a `Signal` at times t: (N,) [s]; every actuator gets its own phase so that they do not coincide."""
+
+def generate(signal: Signal, t: Array, names: tuple[str, ...], rest: Array) -> Array:
+    """(N, nu) from a `Signal` at times t: (N,) [s]; every actuator gets its own frequency so that they do not coincide.
+
+    rest: (nu,) offset where none is stated. Sines and chirps begin there, without a jolt.
+    """
     amplitude = by_name("initial.control.amplitude", signal.amplitude, names, "actuator")
-    offset = by_name("initial.control.offset", signal.offset, names, "actuator")
+    offset = np.array(rest)
+    if signal.offset is not None:
+        offset = by_name("initial.control.offset", signal.offset, names, "actuator")
     shape = np.zeros((len(t), len(names)))
+    spread = 1.0 + SPREAD * np.arange(len(names))
     if signal.kind == "sine":
-        shape = np.sin(2 * np.pi * signal.frequency * t[:, None] + np.pi / 4 * np.arange(len(names)))
+        shape = np.sin(2 * np.pi * signal.frequency * t[:, None] * spread)
     elif signal.kind == "chirp":
         end = signal.frequency_end or 5.0 * signal.frequency
-        phases = 45.0 * np.arange(len(names)) - 90.0
-        shape = np.stack([chirp(t, signal.frequency, t[-1], end, phi=phase) for phase in phases], axis=1)
+        sweeps = [chirp(t, signal.frequency * s, t[-1], end * s, phi=-90.0) for s in spread]
+        shape = np.stack(sweeps, axis=1)
     elif signal.kind == "multisine":
         shape = multisine(t, len(names), signal.frequency, signal.harmonics, np.random.default_rng(signal.seed))
     elif signal.kind == "constant":

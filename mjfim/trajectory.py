@@ -100,8 +100,9 @@ class Evaluation:
     gain: (N, nu, nx) regulator K about the trajectory
     sensitivity: psi, (N+1, nx, p)
     information: (p, p) Fisher information, summed over the measured samples [1 / (theta_i theta_j unit)]
-    eigenvalues: (p,) ascending, of the information per second that the cost sees (`I / measure_rate`)
-    std: (p,) Cramer-Rao standard deviations, infinite where the information is singular
+    eigenvalues: (s,) ascending, of the information per second that the cost sees (scaled, nuisance removed, identifiable
+    combinations only)
+    std: (p,) Cramer-Rao standard deviations, infinite where a parameter cannot be told alone
     min_eigenvalue: (N+1,) smallest eigenvalue of the information (per second) accumulated up to each sample
     criterion: phi, the information term of the cost;  cost: J
     growth: largest open-loop amplification of a small deviation along the trajectory (NaN: not computed)
@@ -126,6 +127,7 @@ class Status(Enum):
     """How an optimisation ended; the value is a sentence for the user."""
 
     CONVERGED = "converged: the slope fell below tolerance × cost (a local optimum)"
+    SMOOTHED = "converged on a smooth λ_min, used because the smallest eigenvalues meet (a local optimum)"
     STALLED = "stalled: no step along the descent lowers the cost any more, at the accuracy of the differences"
     MAX_ITERATIONS = "stopped at max_iterations before convergence; raise it, or start from the result"
     INTERRUPTED = "interrupted by the user; this is the best trajectory so far"
@@ -133,7 +135,7 @@ class Status(Enum):
     @property
     def success(self) -> bool:
         """True where the result is a (local) optimum to the wanted tolerance."""
-        return self is Status.CONVERGED
+        return self in (Status.CONVERGED, Status.SMOOTHED)
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,8 @@ class Design:
     slope: last |DJ.zeta|;  steps: MuJoCo steps taken;  seconds: wall time
     limits: worst margin per kind of limit (positive = inside), by kind;  warnings: sentences for the user
     found_by: name of the start that led here;  starts: all of them
+    nuisance: names of the parameters that the design did not look at
+    combinations: what is identifiable of parameters that are not so alone, in words;  prior: (p, p) information put in
     """
 
     status: Status
@@ -187,9 +191,12 @@ class Design:
     warnings: tuple[str, ...] = ()
     found_by: str = "initial control"
     starts: tuple[StartResult, ...] = ()
+    nuisance: tuple[str, ...] = ()
+    combinations: tuple[str, ...] = ()
+    prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
-        freeze(self, "theta")
+        freeze(self, "theta", "prior")
 
     @property
     def success(self) -> bool:

@@ -116,6 +116,24 @@ def test_json_holds_what_is_promised(folder: Path, design: Design) -> None:
         assert part["eigenvalues"] == sorted(part["eigenvalues"])
         assert part["std"] == pytest.approx(np.sqrt(np.diag(np.linalg.inv(evaluation.information))), rel=1e-9)
     assert data["final"]["cost"] < data["initial"]["cost"]
+    assert (data["nuisance"], data["combinations"], data["prior"]) == ([], [], np.zeros((P, P)).tolist())
+
+
+def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
+    """Information holds the prior, which is written beside it so that a later experiment can take it out."""
+    e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    table = {"m": {"prior": 0.5}, "c": {"nuisance": True}}
+    known = Setup(
+        e.replace(horizon=0.4, parameters=table, nuisance={"delay": 0.1, "initial": 0.2}, descent={"max_iterations": 0})
+    )
+    archive.write_design(tmp_path, mjfim.design(known), known)
+    data = strict_json((tmp_path / "design.json").read_text(encoding="utf-8"))
+    starts = ["initial qpos:slide", "initial qpos:hinge", "initial qvel:slide", "initial qvel:hinge"]
+    assert data["parameters"] == ["m", "l", "c", *starts, "delay"]
+    assert data["nuisance"] == ["c", *starts, "delay"]
+    assert np.allclose(data["prior"], np.diag([4.0, 0.0, 0.0, *[25.0] * 4, 100.0]), rtol=1e-12, atol=0)
+    left = np.array(data["final"]["information"]) - np.array(data["prior"])
+    assert np.linalg.eigvalsh(left)[0] > -1e-8 * np.linalg.eigvalsh(left)[-1]
 
 
 def test_csv_plays_back(folder: Path, design: Design, setup: Setup) -> None:
@@ -571,6 +589,8 @@ def test_estimate_summary(setup: Setup, recording: Recording) -> None:
     assert np.sqrt(np.diag(data["covariance"])) == pytest.approx(data["std"], rel=1e-6)
     assert set(data["residual_rms"]) == set(setup.outputs.names)
     assert data["misfit"] is False
+    assert (data["parameters"], data["units"]) == (["m", "l", "c"], list(setup.units))
+    assert data["prior"] == np.zeros((P, P)).tolist()
 
 
 def test_study_summary(setup: Setup, design: Design) -> None:

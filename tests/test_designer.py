@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numerics import CART_PARAMETERS, cart_setup
 
 import mjfim
 from mjfim.errors import ExperimentError, ModelError, UnidentifiableError
 from mjfim.experiment import Experiment
 from mjfim.setup import Setup
+from mjfim.trajectory import Status
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -111,3 +113,79 @@ def test_units_come_from_the_path_where_none_is_stated(experiment: Experiment) -
         table.pop("unit")
     setup = Setup(Experiment(**values, directory=ROOT / "models"))
     assert setup.units == ("kg", "m", "N m s/rad")
+
+
+def test_where_the_smallest_eigenvalues_meet_the_descent_goes_on_smoothly(tmp_path: Path) -> None:
+    setup = cart_setup(tmp_path, horizon=1.0, cost={"control": 1e-4})
+    made = mjfim.design(setup)
+    assert made.status is Status.SMOOTHED
+    assert made.success
+    first, second = made.final.eigenvalues[:2]
+    assert second < 1.2 * first
+    # what is reported is the exact criterion, and the best that any iterate had
+    assert made.final.criterion == pytest.approx(1.0 / first, rel=1e-9)
+    assert made.final.cost == pytest.approx(1.0 / first + setup.problem.running.value(made.trajectory), rel=1e-9)
+    fine = [row.cost for row in made.history if row.rate == 100.0]
+    assert made.final.cost == pytest.approx(min(fine), rel=1e-12)
+    assert [row.iteration for row in made.history] == list(range(len(made.history)))
+    # no small change of the control is much better
+    rng, here = np.random.default_rng(0), made.trajectory.ctrl
+    for _ in range(10):
+        wave = np.sin(2 * np.pi * rng.uniform(0.5, 4.0) * setup.t + rng.uniform(0.0, 6.3))[:, None]
+        for size in (-0.3, 0.3):
+            moved = setup.problem.point(setup.plant.simulate(setup.theta, here + size * wave))
+            assert moved.cost > 0.99 * made.final.cost
+
+
+def test_a_design_that_knows_of_its_nuisances_beats_one_that_does_not(tmp_path: Path) -> None:
+    shared = {"horizon": 1.0, "cost": {"control": 1e-3}}
+    unsure = cart_setup(tmp_path, **shared, nuisance={"initial": True, "bias": 0.2})
+    aware, naive = mjfim.design(unsure), mjfim.design(cart_setup(tmp_path, **shared))
+    assert naive.nuisance == ()
+    assert aware.nuisance[0] == "initial qpos:slide"
+    assert len(aware.nuisance) == 8
+    assert aware.final.eigenvalues.shape == (3,)
+    there = mjfim.evaluate_trajectory(unsure, naive.trajectory)
+    assert aware.final.cost < 0.95 * there.cost
+    # the trajectory is judged by the block of the full inverse that belongs to the wanted parameters
+    block = np.linalg.inv(aware.final.information)[:3, :3] / np.outer(unsure.theta[:3], unsure.theta[:3])
+    seen = np.sort(1.0 / np.linalg.eigvalsh(block)) / unsure.measure_rate
+    np.testing.assert_allclose(aware.final.eigenvalues, seen, rtol=1e-6)
+
+
+def test_a_design_for_one_combination_tells_it_better_than_one_for_all(tmp_path: Path) -> None:
+    wanted = {"criterion": "c", "combination": {"m": 1.0, "l": -1.0}, "control": 1e-3}
+    setup = cart_setup(tmp_path, horizon=1.0, cost=wanted)
+    made, general = mjfim.design(setup), mjfim.design(cart_setup(tmp_path, horizon=1.0))
+    assert made.final.cost < 0.9 * mjfim.evaluate_trajectory(setup, general.trajectory).cost
+    c = np.array([1.0, -1.0, 0.0])
+    variance = c @ np.linalg.inv(made.final.information) @ c
+    assert made.final.criterion == pytest.approx(variance * setup.measure_rate, rel=1e-9)
+
+
+RATED = {"state": 0.05, "qpos:hinge": {"sigma": 0.01, "rate": 20.0}}
+LEVELS = {
+    "plain": {},
+    "sensors at their own rates": {"noise": RATED},
+    "nuisances": {"nuisance": {"initial": 0.1, "bias": 0.05, "delay": 0.01}},
+    "priors": {"parameters": {name: {**target, "prior": 0.01} for name, target in CART_PARAMETERS.items()}},
+    "slow": {"measure_rate": 20.0, "noise": {"state": 0.05}},
+}
+
+
+@pytest.mark.parametrize("case", LEVELS)
+def test_a_coarser_level_costs_about_the_same(case: str, tmp_path: Path) -> None:
+    setup = cart_setup(tmp_path, horizon=4.0, **LEVELS[case])
+    fine, coarse = (s.problem.point(s.initial) for s in (setup, setup.coarser(4)))
+    assert coarse.criterion.value == pytest.approx(fine.criterion.value, rel=0.03)
+    assert coarse.cost == pytest.approx(fine.cost, rel=0.03)
+
+
+def test_the_choice_of_a_group_needs_no_error_where_members_are_invisible(tmp_path: Path) -> None:
+    parameters = {"bob": {"inertial": "bob", "coordinates": "barycentric"}}
+    made = mjfim.design(cart_setup(tmp_path, parameters=parameters, descent={"max_iterations": 3}))
+    # a point on a planar pendulum shows its mass, two first moments and the inertia about the hinge
+    assert made.combinations[-1].endswith("no effect on anything that is measured")
+    assert len(made.final.eigenvalues) < 10
+    assert np.isinf(made.final.std).sum() >= 10 - len(made.final.eigenvalues)
+    assert made.final.cost < made.initial.cost

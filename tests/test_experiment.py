@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
-from mjfim.experiment import Cost, Descent, Experiment, Limits, Signal
+from mjfim.experiment import Correlated, Cost, Descent, Experiment, Limits, NoiseSpec, Nuisance, Robust, Signal
 from mjfim.setup import Setup
 
 MODELS = Path(__file__).parents[1] / "models"
@@ -192,6 +192,81 @@ def test_contract_parses(folder: Path) -> None:
     assert (e.directory, e.source) == (folder, str(path))
 
 
+# What a file can say beyond the paper: correlated noise, rates, nuisance, inertial groups, other criteria.
+EXTENDED = """
+model = "cart_pendulum.xml"
+rate = 100.0
+horizon = 1.0
+
+[initial]
+keyframe = "hanging"
+control = { kind = "sine", offset = { force = 0.5 } }
+
+[parameters.bob]
+inertial = "bob"
+coordinates = "barycentric"
+prior = 0.2
+nuisance = true
+
+[parameters.c]
+target = "joint/hinge:damping"
+wanted = 0.01
+
+[noise]
+state = { covariance = [[4.0, 1.0, 0.0, 0.0], [1.0, 4.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], rate = 50.0 }
+hinge_angle = { sigma = [0.01] }
+slide_position = 0.02
+
+[[correlated]]
+outputs = ["hinge_angle", "slide_position"]
+covariance = [[1e-4, 1e-5], [1e-5, 4e-4]]
+
+[nuisance]
+initial = { "qpos:slide" = 0.01, "qvel:hinge" = true }
+bias = true
+delay = 0.005
+
+[cost]
+criterion = "c"
+subset = ["c"]
+control_about = { force = 1.5 }
+
+[robust]
+over = "worst"
+samples = 3
+seed = 4
+
+[descent]
+starts = 3
+coarse = 2
+seed = 5
+"""
+
+
+def test_extended_contract_parses_and_resolves(resolve: Callable[[str], Setup]) -> None:
+    """Each table arrives with the values that were written, and the numbers where they act."""
+    setup = resolve(EXTENDED)
+    e = setup.experiment
+    assert e.noise["hinge_angle"] == NoiseSpec(sigma=(0.01,)) and e.noise["slide_position"] == 0.02
+    assert e.correlated == (
+        Correlated(outputs=("hinge_angle", "slide_position"), covariance=((1e-4, 1e-5), (1e-5, 4e-4))),
+    )
+    assert e.nuisance == Nuisance(initial={"qpos:slide": 0.01, "qvel:hinge": True}, bias=True, delay=0.005)
+    assert e.robust == Robust(over="worst", samples=3, seed=4)
+    assert (e.parameters["c"].wanted, e.parameters["bob"].coordinates) == (0.01, "barycentric")
+    assert (e.descent.starts, e.descent.coarse, e.descent.seed) == (3, 2, 5)
+    assert setup.noise.strides.tolist() == [2] * 4 + [1] * 2
+    assert setup.noise.covariance[0, 1] == 1.0 and setup.noise.covariance[4, 5] == 1e-5
+    names = setup.parameters.names
+    assert names[:2] == ("bob.mass", "bob.mx") and names[10] == "c"
+    assert names[11:13] == ("initial qpos:slide", "initial qvel:hinge")
+    assert names[13:-1] == tuple(f"bias {n}" for n in setup.outputs.names) and names[-1] == "delay"
+    assert setup.parameters.interest.tolist() == [10]
+    assert setup.control[0] == pytest.approx(0.5)
+    assert Experiment(**e.model_dump(), directory=e.directory, source=e.source) == e
+    assert e.replace(noise={"hinge_angle": 0.3}).noise == {**e.noise, "hinge_angle": 0.3}
+
+
 def test_contract_resolves(resolve: Callable[[str], Setup]) -> None:
     """The numbers arrive where they act."""
     setup = resolve(CONTRACT)
@@ -202,7 +277,7 @@ def test_contract_resolves(resolve: Callable[[str], Setup]) -> None:
     assert setup.parameters.lower.tolist() == [0.1, -np.inf, -np.inf]
     assert setup.parameters.prior_information.tolist() == np.diag([4.0, 0.0, 0.0]).tolist()
     assert (setup.substeps, setup.stride, setup.samples, setup.measure_rate) == (1, 2, 100, 50.0)
-    sigma = dict(zip(setup.outputs.names, setup.outputs.sigma, strict=True))
+    sigma = dict(zip(setup.outputs.names, setup.noise.sigma, strict=True))
     assert sigma == {
         "qpos:slide": 0.05,
         "qpos:hinge": 0.05,
@@ -213,7 +288,7 @@ def test_contract_resolves(resolve: Callable[[str], Setup]) -> None:
     assert setup.tracking.tolist() == [0.05, 0.0, 0.0, 0.1]
     assert setup.control_weight.tolist() == [1e-2]
     assert setup.theta.tolist() == setup.parameters.true.tolist()
-    assert setup.start.tolist() == [0.0, np.pi, 0.0, 0.0]
+    assert setup.plant.nominal_start.tolist() == [0.0, np.pi, 0.0, 0.0]
     assert setup.control.shape == (100, 1)
     assert {(x.kind, x.name, x.lower, x.upper) for x in setup.limits} == {
         ("position", "slide", -1.0, 1.0),
@@ -238,14 +313,14 @@ def test_mjcf_noise_is_the_default(resolve: Callable[[str], Setup]) -> None:
     """Without a noise table the sensors that state their noise are measured."""
     setup = resolve(edited("state = 0.05", ""))
     assert setup.outputs.names == ("slide_position", "hinge_angle", "slide_velocity", "hinge_velocity")
-    assert setup.outputs.sigma.tolist() == [0.05] * 4
+    assert setup.noise.sigma.tolist() == [0.05] * 4
 
 
 def test_start_from_qpos(resolve: Callable[[str], Setup]) -> None:
     """Positions and velocities stand for themselves, what is missing is the model's."""
     setup = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
-    assert setup.start.tolist() == [0.5, 3.0, 0.0, -1.0]
-    assert resolve(edited('keyframe = "hanging"', "")).start.tolist() == [0.0, 0.0, 0.0, 0.0]
+    assert setup.plant.nominal_start.tolist() == [0.5, 3.0, 0.0, -1.0]
+    assert resolve(edited('keyframe = "hanging"', "")).plant.nominal_start.tolist() == [0.0, 0.0, 0.0, 0.0]
 
 
 def test_rate_below_the_timestep(resolve: Callable[[str], Setup]) -> None:
@@ -358,9 +433,17 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "keyframe": (edited('"hanging"', '"hangin"'), E, [HOME, "initial.keyframe", "'hangin'", "did you mean 'hanging'"]),
     # parameter paths
     "path form": (target("body/bob"), E, [HOME, "parameters.m", "'body/bob'", "kind/name:field[index]"]),
-    "path kind": (target("bdy/bob:mass"), E, [HOME, "parameters.m", "kind 'bdy'", "actuator, body, geom, joint"]),
+    "path kind": (
+        target("bdy/bob:mass"),
+        E,
+        [HOME, "parameters.m", "kind 'bdy'", "actuator, body, geom, initial, joint, option, output, site, tendon"],
+    ),
     "path name": (target("body/bo:mass"), E, [HOME, "parameters.m", "body 'bo'", "'bob'", "cart, pendulum"]),
-    "path field": (target("body/bob:mas"), E, [HOME, "parameters.m", "field 'mas'", "'mass'", "inertia, ipos, mass"]),
+    "path field": (
+        target("body/bob:mas"),
+        E,
+        [HOME, "parameters.m", "field 'mas'", "'mass'", "inertia, ipos, logcholesky, mass"],
+    ),
     "path index": (target("body/bob:pos[3]"), E, [HOME, "parameters.m", "index 3", "0 to 2"]),
     "path index of a scalar": (target("joint/hinge:damping[1]"), E, [HOME, "parameters.m", "index 1", "0 to 0"]),
     "path without a name": (target("body:mass"), E, [HOME, "parameters.m", "bob, cart, pendulum"]),
@@ -408,7 +491,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "guess zero": (
         parameter('target = "joint/slide:damping"'),
         E,
-        [HOME, "parameters.m.scale", "the guess is 0", "state a scale"],
+        [HOME, "parameters.m.scale", "is 0: state a guess, or a scale"],
     ),
     "guess not a number": (
         parameter('target = "body/bob:mass"\nguess = nan'),
@@ -454,7 +537,81 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "cost.control", "actuator 'force' has no weight"],
     ),
-    "criterion": (edited("[cost]", '[cost]\ncriterion = "F"'), E, [HOME, "cost.criterion", "'E', 'A' or 'D'", "'F'"]),
+    "criterion": (
+        edited("[cost]", '[cost]\ncriterion = "F"'),
+        E,
+        [HOME, "cost.criterion", "'E', 'A', 'D' or 'c'", "'F'"],
+    ),
+    "criterion c alone": (
+        edited("[cost]", '[cost]\ncriterion = "c"'),
+        E,
+        [HOME, "cost", "exactly one of combination and subset"],
+    ),
+    "combination of another criterion": (
+        edited("[cost]", "[cost]\ncombination = { m = 1 }"),
+        E,
+        [HOME, "cost", "no other criterion takes one"],
+    ),
+    "combination of nothing": (
+        edited("[cost]", '[cost]\ncriterion = "c"\ncombination = { m = 0 }'),
+        E,
+        [HOME, "cost", "no coefficient other than 0"],
+    ),
+    "combination of a stranger": (
+        edited("[cost]", '[cost]\ncriterion = "c"\ncombination = { l = 1 }'),
+        E,
+        [HOME, "cost.combination", "wanted parameter 'l'", "valid: m"],
+    ),
+    "subset of nothing": (
+        edited("[cost]", '[cost]\ncriterion = "c"\nsubset = []'),
+        E,
+        [HOME, "cost.subset", "empty", "valid: m"],
+    ),
+    "metric weight without the metric": (
+        LEAST + "[descent]\npsi_weight = 1\n",
+        E,
+        [HOME, "descent", "psi_weight belongs to method"],
+    ),
+    "coarse word": (LEAST + '[descent]\ncoarse = "no"\n', E, [HOME, "descent.coarse", "integer", "'no'"]),
+    # further tables
+    "function in a file": (
+        parameter('function = "f"\nguess = 1'),
+        E,
+        [HOME, "parameters.m.function", "given in Python, not in a file"],
+    ),
+    "noise key": (
+        edited("state = 0.05", "state = { sigm = 1 }"),
+        E,
+        [HOME, "noise.state.sigm", "covariance, rate, sigma"],
+    ),
+    "noise of both": (
+        edited("state = 0.05", "state = { sigma = 1, covariance = [[1]] }"),
+        E,
+        [HOME, "noise.state", "exactly one of sigma and covariance"],
+    ),
+    "noise rate": (edited("state = 0.05", "state = { sigma = 1, rate = 0 }"), E, [HOME, "noise.state.rate", "greater"]),
+    "noise infinite": (
+        edited("state = 0.05", "hinge_angle = { covariance = [[inf]] }"),
+        E,
+        [HOME, "noise.hinge_angle.covariance.0.0", "finite"],
+    ),
+    "correlated key": (
+        LEAST + "[[correlated]]\noutput = []\n",
+        E,
+        [HOME, "correlated.0.output", "covariance, outputs"],
+    ),
+    "nuisance key": (LEAST + "[nuisance]\nstart = true\n", E, [HOME, "nuisance.start", "bias, delay, initial"]),
+    "nuisance false": (LEAST + "[nuisance]\ndelay = false\n", E, [HOME, "nuisance.delay", "True"]),
+    "robust key": (LEAST + "[robust]\ncount = 3\n", E, [HOME, "robust.count", "over, samples, seed"]),
+    "robust over": (LEAST + '[robust]\nover = "best"\n', E, [HOME, "robust.over", "'mean' or 'worst'", "'best'"]),
+    "robust of one": (LEAST + "[robust]\nsamples = 1\n", E, [HOME, "robust.samples", "greater than or equal to 2"]),
+    "robust without knowledge": (LEAST + "[robust]\n", E, [HOME, "robust", "state `prior` or `bounds`"]),
+    "earlier": ('earlier = ["gone.json"]\n' + LEAST, E, [HOME, "earlier", "gone.json", "cannot read"]),
+    "earlier that is no file of ours": (
+        'earlier = ["cart_pendulum.csv"]\n' + LEAST,
+        E,
+        [HOME, "earlier", "cart_pendulum.csv", "neither a design.json"],
+    ),
     # limits
     "position limits inverted": (
         LEAST + "[limits]\nposition = { slide = [1, -1] }\n",
@@ -518,6 +675,12 @@ def test_faults_are_named(name: str, resolve: Callable[[str], Setup]) -> None:
     message = str(caught.value)
     assert fragments[0] in message.splitlines()[0].split(": ")[0]
     assert [f for f in fragments if f not in message] == []
+
+
+def test_a_free_control_is_named_by_its_actuator(resolve: Callable[[str], Setup]) -> None:
+    """At the latest where the cost is built."""
+    with pytest.raises(ExperimentError, match=r"cost\.control_about: .*actuator 'motor'.*force"):
+        _ = resolve(edited("[cost]", "[cost]\ncontrol_about = { motor = 1 }")).problem
 
 
 def test_least_is_sound(resolve: Callable[[str], Setup]) -> None:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from numerics import Array, Loop, body_setup, cart_setup, relative_error
 
-from mjfim.designer import design, direction_for
+from mjfim.designer import Stage, design, direction_for
 from mjfim.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.extended import extend
 from mjfim.fisher import Information
 from mjfim.lq import Recursion, TangentCurve
+from mjfim.noise import Noise
 from mjfim.plant import CENTRAL, Bilinear
 from mjfim.pronto import Expansion
 from mjfim.setup import Setup
@@ -21,6 +22,8 @@ from mjfim.trajectory import Sensitivity
 
 TRACKING = {"tracking": {"slide": 0.3, "hinge": 0.1}, "control": 1e-2}
 SENSED = {"angle": 0.01, "acc": 0.3, "drive": 0.1}
+
+CORRELATED = ({"outputs": ("angle", "drive"), "covariance": ((1e-4, 5e-4), (5e-4, 0.01))},)
 
 
 def expanded(setup: Setup) -> Expansion:
@@ -49,6 +52,9 @@ CASES = {
     "cart E": lambda f: cart_setup(f, cost=TRACKING),
     "cart A": lambda f: cart_setup(f, cost={**TRACKING, "criterion": "A"}),
     "cart D sensors": lambda f: cart_setup(f, "Euler", noise=SENSED, cost={**TRACKING, "criterion": "D"}),
+    "cart, correlated, nuisances": lambda f: cart_setup(
+        f, noise=SENSED, correlated=CORRELATED, nuisance={"initial": 0.05, "bias": 0.1, "delay": 0.02}
+    ),
     "free body": body_setup,
 }
 
@@ -73,7 +79,8 @@ def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None
     C, D = rng.normal(size=(N + 1, ny, nx)), rng.normal(size=(N + 1, ny, nu))
     unit = Bilinear(A, B, C, D, rng.normal(size=(p, N, nx + nu, nx)), rng.normal(size=(p, N + 1, nx + nu, ny)))
     S = Sensitivity(rng.normal(size=(N + 1, nx, p)), rng.normal(size=(N + 1, ny, p)))
-    made = Information(np.array([0.3, 2.0]), 1, 20.0, np.array([1.0, 0.5, 3.0]), np.zeros((p, p)), criterion)
+    noise = Noise.independent([0.3, 2.0])
+    made = Information(noise, 20.0, np.array([1.0, 0.5, 3.0]), np.zeros((p, p)), criterion)
     found = made.evaluate(made.matrix(S))
     F, h = (np.einsum("rj,jkzx->rkzx", found.directions, m) for m in (unit.F_mixed, unit.h_mixed))
     a, b = made.gradient(found, S, Bilinear(A, B, C, D, F, h))
@@ -140,7 +147,9 @@ def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tm
     for k, j in ((11, 0), (37, p - 1)):
         h = 1e-3 * abs(setup.theta[j])
         shift = h * np.eye(p)[j]
-        pair = tuple(Loop(setup.parameters.model(setup.plant.base, setup.theta + s * shift), 1) for s in (1, -1))
+        pair = tuple(
+            Loop(setup.parameters.model(setup.plant.source.model, setup.theta + s * shift), 1) for s in (1, -1)
+        )
         x, u, psi, loop = curve.state[k], curve.ctrl[k], S.psi[k][:, j], pair[0]
         columns = []
         for i in range(nx + nu):
@@ -179,7 +188,7 @@ def test_an_expansion_without_psi_is_refused(tmp_path) -> None:
 
 def test_the_experiment_chooses_the_extended_metric_and_it_lowers_the_cost(tmp_path: Path) -> None:
     setup = cart_setup(tmp_path, descent={"method": "metric", "psi_weight": 1e-4, "max_iterations": 3})
-    direction, problem = direction_for(setup)
+    direction, problem = direction_for(Stage(setup, None))
     assert isinstance(direction, ExtendedMetricDescent)
     assert problem.extended
     assert direction.Q.shape == (16, 16)

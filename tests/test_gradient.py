@@ -7,13 +7,25 @@ reach them (said where it applies).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numerics import Array, body_setup, cart_setup, directional_check, filtered_setup, make_setup, shared_model
+from numerics import (
+    CART_PARAMETERS,
+    CART_PENDULUM,
+    Array,
+    body_setup,
+    cart_setup,
+    directional_check,
+    filtered_setup,
+    make_setup,
+    shared_model,
+)
 
+from mjfim.designer import Stage
 from mjfim.lq import TangentCurve, regulator
 from mjfim.objective import Point
 from mjfim.plant import CENTRAL, FAST, Accuracy
@@ -64,6 +76,37 @@ def cart(integrator: str = "RK4", **tables: Any) -> Callable[[Path], Setup]:
     return lambda folder: cart_setup(folder, integrator, **tables)
 
 
+def servo(folder: Path) -> Setup:
+    """Cart under a position servo whose gain and damping are unknown but not wanted."""
+    motor, position = '<motor name="force" joint="slide"/>', '<position name="force" joint="slide" kp="30" kv="4"/>'
+    xml = CART_PENDULUM.format(integrator="implicitfast")
+    assert motor in xml
+    unwanted = {n: {"target": f"actuator/force:{n}", "nuisance": True, "prior": 2.0} for n in ("kp", "kv")}
+    control = {"kind": "sine", "amplitude": 0.3, "frequency": 1.2}
+    return make_setup(
+        xml.replace(motor, position),
+        folder,
+        parameters={**CART_PARAMETERS, **unwanted},
+        noise={"angle": 0.01, "rate": 0.05, "drive": 0.1},
+        initial={"qpos": (0.1, 3.0), "qvel": (0.0, 0.4), "control": control},
+    )
+
+
+def staged(setup: Setup, basis: Array | None = None, power: float = np.inf) -> Setup:
+    """The same setup, its cost as a stage of the descent sees it."""
+    setup.problem = Stage(setup, basis, power).problem
+    return setup
+
+
+# Components of one quaternion measured alike would hold the same information at every orientation.
+BALL = {"qpos:ball.qw": 0.01, "qpos:ball.qx": 0.05, "qpos:float": 0.02, "qvel:ball": 0.05, "gyro": 0.05}
+COVARIANCE = ((1e-4, 3e-4, 0.0), (3e-4, 2.5e-3, 5e-4), (0.0, 5e-4, 0.01))
+CORRELATED = ({"outputs": ("angle", "rate", "drive"), "covariance": COVARIANCE},)
+SENSED = {"angle": 0.01, "rate": 0.05, "drive": 0.1, "acc": 0.3}
+LATE = {"initial": {"qpos:hinge": 0.05, "qvel:slide": True}, "bias": 0.1, "delay": 0.02}
+KNOWN = {n: {**t, "bounds": (0.2, 3.0), "prior": 0.1} for n, t in CART_PARAMETERS.items()}
+BASIS = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 2)))[0]
+
 SETUPS: dict[str, Callable[[Path], Setup]] = {
     "cart E tracking": cart(cost={**TRACKING, "criterion": "E"}),
     "cart A tracking": cart(cost={**TRACKING, "criterion": "A"}),
@@ -83,6 +126,31 @@ SETUPS: dict[str, Callable[[Path], Setup]] = {
     "free body with ball joint": body_setup,
     "free body D": lambda folder: body_setup(folder, "Euler", cost={"criterion": "D"}),
     "activation": filtered_setup,
+    "start unknown": cart(nuisance={"initial": 0.05}, cost={"criterion": "A"}),
+    "ball joint, start unknown": lambda folder: body_setup(folder, nuisance={"initial": {"qvel:ball[1]": True}}),
+    "bias and delay unknown": cart(nuisance={"bias": True, "delay": True}, cost={"criterion": "D"}),
+    "delay wanted": cart(
+        parameters={**CART_PARAMETERS, "lag": {"target": "output:delay", "guess": 0.013}}, noise=SENSED
+    ),
+    "sensors, all nuisances": cart("implicitfast", noise=SENSED, nuisance=LATE, cost={"criterion": "A"}),
+    "servo of unknown gain": servo,
+    "correlated noise": cart(noise=SENSED, correlated=CORRELATED),
+    "correlated noise, nuisances": cart(noise=SENSED, correlated=CORRELATED, nuisance=LATE, measure_rate=50.0),
+    "every sensor at its own rate": cart(noise={**SENSED, "acc": {"sigma": 0.3, "rate": 20.0}}),
+    "quaternions measured": lambda folder: body_setup(folder, noise=BALL),
+    "all states of a free body": lambda folder: body_setup(folder, noise={"state": 0.02}),
+    "quaternions measured late": lambda folder: body_setup(folder, noise=BALL, nuisance={"delay": 0.01}),
+    "cart c combination": cart(cost={"criterion": "c", "combination": {"m": 1.0, "l": -0.5}}, nuisance=LATE),
+    "cart c subset": cart(cost={"criterion": "c", "subset": ("l", "c")}),
+    "cart E smooth": lambda folder: staged(cart_setup(folder, nuisance=LATE), power=40.0),
+    "cart E smooth, nearly a sum": lambda folder: staged(cart_setup(folder), power=1.5),
+    "cart E on combinations": lambda folder: staged(cart_setup(folder, nuisance=LATE), BASIS),
+    "cart c on combinations": lambda folder: staged(
+        cart_setup(folder, cost={"criterion": "c", "subset": ("m", "l", "c")}), BASIS, 40.0
+    ),
+    "robust mean": cart(parameters=KNOWN, robust={"over": "mean", "samples": 4}, nuisance=LATE),
+    "robust worst": cart(parameters=KNOWN, robust={"over": "worst", "samples": 4}, noise=SENSED),
+    "robust worst D": cart(parameters=KNOWN, robust={"over": "worst", "samples": 3}, cost={"criterion": "D"}),
     "dmc_cartpole": cartpole,
     "dmc_acrobot": acrobot,
     "qube_furuta": furuta,
@@ -149,7 +217,10 @@ def test_gradient_by_fast_differences_is_close(case: str, feedback: bool, tmp_pa
     assert gradient_error(setup, K, FAST, 5e-3) < 1e-3
 
 
-@pytest.mark.parametrize("case", ["cart E tracking", "free body with ball joint", "activation"])
+OFF = ["cart E tracking", "free body with ball joint", "activation", "sensors, all nuisances", "robust worst"]
+
+
+@pytest.mark.parametrize("case", OFF)
 def test_a_gradient_off_by_a_thousandth_would_be_rejected(case: str, tmp_path) -> None:
     setup = SETUPS[case](tmp_path)
     K = gain(setup)
@@ -171,6 +242,31 @@ def test_leaving_out_what_psi_does_to_the_information_would_be_rejected(tmp_path
 
     assert directional_check([expansion.slope(zeta)], [J], 5e-3) < 1e-5
     assert directional_check([wrong.slope(zeta)], [J], 5e-3) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("case", "term"),
+    [("bias and delay unknown", "delay"), ("delay wanted", "lag"), ("quaternions measured", "h_mixed")],
+)
+def test_leaving_out_a_term_of_the_measurement_would_be_rejected(case: str, term: str, tmp_path, monkeypatch) -> None:
+    setup = SETUPS[case](tmp_path)
+    K, whole = np.zeros((setup.samples, setup.plant.nu, setup.space.nx)), setup.plant.bilinear
+    monkeypatch.setattr(setup.plant, "bilinear", lambda *given: replace(whole(*given), **{term: None}))
+    assert gradient_error(setup, K, CENTRAL, 5e-3) > 1e-3
+
+
+@pytest.mark.parametrize("case", ["robust mean", "robust worst", "robust worst D"])
+def test_leaving_out_a_sample_of_a_robust_design_would_be_rejected(case: str, tmp_path) -> None:
+    setup = SETUPS[case](tmp_path)
+    point, K = setup.problem.point(setup.initial, CENTRAL), np.zeros((setup.samples, 1, 4))
+    whole, blind = setup.problem.expand(point), replace(setup.problem, pool=None).expand(point)
+    zeta = whole.lift(K, directions(setup, whole.gradient(K))[0])
+
+    def J(t: float) -> float:
+        return setup.problem.value(setup.problem.project(point, zeta, t, K))
+
+    assert directional_check([whole.slope(zeta)], [J], 5e-3) < 1e-5
+    assert directional_check([blind.slope(zeta)], [J], 5e-3) > 1e-2
 
 
 @pytest.mark.parametrize("case", ["cart A tracking", "free body with ball joint"])

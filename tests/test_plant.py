@@ -20,11 +20,12 @@ from numerics import (
     relative_error,
     shared_model,
 )
+from scipy.interpolate import CubicSpline
 
 from mjfim.errors import SimulationDiverged
 from mjfim.identified import write_spec
 from mjfim.lq import Recursion, TangentCurve, regulator
-from mjfim.models import compile_spec, load_spec, private_model, unconstrained
+from mjfim.models import Source, compile_spec, load_spec, unconstrained
 from mjfim.plant import CENTRAL, FAST
 from mjfim.setup import Setup
 from mjfim.trajectory import Linearization
@@ -133,10 +134,16 @@ def test_a_wrong_jacobian_would_be_noticed(tmp_path) -> None:
 def rebuilt(setup: Setup, theta: Array) -> Any:
     """The model compiled anew at theta, sensors and solver as in the plant."""
     spec = setup.spec.copy()
-    write_spec(spec, setup.model, setup.parameters, theta)
+    write_spec(spec, setup.model, setup.model_at(theta), setup.parameters, theta)
     for body in spec.bodies:
         body.simple = 0
     return spec.compile()
+
+
+def sensed(setup: Setup) -> tuple[list[int], list[int]]:
+    """Rows of the outputs that are sensors, and where those stand in sensordata."""
+    found = [(i, o.sensor) for i, o in enumerate(setup.outputs.outputs) if o.sensor is not None]
+    return [i for i, _ in found], [s for _, s in found]
 
 
 @pytest.mark.parametrize(
@@ -145,7 +152,7 @@ def rebuilt(setup: Setup, theta: Array) -> Any:
 def test_E_and_H_are_differences_of_rebuilt_models(make, tolerance: float, tmp_path) -> None:
     setup = make(tmp_path)
     found, curve, theta = linear(setup), setup.initial, setup.theta
-    rows = setup.outputs.sensor_rows
+    rows, address = sensed(setup)
     for j, h in enumerate(1e-5 * np.abs(theta)):
         step = h * np.eye(len(theta))[j]
         up, down = (Loop(rebuilt(setup, theta + s), setup.substeps) for s in (step, -step))
@@ -153,7 +160,7 @@ def test_E_and_H_are_differences_of_rebuilt_models(make, tolerance: float, tmp_p
         for i, k in enumerate(SAMPLES):
             x, u = curve.state[k], curve.ctrl[k]
             F[i] = up.minus(up.F(x, u), down.F(x, u)) / (2 * h)
-            H[i] = ((up.h(x, u) - down.h(x, u)) / (2 * h))[setup.outputs.sensor_address]
+            H[i] = ((up.h(x, u) - down.h(x, u)) / (2 * h))[address]
         assert relative_error(found.E[list(SAMPLES), :, j], F) < tolerance
         if len(rows) and np.abs(H).max() > 1e-9:
             assert relative_error(found.H[list(SAMPLES)][:, rows, j], H) < tolerance
@@ -220,6 +227,7 @@ def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, t
     w = np.abs(theta) * np.linspace(1.0, 0.5, len(theta))
     found = setup.plant.bilinear(theta, curve, psi, w[None], CENTRAL)
     e, d = 3e-4, 3e-4
+    rows, address = sensed(setup)
     plus, minus = (Loop(rebuilt(setup, theta + s * e * w), setup.substeps) for s in (1, -1))
     for k in (7, 23):
         x, u, push = curve.state[k], curve.ctrl[k], psi[k] @ w
@@ -234,10 +242,9 @@ def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, t
             step = d * np.eye(nx + setup.plant.nu)[i]
             ahead, back = DF(plus.plus(x, step[:nx]), u + step[nx:]), DF(plus.plus(x, -step[:nx]), u - step[nx:])
             F.append((ahead[0] - back[0]) / (2 * d))
-            H.append((ahead[1] - back[1])[setup.outputs.sensor_address] / (2 * d))
+            H.append((ahead[1] - back[1])[address] / (2 * d))
         assert relative_error(found.F_mixed[0, k], np.array(F)) < 1e-4
         if setup.outputs.needs_sensors:
-            rows = setup.outputs.sensor_rows
             assert relative_error(found.h_mixed[0, k][:, rows], np.array(H)) < 1e-4
 
 
@@ -404,7 +411,7 @@ def test_mujoco_itself_would_have_made_that_noise(tmp_path, monkeypatch, capfd) 
     setup = cart_setup(tmp_path)
     setup.initial  # noqa: B018  (quiet work first: afterwards MuJoCo's own settings must be back)
     loop = Loop(setup.plant.model(setup.theta), 5)
-    loop.F(setup.start, np.array([9e9]))
+    loop.F(setup.plant.nominal_start, np.array([9e9]))
     out = "".join(capfd.readouterr())
     assert "WARNING" in out or (tmp_path / "MUJOCO_LOG.TXT").exists()
 
@@ -486,7 +493,7 @@ def written(folder: Path, xml: str) -> tuple[Any, Path]:
 @pytest.mark.parametrize("integrator", ["RK4", "Euler", "implicitfast"])
 def test_switching_off_solver_and_sensors_of_an_unconstrained_model_changes_no_bit(integrator: str, tmp_path) -> None:
     spec, path = written(tmp_path, CART_PENDULUM.format(integrator=integrator))
-    plain, lean = compile_spec(spec, path), private_model(spec, path, ["bob"], sensors=False, friction=False)
+    plain, lean = compile_spec(spec, path), Source(spec, path, ["bob"], sensors=False, friction=False).model
     assert (bits(plain), bits(lean)) == ((False, False), (True, True))
     states = []
     for model in (plain, lean):
@@ -526,15 +533,15 @@ def test_the_solver_stays_on_where_a_constraint_can_act(case: str, tmp_path) -> 
     assert old in FREE_OF_CONSTRAINTS
     spec, path = written(tmp_path, FREE_OF_CONSTRAINTS.replace(old, new))
     assert not unconstrained(compile_spec(spec, path))
-    assert bits(private_model(spec, path, [], sensors=True, friction=False)) == (False, False)
+    assert bits(Source(spec, path, [], sensors=True, friction=False).model) == (False, False)
 
 
 def test_the_solver_stays_on_where_friction_is_to_be_identified(tmp_path) -> None:
     spec, path = written(tmp_path, FREE_OF_CONSTRAINTS)
-    assert bits(private_model(spec, path, [], sensors=True, friction=True)) == (False, False)
+    assert bits(Source(spec, path, [], sensors=True, friction=True).model) == (False, False)
     loss = {"loss": {"target": "joint/slide:frictionloss", "guess": 0.2}}
     setup = cart_setup(tmp_path, parameters=loss)
-    assert bits(setup.plant.base)[0] is False
+    assert bits(setup.plant.source.model)[0] is False
     assert np.abs(setup.plant.sensitivity(setup.theta, setup.initial).psi).max() > 1e-3
 
 
@@ -545,3 +552,102 @@ def test_private_copies_leave_the_users_spec_and_model_alone(tmp_path) -> None:
     assert setup.spec.to_xml() == before
     assert setup.model.body("arm").mass[0] == pytest.approx(0.4)
     assert bits(setup.model) == (False, False)
+
+
+OUTSIDE = {"noise": {"state": 0.05, **SENSED}}
+START = {"initial": {"qpos:hinge": True, "qvel:slide": True}}
+
+
+def test_the_start_enters_the_sensitivity_as_its_own_initial_value(tmp_path) -> None:
+    setup = cart_setup(tmp_path, **OUTSIDE, nuisance=START)
+    L, S = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial)
+    start = np.eye(4)[:, [1, 2]]  # (dq, dv): the hinge's angle, the slide's speed
+    np.testing.assert_allclose(S.psi[0][:, 3:], start, rtol=0, atol=1e-9)
+    for j in (0, 1):
+        alone = Recursion(L.A).forward(start[:, j], np.zeros((setup.samples, 4)))
+        assert relative_error(S.psi[..., 3 + j], alone) < 1e-6
+        assert relative_error(S.G[..., 3 + j], np.einsum("kyx,kx->ky", L.C, alone)) < 1e-6
+
+
+def test_the_start_of_a_quaternion_moves_in_its_tangent_space(tmp_path) -> None:
+    setup = body_setup(tmp_path, nuisance={"initial": {"qpos:ball[2]": True, "qvel:float[4]": True}})
+    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    np.testing.assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)
+    loop, h = Loop(setup.plant.model(setup.theta), 1), 1e-4
+    ends = []
+    for sign in (1, -1):
+        state = loop.plus(setup.initial.state[0], sign * h * np.eye(18)[8])
+        for u in setup.initial.ctrl[:20]:
+            state = loop.F(state, u)
+        ends.append(state)
+    assert relative_error(S.psi[20][:, 4], loop.minus(*ends) / (2 * h)) < 1e-6
+
+
+def test_biases_add_to_their_own_output_and_to_nothing_else(tmp_path) -> None:
+    setup = cart_setup(tmp_path, **OUTSIDE, nuisance={"bias": {"angle": True, "acc[2]": 0.1}})
+    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    names = list(setup.outputs.names)
+    for j, name in ((3, "angle"), (4, "acc[2]")):
+        expected = np.zeros(len(names))
+        expected[names.index(name)] = 1.0
+        np.testing.assert_array_equal(S.G[..., j], np.broadcast_to(expected, S.G.shape[:2]))
+        np.testing.assert_array_equal(S.psi[..., j], 0.0)
+    theta = setup.theta + np.array([0.0, 0.0, 0.0, 0.7, -0.2])
+    y, _ = setup.plant.measure(np.stack([setup.theta, theta]), setup.control)
+    shift = np.zeros(len(names))
+    shift[[names.index("angle"), names.index("acc[2]")]] = 0.7, -0.2
+    np.testing.assert_allclose(y[1] - y[0], np.broadcast_to(shift, y[0].shape), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.0237])
+def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
+    parameters = {**CART_PARAMETERS, "late": {"target": "output:delay", "guess": delay, "scale": 0.01}}
+    late, plain = cart_setup(tmp_path, **OUTSIDE, parameters=parameters), cart_setup(tmp_path, **OUTSIDE)
+    (y, G), (exact, exact_G) = (s.plant.predict(s.theta, s.control) for s in (late, plain))
+    t, states = np.arange(51) * 0.01, slice(0, 4)  # smooth states; accelerations follow the steps of the control
+    for i in range(4):
+        moved = CubicSpline(t, exact[:, i])
+        np.testing.assert_allclose(y[5:, i], moved(t[5:] - delay), rtol=0, atol=1e-4 * np.ptp(exact[:, i]))
+        slope = -moved(t[5:-3] - delay, 1)
+        np.testing.assert_allclose(G[5:-3, i, 3], slope, rtol=0, atol=1e-2 * np.abs(slope).max())
+    if not delay:
+        np.testing.assert_allclose(y, exact, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(G[:, states, :3], exact_G[:, states], rtol=0, atol=1e-12)
+    h = 1e-6
+    moved, _ = late.plant.measure(late.theta + np.outer([h, -h], np.eye(4)[3]), late.control)
+    if delay:  # at a knot of the interpolation the two sides differ
+        assert relative_error(G[..., 3], (moved[0] - moved[1]) / (2 * h)) < 1e-5
+    assert relative_error(late.plant.sensitivity(late.theta, late.initial).G, G) < 1e-6
+
+
+def test_faint_parameters_get_longer_differences_and_others_keep_theirs(tmp_path) -> None:
+    faint = {"tiny": {"target": "body/bob:inertia[1]"}, **CART_PARAMETERS}
+    setup = cart_setup(tmp_path, parameters=faint)
+    relative = setup.plant.span / setup.parameters.step
+    assert relative[0] > 5.0
+    assert (relative >= 1.0).all() and (relative <= 100.0).all()
+    np.testing.assert_array_equal(relative[1:3], 1.0)
+    # what the longer step is for: less round-off, without a change of the derivative
+    S = setup.plant.sensitivity(setup.theta, setup.initial).psi[..., 0]
+    far = setup.plant.sensitivity(setup.theta, setup.initial, 1e-4).psi[..., 0]
+    assert relative_error(S, far) < 1e-6
+
+
+def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> None:
+    setup = body_setup(tmp_path)
+    picked, L = np.array([3, 20, 41]), linear(setup)
+    found = setup.plant.one_step(setup.theta, setup.initial, picked, 1e-5)
+    nx, ny, p = setup.space.nx, len(setup.outputs), len(setup.theta)
+    states = found[: 3 * nx].reshape(3, nx, p) * (setup.dt * setup.plant.steps_of(setup.initial)[:nx])[:, None]
+    assert relative_error(states, L.E[picked]) < 1e-6
+    sensors = found[3 * nx :].reshape(3, ny, p)
+    H = L.H[picked] * setup.parameters.step
+    size = np.abs(H).max(axis=(0, 2))
+    moving = size > 1e-6
+    assert moving.sum() >= 3
+    assert (
+        relative_error(
+            sensors[:, moving] * setup.parameters.step, (H / np.where(moving, size, 1.0)[:, None])[:, moving]
+        )
+        < 1e-5
+    )

@@ -10,6 +10,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mjfim.experiment import Experiment
@@ -31,10 +32,10 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(command: list[str], folder: Path) -> None:
+def run(command: list[str], folder: Path, code: int = 0) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error"}
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.returncode == code, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("block", blocks("python"))
@@ -44,16 +45,32 @@ def test_python_blocks_run(block: str, checkout: Path) -> None:
 
 def test_command_lines_run(checkout: Path) -> None:
     lines = [line for block in blocks("sh") for line in block.splitlines() if line.startswith("mjfim ")]
-    assert {line.split()[1] for line in lines} == {"design", "simulate", "identify", "montecarlo", "replay"}
+    verbs = {"check", "design", "simulate", "identify", "montecarlo", "replay"}
+    assert {line.split()[1] for line in lines} == verbs
     for line in lines:
-        run([sys.executable, "-m", *line.split()], checkout)
+        command, _, comment = line.partition("#")
+        run([sys.executable, "-m", *command.split()], checkout, 1 if "exits with 1" in comment else 0)
     assert (checkout / "out" / "replay.rrd").is_file()
 
 
 def test_experiment_block_is_a_valid_experiment() -> None:
-    (block,) = blocks("toml")
-    setup = Setup(Experiment(**tomllib.loads(block), directory=ROOT / "models"))
+    setup = Setup(Experiment(**tomllib.loads(blocks("toml")[0]), directory=ROOT / "models"))
     assert setup.parameters.names == ("m", "c")
+
+
+def test_further_tables_extend_it() -> None:
+    whole, *further = (tomllib.loads(block) for block in blocks("toml"))
+    assert further
+    for tables in further:
+        merged = {**whole, **{k: {**whole.get(k, {}), **v} for k, v in tables.items()}}
+        setup = Setup(Experiment(**merged, directory=ROOT / "models"))
+        assert set(tables["parameters"]) < set(setup.parameters.names)
+        assert np.isfinite(setup.problem.point(setup.initial).cost)
+
+
+def test_every_example_is_in_the_tour() -> None:
+    listed = set(re.findall(r"models/(\w+)\.toml", README))
+    assert {path.stem for path in (ROOT / "models").glob("*.toml")} <= listed
 
 
 def test_two_install_commands_stand_alone_and_ci_takes_them_from_here() -> None:

@@ -20,6 +20,7 @@ Read = Callable[..., Array]
 
 MODELS = Path(__file__).parents[1] / "models"
 NAMES = ("left", "right")
+REST = np.zeros(2)
 T = np.arange(400) * 0.01
 
 
@@ -127,7 +128,7 @@ def test_amplitude_bounds_the_signal(kind: str) -> None:
     signal = Signal(
         kind=kind, amplitude={"left": 2.0, "right": 0.5}, offset={"left": -1.0, "right": 3.0}, frequency=1.0
     )
-    u = generate(signal, T, NAMES)
+    u = generate(signal, T, NAMES, REST)
     assert u.shape == (400, 2)
     peak = np.abs(u - [-1.0, 3.0]).max(axis=0)
     assert np.all(peak <= np.array([2.0, 0.5]) * (1 + 1e-12))
@@ -136,37 +137,51 @@ def test_amplitude_bounds_the_signal(kind: str) -> None:
 
 def test_one_amplitude_for_all_and_none_for_the_unnamed() -> None:
     """A number holds for every actuator; a table leaves the others at rest."""
-    u = generate(Signal(kind="constant", amplitude=2.0, offset=1.0), T, NAMES)
+    u = generate(Signal(kind="constant", amplitude=2.0, offset=1.0), T, NAMES, REST)
     assert np.array_equal(u, np.full((400, 2), 3.0))
-    u = generate(Signal(kind="sine", amplitude={"right": 2.0}), T, NAMES)
+    u = generate(Signal(kind="sine", amplitude={"right": 2.0}), T, NAMES, REST)
     assert not u[:, 0].any()
     assert u[:, 1].any()
 
 
 def test_sine() -> None:
-    """Its frequency, and a phase of its own for each actuator."""
-    u = generate(Signal(kind="sine", amplitude=3.0, frequency=0.5), T, NAMES)
+    """Its frequency; each actuator is 17 % faster than the one before, so that no two move alike."""
+    u = generate(Signal(kind="sine", amplitude=3.0, frequency=0.5), T, NAMES, REST)
     assert np.allclose(u[:, 0], 3.0 * np.sin(np.pi * T), rtol=0, atol=1e-12)
-    assert np.abs(np.corrcoef(u.T)[0, 1]) < 0.9
+    assert np.allclose(u[:, 1], 3.0 * np.sin(1.17 * np.pi * T), rtol=0, atol=1e-12)
 
 
 def test_chirp_sweeps_its_frequencies() -> None:
-    """Starts at zero, its frequency grows linearly to the end; the next actuator is an eighth of a turn ahead."""
-    u = generate(Signal(kind="chirp", amplitude=2.0, frequency=1.0, frequency_end=5.0), T, NAMES)
+    """Starts at zero, its frequency grows linearly to the end; the next actuator sweeps 17 % higher."""
+    u = generate(Signal(kind="chirp", amplitude=2.0, frequency=1.0, frequency_end=5.0), T, NAMES, REST)
     turns = 1.0 * T + 0.5 * (5.0 - 1.0) * T**2 / T[-1]
     assert np.allclose(u[:, 0], 2.0 * np.sin(2 * np.pi * turns), rtol=0, atol=1e-9)
-    assert np.allclose(u[:, 1], 2.0 * np.sin(2 * np.pi * turns + np.pi / 4), rtol=0, atol=1e-9)
+    assert np.allclose(u[:, 1], 2.0 * np.sin(2 * np.pi * 1.17 * turns), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["sine", "chirp"])
+def test_signals_begin_at_rest_without_a_jolt(kind: str) -> None:
+    """Where no offset is stated they swing about the control at rest; a stated offset replaces all of it."""
+    rest = np.array([4.0, -7.0])
+    u = generate(Signal(kind=kind, amplitude=2.0), T, NAMES, rest)
+    assert u[0] == pytest.approx(rest, abs=1e-12)
+    assert np.array_equal(u, rest + generate(Signal(kind=kind, amplitude=2.0), T, NAMES, REST))
+    stated = generate(Signal(kind=kind, amplitude=2.0, offset={"right": 1.0}), T, NAMES, rest)
+    assert stated[0] == pytest.approx([0.0, 1.0], abs=1e-12)
+    assert rest.tolist() == [4.0, -7.0]
 
 
 def test_chirp_ends_at_five_times_its_start_by_default() -> None:
     """The end of the sweep may be left out."""
-    default = generate(Signal(kind="chirp", frequency=0.5), T, ("u",))
-    assert np.array_equal(default, generate(Signal(kind="chirp", frequency=0.5, frequency_end=2.5), T, ("u",)))
+    default = generate(Signal(kind="chirp", frequency=0.5), T, ("u",), REST[:1])
+    assert np.array_equal(
+        default, generate(Signal(kind="chirp", frequency=0.5, frequency_end=2.5), T, ("u",), REST[:1])
+    )
 
 
 def test_multisine_holds_its_harmonics_only() -> None:
     """Over whole periods all power is at f, 2 f, ..., n f."""
-    u = generate(Signal(kind="multisine", frequency=0.5, harmonics=4, seed=2), T, ("u",))[:, 0]
+    u = generate(Signal(kind="multisine", frequency=0.5, harmonics=4, seed=2), T, ("u",), REST[:1])[:, 0]
     spectrum = np.abs(np.fft.rfft(u))  # bins of 0.25 Hz
     expected = {2, 4, 6, 8}
     assert set(np.flatnonzero(spectrum > 1e-9 * spectrum.max())) == expected
@@ -174,7 +189,9 @@ def test_multisine_holds_its_harmonics_only() -> None:
 
 def test_multisine_seed() -> None:
     """Same seed, same signal; another seed, another; actuators differ."""
-    first, again, other = (generate(Signal(kind="multisine", amplitude=1.0, seed=seed), T, NAMES) for seed in (1, 1, 2))
+    first, again, other = (
+        generate(Signal(kind="multisine", amplitude=1.0, seed=seed), T, NAMES, REST) for seed in (1, 1, 2)
+    )
     assert np.array_equal(first, again)
     assert np.abs(first - other).max() > 0.1
     assert np.abs(first[:, 0] - first[:, 1]).max() > 0.1
@@ -193,7 +210,7 @@ def test_unknown_actuator(key: str) -> None:
     """Names key, fault, valid names."""
     signal = Signal(kind="sine", **{key: {"lift": 1.0}})
     with pytest.raises(ExperimentError, match=rf"initial\.control\.{key}: .*'lift'.*left, right"):
-        generate(signal, T, NAMES)
+        generate(signal, T, NAMES, REST)
 
 
 def test_setup_samples_the_signal_at_its_rate() -> None:
@@ -206,3 +223,18 @@ def test_setup_samples_the_signal_at_its_rate() -> None:
     coarse = fine.coarser(4)
     assert coarse.dt == pytest.approx(4 * fine.dt)
     assert np.allclose(coarse.control[:, 0], fine.control.reshape(-1, 4).mean(axis=1), rtol=0, atol=1e-12)
+
+
+def test_setup_swings_about_the_control_of_the_keyframe(tmp_path: Path) -> None:
+    """The keyframe's control is where the signal starts, an offset in the file wins over it."""
+    model = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
+    held = model.replace('name="hanging"', 'name="hanging" ctrl="1.5"')
+    assert held != model
+    (tmp_path / "held.xml").write_text(held, encoding="utf-8")
+    e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
+        model=str(tmp_path / "held.xml"), horizon=1.0, initial={"control": {"kind": "sine", "amplitude": 0.5}}
+    )
+    control = Setup(e).control[:, 0]
+    assert (control[0], control.max(), control.min()) == pytest.approx((1.5, 2.0, 1.5), abs=1e-2)
+    stated = Setup(e.replace(initial={"control": {"kind": "sine", "amplitude": 0.5, "offset": -1.0}}))
+    assert stated.control[:, 0] == pytest.approx(control - 2.5, abs=1e-12)

@@ -5,6 +5,7 @@ This package is the only importer of matplotlib.
 
 from __future__ import annotations
 
+from mjfim.plots.check import check_figure
 from mjfim.plots.design import convergence, sensitivity_phase, trajectories
 from mjfim.plots.estimates import fit, histogram
 from mjfim.plots.parameters import parameter_intervals, std_bars
@@ -12,6 +13,7 @@ from mjfim.plots.style import save
 from mjfim.plots.tables import design_table, study_table
 
 __all__ = [
+    "check_figure",
     "convergence",
     "design_table",
     "fit",

@@ -1,0 +1,279 @@
+"""`mjfim.check`: what an experiment, or recordings that are there already, can tell about the parameters, before any fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.designer import Stage
+from mjfim.errors import RecordingError, SimulationDiverged
+from mjfim.estimate import Fit
+from mjfim.experiment import Experiment
+from mjfim.fisher import Information
+from mjfim.identifiability import COARSER, Group
+from mjfim.plant import CENTRAL, SENSITIVITY_STEP
+from mjfim.selftest import SelfTest, self_test
+from mjfim.setup import Setup
+from mjfim.survey import Survey, survey, survey_rows
+from mjfim.trajectory import Array, Recording, Trajectory, freeze
+
+CONFOUNDED = 0.95
+DEFAULT_WANTED = 0.05  # of a parameter's own size, where none is stated
+MOST = 1_000_000_000
+LONGEST_LINE = 400
+
+
+@dataclass(frozen=True)
+class Row:
+    """One parameter. std: predicted standard deviation, infinite where it cannot be told alone;  relative: to its size
+
+    size: its magnitude, of its value or, for components of vectors and tensors, of the whole
+    wanted: standard deviation aimed at, stated or 5 % of the parameter's size;  stated: which of the two
+    repetitions: of this experiment that reach it, 0 where none do;  seconds: the same as time
+    """
+
+    name: str
+    unit: str
+    value: float
+    nuisance: bool
+    size: float
+    std: float
+    relative: float
+    wanted: float
+    stated: bool
+    repetitions: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two parameters that the data hardly tell apart."""
+
+    first: str
+    second: str
+    correlation: float
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What can be identified.
+
+    source: what was looked at;  horizon: its duration [s];  rows: one per parameter
+    information: (p, p);  eigenvalues: ascending, of what the criterion sees;  correlation: (t, t) of the wanted parameters,
+    NaN where one cannot be told alone;  wanted: their names
+    never: groups that no experiment with these outputs tells apart;  not_here: those that another control would
+    """
+
+    source: str
+    horizon: float
+    rows: tuple[Row, ...]
+    wanted: tuple[str, ...]
+    information: Array
+    eigenvalues: Array
+    correlation: Array
+    confounded: tuple[Pair, ...]
+    never: tuple[Group, ...]
+    not_here: tuple[Group, ...]
+    self_test: SelfTest
+    verdict: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        freeze(self, "information", "eigenvalues", "correlation")
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest eigenvalue."""
+        low = self.eigenvalues[0] if len(self.eigenvalues) else 0.0
+        return float(self.eigenvalues[-1] / low) if low > 0.0 else np.inf
+
+    @property
+    def ok(self) -> bool:
+        """Derivatives hold, every parameter can be told, and what was stated as wanted is reached by one repetition."""
+        reached = all(row.repetitions == 1 for row in self.rows if row.stated and not row.nuisance)
+        return self.self_test.passed and not self.never and not self.not_here and reached
+
+
+def check(
+    experiment: Experiment | Setup,
+    recordings: Sequence[Recording] = (),
+    trajectory: Trajectory | None = None,
+    threads: int | None = None,
+) -> Check:
+    """Look at an experiment's initial trajectory, at a given one (a design), or at recordings, at the design's theta.
+
+    Raises SimulationDiverged where that cannot be simulated, RecordingError for unusable recordings.
+    """
+    setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
+    if recordings and trajectory is not None:
+        raise RecordingError("check either recordings or a designed trajectory, not both")
+    curve = setup.initial if trajectory is None else setup.plant.simulate(setup.theta, trajectory.ctrl)
+    if recordings:
+        fit = Fit(setup, recordings, data_only=True)
+        longest = max(fit.recordings, key=lambda r: len(r.t))
+        curve = setup.plant.simulate(setup.theta, longest.ctrl[: setup.samples])
+        J, error = _recorded(setup, fit)
+        seen = survey_rows(setup, curve, J, error)
+        data, horizon = J.T @ J, float(sum(r.t[-1] for r in fit.recordings))
+        source = f"{len(recordings)} recording{'s' if len(recordings) > 1 else ''}"
+    problem = setup.problem
+    problem = replace(problem, running=replace(problem.running, desired=curve.state))
+    point = problem.point(curve, CENTRAL)
+    if point.information is None or point.sensitivity is None:
+        raise SimulationDiverged("the simulation diverges when the parameters move a little")
+    if not recordings:
+        seen = survey(setup, curve, point.sensitivity)
+        data, horizon = point.information - setup.information.prior, float(curve.t[-1])
+        source = "the initial control" if trajectory is None else "the given trajectory"
+    judged = replace(problem, information=replace(problem.information, basis=seen.basis))
+    tested = self_test(setup, judged, judged.judged(point))
+    return _concluded(setup, seen, data, horizon, source, tested)
+
+
+def _recorded(setup: Setup, fit: Fit) -> tuple[Array, Array]:
+    """Whitened rows of G along all recordings and their change with the longer difference step."""
+    rows, errors = [], []
+    for recording, mask in zip(fit.recordings, fit.masks, strict=True):
+        pair = [
+            setup.plant.predict(setup.theta, recording.ctrl, step)
+            for step in (SENSITIVITY_STEP, COARSER * SENSITIVITY_STEP)
+        ]
+        if pair[0] is None:
+            raise SimulationDiverged(f"{recording.name}: the simulation diverges under its control")
+        rows.append(setup.noise.whiten_present(pair[0][1], mask))
+        longer = pair[0][1] if pair[1] is None else pair[1][1]
+        errors.append(setup.noise.whiten_present(longer - pair[0][1], mask))
+    return np.concatenate(rows), np.concatenate(errors)
+
+
+def _concluded(setup: Setup, seen: Survey, data: Array, horizon: float, source: str, tested: SelfTest) -> Check:
+    p = setup.parameters
+    information = replace(setup.information, prior=setup.prior, basis=seen.here.basis if seen.here.count else None)
+    total = data + setup.prior
+    covariance = information.covariance(total)
+    std = np.full(len(p), np.inf)
+    std[p.interest] = np.nan_to_num(np.sqrt(np.diag(covariance)), nan=np.inf)
+    rows = tuple(_rows(setup, information, data, std, horizon))
+    spread = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(spread, spread)
+    confounded = tuple(_pairs(seen.names, correlation))
+    criterion = setup.information
+    visible = Stage(setup, seen.basis).problem.information
+    never, more = seen.groups_always, seen.here.count > seen.always.count
+    known = {str(g) for g in never}
+    not_here = tuple(g for g in seen.groups_here if str(g) not in known) if more else ()
+    eigenvalues = np.maximum(visible.evaluate(data + criterion.prior).eigenvalues, 0.0)
+    verdict = tuple(_verdict(rows, never, not_here, confounded, tested, source))
+    return Check(
+        source, horizon, rows, seen.names, total, eigenvalues, correlation, confounded, never, not_here, tested, verdict
+    )
+
+
+def _rows(setup: Setup, information: Information, data: Array, std: Array, horizon: float) -> Iterator[Row]:
+    p = setup.parameters
+    for j, parameter in enumerate(p.parameters):
+        value = float(setup.theta[j])
+        plain = parameter.size == abs(parameter.guess) and value != 0.0
+        size = abs(value) if plain else float(p.step[j])
+        stated = parameter.wanted is not None
+        wanted = parameter.wanted or DEFAULT_WANTED * size
+        needed = 0 if parameter.nuisance else _repetitions(information, data, setup.prior, j, wanted)
+        yield Row(
+            parameter.name,
+            parameter.unit,
+            value,
+            parameter.nuisance,
+            size,
+            float(std[j]),
+            float(std[j] / size),
+            wanted,
+            stated,
+            needed,
+            needed * horizon,
+        )
+
+
+def _repetitions(information: Information, data: Array, prior: Array, parameter: int, wanted: float) -> int:
+    """Least number of repetitions whose information, with the prior, brings a parameter to the wanted sigma; 0: none do."""
+    t = np.arange(len(data)) if information.interest is None else information.interest
+    place = int(np.flatnonzero(t == parameter)[0])
+
+    def reached(n: int) -> bool:
+        variance = information.covariance(n * data + prior)[place, place]
+        return bool(variance <= wanted**2)
+
+    low, high = 0, 1
+    while not reached(high):
+        low, high = high, 2 * high
+        if high > MOST:
+            return 0
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if reached(middle) else (middle, high)
+    return high
+
+
+def _pairs(names: Sequence[str], correlation: Array) -> Iterator[Pair]:
+    """Confounded pairs, the worst first."""
+    found = [
+        Pair(names[i], names[j], float(correlation[i, j]))
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(correlation[i, j]) > CONFOUNDED
+    ]
+    yield from sorted(found, key=lambda pair: -abs(pair.correlation))
+
+
+def _brief(groups: Sequence[Group]) -> str:
+    """Groups in words, or only how many where that would fill a page."""
+    said = "; ".join(str(group) for group in groups)
+    if len(said) <= LONGEST_LINE:
+        return said
+    members = sum(len(group.members) for group in groups)
+    return f"{members} parameters in {len(groups)} groups (listed under combinations)"
+
+
+def _verdict(
+    rows: Sequence[Row],
+    never: Sequence[Group],
+    not_here: Sequence[Group],
+    confounded: Sequence[Pair],
+    tested: SelfTest,
+    source: str,
+) -> Iterator[str]:
+    """Sentences that a person can act on, the gravest first."""
+    if tested.rough is not None:
+        yield f"{tested.rough}"
+    elif not tested.passed:
+        yield (
+            f"derivatives do not agree (psi recursion {tested.recursion:.1e}, slope {tested.slope:.1e}): the motion may be too "
+            "unstable, or something in the model switches (clamps, muscle activation); shorten horizon or timestep, or smooth "
+            "the switch, before trusting numbers here"
+        )
+    if never:
+        yield (
+            f"no experiment with these outputs can tell apart: {_brief(never)}. Take out or fix one of each group, or measure "
+            "something else; a design works on the combinations"
+        )
+    if not_here:
+        yield f"not visible from {source}, but another control would show: {_brief(not_here)}. Move those joints more"
+    wanted = [row for row in rows if not row.nuisance]
+    alone = [row for row in wanted if np.isfinite(row.std)]
+    late = [row for row in alone if row.repetitions != 1]
+    if not alone:
+        yield "nothing can be identified from this"
+        return
+    worst = max(alone, key=lambda row: row.std / row.wanted)
+    if not late and tested.passed:
+        yield f"all that can be told alone reaches its wanted sigma from {source}: nothing more is needed"
+    elif late:
+        reach = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s)" if worst.repetitions else "no repetition"
+        yield (
+            f"not known to the wanted sigma from {source} alone: {len(late)} of {len(alone)} parameters, above all "
+            f"{worst.name}: {reach} for {worst.wanted:.3g}. An excitation that is designed (`mjfim design`) tells more"
+        )
+    if confounded:
+        said = ", ".join(f"{p.first} / {p.second} ({p.correlation:+.3f})" for p in confounded[:5])
+        more = f" and {len(confounded) - 5} more pairs" if len(confounded) > 5 else ""
+        yield f"hardly told apart (correlation): {said}{more}; fixing one of a pair sharpens the other"

@@ -1,0 +1,107 @@
+"""Where derivatives do not exist: contacts, dry friction, limits and clamps make two difference steps disagree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.identifiability import BLIND, FAINT
+from mjfim.limits import saturated
+from mjfim.plant import SENSITIVITY_STEP
+from mjfim.sensing import joint_names
+from mjfim.setup import Setup
+from mjfim.trajectory import Array, Trajectory
+
+LONGER = 30.0  # the second step, times the first
+TOLERANCE = 1e-2  # relative disagreement that is told
+MINOR = 1e-3  # of the largest effect of a parameter; an output that shows less of it tells nothing
+
+
+@dataclass(frozen=True)
+class Roughness:
+    """Disagreement of dy/dtheta by two difference steps.
+
+    error: largest relative disagreement;  parameter: whose;  sample, time [s]: where it first shows;  causes: what acts there
+    """
+
+    error: float
+    parameter: str
+    sample: int
+    time: float
+    causes: tuple[str, ...]
+
+    def __str__(self) -> str:
+        cause = ", ".join(self.causes) or "no contact, friction or limit acts there: the motion may be chaotic"
+        size = f"{100 * self.error:.2g} %" if np.isfinite(self.error) else "without bound"
+        return (
+            f"not smooth: derivatives by two difference steps disagree by {size} for {self.parameter}, first at sample "
+            f"{self.sample} (t = {self.time:.4g} s; {cause}); sigma and design rest on derivatives that hardly exist there"
+        )
+
+
+def disagreement(fine: Array, coarse: Array) -> Array:
+    """(N+1, p) relative disagreement of two derivatives G: (N+1, ny, p), each output's against its own largest value."""
+    size = np.maximum(np.abs(fine).max(axis=0), np.abs(coarse).max(axis=0))
+    size = np.maximum(size, MINOR * size.max(axis=0, initial=0.0))
+    return np.asarray((np.abs(fine - coarse) / np.where(size > 0.0, size, 1.0)).max(axis=1))
+
+
+def roughness(setup: Setup, theta: Array, trajectory: Trajectory) -> Roughness | None:
+    """The worst disagreement along a trajectory, or None where it is below `TOLERANCE`."""
+    fine = setup.plant.sensitivity(theta, trajectory)
+    coarse = setup.plant.sensitivity(theta, trajectory, LONGER * SENSITIVITY_STEP)
+    names = setup.parameters.names
+    if fine is None or coarse is None:
+        causes = tuple(_active(setup.model_at(theta), trajectory, range(trajectory.samples)))
+        return Roughness(np.inf, ", ".join(names), 0, 0.0, causes)
+    G = setup.noise.whiten(fine.G)
+    error = disagreement(G, setup.noise.whiten(coarse.G))[:, visible_columns(setup, G)]
+    kept = np.flatnonzero(visible_columns(setup, G))
+    if not len(kept):
+        return None
+    worst = int(np.argmax(error.max(axis=0)))
+    if not error[:, worst].max() > TOLERANCE:
+        return None
+    first = int(np.argmax(error[:, worst] > TOLERANCE))
+    near = range(max(first - 2, 0), min(first + 1, trajectory.samples))
+    causes = tuple(_active(setup.model_at(theta), trajectory, near))
+    return Roughness(float(error[:, worst].max()), names[kept[worst]], first, float(trajectory.t[first]), causes)
+
+
+def visible_columns(setup: Setup, G: Array) -> np.ndarray:
+    """(p,) True where a parameter has an effect that stands out of round-off. G: (N+1, ny, p), whitened"""
+    length = np.linalg.norm(G, axis=(0, 1)) * setup.parameters.step
+    return np.asarray((length > BLIND) & (length > FAINT * length.max(initial=0.0)))
+
+
+def _active(model: Any, trajectory: Trajectory, samples: range) -> Iterator[str]:
+    """Contacts, frictions, limits and clamps that act at these samples, each once."""
+    data, told = mujoco.MjData(model), set[str]()
+    for k in samples:
+        data.qpos[:], data.qvel[:], data.act[:] = trajectory.qpos[k], trajectory.qvel[k], trajectory.act[k]
+        data.ctrl[:] = trajectory.ctrl[k]
+        mujoco.mj_forward(model, data)
+        told.update(_at(model, data))
+    yield from sorted(told)
+    yield from (f"force range of {name}" for name in saturated(model, trajectory, samples))
+
+
+def _at(model: Any, data: Any) -> Iterator[str]:
+    for contact in data.contact[: data.ncon]:
+        names = (mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or f"geom{g}" for g in contact.geom)
+        yield f"contact {' - '.join(names)}"
+    joints = joint_names(model)
+    for kind, ident in zip(data.efc_type, data.efc_id, strict=True):
+        if kind == int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF):
+            yield f"dry friction of {joints[model.dof_jntid[ident]]}"
+        elif kind == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT):
+            yield f"limit of {joints[ident]}"
+        elif kind in (
+            int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON),
+            int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON),
+        ):
+            yield f"friction or limit of tendon {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, ident)}"

@@ -1,0 +1,92 @@
+"""Derivatives checked on the user's own model: two difference steps, the recursion of psi, the slope along the manifold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjfim.designer import regulator_for
+from mjfim.directions import LBFGS
+from mjfim.errors import SimulationDiverged
+from mjfim.lq import TangentCurve
+from mjfim.objective import DesignProblem, Point
+from mjfim.pronto import Expansion
+from mjfim.roughness import Roughness, roughness, visible_columns
+from mjfim.setup import Setup
+from mjfim.trajectory import Array, Sensitivity, Trajectory
+
+RECURSION = 1e-3
+SLOPE = 1e-2
+
+
+@dataclass(frozen=True)
+class SelfTest:
+    """Relative errors; infinite where a perturbed motion diverges, NaN where the criterion itself is infinite.
+
+    rough: disagreement of two difference steps that is too large, or None
+    recursion: psi by rollouts against `psi_{k+1} = A psi + E`;  slope: DJ.zeta against differences of J(P(xi + gamma zeta))
+    """
+
+    rough: Roughness | None
+    recursion: float
+    slope: float
+
+    @property
+    def passed(self) -> bool:
+        """True where all derivatives agree."""
+        return self.rough is None and not self.recursion > RECURSION and not self.slope > SLOPE
+
+
+def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
+    """Test the derivatives about a point of a problem that was computed with central differences."""
+    trajectory = point.trajectory
+    if trajectory is None or point.sensitivity is None:
+        raise SimulationDiverged("the trajectory diverges when the parameters move a little")
+    return SelfTest(
+        roughness(setup, setup.theta, trajectory),
+        recursion_error(setup, trajectory, point.sensitivity),
+        slope_error(setup, problem, point),
+    )
+
+
+def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivity) -> float:
+    """Largest difference between two ways to psi, relative to the largest entry of each parameter's psi."""
+    try:
+        line = setup.plant.linearize(setup.theta, trajectory)
+    except SimulationDiverged:
+        return np.inf
+    psi = sensitivity.psi
+    own = np.array(psi)
+    for k in range(trajectory.samples):
+        own[k + 1] = line.A[k] @ own[k] + line.E[k]
+    size = np.abs(psi).max(axis=(0, 1))
+    moving = (size > 0.0) & visible_columns(setup, setup.noise.whiten(sensitivity.G))
+    if not moving.any():
+        return 0.0
+    return float((np.abs(own - psi).max(axis=(0, 1))[moving] / size[moving]).max())
+
+
+def slope_error(setup: Setup, problem: DesignProblem, point: Point) -> float:
+    """Relative error of DJ.zeta along the first descent direction, against central differences through the projection."""
+    if not np.isfinite(point.cost) or point.trajectory is None:
+        return float("nan")
+    expansion = problem.expand(point)
+    K = regulator_for(setup).gain(expansion)
+    zeta = LBFGS(np.diag(setup.control_weight) * setup.dt)(expansion, K)
+    size = setup.plant.steps_of(point.trajectory)
+    relative = max(np.abs(zeta.z / size[: zeta.z.shape[1]]).max(), np.abs(zeta.v / size[zeta.z.shape[1] :]).max())
+    if relative == 0.0:
+        return 0.0
+    unit = TangentCurve(zeta.z / relative, zeta.v / relative)
+    return min(_slope_error(problem, point, expansion, unit, K, step) for step in (1e-3, 1e-4))
+
+
+def _slope_error(
+    problem: DesignProblem, point: Point, expansion: Expansion, zeta: TangentCurve, K: Array, step: float
+) -> float:
+    ends = [problem.value(problem.project(point, zeta, sign * step, K)) for sign in (1.0, -1.0)]
+    expected = expansion.slope(zeta)
+    if not np.isfinite(ends).all():
+        return np.inf
+    return float(abs((ends[0] - ends[1]) / (2.0 * step) - expected) / max(abs(expected), 1e-300))

@@ -1,0 +1,157 @@
+"""Experiments for the models of others: name -> keyword arguments of `mjfim.Experiment`. Data only.
+
+Model paths are relative to ../shared/models beside the repository's root (`numerics.SHARED`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+PI = 3.141592653589793
+SO_ARM = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+PANDA = tuple(f"joint{i}" for i in range(1, 8))
+
+
+def chirp(amplitude: float, low: float, high: float, **more: Any) -> dict[str, Any]:
+    """A chirp from low to high [Hz] as initial control."""
+    return {"kind": "chirp", "amplitude": amplitude, "frequency": low, "frequency_end": high, **more}
+
+
+def state_noise(joints: tuple[str, ...], q: float = 0.002, v: float = 0.02) -> dict[str, float]:
+    """Encoders [rad or m] and their rates."""
+    return {f"qpos:{j}": q for j in joints} | {f"qvel:{j}": v for j in joints}
+
+
+EXPERIMENTS: dict[str, dict[str, Any]] = {
+    # swings about hanging; motor torque is weak against gravity
+    "pendulum": {
+        "model": "dmc_pendulum/pendulum.xml",
+        "rate": 50.0,
+        "horizon": 5.0,
+        "initial": {"qpos": (PI,), "control": chirp(0.3, 0.2, 1.5)},
+        "parameters": {
+            "mass": {"target": "body/pole:mass"},
+            "com": {"target": "body/pole:ipos[2]"},
+            "damping": {"target": "joint/hinge:damping"},
+        },
+        "noise": state_noise(("hinge",)),
+        "cost": {"criterion": "E", "control": 2e-4},
+    },
+    "cartpole": {
+        "model": "dmc_cartpole/cartpole.xml",
+        "rate": 100.0,
+        "horizon": 4.0,
+        "initial": {"qpos": (0.0, PI), "control": chirp(0.25, 0.8, 2.5)},
+        "parameters": {
+            "cart_mass": {"target": "body/cart:mass"},
+            "pole_mass": {"target": "body/pole_1:mass"},
+            "pole_com": {"target": "body/pole_1:ipos[2]"},
+            # the model's own dampings, 5e-4 and 2e-6, do not show in four seconds
+            "cart_damping": {"target": "joint/slider:damping", "guess": 0.5},
+            "pole_damping": {"target": "joint/hinge_1:damping", "guess": 2e-3},
+        },
+        "noise": state_noise(("slider", "hinge_1")),
+        "cost": {"criterion": "E", "control": 1e-2, "tracking": {"slider": 1e-3}},  # stay on the rail
+    },
+    "acrobot": {
+        "model": "dmc_acrobot/acrobot.xml",
+        "rate": 100.0,
+        "horizon": 4.0,
+        "initial": {"qpos": (PI, 0.0), "control": chirp(0.5, 0.2, 2.0)},
+        "parameters": {
+            "upper_mass": {"target": "body/upper_arm:mass"},
+            "lower_mass": {"target": "body/lower_arm:mass"},
+            "upper_com": {"target": "body/upper_arm:ipos[2]"},
+            "lower_com": {"target": "body/lower_arm:ipos[2]"},
+            "shoulder_damping": {"target": "joint/shoulder:damping"},
+            "elbow_damping": {"target": "joint/elbow:damping"},
+        },
+        "noise": state_noise(("shoulder", "elbow")),
+        "cost": {"criterion": "E", "control": 0.2},
+    },
+    # motor in N m; it bears +-0.02, the arm's cable two radians
+    "furuta": {
+        "model": "qube_furuta/furuta_pendulum_implicitfast.xml",
+        "rate": 100.0,
+        "horizon": 3.0,
+        "initial": {"control": chirp(0.004, 1.0, 4.0)},
+        "parameters": {
+            "arm_damping": {"target": "joint/theta:damping"},
+            "pole_damping": {"target": "joint/alpha:damping"},
+            "arm_armature": {"target": "joint/theta:armature", "guess": 5e-6},
+            "motor_gain": {"target": "actuator/motor:gainprm[0]"},
+        },
+        "noise": state_noise(("theta", "alpha")),
+        "cost": {"criterion": "E", "control": 300.0, "tracking": {"theta": 6e-3}},
+        "limits": {"control": {"motor": (-0.02, 0.02)}, "position": {"theta": (-2.0, 2.0)}},
+    },
+    # home with the jaw open: closed, its pads touch
+    "so_arm100": {
+        "model": "menagerie_so_arm100/so_arm100_nomesh.xml",
+        "rate": 50.0,
+        "horizon": 4.0,
+        "initial": {
+            "qpos": (0.0, -1.57079, 1.57079, 1.57079, -1.57079, 0.5),
+            "control": chirp(
+                0.1,
+                0.3,
+                1.2,
+                offset={
+                    "Rotation": 0.0,
+                    "Pitch": -1.57079,
+                    "Elbow": 1.57079,
+                    "Wrist_Pitch": 1.57079,
+                    "Wrist_Roll": -1.57079,
+                    "Jaw": 0.5,
+                },
+            ),
+        },
+        "parameters": {
+            "upper_mass": {"target": "body/Upper_Arm:mass"},
+            "lower_mass": {"target": "body/Lower_Arm:mass"},
+            "lower_com": {"target": "body/Lower_Arm:ipos[2]"},
+            "jaw_mass": {"target": "body/Fixed_Jaw:mass"},
+            "pitch_armature": {"target": "joint/Pitch:armature"},
+            "elbow_armature": {"target": "joint/Elbow:armature"},
+            "pitch_friction": {"target": "joint/Pitch:frictionloss"},
+            "elbow_friction": {"target": "joint/Elbow:frictionloss"},
+        },
+        "noise": state_noise(SO_ARM),
+        "cost": {
+            "criterion": "E",
+            "control": 2.0,
+            "control_about": {
+                "Pitch": -1.57079,
+                "Elbow": 1.57079,
+                "Wrist_Pitch": 1.57079,
+                "Wrist_Roll": -1.57079,
+                "Jaw": 0.5,
+            },
+            "tracking": dict.fromkeys(SO_ARM, 5.0),
+            "tracking_velocity": dict.fromkeys(SO_ARM, 20.0),
+        },
+        "descent": {"tolerance": 1e-2, "max_iterations": 40},
+    },
+    "panda": {
+        "model": "menagerie_panda/panda_nohand_nomesh.xml",
+        "rate": 100.0,
+        "horizon": 3.0,
+        "initial": {"keyframe": "home", "control": chirp(0.03, 0.2, 0.8)},
+        "parameters": {
+            "link4_mass": {"target": "body/link4:mass"},
+            "link4_com": {"target": "body/link4:ipos[1]"},
+            "link7_mass": {"target": "body/link7:mass"},
+            "link7_com": {"target": "body/link7:ipos[2]"},
+            # the model has neither damping nor armature: values as in Menagerie's Panda with hand, more damping
+            "damping_big": {"targets": [{"path": f"joint/joint{i}:damping"} for i in (1, 2, 3, 4)], "guess": 10.0},
+            "damping_small": {"targets": [{"path": f"joint/joint{i}:damping"} for i in (5, 6, 7)], "guess": 2.0},
+            "armature": {"targets": [{"path": f"joint/joint{i}:armature"} for i in range(1, 8)], "guess": 0.1},
+        },
+        "noise": state_noise(PANDA),
+        "cost": {
+            "criterion": "E",
+            "control": 1000.0,
+        },
+        "descent": {"tolerance": 1e-2, "max_iterations": 40},
+    },
+}
