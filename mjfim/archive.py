@@ -73,6 +73,10 @@ def design_summary(design: Design) -> dict[str, Any]:
         "warnings": list(design.warnings),
         "nuisance": list(design.nuisance),
         "combinations": list(design.combinations),
+        "combined": [
+            {"words": c.words, "value": c.value, "std_initial": c.initial, "std_final": c.final}
+            for c in design.combined
+        ],
         "prior": design.prior,
     }
 
@@ -274,6 +278,7 @@ def check_summary(check: Check) -> dict[str, Any]:
         "correlation": check.correlation,
         "confounded": [{"a": p.first, "b": p.second, "correlation": p.correlation} for p in check.confounded],
         "combinations": [_group(g) for g in check.never],
+        "combined": [{"words": c.words, "value": c.value, "std": c.final} for c in check.combined],
         "not_excited": [_group(g) for g in check.not_here],
         "self_test": {
             "passed": check.self_test.passed,

@@ -12,12 +12,12 @@ from mjfim.errors import RecordingError, SimulationDiverged
 from mjfim.estimate import Fit
 from mjfim.experiment import Experiment
 from mjfim.fisher import Information
-from mjfim.identifiability import COARSER, Group
+from mjfim.identifiability import COARSER, Group, rows_of
 from mjfim.plant import CENTRAL, SENSITIVITY_STEP
 from mjfim.selftest import SelfTest, self_test
 from mjfim.setup import Setup
 from mjfim.survey import Survey, survey, survey_rows
-from mjfim.trajectory import Array, Recording, Trajectory, freeze
+from mjfim.trajectory import Array, Combined, Recording, Trajectory, freeze
 
 CONFOUNDED = 0.95
 DEFAULT_WANTED = 0.05  # of a parameter's own size, where none is stated
@@ -63,6 +63,7 @@ class Check:
     source: what was looked at;  horizon: its duration [s];  rows: one per parameter
     information: (p, p);  eigenvalues: ascending, of what the criterion sees;  correlation: (t, t) of the wanted parameters,
     NaN where one cannot be told alone;  wanted: their names
+    combined: what is identifiable of groups, with its standard deviation (`initial` and `final` alike)
     never: groups that no experiment with these outputs tells apart;  not_here: those that another control would
     """
 
@@ -78,6 +79,7 @@ class Check:
     not_here: tuple[Group, ...]
     self_test: SelfTest
     verdict: tuple[str, ...]
+    combined: tuple[Combined, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "information", "eigenvalues", "correlation")
@@ -165,8 +167,26 @@ def _concluded(setup: Setup, seen: Survey, data: Array, horizon: float, source: 
     not_here = tuple(g for g in seen.groups_here if str(g) not in known) if more else ()
     eigenvalues = np.maximum(visible.evaluate(data + criterion.prior).eigenvalues, 0.0)
     verdict = tuple(_verdict(rows, never, not_here, confounded, tested, source))
+    combinations = rows_of(never, seen.names)
+    combinations = combinations[: 0 if not_here else len(combinations)]
+    spread = information.spread(total, combinations)
+    words = [str(c) for group in never for c in group.combinations]
+    values = combinations @ setup.theta[p.interest]
+    combined = tuple(Combined(w, float(v), float(s), float(s)) for w, v, s in zip(words, values, spread, strict=False))
     return Check(
-        source, horizon, rows, seen.names, total, eigenvalues, correlation, confounded, never, not_here, tested, verdict
+        source,
+        horizon,
+        rows,
+        seen.names,
+        total,
+        eigenvalues,
+        correlation,
+        confounded,
+        never,
+        not_here,
+        tested,
+        verdict,
+        combined,
     )
 
 

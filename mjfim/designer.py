@@ -12,6 +12,7 @@ import numpy as np
 from mjfim.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.experiment import Experiment
+from mjfim.identifiability import rows_of
 from mjfim.limits import margins, saturated
 from mjfim.lq import growth, regulator
 from mjfim.objective import DIVERGED, DesignProblem, Point
@@ -21,7 +22,7 @@ from mjfim.roughness import roughness
 from mjfim.setup import Setup
 from mjfim.signals import multisine
 from mjfim.survey import Survey, require_designable, survey
-from mjfim.trajectory import Array, Design, Evaluation, HistoryRow, StartResult, Status, Trajectory
+from mjfim.trajectory import Array, Combined, Design, Evaluation, HistoryRow, StartResult, Status, Trajectory
 
 Monitor = Callable[[HistoryRow], None]
 
@@ -48,7 +49,10 @@ def design(
             raise ExperimentError(f"start: shape {start.shape}, wanted (samples, actuators) = {setup.control.shape}")
     begin = first if start is None else problem.point(setup.plant.simulate(setup.theta, start), CENTRAL)
     if first.information is None or begin.information is None:
-        raise SimulationDiverged("the simulation diverges when the parameters move a little along the initial control")
+        why = "when the parameters move a little along the initial control"
+        if setup.pool is not None:
+            why += ", or at a parameter sample of [robust]; bounds keep samples where the model makes sense"
+        raise SimulationDiverged(f"the simulation diverges {why}")
     if begin.trajectory is None or begin.sensitivity is None:
         raise SimulationDiverged("the simulation diverges along the initial control")
     seen = survey(setup, begin.trajectory, begin.sensitivity)
@@ -306,8 +310,22 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
         starts=tuple(StartResult(r.name, r.cost, r.status, r.history[-1].iteration if r.history else 0) for r in runs),
         nuisance=tuple(p.name for p in setup.parameters.parameters if p.nuisance),
         combinations=tuple(str(group) for group in seen.groups_always),
+        combined=_combined(stage, seen, first, final),
         prior=setup.prior,
     )
+
+
+def _combined(stage: Stage, seen: Survey, first: Point, final: Evaluation) -> tuple[Combined, ...]:
+    """Standard deviations of the identifiable combinations before and after."""
+    setup, groups = stage.setup, seen.groups_always
+    rows = rows_of(groups, seen.names)
+    if not len(rows) or first.information is None:
+        return ()
+    words = [str(c) for group in groups for c in group.combinations]
+    values = rows @ setup.theta[setup.parameters.interest]
+    before, after = (stage.problem.information.spread(told, rows) for told in (first.information, final.information))
+    columns = zip(words, values.tolist(), before.tolist(), after.tolist(), strict=True)
+    return tuple(Combined(*column) for column in columns)
 
 
 def _fine_point(stage: Stage, control: Array) -> Point | None:

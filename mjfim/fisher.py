@@ -95,19 +95,29 @@ class Information:
 
     def covariance(self, information: Array) -> Array:
         """(t, t) Cramer-Rao covariance of the wanted parameters; NaN where one is no identifiable combination by itself."""
+        covariance, basis = self._visible(information)
+        alone = 1.0 - np.sum(basis**2, axis=1) < ESTIMABLE
+        return np.where(np.outer(alone, alone), covariance, np.nan)
+
+    def spread(self, information: Array, combinations: Array) -> Array:
+        """(c,) Cramer-Rao standard deviations of identifiable combinations of the wanted parameters, (c, t)."""
+        covariance, _ = self._visible(information)
+        return np.asarray(np.sqrt(np.einsum("ci,ij,cj->c", combinations, covariance, combinations)))
+
+    def _visible(self, information: Array) -> tuple[Array, Array]:
+        """(t, t) covariance within the identifiable combinations, zero across, and their basis in scaled units."""
         t = np.arange(len(information)) if self.interest is None else self.interest
         basis = np.eye(len(t)) if self.basis is None else self._with_prior(self.basis, t)
         if not basis.shape[1]:
-            return np.full((len(t), len(t)), np.nan)
+            return np.full((len(t), len(t)), np.nan), basis
         R, _ = replace(self, basis=basis).reduced(information)
         size = np.sqrt(np.maximum(np.diag(R), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(R / np.outer(size, size))
         if values[0] <= SINGULAR * values[-1]:
-            return np.full((len(t), len(t)), np.nan)
+            return np.full((len(t), len(t)), np.nan), basis
         known = basis @ (vectors / size[:, None])
         covariance = (known / values) @ known.T * np.outer(self.scale[t], self.scale[t]) / self.measure_rate
-        alone = 1.0 - np.sum(basis**2, axis=1) < ESTIMABLE
-        return np.where(np.outer(alone, alone), covariance, np.nan)
+        return covariance, basis
 
     def std(self, information: Array) -> Array:
         """(p,) Cramer-Rao standard deviations; infinite for parameters that are no identifiable combination by themselves."""

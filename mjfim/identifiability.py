@@ -55,6 +55,16 @@ class Combination:
         return " ".join([head[0], *(f"{'+' if c > 0 else '-'} {_number(abs(c))}{name}" for name, c in rest)])
 
 
+def rows_of(groups: Sequence[Group], names: Sequence[str]) -> Array:
+    """(c, t) coefficients of all combinations of the groups, over the named parameters."""
+    combinations = [c for group in groups for c in group.combinations]
+    rows = np.zeros((len(combinations), len(names)))
+    for row, combination in zip(rows, combinations, strict=True):
+        for member, coefficient in zip(combination.members, combination.coefficients, strict=True):
+            row[list(names).index(member)] = coefficient
+    return rows
+
+
 @dataclass(frozen=True)
 class Group:
     """Parameters that are visible only together: as `combinations`, fewer than members; none where all are invisible."""

@@ -213,6 +213,12 @@ class ParameterSet:
         return np.asarray(self._linear(1, lambda slot: 0 if isinstance(slot, DelaySlot) else None)[0])
 
     @cached_property
+    def outside(self) -> np.ndarray:
+        """(p,) True where a parameter concerns the start or the measurement."""
+        kinds = (StartSlot, BiasSlot, DelaySlot)
+        return np.array([any(isinstance(slot, kinds) for slot in slots) for slots in self.slots], dtype=bool)
+
+    @cached_property
     def in_model(self) -> np.ndarray:
         """(p,) True where a parameter changes the model."""
         outside = (StartSlot, BiasSlot, DelaySlot)

@@ -162,6 +162,13 @@ class Plant:
             self.parameters.write(model, row)
         return self._pool[: len(theta)], sound
 
+    def _all(self, theta: Array) -> list[Any]:
+        """Models, one per row of theta. Raises SimulationDiverged where one cannot be compiled."""
+        models, sound = self._many(theta)
+        if not sound.all():
+            raise SimulationDiverged("MuJoCo cannot compile the model when the parameters move a little")
+        return models
+
     def _compiled(self, theta: Array) -> tuple[list[Any], np.ndarray]:
         models, sound = [], np.ones(len(theta), dtype=bool)
         for i, row in enumerate(theta):
@@ -253,7 +260,7 @@ class Plant:
         thetas = np.concatenate([theta + np.diag(theta_step), theta - np.diag(theta_step)])
         same = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
         held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.nu)
-        dp, hp = self._halves(self._many(thetas)[0], same, held, p, theta_step)
+        dp, hp = self._halves(self._all(thetas), same, held, p, theta_step)
         E = np.moveaxis(_finite(dp[:, :-1]), 0, 2)
         H = np.moveaxis(self.outputs.tangent(states, np.zeros((p, len(states), self.space.nx)), hp), 0, 2)
         H = H + self._bias
@@ -267,7 +274,7 @@ class Plant:
         p, h = len(self.parameters), step * self.span
         states, ctrl = trajectory.state[samples], trajectory.ctrl[samples]
         moves = np.diag(h)
-        models, _ = self._many(np.concatenate([theta + moves, theta - moves]))
+        models = self._all(np.concatenate([theta + moves, theta - moves]))
         same = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
         held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.nu)
         dx, ds = self._halves(models, same, held, p, h)
@@ -340,7 +347,7 @@ class Plant:
             epsilon = self._epsilon(accuracy, push, w)
             shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
             both = np.concatenate([self.space.plus(xs, shift), self.space.plus(xs, -shift)])
-            models, _ = self._many(np.stack([theta + epsilon * w, theta - epsilon * w]))
+            models = self._all(np.stack([theta + epsilon * w, theta - epsilon * w]))
             out, sensed = self.engine.step(models, both, np.concatenate([us, us]))
             pair = out.reshape(2, *shape)
             widths = (2.0 if accuracy.central else 1.0) * delta[:, None, None]

@@ -21,9 +21,16 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
         table.add_column(heading, justify="left" if heading == "parameter" else "right")
     rows = zip(design.parameters, units, design.theta, design.initial.std, design.final.std, strict=True)
     for name, unit, value, before, after in rows:
-        relative = f"{100 * after / abs(value):.2g} %" if value else "-"
-        gain = _ratio(before, after)
-        table.add_row(_named(name, unit), f"{value:.4g}", f"{before:.3g}", f"{after:.3g}", relative, gain)
+        if name in design.nuisance:
+            continue
+        alone = np.isfinite(after)
+        relative = f"{100 * after / abs(value):.2g} %" if value and alone else "-"
+        shown = [f"{std:.3g}" if np.isfinite(std) else "not alone" for std in (before, after)]
+        table.add_row(_named(name, unit), f"{value:.4g}", *shown, relative, _ratio(before, after))
+    for c in design.combined:
+        relative = f"{100 * c.final / abs(c.value):.2g} %" if c.value else "-"
+        stds = (f"{c.initial:.3g}", f"{c.final:.3g}")
+        table.add_row(c.words, f"{c.value:.4g}", *stds, relative, _ratio(c.initial, c.final), style="cyan")
     last = design.history[-1] if design.history else None
     before, after = design.initial.eigenvalues[0], design.final.eigenvalues[0]
     lines = [
@@ -34,7 +41,9 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
     ]
     if design.nuisance:
         lines.append(f"nuisance, not designed for: {', '.join(design.nuisance)}")
-    together: list[RenderableType] = [Text(f"only in combination: {words}") for words in design.combinations]
+    together: list[RenderableType] = []
+    if design.combinations:
+        together.append("not identifiable alone, so designed for the combinations; see design.json")
     return Group(table, *lines, *together, Text(BEST_CASE, style="dim"), *_warnings(design.warnings))
 
 
@@ -109,7 +118,7 @@ def check_report(check: Check) -> RenderableType:
     ):
         if groups:
             parts.append(Text(f"{title}:", style="bold"))
-            parts += [Text(line) for group in groups for line in _lines(group)]
+            parts += [Text(line) for group in groups for line in _lines(group, check)]
     few = check.eigenvalues
     shown = ", ".join(f"{v:.3g}" for v in (few if len(few) <= 8 else np.concatenate([few[:4], few[-2:]])))
     tested = check.self_test
@@ -124,11 +133,12 @@ def check_report(check: Check) -> RenderableType:
     return Group(*parts)
 
 
-def _lines(group: Combinations) -> list[str]:
-    """A group of parameters: its members, then one combination a line."""
+def _lines(group: Combinations, check: Check) -> list[str]:
+    """A group of parameters: its members, then one combination a line, with its value and standard deviation."""
     if not group.combinations:
         return [f"  {group}"]
-    return [f"  {', '.join(group.members)} only as", *(f"    {c}" for c in group.combinations)]
+    known = {c.words: f" = {c.value:.4g} ± {c.final:.2g}" for c in check.combined}
+    return [f"  {', '.join(group.members)} only as", *(f"    {c}{known.get(str(c), '')}" for c in group.combinations)]
 
 
 def _ratio(before: float, after: float) -> str:

@@ -19,6 +19,7 @@ from mjfim.parameters import ParameterSet
 from mjfim.trajectory import Array
 
 SHARPNESS = 20.0
+SAME_SIGN = 0.05  # least share of a scalar's value that a normal sample keeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +59,13 @@ class Pool:
 def sampled(parameters: ParameterSet, theta: Array, count: int, seed: int) -> Array:
     """(count, p) parameter values: theta itself, then a Latin hypercube over the priors (normal) or the bounds (uniform).
 
-    Normal samples keep within the bounds and 2.5 standard deviations. Parameters with neither stay at theta; raises
-    ExperimentError where that holds for all.
+    Normal samples keep within the bounds, within 2.5 standard deviations, and do not change the sign of a scalar (a mass, a
+    damping). Parameters with neither prior nor bounds, and those outside the model, stay at theta; raises ExperimentError
+    where that holds for all.
     """
-    p = len(parameters)
-    free = [j for j, q in enumerate(parameters.parameters) if q.prior is not None or np.isfinite(q.bounds).all()]
+    p, outside = len(parameters), parameters.outside
+    stated = [q.prior is not None or bool(np.isfinite(q.bounds).all()) for q in parameters.parameters]
+    free = [j for j in range(p) if stated[j] and not outside[j]]
     if not free:
         raise ExperimentError("robust: no parameter has a prior or bounds to sample from; state `prior` or `bounds`")
     out = np.tile(theta, (count, 1))
@@ -73,6 +76,10 @@ def sampled(parameters: ParameterSet, theta: Array, count: int, seed: int) -> Ar
             low, high = q.bounds
             if q.prior is not None:
                 drawn = theta[j] + q.prior * np.clip(ndtri(u[:, column]), -2.5, 2.5)
+                if q.size == abs(q.guess) and theta[j] > 0.0:
+                    low = max(low, SAME_SIGN * theta[j])
+                elif q.size == abs(q.guess) and theta[j] < 0.0:
+                    high = min(high, SAME_SIGN * theta[j])
                 out[1:, j] = np.clip(drawn, low, high)
             else:
                 out[1:, j] = low + (high - low) * u[:, column]

@@ -166,6 +166,16 @@ class StartResult:
     iterations: int
 
 
+@dataclass(frozen=True)
+class Combined:
+    """An identifiable combination of parameters that are not so alone: its words, value and standard deviations."""
+
+    words: str
+    value: float
+    initial: float
+    final: float
+
+
 @dataclass(frozen=True, eq=False)
 class Design:
     """Result of `mjfim.design`: the designed trajectory beside the one it started from.
@@ -175,7 +185,8 @@ class Design:
     limits: worst margin per kind of limit (positive = inside), by kind;  warnings: sentences for the user
     found_by: name of the start that led here;  starts: all of them
     nuisance: names of the parameters that the design did not look at
-    combinations: what is identifiable of parameters that are not so alone, in words;  prior: (p, p) information put in
+    combinations: groups of parameters that are not identifiable alone, in words;  combined: what is identifiable of them
+    prior: (p, p) information put in
     """
 
     status: Status
@@ -193,10 +204,16 @@ class Design:
     starts: tuple[StartResult, ...] = ()
     nuisance: tuple[str, ...] = ()
     combinations: tuple[str, ...] = ()
+    combined: tuple[Combined, ...] = ()
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         freeze(self, "theta", "prior")
+
+    @property
+    def wanted(self) -> tuple[int, ...]:
+        """Places of the parameters that are no nuisance."""
+        return tuple(j for j, name in enumerate(self.parameters) if name not in self.nuisance)
 
     @property
     def success(self) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 
 PI = 3.141592653589793
 SO_ARM = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+ARM26 = {"SF": 0.489, "SE": 0.41, "EF": 0.389, "EE": 0.5, "BF": 0.36, "BE": 0.506}  # holds (0.9, 1.2)
 PANDA = tuple(f"joint{i}" for i in range(1, 8))
 
 
@@ -36,6 +37,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         },
         "noise": state_noise(("hinge",)),
         "cost": {"criterion": "E", "control": 2e-4},
+        "descent": {"tolerance": 1e-3},
     },
     "cartpole": {
         "model": "dmc_cartpole/cartpole.xml",
@@ -51,7 +53,8 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
             "pole_damping": {"target": "joint/hinge_1:damping", "guess": 2e-3},
         },
         "noise": state_noise(("slider", "hinge_1")),
-        "cost": {"criterion": "E", "control": 1e-2, "tracking": {"slider": 1e-3}},  # stay on the rail
+        "cost": {"criterion": "E", "control": 4e-3, "tracking": {"slider": 1e-3}},  # stay on the rail
+        "descent": {"tolerance": 1e-3},
     },
     "acrobot": {
         "model": "dmc_acrobot/acrobot.xml",
@@ -68,13 +71,14 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         },
         "noise": state_noise(("shoulder", "elbow")),
         "cost": {"criterion": "E", "control": 0.2},
+        "descent": {"tolerance": 1e-3},
     },
     # motor in N m; it bears +-0.02, the arm's cable two radians
     "furuta": {
         "model": "qube_furuta/furuta_pendulum_implicitfast.xml",
         "rate": 100.0,
         "horizon": 3.0,
-        "initial": {"control": chirp(0.004, 1.0, 4.0)},
+        "initial": {"control": chirp(0.004, 1.0, 4.0, offset=-0.0005)},
         "parameters": {
             "arm_damping": {"target": "joint/theta:damping"},
             "pole_damping": {"target": "joint/alpha:damping"},
@@ -82,7 +86,8 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
             "motor_gain": {"target": "actuator/motor:gainprm[0]"},
         },
         "noise": state_noise(("theta", "alpha")),
-        "cost": {"criterion": "E", "control": 300.0, "tracking": {"theta": 6e-3}},
+        "cost": {"criterion": "E", "control": 200.0, "tracking": {"theta": 6e-3}},
+        "descent": {"tolerance": 1e-2},
         "limits": {"control": {"motor": (-0.02, 0.02)}, "position": {"theta": (-2.0, 2.0)}},
     },
     # home with the jaw open: closed, its pads touch
@@ -132,6 +137,26 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         },
         "descent": {"tolerance": 1e-2, "max_iterations": 40},
     },
+    # six muscles; about the equilibrium of half activation
+    "arm26": {
+        "model": "mj_arm26/arm26_lengthrange.xml",
+        "rate": 50.0,
+        "horizon": 4.0,
+        "initial": {
+            "qpos": (0.9, 1.2),
+            "act": tuple(ARM26.values()),
+            "control": chirp(0.05, 0.8, 2.0, offset=ARM26),
+        },
+        "parameters": {
+            "shoulder_damping": {"target": "joint/shoulder:damping"},
+            "elbow_damping": {"target": "joint/elbow:damping"},
+            "shoulder_armature": {"target": "joint/shoulder:armature", "guess": 0.05},
+            "elbow_armature": {"target": "joint/elbow:armature", "guess": 0.02},
+        },
+        "noise": state_noise(("shoulder", "elbow")),
+        "cost": {"criterion": "E", "control": 3.0, "control_about": ARM26},
+        "descent": {"tolerance": 1e-2, "max_iterations": 60},
+    },
     "panda": {
         "model": "menagerie_panda/panda_nohand_nomesh.xml",
         "rate": 100.0,
@@ -150,7 +175,7 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "noise": state_noise(PANDA),
         "cost": {
             "criterion": "E",
-            "control": 1000.0,
+            "control": 5000.0,
         },
         "descent": {"tolerance": 1e-2, "max_iterations": 40},
     },

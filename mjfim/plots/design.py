@@ -108,7 +108,9 @@ def trajectories(design: Design, labels: Labels) -> Figure:
 def phase_choice(design: Design, dofs: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Dofs of largest sensitivity and parameters of largest predicted relative std, in their own order."""
     scale = np.where(design.theta == 0.0, 1.0, np.abs(design.theta))
-    worst = np.argsort(-(design.final.std / scale), kind="stable")[:MAX_PHASE_PARAMETERS]
+    wanted = np.array(design.wanted, dtype=np.intp)
+    known = np.where(np.isfinite(design.final.std), design.final.std, 0.0) / scale
+    worst = wanted[np.argsort(-known[wanted], kind="stable")][:MAX_PHASE_PARAMETERS]
     psi = np.abs(design.final.sensitivity[:, :dofs] * scale)
     strongest = np.argsort(-psi.max(axis=(0, 2)), kind="stable")[:MAX_PHASE_DOFS]
     return np.sort(strongest), np.sort(worst)

@@ -58,8 +58,9 @@ def draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
 def annotate_bars(axes: Axes, design: Design) -> None:
     """Columns right of the bars: std as percent of the value for both trajectories, and the ratio of the stds."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative = [np.abs(e.std / design.theta) for e in (design.initial, design.final)]
-        ratio = design.initial.std / design.final.std
+        shown = list(design.wanted)
+        relative = [np.abs(e.std / design.theta)[shown] for e in (design.initial, design.final)]
+        ratio = (design.initial.std / design.final.std)[shown]
     cells = [
         (62.0, INITIAL, "of value", [percent(v) for v in relative[0]]),
         (122.0, OPTIMIZED, "of value", [percent(v) for v in relative[1]]),
@@ -95,24 +96,25 @@ def place_text(
 
 
 def std_bars(design: Design, labels: Labels) -> Figure:
-    """Predicted standard deviation of every parameter along both trajectories, with the gain."""
-    count = len(design.theta)
-    labels.check(parameters=count)
+    """Predicted standard deviation of every wanted parameter along both trajectories, with the gain."""
+    labels.check(parameters=len(design.theta))
+    shown = list(design.wanted)
+    count, before, after = len(shown), design.initial.std[shown], design.final.std[shown]
     figure = new_figure(9.0, 1.7 + (0.5 if count <= ROOMY else 0.3) * count)
     axes = figure.subplots()
     axes.set_xscale("log")
-    axes.set_xlim(*bar_limits(design.initial.std, design.final.std))
+    axes.set_xlim(*bar_limits(before, after))
     axes.set_ylim(count - 0.45, -0.55)
-    draw_bars(axes, design.initial.std, -0.19, INITIAL)
-    draw_bars(axes, design.final.std, 0.19, OPTIMIZED)
+    draw_bars(axes, before, -0.19, INITIAL)
+    draw_bars(axes, after, 0.19, OPTIMIZED)
     dress(axes, "predicted standard deviation [unit of the parameter]")
     axes.grid(False, axis="y")
-    axes.set_yticks(range(count), [brief(labels.parameter(j)) for j in range(count)])
+    axes.set_yticks(range(count), [brief(labels.parameter(j)) for j in shown])
     annotate_bars(axes, design)
     note = BEST_CASE
     handles = [Patch(color=INITIAL, label="initial"), Patch(color=OPTIMIZED, label="optimized")]
-    if not np.isfinite(np.concatenate([design.initial.std, design.final.std])).all():
-        note += " ∞: this trajectory does not determine the parameter."
+    if not np.isfinite(np.concatenate([before, after])).all():
+        note += " ∞: this trajectory does not determine the parameter by itself."
     headline(figure, "Predicted accuracy (Cramér–Rao)", handles, note)
     return figure
 

@@ -139,7 +139,7 @@ def draw_tables(title: str, blocks: Sequence[Block], notes: Sequence[str]) -> Fi
 
 def eigenvalue_block(design: Design) -> Block:
     """Eigenvalues (largest first) and cost of both trajectories; the middle ones are left out when there are many."""
-    count = len(design.theta)
+    count = len(design.final.eigenvalues)
     shown = list(range(count)) if count <= MAX_EIGENVALUES else [0, 1, 2, count - 2, count - 1]
     header = [f"λ{str(k + 1).translate(str.maketrans('0123456789', '₀₁₂₃₄₅₆₇₈₉'))}" for k in shown]
     rows = []
@@ -163,7 +163,8 @@ def bound_block(design: Design, labels: Labels) -> Block:
     """Cramer-Rao standard deviation of every parameter along both trajectories."""
     rows = []
     with np.errstate(divide="ignore", invalid="ignore"):
-        for j, theta in enumerate(design.theta):
+        for j in design.wanted:
+            theta = design.theta[j]
             before, after = design.initial.std[j], design.final.std[j]
             ratio = before / after
             rows.append(

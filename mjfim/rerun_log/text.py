@@ -15,6 +15,7 @@ def design_text(design: Design, summary: str = "") -> str:
     rows = [
         (name, f"{theta:.4g}", f"{a:.3g}", f"{b:.3g}", f"{a / b:.3g}×" if 0.0 < b < np.inf else "")
         for name, theta, a, b in zip(design.parameters, design.theta, first.std, last.std, strict=True)
+        if name not in design.nuisance
     ]
     low, high = float(first.eigenvalues[0]), float(last.eigenvalues[0])
     ratio = f" (×{high / low:.3g})" if low > 0.0 else ""
