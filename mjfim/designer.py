@@ -18,7 +18,7 @@ from mjfim.lq import growth, regulator
 from mjfim.objective import DIVERGED, DesignProblem, Point
 from mjfim.plant import CENTRAL
 from mjfim.pronto import Armijo, Direction, Iterate, Regulator, optimize
-from mjfim.roughness import roughness
+from mjfim.roughness import Roughness, roughness
 from mjfim.setup import Setup
 from mjfim.signals import multisine
 from mjfim.survey import Survey, require_designable, survey
@@ -294,8 +294,12 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
     final = evaluate(stage, first if best.point is None or best.cost > first.cost else best.point)
     limits = margins(setup.limits, final.trajectory)
     clamped = saturated(setup.model_at(setup.theta), final.trajectory)
+    rough = None if interrupted else roughness(setup, setup.theta, final.trajectory)
+    status = Status.INTERRUPTED if interrupted else best.status
+    if status.success and (rough is not None or clamped):
+        status = Status.ROUGH
     return Design(
-        status=Status.INTERRUPTED if interrupted else best.status,
+        status=status,
         parameters=setup.parameters.names,
         theta=setup.theta,
         initial=evaluate(stage, first),
@@ -305,7 +309,7 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
         steps=steps,
         seconds=seconds,
         limits=limits,
-        warnings=tuple(_warnings(setup, final, limits, clamped, interrupted)),
+        warnings=tuple(_warnings(final, limits, clamped, rough)),
         found_by=best.name,
         starts=tuple(StartResult(r.name, r.cost, r.status, r.history[-1].iteration if r.history else 0) for r in runs),
         nuisance=tuple(p.name for p in setup.parameters.parameters if p.nuisance),
@@ -361,15 +365,14 @@ UNSTABLE = 1e3
 
 
 def _warnings(
-    setup: Setup, final: Evaluation, limits: dict[str, float], clamped: tuple[str, ...], interrupted: bool
+    final: Evaluation, limits: dict[str, float], clamped: tuple[str, ...], rough: Roughness | None
 ) -> Iterator[str]:
-    rough = None if interrupted else roughness(setup, setup.theta, final.trajectory)
     if rough is not None:
         yield str(rough)
     if clamped:
         yield (
-            f"forcerange clamps {', '.join(clamped)} during the design: the derivatives do not hold there, and the descent "
-            "may have stopped early; raise cost.control"
+            f"forcerange clamps {', '.join(clamped)} along the design: its derivatives do not hold there, it may rest on "
+            "information that the clamp feigns, and the descent may have stopped early; raise cost.control or start more gently"
         )
     if final.growth > UNSTABLE:
         yield (

@@ -30,6 +30,7 @@ class Signal(Section):
     """A generated initial control. Amplitudes and offsets in the actuator's unit, one number or one per actuator by name.
 
     offset: default: the keyframe's control, else 0
+    Sines and chirps begin at the offset, so what only integrates drifts to one side; a small offset holds against it.
     """
 
     kind: Literal["constant", "sine", "chirp", "multisine"]
@@ -282,7 +283,10 @@ class Experiment(Section):
         return Experiment(**values, directory=path.parent, source=str(path))
 
     def replace(self, **tables: Any) -> Experiment:
-        """A checked copy with changes; tables merge into the old ones: `e.replace(cost={"control": 1e-2})`."""
+        """A checked copy with changes; tables merge into the old ones, one level deep: `e.replace(cost={"control": 1e-2})`.
+
+        `parameters` merges parameter by parameter; none can be taken out.
+        """
         values = self.model_dump(exclude_unset=True)
         for key, value in tables.items():
             old = values.get(key)

@@ -13,6 +13,7 @@ import numpy as np
 from mjfim.errors import ModelError
 
 KEPT = 512  # compiled variants
+SOLVER_TOLERANCE = 1e-14
 
 
 def load_spec(path: Path) -> Any:
@@ -124,6 +125,9 @@ class Source:
         if not self._friction and unconstrained(model):
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         model.opt.timestep *= self._coarsen
+        # differences of steps see what the constraint solver leaves undone, and where it starts from
+        model.opt.tolerance = min(model.opt.tolerance, SOLVER_TOLERANCE)
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
         return model
 
 

@@ -191,7 +191,8 @@ class Plant:
         if not K.any():
             out = self.engine.rollout([model], base.state[:1], mu[None])
             return self.trajectory(out.states[0], mu) if out.finite[0] else None
-        alpha = self.space.plus(base.state, gamma * zeta.z)
+        with np.errstate(over="ignore", invalid="ignore"):
+            alpha = self.space.plus(base.state, gamma * zeta.z)
         states, ctrl, finite = self.engine.closed_loop(model, alpha, mu, K)
         return self.trajectory(states, ctrl) if finite else None
 
@@ -208,13 +209,18 @@ class Plant:
         ctrl = np.abs(trajectory.ctrl).max(axis=0)
         return np.concatenate([dq, speed, act, np.where(ctrl > 1e-3, ctrl, 1.0)])
 
-    def sensitivity(self, theta: Array, trajectory: Trajectory, step: float = SENSITIVITY_STEP) -> Sensitivity | None:
-        """psi and G by central differences of whole rollouts under the same control; None if one diverged."""
+    def sensitivity(
+        self, theta: Array, trajectory: Trajectory, step: float | Array = SENSITIVITY_STEP
+    ) -> Sensitivity | None:
+        """psi and G by central differences of whole rollouts under the same control; None if one diverged.
+
+        step: relative to `span`, one number or (p,)
+        """
         found = self._differences(theta, trajectory.state[0], trajectory.ctrl, step, trajectory.state)
         return None if found is None else found[1]
 
     def _differences(
-        self, theta: Array, start: Array, ctrl: Array, step: float, states: Array | None
+        self, theta: Array, start: Array, ctrl: Array, step: float | Array, states: Array | None
     ) -> tuple[Array, Sensitivity] | None:
         """Outputs (N+1, ny) and sensitivity from rollouts at theta +- h, one pair per parameter that moves anything.
 
@@ -224,7 +230,7 @@ class Plant:
         m, p, N = len(moving), len(theta), len(ctrl)
         lag = self.lag(theta, N + 1)
         own = states is None or (lag is not None and self.outputs.needs_sensors)
-        h = step * self.span[moving]
+        h = (step * self.span)[moving]
         moves = np.zeros((m, p))
         moves[np.arange(m), moving] = h
         moves = np.concatenate([moves, -moves, np.zeros((int(own), p))])

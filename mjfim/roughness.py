@@ -16,7 +16,8 @@ from mjfim.sensing import joint_names
 from mjfim.setup import Setup
 from mjfim.trajectory import Array, Trajectory
 
-LONGER = 30.0  # the second step, times the first
+LONGER = 300.0  # the second step, times the first: a change of 0.3 %
+LEAST = 3.0  # the same for parameters so weak that the first step is long already
 TOLERANCE = 1e-2  # relative disagreement that is told
 MINOR = 1e-3  # of the largest effect of a parameter; an output that shows less of it tells nothing
 
@@ -53,7 +54,9 @@ def disagreement(fine: Array, coarse: Array) -> Array:
 def roughness(setup: Setup, theta: Array, trajectory: Trajectory) -> Roughness | None:
     """The worst disagreement along a trajectory, or None where it is below `TOLERANCE`."""
     fine = setup.plant.sensitivity(theta, trajectory)
-    coarse = setup.plant.sensitivity(theta, trajectory, LONGER * SENSITIVITY_STEP)
+    plant = setup.plant
+    longer = np.maximum(LONGER * setup.parameters.step / plant.span, LEAST)
+    coarse = plant.sensitivity(theta, trajectory, longer * SENSITIVITY_STEP)
     names = setup.parameters.names
     if fine is None or coarse is None:
         causes = tuple(_active(setup.model_at(theta), trajectory, range(trajectory.samples)))

@@ -128,6 +128,7 @@ class Status(Enum):
 
     CONVERGED = "converged: the slope fell below tolerance × cost (a local optimum)"
     SMOOTHED = "converged on a smooth λ_min, used because the smallest eigenvalues meet (a local optimum)"
+    ROUGH = "ended where derivatives hardly exist (contact, dry friction or clamps): the numbers are indications, see warnings"
     STALLED = "stalled: no step along the descent lowers the cost any more, at the accuracy of the differences"
     MAX_ITERATIONS = "stopped at max_iterations before convergence; raise it, or start from the result"
     INTERRUPTED = "interrupted by the user; this is the best trajectory so far"

@@ -97,7 +97,8 @@ def test_dry_friction_at_the_verge_of_sliding_is_flagged_where_it_breaks_away(tm
     assert found.causes == ("dry friction of rail",)
     assert force[found.sample - 2 : found.sample + 1].max() > 0.99 * force.max()  # at a peak of the push
     assert found.time == pytest.approx(0.01 * found.sample)
-    assert along(dry(tmp_path, 0.5 * force.max())) is None  # far from the verge the derivative exists
+    for share in (0.2, 10.0):  # sliding nearly always, or never: far from the verge the derivative exists
+        assert along(dry(tmp_path, share * force.max())) is None
 
 
 def test_a_bouncing_ball_is_flagged_at_a_contact_and_before_the_first_it_is_not(tmp_path) -> None:
@@ -178,8 +179,8 @@ def test_a_model_that_diverges_under_the_longer_step_is_rough_without_bound(tmp_
     setup = slider(tmp_path, 'frictionloss="1.5"')
     whole = setup.plant.sensitivity
 
-    def sensitivity(theta: Array, curve: object, step: float = 0.0) -> object:
-        return whole(theta, curve) if step == 0.0 else None
+    def sensitivity(theta: Array, curve: object, step: object = None) -> object:
+        return whole(theta, curve) if step is None else None
 
     monkeypatch.setattr(setup.plant, "sensitivity", sensitivity)
     found = along(setup)
