@@ -23,6 +23,7 @@ from mjfim.plots.style import (
     new_figure,
     number,
     percent,
+    shorten,
     with_error,
 )
 from mjfim.trajectory import Array, Design, Estimate
@@ -55,12 +56,11 @@ def draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
         axes.text(high, y, "∞ ", ha="right", va="center", fontsize=NORMAL, color=colour, backgroundcolor="white")
 
 
-def annotate_bars(axes: Axes, design: Design) -> None:
+def annotate_bars(axes: Axes, values: Array, before: Array, after: Array) -> None:
     """Columns right of the bars: std as percent of the value for both trajectories, and the ratio of the stds."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        shown = list(design.wanted)
-        relative = [np.abs(e.std / design.theta)[shown] for e in (design.initial, design.final)]
-        ratio = (design.initial.std / design.final.std)[shown]
+        relative = [np.abs(std / values) for std in (before, after)]
+        ratio = before / after
     cells = [
         (62.0, INITIAL, "of value", [percent(v) for v in relative[0]]),
         (122.0, OPTIMIZED, "of value", [percent(v) for v in relative[1]]),
@@ -96,10 +96,14 @@ def place_text(
 
 
 def std_bars(design: Design, labels: Labels) -> Figure:
-    """Predicted standard deviation of every wanted parameter along both trajectories, with the gain."""
+    """Predicted standard deviation of every wanted parameter and combination along both trajectories, with the gain."""
     labels.check(parameters=len(design.theta))
     shown = list(design.wanted)
-    count, before, after = len(shown), design.initial.std[shown], design.final.std[shown]
+    names = [*(brief(labels.parameter(j)) for j in shown), *(shorten(c.words) for c in design.combined)]
+    values = np.array([*design.theta[shown], *(c.value for c in design.combined)])
+    before = np.array([*design.initial.std[shown], *(c.initial for c in design.combined)])
+    after = np.array([*design.final.std[shown], *(c.final for c in design.combined)])
+    count = len(names)
     figure = new_figure(9.0, 1.7 + (0.5 if count <= ROOMY else 0.3) * count)
     axes = figure.subplots()
     axes.set_xscale("log")
@@ -109,8 +113,8 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     draw_bars(axes, after, 0.19, OPTIMIZED)
     dress(axes, "predicted standard deviation [unit of the parameter]")
     axes.grid(False, axis="y")
-    axes.set_yticks(range(count), [brief(labels.parameter(j)) for j in shown])
-    annotate_bars(axes, design)
+    axes.set_yticks(range(count), names)
+    annotate_bars(axes, values, before, after)
     note = BEST_CASE
     handles = [Patch(color=INITIAL, label="initial"), Patch(color=OPTIMIZED, label="optimized")]
     if not np.isfinite(np.concatenate([before, after])).all():

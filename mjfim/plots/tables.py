@@ -178,6 +178,10 @@ def bound_block(design: Design, labels: Labels) -> Block:
                     f"{number(float(ratio))}×" if np.isfinite(ratio) else number(float(ratio)),
                 )
             )
+        for c in design.combined:
+            relative = [percent(abs(std / c.value)) if c.value else "–" for std in (c.initial, c.final)]
+            stds = (number(c.initial), relative[0], number(c.final), relative[1])
+            rows.append((shorten(c.words), number(c.value, 4), *stds, f"{number(c.initial / c.final)}×"))
     return Block(
         "Cramér–Rao standard deviation",
         ("parameter [unit]", "value", "std", "of value", "std", "of value", "ratio"),

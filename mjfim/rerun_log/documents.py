@@ -29,6 +29,7 @@ from mjfim.rerun_log.panels import (
     log_steps,
     series_view,
     series_views,
+    shown_parameters,
     stack,
 )
 from mjfim.rerun_log.scene import Camera, Route, camera, entity, has_floor, log_robot, log_trail, motion
@@ -52,7 +53,7 @@ def log_design(path: Path, model: mujoco.MjModel, design: Design, names: Labels,
     summary: Markdown to append to the table;  names: labels of the model's columns, usually `Labels.of_model(model)`
     """
     sides = {"initial": design.initial, "optimized": design.final}
-    phases = [Phase.most_sensitive(design, index, model.nv) for index in range(len(design.parameters))]
+    phases = [Phase.most_sensitive(design, index, model.nv) for index in shown_parameters(design)]
     motions = {key: motion(model, e.trajectory.t, e.trajectory.qpos) for key, e in sides.items()}
     eye = camera(model, list(motions.values()), views=2, aspect=SHORT)
     titles = {"initial trajectory (blue)": ("robots", "initial"), "optimized trajectory (red)": ("robots", "optimized")}

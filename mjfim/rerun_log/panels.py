@@ -106,6 +106,17 @@ def stack(blocks: Sequence[Block], name: str | None = None) -> rrb.Vertical:
 # Phase plots of the sensitivity
 
 
+MAX_PHASES = 9
+
+
+def shown_parameters(design: Design) -> list[int]:
+    """Wanted parameters that move something; of many, those of the largest relative standard deviation."""
+    moving = [j for j in design.wanted if any(e.sensitivity[..., j].any() for e in (design.initial, design.final))]
+    size = np.where(design.theta == 0.0, 1.0, np.abs(design.theta))
+    known = np.where(np.isfinite(design.final.std), design.final.std, 0.0) / size
+    return sorted(sorted(moving, key=lambda j: -known[j])[:MAX_PHASES])
+
+
 @dataclass(frozen=True)
 class Phase:
     """One phase plot: what parameter `index` does to degree of freedom `dof`, both trajectories on one scale.
