@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from numerics import make_setup
+from numerics import Loop, make_setup
 
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.identified import write_identified, write_spec
@@ -903,3 +903,26 @@ def test_an_inertia_that_no_body_can_have_is_refused_by_a_message_of_ours(tmp_pa
     setup = make_setup(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
     with pytest.raises(MjfimError, match="inertia"):
         write_identified(tmp_path / "identified.xml", setup, np.array([5.0]))
+
+
+@pytest.mark.parametrize(
+    ("path", "guess"), [("geom/box:pos[0]", 0.1), ("geom/box:size[0]", 0.1), ("geom/box:mass", 1.0)]
+)
+def test_geoms_that_make_a_simple_bodys_inertia_are_followed(path: str, guess: float, tmp_path) -> None:
+    """The body would be 'simple' but for the parameter; psi is that of models compiled one by one."""
+    setup = make_setup(
+        SIMPLE, tmp_path, parameters={"g": {"target": path, "guess": guess}}, noise={"state": 0.01}, horizon=0.2
+    )
+    found = setup.plant.sensitivity(setup.theta, setup.initial)
+    assert found is not None
+    h, ends = 1e-4 * guess, []
+    for sign in (1.0, -1.0):
+        loop = Loop(setup.parameters.model(setup.plant.source, np.array([guess + sign * h])), 1)
+        state = setup.initial.state[0]
+        for u in setup.initial.ctrl:
+            for _ in range(setup.substeps):
+                state = loop.F(state, u)
+        ends.append(state)
+    reference = loop.minus(ends[0], ends[1]) / (2.0 * h)
+    assert np.abs(reference).max() > 1e-6
+    np.testing.assert_allclose(found.psi[-1, :, 0], reference, rtol=1e-5, atol=1e-7 * np.abs(reference).max())
