@@ -78,6 +78,7 @@ def design_summary(design: Design) -> dict[str, Any]:
             for c in design.combined
         ],
         "prior": design.prior,
+        "data": design.data,
     }
 
 
@@ -223,6 +224,8 @@ def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
         "recordings": [r.name for r in estimate.recordings],
         "warnings": list(estimate.warnings),
         "prior": setup.parameters.prior_information,
+        "data": estimate.data,
+        "combinations": list(estimate.combinations),
     }
 
 
@@ -284,6 +287,7 @@ def check_summary(check: Check) -> dict[str, Any]:
             "passed": check.self_test.passed,
             "recursion": check.self_test.recursion,
             "slope": check.self_test.slope,
+            "suspect": check.self_test.suspect,
             "rough": None
             if rough is None
             else {

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.designer import Stage
+from mjfim.earlier import shared
 from mjfim.errors import RecordingError, SimulationDiverged
-from mjfim.estimate import Fit
 from mjfim.experiment import Experiment
 from mjfim.fisher import Information
-from mjfim.identifiability import COARSER, Group, rows_of
-from mjfim.plant import CENTRAL, SENSITIVITY_STEP
+from mjfim.identifiability import Group, listed, rows_of
+from mjfim.plant import CENTRAL
+from mjfim.residuals import Fit
 from mjfim.selftest import SelfTest, self_test
 from mjfim.setup import Setup
 from mjfim.survey import Survey, survey, survey_rows
@@ -61,7 +61,8 @@ class Check:
     """What can be identified.
 
     source: what was looked at;  horizon: its duration [s];  rows: one per parameter
-    information: (p, p);  eigenvalues: ascending, of what the criterion sees;  correlation: (t, t) of the wanted parameters,
+    information: (p, p), priors included, deviations of each start marginalised
+    eigenvalues: ascending, of what the criterion sees;  correlation: (t, t) of the wanted parameters,
     NaN where one cannot be told alone;  wanted: their names
     combined: what is identifiable of groups, with its standard deviation (`initial` and `final` alike)
     never: groups that no experiment with these outputs tells apart;  not_here: those that another control would
@@ -92,9 +93,11 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        """Derivatives hold, every parameter can be told, and what was stated as wanted is reached by one repetition."""
+        """Derivatives hold, every parameter can be told (if only by its prior), one repetition reaches what was stated."""
         reached = all(row.repetitions == 1 for row in self.rows if row.stated and not row.nuisance)
-        return self.self_test.passed and not self.never and not self.not_here and reached
+        known = {row.name for row in self.rows if np.isfinite(row.std)}
+        apart = all(set(group.members) <= known for group in self.never)
+        return self.self_test.passed and apart and not self.not_here and reached
 
 
 def check(
@@ -115,9 +118,9 @@ def check(
         fit = Fit(setup, recordings, data_only=True)
         longest = max(fit.recordings, key=lambda r: len(r.t))
         curve = setup.plant.simulate(setup.theta, longest.ctrl[: setup.samples])
-        J, error = _recorded(setup, fit)
-        seen = survey_rows(setup, curve, J, error)
-        data, horizon = J.T @ J, float(sum(r.t[-1] for r in fit.recordings))
+        recorded = fit.sensed(setup.theta)
+        seen = survey_rows(setup, curve, *(np.concatenate(part) for part in zip(*recorded, strict=True)))
+        tells, horizon = [J.T @ J for J, _ in recorded], float(sum(r.t[-1] for r in fit.recordings))
         source = f"{len(recordings)} recording{'s' if len(recordings) > 1 else ''}"
     problem = setup.problem
     problem = replace(problem, running=replace(problem.running, desired=curve.state))
@@ -126,30 +129,17 @@ def check(
         raise SimulationDiverged("the simulation diverges when the parameters move a little")
     if not recordings:
         seen = survey(setup, curve, point.sensitivity)
-        data, horizon = point.information - setup.information.prior, float(curve.t[-1])
+        tells, horizon = [point.information - setup.information.prior], float(curve.t[-1])
         source = "the initial control" if trajectory is None else "the given trajectory"
     judged = replace(problem, information=replace(problem.information, basis=seen.basis))
     tested = self_test(setup, judged, judged.judged(point))
-    return _concluded(setup, seen, data, horizon, source, tested)
-
-
-def _recorded(setup: Setup, fit: Fit) -> tuple[Array, Array]:
-    """Whitened rows of G along all recordings and their change with the longer difference step."""
-    rows, errors = [], []
-    for recording, mask in zip(fit.recordings, fit.masks, strict=True):
-        pair = [
-            setup.plant.predict(setup.theta, recording.ctrl, step)
-            for step in (SENSITIVITY_STEP, COARSER * SENSITIVITY_STEP)
-        ]
-        if pair[0] is None:
-            raise SimulationDiverged(f"{recording.name}: the simulation diverges under its control")
-        rows.append(setup.noise.whiten_present(pair[0][1], mask))
-        longer = pair[0][1] if pair[1] is None else pair[1][1]
-        errors.append(setup.noise.whiten_present(longer - pair[0][1], mask))
-    return np.concatenate(rows), np.concatenate(errors)
+    p = setup.parameters
+    common = sum((shared(each, p.prior_information, p.private) for each in tells), start=np.zeros_like(setup.prior))
+    return _concluded(setup, seen, common, horizon, source, tested)
 
 
 def _concluded(setup: Setup, seen: Survey, data: Array, horizon: float, source: str, tested: SelfTest) -> Check:
+    """data: (p, p) of all that was looked at, each start's own nuisance marginalised"""
     p = setup.parameters
     information = replace(setup.information, prior=setup.prior, basis=seen.here.basis if seen.here.count else None)
     total = data + setup.prior
@@ -161,7 +151,7 @@ def _concluded(setup: Setup, seen: Survey, data: Array, horizon: float, source: 
     correlation = covariance / np.outer(spread, spread)
     confounded = tuple(_pairs(seen.names, correlation))
     criterion = setup.information
-    visible = Stage(setup, seen.basis).problem.information
+    visible = replace(criterion, basis=seen.basis)
     never, more = seen.groups_always, seen.here.count > seen.always.count
     known = {str(g) for g in never}
     not_here = tuple(g for g in seen.groups_here if str(g) not in known) if more else ()
@@ -267,15 +257,19 @@ def _verdict(
         yield f"{tested.rough}"
     elif not tested.passed:
         yield (
-            f"derivatives do not agree (psi recursion {tested.recursion:.1e}, slope {tested.slope:.1e}): the motion may be too "
-            "unstable, or something in the model switches (clamps, muscle activation); shorten horizon or timestep, or smooth "
-            "the switch, before trusting numbers here"
+            f"derivatives do not agree (psi recursion {tested.recursion:.1e}, slope {tested.slope:.1e}); {tested.suspect}. "
+            "Shorten horizon or timestep, or smooth the switch, before trusting numbers here"
         )
-    if never:
+    known = {row.name for row in rows if np.isfinite(row.std)}
+    open_ = [group for group in never if not set(group.members) <= known]
+    settled = [group for group in never if set(group.members) <= known]
+    if open_:
         yield (
-            f"no experiment with these outputs can tell apart: {_brief(never)}. Take out or fix one of each group, or measure "
-            "something else; a design works on the combinations"
+            f"no control from this start tells apart (nor did random ones): {_brief(open_)}. Take out or fix one of each group, "
+            "give it a prior, or measure something else; a design works on the combinations"
         )
+    if settled:
+        yield f"told apart by priors only, not by data: {'; '.join(listed(group.members) for group in settled)}"
     if not_here:
         yield f"not visible from {source}, but another control would show: {_brief(not_here)}. Move those joints more"
     wanted = [row for row in rows if not row.nuisance]
@@ -285,7 +279,7 @@ def _verdict(
         yield "nothing can be identified from this"
         return
     worst = max(alone, key=lambda row: row.std / row.wanted)
-    if not late and tested.passed:
+    if not late and tested.passed and not open_ and not not_here:
         yield f"all that can be told alone reaches its wanted sigma from {source}: nothing more is needed"
     elif late:
         reach = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s)" if worst.repetitions else "no repetition"

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.directions import LBFGS, ExtendedMetricDescent, MetricDescent
+from mjfim.earlier import shared
 from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.experiment import Experiment
 from mjfim.identifiability import rows_of
@@ -155,10 +156,20 @@ def regulator_for(setup: Setup) -> Regulator:
 
 
 def _coarse_level(setup: Setup, first: Point, basis: Array | None) -> Setup | None:
-    """The coarse level, where the experiment wants it and the model bears it (the initial cost agrees within 5 %)."""
+    """The coarse level, where the experiment wants it and the model bears it (the initial cost agrees within 5 %).
+
+    Raises ExperimentError where a stated factor does not divide the samples.
+    """
     d = setup.experiment.descent
     factor = 4 if d.coarse == "auto" else d.coarse
-    if factor == 1 or d.method != "lbfgs" or setup.samples % factor or setup.samples < 50 * factor:
+    if factor == 1 or d.method != "lbfgs":
+        return None
+    if d.coarse != "auto" and setup.samples % factor:
+        valid = ", ".join(str(k) for k in range(1, 17) if setup.samples % k == 0)
+        raise ExperimentError(
+            f"descent.coarse: {factor} does not divide the {setup.samples} samples; valid for example: {valid}"
+        )
+    if setup.samples % factor or setup.samples < 50 * factor:
         return None
     coarse = setup.coarser(factor)
     try:
@@ -316,6 +327,11 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
         combinations=tuple(str(group) for group in seen.groups_always),
         combined=_combined(stage, seen, first, final),
         prior=setup.prior,
+        data=shared(
+            stage.problem.information.visible(final.information - setup.prior),
+            setup.parameters.prior_information,
+            setup.parameters.private,
+        ),
     )
 
 

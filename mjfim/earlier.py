@@ -44,17 +44,32 @@ def marginal(information: Array, prior: Array, kept: np.ndarray) -> Array:
     return np.asarray(own)
 
 
+def shared(information: Array, prior: Array, private: np.ndarray) -> Array:
+    """(p, p) information about what several experiments have in common: private: (p,) parameters are marginalised.
+
+    prior: (p, p), what is known of the private ones
+    """
+    if not private.any():
+        return information
+    kept = np.flatnonzero(~private)
+    out = np.zeros_like(information)
+    out[np.ix_(kept, kept)] = marginal(information, prior, kept)
+    return out
+
+
 def _read(path: Path) -> tuple[list[str], Array, Array]:
     """Names, information without prior, and prior of one file."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         names = [str(n) for n in values["parameters"]]
         shape = (len(names), len(names))
-        if "final" in values:
+        prior = np.array(values.get("prior", np.zeros(shape)), dtype=np.float64)
+        if "data" in values:
+            matrix = np.array(values["data"], dtype=np.float64) + prior
+        elif "final" in values:
             matrix = np.array(values["final"]["information"], dtype=np.float64)
         else:
             matrix = np.linalg.inv(np.array(values["covariance"], dtype=np.float64))
-        prior = np.array(values.get("prior", np.zeros(shape)), dtype=np.float64)
     except OSError as error:
         raise ExperimentError(f"earlier: {path}: cannot read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, np.linalg.LinAlgError):

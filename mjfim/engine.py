@@ -26,6 +26,7 @@ RECORD = int(
 START = 1.0
 # Larger controls MuJoCo replaces by zero.
 MAX_CONTROL = float(mujoco.mjMAXVAL)
+CLOCK = int(mujoco.mjtSensor.mjSENS_CLOCK)
 FEW = 64  # rollouts of a handful of models keep their own batch beside those of a Monte-Carlo study
 
 
@@ -80,6 +81,8 @@ class Engine:
         self.steps = 0
         self._batches: dict[str, Batch] = {}
         self._data = mujoco.MjData(model)
+        self._clocks = model.sensor_adr[model.sensor_type == CLOCK]
+        self._mocap = np.flatnonzero(model.body_mocapid >= 0)[np.argsort(model.body_mocapid[model.body_mocapid >= 0])]
 
     def _batch(self, kind: str, count: int) -> Batch:
         """A batch of at least `count` simulations; making one costs milliseconds, so it grows and is kept."""
@@ -88,7 +91,7 @@ class Engine:
             batch = self._batches[kind] = Batch(self.model, count, min(self.threads, count))
         return batch
 
-    def _load(self, batch: Batch, states: Array) -> np.ndarray | None:
+    def _load(self, batch: Batch, states: Array, models: Sequence[Any]) -> np.ndarray | None:
         """Write states into the first simulations of a batch; returns their ids, None for all of them."""
         n = len(states)
         qpos, qvel, act = self.space.split(states)
@@ -98,6 +101,11 @@ class Engine:
             batch.bind("act")[:n] = act
         batch.bind("qacc_warmstart")[:n] = 0.0
         batch.bind("time")[:n] = START
+        if len(self._mocap):  # a batch keeps the places of the model that it was made with
+            mocap_pos, mocap_quat = batch.bind("mocap_pos"), batch.bind("mocap_quat")
+            for i, model in enumerate(models):
+                own = slice(None, n) if len(models) == 1 else i
+                mocap_pos[own], mocap_quat[own] = model.body_pos[self._mocap], model.body_quat[self._mocap]
         return None if n == batch.nsim else np.arange(n)
 
     def step(self, models: Sequence[Any], states: Array, ctrl: Array) -> tuple[Array, Array | None]:
@@ -117,14 +125,14 @@ class Engine:
         count = len(states)
         batch = self._batch("step", count)
         batch.set_models(model)
-        ids = self._load(batch, states)
+        ids = self._load(batch, states, [model])
         batch.bind("ctrl")[:count] = ctrl
         sensed, remaining = None, self.substeps
         with quiet():
             if self.sensors:
                 batch.bind("sensordata")
                 batch.step(ids, nstep=1)
-                sensed, remaining = np.array(batch.bind("sensordata")[:count]), remaining - 1
+                sensed, remaining = self._sensed(batch.bind("sensordata")[:count]), remaining - 1
             if remaining:
                 batch.step(ids, nstep=remaining)
         self.steps += self.substeps * count
@@ -141,7 +149,7 @@ class Engine:
         count, N, _ = ctrl.shape
         batch = self._batch("rollout" if count <= FEW else "rollouts", count)
         batch.set_models(models[0] if len(models) == 1 else [*models, *[models[-1]] * (batch.nsim - count)])
-        ids = self._load(batch, start)
+        ids = self._load(batch, start, models)
         held = np.repeat(ctrl, self.substeps, axis=1)
         record: tuple[Any, ...] = (RECORD,)
         if self.sensors:  # one more step: sensor data belongs to the state before a step
@@ -154,8 +162,14 @@ class Engine:
         states = np.concatenate([start[:, None], rows[:, :, 1:]], axis=1)
         on_time = np.abs(rows[:, -1, 0] - START - last * self.model.opt.timestep) < 0.5 * self.model.opt.timestep
         finite = on_time & np.isfinite(states).all(axis=(1, 2)) & _acceptable(ctrl).all(axis=(1, 2))
-        sensed = np.array(out["sensordata"][:, :: self.substeps]) if self.sensors else None
+        sensed = self._sensed(out["sensordata"][:, :: self.substeps]) if self.sensors else None
         return Rollouts(states, sensed, finite)
+
+    def _sensed(self, data: Array) -> Array:
+        """A copy of sensor data: (..., nsensordata), its clocks as if time had begun at zero."""
+        out = np.array(data)
+        out[..., self._clocks] -= START
+        return out
 
     def closed_loop(self, model: Any, reference: Array, mu: Array, K: Array) -> tuple[Array, Array, bool]:
         """Projection: `u = mu + K (alpha - x)`. Returns states (N+1, ns), ctrl (N, nu), and False if it diverged.

@@ -14,12 +14,14 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
-from mjfim.errors import ExperimentError, RecordingError, SimulationDiverged, unknown
+from mjfim.earlier import shared
+from mjfim.errors import ExperimentError, SimulationDiverged, unknown
 from mjfim.experiment import Experiment
 from mjfim.fisher import standard_deviations
-from mjfim.sensing import components
+from mjfim.identifiability import Null, grouped, invisible
+from mjfim.residuals import Fit, Residuals
 from mjfim.setup import Setup
-from mjfim.trajectory import Array, Estimate, Recording, Trajectory
+from mjfim.trajectory import Array, Estimate, Recording
 
 MISFIT = 1e-3
 # of scipy.optimize.least_squares, by status
@@ -31,129 +33,6 @@ OUTCOMES = {
     4: "converged: neither step nor residual changed any more",
 }
 Method = Literal["least_squares", "newton"]
-
-
-@dataclass(frozen=True, eq=False)
-class Residuals:
-    """Whitened residuals of all recordings, prior rows last, and their Jacobian. r: (n,), J: (n, p)."""
-
-    r: Array
-    J: Array
-
-
-class Fit:
-    """Residuals of an experiment against recordings, as functions of the unknowns. Evaluates each of them once.
-
-    The unknowns are theta, whose start deviations are those of the first recording, then the start deviations of every
-    further recording.
-    data_only: leave priors and bounds out
-    """
-
-    def __init__(self, setup: Setup, recordings: Sequence[Recording], data_only: bool = False) -> None:
-        self.setup = setup
-        self.data_only = data_only
-        self.recordings = [aligned(setup, r) for r in recordings]
-        if not self.recordings:
-            raise RecordingError("identify needs at least one recording")
-        self.masks = [_used(r) for r in self.recordings]
-        if not any(mask.any() for mask in self.masks):
-            raise RecordingError("the recordings hold no measured value after t = 0")
-        p = setup.parameters
-        self.starts = np.flatnonzero(p.start(setup.space.nx).any(axis=0))
-        self._key: bytes = b""
-        self._value: Residuals | None = None
-
-    @property
-    def count(self) -> int:
-        """Number of measured values."""
-        return int(sum(mask.sum() for mask in self.masks))
-
-    def whole(self, theta: Array) -> Array:
-        """Unknowns from theta: (p,), every recording starting as the first."""
-        return np.concatenate([theta, np.tile(theta[self.starts], len(self.recordings) - 1)])
-
-    def of(self, unknowns: Array, recording: int) -> Array:
-        """(p,) theta of one recording."""
-        theta, further = np.array(unknowns[: len(self.setup.parameters)]), unknowns[len(self.setup.parameters) :]
-        if recording and len(self.starts):
-            theta[self.starts] = further.reshape(-1, len(self.starts))[recording - 1]
-        return theta
-
-    def _columns(self, recording: int) -> np.ndarray:
-        """(p,) places of one recording's theta among the unknowns."""
-        places = np.arange(len(self.setup.parameters))
-        if recording:
-            places[self.starts] = len(places) + (recording - 1) * len(self.starts) + np.arange(len(self.starts))
-        return places
-
-    def at(self, theta: Array) -> Residuals | None:
-        """Residuals and Jacobian at the unknowns; None where the simulation diverges."""
-        key = np.asarray(theta).tobytes()
-        if key != self._key:
-            self._key, self._value = key, self._evaluate(np.asarray(theta))
-        return self._value
-
-    def _evaluate(self, theta: Array) -> Residuals | None:
-        noise, p = self.setup.noise, self.setup.parameters
-        rows, slopes = [], []
-        for i, (recording, mask) in enumerate(zip(self.recordings, self.masks, strict=True)):
-            predicted = self.setup.plant.predict(self.of(theta, i), recording.ctrl)
-            if predicted is None:
-                return None
-            y, G = predicted
-            rows.append(noise.whiten_present(np.where(mask, y - recording.y, 0.0), mask))
-            own = noise.whiten_present(G, mask)
-            slopes.append(np.zeros((len(own), len(theta))))
-            slopes[-1][:, self._columns(i)] = own
-        weight = self.whole(np.sqrt(np.diag(p.prior_information)) * (not self.data_only))
-        rows.append((weight * (theta - self.whole(p.guess)))[weight > 0])
-        slopes.append(np.diag(weight)[weight > 0])
-        return Residuals(np.concatenate(rows), np.concatenate(slopes))
-
-
-def aligned(setup: Setup, recording: Recording) -> Recording:
-    """The recording on the experiment's sample grid and in the order of its outputs (absent ones NaN).
-
-    Raises RecordingError where time, control or columns do not fit.
-    """
-    names, where = setup.outputs.names, recording.name
-    t = recording.t - recording.t[0]
-    if len(t) < 3:
-        raise RecordingError(f"{where}: too few rows ({len(t)}); an identification needs at least 3")
-    if np.abs(t - np.arange(len(t)) * setup.dt).max() > 0.01 * setup.dt:
-        raise RecordingError(f"{where}: column 't' is not the experiment's grid of {setup.experiment.rate:g} Hz")
-    ctrl = recording.ctrl[: len(t) - 1]
-    if not np.isfinite(ctrl).all():
-        row = int(np.argmax(~np.isfinite(ctrl).all(axis=1)))
-        raise RecordingError(f"{where}: the control in data row {row + 1} is NaN; only the last row may leave it out")
-    shared = [name for name in names if name in recording.outputs]
-    if not shared:
-        raise RecordingError(f"{where}: no measured column; {unknown('column', ', '.join(recording.outputs), names)}")
-    y = np.full((len(t), len(names)), np.nan)
-    for name in shared:
-        y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
-    return Recording(t, ctrl, _continuous(setup, y), names, where)
-
-
-def _continuous(setup: Setup, y: Array) -> Array:
-    """Measured quaternions with the sign that follows from the start: q and -q are one orientation."""
-    start = setup.plant.nominal_start
-    for q, _ in setup.space.quaternions:
-        found = [(i, o.state) for i, o in enumerate(setup.outputs.outputs) if o.state is not None]
-        at, states = [i for i, s in found if q <= s < q + 4], [s for _, s in found if q <= s < q + 4]
-        last = start[states]
-        for row in y:
-            if at and np.isfinite(row[at]).all():
-                row[at] *= 1.0 if last @ row[at] >= 0.0 else -1.0
-                last = np.array(row[at])
-    return y
-
-
-def _used(recording: Recording) -> np.ndarray:
-    """Measured values after the known start, (N+1, ny)."""
-    mask = np.isfinite(recording.y)
-    mask[0] = False
-    return mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,9 +69,20 @@ def identify(
         raise SimulationDiverged(
             f"the simulation diverges at the start {dict(zip(setup.parameters.names, theta0, strict=True))}"
         )
+    null = _null(setup, fit, theta0)
+    fit.pin(theta0, null)
     solve = newton_raphson if method == "newton" else trust_region
     solution = solve(fit, fit.whole(theta0))
-    return _report(setup, fit, theta0, solution)
+    return _report(setup, fit, theta0, solution, null)
+
+
+def _null(setup: Setup, fit: Fit, theta: Array) -> Null:
+    """Directions of theta that neither the recordings nor the priors tell, at the start of the search."""
+    p = setup.parameters
+    J, error = (np.concatenate(part) for part in zip(*fit.sensed(theta), strict=True))
+    weight = np.sqrt(np.diag(np.diag(p.prior_information)))
+    J, error = np.concatenate([J, weight]), np.concatenate([error, np.zeros_like(weight)])
+    return invisible(J, error, p.step, p.scale, np.arange(len(p)), np.zeros_like(weight))
 
 
 def trust_region(fit: Fit, theta0: Array) -> Solution:
@@ -250,7 +140,7 @@ def _at(fit: Fit, theta: Array) -> Residuals:
     return value
 
 
-def _report(setup: Setup, fit: Fit, theta0: Array, solution: Solution) -> Estimate:
+def _report(setup: Setup, fit: Fit, theta0: Array, solution: Solution, null: Null) -> Estimate:
     p = setup.parameters
     final, theta = _at(fit, solution.theta), solution.theta[: len(p)]
     information = final.J.T @ final.J
@@ -258,6 +148,11 @@ def _report(setup: Setup, fit: Fit, theta0: Array, solution: Solution) -> Estima
     singular = not np.isfinite(std).all()
     blank = np.full((len(p), len(p)), np.inf)
     covariance = blank if singular else np.asarray(np.linalg.inv(information))[: len(p), : len(p)]
+    groups = grouped(null, p.names, p.step, [q.unit for q in p.parameters])
+    together = np.isin(p.names, [name for group in groups for name in group.members])
+    std = np.where(together, np.inf, std)
+    covariance = np.where(np.logical_or.outer(together, together), np.inf, covariance)
+    lost = together & np.array([not q.group for q in p.parameters])
     data = final.r[: fit.count]
     chi2, dof = float(data @ data), max(fit.count - len(solution.theta), 1)
     predicted = tuple(_predict(setup, fit.of(solution.theta, i), r) for i, r in enumerate(fit.recordings))
@@ -275,41 +170,34 @@ def _report(setup: Setup, fit: Fit, theta0: Array, solution: Solution) -> Estima
         chi2=chi2,
         dof=dof,
         status=solution.status,
-        success=solution.success and not singular and not outside.any(),
+        success=solution.success and not singular and not outside.any() and not lost.any(),
         misfit=misfit,
         iterations=solution.iterations,
         residual_rms=_rms(setup, fit, predicted),
         at_bound=at_bound,
         predicted=predicted,
         recordings=tuple(fit.recordings),
-        warnings=tuple(_warnings(chi2, dof, misfit, at_bound, singular, bool(outside.any()))),
+        warnings=(
+            *(f"the recordings tell {group}; the rest was held at the start" for group in groups),
+            *_warnings(chi2, dof, misfit, at_bound, singular, bool(outside.any())),
+        ),
+        combinations=tuple(str(group) for group in groups),
+        data=_data(fit, final),
     )
+
+
+def _data(fit: Fit, final: Residuals) -> Array:
+    """(p, p) information of the recordings alone, every start's own deviation marginalised."""
+    p, J = fit.setup.parameters, final.J[: fit.count]
+    information = J.T @ J
+    private = np.concatenate([p.private, np.ones(len(information) - len(p), dtype=bool)])
+    prior = np.diag(fit.whole(np.diag(p.prior_information)))
+    return shared(information, prior, private)[: len(p), : len(p)]
 
 
 def _predict(setup: Setup, theta: Array, recording: Recording) -> Array:
     y, _ = setup.plant.measure(theta[None], recording.ctrl)
     return np.asarray(y[0])
-
-
-def measured_trajectory(setup: Setup, recording: Recording) -> Trajectory | None:
-    """The recorded motion as a trajectory, where every position was measured at most samples; else None.
-
-    Gaps are bridged linearly; unmeasured velocities are zero. For pictures, not for estimation.
-    """
-    positions = [c for c in components(setup.model) if c.state < setup.model.nq]
-    if any(c.name not in recording.outputs for c in positions):
-        return None
-    qpos = np.empty((len(recording.t), setup.model.nq))
-    for component in positions:
-        column = recording.y[:, recording.outputs.index(component.name)]
-        seen = np.isfinite(column)
-        if not seen.any():
-            return None
-        qpos[:, component.state] = np.interp(recording.t, recording.t[seen], column[seen])
-    for q, _ in setup.space.quaternions:
-        qpos[:, q : q + 4] /= np.maximum(np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True), 1e-12)
-    n = len(qpos)
-    return Trajectory(recording.t, qpos, np.zeros((n, setup.model.nv)), np.zeros((n, setup.model.na)), recording.ctrl)
 
 
 def _rms(setup: Setup, fit: Fit, predicted: tuple[Array, ...]) -> dict[str, float]:

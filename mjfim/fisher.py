@@ -35,6 +35,7 @@ class Information:
     basis: (t, s) orthonormal, the identifiable combinations of the scaled wanted parameters (None: all of them)
     contrast: (t, c) combinations of the scaled wanted parameters whose variance criterion "c" sums
     power: of the smooth E-criterion, infinite for 1/lambda_min itself
+    told: (p,) information of the stated priors, by which a combination is known that nothing shows (None: the diagonal of prior)
     """
 
     noise: Noise
@@ -47,6 +48,7 @@ class Information:
     basis: Array | None = None
     contrast: Array | None = None
     power: float = np.inf
+    told: Array | None = None
 
     def matrix(self, sensitivity: Sensitivity) -> Array:
         """(p, p) sum over the measured samples, prior included [1 / (theta_i theta_j unit)]."""
@@ -80,6 +82,8 @@ class Information:
     def evaluate(self, information: Array) -> Criterion:
         """Criterion of an information matrix, times Q_p; directions w are in raw parameter units."""
         R, P = self.reduced(information)
+        if not len(R):
+            return Criterion(np.inf, np.zeros(0), np.zeros((0, len(information))), np.zeros(0))
         raw = self._criterion(R)
         directions = raw.directions @ P * self.scale
         return Criterion(self.weight * raw.value, self.weight * raw.weights, directions, raw.eigenvalues)
@@ -129,10 +133,33 @@ class Information:
         return std
 
     def _with_prior(self, basis: Array, t: np.ndarray) -> Array:
-        """The identifiable combinations and those that the prior tells."""
+        """The identifiable combinations and those that stated priors tell."""
+        stated = np.diag(self.prior) if self.told is None else self.told
+        if not stated[t].any():
+            return basis
         rest = np.linalg.qr(basis, mode="complete")[0][:, basis.shape[1] :]
-        told, vectors = np.linalg.eigh(rest.T @ self.scaled(self.prior)[np.ix_(t, t)] @ rest)
+        told, vectors = np.linalg.eigh(rest.T @ self.scaled(np.diag(stated))[np.ix_(t, t)] @ rest)
         return np.concatenate([basis, rest @ vectors[:, told > ESTIMABLE * told.max(initial=0.0)]], axis=1)
+
+    def visible(self, information: Array) -> Array:
+        """(p, p) information without the round-off along invisible directions."""
+        if self.basis is None:
+            return information
+        p = len(information)
+        t = np.arange(p) if self.interest is None else self.interest
+        projector = np.eye(p)
+        projector[np.ix_(t, t)] = self.basis @ self.basis.T
+        both = projector / self.scale[:, None] * self.scale
+        return np.asarray(both @ information @ both.T)
+
+    def estimable(self, combinations: Array) -> np.ndarray:
+        """(c,) True where a combination of the scaled wanted parameters, (t, c), is identifiable or told by priors."""
+        t = np.arange(len(self.scale)) if self.interest is None else self.interest
+        if self.basis is None:
+            return np.ones(combinations.shape[1], dtype=bool)
+        unit = combinations / np.linalg.norm(combinations, axis=0)
+        inside = np.sum((self._with_prior(self.basis, t).T @ unit) ** 2, axis=0)
+        return np.asarray(1.0 - inside < ESTIMABLE)
 
     def _rays(self, criterion: Criterion, sensitivity: Sensitivity) -> Array:
         """v: (r, N+1, ny) with `V_k = sum_r v^r_k w_r'`, zero where nothing is measured."""

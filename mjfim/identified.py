@@ -41,7 +41,7 @@ def write_identified(path: Path, setup: Setup, theta: Array) -> None:
 
     MuJoCo prints six significant digits; the full ones are in estimate.json. Raises ModelError where MJCF cannot say it.
     """
-    wanted = setup.model_at(theta)
+    wanted = setup.model_at(theta, placed=False)
     for settled in (False, True):
         spec = setup.spec.copy()
         if settled:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import mujoco
 
 from mjfim.errors import MjfimError
+from mjfim.models import actuator_names, joint_names
 from mjfim.setup import Setup
 
 JOINT_DOFS = {
@@ -67,7 +68,7 @@ class Labels:
             qpos=positions if model.nq == model.nv else _coordinates(model),
             positions=positions,
             velocities=tuple(f"{name} velocity [{unit}/s]" for name, unit in dofs),
-            controls=tuple(_control_name(model, actuator) for actuator in range(model.nu)),
+            controls=tuple(label for actuator in range(model.nactuator) for label in _control_labels(model, actuator)),
         )
 
     @classmethod
@@ -110,24 +111,26 @@ def _coordinates(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def _joint_name(model: mujoco.MjModel, joint: int) -> str:
-    return model.joint(joint).name or f"joint{joint}"
+    return joint_names(model)[joint]
 
 
 def _joint_unit(model: mujoco.MjModel, joint: int) -> str:
     return JOINT_DOFS[mujoco.mjtJoint(int(model.jnt_type[joint]))][0][1]
 
 
-def _control_name(model: mujoco.MjModel, actuator: int) -> str:
-    """Actuator's name, with the unit where it is plain: direct drives (N or N m) and position servos (m or rad)."""
-    name = model.actuator(actuator).name or f"actuator{actuator}"
-    plain = f"{name} (control)"
-    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT) or model.actuator_gear[actuator, 0] != 1:
-        return plain
+def _control_labels(model: mujoco.MjModel, actuator: int) -> list[str]:
+    """One label per control of an actuator, with the unit where it is plain: direct drives and position servos."""
+    name, count = actuator_names(model)[actuator], int(model.actuator_ctrlnum[actuator])
+    if count != 1:
+        return [f"{name}[{c}] (control)" for c in range(count)]
+    gear = model.actuator_gear[int(model.actuator_outadr[actuator]), 0]
+    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT) or gear != 1:
+        return [f"{name} (control)"]
     unit = _joint_unit(model, int(model.actuator_trnid[actuator, 0]))
     gain, bias = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator]
     if int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE):
-        return f"{name} [{'N' if unit == 'm' else 'N m'}]" if gain == 1.0 else plain
-    return f"{name} [{unit}]" if bias[1] == -gain else plain
+        return [f"{name} [{'N' if unit == 'm' else 'N m'}]" if gain == 1.0 else f"{name} (control)"]
+    return [f"{name} [{unit}]" if bias[1] == -gain else f"{name} (control)"]
 
 
 def output_label(model: mujoco.MjModel, output: str) -> str:

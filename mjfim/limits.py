@@ -11,10 +11,11 @@ import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment import Limits
-from mjfim.models import Coordinate
+from mjfim.models import Coordinate, actuator_names
 from mjfim.trajectory import Trajectory
 
 Range = tuple[float, float]
+CLAMPED = 1e-12  # relative distance from its bound at which a force counts as clamped
 
 
 @dataclass(frozen=True)
@@ -71,19 +72,26 @@ def saturated(model: Any, trajectory: Trajectory, samples: Iterable[int] | None 
 
     model: at the design's theta
     """
-    limited = np.flatnonzero(model.actuator_forcelimited)
-    if not len(limited):
+    limited = np.flatnonzero(model.actuator_forcelimited).tolist()
+    if not limited:
         return ()
-    data, hit = mujoco.MjData(model), np.zeros(model.nactuator, dtype=bool)
-    low, high = model.actuator_forcerange.T
+    data, hit = mujoco.MjData(model), set[int]()
     for k in range(trajectory.samples) if samples is None else samples:
         data.qpos[:], data.qvel[:], data.act[:] = trajectory.qpos[k], trajectory.qvel[k], trajectory.act[k]
         data.ctrl[:] = trajectory.ctrl[k]
         mujoco.mj_forward(model, data)
-        hit[limited] |= ((data.actuator_force <= low) | (data.actuator_force >= high))[limited]
-    return tuple(
-        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator{i}" for i in np.flatnonzero(hit)
-    )
+        hit.update(i for i in limited if _clamped(model, data, i))
+    names = actuator_names(model)
+    return tuple(names[i] for i in sorted(hit))
+
+
+def _clamped(model: Any, data: Any, actuator: int) -> bool:
+    """True where forcerange acts: on the force, or on the norm of an actuator's several forces."""
+    first, count = int(model.actuator_outadr[actuator]), int(model.actuator_outnum[actuator])
+    force, (low, high) = data.actuator_force[first : first + count], model.actuator_forcerange[actuator]
+    if count == 1:
+        return bool(force[0] <= low or force[0] >= high)
+    return bool(np.linalg.norm(force) >= high * (1.0 - CLAMPED))
 
 
 def margins(limits: tuple[Limit, ...], trajectory: Trajectory) -> dict[str, float]:

@@ -10,7 +10,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.errors import ModelError
+from mjfim.errors import ExperimentError, ModelError
+from mjfim.trajectory import Array
 
 KEPT = 512  # compiled variants
 SOLVER_TOLERANCE = 1e-14
@@ -47,20 +48,41 @@ class Coordinate:
 
 def coordinates(model: Any) -> tuple[Coordinate, ...]:
     """All slide and hinge joints, in order."""
-    found = []
+    found, names = [], joint_names(model)
     for j in range(model.njnt):
         if int(model.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)):
-            name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint{j}"
             unit = "m" if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
-            found.append(Coordinate(name, unit, j, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])))
+            found.append(Coordinate(names[j], unit, j, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])))
     return tuple(found)
+
+
+def joint_names(model: Any) -> tuple[str, ...]:
+    """njnt names; unnamed joints are called by their number."""
+    return _names(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt, "joint")
+
+
+def actuator_names(model: Any) -> tuple[str, ...]:
+    """nactuator names; unnamed actuators are called by their number."""
+    return _names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nactuator, "actuator")
+
+
+def _names(model: Any, kind: Any, count: int, fallback: str) -> tuple[str, ...]:
+    """Names of all objects of a kind, no two alike: a number that another one is called by gets underscores."""
+    given = [mujoco.mj_id2name(model, kind, i) for i in range(count)]
+    taken = {name for name in given if name}
+    for i in range(count):
+        if not given[i]:
+            name = f"{fallback}{i}"
+            while name in taken:
+                name += "_"
+            given[i] = name
+    return tuple(given)
 
 
 def control_names(model: Any) -> tuple[str, ...]:
     """nu names; an actuator with several controls gets one name per control."""
     names: list[str] = []
-    for i in range(model.nactuator):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) or f"actuator{i}"
+    for i, name in enumerate(actuator_names(model)):
         count = int(model.actuator_ctrlnum[i])
         names += [name] if count == 1 else [f"{name}[{c}]" for c in range(count)]
     return tuple(names)
@@ -82,27 +104,67 @@ def decoration(spec: Any, model: Any) -> frozenset[str]:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Mocap:
+    """Where a keyframe puts mocap bodies, written over the places at which they compile: MjData starts from there.
+
+    MuJoCo derives constants of equalities and tendons from the compiled places, so these must stand there meanwhile.
+    bodies: (n,) ids;  compiled, start: (n, 7) position [m] and quaternion (w, x, y, z)
+    """
+
+    bodies: np.ndarray
+    compiled: Array
+    start: Array
+
+    @staticmethod
+    def of(model: Any, key: Any) -> Mocap | None:
+        """Of the mocap bodies that a keyframe (`model.key(name)` or None) puts elsewhere; None where there are none."""
+        if key is None or model.nmocap == 0:
+            return None
+        bodies = np.flatnonzero(model.body_mocapid >= 0)
+        order = model.body_mocapid[bodies]
+        places = np.concatenate([model.body_pos[bodies], model.body_quat[bodies]], axis=1)
+        start = np.concatenate([key.mpos.reshape(-1, 3)[order], key.mquat.reshape(-1, 4)[order]], axis=1)
+        moved = (places != start).any(axis=1)
+        return Mocap(bodies[moved], places[moved], start[moved]) if moved.any() else None
+
+    def put(self, model: Any, places: Array) -> None:
+        """Write places: (n, 7) into a model in place."""
+        model.body_pos[self.bodies], model.body_quat[self.bodies] = places[:, :3], places[:, 3:]
+
+
 class Source:
     """Where the private copies of a model come from: work that cannot matter is off, bodies that move inside are not 'simple'.
 
     moved: bodies whose inertial frame parameters change, None: any of them may;  sensors: whether sensor data is wanted
     friction: whether a parameter is a frictionloss (the constraint solver must then stay on)
-    coarsen: how many times longer than stated the timestep is
+    coarsen: how many times longer than stated the timestep is;  mocap: where mocap bodies start, None: as compiled
     """
 
     def __init__(
-        self, spec: Any, path: Path, moved: Collection[str] | None, sensors: bool, friction: bool, coarsen: int = 1
+        self,
+        spec: Any,
+        path: Path,
+        moved: Collection[str] | None,
+        sensors: bool,
+        friction: bool,
+        coarsen: int = 1,
+        mocap: Mocap | None = None,
     ) -> None:
         self._spec, self._path = spec.copy(), path
         for body in self._spec.bodies[1:]:
             if moved is None or body.name in moved:
                 body.simple = 0
         self._sensors, self._friction, self._coarsen = sensors, friction, coarsen
+        self._mocap = mocap
         self.model = self._compile(self._spec)
         self._edited: dict[bytes, Any] = {}
 
     def edited(self, key: bytes, edit: Callable[[Any], None]) -> Any:
-        """The model of an edited spec, kept under a key. Raises ModelError where it no longer compiles or fits."""
+        """The model of an edited spec, kept under a key. Raises ModelError where it no longer compiles or fits.
+
+        Raises ExperimentError where the timestep changes: rate and samples rest on it.
+        """
         if key not in self._edited:
             if len(self._edited) > KEPT:
                 self._edited.clear()
@@ -115,6 +177,12 @@ class Source:
                         f"{self._path}: a parameter changes {size} of the model from {getattr(self.model, size)} to "
                         f"{getattr(model, size)}; it may change numbers only"
                     )
+            stated, found = float(self.model.opt.timestep), float(model.opt.timestep)
+            if found != stated:
+                raise ExperimentError(
+                    f"parameters: a function changes option.timestep of {self._path} from {stated / self._coarsen:g} s to "
+                    f"{found / self._coarsen:g} s; rate and samples rest on it: state the timestep in the MJCF"
+                )
             self._edited[key] = model
         return self._edited[key]
 
@@ -128,6 +196,8 @@ class Source:
         # differences of steps see what the constraint solver leaves undone, and where it starts from
         model.opt.tolerance = min(model.opt.tolerance, SOLVER_TOLERANCE)
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
+        if self._mocap is not None:
+            self._mocap.put(model, self._mocap.start)
         return model
 
 

@@ -17,8 +17,9 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from mjfim.errors import ExperimentError, SimulationDiverged
-from mjfim.estimate import Fit, newton_raphson, trust_region
+from mjfim.estimate import newton_raphson, trust_region
 from mjfim.experiment import Experiment
+from mjfim.residuals import Fit
 from mjfim.setup import Setup
 from mjfim.survey import require_visible
 from mjfim.trajectory import Array, Recording, Study, Trajectory, TrialSet

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.inertia import CHARTS
 from mjfim.mjcf import write_element
-from mjfim.models import Source
+from mjfim.models import Mocap, Source
 from mjfim.paths import INERTIAL_FIELDS, PATH, resolve
 from mjfim.quiet import quiet
 from mjfim.slots import AnySlot, BiasSlot, DelaySlot, InertiaSlot, RotationSlot, Slot, SpecSlot, StartSlot, inertial
@@ -27,6 +27,7 @@ from mjfim.trajectory import Array
 
 INERTIAL = {"pos", "ipos", "inertia", "mass", "rot", *INERTIAL_FIELDS}
 Function = Callable[[Any, float], None]
+ROUNDED = 1e-6  # relative: by how much moments of a plate or rod, typed with few digits, may miss what a body can have
 LAYOUT = (
     "ngeom",
     "nsite",
@@ -93,11 +94,13 @@ class ParameterSet:
     """All parameters of an experiment, in the order of theta, resolved against a model.
 
     nominal: (10,) coordinates of every inertia that is written in a chart, by (body, chart), and quaternions by (array, row)
+    mocap: where mocap bodies start, None: as compiled
     """
 
     parameters: tuple[Parameter, ...]
     slots: tuple[tuple[AnySlot, ...], ...]
     nominal: dict[tuple[str, int], Array] = field(default_factory=dict)
+    mocap: Mocap | None = None
     _cache: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @staticmethod
@@ -106,6 +109,7 @@ class ParameterSet:
         model: Any,
         outputs: Sequence[str] = (),
         decoration: Collection[str] = frozenset(),
+        mocap: Mocap | None = None,
     ) -> ParameterSet:
         """Resolve every target (`paths.resolve`). Raises ExperimentError naming the parameter and the path."""
         slots: list[tuple[AnySlot, ...]] = []
@@ -124,6 +128,7 @@ class ParameterSet:
                 if other is not None:
                     taken = f"target {target.path!r} already belongs to parameters.{other}"
                     raise ExperimentError(f"parameters.{parameter.name}: {taken}; one number takes one parameter")
+                _movable(model, parameter, slot, mocap)
                 owner[slot] = parameter.name
                 written |= dict.fromkeys(numbers, parameter.name)
         nominal: dict[tuple[str, int], Array] = {}
@@ -136,7 +141,7 @@ class ParameterSet:
                 nominal[slot.chart, slot.body] = CHARTS[slot.chart].of(inertial(model, slot.body))
             elif isinstance(slot, RotationSlot):
                 nominal[slot.array, slot.row] = np.array(getattr(model, slot.array)[slot.row])
-        return ParameterSet(tuple(parameters), tuple(slots), nominal)
+        return ParameterSet(tuple(parameters), tuple(slots), nominal, mocap)
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -219,6 +224,12 @@ class ParameterSet:
         return np.array([any(isinstance(slot, kinds) for slot in slots) for slots in self.slots], dtype=bool)
 
     @cached_property
+    def private(self) -> np.ndarray:
+        """(p,) True for nuisance deviations of the start: every experiment and recording has its own."""
+        starts = [any(isinstance(slot, StartSlot) for slot in slots) for slots in self.slots]
+        return np.array([p.nuisance and s for p, s in zip(self.parameters, starts, strict=True)], dtype=bool)
+
+    @cached_property
     def in_model(self) -> np.ndarray:
         """(p,) True where a parameter changes the model."""
         outside = (StartSlot, BiasSlot, DelaySlot)
@@ -252,6 +263,24 @@ class ParameterSet:
 
         What needs a compile is not written here; see `model`.
         """
+        if self.mocap is not None:
+            self.mocap.put(model, self.mocap.compiled)
+        whole = self._write_numbers(model, theta)
+        for (kind, row), values in whole.items():
+            if kind in CHARTS:
+                _write_inertia(model, row, kind, values)
+            else:
+                turned = Rotation.from_quat(self.nominal[kind, row], scalar_first=True) * Rotation.from_rotvec(values)
+                getattr(model, kind)[row] = turned.as_quat(scalar_first=True)
+                if kind == "site_quat":
+                    model.site_sameframe[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        with quiet():
+            mujoco.mj_setConst(model, self._scratch(model))
+        if self.mocap is not None:
+            self.mocap.put(model, self.mocap.start)
+
+    def _write_numbers(self, model: Any, theta: Array) -> dict[tuple[str, int], Array]:
+        """Write what is a number of its own; returns coordinates of inertias and orientations, by (chart or array, row)."""
         whole: dict[tuple[str, int], Array] = {}
         for parameter, slots, value in zip(self.parameters, self.slots, theta, strict=True):
             for target, slot in zip(parameter.targets, slots, strict=True):
@@ -263,16 +292,29 @@ class ParameterSet:
                     whole.setdefault(key, np.array(self.nominal[key]))[slot.component] = number
                 elif isinstance(slot, RotationSlot):
                     whole.setdefault((slot.array, slot.row), np.zeros(3))[slot.component] = number
-        for (kind, row), values in whole.items():
-            if kind in CHARTS:
-                _write_inertia(model, row, kind, values)
-            else:
-                turned = Rotation.from_quat(self.nominal[kind, row], scalar_first=True) * Rotation.from_rotvec(values)
-                getattr(model, kind)[row] = turned.as_quat(scalar_first=True)
-                if kind == "site_quat":
-                    model.site_sameframe[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-        with quiet():
-            mujoco.mj_setConst(model, self._scratch(model))
+        return whole
+
+    def impossible(self, base: Source | Any, theta: Array) -> list[tuple[tuple[int, ...], str]]:
+        """Bodies whose inertia at theta: (p,) none can have: indices of the parameters that make it, and the fault in words.
+
+        Raises ModelError where MuJoCo refuses to compile the values.
+        """
+        makers: dict[int, list[int]] = {}
+        for j, slots in enumerate(self.slots):
+            for slot in slots:
+                if isinstance(slot, InertiaSlot):
+                    makers.setdefault(slot.body, []).append(j)
+                elif isinstance(slot, Slot) and slot.array in ("body_mass", "body_inertia"):
+                    makers.setdefault(slot.rows[0], []).append(j)
+        own = copy.copy(self.base(base, theta))
+        charted = {row: (kind, v) for (kind, row), v in self._write_numbers(own, theta).items() if kind in CHARTS}
+        found = []
+        for body, columns in makers.items():
+            fault = _fault(own, body, *charted.get(body, ("", None)))
+            if fault:
+                name = mujoco.mj_id2name(own, mujoco.mjtObj.mjOBJ_BODY, body)
+                found.append((tuple(dict.fromkeys(columns)), f"body {name!r} has {fault}"))
+        return found
 
     def _scratch(self, model: Any) -> Any:
         """Scratch data for `mj_setConst`, shared by all copies of one model."""
@@ -314,6 +356,50 @@ class ParameterSet:
                 if isinstance(slot, SpecSlot):
                     number = target.scale * float(theta[j]) + target.offset
                     write_element(spec, source.model, source.model, target.path, number)
+
+
+def _fault(model: Any, body: int, chart: str, values: Array | None) -> str:
+    """What is wrong with a body's inertia, or nothing. values: (10,) in a chart, None where the model holds all of it.
+
+    A body that is fixed to others with mass may itself have none.
+    """
+    mass, moments, missing = float(model.body_mass[body]), np.sort(model.body_inertia[body]), 0.0
+    others = model.body_weldid == model.body_weldid[body]
+    others[body] = False
+    least = 0.0 if model.body_weldid[body] == 0 or model.body_mass[others].any() else mujoco.mjMINVAL
+    if values is not None:
+        mass = float(values[0]) if chart == "barycentric" else mass
+        least = mujoco.mjMINVAL if chart == "barycentric" else least
+        if chart == "logcholesky":
+            return ""
+    if not mass >= least:
+        return f"mass {mass:g} kg; it must be > 0"
+    if values is not None:
+        moments = np.linalg.eigvalsh(CHARTS[chart].back(values).inertia)
+        missing = float(moments[2] - moments[0] - moments[1])
+    if moments[0] >= least and missing <= ROUNDED * moments[2]:
+        return ""
+    listed = ", ".join(f"{m:.4g}" for m in moments)
+    wanted = "all must be > 0"
+    if moments[0] >= least:
+        wanted = "the smaller two must add up to the largest at least (its pseudo-inertia is not positive semidefinite)"
+    return f"principal moments of inertia {listed} kg m²; {wanted}"
+
+
+def _movable(model: Any, parameter: Parameter, slot: AnySlot, mocap: Mocap | None) -> None:
+    """Raise where a keyframe says where the mocap body is that a parameter moves."""
+    if isinstance(slot, RotationSlot):
+        array, row = slot.array, slot.row
+    elif isinstance(slot, Slot):
+        array, row = slot.array, slot.rows[0]
+    else:
+        return
+    if mocap is not None and array in ("body_pos", "body_quat") and row in mocap.bodies:
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, row)
+        raise ExperimentError(
+            f"parameters.{parameter.name}: the keyframe says where mocap body {name!r} is; take its mpos and mquat out of the "
+            "keyframe, or the parameter out of the experiment"
+        )
 
 
 def _write_inertia(model: Any, body: int, chart: str, values: Array) -> None:

@@ -160,7 +160,10 @@ def _plain(model: Any, path: str, kind: str, field: str, ident: int, index: int)
 def _servo(model: Any, path: str, ident: int, field: str) -> Slot:
     """Gain of a position or velocity servo together with its bias: kp moves gainprm[0] and biasprm[1], kv biasprm[2]."""
     gain, bias = float(model.actuator_gainprm[ident, 0]), model.actuator_biasprm[ident]
-    affine = int(model.actuator_biastype[ident]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
+    kinds = (int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_SO3))
+    affine = int(model.actuator_biastype[ident]) in kinds
+    if int(model.actuator_gaintype[ident]) == int(mujoco.mjtGain.mjGAIN_PID):  # its own gain is the integral one
+        return Slot("actuator_biasprm", (ident,), {"kp": 1, "kv": 2}[field], factor=-1.0)
     if affine and field == "kp" and gain != 0.0 and bias[1] == -gain:
         return Slot("actuator_gainprm", (ident,), 0, also=(("actuator_biasprm", ident, 1, -1.0),))
     if affine and field == "kv" and gain != 0.0 and bias[1] == 0.0 and bias[2] == -gain:  # a velocity servo
@@ -218,4 +221,7 @@ def _rows(model: Any, array: str, ident: int, path: str) -> tuple[int, ...]:
         if int(model.jnt_type[ident]) < 2:
             raise ExperimentError(f"in parameter path {path!r}: springref exists on slide and hinge joints only")
         return (int(model.jnt_qposadr[ident]),)
+    if array == "actuator_gear":  # one row per force output
+        first = int(model.actuator_outadr[ident])
+        return tuple(range(first, first + int(model.actuator_outnum[ident])))
     return (ident,)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from rich.console import Group, RenderableType
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -30,7 +31,7 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
     for c in design.combined:
         relative = f"{100 * c.final / abs(c.value):.2g} %" if c.value else "-"
         stds = (f"{c.initial:.3g}", f"{c.final:.3g}")
-        table.add_row(c.words, f"{c.value:.4g}", *stds, relative, _ratio(c.initial, c.final), style="cyan")
+        table.add_row(escape(c.words), f"{c.value:.4g}", *stds, relative, _ratio(c.initial, c.final), style="cyan")
     last = design.history[-1] if design.history else None
     before, after = design.initial.eigenvalues[0], design.final.eigenvalues[0]
     lines = [
@@ -40,7 +41,7 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
         f"{design.steps / 1e6:.2f} million MuJoCo steps",
     ]
     if design.nuisance:
-        lines.append(f"nuisance, not designed for: {', '.join(design.nuisance)}")
+        lines.append(escape(f"nuisance, not designed for: {', '.join(design.nuisance)}"))
     together: list[RenderableType] = []
     if design.combinations:
         together.append("not identifiable alone, so designed for the combinations; see design.json")
@@ -55,8 +56,9 @@ def estimate_report(estimate: Estimate, units: tuple[str, ...]) -> RenderableTyp
     rows = zip(estimate.parameters, units, estimate.initial_theta, estimate.theta, estimate.std, strict=True)
     for name, unit, start, value, std in rows:
         low, high = value - 1.96 * std, value + 1.96 * std
-        table.add_row(_named(name, unit), f"{start:.5g}", f"{value:.5g}", f"{std:.2g}", f"{low:.5g} … {high:.5g}")
-    rms = ", ".join(f"{name} {value:.3g}" for name, value in estimate.residual_rms.items())
+        told = (f"{std:.2g}", f"{low:.5g} … {high:.5g}") if np.isfinite(std) else ("not alone", "-")
+        table.add_row(_named(name, unit), f"{start:.5g}", f"{value:.5g}", *told)
+    rms = ", ".join(f"{escape(name)} {value:.3g}" for name, value in estimate.residual_rms.items())
     lines = [
         f"χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof} degrees of freedom; residual rms: {rms}",
         f"{estimate.status} ({estimate.iterations} iterations)",
@@ -113,7 +115,10 @@ def check_report(check: Check) -> RenderableType:
         )
     parts: list[RenderableType] = [table]
     for title, groups in (
-        ("Identifiable in combination only, by any experiment with these outputs", check.never),
+        (
+            "Identifiable in combination only; neither this control nor random ones from this start tell more",
+            check.never,
+        ),
         ("Not excited here; another control would show", check.not_here),
     ):
         if groups:
@@ -149,7 +154,7 @@ def _ratio(before: float, after: float) -> str:
 
 
 def _named(name: str, unit: str) -> str:
-    return f"{name} ({unit})" if unit else name
+    return escape(f"{name} ({unit})" if unit else name)
 
 
 def _warnings(sentences: tuple[str, ...]) -> list[RenderableType]:

@@ -8,9 +8,9 @@ from pathlib import Path
 from mjfim import archive, plots, rerun_log
 from mjfim.checker import Check
 from mjfim.errors import ModelError
-from mjfim.estimate import measured_trajectory
 from mjfim.identified import write_identified
 from mjfim.labels import Labels
+from mjfim.residuals import measured_trajectory
 from mjfim.setup import Setup
 from mjfim.trajectory import Design, Estimate, Study
 

@@ -6,7 +6,7 @@ worst   (1/S sum_s phi_s^q)^(1/q), a smooth maximum; for D-optimality, whose phi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +19,7 @@ from mjfim.parameters import ParameterSet
 from mjfim.trajectory import Array
 
 SHARPNESS = 20.0
+HALVINGS = 20  # of a sample's distance from the guess, until its bodies can exist
 SAME_SIGN = 0.05  # least share of a scalar's value that a normal sample keeps
 
 
@@ -56,12 +57,21 @@ class Pool:
         return np.asarray((values / pooled) ** (SHARPNESS - 1.0) / len(values))
 
 
-def sampled(parameters: ParameterSet, theta: Array, count: int, seed: int) -> Array:
+def sampled(
+    parameters: ParameterSet,
+    theta: Array,
+    count: int,
+    seed: int,
+    impossible: Callable[[Array], Sequence[int]] | None = None,
+) -> Array:
     """(count, p) parameter values: theta itself, then a Latin hypercube over the priors (normal) or the bounds (uniform).
 
     Normal samples keep within the bounds, within 2.5 standard deviations, and do not change the sign of a scalar (a mass, a
     damping). Parameters with neither prior nor bounds, and those outside the model, stay at theta; raises ExperimentError
-    where that holds for all.
+    where that holds for all. Where bodies of a sample cannot exist, the parameters that make them go half of their way back
+    to theta, again and again (at most `HALVINGS` times, then all the way).
+
+    impossible: indices of the parameters that make bodies which cannot exist; nobody looks where it is left out
     """
     p, outside = len(parameters), parameters.outside
     stated = [q.prior is not None or bool(np.isfinite(q.bounds).all()) for q in parameters.parameters]
@@ -83,4 +93,21 @@ def sampled(parameters: ParameterSet, theta: Array, count: int, seed: int) -> Ar
                 out[1:, j] = np.clip(drawn, low, high)
             else:
                 out[1:, j] = low + (high - low) * u[:, column]
-    return out.reshape(count, p)
+    if impossible is not None:
+        for row in out[1:]:
+            _tame(row, theta, impossible)
+    return out
+
+
+def _tame(sample: Array, theta: Array, impossible: Callable[[Array], Sequence[int]]) -> None:
+    """Move a sample: (p,) in place towards theta: (p,) until its bodies can exist."""
+    columns: list[int] = []
+    for _ in range(HALVINGS):
+        columns = list(impossible(sample))
+        if not columns:
+            return
+        sample[columns] = 0.5 * (sample[columns] + theta[columns])
+    while columns := list(impossible(sample)):
+        if np.array_equal(sample[columns], theta[columns]):
+            return
+        sample[columns] = theta[columns]

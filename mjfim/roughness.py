@@ -19,6 +19,7 @@ from mjfim.trajectory import Array, Trajectory
 LONGER = 300.0  # the second step, times the first: a change of 0.3 %
 LEAST = 3.0  # the same for parameters so weak that the first step is long already
 TOLERANCE = 1e-2  # relative disagreement that is told
+CURVED = 6.0  # by how much the disagreement at least falls with a third of the step where a derivative exists
 MINOR = 1e-3  # of the largest effect of a parameter; an output that shows less of it tells nothing
 
 
@@ -69,6 +70,11 @@ def roughness(setup: Setup, theta: Array, trajectory: Trajectory) -> Roughness |
     worst = int(np.argmax(error.max(axis=0)))
     if not error[:, worst].max() > TOLERANCE:
         return None
+    between = plant.sensitivity(theta, trajectory, np.maximum(longer / 3.0, 1.5) * SENSITIVITY_STEP)
+    if between is not None:
+        less = disagreement(G, setup.noise.whiten(between.G))[:, kept]
+        if (less.max(axis=0) * CURVED <= error.max(axis=0)).all():
+            return None  # the error of central differences falls ninefold: strongly curved, but smooth
     first = int(np.argmax(error[:, worst] > TOLERANCE))
     near = range(max(first - 2, 0), min(first + 1, trajectory.samples))
     causes = tuple(_active(setup.model_at(theta), trajectory, near))
@@ -79,6 +85,15 @@ def visible_columns(setup: Setup, G: Array) -> np.ndarray:
     """(p,) True where a parameter has an effect that stands out of round-off. G: (N+1, ny, p), whitened"""
     length = np.linalg.norm(G, axis=(0, 1)) * setup.parameters.step
     return np.asarray((length > BLIND) & (length > FAINT * length.max(initial=0.0)))
+
+
+def first_active(model: Any, trajectory: Trajectory) -> tuple[int, tuple[str, ...]] | None:
+    """First sample at which a contact, friction, limit or clamp acts, and what; None where none ever does."""
+    for k in range(trajectory.samples):
+        causes = tuple(_active(model, trajectory, range(k, k + 1)))
+        if causes:
+            return k, causes
+    return None
 
 
 def _active(model: Any, trajectory: Trajectory, samples: range) -> Iterator[str]:
@@ -107,4 +122,4 @@ def _at(model: Any, data: Any) -> Iterator[str]:
             int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON),
             int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON),
         ):
-            yield f"friction or limit of tendon {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, ident)}"
+            yield f"friction or limit of tendon {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, ident) or ident}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from mjfim.errors import SimulationDiverged
 from mjfim.lq import TangentCurve
 from mjfim.objective import DesignProblem, Point
 from mjfim.pronto import Expansion
-from mjfim.roughness import Roughness, roughness, visible_columns
+from mjfim.roughness import Roughness, first_active, roughness, visible_columns
 from mjfim.setup import Setup
 from mjfim.trajectory import Array, Sensitivity, Trajectory
 
@@ -25,12 +25,14 @@ class SelfTest:
     """Relative errors; infinite where a perturbed motion diverges, NaN where the criterion itself is infinite.
 
     rough: disagreement of two difference steps that is too large, or None
+    suspect: where to look when another test fails, in words
     recursion: psi by rollouts against `psi_{k+1} = A psi + E`;  slope: DJ.zeta against differences of J(P(xi + gamma zeta))
     """
 
     rough: Roughness | None
     recursion: float
     slope: float
+    suspect: str = ""
 
     @property
     def passed(self) -> bool:
@@ -43,11 +45,19 @@ def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
     trajectory = point.trajectory
     if trajectory is None or point.sensitivity is None:
         raise SimulationDiverged("the trajectory diverges when the parameters move a little")
-    return SelfTest(
+    found = SelfTest(
         roughness(setup, setup.theta, trajectory),
         recursion_error(setup, trajectory, point.sensitivity),
         slope_error(setup, problem, point),
     )
+    if found.passed or found.rough is not None:
+        return found
+    active = first_active(setup.model_at(setup.theta), trajectory)
+    if active is None:
+        return replace(found, suspect="the motion may be too unstable, or something switches (muscle activation)")
+    sample, causes = active
+    where = f"sample {sample} (t = {trajectory.t[sample]:.4g} s)"
+    return replace(found, suspect=f"something that switches acts from {where} on: {', '.join(causes)}")
 
 
 def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivity) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment import Correlated, Experiment, NoiseSpec
+from mjfim.models import joint_names as joint_names
 from mjfim.noise import Noise
 from mjfim.outputs import Output, OutputMap
 from mjfim.paths import names_of
@@ -33,11 +34,6 @@ class Component:
     state: int
     unit: str
     share: float = 1.0
-
-
-def joint_names(model: Any) -> tuple[str, ...]:
-    """njnt names; unnamed joints are called by their number."""
-    return tuple(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint{j}" for j in range(model.njnt))
 
 
 def components(model: Any) -> tuple[Component, ...]:

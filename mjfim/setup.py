@@ -15,7 +15,7 @@ from mjfim.errors import ExperimentError, ModelError, SimulationDiverged, unknow
 from mjfim.experiment import Experiment, Signal, by_name
 from mjfim.fisher import Information
 from mjfim.limits import limits_of
-from mjfim.models import Source, compile_spec, control_names, coordinates, decoration, load_spec
+from mjfim.models import Mocap, Source, compile_spec, control_names, coordinates, decoration, load_spec
 from mjfim.objective import DesignProblem, RunningCost
 from mjfim.parameters import ParameterSet, moved_bodies
 from mjfim.paths import joint_width
@@ -28,6 +28,7 @@ from mjfim.trajectory import Array, Trajectory
 from mjfim.unknowns import parameters_of
 
 MAX_SAMPLES = 10_000_000
+NO_ROTATION = 1e-6  # norm of a quaternion that says nothing
 
 
 class Setup:
@@ -73,13 +74,17 @@ class Setup:
         self.t = np.arange(self.samples, dtype=np.float64) * self.dt
         self.outputs, noise = outputs_of(e, self.model, state_space(self.model), measured_every)
         self.noise = noise if self.coarsen == 1 else noise.every_sample(measured_every)
+        self._mocap = Mocap.of(self.model, self._keyframe())
         self.parameters = ParameterSet.build(
             parameters_of(e, self.model, self.outputs.names),
             self.model,
             self.outputs.names,
             decoration(self.spec, self.model),
+            self._mocap,
         )
-        self.plant = Plant(self._private(), self.parameters, self.outputs, self._start(), self.substeps, threads)
+        private = self._private()
+        self._require_bodies(private)
+        self.plant = Plant(private, self.parameters, self.outputs, self._start(), self.substeps, threads)
         self.tracking = self._weights()
         self.control_weight = by_name("cost.control", e.cost.control, self.controls, "actuator")
         if np.any(self.control_weight <= 0):
@@ -129,9 +134,15 @@ class Setup:
         """Everything that a recording may hold column by column: state components and sensors."""
         return measurable(self.model)
 
-    def model_at(self, theta: Array) -> Any:
-        """The user's model, everything on, with theta: (p,) written into it."""
-        return self.parameters.model(self._whole, theta)
+    def model_at(self, theta: Array, placed: bool = True) -> Any:
+        """The user's model, everything on, with theta: (p,) written into it.
+
+        placed: its mocap bodies where the keyframe has them, else where the MJCF has them
+        """
+        model = self.parameters.model(self._whole, theta)
+        if self._mocap is not None and not placed:
+            self._mocap.put(model, self._mocap.compiled)
+        return model
 
     @cached_property
     def _whole(self) -> Source:
@@ -151,13 +162,14 @@ class Setup:
             e.cost.information,
             p.interest if len(p.interest) < len(p) else None,
             contrast=self.contrast,
+            told=np.diag(p.prior_information),
         )
 
     @property
     def rest(self) -> Array:
         """(nu,) control of the initial keyframe, zero without one."""
-        name = self.experiment.initial.keyframe
-        return np.zeros(len(self.controls)) if name is None else np.array(self.model.key(name).ctrl)
+        key = self._keyframe()
+        return np.zeros(len(self.controls)) if key is None else np.array(key.ctrl)
 
     @cached_property
     def initial(self) -> Trajectory:
@@ -200,23 +212,42 @@ class Setup:
 
     def _source(self, sensors: bool, friction: bool, coarsen: int) -> Source:
         moved = None if self.parameters.compiled.any() else moved_bodies(self.parameters.parameters)
-        return Source(self.spec, self.model_path, moved, sensors, friction, coarsen)
+        return Source(self.spec, self.model_path, moved, sensors, friction, coarsen, self._mocap)
 
     def _private(self) -> Source:
         friction = any("frictionloss" in t.path for p in self.parameters.parameters for t in p.targets)
         anything = friction or any(p.function is not None for p in self.parameters.parameters)
         return self._source(self.outputs.needs_sensors, anything, self.coarsen)
 
+    def _require_bodies(self, source: Source) -> None:
+        """Raise where the guess or the true values make a body that cannot exist."""
+        p = self.parameters
+        for key, theta in (("guess", p.guess), ("true", p.true)):
+            for columns, fault in p.impossible(source, theta):
+                makers = dict.fromkeys(p.parameters[j].group or f"{p.parameters[j].name}.{key}" for j in columns)
+                raise ExperimentError(f"{', '.join(f'parameters.{m}' for m in makers)}: {fault}")
+
+    def _impossible(self, theta: Array) -> list[int]:
+        """Indices of the parameters that make bodies which cannot exist at theta: (p,)."""
+        try:
+            return sorted({j for columns, _ in self.parameters.impossible(self.plant.source, theta) for j in columns})
+        except ModelError:
+            return np.flatnonzero(self.parameters.compiled).tolist()
+
+    def _keyframe(self) -> Any:
+        """The initial keyframe, or None. Raises ExperimentError where there is none of that name."""
+        name, model = self.experiment.initial.keyframe, self.model
+        if name is None:
+            return None
+        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or "" for i in range(model.nkey)]
+        if name not in names:
+            raise ExperimentError(f"initial.keyframe: {unknown('keyframe', name, [n for n in names if n])}")
+        return model.key(name)
+
     def _start(self) -> Array:
-        initial, model = self.experiment.initial, self.model
+        initial, model, key = self.experiment.initial, self.model, self._keyframe()
         qpos, qvel, act = np.array(model.qpos0), np.zeros(model.nv), np.zeros(model.na)
-        if initial.keyframe is not None:
-            names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or "" for i in range(model.nkey)]
-            if initial.keyframe not in names:
-                raise ExperimentError(
-                    f"initial.keyframe: {unknown('keyframe', initial.keyframe, [n for n in names if n])}"
-                )
-            key = model.key(initial.keyframe)
+        if key is not None:
             qpos, qvel, act = np.array(key.qpos), np.array(key.qvel), np.array(key.act)
         for key_name, given, default in (
             ("qpos", initial.qpos, qpos),
@@ -227,6 +258,13 @@ class Setup:
                 if len(given) != len(default):
                     raise ExperimentError(f"initial.{key_name}: {len(given)} numbers, the model has {len(default)}")
                 default[:] = given
+        for j, name in enumerate(joint_names(model)):
+            q = int(model.jnt_qposadr[j]) + (3 if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE) else 0)
+            if joint_width(model, j) > 1 and not np.linalg.norm(qpos[q : q + 4]) > NO_ROTATION:
+                raise ExperimentError(
+                    f"initial.qpos: the quaternion of joint {name!r} (numbers {q} to {q + 3}) is zero; no rotation is 1, 0, 0, 0"
+                )
+        mujoco.mj_normalizeQuat(model, qpos)
         return np.concatenate([qpos, qvel, act])
 
     def _weights(self) -> Array:
@@ -260,7 +298,7 @@ class Setup:
             return None
         if self.experiment.descent.psi_weight:
             raise ExperimentError("robust: descent.psi_weight belongs to a design at one parameter value")
-        thetas = sampled(self.parameters, self.theta, robust.samples, robust.seed)
+        thetas = sampled(self.parameters, self.theta, robust.samples, robust.seed, self._impossible)
         return Pool(thetas, robust.over, self.experiment.cost.criterion == "D")
 
     def _calibrate(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from mjfim.signals import multisine
 from mjfim.trajectory import Array, Sensitivity, Trajectory
 
 PROBES = 3
+ROUND_OFF = 1e-7  # relative error of rows that are taken from an information matrix
+FAINTEST = 1e-6  # of the strongest effect in earlier experiments; less is their round-off
 LOCAL = 60  # samples of a trajectory that are looked at one by one, before all of them
 ONE_STEPS = (1e-4, 4e-4)  # relative to the parameters' sizes: a single step is smooth in them
 
@@ -125,7 +127,7 @@ def _words(setup: Setup, here: Null, always: Null) -> Survey:
 def _null(setup: Setup, stack: Sequence[Array], errors: Sequence[Array] | None, known: Array | None) -> Null:
     p = setup.parameters
     before = _rows_of(setup.earlier)
-    error = None if errors is None else np.concatenate([*errors, np.zeros_like(before)])
+    error = None if errors is None else np.concatenate([*errors, ROUND_OFF * np.abs(before)])
     return invisible(np.concatenate([*stack, before]), error, p.step, p.scale, p.interest, setup.prior, known)
 
 
@@ -145,7 +147,8 @@ def _unseen_before(setup: Setup, directions: Array) -> Array:
     _, values, V = np.linalg.svd(
         np.concatenate([effect, np.zeros((unit.shape[1], unit.shape[1]))]), full_matrices=False
     )
-    return np.asarray(unit @ V[values <= BLIND].T)
+    strongest = np.linalg.norm(_rows_of(setup.earlier) * setup.parameters.step, 2)
+    return np.asarray(unit @ V[values <= max(BLIND, FAINTEST * strongest)].T)
 
 
 def _pair(setup: Setup, trajectory: Trajectory, fine: Sensitivity) -> tuple[Array, Array]:
@@ -186,6 +189,13 @@ def require_designable(setup: Setup, seen: Survey) -> None:
             f"{_parameters(dead)} nothing in the measured outputs, neither along the initial control nor along "
             f"{PROBES} random ones; take {'it' if len(dead) == 1 else 'them'} out, or measure what shows the effect"
         )
+    if setup.contrast is not None:
+        information = replace(setup.information, basis=seen.basis)
+        if not information.estimable(setup.contrast).all():
+            raise UnidentifiableError(
+                "cost.combination or cost.subset asks for what cannot be identified; what can is: "
+                + "; ".join(str(group) for group in seen.groups_always)
+            )
     if not seen.always.basis.shape[1]:
         raise UnidentifiableError("none of the parameters shows in the measured outputs")
     if seen.here.count > seen.always.count:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from mjfim.designer import Monitor, design
-from mjfim.earlier import marginal
+from mjfim.earlier import shared
 from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.experiment import Experiment
 from mjfim.plant import CENTRAL
 from mjfim.setup import Setup
+from mjfim.survey import survey
 from mjfim.trajectory import Array, Design
 
 
@@ -25,8 +27,9 @@ def design_together(
     """Design each experiment in turn, given what the others tell, until none improves the criterion by more than tolerance.
 
     The designs depend on each other through the sum of their information alone, so where no single one can improve, none
-    of them together can to first order. `final.information` of each design holds all of it. The experiments state the same
-    parameters in the same order. Raises ExperimentError where they do not; see also `design`.
+    of them together can to first order. `final.information` of each design holds all of it; deviations of the start are
+    each experiment's own, all other nuisance is common. The experiments state the same parameters in the same order;
+    raises ExperimentError where they do not. See also `design`.
     """
     setups = [Setup(experiment, threads) for experiment in experiments]
     names = [setup.parameters.names for setup in setups]
@@ -45,7 +48,7 @@ def design_together(
             others = sum((tells[j] for j in range(len(setups)) if j != i), start=np.zeros_like(tells[0]))
             found = design(Setup(setup.experiment, threads, added=others), monitor, controls[i])
             controls[i] = found.trajectory.ctrl
-            tells[i] = _wanted(setup, found.final.information - found.prior)
+            tells[i] = found.data
             designs.append(found)
         reached = designs[-1].final.criterion
         if last - reached <= tolerance * abs(reached):
@@ -55,16 +58,11 @@ def design_together(
 
 
 def _data(setup: Setup) -> Array:
-    """What the initial control tells about the wanted parameters."""
-    information = setup.problem.point(setup.initial, CENTRAL).information
-    if information is None:
+    """What the initial control tells about the parameters that all experiments share."""
+    point = setup.problem.point(setup.initial, CENTRAL)
+    if point.information is None or point.sensitivity is None:
         raise SimulationDiverged("the simulation diverges when the parameters move a little along the initial control")
-    return _wanted(setup, information - setup.information.prior)
-
-
-def _wanted(setup: Setup, data: Array) -> Array:
-    """(p, p) information about the wanted parameters alone: every experiment has its own nuisance, known by its prior."""
+    seen = survey(setup, setup.initial, point.sensitivity)
+    information = replace(setup.information, basis=seen.here.basis if seen.here.count else None)
     p = setup.parameters
-    out = np.zeros_like(data)
-    out[np.ix_(p.interest, p.interest)] = marginal(data, p.prior_information, p.interest)
-    return out
+    return shared(information.visible(point.information - setup.information.prior), p.prior_information, p.private)

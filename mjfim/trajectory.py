@@ -187,7 +187,7 @@ class Design:
     found_by: name of the start that led here;  starts: all of them
     nuisance: names of the parameters that the design did not look at
     combinations: groups of parameters that are not identifiable alone, in words;  combined: what is identifiable of them
-    prior: (p, p) information put in
+    prior: (p, p) information put in;  data: (p, p) information of this experiment alone, its private nuisance marginalised
     """
 
     status: Status
@@ -207,9 +207,10 @@ class Design:
     combinations: tuple[str, ...] = ()
     combined: tuple[Combined, ...] = ()
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    data: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
-        freeze(self, "theta", "prior")
+        freeze(self, "theta", "prior", "data")
 
     @property
     def wanted(self) -> tuple[int, ...]:
@@ -254,6 +255,8 @@ class Estimate:
     chi2: whitened squared residual sum;  dof: its degrees of freedom;  residual_rms: per output, in its unit
     misfit: True where chi2 is improbable (< 1e-3) for noise of the stated sigma: the formal std is then not accuracy
     predicted, measured: per recording, (N+1, ny);  initial_theta: the start
+    combinations: groups of parameters that the recordings tell in combination only, in words
+    data: (p, p) information of the recordings, priors left out, private nuisance marginalised
     """
 
     parameters: tuple[str, ...]
@@ -272,9 +275,11 @@ class Estimate:
     predicted: tuple[Array, ...]
     recordings: tuple[Recording, ...]
     warnings: tuple[str, ...] = ()
+    combinations: tuple[str, ...] = ()
+    data: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
-        freeze(self, "theta", "std", "covariance", "initial_theta")
+        freeze(self, "theta", "std", "covariance", "initial_theta", "data")
 
 
 @dataclass(frozen=True, eq=False)

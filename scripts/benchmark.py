@@ -8,6 +8,7 @@
 (b) time until J is within 1e-6 (relative) of the best J of all solvers, beside CasADi on the hand-derived model
 (c) iterations and time beside the paper's metric descent, to the same J
 (d) 1500 Monte-Carlo trials at 100 Hz
+(e) seconds per iteration by number of parameters on a seven-joint arm, where its model is at hand (benchmark_arm.py)
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import benchmark_arm
 import mujoco
 import numpy as np
 from rich.console import Console
@@ -292,6 +294,11 @@ def main() -> None:
     console.print(tables[-1])
     tables.append(monte_carlo_table(default[-1][1] if args.quick else default[1][1], trials))
     console.print(tables[-1])
+    if benchmark_arm.ARM.is_file() and not args.quick:
+        tables.append(
+            benchmark_arm.cost_table([benchmark_arm.measured(benchmark_arm.ARM, p, 8) for p in (3, 10, 30, 70)])
+        )
+        console.print(tables[-1])
     if args.markdown:
         args.markdown.write_text(markdown(tables, verdicts, threads), encoding="utf-8")
 

@@ -11,9 +11,9 @@ from numerics import CART_PARAMETERS, MODELS, SHARED, Array, cart_setup, make_se
 import mjfim
 from mjfim import archive
 from mjfim.checker import check
-from mjfim.estimate import Fit
 from mjfim.fisher import Information
 from mjfim.plant import Plant
+from mjfim.residuals import Fit
 from mjfim.setup import Setup
 from mjfim.trajectory import Recording
 

@@ -189,3 +189,11 @@ def test_the_choice_of_a_group_needs_no_error_where_members_are_invisible(tmp_pa
     assert len(made.final.eigenvalues) < 10
     assert np.isinf(made.final.std).sum() >= 10 - len(made.final.eigenvalues)
     assert made.final.cost < made.initial.cost
+
+
+def test_a_coarse_factor_that_does_not_divide_the_samples_is_refused(tmp_path: Path) -> None:
+    """By default it is just not used."""
+    tables = {"horizon": 4.06, "descent": {"max_iterations": 1}}
+    with pytest.raises(ExperimentError, match=r"descent\.coarse: 4 does not divide the 406 samples; .*: 1, 2, 7, 14$"):
+        mjfim.design(cart_setup(tmp_path, **{**tables, "descent": {"max_iterations": 1, "coarse": 4}}))
+    mjfim.design(cart_setup(tmp_path, **tables))

@@ -11,9 +11,10 @@ from scipy.stats import chi2
 
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError, SimulationDiverged
-from mjfim.estimate import Fit, aligned, identify, newton_raphson, trust_region
+from mjfim.estimate import identify, newton_raphson, trust_region
 from mjfim.experiment import Experiment
 from mjfim.montecarlo import simulate
+from mjfim.residuals import Fit, aligned
 from mjfim.setup import Setup
 from mjfim.trajectory import Recording
 

@@ -51,6 +51,7 @@ ORDER = (
     "designer",
     "together",
     "selftest",
+    "residuals",
     "estimate",
     "montecarlo",
     "checker",

@@ -8,7 +8,7 @@ import pytest
 
 from mjfim.errors import ExperimentError
 from mjfim.experiment import Limits
-from mjfim.limits import Limit, limits_of, margins
+from mjfim.limits import Limit, limits_of, margins, saturated
 from mjfim.models import control_names, coordinates
 from mjfim.trajectory import Trajectory
 
@@ -120,3 +120,44 @@ def test_margin_is_the_worst_of_its_kind(model: mujoco.MjModel) -> None:
         found = limits(model, velocity={tight: 1.0, loose: 10.0})
         moving = curve(model, qvel=({"lift": 3, "turn": 4}[tight], [0.0, 1.5, 0.0]))
         assert margins(found, moving)["velocity"] == pytest.approx(-0.5)
+
+
+# An actuator with three controls and three forces before one with one of each.
+SERVOED = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body><joint name="ball" type="ball"/><geom size=".1"/>
+      <body pos="0 0 1"><joint name="turn" type="hinge"/><geom size=".1"/></body>
+    </body>
+  </worldbody>
+  <actuator>
+    <orientation name="aim" joint="ball" kp="10" ctrlrange="-1 1" forcerange="0 2"/>
+    <motor joint="turn" ctrlrange="-5 5" forcerange="-3 4"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_every_control_of_an_actuator_has_its_range() -> None:
+    """MuJoCo keeps ranges of controls per control."""
+    found = limits(mujoco.MjModel.from_xml_string(SERVOED))
+    aims = [Limit("control", f"aim[{i}]", i, -1.0, 1.0) for i in range(3)]
+    assert found == (*aims, Limit("control", "actuator1", 3, -5.0, 5.0))
+
+
+@pytest.mark.parametrize(
+    ("ctrl", "names"),
+    [
+        ([0.1, 0.1, 0.1, 2.0], ()),
+        ([0.15, 0.15, 0.0, -2.0], ("aim",)),  # the norm of three forces is clamped, none of them alone is that large
+        ([0.1, 0.1, 0.1, -3.5], ("actuator1",)),
+        ([-0.5, 0.0, 0.0, 4.5], ("aim", "actuator1")),
+    ],
+)
+def test_clamped_forces_are_found_beside_actuators_with_several(ctrl: list[float], names: tuple[str, ...]) -> None:
+    model = mujoco.MjModel.from_xml_string(SERVOED)
+    still = Trajectory(
+        np.arange(3) * 0.1, np.tile(model.qpos0, (3, 1)), np.zeros((3, 4)), np.zeros((3, 0)), np.array([ctrl] * 2)
+    )
+    assert saturated(model, still) == names

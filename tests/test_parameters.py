@@ -567,6 +567,41 @@ def test_a_gain_by_two_names_is_one_number(first: str, second: str) -> None:
         )
 
 
+BALL = """
+<mujoco>
+  <worldbody><body name="b"><joint name="j" type="ball"/><geom type="box" size=".1 .2 .3" mass="1"/>
+    <body pos="0 0 .5"><joint name="h" axis="0 1 0"/><geom size=".1" mass="1"/></body>
+  </body></worldbody>
+  <actuator>{}<motor name="m" joint="h" gear="1.5"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("written", "path"),
+    [
+        ('<orientation name="s" joint="j" kp="{}" kv="1"/>', "actuator/s:kp"),
+        ('<orientation name="s" joint="j" kp="4" kv="{}"/>', "actuator/s:kv"),
+        ('<pid name="s" joint="h" kp="{}" kv="1" ki="2"/>', "actuator/s:kp"),
+        ('<pid name="s" joint="h" kp="4" kv="{}" ki="4"/>', "actuator/s:kv"),
+    ],
+)
+def test_servos_with_several_controls_have_gains_too(written: str, path: str) -> None:
+    """Bit for bit what a compile of the other number gives; a PID controller's first gain is another one."""
+    base, again = (mujoco.MjModel.from_xml_string(BALL.format(written.format(gain))) for gain in ("2", "3.5"))
+    resolved = ParameterSet.build([one(path)], base)
+    assert resolved.slots[0][0].read(base) == 2.0
+    mine, theirs = arrays(resolved.model(base, np.array([3.5]))), arrays(again)
+    assert [n for n in theirs if not np.array_equal(mine[n], theirs[n])] == []
+
+
+def test_gears_are_counted_by_force_outputs() -> None:
+    base = mujoco.MjModel.from_xml_string(BALL.format('<orientation name="s" joint="j" kp="2"/>'))
+    resolved = ParameterSet.build([one("actuator/m:gear")], base)
+    assert resolved.slots[0][0].read(base) == 1.5
+    np.testing.assert_array_equal(resolved.model(base, np.array([7.0])).actuator_gear[:, 0], [1.0, 1.0, 1.0, 7.0])
+
+
 def test_the_damping_of_a_servo_does_not_follow_its_gain() -> None:
     parameters = [one("actuator/p:kp"), Parameter("kv", (Target("actuator/p:kv"),), 1.0)]
     _, base = compiled(ARM, [])
@@ -926,3 +961,60 @@ def test_geoms_that_make_a_simple_bodys_inertia_are_followed(path: str, guess: f
     reference = loop.minus(ends[0], ends[1]) / (2.0 * h)
     assert np.abs(reference).max() > 1e-6
     np.testing.assert_allclose(found.psi[-1, :, 0], reference, rtol=1e-5, atol=1e-7 * np.abs(reference).max())
+
+
+def in_arm(folder: Path, tables: dict) -> Any:
+    """Setup of an experiment on ARM."""
+    return make_setup(ARM, folder, rate=500.0, horizon=0.1, parameters=tables, noise={"state": 0.1})
+
+
+@pytest.mark.parametrize("key", ["guess", "true"])
+@pytest.mark.parametrize(
+    ("field", "value", "fault"),
+    [
+        ("mass", -1.0, r"mass -1 kg; it must be > 0"),
+        ("mass", 0.0, r"mass 0 kg; it must be > 0"),
+        ("inertia[1]", -0.1, r"principal moments of inertia -0\.1, .*; all must be > 0"),
+        (
+            "fullinertia[0]",
+            50.0,
+            r"principal moments of inertia .*, 50 kg m².*pseudo-inertia is not positive semidefinite",
+        ),
+        ("firstmoment[0]", 50.0, r"principal moments of inertia -.*; all must be > 0"),
+        ("origininertia[1]", 1e-6, r"principal moments of inertia -.*; all must be > 0"),
+    ],
+)
+def test_bodies_that_cannot_exist_are_refused_before_anything_is_simulated(
+    field: str, value: float, fault: str, key: str, tmp_path: Path
+) -> None:
+    table = {"theta": {"target": f"body/a:{field}", "scale": 1.0, key: value}}
+    with pytest.raises(ExperimentError, match=rf"parameters\.theta\.{key}: body 'a' has {fault}"):
+        in_arm(tmp_path, table)
+
+
+def test_both_makers_of_a_barycentric_inertia_are_named(tmp_path: Path) -> None:
+    table = {"m": {"target": "body/a:mass", "guess": -2.0}, "h": {"target": "body/a:firstmoment[2]"}}
+    with pytest.raises(ExperimentError, match=r"parameters\.m\.guess, parameters\.h\.guess: body 'a' has mass -2 kg"):
+        in_arm(tmp_path, table)
+
+
+@pytest.mark.parametrize("field", ["origininertia[0]", "fullinertia[0]", "mass"])
+def test_plates_and_loads_without_mass_are_bodies(field: str, tmp_path: Path) -> None:
+    """A plate typed with few digits; a load of no mass that is fixed to a link."""
+    plate = '<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.02 0.03"/>'
+    load = '<body name="load" pos="0 0 .1"><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>'
+    xml = BALL.format("").replace('<geom type="box" size=".1 .2 .3" mass="1"/>', plate + load)
+    path = "body/load:mass" if field == "mass" else f"body/b:{field}"
+    table = {"theta": {"target": path, "guess": 0.0 if field == "mass" else 0.00999999999, "scale": 1.0}}
+    make_setup(xml, tmp_path, rate=100.0, horizon=0.1, parameters=table, noise={"state": 0.1})
+
+
+def test_a_function_that_changes_the_timestep_is_refused(tmp_path: Path) -> None:
+    """Also where it leaves it alone at the guess."""
+
+    def edit(spec: Any, value: float) -> None:
+        spec.option.timestep = value
+
+    for guess in (0.001, 0.002):  # ARM's is the second
+        with pytest.raises(ExperimentError, match=r"changes option\.timestep of .*model\.xml from 0\.002 s to"):
+            in_arm(tmp_path, {"dt": {"function": edit, "guess": guess}})

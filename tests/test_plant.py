@@ -22,7 +22,7 @@ from numerics import (
 )
 from scipy.interpolate import CubicSpline
 
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.identified import write_spec
 from mjfim.lq import Recursion, TangentCurve, regulator
 from mjfim.models import Source, compile_spec, load_spec, unconstrained
@@ -651,3 +651,100 @@ def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> Non
         )
         < 1e-5
     )
+
+
+# A cart that hangs on two mocap bodies: on one by a spring, on the other by an equality, whose constants MuJoCo derives
+# from where they compile.
+CARRIED = """
+<mujoco>
+  <option timestep="0.01" gravity="0 0 0"/>
+  <worldbody>
+    <body name="near" mocap="true" pos="0.1 0 0"><site name="near"/></body>
+    <body name="cart">
+      <joint name="x" type="slide" axis="1 0 0" damping="1"/><joint name="turn" axis="0 0 1" damping="0.1"/>
+      <geom size=".1" mass="1" contype="0" conaffinity="0"/><site name="cart"/>
+    </body>
+    <body name="far" mocap="true" pos="0 1 0"><site name="far" pos="0 0.1 0"/></body>
+  </worldbody>
+  <tendon><spatial name="t" stiffness="20"><site site="cart"/><site site="near"/></spatial></tendon>
+  <equality><weld body1="cart" body2="far" solref="0.3 1"/></equality>
+  <actuator><motor name="m" joint="x"/></actuator>
+  <sensor><framepos name="far" objtype="site" objname="far" noise="0.1"/></sensor>
+  <keyframe><key name="moved" mpos="0.6 0 0  0.2 1.1 0" mquat="1 0 0 0  0.9 0 0 0.4" qpos="0.1 0.05"/></keyframe>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("function", [False, True])
+def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> None:
+    """Against plain MuJoCo from `mj_resetDataKeyframe`, by every way of stepping."""
+    damped: dict[str, Any] = {"target": "joint/x:damping"}
+    if function:
+        damped = {"function": lambda spec, v: setattr(spec.joint("x"), "damping", [v, 0.0, 0.0]), "guess": 1.0}
+    initial = {"keyframe": "moved", "control": {"kind": "sine", "amplitude": 2.0}}
+    setup = make_setup(CARRIED, tmp_path, initial=initial, parameters={"d": damped})
+    data = mujoco.MjData(setup.model)
+    mujoco.mj_resetDataKeyframe(setup.model, data, 0)
+    states, sensed = [], []
+    for u in [*setup.control, setup.control[-1]]:
+        states.append(np.concatenate([data.qpos, data.qvel]))
+        data.ctrl[:] = u
+        mujoco.mj_step(setup.model, data)
+        sensed.append(np.array(data.sensordata))
+    wanted = np.array(states)
+    assert np.abs(wanted[-1] - wanted[0]).max() > 0.05
+    tolerance = {"rtol": 0.0, "atol": 1e-6}  # the model is stepped to a tighter solver tolerance
+    for theta in (setup.theta, setup.theta + 0.5, setup.theta):  # models are written anew
+        y, _ = setup.plant.measure(theta[None], setup.control)
+    np.testing.assert_allclose(setup.initial.state, wanted, **tolerance)
+    np.testing.assert_allclose(y[0], sensed, **tolerance)
+    model, K = setup.plant.model(setup.theta), np.zeros((setup.samples, 1, 4))
+    closed, _, _ = setup.plant.engine.closed_loop(model, setup.initial.state, setup.control, K)
+    np.testing.assert_allclose(closed, wanted, **tolerance)
+    stepped, _ = setup.plant.engine.step([model], wanted[:-1], setup.control)
+    np.testing.assert_allclose(stepped, wanted[1:], **tolerance)
+    whole = setup.model_at(setup.theta)
+    np.testing.assert_allclose(whole.eq_data, setup.model.eq_data, atol=1e-12)
+    np.testing.assert_array_equal(mujoco.MjData(whole).mocap_pos, [[0.6, 0, 0], [0.2, 1.1, 0]])
+    np.testing.assert_array_equal(setup.model_at(setup.theta, placed=False).body_pos, setup.model.body_pos)
+
+
+def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tmp_path) -> None:
+    place = {"x": {"target": "body/near:pos[0]", "scale": 1.0}}
+    setup = make_setup(CARRIED, tmp_path, parameters=place)
+    found = setup.plant.sensitivity(setup.theta, setup.initial)
+    assert found is not None
+    ends = [setup.plant.simulate(setup.theta + h, setup.control).state[-1] for h in (1e-4, -1e-4)]
+    slope = (ends[0] - ends[1]) / 2e-4
+    assert np.abs(slope).max() > 0.1
+    np.testing.assert_allclose(found.psi[-1, :, 0], slope, rtol=1e-4, atol=1e-6)
+    initial = {"keyframe": "moved", "control": {"kind": "sine"}}
+    with pytest.raises(ExperimentError, match=r"parameters\.x: the keyframe says where mocap body 'near' is"):
+        make_setup(CARRIED, tmp_path, parameters=place, initial=initial)
+
+
+def test_clocks_begin_at_zero(tmp_path) -> None:
+    xml = CART_PENDULUM.format(integrator="RK4").replace("<sensor>", '<sensor><clock name="clock" noise="0.1"/>')
+    parameters = {"c": {"target": "joint/hinge:damping"}}
+    setup = make_setup(xml, tmp_path, rate=50.0, parameters=parameters, noise={"clock": 0.1, "rate": 0.1})
+    y, _ = setup.plant.measure(setup.theta[None], setup.control)
+    t = np.arange(setup.samples + 1) * setup.dt
+    np.testing.assert_allclose(y[0, :, setup.outputs.names.index("clock")], t, atol=1e-12)
+    _, sensed = setup.plant.engine.step([setup.plant.model(setup.theta)], setup.initial.state[:1], setup.control[:1])
+    assert sensed is not None
+    assert sensed[0, setup.model.sensor("clock").adr[0]] == 0.0
+
+
+def test_quaternions_of_the_start_have_unit_length_or_are_refused(tmp_path) -> None:
+    def start(*qpos: float) -> Array:
+        return body_setup(tmp_path, initial={"qpos": qpos, "control": {"kind": "sine"}}).plant.nominal_start
+
+    unit = start(1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0)
+    np.testing.assert_array_equal(unit[:11], [1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0])
+    np.testing.assert_allclose(start(1, 2, 3, 1.2, 0, 1.6, 0, 0, 0, 5, 0), unit, atol=1e-15)
+    with pytest.raises(
+        ExperimentError, match=r"initial\.qpos: the quaternion of joint 'ball' \(numbers 7 to 10\) is zero"
+    ):
+        start(1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 0, 1e-9)
+    with pytest.raises(ExperimentError, match=r"joint 'float' \(numbers 3 to 6\)"):
+        start(*[0.0] * 11)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numerics import CART_PARAMETERS, Array, cart_setup
+from numerics import CART_PARAMETERS, Array, body_setup, cart_setup
 from scipy.stats import norm
 
 from mjfim.designer import design, evaluate_trajectory
@@ -179,3 +179,28 @@ def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
     fresh = sampled(robust.parameters, robust.theta, 9, seed=7)[1:]
     ours, theirs = (phis(nominal, d.trajectory.ctrl, fresh) for d in (made, plain))
     assert pooled(ours) < 0.9 * pooled(theirs)
+
+
+def test_samples_are_halved_until_their_bodies_can_exist() -> None:
+    parameters = unknowns({"bounds": (0.0, 8.0), "guess": 1.0}, {"bounds": (0.0, 8.0), "guess": 1.0})
+    theta, free = np.ones(2), sampled(unknowns({"bounds": (0.0, 8.0)}, {"bounds": (0.0, 8.0)}), np.ones(2), 9, 0)
+    drawn = sampled(parameters, theta, 9, 0, lambda row: [0] if row[0] > 2.0 else [])
+    np.testing.assert_array_equal(drawn[:, 1], free[:, 1])
+    assert (free[:, 0] > 2.0).sum() >= 4
+    times = np.log2((free[1:, 0] - 1.0) / (drawn[1:, 0] - 1.0))
+    np.testing.assert_allclose(times, np.ceil(np.log2(np.maximum(free[1:, 0] - 1.0, 1.0))), atol=1e-9)
+    assert (drawn[:, 0] <= 2.0).all()
+    # where no halving helps they end at the guess, even those that are never right
+    np.testing.assert_array_equal(sampled(parameters, theta, 3, 0, lambda row: [0, 1]), 1.0)
+
+
+def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
+    table = {"B": {"inertial": "hull", "coordinates": "barycentric", "prior": 0.5}}
+    setup = body_setup(tmp_path, parameters=table, robust={"samples": 8})
+    assert setup.pool is not None
+    moments = np.array([setup.plant.model(theta).body("hull").inertia for theta in setup.pool.thetas])
+    assert (moments > 0.0).all()
+    assert (2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)).all()
+    free = sampled(setup.parameters, setup.theta, 8, 0)
+    assert any(setup.parameters.impossible(setup.plant.source, theta) for theta in free)
+    assert len(np.unique(setup.pool.thetas, axis=0)) == 8

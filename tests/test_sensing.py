@@ -8,10 +8,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from numerics import FREE_BODY, Array, Loop, body_setup, cart_setup
+from numerics import FREE_BODY, Array, Loop, body_setup, cart_setup, make_setup
 
 from mjfim.errors import ExperimentError
 from mjfim.experiment import Experiment
+from mjfim.models import control_names, coordinates
 from mjfim.sensing import components, joint_names, measurable, outputs_of
 from mjfim.setup import Setup
 
@@ -97,6 +98,18 @@ def test_unnamed_joints_are_called_by_their_number(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(xml)
     assert joint_names(model) == ("joint0", "joint1")
     assert [c.name for c in components(model)][6:9] == ["qpos:joint0.qz", "qpos:joint1.qw", "qpos:joint1.qx"]
+
+
+def test_an_unnamed_joint_does_not_take_the_name_of_another(tmp_path: Path) -> None:
+    xml = """<mujoco><worldbody><body><joint type="slide"/><geom size="1"/><body><joint name="joint0"/><geom size="1"/>
+      </body></body></worldbody><actuator><motor joint="joint0"/><motor name="actuator0" joint="joint0"/></actuator></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    assert joint_names(model) == ("joint0_", "joint0")
+    assert [c.name for c in coordinates(model)] == ["joint0_", "joint0"]
+    assert control_names(model) == ("actuator0_", "actuator0")
+    parameters = {"d": {"target": "joint/joint0:damping", "guess": 0.1}}
+    setup = make_setup(xml, tmp_path, parameters=parameters, noise={"state": 0.1})
+    assert setup.outputs.names == ("qpos:joint0_", "qpos:joint0", "qvel:joint0_", "qvel:joint0")
 
 
 def test_rates_are_each_outputs_own(tmp_path: Path) -> None:
