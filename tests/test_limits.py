@@ -8,6 +8,7 @@ import pytest
 
 from mjfim.errors import ExperimentError
 from mjfim.experiment import Limits
+from mjfim.labels import Labels
 from mjfim.limits import Limit, limits_of, margins, saturated
 from mjfim.models import control_names, coordinates
 from mjfim.trajectory import Trajectory
@@ -161,3 +162,16 @@ def test_clamped_forces_are_found_beside_actuators_with_several(ctrl: list[float
         np.arange(3) * 0.1, np.tile(model.qpos0, (3, 1)), np.zeros((3, 4)), np.zeros((3, 0)), np.array([ctrl] * 2)
     )
     assert saturated(model, still) == names
+
+
+def test_every_control_has_its_label_also_where_an_actuator_has_several() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """
+        <mujoco><worldbody><body name="b"><joint name="ball" type="ball"/><geom size="0.1"/>
+          <body><joint name="h" axis="0 1 0"/><geom size="0.1"/></body></body></worldbody>
+        <actuator><orientation name="o" joint="ball" kp="4"/><motor joint="h"/></actuator></mujoco>
+        """
+    )
+    labels = Labels.of_model(model)
+    assert len(labels.controls) == model.nu == model.nactuator + 2
+    assert labels.controls == ("o[0] (control)", "o[1] (control)", "o[2] (control)", "actuator1 [N m]")
