@@ -256,7 +256,7 @@ class _Pass:
                 raise SimulationDiverged("an iterate of Algorithm 1 diverged")
             self.control = run.control = np.repeat(trajectory.ctrl, level.coarsen, axis=0)
             self.eigenvalues = criterion.eigenvalues
-            point = exact.judged(iterate.point)
+            point = iterate.point if np.isinf(self.stage.power) else exact.judged(iterate.point)
             run.slope, run.status = iterate.slope, iterate.status or Status.INTERRUPTED
             if run.status is Status.CONVERGED and np.isfinite(self.stage.power):
                 run.status = Status.SMOOTHED

@@ -59,25 +59,26 @@ class Information:
         """(N+1,) smallest eigenvalue of what the criterion sees, accumulated up to each sample."""
         G = self.noise.whiten(sensitivity.G) * self.noise.measured(len(sensitivity.G) - 1)[..., None]
         total = np.cumsum(np.swapaxes(G, 1, 2) @ G, axis=0) + self.prior
-        return np.array([max(float(np.linalg.eigvalsh(self.reduced(each)[0])[0]), 0.0) for each in total])
+        return np.asarray(np.maximum(np.linalg.eigvalsh(self.reduced(total)[0])[:, 0], 0.0))
 
     def scaled(self, information: Array) -> Array:
         """`S I S / f_m`."""
         return np.asarray(information * np.outer(self.scale, self.scale) / self.measure_rate)
 
     def reduced(self, information: Array) -> tuple[Array, Array]:
-        """R: (s, s), what the criterion sees of an information matrix, and P: (s, p) with `dR = P dI~ P'`."""
+        """R: (..., s, s), what the criterion sees of information (..., p, p), and P: (..., s, p) with `dR = P dI~ P'`."""
         scaled = self.scaled(information)
-        p = len(scaled)
+        p = scaled.shape[-1]
         t = np.arange(p) if self.interest is None else self.interest
         n = np.setdiff1d(np.arange(p), t)
-        P = np.eye(p)[t]
+        P = np.array(np.broadcast_to(np.eye(p)[t], (*scaled.shape[:-2], len(t), p)))
         if len(n):
-            P[:, n] = -scaled[np.ix_(t, n)] @ np.linalg.pinv(scaled[np.ix_(n, n)], rcond=1e-13, hermitian=True)
+            known = np.linalg.pinv(scaled[..., n[:, None], n], rcond=1e-13, hermitian=True)
+            P[..., n] = -scaled[..., t[:, None], n] @ known
         if self.basis is not None:
             P = self.basis.T @ P
-        R = P @ scaled @ P.T
-        return 0.5 * (R + R.T), P
+        R = P @ scaled @ np.swapaxes(P, -1, -2)
+        return 0.5 * (R + np.swapaxes(R, -1, -2)), P
 
     def evaluate(self, information: Array) -> Criterion:
         """Criterion of an information matrix, times Q_p; directions w are in raw parameter units."""
