@@ -86,8 +86,8 @@ class OutputMap:
         return bool(self._turned.shape[1])
 
     def __call__(self, states: Array, sensors: Array | None) -> Array:
-        """(..., ny) from states (..., ns) and sensordata (..., nsensordata)."""
-        y = np.empty((*states.shape[:-1], len(self.outputs)))
+        """(..., ny) from states (..., ns) and sensordata (..., nsensordata); NaN for sensors where that is None."""
+        y = np.full((*states.shape[:-1], len(self.outputs)), np.nan)
         y[..., self._states[0]] = states[..., self._states[1]]
         if sensors is not None:
             y[..., self._sensors[0]] = sensors[..., self._sensors[1]]
