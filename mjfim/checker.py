@@ -11,7 +11,7 @@ from mjfim.earlier import shared
 from mjfim.errors import RecordingError, SimulationDiverged
 from mjfim.experiment import Experiment
 from mjfim.fisher import Information
-from mjfim.identifiability import Group, listed, rows_of
+from mjfim.identifiability import Group, listed
 from mjfim.plant import CENTRAL
 from mjfim.residuals import Fit
 from mjfim.selftest import SelfTest, self_test
@@ -157,12 +157,7 @@ def _concluded(setup: Setup, seen: Survey, data: Array, horizon: float, source: 
     not_here = tuple(g for g in seen.groups_here if str(g) not in known) if more else ()
     eigenvalues = np.maximum(visible.evaluate(data + criterion.prior).eigenvalues, 0.0)
     verdict = tuple(_verdict(rows, never, not_here, confounded, tested, source))
-    combinations = rows_of(never, seen.names)
-    combinations = combinations[: 0 if not_here else len(combinations)]
-    spread = information.spread(total, combinations)
-    words = [str(c) for group in never for c in group.combinations]
-    values = combinations @ setup.theta[p.interest]
-    combined = tuple(Combined(w, float(v), float(s), float(s)) for w, v, s in zip(words, values, spread, strict=False))
+    combined = () if not_here else seen.combined(information, setup.theta[p.interest], total, total)
     return Check(
         source,
         horizon,
@@ -210,6 +205,7 @@ def _repetitions(information: Information, data: Array, prior: Array, parameter:
     place = int(np.flatnonzero(t == parameter)[0])
 
     def reached(n: int) -> bool:
+        """True where n repetitions are enough."""
         variance = information.covariance(n * data + prior)[place, place]
         return bool(variance <= wanted**2)
 

@@ -13,7 +13,6 @@ from mjfim.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.earlier import shared
 from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.experiment import Experiment
-from mjfim.identifiability import rows_of
 from mjfim.limits import margins, saturated
 from mjfim.lq import growth, regulator
 from mjfim.objective import DIVERGED, DesignProblem, Point
@@ -23,7 +22,7 @@ from mjfim.roughness import Roughness, roughness
 from mjfim.setup import Setup
 from mjfim.signals import multisine
 from mjfim.survey import Survey, require_designable, survey
-from mjfim.trajectory import Array, Combined, Design, Evaluation, HistoryRow, StartResult, Status, Trajectory
+from mjfim.trajectory import Array, Design, Evaluation, HistoryRow, StartResult, Status, Trajectory
 
 Monitor = Callable[[HistoryRow], None]
 
@@ -49,13 +48,11 @@ def design(
         if start.shape != setup.control.shape:
             raise ExperimentError(f"start: shape {start.shape}, wanted (samples, actuators) = {setup.control.shape}")
     begin = first if start is None else problem.point(setup.plant.simulate(setup.theta, start), CENTRAL)
-    if first.information is None or begin.information is None:
+    if first.information is None or begin.trajectory is None or begin.sensitivity is None:
         why = "when the parameters move a little along the initial control"
         if setup.pool is not None:
             why += ", or at a parameter sample of [robust]; bounds keep samples where the model makes sense"
         raise SimulationDiverged(f"the simulation diverges {why}")
-    if begin.trajectory is None or begin.sensitivity is None:
-        raise SimulationDiverged("the simulation diverges along the initial control")
     seen = survey(setup, begin.trajectory, begin.sensitivity)
     require_designable(setup, seen)
     stage = Stage(setup, seen.basis)
@@ -302,10 +299,11 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
     interrupted = any(run.status is Status.INTERRUPTED for run in runs)
     if best.point is None and not interrupted:
         raise SimulationDiverged("the simulation diverges from every start")
-    final = evaluate(stage, first if best.point is None or best.cost > first.cost else best.point)
+    chosen = first if best.point is None or best.cost > first.cost else best.point
+    initial, final, information = evaluate(stage, first), evaluate(stage, chosen), stage.problem.information
     limits = margins(setup.limits, final.trajectory)
     clamped = saturated(setup.model_at(setup.theta), final.trajectory)
-    rough = None if interrupted else roughness(setup, setup.theta, final.trajectory)
+    rough = None if interrupted else roughness(setup, setup.theta, final.trajectory, chosen.sensitivity)
     status = Status.INTERRUPTED if interrupted else best.status
     if status.success and (rough is not None or clamped):
         status = Status.ROUGH
@@ -313,7 +311,7 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
         status=status,
         parameters=setup.parameters.names,
         theta=setup.theta,
-        initial=evaluate(stage, first),
+        initial=initial,
         final=final,
         history=best.history,
         slope=best.slope,
@@ -325,27 +323,16 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
         starts=tuple(StartResult(r.name, r.cost, r.status, r.history[-1].iteration if r.history else 0) for r in runs),
         nuisance=tuple(p.name for p in setup.parameters.parameters if p.nuisance),
         combinations=tuple(str(group) for group in seen.groups_always),
-        combined=_combined(stage, seen, first, final),
+        combined=seen.combined(
+            information, setup.theta[setup.parameters.interest], initial.information, final.information
+        ),
         prior=setup.prior,
         data=shared(
-            stage.problem.information.visible(final.information - setup.prior),
+            information.visible(final.information - setup.prior),
             setup.parameters.prior_information,
             setup.parameters.private,
         ),
     )
-
-
-def _combined(stage: Stage, seen: Survey, first: Point, final: Evaluation) -> tuple[Combined, ...]:
-    """Standard deviations of the identifiable combinations before and after."""
-    setup, groups = stage.setup, seen.groups_always
-    rows = rows_of(groups, seen.names)
-    if not len(rows) or first.information is None:
-        return ()
-    words = [str(c) for group in groups for c in group.combinations]
-    values = rows @ setup.theta[setup.parameters.interest]
-    before, after = (stage.problem.information.spread(told, rows) for told in (first.information, final.information))
-    columns = zip(words, values.tolist(), before.tolist(), after.tolist(), strict=True)
-    return tuple(Combined(*column) for column in columns)
 
 
 def _fine_point(stage: Stage, control: Array) -> Point | None:

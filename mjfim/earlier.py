@@ -23,13 +23,13 @@ def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
     total = np.zeros((len(names), len(names)))
     for path in paths:
         theirs, matrix, prior = _read(path)
-        shared = [n for n in names if n in theirs and not n.startswith(START)]
-        if not shared:
+        common = [n for n in names if n in theirs and not n.startswith(START)]
+        if not common:
             raise ExperimentError(
                 f"earlier: {path}: it knows {', '.join(theirs)}, but none of the parameters {', '.join(names)}"
             )
-        mine = np.array([list(names).index(n) for n in shared])
-        at = np.array([theirs.index(n) for n in shared])
+        mine = np.array([list(names).index(n) for n in common])
+        at = np.array([theirs.index(n) for n in common])
         total[np.ix_(mine, mine)] += marginal(matrix, prior, at)
     return total
 
@@ -65,7 +65,7 @@ def _read(path: Path) -> tuple[list[str], Array, Array]:
         shape = (len(names), len(names))
         prior = np.array(values.get("prior", np.zeros(shape)), dtype=np.float64)
         if "data" in values:
-            matrix = np.array(values["data"], dtype=np.float64) + prior
+            matrix = np.array(values["data"], dtype=np.float64)
         elif "final" in values:
             matrix = np.array(values["final"]["information"], dtype=np.float64)
         else:
@@ -76,4 +76,4 @@ def _read(path: Path) -> tuple[list[str], Array, Array]:
         raise ExperimentError(f"earlier: {path}: neither a design.json nor an estimate.json of mjfim") from None
     if matrix.shape != shape or prior.shape != shape or not (np.isfinite(matrix).all() and np.isfinite(prior).all()):
         raise ExperimentError(f"earlier: {path}: its information is not {len(names)} x {len(names)} finite numbers")
-    return names, matrix - prior, prior
+    return names, matrix if "data" in values else matrix - prior, prior

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,21 +67,27 @@ def _rows(kind: str, table: Mapping[str, Range], index: Mapping[str, int]) -> li
     return [Limit(kind, name, index[name], float(low), float(high)) for name, (low, high) in table.items()]
 
 
-def saturated(model: Any, trajectory: Trajectory, samples: Iterable[int] | None = None) -> tuple[str, ...]:
-    """Names of actuators whose force is clamped by forcerange at some sample (of those given).
-
-    model: at the design's theta
-    """
-    limited = np.flatnonzero(model.actuator_forcelimited).tolist()
-    if not limited:
-        return ()
-    data, hit = mujoco.MjData(model), set[int]()
-    for k in range(trajectory.samples) if samples is None else samples:
+def forwarded(model: Any, trajectory: Trajectory, samples: Iterable[int]) -> Iterator[tuple[int, Any]]:
+    """Each sample k with MjData at which everything is computed; one MjData serves them all."""
+    data = mujoco.MjData(model)
+    for k in samples:
         data.qpos[:], data.qvel[:], data.act[:] = trajectory.qpos[k], trajectory.qvel[k], trajectory.act[k]
         data.ctrl[:] = trajectory.ctrl[k]
         mujoco.mj_forward(model, data)
-        hit.update(i for i in limited if _clamped(model, data, i))
-    names = actuator_names(model)
+        yield k, data
+
+
+def clamped(model: Any, data: Any) -> list[int]:
+    """Ids of actuators whose force is clamped by forcerange at this moment."""
+    return [i for i in np.flatnonzero(model.actuator_forcelimited).tolist() if _clamped(model, data, i)]
+
+
+def saturated(model: Any, trajectory: Trajectory) -> tuple[str, ...]:
+    """Names of actuators whose force is clamped by forcerange at some sample. model: at the design's theta."""
+    if not model.actuator_forcelimited.any():
+        return ()
+    names, every = actuator_names(model), range(trajectory.samples)
+    hit = {i for _, data in forwarded(model, trajectory, every) for i in clamped(model, data)}
     return tuple(names[i] for i in sorted(hit))
 
 

@@ -15,6 +15,30 @@ from mjfim.trajectory import Array
 
 KEPT = 512  # compiled variants
 SOLVER_TOLERANCE = 1e-14
+# MjData of another layout would be written past its end
+LAYOUT = (
+    "nq",
+    "nv",
+    "na",
+    "nu",
+    "nbody",
+    "nsensordata",
+    "ngeom",
+    "nsite",
+    "ncam",
+    "nlight",
+    "njnt",
+    "ntendon",
+    "nwrap",
+    "neq",
+    "nmocap",
+    "nM",
+    "nC",
+    "nJmom",
+    "nbvh",
+    "nflex",
+    "nskin",
+)
 
 
 def load_spec(path: Path) -> Any:
@@ -171,7 +195,7 @@ class Source:
             own = self._spec.copy()
             edit(own)
             model = self._compile(own)
-            for size in ("nq", "nv", "na", "nu", "nbody", "nsensordata"):
+            for size in LAYOUT:
                 if getattr(model, size) != getattr(self.model, size):
                     raise ModelError(
                         f"{self._path}: a parameter changes {size} of the model from {getattr(self.model, size)} to "

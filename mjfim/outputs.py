@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -37,11 +36,6 @@ class OutputMap:
 
     outputs: tuple[Output, ...]
     space: StateSpace
-
-    @staticmethod
-    def build(outputs: Sequence[Output], space: StateSpace) -> OutputMap:
-        """Outputs of states laid out by space."""
-        return OutputMap(tuple(outputs), space)
 
     @cached_property
     def _states(self) -> np.ndarray:

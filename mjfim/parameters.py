@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mjfim.errors import ExperimentError, ModelError
+from mjfim.errors import ExperimentError
 from mjfim.inertia import CHARTS
 from mjfim.mjcf import write_element
 from mjfim.models import Mocap, Source
@@ -28,23 +28,7 @@ from mjfim.trajectory import Array
 INERTIAL = {"pos", "ipos", "inertia", "mass", "rot", *INERTIAL_FIELDS}
 Function = Callable[[Any, float], None]
 ROUNDED = 1e-6  # relative: by how much moments of a plate or rod, typed with few digits, may miss what a body can have
-LAYOUT = (
-    "ngeom",
-    "nsite",
-    "ncam",
-    "nlight",
-    "njnt",
-    "ntendon",
-    "nwrap",
-    "neq",
-    "nmocap",
-    "nM",
-    "nC",
-    "nJmom",
-    "nbvh",
-    "nflex",
-    "nskin",
-)
+OUTSIDE = (StartSlot, BiasSlot, DelaySlot)  # of the model
 
 
 @dataclass(frozen=True)
@@ -217,46 +201,40 @@ class ParameterSet:
         """(p,) derivative of the time by which outputs lag."""
         return np.asarray(self._linear(1, lambda slot: 0 if isinstance(slot, DelaySlot) else None)[0])
 
+    def _any(self, kind: Callable[[AnySlot], bool]) -> np.ndarray:
+        """(p,) True where a parameter has a slot of a kind."""
+        return np.array([any(kind(slot) for slot in slots) for slots in self.slots], dtype=bool)
+
+    @property
+    def _functions(self) -> np.ndarray:
+        """(p,) True where a function of the MjSpec stands for targets."""
+        return np.array([p.function is not None for p in self.parameters], dtype=bool)
+
     @cached_property
     def outside(self) -> np.ndarray:
         """(p,) True where a parameter concerns the start or the measurement."""
-        kinds = (StartSlot, BiasSlot, DelaySlot)
-        return np.array([any(isinstance(slot, kinds) for slot in slots) for slots in self.slots], dtype=bool)
+        return self._any(lambda slot: isinstance(slot, OUTSIDE))
 
     @cached_property
     def private(self) -> np.ndarray:
         """(p,) True for nuisance deviations of the start: every experiment and recording has its own."""
-        starts = [any(isinstance(slot, StartSlot) for slot in slots) for slots in self.slots]
-        return np.array([p.nuisance and s for p, s in zip(self.parameters, starts, strict=True)], dtype=bool)
+        nuisance = np.array([p.nuisance for p in self.parameters], dtype=bool)
+        return np.asarray(nuisance & self._any(lambda slot: isinstance(slot, StartSlot)))
 
     @cached_property
     def in_model(self) -> np.ndarray:
         """(p,) True where a parameter changes the model."""
-        outside = (StartSlot, BiasSlot, DelaySlot)
-        return np.array(
-            [
-                p.function is not None or any(not isinstance(s, outside) for s in slots)
-                for p, slots in zip(self.parameters, self.slots, strict=True)
-            ],
-            dtype=bool,
-        )
+        return np.asarray(self._functions | self._any(lambda slot: not isinstance(slot, OUTSIDE)))
 
     @cached_property
     def moving(self) -> np.ndarray:
         """(p,) True where a parameter changes the motion: through the model or the start."""
-        starts = [any(isinstance(s, StartSlot) for s in slots) for slots in self.slots]
-        return np.asarray(self.in_model | np.array(starts, dtype=bool))
+        return np.asarray(self.in_model | self._any(lambda slot: isinstance(slot, StartSlot)))
 
     @cached_property
     def compiled(self) -> np.ndarray:
         """(p,) True where a change needs a compile."""
-        return np.array(
-            [
-                p.function is not None or any(isinstance(s, SpecSlot) for s in slots)
-                for p, slots in zip(self.parameters, self.slots, strict=True)
-            ],
-            dtype=bool,
-        )
+        return np.asarray(self._functions | self._any(lambda slot: isinstance(slot, SpecSlot)))
 
     def write(self, model: Any, theta: Array) -> None:
         """Write theta: (p,) into a model that the caller owns, in place, then recompute MuJoCo's derived constants.
@@ -338,11 +316,7 @@ class ParameterSet:
             return source
         if not self.compiled.any():
             return source.model
-        model = source.edited(np.asarray(theta)[self.compiled].tobytes(), lambda spec: self._edit(spec, source, theta))
-        for size in LAYOUT:  # MjData of another layout would be written past its end
-            if getattr(model, size) != getattr(source.model, size):
-                raise ModelError(f"a parameter changes {size} of the model; it may change numbers only")
-        return model
+        return source.edited(np.asarray(theta)[self.compiled].tobytes(), lambda spec: self._edit(spec, source, theta))
 
     def _edit(self, spec: Any, source: Source, theta: Array) -> None:
         for j in np.flatnonzero(self.compiled):
@@ -425,6 +399,7 @@ def _in_charts(parameters: Sequence[Parameter], slots: list[tuple[AnySlot, ...]]
     allowed = {"central": {"body_mass", "body_ipos"}, "barycentric": {"body_mass"}, "logcholesky": set[str]()}
 
     def settled(parameter: Parameter, slot: AnySlot) -> AnySlot:
+        """The slot in the chart of its body."""
         body = slot.rows[0] if isinstance(slot, Slot) and slot.array.startswith("body_") else None
         body = slot.body if isinstance(slot, InertiaSlot) else body
         own = charts.get(-1 if body is None else body, set())

@@ -66,7 +66,7 @@ INERTIAL_FIELDS = {
     "logcholesky": ("logcholesky", 0, 10),
 }
 COMPILED = {"geom": ("size", "pos", "mass", "density")}
-SERVO = {"kp": 3, "kv": 3}
+SERVO = ("kp", "kv")
 START_FIELDS = ("qpos", "qvel", "act")
 
 

@@ -262,11 +262,7 @@ class Plant:
         p = len(self.parameters)
         states, ctrl = self._ends(trajectory)
         A, B, C, D = self.jacobians(theta, trajectory, step)
-        theta_step = step * self.span
-        thetas = np.concatenate([theta + np.diag(theta_step), theta - np.diag(theta_step)])
-        same = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
-        held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.nu)
-        dp, hp = self._halves(self._all(thetas), same, held, p, theta_step)
+        dp, hp = self._by_theta(theta, states, ctrl, step)
         E = np.moveaxis(_finite(dp[:, :-1]), 0, 2)
         H = np.moveaxis(self.outputs.tangent(states, np.zeros((p, len(states), self.space.nx)), hp), 0, 2)
         H = H + self._bias
@@ -277,19 +273,22 @@ class Plant:
 
         Rows are relative to the sizes of states and to the largest effect on each sensor. Raises SimulationDiverged.
         """
-        p, h = len(self.parameters), step * self.span
-        states, ctrl = trajectory.state[samples], trajectory.ctrl[samples]
-        moves = np.diag(h)
-        models = self._all(np.concatenate([theta + moves, theta - moves]))
-        same = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
-        held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.nu)
-        dx, ds = self._halves(models, same, held, p, h)
+        p, states = len(self.parameters), trajectory.state[samples]
+        dx, ds = self._by_theta(theta, states, trajectory.ctrl[samples], step)
         parts = [_finite(dx) / (self.dt * self.steps_of(trajectory)[: self.space.nx])]
         if ds is not None:
             dy = self.outputs.tangent(states, np.zeros_like(dx), ds)
             size = np.abs(dy * self.parameters.step[:, None, None]).max(axis=(0, 1))
             parts.append(dy / np.where(size > 0.0, size, 1.0))
         return np.concatenate([part.reshape(p, -1) for part in parts], axis=1).T
+
+    def _by_theta(self, theta: Array, states: Array, ctrl: Array, step: float) -> tuple[Array, Array | None]:
+        """Derivatives of one sample by every parameter: (p, n, nx), and of the sensors (p, n, ns) or None."""
+        p, h = len(self.parameters), step * self.span
+        models = self._all(np.concatenate([theta + np.diag(h), theta - np.diag(h)]))
+        same = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
+        held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.nu)
+        return self._halves(models, same, held, p, h)
 
     def jacobians(
         self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +10,12 @@ import mujoco
 import numpy as np
 
 from mjfim.identifiability import BLIND, FAINT
-from mjfim.limits import saturated
+from mjfim.limits import clamped, forwarded
+from mjfim.models import actuator_names
 from mjfim.plant import SENSITIVITY_STEP
 from mjfim.sensing import joint_names
 from mjfim.setup import Setup
-from mjfim.trajectory import Array, Trajectory
+from mjfim.trajectory import Array, Sensitivity, Trajectory
 
 LONGER = 300.0  # the second step, times the first: a change of 0.3 %
 LEAST = 3.0  # the same for parameters so weak that the first step is long already
@@ -52,10 +53,10 @@ def disagreement(fine: Array, coarse: Array) -> Array:
     return np.asarray((np.abs(fine - coarse) / np.where(size > 0.0, size, 1.0)).max(axis=1))
 
 
-def roughness(setup: Setup, theta: Array, trajectory: Trajectory) -> Roughness | None:
-    """The worst disagreement along a trajectory, or None where it is below `TOLERANCE`."""
-    fine = setup.plant.sensitivity(theta, trajectory)
+def roughness(setup: Setup, theta: Array, trajectory: Trajectory, fine: Sensitivity | None = None) -> Roughness | None:
+    """The worst disagreement along a trajectory, or None where it is below `TOLERANCE`. fine: by the first step, if known"""
     plant = setup.plant
+    fine = plant.sensitivity(theta, trajectory) if fine is None else fine
     longer = np.maximum(LONGER * setup.parameters.step / plant.span, LEAST)
     coarse = plant.sensitivity(theta, trajectory, longer * SENSITIVITY_STEP)
     names = setup.parameters.names
@@ -63,10 +64,10 @@ def roughness(setup: Setup, theta: Array, trajectory: Trajectory) -> Roughness |
         causes = tuple(_active(setup.model_at(theta), trajectory, range(trajectory.samples)))
         return Roughness(np.inf, ", ".join(names), 0, 0.0, causes)
     G = setup.noise.whiten(fine.G)
-    error = disagreement(G, setup.noise.whiten(coarse.G))[:, visible_columns(setup, G)]
     kept = np.flatnonzero(visible_columns(setup, G))
     if not len(kept):
         return None
+    error = disagreement(G, setup.noise.whiten(coarse.G))[:, kept]
     worst = int(np.argmax(error.max(axis=0)))
     if not error[:, worst].max() > TOLERANCE:
         return None
@@ -89,8 +90,8 @@ def visible_columns(setup: Setup, G: Array) -> np.ndarray:
 
 def first_active(model: Any, trajectory: Trajectory) -> tuple[int, tuple[str, ...]] | None:
     """First sample at which a contact, friction, limit or clamp acts, and what; None where none ever does."""
-    for k in range(trajectory.samples):
-        causes = tuple(_active(model, trajectory, range(k, k + 1)))
+    for k, data in forwarded(model, trajectory, range(trajectory.samples)):
+        causes = (*sorted(set(_at(model, data))), *_ranges(model, clamped(model, data)))
         if causes:
             return k, causes
     return None
@@ -98,14 +99,17 @@ def first_active(model: Any, trajectory: Trajectory) -> tuple[int, tuple[str, ..
 
 def _active(model: Any, trajectory: Trajectory, samples: range) -> Iterator[str]:
     """Contacts, frictions, limits and clamps that act at these samples, each once."""
-    data, told = mujoco.MjData(model), set[str]()
-    for k in samples:
-        data.qpos[:], data.qvel[:], data.act[:] = trajectory.qpos[k], trajectory.qvel[k], trajectory.act[k]
-        data.ctrl[:] = trajectory.ctrl[k]
-        mujoco.mj_forward(model, data)
+    told, hit = set[str](), set[int]()
+    for _, data in forwarded(model, trajectory, samples):
         told.update(_at(model, data))
+        hit.update(clamped(model, data))
     yield from sorted(told)
-    yield from (f"force range of {name}" for name in saturated(model, trajectory, samples))
+    yield from _ranges(model, hit)
+
+
+def _ranges(model: Any, actuators: Iterable[int]) -> Iterator[str]:
+    names = actuator_names(model)
+    yield from (f"force range of {names[i]}" for i in sorted(actuators))
 
 
 def _at(model: Any, data: Any) -> Iterator[str]:

@@ -9,7 +9,7 @@ import numpy as np
 from mjfim.designer import regulator_for
 from mjfim.directions import LBFGS
 from mjfim.errors import SimulationDiverged
-from mjfim.lq import TangentCurve
+from mjfim.lq import Recursion, TangentCurve
 from mjfim.objective import DesignProblem, Point
 from mjfim.pronto import Expansion
 from mjfim.roughness import Roughness, first_active, roughness, visible_columns
@@ -46,7 +46,7 @@ def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
     if trajectory is None or point.sensitivity is None:
         raise SimulationDiverged("the trajectory diverges when the parameters move a little")
     found = SelfTest(
-        roughness(setup, setup.theta, trajectory),
+        roughness(setup, setup.theta, trajectory, point.sensitivity),
         recursion_error(setup, trajectory, point.sensitivity),
         slope_error(setup, problem, point),
     )
@@ -67,9 +67,8 @@ def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivi
     except SimulationDiverged:
         return np.inf
     psi = sensitivity.psi
-    own = np.array(psi)
-    for k in range(trajectory.samples):
-        own[k + 1] = line.A[k] @ own[k] + line.E[k]
+    recursion = Recursion(line.A)
+    own = np.stack([recursion.forward(psi[0, :, j], line.E[..., j]) for j in range(psi.shape[2])], axis=2)
     size = np.abs(psi).max(axis=(0, 1))
     moving = (size > 0.0) & visible_columns(setup, setup.noise.whiten(sensitivity.G))
     if not moving.any():

@@ -8,7 +8,7 @@ A number of an MjModel array (`Slot`), a coordinate of a body's inertia (`Inerti
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -95,21 +95,28 @@ class InertiaSlot:
         return float(CHARTS[self.chart].size(inertial(model, self.body))[self.component])
 
 
-@dataclass(frozen=True)
-class RotationSlot:
-    """One component of a rotation vector [rad] by which a body or site is turned from its compiled orientation."""
+class FromOrigin:
+    """What is counted from the model as it is: its value there is zero. natural: magnitude that a change is compared with."""
 
-    array: str
-    row: int
-    component: int
+    natural: ClassVar[float]
 
     def read(self, model: Any) -> float:
-        """Zero: the compiled orientation is the origin."""
+        """Zero."""
         return 0.0
 
     def size(self, model: Any) -> float:
-        """One radian."""
-        return 1.0
+        """Magnitude that a change is compared with."""
+        return self.natural
+
+
+@dataclass(frozen=True)
+class RotationSlot(FromOrigin):
+    """One component of a rotation vector [rad] by which a body or site is turned from its compiled orientation."""
+
+    natural: ClassVar[float] = 1.0
+    array: str
+    row: int
+    component: int
 
 
 @dataclass(frozen=True)
@@ -134,46 +141,26 @@ class SpecSlot:
 
 
 @dataclass(frozen=True)
-class StartSlot:
+class StartSlot(FromOrigin):
     """Deviation of one component of the initial state, by its place in the tangent space."""
 
+    natural: ClassVar[float] = 1.0
     tangent: int
 
-    def read(self, model: Any) -> float:
-        """Zero: the stated start is the origin."""
-        return 0.0
-
-    def size(self, model: Any) -> float:
-        """Order of magnitude of states."""
-        return 1.0
-
 
 @dataclass(frozen=True)
-class BiasSlot:
+class BiasSlot(FromOrigin):
     """Constant bias of one measured output."""
 
+    natural: ClassVar[float] = 1.0
     output: int
-
-    def read(self, model: Any) -> float:
-        """Zero."""
-        return 0.0
-
-    def size(self, model: Any) -> float:
-        """Order of magnitude of outputs."""
-        return 1.0
 
 
 @dataclass(frozen=True)
-class DelaySlot:
+class DelaySlot(FromOrigin):
     """Time by which all outputs lag [s]."""
 
-    def read(self, model: Any) -> float:
-        """Zero."""
-        return 0.0
-
-    def size(self, model: Any) -> float:
-        """Ten milliseconds."""
-        return 0.01
+    natural: ClassVar[float] = 0.01
 
 
 AnySlot = Slot | InertiaSlot | RotationSlot | SpecSlot | StartSlot | BiasSlot | DelaySlot

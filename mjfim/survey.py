@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.errors import SimulationDiverged, UnidentifiableError
-from mjfim.identifiability import BLIND, COARSER, SURE, Group, Null, grouped, invisible, listed
+from mjfim.fisher import Information
+from mjfim.identifiability import BLIND, COARSER, SURE, Group, Null, grouped, invisible, listed, rows_of
 from mjfim.plant import SENSITIVITY_STEP
 from mjfim.setup import Setup
 from mjfim.signals import multisine
-from mjfim.trajectory import Array, Sensitivity, Trajectory
+from mjfim.trajectory import Array, Combined, Sensitivity, Trajectory
 
 PROBES = 3
 ROUND_OFF = 1e-7  # relative error of rows that are taken from an information matrix
@@ -39,6 +40,16 @@ class Survey:
         """(t, s) combinations that some experiment can see; None where all parameters are such."""
         return self.always.basis if self.always.count else None
 
+    def combined(self, information: Information, values: Array, before: Array, after: Array) -> tuple[Combined, ...]:
+        """The visible combinations of `groups_always`: words, value and standard deviations of two informations (p, p).
+
+        values: (t,) of the wanted parameters
+        """
+        rows = rows_of(self.groups_always, self.names)
+        words = [str(c) for group in self.groups_always for c in group.combinations]
+        stds = (information.spread(told, rows).tolist() for told in (before, after))
+        return tuple(Combined(*column) for column in zip(words, (rows @ values).tolist(), *stds, strict=True))
+
 
 def rows(setup: Setup, sensitivity: Sensitivity) -> Array:
     """(n, p) whitened rows of G at the measured samples."""
@@ -52,7 +63,7 @@ def survey(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivity) -> Su
     quick = _null(setup, [J], None, local)
     if quick.smallest > SURE and not quick.count:
         return _words(setup, quick, quick)
-    return survey_rows(setup, trajectory, *_pair(setup, trajectory, sensitivity))
+    return _survey(setup, trajectory, *_pair(setup, trajectory, sensitivity), local)
 
 
 def survey_rows(setup: Setup, trajectory: Trajectory, J: Array, error: Array) -> Survey:
@@ -60,7 +71,10 @@ def survey_rows(setup: Setup, trajectory: Trajectory, J: Array, error: Array) ->
 
     trajectory: one of those that the rows belong to
     """
-    local = _local(setup, [trajectory])
+    return _survey(setup, trajectory, J, error, _local(setup, [trajectory]))
+
+
+def _survey(setup: Setup, trajectory: Trajectory, J: Array, error: Array, local: Array | None) -> Survey:
     here = _null(setup, [J], [error], local)
     if not here.count:
         return _words(setup, here, here)
@@ -87,10 +101,8 @@ def _local(setup: Setup, trajectories: Sequence[Trajectory]) -> Array | None:
     if not len(inside):
         return None
     unseen = np.zeros_like(setup.prior)
-    for most in (
-        LOCAL,
-        max(t.samples for t in trajectories),
-    ):  # what a few samples do not show, a contact between them may
+    every = max(t.samples for t in trajectories)
+    for most in (LOCAL, every):  # what a few samples do not show, a contact between them may
         found = _stepped(setup, trajectories, most)
         if found is None:
             return None
@@ -143,11 +155,12 @@ def _unseen_before(setup: Setup, directions: Array) -> Array:
     if not setup.earlier.any() or not directions.shape[1]:
         return directions
     unit = directions / np.linalg.norm(directions / setup.parameters.step[setup.parameters.interest][:, None], axis=0)
-    effect = _rows_of(setup.earlier)[:, setup.parameters.interest] @ unit
+    before = _rows_of(setup.earlier)
+    effect = before[:, setup.parameters.interest] @ unit
     _, values, V = np.linalg.svd(
         np.concatenate([effect, np.zeros((unit.shape[1], unit.shape[1]))]), full_matrices=False
     )
-    strongest = np.linalg.norm(_rows_of(setup.earlier) * setup.parameters.step, 2)
+    strongest = np.linalg.norm(before * setup.parameters.step, 2)
     return np.asarray(unit @ V[values <= max(BLIND, FAINTEST * strongest)].T)
 
 
