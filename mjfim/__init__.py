@@ -5,9 +5,10 @@ parameters from recordings, `monte_carlo` holds the estimator against the Cramer
 """
 
 from mjfim.checker import Check, check
-from mjfim.designer import design, evaluate_trajectory
+from mjfim.designer import design
 from mjfim.errors import MjfimError
 from mjfim.estimate import identify
+from mjfim.evaluation import evaluate_trajectory
 from mjfim.experiment import Experiment
 from mjfim.montecarlo import monte_carlo, simulate
 from mjfim.together import design_together

@@ -18,12 +18,14 @@ class Criterion:
     """Value of phi and its derivative `M = sum_r weights_r directions_r directions_r'`.
 
     weights: (r,);  directions: (r, p);  eigenvalues: (p,) ascending
+    power: q of `(sum lambda^-q)^(1/q)`, whose first directions belong to the first eigenvalues; infinite for other criteria
     """
 
     value: float
     weights: Array
     directions: Array
     eigenvalues: Array
+    power: float = np.inf
 
 
 def _spectrum(information: Array) -> tuple[Array, Array, bool]:
@@ -43,10 +45,10 @@ def e_optimality(information: Array) -> Criterion:
     return Criterion(float(1.0 / values[0]), np.array([-(values[0] ** -2)]), vectors[:, :1].T, values)
 
 
-def smooth_e_optimality(information: Array, power: float) -> Criterion:
+def smooth_e_optimality(information: Array, power: float, faint: float = NEGLIGIBLE) -> Criterion:
     """`(sum_i lambda_i^-q)^(1/q)`, Kiefer's criterion: differentiable where eigenvalues meet, 1/lambda_min as q grows.
 
-    At most `p^(1/q)` times 1/lambda_min. Every eigenvector that has weight is among the directions.
+    At most `p^(1/q)` times 1/lambda_min. Every eigenvector of more than faint weight is among the directions.
     """
     values, vectors, sound = _spectrum(information)
     if not sound:
@@ -54,8 +56,8 @@ def smooth_e_optimality(information: Array, power: float) -> Criterion:
     ratio = values[0] / values
     total = float(np.sum(ratio**power))
     weights = total ** (1.0 / power - 1.0) * ratio ** (power + 1.0) / values[0] ** 2
-    kept = weights > NEGLIGIBLE * weights[0]
-    return Criterion(total ** (1.0 / power) / values[0], -weights[kept], vectors.T[kept], values)
+    kept = weights > faint * weights[0]
+    return Criterion(total ** (1.0 / power) / values[0], -weights[kept], vectors.T[kept], values, power)
 
 
 def a_optimality(information: Array) -> Criterion:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,12 +57,61 @@ def state_space(model: Any) -> StateSpace:
 
 
 @dataclass(frozen=True, eq=False)
+class Taps:
+    """What is looked at between the samples, w numbers per engine step: addresses or dofs of each kind, side by side.
+
+    q: positions, v: velocities after the step;  a: change of velocity over the step, per second
+    f: actuator forces, j: joint forces of the actuators, during the step
+    substeps: engine steps of a sample that derivatives look at, counted from 1;  timestep: [s]
+    """
+
+    q: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    f: np.ndarray
+    j: np.ndarray
+    substeps: tuple[int, ...]
+    timestep: float
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """MjData fields that are recorded beside the state."""
+        return ("actuator_force",) * bool(len(self.f)) + ("qfrc_actuator",) * bool(len(self.j))
+
+    def rows(self, qpos: Array, qvel: Array, before: Array, read: Callable[[str], Array]) -> Array:
+        """(..., w) from states after a step, velocities before it, and a reader of MjData fields."""
+        parts = [qpos[..., self.q], qvel[..., self.v], (qvel[..., self.a] - before[..., self.a]) / self.timestep]
+        if len(self.f):
+            parts.append(read("actuator_force")[..., self.f])
+        if len(self.j):
+            parts.append(read("qfrc_actuator")[..., self.j])
+        return np.concatenate(parts, axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
 class Rollouts:
-    """Many simulated curves. states: (m, N+1, ns); sensors: (m, N+1, nsensordata) or None; finite: (m,) False = diverged."""
+    """Many simulated curves.
+
+    states: (m, N+1, ns);  sensors: (m, N+1, nsensordata) or None;  finite: (m,) False = diverged
+    tapped: (m, N, substeps, w) at every engine step, or None
+    """
 
     states: Array
     sensors: Array | None
     finite: np.ndarray
+    tapped: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Stepped:
+    """One sample of many simulations. states: (n, ns) after it;  sensors: (n, nsensordata) before it, or None
+
+    tapped: (n, looked-at substeps, w), or None
+    """
+
+    states: Array
+    sensors: Array | None
+    tapped: Array | None
 
 
 class Engine:
@@ -108,33 +157,46 @@ class Engine:
                 mocap_pos[own], mocap_quat[own] = model.body_pos[self._mocap], model.body_quat[self._mocap]
         return None if n == batch.nsim else np.arange(n)
 
-    def step(self, models: Sequence[Any], states: Array, ctrl: Array) -> tuple[Array, Array | None]:
-        """One sample of every simulation: next states (n, ns), and the sensors at the given states or None.
+    def step(self, models: Sequence[Any], states: Array, ctrl: Array, taps: Taps | None = None) -> Stepped:
+        """One sample of every simulation.
 
         states: (n, ns);  ctrl: (n, nu), held. Each model steps its equal, contiguous share. Diverged simulations are NaN.
         """
         share = len(states) // len(models)
         parts = [
-            self._share(model, states[i * share : (i + 1) * share], ctrl[i * share : (i + 1) * share])
+            self._share(model, states[i * share : (i + 1) * share], ctrl[i * share : (i + 1) * share], taps)
             for i, model in enumerate(models)
         ]
-        sensed = np.concatenate([s for _, s in parts if s is not None]) if self.sensors else None
-        return np.concatenate([x for x, _ in parts]), sensed
+        sensed = np.concatenate([p.sensors for p in parts if p.sensors is not None]) if self.sensors else None
+        tapped = None if taps is None else np.concatenate([p.tapped for p in parts if p.tapped is not None])
+        return Stepped(np.concatenate([p.states for p in parts]), sensed, tapped)
 
-    def _share(self, model: Any, states: Array, ctrl: Array) -> tuple[Array, Array | None]:
+    def _share(self, model: Any, states: Array, ctrl: Array, taps: Taps | None) -> Stepped:
         count = len(states)
         batch = self._batch("step", count)
         batch.set_models(model)
         ids = self._load(batch, states, [model])
         batch.bind("ctrl")[:count] = ctrl
-        sensed, remaining = None, self.substeps
+        looks = () if taps is None else taps.substeps
+        sensed, done, tapped = None, 0, []
+        if self.sensors:
+            batch.bind("sensordata")
+        for name in () if taps is None else taps.fields:
+            batch.bind(name)
         with quiet():
-            if self.sensors:
-                batch.bind("sensordata")
-                batch.step(ids, nstep=1)
-                sensed, remaining = self._sensed(batch.bind("sensordata")[:count]), remaining - 1
-            if remaining:
-                batch.step(ids, nstep=remaining)
+            for stop in sorted({*looks, *((1,) if self.sensors else ()), self.substeps}):
+                if stop - done > 1 and stop in looks:
+                    batch.step(ids, nstep=stop - done - 1)
+                    done = stop - 1
+                before = np.array(batch.bind("qvel")[:count]) if taps is not None and len(taps.a) else np.empty((0, 0))
+                batch.step(ids, nstep=stop - done)
+                done = stop
+                if self.sensors and stop == 1:
+                    sensed = self._sensed(batch.bind("sensordata")[:count])
+                if taps is not None and stop in looks:
+                    before = before if len(taps.a) else batch.bind("qvel")[:count]
+                    now = (batch.bind("qpos")[:count], batch.bind("qvel")[:count], before)
+                    tapped.append(taps.rows(*now, lambda name: batch.bind(name)[:count]))
         self.steps += self.substeps * count
         names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
         out = np.concatenate([batch.bind(name)[:count] for name in names], axis=1)
@@ -142,9 +204,9 @@ class Engine:
         elapsed = batch.bind("time").reshape(-1)[:count] - START
         bad = np.abs(elapsed - self.substeps * timestep) > 0.5 * timestep
         out[bad | ~_acceptable(ctrl).all(axis=1)] = np.nan
-        return out, sensed
+        return Stepped(out, sensed, np.stack(tapped, axis=1) if tapped else None)
 
-    def rollout(self, models: Sequence[Any], start: Array, ctrl: Array) -> Rollouts:
+    def rollout(self, models: Sequence[Any], start: Array, ctrl: Array, taps: Taps | None = None) -> Rollouts:
         """Open-loop simulations from start: (m, ns) under ctrl: (m, N, nu), each sample held over its substeps."""
         count, N, _ = ctrl.shape
         batch = self._batch("rollout" if count <= FEW else "rollouts", count)
@@ -154,6 +216,8 @@ class Engine:
         record: tuple[Any, ...] = (RECORD,)
         if self.sensors:  # one more step: sensor data belongs to the state before a step
             held, record = np.concatenate([held, held[:, -1:]], axis=1), (RECORD, "sensordata")
+        if taps is not None:
+            record = (*record, *taps.fields)
         with quiet():
             out = batch.rollout(held.shape[1], np.ascontiguousarray(held), record=record, ids=ids)
         self.steps += count * held.shape[1]
@@ -163,7 +227,14 @@ class Engine:
         on_time = np.abs(rows[:, -1, 0] - START - last * self.model.opt.timestep) < 0.5 * self.model.opt.timestep
         finite = on_time & np.isfinite(states).all(axis=(1, 2)) & _acceptable(ctrl).all(axis=(1, 2))
         sensed = self._sensed(out["sensordata"][:, :: self.substeps]) if self.sensors else None
-        return Rollouts(states, sensed, finite)
+        return Rollouts(states, sensed, finite, None if taps is None else self._tapped(taps, start, out, last))
+
+    def _tapped(self, taps: Taps, start: Array, out: dict[Any, Array], last: int) -> Array:
+        """(m, N, substeps, w) from the records of a rollout of `last` engine steps."""
+        qpos, qvel, _ = self.space.split(out[RECORD][:, :last, 1:])
+        before = np.concatenate([self.space.split(start)[1][:, None], qvel[:, :-1]], axis=1)
+        rows = taps.rows(qpos, qvel, before, lambda name: out[name][:, :last])
+        return np.asarray(rows.reshape(len(start), last // self.substeps, self.substeps, rows.shape[-1]))
 
     def _sensed(self, data: Array) -> Array:
         """A copy of sensor data: (..., nsensordata), its clocks as if time had begun at zero."""

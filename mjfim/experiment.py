@@ -172,8 +172,9 @@ class Robust(Section):
 
 
 class Cost(Section):
-    """Weights of eq. 3 and where it is evaluated. control: R_tau; tracking, tracking_velocity: Q_tau by joint name.
+    """Weights of eq. 3 and where it is evaluated.
 
+    control: R_tau, 0 where hard limits bound the control;  tracking, tracking_velocity: Q_tau by joint name
     control_about: control that costs nothing, one number or by actuator; default: the keyframe's control, else 0
     combination: for criterion c, coefficients by parameter: the variance of their sum is minimised
     subset: for criterion c, parameters whose relative variances (in units of their scales) are summed
@@ -183,7 +184,7 @@ class Cost(Section):
     combination: dict[str, Finite] | None = None
     subset: tuple[str, ...] | None = None
     information: Positive = 1.0
-    control: Positive | dict[str, Positive] = 1e-3
+    control: NonNegative | dict[str, NonNegative] = 1e-3
     control_about: Finite | dict[str, Finite] | None = None
     tracking: dict[str, NonNegative] = {}
     tracking_velocity: dict[str, NonNegative] = {}
@@ -204,7 +205,11 @@ class Cost(Section):
 class Descent(Section):
     """How the cost is minimised. tolerance: stop at `|DJ.zeta| <= tolerance * J`; psi_weight: metric weight on psi.
 
+    seconds: stop after that long, with the best so far
+
     starts: 1 = from the initial control only; more adds random multisines, the best result is kept
+    previous: design.csv files to start from as well, repeated where they are shorter
+    fourier: [Hz] base frequencies of Fourier series to start from as well, each optimised first
     coarse: descend first at a sample period that many times longer, where it is cheap; 1 = never; auto = 4 where the model
     allows it
     """
@@ -212,8 +217,11 @@ class Descent(Section):
     method: Literal["lbfgs", "metric"] = "lbfgs"
     tolerance: Positive = 1e-7
     max_iterations: Annotated[int, Field(ge=0)] = 200
+    seconds: Positive | None = None
     psi_weight: NonNegative = 0.0
     starts: Annotated[int, Field(ge=1)] = 1
+    previous: tuple[str, ...] = ()
+    fourier: tuple[Positive, ...] = ()
     coarse: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     seed: Annotated[int, Field(ge=0)] = 0
 
@@ -225,11 +233,46 @@ class Descent(Section):
 
 
 class Limits(Section):
-    """Ranges by joint or actuator name. Checked and reported at every sample."""
+    """Hard limits by joint or actuator name; one number stands for all names. Default: the MJCF's ranges.
+
+    position, velocity, acceleration: of joints [m or rad, per s, per s²];  control, control_rate: of actuators [unit, unit/s]
+    force: of actuators [N or N m];  where the MJCF has a range too, both hold
+    clearance: [m] least distance to itself and to the world;  ignored: pairs of bodies that may come closer
+    bandwidth: [Hz] of the control, then a cubic spline with a knot every 1/(2 bandwidth) s
+    enforce: false: check and report only
+    """
 
     position: dict[str, Range] = {}
-    velocity: dict[str, Positive | Range] = {}
+    velocity: Positive | dict[str, Positive | Range] = {}
+    acceleration: Positive | dict[str, Positive | Range] = {}
     control: dict[str, Range] = {}
+    control_rate: Positive | dict[str, Positive | Range] = {}
+    force: Positive | dict[str, Positive | Range] = {}
+    clearance: Positive | None = None
+    ignored: tuple[tuple[str, str], ...] = ()
+    bandwidth: Positive | None = None
+    enforce: bool = True
+
+
+class Boundary(Section):
+    """How a design begins and ends.
+
+    start: rest: the control begins at what holds the start, without a jolt;  given: anything
+    end: rest: at a standstill, at the start or at a keyframe;  periodic: at the start's state, ready to be repeated;  free
+    position, velocity: [m or rad, m/s or rad/s] how exactly the end is met
+    """
+
+    start: Literal["given", "rest"] = "given"
+    end: Literal["free", "rest", "periodic"] = "free"
+    keyframe: str | None = None
+    position: Positive = 1e-2
+    velocity: Positive = 2e-2
+
+    @model_validator(mode="after")
+    def _somewhere(self) -> Boundary:
+        if self.keyframe is not None and self.end != "rest":
+            raise ValueError('keyframe says where a design with end = "rest" comes to rest')
+        return self
 
 
 class Experiment(Section):
@@ -252,6 +295,7 @@ class Experiment(Section):
     robust: Robust | None = None
     descent: Descent = Descent()
     limits: Limits = Limits()
+    boundary: Boundary = Boundary()
     directory: Path = Field(default=Path("."), exclude=True)
     source: str = Field(default="experiment", exclude=True)
 

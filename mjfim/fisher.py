@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.criteria import CRITERIA, SINGULAR, Criterion, c_optimality, smooth_e_optimality
+from mjfim.criteria import CRITERIA, NEGLIGIBLE, SINGULAR, Criterion, c_optimality, smooth_e_optimality
 from mjfim.lq import Recursion
 from mjfim.noise import Noise
 from mjfim.plant import Bilinear
@@ -35,6 +35,7 @@ class Information:
     basis: (t, s) orthonormal, the identifiable combinations of the scaled wanted parameters (None: all of them)
     contrast: (t, c) combinations of the scaled wanted parameters whose variance criterion "c" sums
     power: of the smooth E-criterion, infinite for 1/lambda_min itself
+    faint: weight of an eigenvector in it, over the largest, below which its share of the gradient is left out
     told: (p,) information of the stated priors, by which a combination is known that nothing shows (None: the diagonal of prior)
     """
 
@@ -48,6 +49,7 @@ class Information:
     basis: Array | None = None
     contrast: Array | None = None
     power: float = np.inf
+    faint: float = NEGLIGIBLE
     told: Array | None = None
 
     def matrix(self, sensitivity: Sensitivity) -> Array:
@@ -87,11 +89,11 @@ class Information:
             return Criterion(np.inf, np.zeros(0), np.zeros((0, len(information))), np.zeros(0))
         raw = self._criterion(R)
         directions = raw.directions @ P * self.scale
-        return Criterion(self.weight * raw.value, self.weight * raw.weights, directions, raw.eigenvalues)
+        return replace(raw, value=self.weight * raw.value, weights=self.weight * raw.weights, directions=directions)
 
     def _criterion(self, R: Array) -> Criterion:
         if self.criterion == "E" and np.isfinite(self.power):
-            return smooth_e_optimality(R, self.power)
+            return smooth_e_optimality(R, self.power, self.faint)
         if self.criterion == "c":
             if self.contrast is None:
                 raise ValueError("criterion c needs a contrast")
@@ -174,18 +176,25 @@ class Information:
     def gradient(self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear) -> tuple[Array, Array]:
         """(a, b): derivative of phi by x_k (N+1, nx) and u_k (N, nu), psi eliminated by the adjoint."""
         nx = bilinear.A.shape[1]
+        total = np.sum(self.gradients(criterion, sensitivity, bilinear), axis=0)
+        return total[:, :nx], total[:-1, nx:]
+
+    def gradients(self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear) -> Array:
+        """(r, N+1, nx+nu) the share of each direction in the derivative of phi by (x_k, u_k)."""
+        nx = bilinear.A.shape[1]
         recursion = Recursion(bilinear.A)
-        total = np.zeros((len(bilinear.A) + 1, nx + bilinear.B.shape[2]))
-        for r, v in enumerate(self._rays(criterion, sensitivity)):
+        rays = self._rays(criterion, sensitivity)
+        total = np.zeros((len(rays), len(bilinear.A) + 1, nx + bilinear.B.shape[2]))
+        for r, (v, share) in enumerate(zip(rays, total, strict=True)):
             own = v if bilinear.lag is None else bilinear.lag.apply_transposed(v)
             costate = recursion.adjoint(np.einsum("kyx,ky->kx", bilinear.C, own))
-            total[:-1] += np.einsum("kzx,kx->kz", bilinear.F_mixed[r], costate[1:])
+            share[:-1] += np.einsum("kzx,kx->kz", bilinear.F_mixed[r], costate[1:])
             if bilinear.h_mixed is not None:
-                total += np.einsum("kzy,ky->kz", bilinear.h_mixed[r], own)
+                share += np.einsum("kzy,ky->kz", bilinear.h_mixed[r], own)
             if bilinear.lag is not None and bilinear.delay is not None:
-                total += _delayed(bilinear, v * float(bilinear.delay @ criterion.directions[r]))
-        total[-2, nx:] += total[-1, nx:]  # the last control is held for the outputs of the last sample
-        return total[:, :nx], total[:-1, nx:]
+                share += _delayed(bilinear, v * float(bilinear.delay @ criterion.directions[r]))
+        total[:, -2, nx:] += total[:, -1, nx:]  # the last control is held for the outputs of the last sample
+        return total
 
     def partials(self, criterion: Criterion, sensitivity: Sensitivity, full: Bilinear) -> tuple[Array, Array, Array]:
         """Derivatives of phi with psi kept as a state: by psi (N+1, nx, p), by x (N+1, nx), by u (N, nu).

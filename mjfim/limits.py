@@ -1,4 +1,4 @@
-"""Limits of an experiment: the MJCF's ranges unless the file states others, and how closely a trajectory keeps them."""
+"""Limits of an experiment: the MJCF's ranges and those that the file states, both hold where there are both."""
 
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ from mjfim.trajectory import Trajectory
 
 Range = tuple[float, float]
 CLAMPED = 1e-12  # relative distance from its bound at which a force counts as clamped
+JOINTS = ("position", "velocity", "acceleration", "joint_force")  # kinds by joint; the others are by actuator
 
 
 @dataclass(frozen=True)
 class Limit:
-    """One scalar range. kind: position, velocity or control;  index: column of the trajectory's array of that kind."""
+    """One scalar range.
+
+    kind: position, velocity, acceleration, control, control_rate, force or joint_force
+    index: place in qpos, qvel, qacc, ctrl, ctrl, actuator_force and qfrc_actuator, in this order
+    """
 
     kind: str
     name: str
@@ -34,37 +39,77 @@ class Limit:
                 f"limits.{self.kind}.{self.name}: [{self.lower:g}, {self.upper:g}] is inverted; needs lower < upper"
             )
 
+    @property
+    def scale(self) -> float:
+        """Half of the range, what margins are compared with."""
+        finite = [abs(b) for b in (self.lower, self.upper) if np.isfinite(b)]
+        return 0.5 * (self.upper - self.lower) if len(finite) == 2 else max(*finite, 1.0)
+
 
 def limits_of(
     model: Any, coordinates: tuple[Coordinate, ...], controls: tuple[str, ...], stated: Limits
 ) -> tuple[Limit, ...]:
-    """All limits. Raises ExperimentError for unknown names and inverted ranges."""
+    """All limits. Raises ExperimentError for unknown names, inverted ranges and ranges that exclude the MJCF's."""
     joints = {c.name: c for c in coordinates}
-    for kind, table, valid in (
-        ("position", stated.position, list(joints)),
-        ("velocity", stated.velocity, list(joints)),
-        ("control", stated.control, list(controls)),
-    ):
-        for name in table:
-            if name not in valid:
-                what = "actuator" if kind == "control" else "joint"
-                raise ExperimentError(f"limits.{kind}: {unknown(what, name, valid)}")
-    position: dict[str, Range] = {
-        c.name: tuple(model.jnt_range[c.joint]) for c in coordinates if model.jnt_limited[c.joint]
+    scalar = {name: i for i, name in enumerate(actuator_names(model)) if int(model.actuator_outnum[i]) == 1}
+    tables = {
+        "position": (stated.position, {c.name: c.q for c in coordinates}, _position(model, coordinates)),
+        "velocity": (stated.velocity, {c.name: c.v for c in coordinates}, {}),
+        "acceleration": (stated.acceleration, {c.name: c.v for c in coordinates}, {}),
+        "control": (stated.control, {name: i for i, name in enumerate(controls)}, _control(model, controls)),
+        "control_rate": (stated.control_rate, {name: i for i, name in enumerate(controls)}, {}),
+        "force": (stated.force, {n: int(model.actuator_outadr[i]) for n, i in scalar.items()}, _force(model, scalar)),
+        "joint_force": ({}, {c.name: c.v for c in coordinates}, _joint_force(model, joints)),
     }
-    control: dict[str, Range] = {
+    found: list[Limit] = []
+    for kind, (wanted, index, given) in tables.items():
+        found += _rows(kind, _ranges(kind, wanted, list(index)), index, given)
+    return tuple(found)
+
+
+def _ranges(kind: str, stated: float | Mapping[str, float | Range], names: list[str]) -> dict[str, Range]:
+    """Ranges by name from one number, or from a table of numbers and ranges."""
+    table = stated if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
+    for name in table:
+        if name not in names:
+            raise ExperimentError(f"limits.{kind}: {unknown('joint' if kind in JOINTS else 'actuator', name, names)}")
+    return {name: v if isinstance(v, tuple) else (-v, v) for name, v in table.items()}
+
+
+def _rows(kind: str, stated: Mapping[str, Range], index: Mapping[str, int], given: Mapping[str, Range]) -> list[Limit]:
+    rows = []
+    for name, place in index.items():
+        if name in stated:
+            Limit(kind, name, place, *(float(b) for b in stated[name]))
+        both = [table[name] for table in (stated, given) if name in table]
+        if not both:
+            continue
+        lower, upper = float(max(low for low, _ in both)), float(min(high for _, high in both))
+        if len(both) == 2 and not lower < upper:
+            own, models = (f"[{low:g}, {high:g}]" for low, high in both)
+            raise ExperimentError(f"limits.{kind}.{name}: {own} and the MJCF's range {models} exclude each other")
+        if np.isfinite(lower) or np.isfinite(upper):
+            rows.append(Limit(kind, name, place, lower, upper))
+    return rows
+
+
+def _position(model: Any, coordinates: tuple[Coordinate, ...]) -> dict[str, Range]:
+    return {c.name: tuple(model.jnt_range[c.joint]) for c in coordinates if model.jnt_limited[c.joint]}
+
+
+def _control(model: Any, controls: tuple[str, ...]) -> dict[str, Range]:
+    return {
         name: tuple(model.actuator_ctrlrange[i]) for i, name in enumerate(controls) if model.actuator_ctrllimited[i]
     }
-    velocity = {name: v if isinstance(v, tuple) else (-v, v) for name, v in stated.velocity.items()}
-    return (
-        *_rows("position", {**position, **stated.position}, {c.name: c.q for c in coordinates}),
-        *_rows("velocity", velocity, {c.name: c.v for c in coordinates}),
-        *_rows("control", {**control, **stated.control}, {name: i for i, name in enumerate(controls)}),
-    )
 
 
-def _rows(kind: str, table: Mapping[str, Range], index: Mapping[str, int]) -> list[Limit]:
-    return [Limit(kind, name, index[name], float(low), float(high)) for name, (low, high) in table.items()]
+def _force(model: Any, scalar: Mapping[str, int]) -> dict[str, Range]:
+    return {name: tuple(model.actuator_forcerange[i]) for name, i in scalar.items() if model.actuator_forcelimited[i]}
+
+
+def _joint_force(model: Any, joints: Mapping[str, Coordinate]) -> dict[str, Range]:
+    limited = {name: c.joint for name, c in joints.items() if model.jnt_actfrclimited[c.joint]}
+    return {name: tuple(model.jnt_actfrcrange[j]) for name, j in limited.items()}
 
 
 def forwarded(model: Any, trajectory: Trajectory, samples: Iterable[int]) -> Iterator[tuple[int, Any]]:
@@ -98,14 +143,3 @@ def _clamped(model: Any, data: Any, actuator: int) -> bool:
     if count == 1:
         return bool(force[0] <= low or force[0] >= high)
     return bool(np.linalg.norm(force) >= high * (1.0 - CLAMPED))
-
-
-def margins(limits: tuple[Limit, ...], trajectory: Trajectory) -> dict[str, float]:
-    """Worst distance to each kind of limit over the samples, negative outside."""
-    series = {"position": trajectory.qpos, "velocity": trajectory.qvel, "control": trajectory.ctrl}
-    worst: dict[str, float] = {}
-    for limit in limits:
-        data = series[limit.kind][:, limit.index]
-        margin = float(min((data - limit.lower).min(), (limit.upper - data).min()))
-        worst[limit.kind] = min(margin, worst.get(limit.kind, margin))
-    return worst

@@ -157,12 +157,38 @@ class Mocap:
         model.body_pos[self.bodies], model.body_quat[self.bodies] = places[:, :3], places[:, 3:]
 
 
+@dataclass(frozen=True)
+class Lifted:
+    """Clamps and stops that are taken out of a private copy, because a design keeps away from them: they hide derivatives.
+
+    joints: whose ranges;  forces: joints whose actuator force;  actuators: whose force;  controls: whether all control ranges
+    contacts: whether all contacts
+    """
+
+    joints: tuple[int, ...]
+    forces: tuple[int, ...]
+    actuators: tuple[int, ...]
+    controls: bool
+    contacts: bool
+
+    def out_of(self, model: Any) -> None:
+        """Change a model that the caller owns, in place."""
+        model.jnt_limited[list(self.joints)] = 0
+        model.jnt_actfrclimited[list(self.forces)] = 0
+        model.actuator_forcelimited[list(self.actuators)] = 0
+        if self.controls:
+            model.actuator_ctrllimited[:] = 0
+        if self.contacts:
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+
+
 class Source:
     """Where the private copies of a model come from: work that cannot matter is off, bodies that move inside are not 'simple'.
 
     moved: bodies whose inertial frame parameters change, None: any of them may;  sensors: whether sensor data is wanted
     friction: whether a parameter is a frictionloss (the constraint solver must then stay on)
     coarsen: how many times longer than stated the timestep is;  mocap: where mocap bodies start, None: as compiled
+    lifted: without the clamps and stops of limits that a design holds anyway
     """
 
     def __init__(
@@ -174,8 +200,9 @@ class Source:
         friction: bool,
         coarsen: int = 1,
         mocap: Mocap | None = None,
+        lifted: Lifted | None = None,
     ) -> None:
-        self._spec, self._path = spec.copy(), path
+        self._spec, self._path, self._lifted = spec.copy(), path, lifted
         for body in self._spec.bodies[1:]:
             if moved is None or body.name in moved:
                 body.simple = 0
@@ -212,6 +239,8 @@ class Source:
 
     def _compile(self, spec: Any) -> Any:
         model = compile_spec(spec, self._path)
+        if self._lifted is not None:
+            self._lifted.out_of(model)
         if not self._sensors:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         if not self._friction and unconstrained(model):

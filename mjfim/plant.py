@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.engine import Engine
+from mjfim.engine import Engine, Taps
 from mjfim.errors import ModelError, SimulationDiverged
 from mjfim.lag import Lag
 from mjfim.lq import TangentCurve
@@ -27,15 +27,18 @@ class Accuracy:
     """Steps of the differences, relative to the size of what is perturbed.
 
     central: two-sided in state and control, else one-sided
+    shared: one-sided also along (psi w, w) and in the parameters, so that all directions share their origin
     delta: state and control step of mixed differences;  epsilon: step along (psi w, w)
     """
 
     central: bool
     delta: float
     epsilon: float
+    shared: bool = False
 
 
 FAST = Accuracy(central=False, delta=1e-6, epsilon=3e-3)
+DRAFT = Accuracy(central=False, delta=1e-6, epsilon=1e-3, shared=True)
 CENTRAL = Accuracy(central=True, delta=1e-4, epsilon=1e-3)
 FIRST_DERIVATIVE_STEP = 1e-6
 SENSITIVITY_STEP = 1e-5
@@ -51,6 +54,7 @@ class Bilinear:
     F_mixed: (r, N, nx+nu, nx) d/dz_i of `DF[psi w, w]`;  h_mixed: (r, N+1, nx+nu, ny) likewise for h, or None where zero
     C: (N+1, ny, nx);  D: (N+1, ny, nu)
     lag: of the outputs, or None;  delay: (p,) its derivative by theta
+    taps: (N, looked-at substeps, w, nx+nu) derivative of what the taps show, or None
     """
 
     A: Array
@@ -61,6 +65,7 @@ class Bilinear:
     h_mixed: Array | None
     lag: Lag | None = None
     delay: Array | None = None
+    taps: Array | None = None
 
 
 class Plant:
@@ -196,6 +201,16 @@ class Plant:
         states, ctrl, finite = self.engine.closed_loop(model, alpha, mu, K)
         return self.trajectory(states, ctrl) if finite else None
 
+    def watch(self, theta: Array, ctrl: Array, taps: Taps) -> tuple[Trajectory, Array] | None:
+        """The open-loop trajectory under ctrl: (N, nu) and what the taps show at every engine step, (N, substeps, w).
+
+        None if it diverged.
+        """
+        out = self.engine.rollout([self.model(theta)], self.start(theta)[None], np.asarray(ctrl)[None], taps)
+        if not out.finite[0] or out.tapped is None:
+            return None
+        return self.trajectory(out.states[0], ctrl), out.tapped[0]
+
     def difference(self, new: Trajectory, old: Trajectory) -> TangentCurve:
         """(x_new - x_old, u_new - u_old) in the tangent space."""
         return TangentCurve(self.space.minus(new.state, old.state), new.ctrl - old.ctrl)
@@ -210,17 +225,24 @@ class Plant:
         return np.concatenate([dq, speed, act, np.where(ctrl > 1e-3, ctrl, 1.0)])
 
     def sensitivity(
-        self, theta: Array, trajectory: Trajectory, step: float | Array = SENSITIVITY_STEP
+        self, theta: Array, trajectory: Trajectory, step: float | Array = SENSITIVITY_STEP, central: bool = True
     ) -> Sensitivity | None:
-        """psi and G by central differences of whole rollouts under the same control; None if one diverged.
+        """psi and G by differences of whole rollouts under the same control; None if one diverged.
 
-        step: relative to `span`, one number or (p,)
+        step: relative to `span`, one number or (p,);  central: else one-sided where no sensor is an output
         """
-        found = self._differences(theta, trajectory.state[0], trajectory.ctrl, step, trajectory.state)
+        central = central or self.outputs.needs_sensors
+        found = self._differences(theta, trajectory.state[0], trajectory.ctrl, step, trajectory.state, central)
         return None if found is None else found[1]
 
     def _differences(
-        self, theta: Array, start: Array, ctrl: Array, step: float | Array, states: Array | None
+        self,
+        theta: Array,
+        start: Array,
+        ctrl: Array,
+        step: float | Array,
+        states: Array | None,
+        central: bool = True,
     ) -> tuple[Array, Sensitivity] | None:
         """Outputs (N+1, ny) and sensitivity from rollouts at theta +- h, one pair per parameter that moves anything.
 
@@ -233,7 +255,7 @@ class Plant:
         h = (step * self.span)[moving]
         moves = np.zeros((m, p))
         moves[np.arange(m), moving] = h
-        moves = np.concatenate([moves, -moves, np.zeros((int(own), p))])
+        moves = np.concatenate([moves, -moves if central else moves[:0], np.zeros((int(own), p))])
         psi, G = np.zeros((N + 1, self.space.nx, p)), np.zeros((N + 1, len(self.outputs), p))
         sensors, here = None, np.zeros((N + 1, 0)) if states is None else states
         if len(moves):
@@ -245,8 +267,8 @@ class Plant:
                 return None
             if own:
                 here, sensors = out.states[-1], None if out.sensors is None else out.sensors[-1]
-            width = 2.0 * h[:, None, None]
-            dx = self.space.minus(out.states[:m], out.states[m : 2 * m]) / width
+            width = (2.0 if central else 1.0) * h[:, None, None]
+            dx = self.space.minus(out.states[:m], out.states[m : 2 * m] if central else here) / width
             ds = None if out.sensors is None else (out.sensors[:m] - out.sensors[m : 2 * m]) / width
             psi[..., moving] = np.moveaxis(dx, 0, 2)
             G[..., moving] = np.moveaxis(self.outputs.tangent(here, dx, ds), 0, 2)
@@ -303,6 +325,23 @@ class Plant:
         dy = np.moveaxis(self.outputs.tangent(trajectory.state, self._identity(dz.shape[1]), hz), 0, 2)
         return dx[..., :nx], dx[..., nx:], dy[..., :nx], dy[..., nx:]
 
+    def tapped(
+        self, theta: Array, trajectory: Trajectory, taps: Taps, step: float = FIRST_DERIVATIVE_STEP
+    ) -> tuple[Array, Array, Array]:
+        """A, B and the derivatives (N, looked-at substeps, w, nx+nu) of what the taps show, by one-sided differences."""
+        nx, states, ctrl = self.space.nx, trajectory.state[:-1], trajectory.ctrl
+        delta = step * self.steps_of(trajectory)
+        moves = np.concatenate([np.diag(delta), np.zeros((1, len(delta)))])
+        xs, us = self._perturbed(states, ctrl, moves)
+        stepped = self.engine.step([self.model(theta)], xs, us, taps)
+        if stepped.tapped is None:
+            raise ValueError("nothing was tapped")
+        out = stepped.states.reshape(len(moves), len(states), -1)
+        rise = stepped.tapped.reshape(len(moves), len(states), *stepped.tapped.shape[1:])
+        AB = np.moveaxis(_finite(self.space.minus(out[:-1], out[-1:]) / delta[:, None, None]), 0, 2)
+        slopes = np.moveaxis((rise[:-1] - rise[-1:]) / delta[:, None, None, None], 0, 3)
+        return AB[..., :nx], AB[..., nx:], slopes
+
     def _identity(self, samples: int) -> Array:
         """(nx+nu, samples, nx) tangent step of the state per unit of (x, u)."""
         nx = self.space.nx
@@ -323,7 +362,8 @@ class Plant:
 
     def _halves(self, models: list[Any], xs: Array, us: Array, count: int, step: Array) -> tuple[Array, Array | None]:
         """Central quotients of a batch whose first half is the plus side: (count, n, nx) and sensors (count, n, ns)."""
-        out, sensed = self.engine.step(models, xs, us)
+        stepped = self.engine.step(models, xs, us)
+        out, sensed = stepped.states, stepped.sensors
         width = 2.0 * step[:, None, None]
         pair = out.reshape(2, count, -1, out.shape[1])
         dx = self.space.minus(pair[0], pair[1]) / width
@@ -333,7 +373,13 @@ class Plant:
         return dx, (s[0] - s[1]) / width
 
     def bilinear(
-        self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array, accuracy: Accuracy
+        self,
+        theta: Array,
+        trajectory: Trajectory,
+        psi: Array,
+        directions: Array,
+        accuracy: Accuracy,
+        taps: Taps | None = None,
     ) -> Bilinear:
         """Derivatives of `DF[psi w, w]` by (x, u) for each direction w, and A, B from the same steps.
 
@@ -346,16 +392,23 @@ class Plant:
         moves = np.concatenate([np.diag(delta), -np.diag(delta) if accuracy.central else np.zeros((1, count))])
         xs, us = self._perturbed(states, ctrl, moves)
         shape = (len(moves), len(states), -1)
+        if accuracy.shared and not self.engine.sensors:
+            return self._drafted(theta, trajectory, psi, directions, accuracy, taps)
         firsts, mixed, h_firsts, h_mixed = [], [], [], []
-        for w in directions:
+        tapped = None
+        for r, w in enumerate(directions):
             push = psi @ w
             epsilon = self._epsilon(accuracy, push, w)
             shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
             both = np.concatenate([self.space.plus(xs, shift), self.space.plus(xs, -shift)])
             models = self._all(np.stack([theta + epsilon * w, theta - epsilon * w]))
-            out, sensed = self.engine.step(models, both, np.concatenate([us, us]))
-            pair = out.reshape(2, *shape)
+            stepped = self.engine.step(models, both, np.concatenate([us, us]), taps if r == 0 else None)
+            sensed, pair = stepped.sensors, stepped.states.reshape(2, *shape)
             widths = (2.0 if accuracy.central else 1.0) * delta[:, None, None]
+            if stepped.tapped is not None:
+                t = stepped.tapped.reshape(2, len(moves), len(states), *stepped.tapped.shape[1:])
+                rise = np.mean(t[:, :count] - t[:, count:], axis=0) / widths[..., None]
+                tapped = np.moveaxis(rise[:, :-1], 0, 3)
             slope = self.space.minus(pair[0], pair[1]) / (2.0 * epsilon)
             mixed.append((slope[:count] - slope[count:]) / widths)
             firsts.append(np.mean(self.space.minus(pair[:, :count], pair[:, count:]), axis=0) / widths)
@@ -385,7 +438,43 @@ class Plant:
             second,
             self.lag(theta, len(states)),
             self.parameters.delay,
+            tapped,
         )
+
+    def _drafted(
+        self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array, accuracy: Accuracy, taps: Taps | None
+    ) -> Bilinear:
+        """`bilinear` by one-sided differences, for outputs that are no sensors: one batch at the origin serves all directions."""
+        states, ctrl = self._ends(trajectory)
+        delta = accuracy.delta * self.steps_of(trajectory)
+        count, nx = len(delta), self.space.nx
+        moves = np.concatenate([np.diag(delta), np.zeros((1, count))])
+        xs, us = self._perturbed(states, ctrl, moves)
+        shape, widths = (len(moves), len(states), -1), delta[:, None, None]
+        stepped = self.engine.step([self.model(theta)], xs, us, taps)
+        origin = stepped.states.reshape(shape)
+        first = self.space.minus(origin[:count], origin[count:]) / widths
+        tapped, mixed = None, []
+        if stepped.tapped is not None:
+            t = stepped.tapped.reshape(len(moves), len(states), *stepped.tapped.shape[1:])
+            tapped = np.moveaxis((t[:count, :-1] - t[count:, :-1]) / widths[..., None], 0, 3)
+        for w in directions:
+            push = psi @ w
+            epsilon = self._epsilon(accuracy, push, w)
+            shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
+            out = self.engine.step(self._all((theta + epsilon * w)[None]), self.space.plus(xs, shift), us).states
+            slope = self.space.minus(out.reshape(shape), origin) / epsilon
+            mixed.append((slope[:count] - slope[count:]) / widths)
+        unit = self._identity(len(states))
+        second = None
+        if self.outputs.curved:
+            second = np.moveaxis(np.array([self.outputs.bend(states, unit, psi @ w, None) for w in directions]), 1, 2)
+        AB = np.moveaxis(first[:, :-1], 0, 2)
+        CD = np.moveaxis(self.outputs.tangent(states, unit, None), 0, 2)
+        F_mixed = np.moveaxis(np.array(mixed)[:, :, :-1], 1, 2)
+        lag = self.lag(theta, len(states))
+        parts = (AB[..., :nx], AB[..., nx:], CD[..., :nx], CD[..., nx:], F_mixed, second)
+        return Bilinear(*parts, lag, self.parameters.delay, tapped)
 
     def _epsilon(self, accuracy: Accuracy, push: Array, w: Array) -> float:
         """Step along (psi w, w): relative to the larger of its two parts."""

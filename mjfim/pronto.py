@@ -12,6 +12,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from mjfim.barrier import Hedge
 from mjfim.lq import Recursion, TangentCurve, growth, regulator
 from mjfim.trajectory import Array, Status
 
@@ -20,11 +21,21 @@ ROUND_OFF = 1e-12  # relative; a promised decrease below it says nothing
 
 
 @dataclass(frozen=True, eq=False)
+class Slope:
+    """A linear form on the tangent space, `sum a'z + b'v`. a: (N+1, nx);  b: (N, nu)"""
+
+    a: Array
+    b: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Expansion:
     """First-order model of the cost on the tangent space, `DJ.zeta = sum a'z + b'v` with `z_{k+1} = A z_k + B v_k`.
 
     A: (N, nx, nx);  B: (N, nx, nu);  a: (N+1, nx) [1 / x-unit];  b: (N, nu) [1 / u-unit]
     extended: the same with psi among the states (nx (1+p) of them), where a metric with weight on psi wants it
+    hedge: the share of hard limits in a and b, with its Gauss-Newton Hessian
+    bends: known parts of the cost's Hessian, the sum of the squares of these slopes
     """
 
     A: Array
@@ -32,6 +43,8 @@ class Expansion:
     a: Array
     b: Array
     extended: Expansion | None = None
+    hedge: Hedge | None = None
+    bends: tuple[Slope, ...] = ()
 
     def slope(self, zeta: TangentCurve) -> float:
         """DJ.zeta."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.designer import regulator_for
+from mjfim.descent import regulator_for
 from mjfim.directions import LBFGS
 from mjfim.errors import SimulationDiverged
 from mjfim.lq import Recursion, TangentCurve

@@ -15,7 +15,7 @@ from mjfim.errors import ExperimentError, ModelError, SimulationDiverged, unknow
 from mjfim.experiment import Experiment, Signal, by_name
 from mjfim.fisher import Information
 from mjfim.limits import limits_of
-from mjfim.models import Mocap, Source, compile_spec, control_names, coordinates, decoration, load_spec
+from mjfim.models import Lifted, Mocap, Source, compile_spec, control_names, coordinates, decoration, load_spec
 from mjfim.objective import DesignProblem, RunningCost
 from mjfim.parameters import ParameterSet, moved_bodies
 from mjfim.paths import joint_width
@@ -28,6 +28,7 @@ from mjfim.trajectory import Array, Trajectory
 from mjfim.unknowns import parameters_of
 
 MAX_SAMPLES = 10_000_000
+HOLDS = 4  # Gauss-Newton steps towards a control that holds a state; one does where forces are linear in it
 NO_ROTATION = 1e-6  # norm of a quaternion that says nothing
 
 
@@ -37,15 +38,25 @@ class Setup:
     spec, model: the user's model, untouched by parameters;  plant: at any theta;  t: (N,) sample times [s]
     added: (p, p) information of other experiments, or None;  earlier: that and what the experiment's `earlier` files hold
     prior: (p, p) earlier information and that of the parameters' priors
+    stretch: 1, or how many times longer the timestep is than stated, and the engine steps of a sample fewer
+    lifted: the plant has no clamps and stops where a design keeps the limits anyway
     coarsen: 1, or how many times longer timestep and sample period are than stated (coarse-to-fine descent)
     """
 
     def __init__(
-        self, experiment: Experiment, threads: int | None = None, coarsen: int = 1, added: Array | None = None
+        self,
+        experiment: Experiment,
+        threads: int | None = None,
+        coarsen: int = 1,
+        added: Array | None = None,
+        lifted: bool = False,
+        stretch: int = 1,
     ) -> None:
         self.experiment = experiment
         self.coarsen = coarsen
         self.added = added
+        self.lifted = lifted
+        self.stretch = stretch
         try:
             self._build(threads, added)
         except ExperimentError as error:
@@ -71,10 +82,14 @@ class Setup:
         if self.stride > self.samples:
             raise ExperimentError(f"measure_rate: {e.measure_rate:g} Hz measures nothing within {e.horizon:g} s")
         self.dt = self.substeps * float(self.model.opt.timestep) * self.coarsen
+        if self.substeps % self.stretch:
+            raise ValueError(f"{self.substeps} engine steps of a sample do not divide by {self.stretch}")
+        self.substeps //= self.stretch
         self.t = np.arange(self.samples, dtype=np.float64) * self.dt
         self.outputs, noise = outputs_of(e, self.model, state_space(self.model), measured_every)
         self.noise = noise if self.coarsen == 1 else noise.every_sample(measured_every)
         self._mocap = Mocap.of(self.model, self._keyframe())
+        self.limits = limits_of(self.model, self.coordinates, self.controls, e.limits)
         self.parameters = ParameterSet.build(
             parameters_of(e, self.model, self.outputs.names),
             self.model,
@@ -87,14 +102,17 @@ class Setup:
         self.plant = Plant(private, self.parameters, self.outputs, self._start(), self.substeps, threads)
         self.tracking = self._weights()
         self.control_weight = by_name("cost.control", e.cost.control, self.controls, "actuator")
-        if np.any(self.control_weight <= 0):
-            missing = self.controls[int(np.argmin(self.control_weight))]
-            raise ExperimentError(f"cost.control: actuator {missing!r} has no weight; every actuator needs one > 0")
+        bounded = {limit.name for limit in self.limits if limit.kind == "control"} if e.limits.enforce else set()
+        for name, weight in zip(self.controls, self.control_weight.tolist(), strict=True):
+            if weight <= 0.0 and name not in bounded:
+                raise ExperimentError(
+                    f"cost.control: actuator {name!r} has neither a weight nor a range; it needs a weight > 0, "
+                    f"or a hard limit: limits.control.{name} = [lower, upper]"
+                )
         self.control_about = self.rest
         if e.cost.control_about is not None:
             self.control_about = by_name("cost.control_about", e.cost.control_about, self.controls, "actuator")
         self.control = self._control()
-        self.limits = limits_of(self.model, self.coordinates, self.controls, e.limits)
         self.contrast = self._contrast()
         files = [e.directory / path for path in e.earlier]
         self.earlier = information_of(files, self.parameters.names)
@@ -166,10 +184,75 @@ class Setup:
         )
 
     @property
+    def stated_times(self) -> Array:
+        """(N * coarsen,) sample times of the experiment as stated [s]."""
+        return np.arange(self.samples * self.coarsen, dtype=np.float64) * (self.dt / self.coarsen)
+
+    @property
+    def centre(self) -> Array:
+        """(nu,) control about which controls swing: what holds the start where it is at rest, else the initial one's mean."""
+        return self.hold if self.experiment.boundary.start == "rest" else np.asarray(self.control.mean(axis=0))
+
+    @property
+    def enforced(self) -> bool:
+        """True where hard limits hold, or the design has to begin, end or move in a certain way."""
+        e = self.experiment
+        shaped = e.boundary.start != "given" or e.boundary.end != "free" or e.limits.bandwidth is not None
+        return shaped or (e.limits.enforce and (bool(self.limits) or e.limits.clearance is not None))
+
+    @property
     def rest(self) -> Array:
         """(nu,) control of the initial keyframe, zero without one."""
         key = self._keyframe()
         return np.zeros(len(self.controls)) if key is None else np.array(key.ctrl)
+
+    @cached_property
+    def hold(self) -> Array:
+        """(nu,) control that holds the start. Raises ExperimentError where none does."""
+        return self._holding(self.plant.start(self.theta), self.rest, "boundary.start", "the start")
+
+    @cached_property
+    def target(self) -> Array:
+        """(ns,) state at which the design ends, where it has to end somewhere."""
+        key = self._key("boundary.keyframe", self.experiment.boundary.keyframe)
+        start = self.plant.start(self.theta)
+        if self.experiment.boundary.end != "rest":
+            return start
+        qpos, _, act = self.space.split(start if key is None else np.concatenate([key.qpos, key.qvel, key.act]))
+        return np.concatenate([qpos, np.zeros(self.space.nv), act])
+
+    @cached_property
+    def final_hold(self) -> Array:
+        """(nu,) control that holds the state at which the design comes to rest. Raises ExperimentError where none does."""
+        key = self._key("boundary.keyframe", self.experiment.boundary.keyframe)
+        rest = self.rest if key is None else np.array(key.ctrl)
+        return self._holding(self.target, rest, "boundary.end", "the end")
+
+    def _holding(self, state: Array, guess: Array, key: str, where: str) -> Array:
+        """Control under which a sample leaves a state as it is, to the experiment's tolerance; Gauss-Newton from a guess."""
+        plant, control = self.plant, np.array(guess)
+        size = np.maximum(np.abs(control), 1.0)
+
+        def drift(controls: Array) -> Array:
+            held = np.broadcast_to(state, (len(controls), len(state)))
+            return self.space.minus(plant.engine.step([plant.model(self.theta)], held, controls).states, state)
+
+        for _ in range(HOLDS):
+            moves = np.concatenate([np.zeros((1, len(control))), 1e-4 * np.diag(size)])
+            rows = drift(control + moves)
+            B = (rows[1:] - rows[0]).T / (1e-4 * size)
+            control = control - np.linalg.lstsq(B, rows[0])[0]
+        left = drift(control[None])[0]
+        nv = self.space.nv
+        pushed = np.abs(left[nv : 2 * nv]) / self.dt
+        worst = int(np.argmax(pushed))
+        if not pushed[worst] <= self.experiment.boundary.velocity / self.dt or np.abs(self.space.split(state)[1]).any():
+            name = joint_names(self.model)[int(self.model.dof_jntid[worst])]
+            raise ExperimentError(
+                f"{key}: no control holds {where}: joint {name!r} still accelerates by {pushed[worst]:.3g} per s²; begin and end "
+                'where the model can stand still (qvel = 0, an equilibrium), or state start = "given", end = "free"'
+            )
+        return control
 
     @cached_property
     def initial(self) -> Trajectory:
@@ -210,14 +293,30 @@ class Setup:
             raise ExperimentError(f"horizon: {N:g} samples are too many; at most {MAX_SAMPLES:g}")
         return N
 
-    def _source(self, sensors: bool, friction: bool, coarsen: int) -> Source:
+    def _source(self, sensors: bool, friction: bool, coarsen: int, lifted: Lifted | None = None) -> Source:
         moved = None if self.parameters.compiled.any() else moved_bodies(self.parameters.parameters)
-        return Source(self.spec, self.model_path, moved, sensors, friction, coarsen, self._mocap)
+        return Source(self.spec, self.model_path, moved, sensors, friction, coarsen, self._mocap, lifted)
 
     def _private(self) -> Source:
         friction = any("frictionloss" in t.path for p in self.parameters.parameters for t in p.targets)
         anything = friction or any(p.function is not None for p in self.parameters.parameters)
-        return self._source(self.outputs.needs_sensors, anything, self.coarsen)
+        longer = self.coarsen * self.stretch
+        return self._source(self.outputs.needs_sensors, anything, longer, self._lift() if self.lifted else None)
+
+    def _lift(self) -> Lifted:
+        """Whatever the limits of the experiment keep a design away from."""
+        named = {
+            kind: {limit.name for limit in self.limits if limit.kind == kind} for kind in ("position", "joint_force")
+        }
+        forced = {limit.index for limit in self.limits if limit.kind == "force"}
+        stated = self.experiment.limits
+        return Lifted(
+            tuple(c.joint for c in self.coordinates if c.name in named["position"]),
+            tuple(c.joint for c in self.coordinates if c.name in named["joint_force"]),
+            tuple(i for i in range(self.model.nactuator) if int(self.model.actuator_outadr[i]) in forced),
+            True,
+            stated.clearance is not None and not stated.ignored,
+        )
 
     def _require_bodies(self, source: Source) -> None:
         """Raise where the guess or the true values make a body that cannot exist."""
@@ -235,13 +334,17 @@ class Setup:
             return np.flatnonzero(self.parameters.compiled).tolist()
 
     def _keyframe(self) -> Any:
-        """The initial keyframe, or None. Raises ExperimentError where there is none of that name."""
-        name, model = self.experiment.initial.keyframe, self.model
+        """The initial keyframe, or None."""
+        return self._key("initial.keyframe", self.experiment.initial.keyframe)
+
+    def _key(self, where: str, name: str | None) -> Any:
+        """A keyframe, or None without a name. Raises ExperimentError where there is none of that name."""
+        model = self.model
         if name is None:
             return None
         names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or "" for i in range(model.nkey)]
         if name not in names:
-            raise ExperimentError(f"initial.keyframe: {unknown('keyframe', name, [n for n in names if n])}")
+            raise ExperimentError(f"{where}: {unknown('keyframe', name, [n for n in names if n])}")
         return model.key(name)
 
     def _start(self) -> Array:
@@ -309,8 +412,7 @@ class Setup:
 
     def _control(self) -> Array:
         source = self.experiment.initial.control
-        dt = self.dt / self.coarsen
-        t = np.arange(self.samples * self.coarsen, dtype=np.float64) * dt
+        t, dt = self.stated_times, self.dt / self.coarsen
         if isinstance(source, Signal):
             return self.averaged(generate(source, t, self.controls, self.rest))
         return self.averaged(read_control(self.experiment.directory / source, t, dt, self.controls))
@@ -321,4 +423,12 @@ class Setup:
 
     def coarser(self, factor: int) -> Setup:
         """The same experiment at a timestep and sample period that are `factor` times longer."""
-        return Setup(self.experiment, self.plant.engine.threads, factor, self.added)
+        return Setup(self.experiment, self.plant.engine.threads, factor, self.added, self.lifted)
+
+    def free(self) -> Setup:
+        """The same experiment on a plant without the clamps and stops that hard limits keep a design away from."""
+        return Setup(self.experiment, self.plant.engine.threads, self.coarsen, self.added, lifted=True)
+
+    def stretched(self, factor: int) -> Setup:
+        """The same experiment at a timestep that is `factor` times longer, its samples as they are."""
+        return Setup(self.experiment, self.plant.engine.threads, self.coarsen, self.added, self.lifted, factor)

@@ -71,8 +71,11 @@ def read_table(path: Path) -> dict[str, Array]:
     return columns
 
 
-def read_control(path: Path, t: Array, dt: float, names: tuple[str, ...]) -> Array:
-    """(N, nu) control at times t: (N,), held between rows. Columns: t and each actuator's name (`ctrl:` optional)."""
+def read_control(path: Path, t: Array, dt: float, names: tuple[str, ...], repeat: bool = False) -> Array:
+    """(N, nu) control at times t: (N,), held between rows. Columns: t and each actuator's name (`ctrl:` optional).
+
+    repeat: where the table ends early, it begins again
+    """
     columns = read_table(path)
     if "t" not in columns:
         raise RecordingError(f"{path}: column 't' is missing; found: {', '.join(columns)}")
@@ -98,7 +101,9 @@ def read_control(path: Path, t: Array, dt: float, names: tuple[str, ...]) -> Arr
     if len(stamps) < 2 or np.any(np.diff(stamps) <= 0):
         raise RecordingError(f"{path}: column 't' must increase from row to row and have at least two rows")
     period = float(np.median(np.diff(stamps)))
-    if stamps[0] > t[0] + 1e-9 or stamps[-1] + period < t[-1] + dt - 1e-9:
+    if repeat:
+        t = stamps[0] + np.mod(t - t[0] + 1e-6 * dt, stamps[-1] + period - stamps[0])
+    elif stamps[0] > t[0] + 1e-9 or stamps[-1] + period < t[-1] + dt - 1e-9:
         raise RecordingError(
             f"{path}: too few rows: the table covers t = {stamps[0]:g} ... {stamps[-1] + period:g} s with {len(stamps)} rows, "
             f"the experiment needs 0 ... {t[-1] + dt:g} s ({len(t)} samples)"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from mjfim.fisher import Information
 from mjfim.identifiability import BLIND, COARSER, SURE, Group, Null, grouped, invisible, listed, rows_of
 from mjfim.plant import SENSITIVITY_STEP
 from mjfim.setup import Setup
-from mjfim.signals import multisine
+from mjfim.starts import probes
 from mjfim.trajectory import Array, Combined, Sensitivity, Trajectory
 
 PROBES = 3
@@ -78,11 +78,11 @@ def _survey(setup: Setup, trajectory: Trajectory, J: Array, error: Array, local:
     here = _null(setup, [J], [error], local)
     if not here.count:
         return _words(setup, here, here)
-    probes = list(_probes(setup))
-    always = _local(setup, [trajectory, *probes])
+    tried = list(probes(setup, PROBES))
+    always = _local(setup, [trajectory, *tried])
     stack, errors = [J], [error]
     if always is None or here.count > always.shape[1]:
-        for probe in probes:
+        for probe in tried:
             fine = setup.plant.sensitivity(setup.theta, probe)
             if fine is not None:
                 more, doubt = _pair(setup, probe, fine)
@@ -169,24 +169,6 @@ def _pair(setup: Setup, trajectory: Trajectory, fine: Sensitivity) -> tuple[Arra
     J = rows(setup, fine)
     coarse = setup.plant.sensitivity(setup.theta, trajectory, COARSER * SENSITIVITY_STEP)
     return J, np.zeros_like(J) if coarse is None else rows(setup, coarse) - J
-
-
-def _probes(setup: Setup) -> Iterator[Trajectory]:
-    """Random multisines about the initial control's mean, of its size, inside the actuators' ranges."""
-    rng = np.random.default_rng(setup.experiment.descent.seed)
-    mean = setup.control.mean(axis=0)
-    peak = np.abs(setup.control - mean).max(axis=0)
-    peak = np.where(peak > 0.0, peak, 1.0)
-    for _ in range(PROBES):
-        wave = multisine(setup.t, len(setup.controls), 1.0 / setup.experiment.horizon, 10, rng)
-        control = mean + peak * rng.uniform(1.0, 2.0) * wave
-        for limit in setup.limits:
-            if limit.kind == "control":
-                control[:, limit.index] = np.clip(control[:, limit.index], limit.lower, limit.upper)
-        try:
-            yield setup.plant.simulate(setup.theta, control)
-        except SimulationDiverged:
-            continue
 
 
 def require_designable(setup: Setup, seen: Survey) -> None:

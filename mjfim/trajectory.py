@@ -130,7 +130,9 @@ class Status(Enum):
     SMOOTHED = "converged on a smooth λ_min, used because the smallest eigenvalues meet (a local optimum)"
     ROUGH = "ended where derivatives hardly exist (contact, dry friction or clamps): the numbers are indications, see warnings"
     STALLED = "stalled: no step along the descent lowers the cost any more, at the accuracy of the differences"
-    MAX_ITERATIONS = "stopped at max_iterations before convergence; raise it, or start from the result"
+    MAX_ITERATIONS = "stopped at max_iterations or seconds before convergence; raise them, or start from the result"
+    INFEASIBLE = "found nothing that keeps all limits; the margins say which is missed: widen it, or start more gently"
+    LEFT = "left behind for a start that promised more"
     INTERRUPTED = "interrupted by the user; this is the best trajectory so far"
 
     @property
@@ -144,6 +146,7 @@ class HistoryRow:
     """One iterate of a design: cost J, criterion phi, smallest eigenvalue, slope |DJ.zeta|, step length gamma.
 
     seconds, steps: wall time and MuJoCo steps since the start;  rate: sample rate of this level [Hz] (coarse-to-fine)
+    mu: weight of the barrier of hard limits, 0 without;  margin: the worst one over half of its range, NaN without
     """
 
     iteration: int
@@ -155,6 +158,8 @@ class HistoryRow:
     seconds: float
     steps: int
     rate: float = 0.0
+    mu: float = 0.0
+    margin: float = float("nan")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.designer import Stage
+from mjfim.descent import Stage
 from mjfim.engine import cores
 from mjfim.experiment import Experiment
 from mjfim.plant import FAST

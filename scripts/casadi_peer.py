@@ -112,18 +112,18 @@ def dynamics(x: ca.SX, u: ca.SX, theta: ca.SX) -> ca.SX:
     return ca.vertcat(s_dot, phi_dot, s_ddot, phi_ddot)
 
 
-def rk4(x: ca.SX, u: ca.SX, theta: ca.SX) -> ca.SX:
-    """Return the state 10 ms later under a held control."""
+def rk4(x: ca.SX, u: ca.SX, theta: ca.SX, dt: float = DT) -> ca.SX:
+    """Return the state `dt` [s] later under a held control."""
     k1 = dynamics(x, u, theta)
-    k2 = dynamics(x + DT / 2 * k1, u, theta)
-    k3 = dynamics(x + DT / 2 * k2, u, theta)
-    k4 = dynamics(x + DT * k3, u, theta)
-    return x + DT / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    k2 = dynamics(x + dt / 2 * k1, u, theta)
+    k3 = dynamics(x + dt / 2 * k2, u, theta)
+    k4 = dynamics(x + dt * k3, u, theta)
+    return x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def information_rate(psi: ca.SX) -> ca.SX:
-    """Return what one sample adds to the six entries of I."""
-    gram = DT / SIGMA**2 * psi.T @ psi
+def information_rate(psi: ca.SX, dt: float = DT) -> ca.SX:
+    """Return what one sample of `dt` [s] adds to the six entries of I."""
+    gram = dt / SIGMA**2 * psi.T @ psi
     return ca.vertcat(*(gram[i, j] for i, j in ENTRIES))
 
 
@@ -153,16 +153,16 @@ class Stage:
 
 
 @functools.cache
-def stage() -> Stage:
-    """Build the blocks of one sample."""
+def stage(dt: float = DT) -> Stage:
+    """Build the blocks of one sample of `dt` [s]."""
     z, u, theta = ca.SX.sym("z", NZ), ca.SX.sym("u"), ca.SX.sym("theta", NP)
     x, psi = z[:NX], ca.reshape(z[NX:], NX, NP)
-    after = rk4(x, u, theta)
+    after = rk4(x, u, theta, dt)
     psi_after = ca.jacobian(after, x) @ psi + ca.jacobian(after, theta)
     z_after = ca.vertcat(after, ca.vec(psi_after))
     costate = ca.SX.sym("costate", NZ)
     second = ca.hessian(ca.dot(costate, z_after), ca.vertcat(z, u))[0]
-    rate, weights, info = information_rate(psi), ca.SX.sym("weights", 6), ca.SX.sym("info", 6)
+    rate, weights, info = information_rate(psi, dt), ca.SX.sym("weights", 6), ca.SX.sym("info", 6)
     value = Q_P / smallest_eigenvalue(info)
     value_hessian, value_gradient = ca.hessian(value, info)
     inputs = [z, u, theta]
@@ -199,37 +199,52 @@ def rollout() -> Rollout:
     return Rollout(u, p, z, info, stage().criterion(info)[0] + running)
 
 
-def condensed_hessian(roll: Rollout, parts: Stage) -> ca.MX:
-    """Return the upper triangle of d2J/du2 by one backward sweep.
+@dataclass(frozen=True)
+class Slopes:
+    """First and second derivatives of a Lagrangian L(I, s_1..s_N, u) that is a sum but for its dependence on I."""
+
+    info: ca.MX  # (6,) dL/dI
+    info_bend: ca.MX  # (6, 6) d2L/dI2
+    slide: ca.MX  # (samples,) dL/ds at samples 1..N
+    slide_bend: ca.MX  # d2L/ds2, alike at all samples
+    control_bend: ca.MX  # d2L/du2, alike at all samples
+
+
+def slopes_of(roll: Rollout) -> Slopes:
+    """Return the derivatives of J."""
+    _, slope, bend = stage().criterion(roll.info)
+    r_dt, q_dt = DT * roll.p[NP], DT * roll.p[NP + 1]
+    return Slopes(slope, bend, q_dt * (roll.z[0, :].T - roll.p[NP + 2 :]), q_dt, r_dt)
+
+
+def condensed_hessian(u: ca.MX, theta: ca.MX, z: ca.MX, slopes: Slopes, parts: Stage) -> ca.MX:
+    """Return the upper triangle of d2L/du2 by one backward sweep.
 
     The sweep carries, at each sample, the adjoints of the six information entries and of the slide cost, the
-    curvature P of the cost to come, and the columns W = d2J/(dz du_j) of all later controls.  Since 1/lambda_min
+    curvature P of the cost to come, and the columns W = d2L/(dz du_j) of all later controls.  Since 1/lambda_min
     is no sum over samples, its own curvature enters at the end through dI/du.
     """
-    u, theta = roll.u, roll.p[:NP]
-    r_dt, q_dt = DT * roll.p[NP], DT * roll.p[NP + 1]
-    _, slope, bend = parts.criterion(roll.info)
-    rate_hessian = parts.rate_hessian(slope)
+    samples, rate_hessian = u.shape[0], parts.rate_hessian(slopes.info)
     slide = ca.DM.eye(NZ)[:, 0]
     start = ca.DM([*X0, *([0.0] * (NZ - NX))])
     adjoint, p_slide, curve, columns = ca.MX.zeros(NZ, 6), ca.MX.zeros(NZ), ca.MX(NZ, NZ), ca.MX(NZ, 0)
     rows, info_slopes = [], []
-    before = ca.horzsplit(ca.horzcat(start, roll.z))
-    for k in reversed(range(N)):
+    before = ca.horzsplit(ca.horzcat(start, z))
+    for k in reversed(range(samples)):
         z_after = before[k + 1]
         adjoint += parts.rate_jacobian(z_after).T
-        p_slide += slide * q_dt * (z_after[0] - roll.p[NP + 2 + k])
-        curve += rate_hessian + q_dt * slide @ slide.T
+        p_slide += slide * slopes.slide[k]
+        curve += rate_hessian + slopes.slide_bend * slide @ slide.T
         a, b = parts.linear(before[k], u[k], theta)
-        h_zz, h_zu, h_uu = parts.curvature(before[k], u[k], theta, adjoint @ slope + p_slide)
+        h_zz, h_zu, h_uu = parts.curvature(before[k], u[k], theta, adjoint @ slopes.info + p_slide)
         curve_b = curve @ b
-        rows.append(ca.horzcat(ca.MX(1, k), h_uu + r_dt + b.T @ curve_b, b.T @ columns))
+        rows.append(ca.horzcat(ca.MX(1, k), h_uu + slopes.control_bend + b.T @ curve_b, b.T @ columns))
         info_slopes.append(b.T @ adjoint)
         columns = ca.horzcat(h_zu + a.T @ curve_b, a.T @ columns)
         curve = h_zz + a.T @ curve @ a
         adjoint, p_slide = a.T @ adjoint, a.T @ p_slide
     info_by_u = ca.vertcat(*reversed(info_slopes))
-    return ca.triu(ca.vertcat(*reversed(rows)) + info_by_u @ bend @ info_by_u.T)
+    return ca.triu(ca.vertcat(*reversed(rows)) + info_by_u @ slopes.info_bend @ info_by_u.T)
 
 
 @dataclass(frozen=True)
@@ -275,7 +290,7 @@ def problem(use_c: bool = True) -> Problem:
         except (OSError, subprocess.CalledProcessError) as error:
             print(f"casadi_peer: no C compiler ({error}); using CasADi's virtual machine", file=sys.stderr)
     factor, no_constraints = ca.MX.sym("factor"), ca.MX.sym("lam_g", 0)
-    triangle = factor * condensed_hessian(roll, parts)
+    triangle = factor * condensed_hessian(roll.u, roll.p[:NP], roll.z, slopes_of(roll), parts)
     hessian = ca.Function("hessian", [*variables, factor, no_constraints], [triangle])
     return Problem(value, gradient, hessian, compiled, time.perf_counter() - begin)
 
@@ -318,10 +333,12 @@ class Recorder:
 class IterateWatch(ca.Callback):
     """IPOPT's iteration callback: notes J of every accepted iterate."""
 
-    def __init__(self) -> None:
-        """Register with CasADi."""
+    def __init__(self, unknowns: int = N, constraints: int = 0, parameters: int = NP + 2 + N) -> None:
+        """Register with CasADi for a problem of this size."""
         super().__init__()
         self.recorder = Recorder()
+        self.rows = {"f": 1, "x": unknowns, "lam_x": unknowns, "lam_p": parameters}
+        self.rows |= {"g": constraints, "lam_g": constraints}
         self.construct("iterate_watch", {})
 
     def get_n_in(self) -> int:
@@ -337,9 +354,8 @@ class IterateWatch(ca.Callback):
         return str(ca.nlpsol_out(i))
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Return the shape of solver output i for N unknowns without constraints."""
-        rows = {"f": 1, "x": N, "lam_x": N, "lam_p": NP + 2 + N}.get(ca.nlpsol_out(i), 0)
-        return ca.Sparsity.dense(rows, 1)
+        """Return the shape of solver output i."""
+        return ca.Sparsity.dense(self.rows[ca.nlpsol_out(i)], 1)
 
     def eval(self, arg: Sequence[ca.DM]) -> list[int]:
         """Note J and let the solver go on."""

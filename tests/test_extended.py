@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numerics import Array, Loop, body_setup, cart_setup, relative_error
 
-from mjfim.designer import Stage, design, direction_for
+from mjfim.descent import Stage, direction_for
+from mjfim.designer import design
 from mjfim.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.extended import extend
 from mjfim.fisher import Information

@@ -9,7 +9,8 @@ import pytest
 from numerics import CART_PARAMETERS, cart_setup, relative_error, richardson
 
 from mjfim.criteria import CRITERIA
-from mjfim.designer import design, evaluate_trajectory
+from mjfim.designer import design
+from mjfim.evaluation import evaluate_trajectory
 from mjfim.errors import UnidentifiableError
 from mjfim.estimate import identify
 from mjfim.fisher import Information, standard_deviations

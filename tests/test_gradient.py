@@ -25,7 +25,7 @@ from numerics import (
     shared_model,
 )
 
-from mjfim.designer import Stage
+from mjfim.descent import Stage
 from mjfim.lq import TangentCurve, regulator
 from mjfim.objective import Point
 from mjfim.plant import CENTRAL, FAST, Accuracy

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numerics import Array, make_setup
 
-from mjfim.designer import evaluate_trajectory
+from mjfim.evaluation import evaluate_trajectory
 from mjfim.identifiability import Null, grouped, invisible
 from mjfim.setup import Setup
 from mjfim.survey import survey

@@ -1,0 +1,110 @@
+"""Several starts under hard limits: all compete on blunt barriers, the best go on to sharp ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.enclosed import Chase, Task, perform, pursue
+from mjfim.ladder import Rungs
+from mjfim.setup import Setup
+from mjfim.starts import Start
+from mjfim.trajectory import Array, HistoryRow, Status
+
+HALFWAY = 0.01  # mu down to which all starts compete
+KEPT = 4  # one in so many goes on
+EARLY = 0.5  # share of the iterations and of the time for the first round
+
+
+@dataclass(frozen=True, eq=False)
+class Contest:
+    """What all starts have in common.
+
+    setup: the experiment on its lifted plant;  coarse: the same on a coarse level, or None
+    combinations: (t, s) identifiable ones, or None;  executor: that runs the starts, None: one after the other here
+    """
+
+    setup: Setup
+    coarse: Setup | None
+    combinations: Array | None
+    executor: Executor | None = None
+
+    def run(self, starts: Sequence[Start], chases: list[Chase]) -> Iterator[HistoryRow]:
+        """Every iterate; `chases` gets one entry per start, the winners' ones after the second round."""
+        d = self.setup.experiment.descent
+        seconds = np.inf if d.seconds is None else d.seconds
+        clock = time.perf_counter()
+        first = self.coarse or self.setup
+        if len(starts) == 1 and self.coarse is None and starts[0].basis is None:
+            yield from self._round(self.setup, starts, Rungs(), d.max_iterations, seconds, chases)
+            return
+        share = EARLY * seconds / self._turns(len(starts))
+        yield from self._round(first, starts, Rungs(last=HALFWAY), round(EARLY * d.max_iterations), share, chases)
+        order = sorted(range(len(chases)), key=lambda i: chases[i].cost)
+        if any(chase.status is Status.INTERRUPTED for chase in chases):
+            return
+        kept = order[: max(1, len(order) // KEPT)]
+        for i in order:
+            if i not in kept and np.isfinite(chases[i].cost):
+                chases[i].status = Status.LEFT
+        again = [Start(chases[i].name, c) for i in kept if (c := chases[i].control) is not None]
+        left = max(seconds - (time.perf_counter() - clock), 0.0) / self._turns(len(again))
+        done = max((row.iteration for i in kept for row in chases[i].history), default=0)
+        second: list[Chase] = []
+        for row in self._round(self.setup, again, Rungs(first=HALFWAY), d.max_iterations - done, left, second):
+            yield replace(row, iteration=row.iteration + done + 1)
+        for i, chase in zip(kept, second, strict=False):
+            chase.history = _joined(chases[i].history, chase.history)
+            chase.steps += chases[i].steps
+            chases[i] = chase
+
+    def _turns(self, count: int) -> int:
+        """How many of the tasks run after one another."""
+        workers = 1 if self.executor is None else int(getattr(self.executor, "_max_workers", 1))
+        return -(-max(count, 1) // workers)
+
+    def _round(
+        self, level: Setup, starts: Sequence[Start], rungs: Rungs, budget: int, seconds: float, chases: list[Chase]
+    ) -> Iterator[HistoryRow]:
+        e, threads = level.experiment, 1 if self.executor is not None else level.plant.engine.threads
+        tasks = [
+            Task(
+                e,
+                s,
+                rungs,
+                max(budget, 1),
+                seconds,
+                self.combinations,
+                level.added,
+                level.coarsen,
+                level.stretch,
+                threads,
+            )
+            for s in starts
+        ]
+        if self.executor is None:
+            for task in tasks:
+                chases.append(Chase(task.start.name))
+                yield from pursue(task, chases[-1], level)
+            return
+        for chase in self.executor.map(perform, tasks):
+            chases.append(chase)
+            yield from chase.history
+
+
+def _joined(early: tuple[HistoryRow, ...], late: tuple[HistoryRow, ...]) -> tuple[HistoryRow, ...]:
+    """One history of two rounds."""
+    if not early:
+        return late
+    end = early[-1]
+    moved = (
+        replace(
+            r, iteration=r.iteration + end.iteration + 1, seconds=r.seconds + end.seconds, steps=r.steps + end.steps
+        )
+        for r in late
+    )
+    return (*early, *moved)

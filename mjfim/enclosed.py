@@ -1,0 +1,117 @@
+"""Descents under hard limits from one start, as tasks that may run anywhere, and the contest between them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mjfim.bounds import basis_of, fence_of
+from mjfim.descent import Stage, regulator_for
+from mjfim.experiment import Experiment
+from mjfim.fence import Fence
+from mjfim.interior import seen
+from mjfim.ladder import Ladder, Rung, Rungs
+from mjfim.objective import Point
+from mjfim.setup import Setup
+from mjfim.starts import Start
+from mjfim.trajectory import Array, HistoryRow, Status
+
+POWER = 40.0  # of the smooth E-criterion: several of the smallest eigenvalues meet under hard limits
+FAINT = 3e-3  # weight of an eigenvector, over the largest, below which it is left out of the gradient
+HALFWAY = 0.01  # mu down to which all starts compete
+KEPT = 4  # one in so many goes on
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A descent under hard limits. seconds: time it may take;  combinations: (t, s) identifiable ones, or None
+
+    added: (p, p) information of other experiments, or None;  coarsen, stretch: of the level;  held: shares held back
+    """
+
+    experiment: Experiment
+    start: Start
+    rungs: Rungs
+    budget: int
+    seconds: float = np.inf
+    combinations: Array | None = None
+    added: Array | None = None
+    coarsen: int = 1
+    stretch: int = 1
+    threads: int | None = None
+    held: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class Chase:
+    """Where a task has come to. control: (N, nu) the best inside all limits, else the last;  cost: J there, infinite outside"""
+
+    name: str
+    control: Array | None = None
+    cost: float = np.inf
+    status: Status = Status.INTERRUPTED
+    slope: float = np.inf
+    history: tuple[HistoryRow, ...] = ()
+    steps: int = 0
+
+
+def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[HistoryRow]:
+    """Every iterate of a task, keeping `chase` up to date. setup: of the experiment on its lifted plant, if there is one"""
+    clock = time.perf_counter()
+    if setup is None:
+        setup = Setup(task.experiment, task.threads, task.coarsen, task.added, True, task.stretch)
+    begun = setup.plant.engine.steps
+    exact = Stage(setup, task.combinations).problem
+    smooth = Stage(setup, task.combinations, POWER if task.experiment.cost.criterion == "E" else np.inf).problem
+    smooth = replace(smooth, information=replace(smooth.information, faint=FAINT))
+    fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
+    basis = None if fine is None else setup.averaged(fine)
+    regulate = replace(regulator_for(setup), calm=np.inf) if basis is not None else regulator_for(setup)
+    fence = fence_of(setup)
+    ladder = Ladder(smooth, fence, setup.centre, basis, regulate, task.rungs)
+    control = setup.averaged(task.start.control)
+    for rung in ladder.climb(control, task.budget, clock + task.seconds, task.held):
+        own = rung.iterate.point
+        point = None if own.point is None else exact.judged(own.point)
+        chase.slope, chase.status = rung.iterate.slope, rung.status or Status.INTERRUPTED
+        chase.steps = setup.plant.engine.steps - begun
+        cost = np.inf if point is None or not rung.feasible else point.cost
+        if cost <= chase.cost:
+            chase.control, chase.cost = _stated(setup, own.ctrl, basis, fine), cost
+        row = _row(rung, point, 1.0 / setup.dt, fence)
+        row = replace(row, seconds=time.perf_counter() - clock, steps=chase.steps)
+        chase.history += (row,)
+        yield row
+    if chase.status is Status.INTERRUPTED and chase.history:  # the rungs asked for are done
+        chase.status = Status.MAX_ITERATIONS
+    if not np.isfinite(chase.cost):
+        chase.status = Status.INFEASIBLE
+
+
+def _stated(setup: Setup, ctrl: Array, basis: Array | None, fine: Array | None) -> Array:
+    """A level's control on the stated grid of samples."""
+    if setup.coarsen == 1 or basis is None or fine is None:
+        return np.repeat(ctrl, setup.coarsen, axis=0)
+    return np.asarray(setup.centre + fine @ np.linalg.lstsq(basis, ctrl - setup.centre)[0])
+
+
+def _row(rung: Rung, point: Point | None, rate: float, fence: Fence) -> HistoryRow:
+    criterion = None if point is None else point.criterion
+    value, smallest = (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
+    cost, i = (np.inf if point is None else point.cost), rung.iterate
+    margin = min(fence.shares(seen(i.point)).values(), default=np.nan)
+    return HistoryRow(i.index, cost, value, smallest, i.slope, i.gamma, 0.0, 0, rate, rung.mu, margin)
+
+
+def perform(task: Task) -> Chase:
+    """A task from beginning to end, for an executor; Ctrl-C ends it with the best so far."""
+    chase = Chase(task.start.name)
+    try:
+        for _ in pursue(task, chase):
+            pass
+    except KeyboardInterrupt:
+        chase.status = Status.INTERRUPTED
+    return chase

@@ -1,0 +1,192 @@
+"""All hard limits along a trajectory: their margins, and their barrier with its Gauss-Newton expansion.
+
+What moves within a sample (positions, velocities, accelerations, forces) is held at several engine steps of it, by taps;
+distances at the samples; controls and their rates as they are; how the design ends, at the last sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.barrier import Band, Hedge
+from mjfim.clearance import Clearance
+from mjfim.engine import Taps
+from mjfim.lq import Weights
+from mjfim.tangent import StateSpace
+from mjfim.trajectory import Array, Trajectory
+
+END_WEIGHT = 0.1  # of a condition at the end, over that of one that is held all the time
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What the limits look at along a trajectory.
+
+    tapped: (N, substeps, w);  distances: (N, m) [m] at the samples 1 ... N, or None
+    slopes: (N, m, nv) their derivatives by position, or None where not wanted
+    """
+
+    trajectory: Trajectory
+    tapped: Array
+    distances: Array | None = None
+    slopes: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Fence:
+    """The limits of an experiment.
+
+    taps, shown: what is looked at within samples, its ranges (w,), and the kind of each
+    control, rate: ranges of (nu,), the latter per second, or None
+    before, after: (nu,) control before the first and after the last sample, None where free;  seam: after is the first one
+    end, target: ranges of x_N - target, (nx,) and (ns,), or None
+    clearance, least: [m] distances and the least allowed, or None
+    """
+
+    space: StateSpace
+    dt: float
+    taps: Taps
+    shown: Band
+    kinds: tuple[str, ...]
+    control: Band
+    rate: Band | None = None
+    before: Array | None = None
+    after: Array | None = None
+    seam: bool = False
+    end: Band | None = None
+    target: Array | None = None
+    clearance: Clearance | None = None
+    least: float = 0.0
+
+    def tightened(self, shares: Mapping[str, float]) -> Fence:
+        """Some kinds held back from their bounds, by shares of half of their ranges."""
+        inner = np.array([shares.get(kind, 0.0) for kind in self.kinds])
+        end = [shares.get(kind, 0.0) for kind in ("end_position", "end_velocity")]
+        return replace(
+            self,
+            shown=self.shown.tightened(inner),
+            control=self.control.tightened(shares.get("control", 0.0)),
+            rate=None if self.rate is None else self.rate.tightened(shares.get("control_rate", 0.0)),
+            least=self.least * (1.0 + shares.get("clearance", 0.0)),
+            end=None if self.end is None else self.end.tightened(np.repeat([*end, 0.0], self._parts)),
+        )
+
+    @property
+    def _parts(self) -> tuple[int, int, int]:
+        """Positions, velocities and activations in the tangent space."""
+        return self.space.nv, self.space.nv, self.space.na
+
+    def sight(self, trajectory: Trajectory, tapped: Array, slopes: bool) -> Sight:
+        """Look at a trajectory. tapped: (N, substeps, w) at every engine step"""
+        if self.clearance is None:
+            return Sight(trajectory, tapped)
+        near = self.clearance(trajectory.qpos[1:], slopes)
+        return Sight(trajectory, tapped, near.d, near.slope)
+
+    def rates(self, ctrl: Array) -> Array:
+        """(N+1, nu) rates of the control into each sample and out of the last, zero where free."""
+        first = ctrl[0] if self.before is None else self.before
+        last = ctrl[-1] if self.after is None else self.after
+        if self.seam:
+            last = ctrl[0]
+        return np.diff(ctrl, axis=0, prepend=first[None], append=last[None]) / self.dt
+
+    def margins(self, sight: Sight) -> dict[str, float]:
+        """Worst margin of each kind, in its unit, negative outside."""
+        return self._worst(sight, relative=False)
+
+    def shares(self, sight: Sight) -> dict[str, float]:
+        """The same over half of the range of each."""
+        return self._worst(sight, relative=True)
+
+    def _worst(self, sight: Sight, relative: bool) -> dict[str, float]:
+        worst: dict[str, float] = {}
+
+        def tell(kind: str, margins: Array, scale: Array | float) -> None:
+            margin = float((margins / scale if relative else margins).min(initial=np.inf))
+            if np.isfinite(margin):
+                worst[kind] = min(margin, worst.get(kind, margin))
+
+        shown, ctrl = self.shown.margin(sight.tapped), sight.trajectory.ctrl
+        for i, kind in enumerate(self.kinds):
+            tell(kind, shown[..., i], float(self.shown.scale[i]))
+        tell("control", self.control.margin(ctrl), self.control.scale)
+        if self.rate is not None:
+            tell("control_rate", self.rate.margin(self.rates(ctrl)), self.rate.scale)
+        if self.end is not None:
+            margin, nv = self.end.margin(self._ended(sight.trajectory)), self.space.nv
+            tell("end_position", margin[:nv], self.end.scale[:nv])
+            tell("end_velocity", margin[nv : 2 * nv], self.end.scale[nv : 2 * nv])
+        if sight.distances is not None:
+            tell("clearance", sight.distances - self.least, self.least)
+        return worst
+
+    def _ended(self, trajectory: Trajectory) -> Array:
+        if self.target is None:
+            raise ValueError("no target, no end")
+        return self.space.minus(trajectory.state[-1], self.target)
+
+    def _weight(self, N: int) -> float:
+        """Of a number that is held at every sample: the barrier is a mean over time."""
+        return 1.0 / N
+
+    def value(self, sight: Sight, delta: float) -> float:
+        """The barrier."""
+        N, looked = len(sight.tapped), np.array(self.taps.substeps) - 1
+        weight, ctrl = self._weight(N), sight.trajectory.ctrl
+        total = self.shown.wall(sight.tapped[:, looked], delta, weight / len(looked)).value
+        total += self.control.wall(ctrl, delta, weight).value
+        if self.rate is not None:
+            total += self.rate.wall(self.rates(ctrl), delta, weight).value
+        if self.end is not None:
+            total += self.end.wall(self._ended(sight.trajectory), delta, END_WEIGHT).value
+        if sight.distances is not None:
+            total += self._near(sight.distances).wall(sight.distances, delta, weight).value
+        return total
+
+    def _near(self, distances: Array) -> Band:
+        """Distances between the least allowed one and where they are no longer looked at."""
+        if self.clearance is None:
+            raise ValueError("nothing is kept clear")
+        m = distances.shape[1]
+        return Band(np.full(m, self.least), np.full(m, np.inf), np.full(m, self.clearance.reach - self.least))
+
+    def expand(self, sight: Sight, rise: Array, delta: float) -> Hedge:
+        """Expansion about a trajectory. rise: (N, looked-at substeps, w, nx+nu) derivative of what the taps show"""
+        N, looked = len(sight.tapped), np.array(self.taps.substeps) - 1
+        nx, ctrl = self.space.nx, sight.trajectory.ctrl
+        nu, weight = ctrl.shape[1], self._weight(N)
+        wall = self.shown.wall(sight.tapped[:, looked], delta, weight / len(looked))
+        both = np.einsum("kswi,ksw->ki", rise, wall.slope)
+        flat = rise.reshape(N, -1, nx + nu)
+        H = np.swapaxes(flat * wall.bend.reshape(N, -1, 1), 1, 2) @ flat
+        a, b, Q = np.zeros((N + 1, nx)), both[:, nx:], np.zeros((N + 1, nx, nx))
+        a[:-1], Q[:-1], S, R = both[:, :nx], H[:, :nx, :nx], H[:, nx:, :nx], H[:, nx:, nx:].copy()
+        wall = self.control.wall(ctrl, delta, weight)
+        b = b + wall.slope
+        R[:, np.arange(nu), np.arange(nu)] += wall.bend
+        W = np.zeros((N + 1, nu))
+        if self.rate is not None:
+            wall = self.rate.wall(self.rates(ctrl), delta, weight)
+            b += (wall.slope[:-1] - wall.slope[1:]) / self.dt
+            W = wall.bend / self.dt**2
+            if self.seam:
+                b[0] += wall.slope[-1] / self.dt
+            if self.before is None:
+                b[0] -= wall.slope[0] / self.dt
+                W[0] = 0.0
+            if self.after is None and not self.seam:
+                b[-1] += wall.slope[-1] / self.dt
+                W[-1] = 0.0
+        if self.end is not None:
+            wall = self.end.wall(self._ended(sight.trajectory), delta, END_WEIGHT)
+            a[-1] += wall.slope
+            Q[-1] += np.diag(wall.bend)
+        if sight.distances is not None and sight.slopes is not None:
+            wall, nv = self._near(sight.distances).wall(sight.distances, delta, weight), self.space.nv
+            a[1:, :nv] += np.einsum("km,kmi->ki", wall.slope, sight.slopes)
+            Q[1:, :nv, :nv] += np.swapaxes(sight.slopes * wall.bend[..., None], 1, 2) @ sight.slopes
+        return Hedge(a, b, Weights(Q, S, R, W), rise / self.shown.scale[:, None], self.control.scale)
