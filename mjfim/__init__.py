@@ -4,31 +4,42 @@
 parameters from recordings, `monte_carlo` holds the estimator against the Cramer-Rao bound.
 """
 
+from mjfim.campaign import Campaign
 from mjfim.checker import Check, check
+from mjfim.compare import compare
+from mjfim.comparison import Comparison
 from mjfim.designer import design
+from mjfim.duration import Shortest, shortest
 from mjfim.errors import MjfimError
 from mjfim.estimate import identify
 from mjfim.evaluation import evaluate_trajectory
 from mjfim.experiment import Experiment
 from mjfim.montecarlo import monte_carlo, simulate
+from mjfim.sequential import sequential
 from mjfim.together import design_together
 from mjfim.trajectory import Design, Estimate, Recording, Study, Trajectory
 
 __all__ = [
+    "Campaign",
     "Check",
+    "Comparison",
     "Design",
     "Estimate",
     "Experiment",
     "MjfimError",
     "Recording",
+    "Shortest",
     "Study",
     "Trajectory",
     "check",
+    "compare",
     "design",
     "design_together",
     "evaluate_trajectory",
     "identify",
     "monte_carlo",
+    "sequential",
+    "shortest",
     "simulate",
 ]
 __version__ = "0.1.0"

@@ -15,10 +15,11 @@ import pyarrow
 import pyarrow.csv
 
 from mjfim.checker import Check
+from mjfim.comparison import Comparison, Row
 from mjfim.errors import RecordingError, unknown
 from mjfim.files import replacing
 from mjfim.identifiability import Group
-from mjfim.sensing import components
+from mjfim.playback import design_columns, playback_of, reference_columns
 from mjfim.setup import Setup
 from mjfim.signals import read_table
 from mjfim.trajectory import Array, Design, Estimate, Evaluation, Recording, Study, Trajectory
@@ -94,24 +95,19 @@ def _evaluation(e: Evaluation) -> dict[str, Any]:
 
 
 def write_design(folder: Path, design: Design, setup: Setup) -> None:
-    """design.json, design.npz and design.csv."""
+    """design.json, design.npz, design.csv and reference.csv."""
+    played = playback_of(setup, design.trajectory, design.final.gain)
     arrays: dict[str, Array] = {}
     for prefix, e in (("", design.final), ("initial_", design.initial)):
         own = {**{n: getattr(e.trajectory, n) for n in ARRAYS[:5]}, "gain": e.gain, "sensitivity": e.sensitivity}
         arrays.update({prefix + name: value for name, value in own.items()})
     with replacing(folder / "design.npz") as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
-    write_table(folder / "design.csv", _playback(design.trajectory, setup))
+    write_table(folder / "design.csv", design_columns(played, setup))
+    write_table(folder / "reference.csv", reference_columns(played, setup))
     source = Path(setup.experiment.source)
     experiment = os.path.relpath(source.resolve(), folder.resolve()) if source.is_file() else None
     write_json(folder / "design.json", {"experiment": experiment, **design_summary(design)})
-
-
-def _playback(trajectory: Trajectory, setup: Setup) -> dict[str, Array]:
-    columns = {"t": trajectory.t}
-    columns.update({c.name: trajectory.state[:, c.state] for c in components(setup.model)})
-    columns.update(_controls(trajectory.ctrl, setup.controls))
-    return columns
 
 
 def _controls(ctrl: Array, names: tuple[str, ...]) -> dict[str, Array]:
@@ -161,6 +157,12 @@ def _trajectory(path: Path, prefix: str, arrays: Mapping[str, Array]) -> Traject
             shape = f"({wanted},)" if key == "t" else f"({wanted}, columns)"
             raise RecordingError(f"{path}: array '{prefix}{key}' has shape {array.shape}, wanted {shape}")
     return Trajectory(*(arrays[prefix + key] for key in ARRAYS[:5]))
+
+
+def write_control(path: Path, control: Array, setup: Setup) -> None:
+    """A control: (N, nu) as a table that `initial.control` reads."""
+    columns = {"t": setup.t, **{name: control[:, i] for i, name in enumerate(setup.controls)}}
+    write_table(path, columns)
 
 
 def check_fits(path: Path, trajectory: Trajectory, setup: Setup) -> None:
@@ -298,6 +300,44 @@ def check_summary(check: Check) -> dict[str, Any]:
                 "causes": list(rough.causes),
             },
         },
+    }
+
+
+def comparison_summary(comparison: Comparison) -> dict[str, Any]:
+    """Contents of compare.json."""
+    return {
+        "ok": comparison.ok,
+        "verdict": list(comparison.verdict),
+        "interrupted": comparison.interrupted,
+        "criterion": comparison.criterion,
+        "budget": {"seconds": comparison.seconds, "steps": comparison.steps},
+        "seed": comparison.seed,
+        "parameters": list(comparison.parameters),
+        "units": list(comparison.units),
+        "scale": comparison.scale,
+        "nuisance": list(comparison.nuisance),
+        "best": None if comparison.best is None else comparison.best.method,
+        "beating": [row.method for row in comparison.beating],
+        "methods": [_compared(row) for row in comparison.rows],
+    }
+
+
+def _compared(row: Row) -> dict[str, Any]:
+    return {
+        "method": row.method,
+        "title": row.title,
+        "outcome": row.outcome.name.lower(),
+        "message": row.outcome.value,
+        "cost": row.cost,
+        "criterion": row.criterion,
+        "smallest_eigenvalue": row.smallest,
+        "worst_relative_sigma": row.worst,
+        "std": row.std,
+        "seconds": row.seconds,
+        "steps": row.steps,
+        "limits": {"margins": row.margins, "shares": row.shares},
+        "found_by": row.found_by,
+        "note": row.note,
     }
 
 

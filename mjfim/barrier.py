@@ -60,6 +60,12 @@ class Band:
         """(..., w) distance to the nearer bound, negative outside, infinite where free."""
         return np.asarray(np.minimum(r - self.lower, self.upper - r))
 
+    def share(self, r: Array) -> Array:
+        """(..., w) where in its range each number is: -1 at the lower bound, 1 at the upper one; 0 where free."""
+        upper, lower = 1.0 - (self.upper - r) / self.scale, (r - self.lower) / self.scale - 1.0
+        both = np.where(np.isfinite(self.upper), upper, np.where(np.isfinite(self.lower), lower, 0.0))
+        return np.asarray(both)
+
     def wall(self, r: Array, delta: float, weight: float) -> Wall:
         """Barrier of the numbers r: (..., w), each times weight."""
         value, slope, bend = 0.0, np.zeros(r.shape), np.zeros(r.shape)

@@ -8,6 +8,7 @@ from scipy.interpolate import BSpline
 from mjfim.trajectory import Array
 
 DEGREE = 3
+FAINT = 1e-5  # size of a combination of curves, over the largest
 
 
 def spline_basis(t: Array, horizon: float, bandwidth: float, begins: bool, ends: bool, periodic: bool) -> Array:
@@ -51,3 +52,12 @@ def fourier_basis(t: Array, horizon: float, frequency: float, harmonics: int, be
     system = np.concatenate([polynomials(np.array([place]), order) for place, order in conditions])
     wanted = np.concatenate([waves(np.array([place]), order) for place, order in conditions])
     return waves(t, 0) - polynomials(t, 0) @ np.linalg.solve(system, wanted)
+
+
+def independent(curves: Array) -> Array:
+    """(N, M) curves, or fewer that span the same but for what is faint: splines finer than samples, waves like polynomials."""
+    U, sizes, _ = np.linalg.svd(curves, full_matrices=False)
+    kept = sizes > FAINT * sizes[0]
+    if kept.sum() == curves.shape[1]:
+        return curves
+    return np.asarray(U[:, kept] * np.sqrt(0.5 * len(curves)))

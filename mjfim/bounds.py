@@ -38,29 +38,33 @@ def _dense(limits: list[Limit], count: int) -> Band | None:
     return Band.of(lower, upper)
 
 
-def fence_of(setup: Setup) -> Fence:
-    """The limits of an experiment. Raises ExperimentError for a boundary that cannot be."""
+def fence_of(setup: Setup, every: bool = False) -> Fence:
+    """The limits that hold a design, or every stated one. Raises ExperimentError for what cannot be.
+
+    Without limits.enforce only its boundary holds a design.
+    """
     e, nu = setup.experiment, len(setup.controls)
-    rows = {kind: _of(setup.limits, kind) for kind in SHOWN}
+    limits = setup.limits if every or e.limits.enforce else ()
+    rows = {kind: _of(limits, kind) for kind in SHOWN}
     flat = [limit for kind in SHOWN for limit in rows[kind]]
     q, v, a, f, j = (np.array([limit.index for limit in rows[kind]], dtype=np.intp) for kind in SHOWN)
     taps = Taps(q, v, a, f, j, looked_at(setup.substeps), float(setup.plant.engine.model.opt.timestep))
     shown = Band.of(np.array([limit.lower for limit in flat]), np.array([limit.upper for limit in flat]))
     free = np.full(nu, np.inf)
-    control = _dense(_of(setup.limits, "control"), nu) or Band(-free, free, _sizes(setup))
+    control = _dense(_of(limits, "control"), nu) or Band(-free, free, _sizes(setup))
     clearance, least = None, 0.0
-    if e.limits.clearance is not None:
-        near = pairs(setup.model, [frozenset(pair) for pair in e.limits.ignored])
+    if e.limits.clearance is not None and (every or e.limits.enforce):
         least = e.limits.clearance
-        clearance = Clearance(setup.model_at(setup.theta), near, least + REACH) if near else None
+        clearance = _kept_clear(setup, least + REACH)
     return Fence(
         space=setup.space,
         dt=setup.dt,
         taps=taps,
         shown=shown,
         kinds=tuple(limit.kind for limit in flat),
+        names=tuple(limit.name for limit in flat),
         control=control,
-        rate=_dense(_of(setup.limits, "control_rate"), nu),
+        rate=_dense(_of(limits, "control_rate"), nu),
         before=setup.hold if e.boundary.start == "rest" else None,
         after=setup.final_hold if e.boundary.end == "rest" else None,
         seam=e.boundary.end == "periodic",
@@ -69,6 +73,15 @@ def fence_of(setup: Setup) -> Fence:
         clearance=clearance,
         least=least,
     )
+
+
+def _kept_clear(setup: Setup, reach: float) -> Clearance:
+    """Distances of all pairs that are not ignored. Raises ExperimentError where there are none, or unknown bodies."""
+    try:
+        near = pairs(setup.model, [frozenset(pair) for pair in setup.experiment.limits.ignored])
+        return Clearance(setup.model_at(setup.theta), near, reach)
+    except ExperimentError as error:
+        raise ExperimentError(f"limits.{error}") from None
 
 
 def _sizes(setup: Setup) -> Array:

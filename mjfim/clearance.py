@@ -81,9 +81,9 @@ def pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Pair, ...]:
     for names in ignored:
         for name in sorted(names):
             if name not in bodies:
-                raise ExperimentError(f"clearance: {unknown('body', name, bodies)}")
+                raise ExperimentError(f"ignored: {unknown('body', name, bodies)}")
         if len(names) != 2:
-            raise ExperimentError(f"clearance: {sorted(names)} is no pair of bodies; needs two different names")
+            raise ExperimentError(f"ignored: {sorted(names)} is no pair of bodies; needs two different names")
     explicit = {frozenset(p) for p in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
     excluded = {frozenset(divmod(s, 1 << 16)) for s in model.exclude_signature.tolist()}
     body, tree = model.geom_bodyid.tolist(), model.body_treeid.tolist()

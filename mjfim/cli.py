@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import multiprocessing
 import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -18,6 +20,9 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 import mjfim
 from mjfim import archive, report
+from mjfim.baselines import METHODS
+from mjfim.compare import Glance
+from mjfim.duration import OutOfReachError, Shortest
 from mjfim.errors import ExperimentError, MjfimError, RecordingError
 from mjfim.files import replacing
 from mjfim.labels import Labels
@@ -142,12 +147,27 @@ def check(
     raise typer.Exit(0 if result.ok else 1)
 
 
+@contextmanager
+def several(setup: Setup) -> Iterator[Executor | None]:
+    """Processes for the starts of a design under hard limits; None where one start has all threads to itself."""
+    d = setup.experiment.descent
+    count = d.starts + len(d.previous) + len(d.fourier)
+    if count == 1 or not setup.enforced:
+        yield None
+        return
+    with ProcessPoolExecutor(min(count, setup.plant.engine.threads), multiprocessing.get_context("spawn")) as pool:
+        yield pool
+
+
 @verb
 def design(
     experiment: ExperimentFile,
     output: Folder,
     as_json: AsJson = False,
     starts: Annotated[int | None, typer.Option(min=1, help="Number of starts; overrides [descent] starts.")] = None,
+    shortest: Annotated[
+        bool, typer.Option("--shortest", help="Find the shortest horizon at which every `wanted` σ is reached.")
+    ] = False,
     threads: Threads = None,
 ) -> None:
     """Design the excitation that reveals most about the parameters."""
@@ -156,7 +176,7 @@ def design(
         stated = stated.replace(descent={"starts": starts})
     setup = Setup(stated, threads)
     check_folder(output)
-    with progress() as bar:
+    with several(setup) as executor, progress() as bar:
         task = bar.add_task("designing", total=None)
 
         def monitor(row: HistoryRow) -> None:
@@ -167,14 +187,77 @@ def design(
             if not errors.is_terminal and row.iteration % 10 == 0:
                 errors.print(text)
 
-        result = mjfim.design(setup, monitor)
+        found = _shortest(setup, monitor, executor) if shortest else None
+        result = mjfim.design(setup, monitor, executor=executor) if found is None else found.design
+    if found is not None:
+        setup = Setup(found.experiment, threads)
     with writing(output) as results:
         results.leave_design(output, result, setup)
-    _say(as_json, archive.design_summary(result), report.design_report(result, setup.units))
+        if found is not None:
+            archive.write_json(output / "shortest.json", found.summary())
+    told = {} if found is None else {"shortest": found.summary()}
+    _say(as_json, {**archive.design_summary(result), **told}, report.design_report(result, setup.units))
+    if found is not None:
+        errors.print(f"{found}\nto go on with it, state horizon = {found.horizon:g} in {experiment}", markup=False)
     errors.print(f"wrote {output}/ (see it move: mjfim replay {output})")
     if not result.success:
         errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
-    raise typer.Exit(0 if result.success else 1)
+    raise typer.Exit(0 if result.success and (found is None or found.closed) else 1)
+
+
+def _shortest(setup: Setup, monitor: Callable[[HistoryRow], None], executor: Executor | None) -> Shortest:
+    """The shortest design, every duration told on the way; exit code 1 where none is long enough."""
+    try:
+        return mjfim.shortest(
+            setup.experiment,
+            monitor=monitor,
+            threads=setup.plant.engine.threads,
+            report=lambda tried: errors.print(str(tried), markup=False),
+            executor=executor,
+        )
+    except OutOfReachError as error:
+        errors.print(f"mjfim: {error}", markup=False)
+        raise typer.Exit(1) from None
+
+
+@verb
+def compare(
+    experiment: ExperimentFile,
+    output: Folder,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Budget of each method [s].")] = 60.0,
+    steps: Annotated[float | None, typer.Option(min=1.0, help="Budget of MuJoCo steps; default: time alone.")] = None,
+    methods: Annotated[
+        str | None, typer.Option(metavar="NAME,...", help=f"Baselines to run before the design: {', '.join(METHODS)}.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the baselines.")] = 0,
+    as_json: AsJson = False,
+    threads: Threads = None,
+) -> None:
+    """Hold the design against chirps, multisines, Fourier series, splines with the same budget; exit code 1 if one is better."""
+    setup = Setup(mjfim.Experiment.from_file(experiment), threads)
+    chosen = None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
+    check_folder(output)
+    with progress() as bar:
+        task = bar.add_task("comparing", total=None)
+        told = [-1]
+
+        def monitor(glance: Glance) -> None:
+            text = f"{glance.place + 1}/{glance.count} {glance.title}  best J {glance.cost:.5g}"
+            bar.update(task, description=text, total=glance.count, completed=glance.place + min(glance.used, 1.0))
+            if not errors.is_terminal and glance.place > told[0]:
+                told[0] = glance.place
+                errors.print(f"{glance.place + 1}/{glance.count} {glance.title}", markup=False)
+
+        result = mjfim.compare(setup, seconds, steps, seed, chosen, monitor=monitor, threads=threads)
+    if not result.rows:
+        raise KeyboardInterrupt
+    with writing(output) as results:
+        results.leave_comparison(output, result, setup)
+    _say(as_json, archive.comparison_summary(result), report.compare_report(result))
+    errors.print(f"wrote {output}/")
+    if not result.ok:
+        errors.print(f"mjfim: {' '.join(result.verdict)}", markup=False)
+    raise typer.Exit(0 if result.ok else 1)
 
 
 @verb

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, wait
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mjfim.audit import audit
 from mjfim.enclosed import Chase, Task, perform, pursue
-from mjfim.ladder import Rungs
+from mjfim.ladder import Rungs, held_back
 from mjfim.setup import Setup
 from mjfim.starts import Start
 from mjfim.trajectory import Array, HistoryRow, Status
 
 HALFWAY = 0.01  # mu down to which all starts compete
 KEPT = 4  # one in so many goes on
+PROOFS, LATE, PATIENCE = 3, 1e-3, 60  # repetitions of a winner that leaks, their first mu, their iterations
+GRACE = 5.0  # [s] that interrupted starts get to tell what they have
 EARLY = 0.5  # share of the iterations and of the time for the first round
 
 
@@ -51,16 +54,42 @@ class Contest:
         for i in order:
             if i not in kept and np.isfinite(chases[i].cost):
                 chases[i].status = Status.LEFT
+        kept = [i for i in kept if chases[i].control is not None]
         again = [Start(chases[i].name, c) for i in kept if (c := chases[i].control) is not None]
         left = max(seconds - (time.perf_counter() - clock), 0.0) / self._turns(len(again))
         done = max((row.iteration for i in kept for row in chases[i].history), default=0)
         second: list[Chase] = []
-        for row in self._round(self.setup, again, Rungs(first=HALFWAY), d.max_iterations - done, left, second):
-            yield replace(row, iteration=row.iteration + done + 1)
-        for i, chase in zip(kept, second, strict=False):
-            chase.history = _joined(chases[i].history, chase.history)
-            chase.steps += chases[i].steps
-            chases[i] = chase
+        try:
+            for row in self._round(self.setup, again, Rungs(first=HALFWAY), d.max_iterations - done, left, second):
+                yield replace(row, iteration=row.iteration + done + 1)
+        finally:  # also where the user interrupts
+            for i, chase in zip(kept, second, strict=False):
+                if chase.status is not Status.INTERRUPTED or np.isfinite(chase.cost):
+                    chase.history = _joined(chases[i].history, chase.history)
+                    chase.steps += chases[i].steps
+                    chases[i] = chase
+
+    def prove(self, chases: list[Chase]) -> Iterator[HistoryRow]:
+        """Hold back a winner that leaves a limit on the untouched model, between what the barrier looked at; a few times."""
+        for _ in range(PROOFS):
+            if not chases or any(chase.status is Status.INTERRUPTED for chase in chases):
+                return
+            i = min(range(len(chases)), key=lambda i: chases[i].cost)
+            best = chases[i]
+            if best.control is None or not np.isfinite(best.cost):
+                return
+            found = audit(self.setup, self.setup.plant.simulate(self.setup.theta, best.control))
+            if found.kept or not np.isfinite(found.deviation):
+                return
+            held = held_back({}, found.shares)
+            again: list[Chase] = []
+            yield from self._round(
+                self.setup, [Start(best.name, best.control)], Rungs(first=LATE), PATIENCE, np.inf, again, held
+            )
+            if np.isfinite(again[0].cost):
+                again[0].history = _joined(best.history, again[0].history)
+                again[0].steps += best.steps
+                chases[i] = again[0]
 
     def _turns(self, count: int) -> int:
         """How many of the tasks run after one another."""
@@ -68,32 +97,47 @@ class Contest:
         return -(-max(count, 1) // workers)
 
     def _round(
-        self, level: Setup, starts: Sequence[Start], rungs: Rungs, budget: int, seconds: float, chases: list[Chase]
+        self,
+        level: Setup,
+        starts: Sequence[Start],
+        rungs: Rungs,
+        budget: int,
+        seconds: float,
+        chases: list[Chase],
+        held: Mapping[str, float] | None = None,
     ) -> Iterator[HistoryRow]:
-        e, threads = level.experiment, 1 if self.executor is not None else level.plant.engine.threads
-        tasks = [
-            Task(
-                e,
-                s,
-                rungs,
-                max(budget, 1),
-                seconds,
-                self.combinations,
-                level.added,
-                level.coarsen,
-                level.stretch,
-                threads,
-            )
-            for s in starts
-        ]
+        """Every iterate of one descent per start, at most `budget` each."""
+        common = Task(
+            level.experiment,
+            starts[0],
+            rungs,
+            max(budget, 1),
+            seconds,
+            self.combinations,
+            level.added,
+            level.coarsen,
+            level.stretch,
+            1 if self.executor is not None else level.plant.engine.threads,
+            held or {},
+        )
+        tasks = [replace(common, start=start) for start in starts]
         if self.executor is None:
             for task in tasks:
                 chases.append(Chase(task.start.name))
                 yield from pursue(task, chases[-1], level)
             return
-        for chase in self.executor.map(perform, tasks):
-            chases.append(chase)
-            yield from chase.history
+        futures = [self.executor.submit(perform, task) for task in tasks]
+        try:
+            for future in futures:
+                chases.append(future.result())
+                yield from chases[-1].history
+        except KeyboardInterrupt:  # other processes are interrupted as well and soon return what they have
+            told = futures[len(chases) :]
+            for future in told:
+                future.cancel()
+            ended = (f for f in wait(told, timeout=GRACE).done if not f.cancelled())
+            chases += [future.result() for future in ended if future.exception() is None]
+            raise
 
 
 def _joined(early: tuple[HistoryRow, ...], late: tuple[HistoryRow, ...]) -> tuple[HistoryRow, ...]:

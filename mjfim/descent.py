@@ -142,9 +142,12 @@ def descend(stages: Sequence[Stage], control: Array, run: Run, fence: Fence | No
 
 
 def _leaves(setup: Setup, fence: Fence, control: Array) -> bool:
-    """Whether a control at the stated rate leaves the limits at some engine step of the level."""
+    """Whether a control at the stated rate leaves the limits at some engine step of the level, or its forces are clamped."""
     watched = setup.plant.watch(setup.theta, setup.averaged(control), fence.taps)
-    return watched is None or any(m < 0.0 for m in fence.margins(fence.sight(*watched, slopes=False)).values())
+    if watched is None:
+        return True
+    margins = fence.margins(fence.sight(*watched, slopes=False))
+    return any(m < 0.0 or (m == 0.0 and kind in ("force", "joint_force")) for kind, m in margins.items())
 
 
 def _sharper(stage: Stage, done: _Pass) -> tuple[float, bool]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -50,6 +50,7 @@ def design(
     Raises UnidentifiableError where the initial control excites nothing, ExperimentError for a faulty experiment.
     """
     setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
+    require_inside(setup)
     clock, begun = time.perf_counter(), setup.plant.engine.steps
     first = setup.problem.point(setup.initial, CENTRAL)
     if start is not None:
@@ -74,6 +75,7 @@ def design(
                 if monitor is not None:
                     monitor(row)
         except KeyboardInterrupt:
+            rows.close()  # what a monitor interrupts is not yet told
             for run in runs[-1:]:
                 run.status = Status.INTERRUPTED
     spent = setup.plant.engine.steps - begun + sum(run.steps for run in runs)
@@ -82,7 +84,7 @@ def design(
 
 def _free(
     stage: Stage, first: Point, start: Array | None, runs: list[Run], fence: Fence | None = None
-) -> Iterator[HistoryRow]:
+) -> Generator[HistoryRow, None, None]:
     """Descents without a barrier, from every start; with a fence, until one leaves it."""
     setup, clock = stage.setup, time.perf_counter()
     coarse = coarse_level(setup, first, stage.basis)
@@ -90,10 +92,12 @@ def _free(
     begun = sum(level.plant.engine.steps for level in levels)
     for begin in starts_of(setup, start):
         runs.append(Run(begin.name))
+        elsewhere = sum(run.steps for run in runs)
         for row in descend([Stage(level, stage.basis) for level in levels], begin.control, runs[-1], fence):
             spent = sum(level.plant.engine.steps for level in levels) - begun
             told = replace(row, seconds=time.perf_counter() - clock, steps=spent)
             runs[-1].history += (told,)
+            runs[-1].steps = 0 if coarse is None else coarse.plant.engine.steps - elsewhere
             yield told
         if runs[-1].outside:
             return
@@ -101,21 +105,24 @@ def _free(
 
 def _enclosed(
     stage: Stage, first: Point, start: Array | None, executor: Executor | None, runs: list[Run]
-) -> Iterator[HistoryRow]:
+) -> Generator[HistoryRow, None, None]:
     """Descents inside the limits. Where soft weights alone keep them, there is no barrier to begin with."""
-    setup = stage.setup
-    require_inside(setup)
+    setup, inside = stage.setup, None
     if _weighted(setup):
         yield from _free(stage, first, start, runs, fence_of(setup))
         if not any(run.outside for run in runs):
             return
-        start = runs[-1].control if start is None else start
+        inside = runs[0].control
         runs.clear()
     free = setup.free()
     chases: list[Chase] = []
     contest = Contest(free, _coarser(free, stage.basis), stage.basis, executor)
+    starts = list(starts_of(setup, start))
+    if inside is not None:  # as far as the first start came without a barrier
+        starts[0] = replace(starts[0], control=inside)
     try:
-        yield from contest.run(list(starts_of(setup, start)), chases)
+        yield from contest.run(starts, chases)
+        yield from contest.prove(chases)
     finally:
         runs += [_settled(stage, chase) for chase in chases]
 
@@ -186,6 +193,7 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
         steps=steps,
         seconds=seconds,
         limits=found.margins,
+        usage=found.usage,
         warnings=tuple(warnings_of(final, found, setup, clamped, rough)),
         found_by=best.name,
         starts=tuple(StartResult(r.name, r.cost, r.status, r.history[-1].iteration if r.history else 0) for r in runs),

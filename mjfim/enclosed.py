@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from mjfim.basis import independent
 from mjfim.bounds import basis_of, fence_of
 from mjfim.descent import Stage, regulator_for
 from mjfim.experiment import Experiment
@@ -68,19 +69,21 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
     smooth = Stage(setup, task.combinations, POWER if task.experiment.cost.criterion == "E" else np.inf).problem
     smooth = replace(smooth, information=replace(smooth.information, faint=FAINT))
     fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
-    basis = None if fine is None else setup.averaged(fine)
+    basis = None if fine is None else independent(setup.averaged(fine))
     regulate = replace(regulator_for(setup), calm=np.inf) if basis is not None else regulator_for(setup)
-    fence = fence_of(setup)
+    fence = fence_of(setup).tightened(task.held)
     ladder = Ladder(smooth, fence, setup.centre, basis, regulate, task.rungs)
     control = setup.averaged(task.start.control)
-    for rung in ladder.climb(control, task.budget, clock + task.seconds, task.held):
+    for rung in ladder.climb(control, task.budget, clock + task.seconds):
         own = rung.iterate.point
         point = None if own.point is None else exact.judged(own.point)
         chase.slope, chase.status = rung.iterate.slope, rung.status or Status.INTERRUPTED
         chase.steps = setup.plant.engine.steps - begun
         cost = np.inf if point is None or not rung.feasible else point.cost
         if cost <= chase.cost:
-            chase.control, chase.cost = _stated(setup, own.ctrl, basis, fine), cost
+            chase.control, chase.cost = _stated(setup, own.ctrl, fine), cost
+        if rung.mended:
+            continue
         row = _row(rung, point, 1.0 / setup.dt, fence)
         row = replace(row, seconds=time.perf_counter() - clock, steps=chase.steps)
         chase.history += (row,)
@@ -91,11 +94,11 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
         chase.status = Status.INFEASIBLE
 
 
-def _stated(setup: Setup, ctrl: Array, basis: Array | None, fine: Array | None) -> Array:
-    """A level's control on the stated grid of samples."""
-    if setup.coarsen == 1 or basis is None or fine is None:
+def _stated(setup: Setup, ctrl: Array, fine: Array | None) -> Array:
+    """A level's control on the stated grid of samples, made of the curves fine: (N * coarsen, M) there, or of anything."""
+    if setup.coarsen == 1 or fine is None:
         return np.repeat(ctrl, setup.coarsen, axis=0)
-    return np.asarray(setup.centre + fine @ np.linalg.lstsq(basis, ctrl - setup.centre)[0])
+    return np.asarray(setup.centre + fine @ np.linalg.lstsq(setup.averaged(fine), ctrl - setup.centre)[0])
 
 
 def _row(rung: Rung, point: Point | None, rate: float, fence: Fence) -> HistoryRow:

@@ -69,7 +69,7 @@ def warnings_of(
     for kind, margin in found.margins.items():
         if margin < 0.0:
             advice = "widen it, start more gently, or give the design more time"
-            if not (setup.enforced and setup.experiment.limits.enforce):
+            if kind in found.told:
                 advice = (
                     "they are checked, not enforced; raise cost.control or cost.tracking until they hold before running "
                     "this on hardware"

@@ -279,11 +279,13 @@ class Experiment(Section):
     """An experiment. Relative paths inside are relative to `directory`, the folder of the experiment file.
 
     earlier: design.json or estimate.json files of experiments whose information adds to this one's
+    playback_rate: [Hz] of the rows of design.csv, the controller's; a multiple of rate; default: rate
     """
 
     model: str
     rate: Positive
     measure_rate: Positive | None = None
+    playback_rate: Positive | None = None
     horizon: Positive
     initial: Initial
     parameters: Annotated[dict[str, ParameterSpec], Field(min_length=1)]
@@ -403,6 +405,7 @@ def _valid_keys(location: list[Any]) -> list[str]:
         "cost": Cost,
         "descent": Descent,
         "limits": Limits,
+        "boundary": Boundary,
         "parameters": ParameterSpec,
         "noise": NoiseSpec,
         "correlated": Correlated,

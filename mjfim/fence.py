@@ -51,6 +51,7 @@ class Fence:
     taps: Taps
     shown: Band
     kinds: tuple[str, ...]
+    names: tuple[str, ...]
     control: Band
     rate: Band | None = None
     before: Array | None = None
@@ -70,9 +71,15 @@ class Fence:
             shown=self.shown.tightened(inner),
             control=self.control.tightened(shares.get("control", 0.0)),
             rate=None if self.rate is None else self.rate.tightened(shares.get("control_rate", 0.0)),
-            least=self.least * (1.0 + shares.get("clearance", 0.0)),
+            least=self._held_clear(shares.get("clearance", 0.0)),
             end=None if self.end is None else self.end.tightened(np.repeat([*end, 0.0], self._parts)),
         )
+
+    def _held_clear(self, share: float) -> float:
+        """The least distance raised by a share of it, at most half of the way to where distances no longer matter."""
+        if self.clearance is None:
+            return self.least
+        return min(self.least * (1.0 + share), 0.5 * (self.least + self.clearance.reach))
 
     @property
     def _parts(self) -> tuple[int, int, int]:
@@ -182,9 +189,10 @@ class Fence:
                 b[-1] += wall.slope[-1] / self.dt
                 W[-1] = 0.0
         if self.end is not None:
-            wall = self.end.wall(self._ended(sight.trajectory), delta, END_WEIGHT)
-            a[-1] += wall.slope
-            Q[-1] += np.diag(wall.bend)
+            ended = self._ended(sight.trajectory)
+            wall, moved = self.end.wall(ended, delta, END_WEIGHT), self.space.minus_slope(ended)
+            a[-1] += moved.T @ wall.slope
+            Q[-1] += moved.T @ (wall.bend[:, None] * moved)
         if sight.distances is not None and sight.slopes is not None:
             wall, nv = self._near(sight.distances).wall(sight.distances, delta, weight), self.space.nv
             a[1:, :nv] += np.einsum("km,kmi->ki", wall.slope, sight.slopes)

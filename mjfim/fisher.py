@@ -21,6 +21,7 @@ from mjfim.criteria import CRITERIA, NEGLIGIBLE, SINGULAR, Criterion, c_optimali
 from mjfim.lq import Recursion
 from mjfim.noise import Noise
 from mjfim.plant import Bilinear
+from mjfim.spectral import Spectral, divided
 from mjfim.trajectory import Array, Sensitivity
 
 ESTIMABLE = 1e-6  # squared share of a parameter outside the identifiable combinations that still counts as round-off
@@ -175,26 +176,57 @@ class Information:
 
     def gradient(self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear) -> tuple[Array, Array]:
         """(a, b): derivative of phi by x_k (N+1, nx) and u_k (N, nu), psi eliminated by the adjoint."""
-        nx = bilinear.A.shape[1]
-        total = np.sum(self.gradients(criterion, sensitivity, bilinear), axis=0)
+        nx, rays = bilinear.A.shape[1], self._rays(criterion, sensitivity)
+        backs = self._back(rays, bilinear)
+        shares = (self._through(backs, r, r, criterion, bilinear) for r in range(len(rays)))
+        total = np.sum(list(shares), axis=0)
         return total[:, :nx], total[:-1, nx:]
 
-    def gradients(self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear) -> Array:
-        """(r, N+1, nx+nu) the share of each direction in the derivative of phi by (x_k, u_k)."""
-        nx = bilinear.A.shape[1]
-        recursion = Recursion(bilinear.A)
-        rays = self._rays(criterion, sensitivity)
-        total = np.zeros((len(rays), len(bilinear.A) + 1, nx + bilinear.B.shape[2]))
-        for r, (v, share) in enumerate(zip(rays, total, strict=True)):
+    def spectral(self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear, cost: float) -> Spectral:
+        """Model of log J about a point of the smooth E-criterion, from the very derivatives that its gradient takes.
+
+        With `V = 2 Sigma^-1 G w_i` the change of `w_i' I w_j` is half of what V_i makes of dG w_j and V_j of dG w_i.
+        """
+        rays = self._rays(criterion, sensitivity) / criterion.weights[:, None, None]
+        backs, nx, r = self._back(rays, bilinear), bilinear.A.shape[1], len(rays)
+        values = criterion.eigenvalues[:r]
+        turn = divided(values)
+        rows = []
+        for i in range(r):
+            for j in range(i, r):
+                both = self._through(backs, i, j, criterion, bilinear)
+                if i != j:
+                    both = (both + self._through(backs, j, i, criterion, bilinear)) / np.sqrt(2.0)
+                rows.append(turn[i, j] * both)
+        slopes = np.stack(rows)
+        return Spectral(values, criterion.power, criterion.value / cost, slopes[..., :nx], slopes[:, :-1, nx:])
+
+    def _back(self, rays: Array, bilinear: Bilinear) -> list[tuple[Array, Array, Array]]:
+        """Each ray, as the outputs themselves see it, and its costate."""
+        recursion, backs = Recursion(bilinear.A), []
+        for v in rays:
             own = v if bilinear.lag is None else bilinear.lag.apply_transposed(v)
-            costate = recursion.adjoint(np.einsum("kyx,ky->kx", bilinear.C, own))
-            share[:-1] += np.einsum("kzx,kx->kz", bilinear.F_mixed[r], costate[1:])
-            if bilinear.h_mixed is not None:
-                share += np.einsum("kzy,ky->kz", bilinear.h_mixed[r], own)
-            if bilinear.lag is not None and bilinear.delay is not None:
-                share += _delayed(bilinear, v * float(bilinear.delay @ criterion.directions[r]))
-        total[:, -2, nx:] += total[:, -1, nx:]  # the last control is held for the outputs of the last sample
-        return total
+            backs.append((v, own, recursion.adjoint(np.einsum("kyx,ky->kx", bilinear.C, own))))
+        return backs
+
+    def _through(
+        self,
+        backs: list[tuple[Array, Array, Array]],
+        ray: int,
+        direction: int,
+        criterion: Criterion,
+        bilinear: Bilinear,
+    ) -> Array:
+        """(N+1, nx+nu) derivative of `sum_k v_k' dG_k w` by (x_k, u_k) for a ray v and a direction w."""
+        nx, (v, own, costate) = bilinear.A.shape[1], backs[ray]
+        share = np.zeros((len(v), nx + bilinear.B.shape[2]))
+        share[:-1] = np.einsum("kzx,kx->kz", bilinear.F_mixed[direction], costate[1:])
+        if bilinear.h_mixed is not None:
+            share += np.einsum("kzy,ky->kz", bilinear.h_mixed[direction], own)
+        if bilinear.lag is not None and bilinear.delay is not None:
+            share += _delayed(bilinear, v * float(bilinear.delay @ criterion.directions[direction]))
+        share[-2, nx:] += share[-1, nx:]  # the last control is held for the outputs of the last sample
+        return share
 
     def partials(self, criterion: Criterion, sensitivity: Sensitivity, full: Bilinear) -> tuple[Array, Array, Array]:
         """Derivatives of phi with psi kept as a state: by psi (N+1, nx, p), by x (N+1, nx), by u (N, nu).

@@ -117,7 +117,7 @@ class InteriorProblem:
             rise = found
         share = self._share(point)
         hedge: Hedge = self.fence.expand(sight, rise, self.delta).times(self.mu)
-        return Expansion(e.A, e.B, e.a / share + hedge.a, e.b / share + hedge.b, None, hedge, e.bends)
+        return Expansion(e.A, e.B, e.a / share + hedge.a, e.b / share + hedge.b, None, hedge, e.spectral)
 
     def project(self, point: InteriorPoint, zeta: TangentCurve, gamma: float, K: Array) -> InteriorPoint:
         """P(xi + gamma zeta), evaluated."""

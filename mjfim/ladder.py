@@ -15,21 +15,22 @@ from mjfim.objective import DesignProblem
 from mjfim.pronto import Armijo, Iterate, Regulator, optimize
 from mjfim.trajectory import Array, Status
 
-FACTOR = 1.0 / 3.0
+FACTOR = 3.0  # between rungs
 RELAXED = 0.3  # delta over mu
 WIDEST = 0.1  # delta at most
 SHRUNK = np.concatenate([[1.0, 0.997, 0.99, 0.97, 0.94, 0.9], 0.8 ** np.arange(1, 24)])  # of a start, tried in turn
 HOLDING = 4e-3  # mu from which on leaks are answered
 SPARE = 1.2  # what was outside at the end of a rung is held back on the next by that much of it
+SLACK = 1.5  # of the time that is left per rung, what one may take
 AGAIN = 3  # times that the last rung is repeated because of leaks, at most
 ROUNDS = 60  # iterations towards the inside
 
 
 @dataclass(frozen=True)
 class Rungs:
-    """first, last: mu;  patience: iterations per rung at most;  settled: slope over mu at which a rung is done
+    """first, last: mu;  patience: iterations per rung at most, twice as many on the last
 
-    tolerance: slope at which the last one is
+    settled: progress over `window` iterations, over mu, below which a rung is done;  tolerance: slope at which the last is
     """
 
     first: float = 0.1
@@ -39,15 +40,24 @@ class Rungs:
     window: int = 8
     tolerance: float = 1e-5
 
+    def ladder(self) -> list[float]:
+        """Every mu, from the first to the last."""
+        count = max(round(np.log(self.first / self.last) / np.log(FACTOR)), 1)
+        return [float(mu) for mu in np.geomspace(self.first, self.last, count + 1)]
+
 
 @dataclass(frozen=True, eq=False)
 class Rung:
-    """An iterate on the ladder. margins: worst of each kind;  status: set on the very last one"""
+    """An iterate on the ladder. margins: worst of each kind;  status: set on the very last one
+
+    mended: no iterate, but the one before shrunk until it kept all limits
+    """
 
     iterate: Iterate[InteriorPoint]
     mu: float
     margins: dict[str, float]
     status: Status | None = None
+    mended: bool = False
 
     @property
     def feasible(self) -> bool:
@@ -69,13 +79,8 @@ class Ladder:
     regulate: Regulator
     rungs: Rungs = Rungs()
 
-    def climb(
-        self, control: Array, budget: int, until: float = np.inf, held: Mapping[str, float] | None = None
-    ) -> Iterator[Rung]:
-        """Every iterate from a control: (N, nu), at most `budget`, until a time of `time.perf_counter`.
-
-        held: shares held back from the bounds at first
-        """
+    def climb(self, control: Array, budget: int, until: float = np.inf) -> Iterator[Rung]:
+        """Every iterate from a control: (N, nu), at most `budget`, until a time of `time.perf_counter`."""
         start = self.inside(control)
         direction = self._direction()
         if start is None:
@@ -88,7 +93,7 @@ class Ladder:
                 return
             start = point.ctrl
             direction = self._direction()
-        yield from self._down(start, direction, budget, until, dict(held or {}))
+        yield from self._down(start, direction, budget, until)
 
     def _direction(self) -> StructuredBFGS:
         N = len(self.base.running.desired) - 1
@@ -115,51 +120,46 @@ class Ladder:
     def _steered(self, control: Array, direction: StructuredBFGS, until: float) -> Iterator[Rung]:
         """Iterates towards the inside, without any cost."""
         problem = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False)
-        for iterate in optimize(problem, problem.point(control), direction, self.regulate, Armijo(), 1e-6, ROUNDS):
+        begin = problem.point(control)
+        if begin.sight is None:  # it diverges
+            return
+        for iterate in optimize(problem, begin, direction, self.regulate, Armijo(), 1e-6, ROUNDS):
             margins = self.fence.margins(seen(iterate.point))
             rung = Rung(iterate, np.inf, margins)
             yield rung
             if all(m > 0.0 for m in margins.values()) or time.perf_counter() > until:
                 return
 
-    def _down(
-        self, control: Array, direction: StructuredBFGS, budget: int, until: float, held: dict[str, float]
-    ) -> Iterator[Rung]:
-        r, mu = self.rungs, self.rungs.first
-        problem = InteriorProblem(self.base, self.fence, mu, WIDEST)
-        point = problem.point(control)
-        done, again = 0, 0
-        while True:
-            last = mu <= r.last
-            problem = replace(problem, mu=mu, delta=min(WIDEST, RELAXED * mu), fence=self.fence.tightened(held))
+    def _down(self, control: Array, direction: StructuredBFGS, budget: int, until: float) -> Iterator[Rung]:
+        r, held = self.rungs, dict[str, float]()
+        ladder, done = r.ladder(), 0
+        point = InteriorProblem(self.base, self.fence, r.first, WIDEST).point(control)
+        for i, mu in enumerate([*ladder, *ladder[-1:] * AGAIN]):
+            left, last, now = max(len(ladder) - i, 1), i >= len(ladder) - 1, time.perf_counter()
+            deadline = until if last else min(until, now + SLACK * (until - now) / left)
+            patience = min(r.patience * (2 if last else 1), -(-(budget - done) // left) if left > 1 else budget - done)
+            fence = self.fence.tightened(held)
+            problem = InteriorProblem(self.base, fence, mu, min(WIDEST, RELAXED * mu))
             point = problem.again(point)
-            patience = min(r.patience * (2 if last else 1), budget - done)
             values: list[float] = []
             for iterate in optimize(problem, point, direction, self.regulate, Armijo(), r.tolerance, patience):
-                values.append(iterate.value)
-                point, status = iterate.point, iterate.status
-                margins = self.fence.margins(seen(point))
-                late = time.perf_counter() > until
-                ended = status if status is not None and (last or done + iterate.index >= budget) else None
-                if ended is Status.CONVERGED and any(m < 0.0 for m in margins.values()) and again < AGAIN:
-                    ended = None
+                point, margins = iterate.point, self.fence.margins(seen(iterate.point))
+                kept = all(m >= 0.0 for m in margins.values())
                 yield Rung(
-                    replace(iterate, index=done + iterate.index), mu, margins, Status.MAX_ITERATIONS if late else ended
+                    replace(iterate, index=done + iterate.index), mu, margins, iterate.status if last and kept else None
                 )
-                if late:
-                    return
-                if not last and len(values) > r.window and values[-1 - r.window] - values[-1] < r.settled * mu:
+                values.append(iterate.value)
+                settled = len(values) > r.window and values[-1 - r.window] - values[-1] < r.settled * mu
+                if time.perf_counter() > deadline or (settled and not last):
                     break
             done += iterate.index
+            over = done >= budget or time.perf_counter() > until
+            if not kept:
+                yield from self._mended(problem, iterate, mu, done)
+            if over or (last and kept):
+                return
             if mu <= HOLDING:
                 held = held_back(held, self.fence.shares(seen(point)))
-            if any(m < 0.0 for m in self.fence.margins(seen(point)).values()) and not late:
-                yield from self._mended(problem, iterate, mu, done)
-            outside = any(m < 0.0 for m in self.fence.margins(seen(point)).values())
-            if done >= budget or (last and (not outside or again >= AGAIN)):
-                return
-            again += last
-            mu = max(mu * FACTOR, r.last)
 
     def _mended(
         self, problem: InteriorProblem, iterate: Iterate[InteriorPoint], mu: float, done: int
@@ -170,7 +170,7 @@ class Ladder:
             point = replace(problem, fence=self.fence).point(control)
             if point.sight is not None:
                 own = replace(iterate, index=done, point=point, value=problem.value(point), gamma=0.0, status=None)
-                yield Rung(own, mu, self.fence.margins(point.sight))
+                yield Rung(own, mu, self.fence.margins(point.sight), mended=True)
 
 
 def held_back(held: Mapping[str, float], shares: Mapping[str, float]) -> dict[str, float]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -18,30 +18,19 @@ BENT = 1e-8  # relative curvature of a pair that still counts
 
 @dataclass(frozen=True, eq=False)
 class Metric:
-    """The quadratic form of the barrier's Gauss-Newton Hessian and a ridge, on what the control may do: anything.
-
-    bends: (N, nu) slopes whose squares are known to be in the Hessian as well
-    """
+    """The quadratic form of the barrier's Gauss-Newton Hessian and a ridge, on what the control may do: anything."""
 
     expansion: Expansion
     K: Array
     weights: Weights
-    bends: tuple[Array, ...]
 
     def apply(self, s: Array) -> Array:
-        """The form's gradient at s: (N, nu), without the bends."""
+        """The form's gradient at s: (N, nu)."""
         e = self.expansion
         a, b = self.weights.force(e.lift(self.K, s))
         return Expansion(e.A, e.B, a, b).gradient(self.K)
 
-    @cached_property
-    def _bent(self) -> tuple[Array, Array]:
-        """U: (N * nu, r) the bends after the form is undone, and `1 + D'U`."""
-        D = np.stack([bend.reshape(-1) for bend in self.bends], axis=1)
-        U = np.stack([self._undone(bend).reshape(-1) for bend in self.bends], axis=1)
-        return U, np.eye(len(self.bends)) + D.T @ U
-
-    def _undone(self, g: Array) -> Array:
+    def solve(self, g: Array) -> Array:
         """What apply undoes, by the Riccati equations."""
         e = self.expansion
         a = np.zeros((len(g) + 1, e.A.shape[1]))
@@ -49,28 +38,17 @@ class Metric:
         zeta = weighted_descent(e.A, e.B, a, -g, self.weights)
         return np.asarray(zeta.v + np.einsum("kui,ki->ku", self.K, zeta.z[:-1]))
 
-    def solve(self, g: Array) -> Array:
-        """What the form with its bends undoes."""
-        undone = self._undone(g)
-        if not self.bends:
-            return undone
-        U, inner = self._bent
-        return np.asarray(undone - (U @ np.linalg.solve(inner, U.T @ g.reshape(-1))).reshape(g.shape))
-
 
 @dataclass(frozen=True, eq=False)
 class BasisMetric:
-    """The same on the coefficients of a basis: (N, M), of every control alike; dense.
-
-    H: the form without bends;  factor: Cholesky factor of the form with them
-    """
+    """The same on the coefficients of a basis: (N, M), of every control alike; dense.  factor: Cholesky factor of H"""
 
     H: Array
     factor: tuple[Array, bool]
 
     @staticmethod
-    def of(expansion: Expansion, weights: Weights, basis: Array, bends: tuple[Array, ...]) -> BasisMetric:
-        """Sums the form over the curves that each coefficient makes. bends: (M, nu) each"""
+    def of(expansion: Expansion, weights: Weights, basis: Array) -> BasisMetric:
+        """Sums the form over the curves that each coefficient makes."""
         A, B = expansion.A, expansion.B
         N, nx, nu = B.shape
         M = basis.shape[1]
@@ -85,15 +63,14 @@ class BasisMetric:
         rows += [stepped.reshape(N * nu, -1), drive[-1] * np.sqrt(weights.W[N, :, None])]
         X = np.concatenate(rows)
         H = X.T @ X
-        D = np.stack([bend.reshape(-1) for bend in bends], axis=1) if bends else np.zeros((len(H), 0))
-        return BasisMetric(H, cho_factor(H + D @ D.T, lower=True))
+        return BasisMetric(H, cho_factor(H, lower=True))
 
     def apply(self, s: Array) -> Array:
-        """The form's gradient at s: (M, nu), without the bends."""
+        """The form's gradient at s: (M, nu)."""
         return np.asarray((self.H @ s.reshape(-1)).reshape(s.shape))
 
     def solve(self, g: Array) -> Array:
-        """What the form with its bends undoes."""
+        """What apply undoes."""
         return np.asarray(cho_solve(self.factor, g.reshape(-1)).reshape(g.shape))
 
 
@@ -106,17 +83,40 @@ def _root(form: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """A step s and the change y of the cost's gradient along it, limits left out; both (N, nu) or (M, nu)."""
+    """A step s and what its model left out of the change y of the cost's gradient, limits not in it; (N, nu) or (M, nu)."""
 
     s: Array
     y: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Local:
+    """What is known at a point, in the coordinates: (N, nu) controls or (M, nu) coefficients of a basis.
+
+    gradient: of all;  cost: of the cost without limits;  slopes: (m, ...) of the spectral model's coordinates
+    """
+
+    expansion: Expansion
+    K: Array
+    metric: Metric | BasisMetric
+    gradient: Array
+    cost: Array
+    slopes: Array
+
+    def modelled(self, s: Array) -> Array:
+        """Gradient of the cost that the model expects after a step s, over that at its start."""
+        model = self.expansion.spectral
+        if model is None:
+            return np.zeros_like(s)
+        d = np.tensordot(self.slopes, s, axes=s.ndim)
+        return np.asarray(np.tensordot(model.gradient(d) - model.gradient(np.zeros_like(d)), self.slopes, axes=1))
+
+
 @dataclass
 class StructuredBFGS:
-    """BFGS of the cost on top of the Gauss-Newton Hessian of the barrier, which is exact at every point.
+    """BFGS of what remains of the cost, on top of the barrier's Gauss-Newton Hessian and the model of the criterion.
 
-    Pairs hold the cost's share alone, so what was learnt outlives a sharper barrier.
+    Both are exact at every point; pairs hold the remainder alone, so what was learnt outlives a sharper barrier.
     ridge: (nu,) weight of the control at every sample;  basis: (N, M) what controls may do, or None
     reach: largest move of anything limited in one step, over half of its range
     """
@@ -126,39 +126,59 @@ class StructuredBFGS:
     memory: int = 30
     reach: float = 0.5
     _pairs: tuple[Learnt, ...] = ()
-    _last: tuple[Expansion, Array, Array, Metric | BasisMetric] | None = field(default=None, repr=False)
+    _last: Local | None = field(default=None, repr=False)
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """zeta = -H DJ by the two-loop recursion, shortened where it would move too far."""
-        _, _, metric = self._state(expansion, K)
-        q, used = self._coordinates(expansion.gradient(K)), []
+        """zeta by the two-loop recursion and the model, shortened where it would move too far."""
+        here = self._local(expansion, K)
+        undo = self._inverse(here.metric)
+        model = expansion.spectral
+        if model is None:
+            step = -undo(here.gradient)
+        else:
+            m = len(here.slopes)
+            rest = here.gradient - np.tensordot(model.gradient(np.zeros(m)), here.slopes, axes=1)
+            away = -undo(rest)
+            moves = np.stack([undo(slope) for slope in here.slopes])
+            flat = here.slopes.reshape(m, -1)
+            spread = flat @ moves.reshape(m, -1).T
+            w = model.settle(flat @ away.reshape(-1), 0.5 * (spread + spread.T))
+            step = away - np.tensordot(w, moves, axes=1)
+        zeta = expansion.lift(K, step if self.basis is None else self.basis @ step)
+        move = self.reach / max(_hedge(expansion).motion(zeta), self.reach)
+        return TangentCurve(move * zeta.z, move * zeta.v)
+
+    def _inverse(self, metric: Metric | BasisMetric) -> Callable[[Array], Array]:
+        """What undoes the Hessian of metric and pairs: BFGS, the two-loop recursion."""
+        used = []
         for pair in self._pairs:
             y = pair.y + metric.apply(pair.s)
             curvature = float(np.vdot(pair.s, y))
             if curvature > BENT * np.linalg.norm(pair.s) * np.linalg.norm(y):
                 used.append((pair.s, y, curvature))
-        alphas = []
-        for s, y, curvature in reversed(used):
-            alphas.append(np.vdot(s, q) / curvature)
-            q = q - alphas[-1] * y
-        q = metric.solve(q)
-        for (s, y, curvature), alpha in zip(used, reversed(alphas), strict=True):
-            q = q + s * (alpha - np.vdot(y, q) / curvature)
-        step = -q if self.basis is None else -self.basis @ q
-        zeta = expansion.lift(K, step)
-        move = self.reach / max(self._hedge(expansion).motion(zeta), self.reach)
-        return TangentCurve(move * zeta.z, move * zeta.v)
+
+        def undo(g: Array) -> Array:
+            q, alphas = g, []
+            for s, y, curvature in reversed(used):
+                alphas.append(np.vdot(s, q) / curvature)
+                q = q - alphas[-1] * y
+            q = metric.solve(q)
+            for (s, y, curvature), alpha in zip(used, reversed(alphas), strict=True):
+                q = q + s * (alpha - np.vdot(y, q) / curvature)
+            return q
+
+        return undo
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Learn from the step that led to this expansion."""
-        if self._last is None:
+        """Learn from the step that led to this expansion what its model left out."""
+        before = self._last
+        if before is None:
             return
-        old = self._last[2]
         s = moved.v + np.einsum("kui,ki->ku", K, moved.z[:-1])
         if self.basis is not None:
             s = np.linalg.lstsq(self.basis, s)[0]
-        gradient = self._state(expansion, K)[1]
-        self._pairs = (*self._pairs, Learnt(s, gradient - old))[-self.memory :]
+        after = self._local(expansion, K)
+        self._pairs = (*self._pairs, Learnt(s, after.cost - before.cost - before.modelled(s)))[-self.memory :]
 
     def reset(self) -> bool:
         """Forget all pairs."""
@@ -166,26 +186,26 @@ class StructuredBFGS:
         self._pairs = ()
         return had
 
-    def _hedge(self, expansion: Expansion) -> Hedge:
-        if expansion.hedge is None:
-            raise ValueError("a direction under hard limits needs their expansion")
-        return expansion.hedge
-
-    def _coordinates(self, g: Array) -> Array:
-        return g if self.basis is None else self.basis.T @ g
-
-    def _state(self, expansion: Expansion, K: Array) -> tuple[Expansion, Array, Metric | BasisMetric]:
-        """The expansion, the gradient of the cost without limits in the coordinates, and the metric; once per expansion."""
-        if self._last is None or self._last[0] is not expansion or self._last[1] is not K:
-            hedge = self._hedge(expansion)
-            own = Expansion(expansion.A, expansion.B, expansion.a - hedge.a, expansion.b - hedge.b)
-            w = hedge.weights
+    def _local(self, expansion: Expansion, K: Array) -> Local:
+        """Everything about an expansion, once."""
+        if self._last is None or self._last.expansion is not expansion or self._last.K is not K:
+            hedge, w = _hedge(expansion), _hedge(expansion).weights
             weights = Weights(w.Q, w.S, w.R + np.diag(self.ridge), w.W)
-            basis = self.basis
-            slopes = (Expansion(expansion.A, expansion.B, bend.a, bend.b) for bend in expansion.bends)
-            bends = tuple(self._coordinates(slope.gradient(K)) for slope in slopes)
-            metric: Metric | BasisMetric = Metric(expansion, K, weights, bends)
-            if basis is not None:
-                metric = BasisMetric.of(expansion, weights, basis, bends)
-            self._last = (expansion, K, self._coordinates(own.gradient(K)), metric)
-        return self._last[0], self._last[2], self._last[3]
+            metric: Metric | BasisMetric = Metric(expansion, K, weights)
+            if self.basis is not None:
+                metric = BasisMetric.of(expansion, weights, self.basis)
+            forms = [(expansion.a, expansion.b), (expansion.a - hedge.a, expansion.b - hedge.b)]
+            if expansion.spectral is not None:
+                forms += list(zip(expansion.spectral.a, expansion.spectral.b, strict=True))
+            found = [Expansion(expansion.A, expansion.B, a, b).gradient(K) for a, b in forms]
+            if self.basis is not None:
+                found = [self.basis.T @ g for g in found]
+            slopes = np.stack(found[2:]) if len(found) > 2 else np.zeros((0, *found[0].shape))
+            self._last = Local(expansion, K, metric, found[0], found[1], slopes)
+        return self._last
+
+
+def _hedge(expansion: Expansion) -> Hedge:
+    if expansion.hedge is None:
+        raise ValueError("a direction under hard limits needs their expansion")
+    return expansion.hedge

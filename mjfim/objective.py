@@ -13,7 +13,7 @@ from mjfim.extended import extend
 from mjfim.fisher import Information
 from mjfim.lq import TangentCurve
 from mjfim.plant import CENTRAL, FAST, Accuracy, Bilinear, Plant
-from mjfim.pronto import Expansion, Slope
+from mjfim.pronto import Expansion
 from mjfim.robust import Pool
 from mjfim.tangent import StateSpace
 from mjfim.trajectory import Array, Sensitivity, Trajectory
@@ -137,17 +137,15 @@ class DesignProblem:
     def tapped(self, point: Point, taps: Taps | None) -> tuple[Expansion, Array | None]:
         """The expansion, and the derivatives (N, looked-at substeps, w, nx+nu) of what the taps show, from the same steps."""
         trajectory, sensitivity, criterion = _computed(point)
-        bilinear, gradients = self._slopes(self.theta, point, taps)
-        a, b = _summed(gradients, bilinear.A.shape[1])
-        bends = (
-            () if self.pool is not None else _bends(criterion, gradients / point.cost, bilinear.A.shape[1], point.cost)
-        )
+        bilinear, a, b = self._slope(self.theta, point, taps)
+        spectral = None
+        if self.pool is None and np.isfinite(criterion.power) and taps is not None:
+            spectral = self.information.spectral(criterion, sensitivity, bilinear, point.cost)
         if self.pool is not None:
             weights = self.pool.weights(point.phi)
             a, b = weights[0] * a, weights[0] * b
             for weight, theta, other in zip(weights[1:], self.pool.thetas[1:], point.others, strict=True):
-                own, gradients = self._slopes(theta, other)
-                a_own, b_own = _summed(gradients, own.A.shape[1])
+                own, a_own, b_own = self._slope(theta, other)
                 open_loop = np.zeros((len(b_own), b_own.shape[1], a_own.shape[1]))
                 b += weight * Expansion(own.A, own.B, a_own, b_own).gradient(open_loop)
         a_running, b_running = self.running.gradient(trajectory)
@@ -156,13 +154,13 @@ class DesignProblem:
             full = self.plant.bilinear(self.theta, trajectory, sensitivity.psi, np.eye(len(self.theta)), point.accuracy)
             a_psi, a_h, b_h = self.information.partials(criterion, sensitivity, full)
             extended = extend(full, a_running + a_h, b_running + b_h, a_psi)
-        return Expansion(bilinear.A, bilinear.B, a + a_running, b + b_running, extended, None, bends), bilinear.taps
+        return Expansion(bilinear.A, bilinear.B, a + a_running, b + b_running, extended, None, spectral), bilinear.taps
 
-    def _slopes(self, theta: Array, point: Point, taps: Taps | None = None) -> tuple[Bilinear, Array]:
-        """Derivatives at a point, and the shares (r, N+1, nx+nu) of the criterion's directions in that of phi."""
+    def _slope(self, theta: Array, point: Point, taps: Taps | None = None) -> tuple[Bilinear, Array, Array]:
+        """Derivatives at a point, and those of phi by x (N+1, nx) and u (N, nu)."""
         trajectory, sensitivity, criterion = _computed(point)
         bilinear = self.plant.bilinear(theta, trajectory, sensitivity.psi, criterion.directions, point.accuracy, taps)
-        return bilinear, self.information.gradients(criterion, sensitivity, bilinear)
+        return bilinear, *self.information.gradient(criterion, sensitivity, bilinear)
 
     def project(self, point: Point, zeta: TangentCurve, gamma: float, K: Array) -> Point:
         """P(xi + gamma zeta), evaluated."""
@@ -185,24 +183,3 @@ def _computed(point: Point) -> tuple[Trajectory, Sensitivity, Criterion]:
     if point.trajectory is None or point.sensitivity is None or point.criterion is None:
         raise ValueError("a diverged trial has no expansion")
     return point.trajectory, point.sensitivity, point.criterion
-
-
-def _summed(gradients: Array, nx: int) -> tuple[Array, Array]:
-    """By x_k (N+1, nx) and u_k (N, nu)."""
-    total = gradients.sum(axis=0)
-    return total[:, :nx], total[:-1, nx:]
-
-
-def _bends(criterion: Criterion, shares: Array, nx: int, cost: float) -> tuple[Slope, ...]:
-    """What is known of the Hessian of log J for the smooth E-criterion with its power q, as squares of slopes.
-
-    With p_i the weight of `g_i = -d log lambda_i` it holds `q cov_p(g)`, stiff where eigenvalues meet.
-    shares: (r, N+1, nx+nu) of the derivative of log J
-    """
-    if not np.isfinite(criterion.power) or criterion.power == 1.0:
-        return ()
-    p = -criterion.weights * criterion.eigenvalues[: len(criterion.weights)] / criterion.value
-    g = shares * (cost / criterion.value) / p[:, None, None]
-    mean = np.tensordot(p / p.sum(), g, axes=1)
-    forms = [np.sqrt(criterion.power * p_i) * (g_i - mean) for p_i, g_i in zip(p, g, strict=True) if len(p) > 1]
-    return tuple(Slope(f[:, :nx], f[:-1, nx:]) for f in forms)

@@ -14,18 +14,11 @@ import numpy as np
 
 from mjfim.barrier import Hedge
 from mjfim.lq import Recursion, TangentCurve, growth, regulator
+from mjfim.spectral import Spectral
 from mjfim.trajectory import Array, Status
 
 P = TypeVar("P")
 ROUND_OFF = 1e-12  # relative; a promised decrease below it says nothing
-
-
-@dataclass(frozen=True, eq=False)
-class Slope:
-    """A linear form on the tangent space, `sum a'z + b'v`. a: (N+1, nx);  b: (N, nu)"""
-
-    a: Array
-    b: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +28,7 @@ class Expansion:
     A: (N, nx, nx);  B: (N, nx, nu);  a: (N+1, nx) [1 / x-unit];  b: (N, nu) [1 / u-unit]
     extended: the same with psi among the states (nx (1+p) of them), where a metric with weight on psi wants it
     hedge: the share of hard limits in a and b, with its Gauss-Newton Hessian
-    bends: known parts of the cost's Hessian, the sum of the squares of these slopes
+    spectral: model of the cost's logarithm where a and b are of that, better than linear
     """
 
     A: Array
@@ -44,7 +37,7 @@ class Expansion:
     b: Array
     extended: Expansion | None = None
     hedge: Hedge | None = None
-    bends: tuple[Slope, ...] = ()
+    spectral: Spectral | None = None
 
     def slope(self, zeta: TangentCurve) -> float:
         """DJ.zeta."""

@@ -9,9 +9,11 @@ from rich.table import Table
 from rich.text import Text
 
 from mjfim.checker import Check
+from mjfim.comparison import DESIGN, Comparison, Row
 from mjfim.identifiability import Group as Combinations
 from mjfim.trajectory import Design, Estimate, Study
 
+FEW = 4  # parameters up to which each has a column
 BEST_CASE = "sigma is the Cramér-Rao bound: a best case, true if model and noise are right."
 
 
@@ -136,6 +138,51 @@ def check_report(check: Check) -> RenderableType:
         Text(BEST_CASE, style="dim"),
     ]
     return Group(*parts)
+
+
+def compare_report(comparison: Comparison) -> RenderableType:
+    """What each method found with the same budget, in the order in which they ran; then who won."""
+    budget = f"{comparison.seconds:g} s"
+    if np.isfinite(comparison.steps):
+        budget += f" or {comparison.steps / 1e6:.3g} million MuJoCo steps"
+    table = Table(title=f"{comparison.source}: each method with {budget}", title_justify="left")
+    shown = [j for j in comparison.wanted if len(comparison.wanted) <= FEW]
+    headings = ["method", *(["J"] if comparison.weighted else []), f"φ ({comparison.criterion})", "J against design"]
+    headings += ["worst σ", *(_named(f"σ {comparison.parameters[j]}", comparison.units[j]) for j in shown)]
+    for heading in (*headings, "time", "steps", "worst margin"):
+        table.add_column(heading, justify="left" if heading == "method" else "right", no_wrap=heading == "method")
+    for row in comparison.rows:
+        table.add_row(*_compared(comparison, row, shown), style=_style(comparison, row))
+    remarks = [f"{row.title}: {'; '.join(_remarks(row))}" for row in comparison.rows if _remarks(row)]
+    said = "worst σ: of the worst combination of parameters, relative to their scales; worst margin: over half of its range"
+    verdict = [Text(sentence, style="bold" if comparison.ok else "bold yellow") for sentence in comparison.verdict]
+    return Group(table, *(Text(line) for line in remarks), Text(f"{said}. {BEST_CASE}", style="dim"), *verdict)
+
+
+def _compared(comparison: Comparison, row: Row, shown: list[int]) -> list[str]:
+    """Cells of one method."""
+    ours, (kind, share) = comparison.design, row.tightest
+    against = "" if ours is None or row is ours or np.isnan(row.cost) else f"{-100 * comparison.gain(row, ours):+.3g} %"
+    first = [*([row.cost] if comparison.weighted else []), row.criterion]
+    cells = [*(_number(n, 4) for n in first), against, _number(row.worst, 4), *(_number(row.std[j], 3) for j in shown)]
+    margin = f"{100.0 * share:.2g} % {kind.replace('_', ' ')}" if kind and np.isfinite(share) else "-"
+    mark = "▶ " if row is comparison.best else "  "
+    return [mark + escape(row.title), *cells, f"{row.seconds:.1f} s", f"{row.steps / 1e6:.2f} M", margin]
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if np.isnan(value) else f"{value:.{digits}g}"
+
+
+def _remarks(row: Row) -> list[str]:
+    return [*([] if row.sound else [row.outcome.value]), *([row.note] if row.note else [])]
+
+
+def _style(comparison: Comparison, row: Row) -> str:
+    """The design stands out, so does what beats it; what may not be played steps back."""
+    if not row.sound:
+        return "dim"
+    return "bold" if row.method == DESIGN else "yellow" if row in comparison.beating else ""
 
 
 def _lines(group: Combinations, check: Check) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mjfim import archive, plots, rerun_log
 from mjfim.checker import Check
+from mjfim.comparison import Comparison
 from mjfim.errors import ModelError
 from mjfim.identified import write_identified
 from mjfim.labels import Labels
@@ -16,7 +17,7 @@ from mjfim.trajectory import Design, Estimate, Study
 
 
 def leave_design(folder: Path, design: Design, setup: Setup) -> None:
-    """design.json, design.npz, design.csv, design.rrd and five pictures."""
+    """design.json, design.npz, design.csv, design.rrd and pictures."""
     archive.write_design(folder, design, setup)
     labels = Labels.of(setup)
     for name, figure in (
@@ -25,6 +26,7 @@ def leave_design(folder: Path, design: Design, setup: Setup) -> None:
         ("convergence", plots.convergence(design)),
         ("standard_deviations", plots.std_bars(design, labels)),
         ("table_eigenvalues", plots.design_table(design, labels)),
+        *((("limits", plots.limits(design)),) if design.usage else ()),
     ):
         plots.save(figure, folder / f"{name}.png")
     rerun_log.log_design(folder / "design.rrd", setup.model_at(setup.theta), design, labels)
@@ -34,6 +36,18 @@ def leave_check(folder: Path, check: Check) -> None:
     """check.json and a picture: accuracies and correlations."""
     archive.write_json(folder / "check.json", archive.check_summary(check))
     plots.save(plots.check_figure(check), folder / "check.png")
+
+
+def leave_comparison(folder: Path, comparison: Comparison, setup: Setup) -> None:
+    """compare.json, a picture, and the control that each method found, `initial.control` of a later experiment."""
+    for stale in list(folder.iterdir()):  # of an earlier run with other methods
+        if re.fullmatch(r"control_[\w-]+\.csv", stale.name):
+            stale.unlink()
+    archive.write_json(folder / "compare.json", archive.comparison_summary(comparison))
+    for row in comparison.rows:
+        if row.control is not None:
+            archive.write_control(folder / f"control_{row.method}.csv", row.control, setup)
+    plots.save(plots.compare_figure(comparison), folder / "compare.png")
 
 
 def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:

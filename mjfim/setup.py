@@ -29,6 +29,7 @@ from mjfim.unknowns import parameters_of
 
 MAX_SAMPLES = 10_000_000
 HOLDS = 4  # Gauss-Newton steps towards a control that holds a state; one does where forces are linear in it
+HELD = 0.1  # [s] for which a control that holds a state has to keep it below the velocity of boundary
 NO_ROTATION = 1e-6  # norm of a quaternion that says nothing
 
 
@@ -41,6 +42,7 @@ class Setup:
     stretch: 1, or how many times longer the timestep is than stated, and the engine steps of a sample fewer
     lifted: the plant has no clamps and stops where a design keeps the limits anyway
     coarsen: 1, or how many times longer timestep and sample period are than stated (coarse-to-fine descent)
+    playback_steps: engine steps from one row of design.csv to the next
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class Setup:
         self.coordinates = coordinates(self.model)
         self.controls = control_names(self.model)
         self.substeps = self._substeps()
+        self.playback_steps = self._playback_steps()
         measured_every = stride_of(e)
         self.stride = measured_every if self.coarsen == 1 else 1
         self.samples = self._samples() // self.coarsen
@@ -229,7 +232,7 @@ class Setup:
         return self._holding(self.target, rest, "boundary.end", "the end")
 
     def _holding(self, state: Array, guess: Array, key: str, where: str) -> Array:
-        """Control under which a sample leaves a state as it is, to the experiment's tolerance; Gauss-Newton from a guess."""
+        """Control that leaves a state as it is, to the experiment's tolerance; Gauss-Newton on a sample, from a guess."""
         plant, control = self.plant, np.array(guess)
         size = np.maximum(np.abs(control), 1.0)
 
@@ -244,12 +247,15 @@ class Setup:
             control = control - np.linalg.lstsq(B, rows[0])[0]
         left = drift(control[None])[0]
         nv = self.space.nv
-        pushed = np.abs(left[nv : 2 * nv]) / self.dt
-        worst = int(np.argmax(pushed))
-        if not pushed[worst] <= self.experiment.boundary.velocity / self.dt or np.abs(self.space.split(state)[1]).any():
+        pushed, speed = np.abs(left[nv : 2 * nv]) / self.dt, np.abs(self.space.split(state)[1])
+        worst = int(np.argmax(speed if speed.any() else pushed))
+        if not pushed[worst] * HELD <= self.experiment.boundary.velocity or speed.any():
             name = joint_names(self.model)[int(self.model.dof_jntid[worst])]
+            does = f"still accelerates by {pushed[worst]:.3g} per s²"
+            if speed.any():
+                does = f"moves at {speed[worst]:.3g} per s"
             raise ExperimentError(
-                f"{key}: no control holds {where}: joint {name!r} still accelerates by {pushed[worst]:.3g} per s²; begin and end "
+                f"{key}: no control holds {where}: joint {name!r} {does}; begin and end "
                 'where the model can stand still (qvel = 0, an equilibrium), or state start = "given", end = "free"'
             )
         return control
@@ -279,6 +285,21 @@ class Setup:
             )
         return n
 
+    def _playback_steps(self) -> int:
+        """Raises ExperimentError where the controller's rate fits neither samples nor timesteps."""
+        rate, wanted = self.experiment.rate, self.experiment.playback_rate
+        if wanted is None:
+            return self.substeps
+        valid = [k for k in range(1, self.substeps + 1) if self.substeps % k == 0]
+        rows = round(wanted / rate)
+        if rows not in valid or abs(wanted / rate - rows) > 1e-6 * rows:
+            listed = ", ".join(f"{k * rate:g}" for k in valid)
+            raise ExperimentError(
+                f"playback_rate: {wanted:g} Hz is not a multiple of rate ({rate:g} Hz) that divides the engine's rate "
+                f"({self.substeps * rate:g} Hz); valid: {listed}"
+            )
+        return self.substeps // rows
+
     def _samples(self) -> int:
         exact = self.experiment.horizon * self.experiment.rate
         N = round(exact)
@@ -300,8 +321,8 @@ class Setup:
     def _private(self) -> Source:
         friction = any("frictionloss" in t.path for p in self.parameters.parameters for t in p.targets)
         anything = friction or any(p.function is not None for p in self.parameters.parameters)
-        longer = self.coarsen * self.stretch
-        return self._source(self.outputs.needs_sensors, anything, longer, self._lift() if self.lifted else None)
+        longer, lifts = self.coarsen * self.stretch, self.lifted and self.experiment.limits.enforce
+        return self._source(self.outputs.needs_sensors, anything, longer, self._lift() if lifts else None)
 
     def _lift(self) -> Lifted:
         """Whatever the limits of the experiment keep a design away from."""

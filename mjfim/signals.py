@@ -13,6 +13,7 @@ from mjfim.errors import RecordingError, unknown
 from mjfim.experiment import Signal, by_name
 from mjfim.trajectory import Array
 
+OF_DESIGN = ("qpos:", "qvel:", "act:", "gain:")  # what a design.csv holds beside t and the control
 SPREAD = 0.17  # frequency of an actuator over that of the one before, less 1
 
 
@@ -92,7 +93,7 @@ def read_control(path: Path, t: Array, dt: float, names: tuple[str, ...], repeat
         while len(values) and np.isnan(values[-1]).all():
             stamps, values = stamps[:-1], values[:-1]
     known = {"t", *names, *(f"ctrl:{n}" for n in names)}
-    strays = [c for c in columns if c not in known and not c.startswith(("qpos:", "qvel:"))]
+    strays = [c for c in columns if c not in known and not c.startswith(OF_DESIGN)]
     if strays:
         raise RecordingError(f"{path}: {unknown('column', strays[0], ['t', *names])}")
     if not np.isfinite(values).all() or not np.isfinite(stamps).all():

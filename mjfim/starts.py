@@ -36,10 +36,11 @@ def starts_of(setup: Setup, given: Array | None) -> Iterator[Start]:
     begins, ends = e.boundary.start == "rest", e.boundary.end == "rest"
     rng = np.random.default_rng(d.seed)
     for frequency in d.fourier:
-        harmonics = int(min(SERIES, (e.limits.bandwidth or 0.5 * e.rate) / frequency))
+        most = e.limits.bandwidth or 0.5 * e.rate
+        harmonics = int(min(SERIES, most / frequency))
         if harmonics < 1:
             raise ExperimentError(
-                f"{e.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of {e.limits.bandwidth:g} Hz"
+                f"{e.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of {most:g} Hz"
             )
         series = fourier_basis(setup.t, e.horizon, frequency, harmonics, begins, ends)
         yield Start(f"Fourier series of {frequency:g} Hz", _random(setup, rng), series)

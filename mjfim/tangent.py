@@ -66,6 +66,13 @@ class StateSpace:
             out[..., v : v + 3] = logarithm(quaternion_product(conjugate, state[..., q : q + 4]))
         return out
 
+    def minus_slope(self, dx: Array) -> Array:
+        """(nx, nx) derivative of `minus` by a move of its state along the tangent space there, where it is dx: (nx,)."""
+        out = np.eye(self.nx)
+        for _, v in self.quaternions:
+            out[v : v + 3, v : v + 3] = logarithm_slope(dx[v : v + 3])
+        return out
+
 
 def quaternion_product(a: Array, b: Array) -> Array:
     """Hamilton product of (w, x, y, z) quaternions, (..., 4)."""
@@ -87,3 +94,14 @@ def logarithm(quaternion: Array) -> Array:
     angle = 2.0 * np.arctan2(length, np.abs(w))
     safe = np.where(length > 0.0, length, 1.0)
     return np.where(w < 0.0, -1.0, 1.0) * v * np.where(length > 0.0, angle / safe, 2.0)
+
+
+def logarithm_slope(rotation: Array) -> Array:
+    """(3, 3) derivative by e of the rotation vector of `exponential(rotation) * exponential(e)`; rotation: (3,), below pi."""
+    x, y, z = rotation
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = float(np.linalg.norm(rotation))
+    bend = 1.0 / 12.0
+    if angle > 1e-3:
+        bend = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+    return np.asarray(np.eye(3) + 0.5 * cross + bend * cross @ cross)

@@ -183,12 +183,29 @@ class Combined:
 
 
 @dataclass(frozen=True, eq=False)
+class Usage:
+    """How much of a limit a trajectory uses. kind: of the limit;  name: of the joint, the actuator or the nearest pair
+
+    t: (n,) [s];  share: (n,) -1 at the lower bound, 1 at the upper one; of a clearance, the least one over what there is
+    """
+
+    kind: str
+    name: str
+    t: Array
+    share: Array
+
+    def __post_init__(self) -> None:
+        freeze(self, "t", "share")
+
+
+@dataclass(frozen=True, eq=False)
 class Design:
     """Result of `mjfim.design`: the designed trajectory beside the one it started from.
 
     parameters: p names;  units: p units or empty strings;  theta: (p,) where the design was made
     slope: last |DJ.zeta|;  steps: MuJoCo steps taken;  seconds: wall time
-    limits: worst margin per kind of limit (positive = inside), by kind;  warnings: sentences for the user
+    limits: worst margin per kind of limit (positive = inside), by kind;  usage: of every limit at every engine step
+    warnings: sentences for the user
     found_by: name of the start that led here;  starts: all of them
     nuisance: names of the parameters that the design did not look at
     combinations: groups of parameters that are not identifiable alone, in words;  combined: what is identifiable of them
@@ -205,6 +222,7 @@ class Design:
     steps: int
     seconds: float
     limits: dict[str, float] = field(default_factory=dict)
+    usage: tuple[Usage, ...] = ()
     warnings: tuple[str, ...] = ()
     found_by: str = "initial control"
     starts: tuple[StartResult, ...] = ()

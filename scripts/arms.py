@@ -47,7 +47,7 @@ from mjfim.survey import survey
 from mjfim.trajectory import Array, Sensitivity
 
 MODELS = Path(__file__).resolve().parents[2] / "shared" / "models"
-RATE = 50.0  # [Hz] samples and control updates
+RATE, MEASURED = 100.0, 50.0  # [Hz] control updates, measurements
 NOISE = {"qpos": 1e-3, "qvel": 1e-2}  # [rad, rad/s] encoders and their filtered derivative, 1 sigma
 CLEARANCE = 0.02  # [m]
 CENTRE_SCALE = 0.05  # [m] unit of the coordinates of the payload's centre of mass
@@ -274,6 +274,7 @@ def experiment(
         directory=folder,
         source=path.stem,
         rate=RATE,
+        measure_rate=MEASURED,
         horizon=horizon,
         initial={"keyframe": "home", "control": control.name},
         parameters=parameters(arm, friction),

@@ -26,6 +26,7 @@ DESIGN = {
     "design.json",
     "design.npz",
     "design.csv",
+    "reference.csv",
     "design.rrd",
     "trajectories.png",
     "sensitivity_phase.png",
@@ -261,7 +262,7 @@ def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
     ("lines", "status", "satisfied"),
     [
         ({"max_iterations": "1"}, "max_iterations", True),
-        ({"max_iterations": "40\n[limits]\nvelocity = { slide = 1e-3 }"}, "converged", False),
+        ({"max_iterations": "40\n[limits]\nvelocity = { slide = 1e-3 }\nenforce = false"}, "converged", False),
     ],
     ids=["not-converged", "limits-violated"],
 )

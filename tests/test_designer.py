@@ -56,9 +56,9 @@ def test_actuator_delays_are_refused(experiment: Experiment, tmp_path: Path) -> 
 
 def test_saturation_is_said(experiment: Experiment, tmp_path: Path) -> None:
     old, new = 'joint="slide"/>', 'joint="slide" forcelimited="true" forcerange="-1.5 1.5"/>'
-    weak = altered(
-        tmp_path, experiment, f'<motor name="force" {old}', f'<motor name="force" {new}', descent={"max_iterations": 8}
-    )
+    # hard limits, the default now, keep a design off the clamp: only what is not enforced can rest on it
+    tables = {"descent": {"max_iterations": 8}, "limits": {"enforce": False}}
+    weak = altered(tmp_path, experiment, f'<motor name="force" {old}', f'<motor name="force" {new}', **tables)
     design = mjfim.design(weak)
     assert any("forcerange clamps force" in sentence for sentence in design.warnings)
     assert not any("forcerange" in sentence for sentence in mjfim.design(experiment).warnings)
@@ -75,7 +75,8 @@ def test_instability_is_said(experiment: Experiment) -> None:
 
 
 def test_limits_that_are_left_are_said_and_no_success(experiment: Experiment) -> None:
-    tight = experiment.replace(limits={"control": {"force": [-1.0, 1.0]}})
+    # by default limits hold now; here they are only to be checked
+    tight = experiment.replace(limits={"control": {"force": [-1.0, 1.0]}, "enforce": False})
     design = mjfim.design(tight)
     assert design.limits["control"] < 0
     assert not design.success

@@ -390,7 +390,20 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "parameters.m.targets.0.scal", "offset, path, scale"],
     ),
-    "limits key": (LEAST + "[limits]\nspeed = 1\n", E, [HOME, "limits.speed", "control, position, velocity"]),
+    "limits key": (
+        LEAST + "[limits]\nspeed = 1\n",
+        E,
+        [
+            HOME,
+            "limits.speed",
+            "acceleration, bandwidth, clearance, control, control_rate, enforce, force, ignored, position, velocity",
+        ],
+    ),
+    "boundary key": (
+        LEAST + "[boundary]\nbegin = 1\n",
+        E,
+        [HOME, "boundary.begin", "end, keyframe, position, start, velocity"],
+    ),
     "descent key": (
         LEAST + "[descent]\niterations = 1\n",
         E,
@@ -531,11 +544,16 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "cost.tracking.slide", "greater than or equal to 0"],
     ),
-    "control weight": (edited("[cost]", "[cost]\ncontrol = -1"), E, [HOME, "cost.control", "greater than 0", "-1"]),
+    # a weight of 0 is for controls with a hard range; without one it is the fault after this one
+    "control weight": (
+        edited("[cost]", "[cost]\ncontrol = -1"),
+        E,
+        [HOME, "cost.control", "greater than or equal to 0", "-1"],
+    ),
     "no control weight": (
         edited("[cost]", "[cost]\ncontrol = {}"),
         E,
-        [HOME, "cost.control", "actuator 'force' has no weight"],
+        [HOME, "cost.control", "actuator 'force' has neither a weight nor a range", "limits.control.force"],
     ),
     "criterion": (
         edited("[cost]", '[cost]\ncriterion = "F"'),

@@ -10,9 +10,9 @@ from numerics import CART_PARAMETERS, cart_setup, relative_error, richardson
 
 from mjfim.criteria import CRITERIA
 from mjfim.designer import design
-from mjfim.evaluation import evaluate_trajectory
 from mjfim.errors import UnidentifiableError
 from mjfim.estimate import identify
+from mjfim.evaluation import evaluate_trajectory
 from mjfim.fisher import Information, standard_deviations
 from mjfim.montecarlo import simulate
 from mjfim.noise import Noise

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from mjfim.lq import Recursion, descent, growth, regulator
+from mjfim.lq import Recursion, TangentCurve, Weights, descent, growth, regulator, weighted_descent
 
 
 def random_system(rng: np.random.Generator, N: int, nx: int, nu: int) -> tuple[np.ndarray, np.ndarray]:
@@ -41,6 +41,24 @@ def dense_solution(A, B, a, b, Q, R, terminal) -> tuple[np.ndarray, np.ndarray]:
     solution = np.linalg.solve(KKT, np.concatenate([-g, np.zeros(nz)]))
     z = np.concatenate([np.zeros((1, nx)), solution[:nz].reshape(N, nx)])
     return z, solution[nz : nz + nv].reshape(N, nu)
+
+
+def random_weights(rng: np.random.Generator, N: int, nx: int, nu: int, steps: bool) -> Weights:
+    """Weights that vary over time and couple state and control, positive definite together; zero or positive on steps."""
+    both = [positive(rng, nx + nu) for _ in range(N)]
+    Q = np.array([*(form[:nx, :nx] for form in both), positive(rng, nx)])
+    S, R = np.array([form[nx:, :nx] for form in both]), np.array([form[nx:, nx:] for form in both])
+    return Weights(Q, S, R, rng.uniform(0.0, 5.0, (N + 1, nu)) * steps)
+
+
+def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
+    """The quadratic form, sample by sample."""
+    total, before = float(z[-1] @ weights.Q[-1] @ z[-1]), np.zeros(v.shape[1])
+    for k, now in enumerate(v):
+        total += z[k] @ weights.Q[k] @ z[k] + 2 * now @ weights.S[k] @ z[k] + now @ weights.R[k] @ now
+        total += weights.W[k] @ (now - before) ** 2
+        before = now
+    return total + weights.W[-1] @ before**2
 
 
 @pytest.mark.parametrize("sizes", [(1, 1), (7, 1), (1, 3), (30, 4)])
@@ -155,6 +173,48 @@ def test_descent_without_weight_on_the_state_is_the_dense_kkt_solution() -> None
     z, v = dense_solution(A, B, a, b, none, R, none)
     np.testing.assert_allclose(zeta.z, z, rtol=0, atol=1e-10 * np.abs(z).max())
     np.testing.assert_allclose(zeta.v, v, rtol=0, atol=1e-10 * np.abs(v).max())
+
+
+@pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
+@pytest.mark.parametrize("sizes", [(1, 2, 1), (2, 1, 1), (8, 3, 2), (25, 4, 1)])
+def test_weighted_descent_solves_the_dense_normal_equations(sizes: tuple[int, int, int], steps: bool) -> None:
+    N, nx, nu = sizes
+    rng = np.random.default_rng(N + 10 * nx)
+    A, B = random_system(rng, N, nx, nu)
+    a, b, weights = rng.normal(size=(N + 1, nx)), rng.normal(size=(N, nu)), random_weights(rng, N, nx, nu, steps)
+
+    def response(v: np.ndarray) -> np.ndarray:
+        return Recursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
+
+    def cost(v: np.ndarray) -> tuple[float, float]:
+        z = response(v)
+        return float(np.sum(a * z) + np.sum(b * v)), form(weights, z, v)
+
+    units = np.eye(N * nu).reshape(-1, N, nu)
+    g, diagonal = np.array([cost(e) for e in units]).T
+    pairs = np.array([[cost(e + f)[1] for f in units] for e in units])
+    H = 0.5 * (pairs - diagonal[:, None] - diagonal)  # by polarisation
+    best = -np.linalg.solve(H, g).reshape(N, nu)
+    zeta = weighted_descent(A, B, a, b, weights)
+    np.testing.assert_allclose(zeta.v, best, rtol=0, atol=1e-8 * np.abs(best).max())
+    np.testing.assert_allclose(zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0))
+    # every weight is seen
+    for name in ("S", "W") if steps else ("S",):
+        other = Weights(**{**weights.__dict__, name: 0.5 * getattr(weights, name)})
+        assert np.abs(weighted_descent(A, B, a, b, other).v - best).max() > 1e-4 * np.abs(best).max() or (
+            name == "S" and N == 1  # z_0 = 0
+        )
+
+
+def test_force_is_half_the_derivative_of_the_form() -> None:
+    rng = np.random.default_rng(21)
+    N, nx, nu = 9, 3, 2
+    weights = random_weights(rng, N, nx, nu, steps=True)
+    z, v, dz, dv = (rng.normal(size=s) for s in ((N + 1, nx), (N, nu), (N + 1, nx), (N, nu)))
+    a, b = weights.force(TangentCurve(z, v))
+    slope = 0.5 * (form(weights, z + dz, v + dv) - form(weights, z - dz, v - dv)) / 2.0  # a quadratic: exact
+    assert np.sum(a * dz) + np.sum(b * dv) == pytest.approx(slope, rel=1e-12)
+    assert np.sum(a * z) + np.sum(b * v) == pytest.approx(form(weights, z, v), rel=1e-12)
 
 
 def test_descent_is_feasible_optimal_and_goes_down_by_its_own_metric() -> None:

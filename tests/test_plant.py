@@ -455,7 +455,7 @@ def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None
     np.testing.assert_array_equal(y[[0, 2, 3]], alone[[0, 2, 3]])
     states, ctrl = setup.initial.state, np.repeat(setup.control, 1, axis=0)
     for count in (5, 50, 1, 12):
-        out, _ = setup.plant.engine.step([setup.plant.model(setup.theta)], states[:count], ctrl[:count])
+        out = setup.plant.engine.step([setup.plant.model(setup.theta)], states[:count], ctrl[:count]).states
         np.testing.assert_array_equal(out, states[1 : count + 1])
 
 
@@ -701,8 +701,8 @@ def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> Non
     model, K = setup.plant.model(setup.theta), np.zeros((setup.samples, 1, 4))
     closed, _, _ = setup.plant.engine.closed_loop(model, setup.initial.state, setup.control, K)
     np.testing.assert_allclose(closed, wanted, **tolerance)
-    stepped, _ = setup.plant.engine.step([model], wanted[:-1], setup.control)
-    np.testing.assert_allclose(stepped, wanted[1:], **tolerance)
+    stepped = setup.plant.engine.step([model], wanted[:-1], setup.control)
+    np.testing.assert_allclose(stepped.states, wanted[1:], **tolerance)
     whole = setup.model_at(setup.theta)
     np.testing.assert_allclose(whole.eq_data, setup.model.eq_data, atol=1e-12)
     np.testing.assert_array_equal(mujoco.MjData(whole).mocap_pos, [[0.6, 0, 0], [0.2, 1.1, 0]])
@@ -730,7 +730,8 @@ def test_clocks_begin_at_zero(tmp_path) -> None:
     y, _ = setup.plant.measure(setup.theta[None], setup.control)
     t = np.arange(setup.samples + 1) * setup.dt
     np.testing.assert_allclose(y[0, :, setup.outputs.names.index("clock")], t, atol=1e-12)
-    _, sensed = setup.plant.engine.step([setup.plant.model(setup.theta)], setup.initial.state[:1], setup.control[:1])
+    model = setup.plant.model(setup.theta)
+    sensed = setup.plant.engine.step([model], setup.initial.state[:1], setup.control[:1]).sensors
     assert sensed is not None
     assert sensed[0, setup.model.sensor("clock").adr[0]] == 0.0
 

@@ -64,7 +64,7 @@ def test_further_tables_extend_it() -> None:
     for tables in further:
         merged = {**whole, **{k: {**whole.get(k, {}), **v} for k, v in tables.items()}}
         setup = Setup(Experiment(**merged, directory=ROOT / "models"))
-        assert set(tables["parameters"]) < set(setup.parameters.names)
+        assert set(tables.get("parameters", {})) < set(setup.parameters.names)
         assert np.isfinite(setup.problem.point(setup.initial).cost)
 
 

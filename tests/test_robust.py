@@ -11,8 +11,8 @@ from numerics import CART_PARAMETERS, Array, body_setup, cart_setup
 from scipy.stats import norm
 
 from mjfim.designer import design
-from mjfim.evaluation import evaluate_trajectory
 from mjfim.errors import ExperimentError
+from mjfim.evaluation import evaluate_trajectory
 from mjfim.parameters import Parameter, ParameterSet
 from mjfim.robust import Pool, sampled
 from mjfim.setup import Setup

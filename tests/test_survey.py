@@ -13,7 +13,8 @@ import mjfim.survey
 from mjfim.designer import design
 from mjfim.errors import SimulationDiverged, UnidentifiableError
 from mjfim.setup import Setup
-from mjfim.survey import Survey, require_designable, require_visible, rows, survey
+from mjfim.starts import probes
+from mjfim.survey import PROBES, Survey, require_designable, require_visible, rows, survey
 
 PRODUCT = {
     "gear": {"target": "actuator/force:gear[0]"},
@@ -58,10 +59,10 @@ def look(setup: Setup) -> Survey:
 
 
 def test_an_experiment_that_shows_everything_needs_no_random_controls(tmp_path, monkeypatch) -> None:
-    def refused(setup: Setup) -> None:
+    def refused(setup: Setup, count: int) -> None:
         raise AssertionError("not needed")
 
-    monkeypatch.setattr(mjfim.survey, "_probes", refused)
+    monkeypatch.setattr(mjfim.survey, "probes", refused)
     seen = look(cart_setup(tmp_path))
     assert seen.basis is None
     assert (seen.here.count, seen.always.count) == (0, 0)
@@ -174,14 +175,14 @@ def test_a_contact_shorter_than_a_sample_period_shows_its_stiffness(tmp_path) ->
 
 def controls(setup: Setup) -> list[Array]:
     """Controls of the random trajectories."""
-    return [probe.ctrl for probe in mjfim.survey._probes(setup)]
+    return [probe.ctrl for probe in probes(setup, PROBES)]
 
 
 def test_random_controls_keep_to_the_actuators_and_about_the_initial_one(tmp_path) -> None:
     control = {"kind": "sine", "amplitude": {"left": 0.8, "right": 3.0}, "offset": {"left": 0.1, "right": 5.0}}
     setup = two_setup(tmp_path, initial={"control": {**control, "frequency": 2.0}})
     made = controls(setup)
-    assert len(made) == mjfim.survey.PROBES
+    assert len(made) == PROBES
     left, right = np.array(made).transpose(2, 0, 1)
     assert np.abs(left).max() == 1.0  # the range is reached, and kept
     assert np.abs(right.mean(axis=1) - 5.0).max() < 1.5

@@ -141,3 +141,16 @@ def test_inputs_are_left_alone(model) -> None:
     space.minus(space.plus(states, dx), states)
     np.testing.assert_array_equal(states, kept)
     np.testing.assert_array_equal(dx, step)
+
+
+def test_the_slope_of_a_difference_is_that_of_nearby_differences(model) -> None:
+    """Also where rotations are small, and where they are nearly half a turn."""
+    space, rng, h = state_space(model), np.random.default_rng(9), 1e-6
+    origin = random_states(space, rng, 1)[0]
+    for longest in (1e-9, 1e-2, 3.0):
+        dx = random_steps(space, longest, rng, 1)[0]
+        state = space.plus(origin, dx)
+        moved = space.plus(state, h * np.eye(space.nx)), space.plus(state, -h * np.eye(space.nx))
+        slope = (space.minus(moved[0], origin) - space.minus(moved[1], origin)).T / (2 * h)
+        np.testing.assert_allclose(space.minus_slope(space.minus(state, origin)), slope, rtol=0, atol=1e-7)
+    assert np.abs(slope - np.eye(space.nx)).max() > 0.1

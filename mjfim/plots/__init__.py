@@ -6,18 +6,22 @@ This package is the only importer of matplotlib.
 from __future__ import annotations
 
 from mjfim.plots.check import check_figure
+from mjfim.plots.compare import compare_figure
 from mjfim.plots.design import convergence, sensitivity_phase, trajectories
 from mjfim.plots.estimates import fit, histogram
+from mjfim.plots.limits import limits
 from mjfim.plots.parameters import parameter_intervals, std_bars
 from mjfim.plots.style import save
 from mjfim.plots.tables import design_table, study_table
 
 __all__ = [
     "check_figure",
+    "compare_figure",
     "convergence",
     "design_table",
     "fit",
     "histogram",
+    "limits",
     "parameter_intervals",
     "save",
     "sensitivity_phase",

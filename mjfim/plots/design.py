@@ -217,6 +217,10 @@ def convergence(design: Design) -> Figure:
             fontsize=SMALL,
             color=MUTED,
         )
+    mus = np.array([row.mu for row in history])
+    for k in np.flatnonzero(np.diff(mus)):
+        for axes in top:
+            axes.axvline(iterations[k + 1], color=FAINT, linewidth=1.0, linestyle="--", zorder=0)
     names = ("cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]")
     for axes, name in zip(top, names, strict=True):
         dress(axes, "iteration [–]", name)
@@ -226,5 +230,10 @@ def convergence(design: Design) -> Figure:
         for name, colour in (("initial", INITIAL), ("optimized", OPTIMIZED))
     ]
     line = Line2D([], [], color=MUTED, linestyle=":", label="slope / J")
-    headline(figure, "Convergence", [*dots, line], f"{design.status.value}.")
+    told = (
+        " Dashed: the barrier of the limits gets sharper; slope and cost are then of log J and barrier."
+        if mus.any()
+        else ""
+    )
+    headline(figure, "Convergence", [*dots, line], f"{design.status.value}.{told}")
     return figure

@@ -1,0 +1,157 @@
+"""Bases of controls: splines of a bandwidth, Fourier series that begin and end at rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from mjfim.basis import fourier_basis, independent, spline_basis
+
+HORIZON = 2.0
+BANDWIDTH = 4.0
+PIECES = 16  # 2 * BANDWIDTH * HORIZON
+T = np.arange(2000) * (HORIZON / 2000)
+CASES = {
+    "free": (False, False, False, PIECES + 3),
+    "begins": (True, False, False, PIECES + 1),
+    "ends": (False, True, False, PIECES + 1),
+    "rest to rest": (True, True, False, PIECES - 1),
+    "periodic": (False, False, True, PIECES),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_spline_basis_spans_all_splines_of_its_knots_and_ends(name: str) -> None:
+    """It has full rank; random cubic splines with these knots and conditions lie in it, those of finer knots do not."""
+    begins, ends, periodic, count = CASES[name]
+    basis = spline_basis(T, HORIZON, BANDWIDTH, begins, ends, periodic)
+    assert basis.shape == (len(T), count)
+    assert np.linalg.matrix_rank(basis) == count
+
+    def left_out(pieces: int) -> float:
+        knots = np.linspace(0.0, HORIZON, pieces + 1)
+        values = np.random.default_rng(1).normal(size=pieces + 1)
+        kinds = ["clamped" if begins else "natural", "clamped" if ends else "natural"]
+        conditions = [(1, 0.0) if kind == "clamped" else (2, 0.0) for kind in kinds]
+        if begins:
+            values[0] = 0.0
+        if ends:
+            values[-1] = 0.0
+        if periodic:
+            values[-1] = values[0]
+        curve = CubicSpline(knots, values, bc_type="periodic" if periodic else tuple(conditions))(T)
+        rest = curve - basis @ np.linalg.lstsq(basis, curve)[0]
+        return float(np.abs(rest).max() / np.abs(curve).max())
+
+    assert left_out(PIECES) < 1e-10
+    assert left_out(PIECES + 3) > 1e-2
+
+
+def ends_of(basis: np.ndarray, t: np.ndarray, at: float) -> tuple[float, float]:
+    """Largest value and slope of any column at a time, by the cubics through its samples beside it."""
+    order = np.argsort(np.abs(t - at))[:4]
+    fits = np.polyfit(t[order] - at, basis[order], 3)
+    return float(np.abs(fits[3]).max()), float(np.abs(fits[2]).max())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_value_and_slope_are_zero_at_ends_at_rest_and_only_there(name: str) -> None:
+    begins, ends, periodic, _ = CASES[name]
+    fine = np.linspace(0.0, HORIZON, 4001)[:-1]
+    basis = spline_basis(fine, HORIZON, BANDWIDTH, begins, ends, periodic)
+    for at, rest in ((0.0, begins), (HORIZON, ends)):
+        value, slope = ends_of(basis, fine, at)
+        assert (value < 1e-9) is rest
+        assert (slope < 1e-6) is rest
+
+
+def test_a_periodic_basis_meets_itself_with_two_derivatives() -> None:
+    """Turned by a knot it is the same basis; its third derivative is the first that jumps, there as anywhere."""
+    fine = np.linspace(0.0, HORIZON, 3201)[:-1]
+    basis = spline_basis(fine, HORIZON, BANDWIDTH, False, False, True)
+    turned = np.roll(basis, len(fine) // PIECES, axis=0)
+    np.testing.assert_allclose(turned, np.roll(basis, -1, axis=1), rtol=0, atol=1e-12)
+    assert np.abs(basis[0] - basis[-1]).max() < 0.02 * np.abs(basis).max()
+    jumps = []
+    for order in (1, 2, 3):  # the largest change of a derivative from sample to sample, over the derivative
+        around = np.diff(np.concatenate([basis, basis[: order + 1]]), order, axis=0)
+        jumps.append(np.abs(np.diff(around, axis=0)).max() / np.abs(around).max())
+    assert jumps[0] < 0.02 and jumps[1] < 0.02 and jumps[2] > 0.5
+
+
+def test_there_is_little_above_the_bandwidth_and_much_below() -> None:
+    """Of random periodic splines, whose spectrum is not that of the window."""
+    basis = spline_basis(T, HORIZON, BANDWIDTH, False, False, True)
+    curves = basis @ np.random.default_rng(3).normal(size=(basis.shape[1], 20))
+    power = np.abs(np.fft.rfft(curves, axis=0)) ** 2
+    f = np.fft.rfftfreq(len(T), T[1])
+    above = power[f > 2.0 * BANDWIDTH].sum(axis=0) / power.sum(axis=0)
+    assert above.max() < 1e-2
+    assert (power[f > 1.2 * BANDWIDTH].sum(axis=0) / power.sum(axis=0)).max() < 0.1
+    assert (power[f <= BANDWIDTH].sum(axis=0) / power.sum(axis=0)).min() > 0.8
+    narrow = spline_basis(T, HORIZON, BANDWIDTH / 4.0, False, False, True)
+    wave = np.sin(2 * np.pi * BANDWIDTH * T)
+    assert np.abs(narrow @ np.linalg.lstsq(narrow, wave)[0]).max() < 0.1  # what is too quick it does not follow
+
+
+def test_a_bandwidth_below_that_of_the_horizon_leaves_a_few_splines() -> None:
+    assert spline_basis(T, HORIZON, 0.01, True, True, False).shape[1] == 3
+    assert spline_basis(T, HORIZON, 0.01, False, False, True).shape[1] == 4
+
+
+HARMONICS = 5
+
+
+def waves(t: np.ndarray, frequency: float) -> np.ndarray:
+    """The plain sines and cosines."""
+    angle = 2 * np.pi * frequency * np.outer(t, np.arange(1, HARMONICS + 1))
+    return np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
+
+
+@pytest.mark.parametrize(("begins", "ends"), [(False, False), (True, False), (False, True), (True, True)])
+@pytest.mark.parametrize("frequency", [0.5, 0.37], ids=["period divides", "period does not divide"])
+def test_a_fourier_series_at_rest_differs_by_one_polynomial_of_least_degree(
+    begins: bool, ends: bool, frequency: float
+) -> None:
+    """Value and two derivatives vanish at ends at rest, by differences of the samples; elsewhere they do not."""
+    t = np.linspace(0.0, HORIZON, 20001)
+    basis = fourier_basis(t, HORIZON, frequency, HARMONICS, begins, ends)
+    assert basis.shape == (len(t), 2 * HARMONICS)
+    for rows, rest in ((slice(None, 6), begins), (slice(None, -7, -1), ends)):
+        fits = np.polyfit((t[rows] - t[rows][0]) / t[1], basis[rows], 5)[::-1]
+        unit = float(2 * np.pi * frequency * HARMONICS * t[1])
+        sizes = [float(np.abs(fit).max()) / unit**k for k, fit in enumerate(fits[:3])]
+        assert (max(sizes) < 1e-6) is rest
+        assert rest or sizes[0] > 0.1
+    degree = 3 * (begins + ends)
+    rest = basis - waves(t, frequency)
+    powers = (t[:, None] / HORIZON) ** np.arange(degree) if degree else np.zeros((len(t), 1))
+    left = rest - powers @ np.linalg.lstsq(powers, rest)[0]
+    assert np.abs(left).max() < 1e-9
+
+
+@pytest.mark.parametrize(("begins", "ends"), [(False, False), (True, False), (True, True)])
+@pytest.mark.parametrize("frequency", [0.65, 1.0], ids=["period does not divide", "period divides"])
+def test_a_fourier_series_keeps_as_many_dimensions_as_it_has_waves(frequency: float, begins: bool, ends: bool) -> None:
+    basis = fourier_basis(T, HORIZON, frequency, HARMONICS, begins, ends)
+    values = np.linalg.svd(basis, compute_uv=False)
+    assert len(values) == 2 * HARMONICS
+    assert values[-1] > 1e-4 * values[0]
+    assert independent(basis) is basis
+
+
+@pytest.mark.parametrize("name", ["slow waves", "splines finer than samples"])
+def test_curves_that_are_hardly_independent_are_replaced_by_fewer_that_are(name: str) -> None:
+    """They span all that is more than faint, and no metric on them is singular."""
+    curves = fourier_basis(T, HORIZON, 0.35, 15, True, True)
+    if name != "slow waves":
+        curves = spline_basis(T[::50], HORIZON, 15.0, False, False, False)
+    N, M = curves.shape
+    fewer = independent(curves)
+    assert 0.3 * M < fewer.shape[1] < M and fewer.shape[1] <= N
+    assert np.linalg.cond(fewer) < 1.0 + 1e-9
+    assert np.linalg.norm(fewer[:, 0]) == pytest.approx(np.sqrt(0.5 * N))
+    left = curves - fewer @ np.linalg.lstsq(fewer, curves)[0]
+    assert np.linalg.norm(left, 2) < 1e-4 * np.linalg.norm(curves, 2)
+    assert np.linalg.cond(curves.T @ curves) > 1e14
