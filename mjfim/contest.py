@@ -107,10 +107,11 @@ class Contest:
         held: Mapping[str, float] | None = None,
     ) -> Iterator[HistoryRow]:
         """Every iterate of one descent per start, at most `budget` each."""
+        stated = level.experiment.descent.tolerance
         common = Task(
             level.experiment,
             starts[0],
-            rungs,
+            replace(rungs, tolerance=max(rungs.tolerance, stated)),
             max(budget, 1),
             seconds,
             self.combinations,

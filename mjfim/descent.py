@@ -113,24 +113,28 @@ MEETING = 1.02  # second over smallest eigenvalue at which E-optimality turns sm
 NEAR = 1.2  # the same for a descent that stalled
 POWERS = (40.0, 160.0)
 CLOSE = 1.01  # smooth over exact criterion that is good enough
+CLAMPED = 10  # iterates in a row that may rest on a clamp of the model before a barrier keeps them off it
 
 
 def descend(stages: Sequence[Stage], control: Array, run: Run, fence: Fence | None = None) -> Iterator[HistoryRow]:
     """Follow Algorithm 1 from one control through the levels, coarse to fine, keeping `run` up to date.
 
-    With a fence it ends where an iterate leaves the limits, its control the last one inside.
+    With a fence it ends where an iterate leaves the limits, or several in a row rest on a clamp; its control is the last inside.
     Where the smallest eigenvalues meet, E-optimality goes on with the smooth criterion, on this level and all finer ones.
     """
-    power, memory, given = np.inf, None, control
+    power, memory, given, clamped = np.inf, None, control, 0
     for level in stages:
         while True:
             stage = replace(level, power=power)
             pass_ = _Pass(stage, (control, given), run, memory)
             for row in pass_.rows():
-                if fence is not None and _leaves(level.setup, fence, pass_.control):
+                margin = np.inf if fence is None else _margin(level.setup, fence, pass_.control)
+                clamped = clamped + 1 if margin == 0.0 else 0
+                if margin < 0.0 or clamped > CLAMPED:
                     run.outside = True
                     return
-                run.control = pass_.control
+                if not clamped:
+                    run.control = pass_.control
                 yield row
             if pass_.failed:
                 return
@@ -139,15 +143,18 @@ def descend(stages: Sequence[Stage], control: Array, run: Run, fence: Fence | No
             memory = None if again else pass_.direction
             if not again:
                 break
+    run.outside = clamped > 0
 
 
-def _leaves(setup: Setup, fence: Fence, control: Array) -> bool:
-    """Whether a control at the stated rate leaves the limits at some engine step of the level, or its forces are clamped."""
+def _margin(setup: Setup, fence: Fence, control: Array) -> float:
+    """Sign of the worst margin at any engine step of the level, for a control at the stated rate; 0 where a force is clamped."""
     watched = setup.plant.watch(setup.theta, setup.averaged(control), fence.taps)
     if watched is None:
-        return True
+        return -1.0
     margins = fence.margins(fence.sight(*watched, slopes=False))
-    return any(m < 0.0 or (m == 0.0 and kind in ("force", "joint_force")) for kind, m in margins.items())
+    if min(margins.values(), default=1.0) < 0.0:
+        return -1.0
+    return float(all(margins.get(kind, 1.0) > 0.0 for kind in ("force", "joint_force")))
 
 
 def _sharper(stage: Stage, done: _Pass) -> tuple[float, bool]:

@@ -8,7 +8,7 @@ counts is the best iterate within the limits at all samples, evaluated anew.
 
 Many local optima lie close together, so starts are searched on a grid with fewer samples (N = 100: a twelfth of the
 time per start) and the promising ones refined on the full grid.  With `--search 400` every start is solved in full.
-Starts are small: from multisines of 0.01 N 80 % reach the best basin, from 1..5 N 30 %, from 5 N 20 %.
+Starts are small: from multisines of 0.01 N 75 % reach the best basin, from 1..5 N 28 %, from 5 N 19 % (150 starts each).
 
 Usage:  python scripts/casadi_limits.py --seconds 60 --seed 0 [--processes 2] [--search 400] [--peak 1 5]
 """
@@ -373,8 +373,23 @@ def limited_starts(
         return merged([task.result() for task in tasks])
 
 
+def show(run: LimitedRun, seconds: float) -> None:
+    """Print every solve, the best lambda_min by time and the switches of the best control."""
+    print(f"built in {run.build_seconds:.1f} s; {len(run.searched)} starts, {len(run.refined)} refined")
+    print("          process  start  lambda_min  violation  iter      s    at s")
+    for name, solves in (("searched", run.searched), ("refined", run.refined)):
+        for r in solves:
+            result = f"{r.process:7d}  {r.start:5d}  {r.information:10.3f}  {r.violation:9.1e}  {r.iterations:4d}"
+            note = "" if r.converged else "  not converged"
+            print(f"{name:8}  {result}  {r.seconds:5.1f}  {r.ended:6.1f}{note}")
+    marks = [t for t in (10.0, 30.0, 60.0, 120.0) if t < seconds] + [np.inf]
+    print("best after " + ", ".join(f"{min(t, seconds):g} s: {run.information_at(t):.3f}" for t in marks))
+    if run.best is not None:
+        print("switches of the best [s]: " + " ".join(f"{t:.2f}" for t in switches(run.best.u)))
+
+
 def main() -> None:
-    """Print every solve that ends on the full grid, and the best lambda_min by time."""
+    """Solve as the command line says."""
     parser = argparse.ArgumentParser(description="Multi-start of the hard-limited design with CasADi + IPOPT.")
     parser.add_argument("--seconds", type=float, default=60.0, help="wall time after building")
     parser.add_argument("--seed", type=int, default=0)
@@ -386,22 +401,9 @@ def main() -> None:
     given = parser.parse_args()
     draw = Draw(given.starts, tuple(given.peak))
     run = limited_starts(given.seconds, given.seed, given.processes, given.search, draw)
-    print(f"built in {run.build_seconds:.1f} s; {len(run.searched)} starts, {len(run.refined)} refined")
-    print(
-        f"{'':8}  {'process':>7}  {'start':>5}  {'lambda_min':>10}  {'violation':>9}  {'iter':>4}  {'s':>5}  {'at s':>6}"
-    )
-    for name, solves in (("searched", run.searched), ("refined", run.refined)):
-        for r in solves:
-            row = (
-                f"{name:8}  {r.process:7d}  {r.start:5d}  {r.information:10.3f}  {r.violation:9.1e}  {r.iterations:4d}"
-            )
-            print(f"{row}  {r.seconds:5.1f}  {r.ended:6.1f}{'' if r.converged else '  not converged'}")
-    marks = [t for t in (10.0, 30.0, 60.0, 120.0) if t < given.seconds] + [given.seconds]
-    print("best after " + ", ".join(f"{t:g} s: {run.information_at(t):.3f}" for t in marks))
-    if run.best is not None:
-        print("switches of the best [s]: " + " ".join(f"{t:.2f}" for t in switches(run.best.u)))
-        if given.save:
-            np.save(given.save, run.best.u)
+    show(run, given.seconds)
+    if given.save and run.best is not None:
+        np.save(given.save, run.best.u)
 
 
 if __name__ == "__main__":

@@ -137,12 +137,13 @@ def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
 
 
 def test_csv_plays_back(folder: Path, design: Design, setup: Setup) -> None:
-    """Columns by name, all digits, no control in the last row; and it starts another design as it is."""
+    """Columns by name, all digits, no control in the last row; and it starts another design as it is. Gains stand behind."""
     with (folder / "design.csv").open(newline="", encoding="utf-8") as stream:
         header, *rows = csv.reader(stream)
-    assert header == ["t", "qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge", "ctrl:force"]
+    states = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
+    assert header == ["t", *states, "ctrl:force", *(f"gain:force:{name}" for name in states)]
     assert len(rows) == N + 1
-    assert rows[-1][-1] == ""
+    assert rows[-1][5] == ""
     curve = design.trajectory
     assert [float(row[2]) for row in rows] == curve.qpos[:, 1].tolist()
     assert [float(row[5]) for row in rows[:-1]] == curve.ctrl[:, 0].tolist()

@@ -27,6 +27,7 @@ from mjfim.identified import write_spec
 from mjfim.lq import Recursion, TangentCurve, regulator
 from mjfim.models import Source, compile_spec, load_spec, unconstrained
 from mjfim.plant import CENTRAL, FAST
+from mjfim.quiet import quiet
 from mjfim.setup import Setup
 from mjfim.trajectory import Linearization
 
@@ -404,6 +405,21 @@ def test_linearising_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_p
     states[20, 2] = bad
     with pytest.raises(SimulationDiverged, match="linearising"):
         setup.plant.linearize(setup.theta, setup.plant.trajectory(states, setup.initial.ctrl))
+
+
+def test_quiet_blocks_may_overlap_in_threads() -> None:
+    """Quiet until the last one is left, and as it was after that."""
+    before = mujoco.MjLogConfig.get()
+    first, second = quiet(), quiet()
+    for block in (first, second):
+        block.__enter__()
+    for block in (first, second):
+        config = mujoco.MjLogConfig.get()
+        assert (config.logto_console, config.logto_file) == (False, False)
+        block.__exit__(None, None, None)
+    after = mujoco.MjLogConfig.get()
+    assert (after.logto_console, after.logto_file) == (before.logto_console, before.logto_file)
+    assert after.logto_console or after.logto_file
 
 
 def test_mujoco_itself_would_have_made_that_noise(tmp_path, monkeypatch, capfd) -> None:
