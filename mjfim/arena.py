@@ -67,6 +67,7 @@ class Arena:
     """One experiment, a budget, and the best control so far.
 
     holds: whether limits hold at all;  exact: the cost by which all are judged
+    grace: looks at the budget before a share of it counts
     """
 
     job: Job
@@ -74,7 +75,7 @@ class Arena:
     attempt: Attempt = field(default_factory=Attempt)
 
     def __post_init__(self) -> None:
-        self.clock = time.perf_counter()
+        self.clock, self.grace = time.perf_counter(), 0
         plain = Setup(self.job.experiment, self.job.threads, added=self.job.added)
         self.holds = plain.enforced
         self.setup = plain.free() if self.holds else plain
@@ -91,10 +92,11 @@ class Arena:
         return max((time.perf_counter() - self.clock) / self.job.seconds, taken / self.job.steps)
 
     def require(self, limit: float = 1.0) -> None:
-        """Raise Spent where that share of the budget is used up."""
+        """Raise Spent where the budget is used up, or that share of it and the grace."""
         if self.monitor is not None:
             self.monitor(self.used, self.attempt)
-        if self.used >= min(limit, 1.0):
+        self.grace -= 1
+        if self.used >= (1.0 if self.grace >= 0 else min(limit, 1.0)):
             raise Spent
 
     def finished(self) -> Attempt:

@@ -142,12 +142,15 @@ class Ladder:
             problem = InteriorProblem(self.base, fence, mu, min(WIDEST, RELAXED * mu))
             point = problem.again(point)
             values: list[float] = []
-            for iterate in optimize(problem, point, direction, self.regulate, Armijo(), r.tolerance, patience):
+            tight = min(r.tolerance, Rungs.tolerance)  # what leaks is mended by less slope than many a stated tolerance
+            for iterate in optimize(problem, point, direction, self.regulate, Armijo(), tight, patience):
                 point, margins = iterate.point, self.fence.margins(seen(iterate.point))
                 kept = all(m >= 0.0 for m in margins.values())
-                yield Rung(
-                    replace(iterate, index=done + iterate.index), mu, margins, iterate.status if last and kept else None
-                )
+                status = Status.CONVERGED if iterate.slope <= r.tolerance else iterate.status
+                status = status if last and kept else None
+                yield Rung(replace(iterate, index=done + iterate.index), mu, margins, status)
+                if status is Status.CONVERGED:
+                    return
                 values.append(iterate.value)
                 settled = len(values) > r.window and values[-1 - r.window] - values[-1] < r.settled * mu
                 if time.perf_counter() > deadline or (settled and not last):

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -28,13 +27,14 @@ from mjfim.objective import DesignProblem
 from mjfim.starts import Start
 from mjfim.trajectory import Array
 
-BASES = (0.1, 0.15, 0.2, 0.4, 0.8)  # [Hz] of Fourier series, to begin with
+BASES = (0.2, 0.1, 0.4, 0.8, 0.15)  # [Hz] of Fourier series, to begin with
 KNOTS = (1.0, 2.0)  # [Hz] bandwidth of B-splines, to begin with
 PERIODS = (0.4, 5.0)  # of the first harmonic of other series within the horizon
 BUSIEST = 5  # harmonics that other series have at least, where the bandwidth allows them
 BLUNT = 0.03  # mu down to which all series are optimised
-FIRST, SECOND = 0.4, 0.6  # share of the budget after which the better ones go on, and the best one
+FIRST, SECOND = 0.3, 0.45  # share of the budget after which the better ones go on, and the best one
 KEPT = 3  # one in so many is a better one
+LEAST = 12  # iterations of each; where the budget does not bear them, fewer series take part
 SCIPY = ("L-BFGS-B", {"maxcor": 30})
 FAR = 1e6  # value of what diverges
 RIDGE = 0.03  # weight of the control in the metric, over that of its barrier
@@ -128,24 +128,29 @@ def tournament(arena: Arena, entrants: Iterator[Series], count: int, optimise: O
     """Optimise so many series a little and bluntly, the better third more, the best one sharply; again until all is spent."""
     known: list[Series] = []
 
-    def heat(runners: Sequence[Series], last: float, until: float) -> None:
-        for i, series in enumerate(runners):
-            limit = arena.used + (until - arena.used) / (len(runners) - i)
-            if series.mu > last:
-                with suppress(Spent):
-                    optimise(arena, series, last, limit)
-            arena.require()
+    def advance(series: Series, last: float, limit: float) -> None:
+        if series.mu > last:
+            with suppress(Spent):
+                optimise(arena, series, last, limit)
+        arena.require()
 
     def best(many: int) -> list[Series]:
         return sorted((s for s in known if not s.finished), key=lambda series: series.cost)[:many]
 
     while True:
-        begun, new = arena.used, list(islice(entrants, count))
-        known += new
-        heat(new, BLUNT, begun + FIRST * (1.0 - begun))
-        heat(best(-(-count // KEPT)), BLUNT, begun + SECOND * (1.0 - begun))
-        heat(best(1), Rungs().last, 1.0)
-        arena.require()
+        begun = arena.used
+        first, second = (begun + share * (1.0 - begun) for share in (FIRST, SECOND))
+        for i in range(count):
+            known.append(next(entrants))
+            arena.grace = LEAST
+            advance(known[-1], BLUNT, arena.used + (first - arena.used) / (count - i))
+            if arena.used >= first:
+                break
+        better = best(-(-len(known) // KEPT))
+        for i, series in enumerate(better):
+            advance(series, BLUNT, arena.used + (second - arena.used) / (len(better) - i))
+        for series in best(1):
+            advance(series, Rungs().last, 1.0)
 
 
 # with mjfim's own optimiser ---------------------------------------------------------------------------------------------
@@ -154,7 +159,7 @@ def tournament(arena: Arena, entrants: Iterator[Series], count: int, optimise: O
 def own(arena: Arena, series: Series, last: float, limit: float) -> None:
     """Descend as designs do, within the series."""
     job, chase = arena.job, Chase(series.name)
-    left = (min(limit, 1.0) - arena.used) * job.seconds
+    left = (1.0 - arena.used) * job.seconds if limit >= 1.0 else np.inf  # else sharper barriers would come too early
     start = Start(series.name, series.control, series.basis)
     rungs = Rungs(first=series.mu, last=last)
     task = Task(job.experiment, start, rungs, 100_000, left, job.combinations, job.added, threads=job.threads)
@@ -196,7 +201,6 @@ class Descent:
         self.ladder = Ladder(base, arena.fence, arena.centre, series.basis, regulator_for(arena.setup))
         self.K = np.zeros((len(series.basis), len(arena.centre), arena.setup.space.nx))
         self.s = np.zeros((series.basis.shape[1], len(arena.centre)))
-        self.values: list[float] = []
 
     def run(self, rungs: Rungs) -> None:
         """All stages. Raises Spent."""
@@ -236,9 +240,8 @@ class Descent:
         if point.sight is None:
             return
         factor = self._whitening(problem, point)
-        patience = rungs.patience * (2 if last else 1)
-        self.values = [problem.value(point)]
-        tried: dict[bytes, float] = {}
+        enough, patience = rungs.tolerance if last else rungs.settled * mu, rungs.patience * (2 if last else 1)
+        values, tried = [problem.value(point)], dict[bytes, float]()
 
         def value(y: Array) -> tuple[float, Array]:
             found, slope = self._valued(problem, solve_triangular(factor.T, y).reshape(self.s.shape))
@@ -247,17 +250,14 @@ class Descent:
 
         def accepted(y: Array) -> None:
             self.s = solve_triangular(factor.T, y).reshape(self.s.shape)
-            self.values.append(tried.get(np.asarray(y).tobytes(), self.values[-1]))
-            enough = rungs.tolerance if last else rungs.settled * mu
-            slow = len(self.values) > rungs.window and self.values[-1 - rungs.window] - self.values[-1] < enough
-            if slow or len(self.values) > patience:
+            values.append(tried.get(np.asarray(y).tobytes(), values[-1]))
+            slow = len(values) > rungs.window and values[-1 - rungs.window] - values[-1] < enough
+            if slow or len(values) > patience:
                 raise Settled
 
         method, options = SCIPY
-        try:
+        with suppress(Settled):
             minimize(value, factor.T @ self.s.reshape(-1), jac=True, method=method, options=options, callback=accepted)
-        except Settled:
-            return
 
     def _valued(self, problem: InteriorProblem, s: Array) -> tuple[float, Array]:
         """Value and slope by the coefficients; every point that keeps the limits is offered."""

@@ -50,7 +50,7 @@ def example() -> Experiment:
         playback_rate=500.0,
         horizon=4.0,
         cost={"control": 0.0},
-        descent={"max_iterations": 60},
+        descent={"max_iterations": 150},
         boundary={"start": "rest", "end": "rest"},
         parameters={"kp_shoulder": {"prior": 4.0}, "kp_elbow": {"prior": 3.0}},  # as wrong as all others
         nuisance={"delay": True},

@@ -131,7 +131,7 @@ class Bench:
         """The experiment on the engine's grid, and with the unknowns that playing it adds."""
         nuisance = e.nuisance.model_dump(exclude_unset=True)
         if self.late:
-            nuisance.setdefault("delay", True)
+            nuisance["delay"] = nuisance.get("delay") or True
         moved = self._movable()
         if nuisance.get("initial") is None and moved:
             nuisance["initial"] = dict.fromkeys(moved, True)

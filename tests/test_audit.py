@@ -118,6 +118,19 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
         assert found.margins[clamp.replace(" ", "_")] == 0.0
 
 
+@pytest.mark.parametrize("enforce", [True, False])
+def test_only_enforced_limits_take_the_clamps_out_of_the_plant(enforce: bool, tmp_path: Path) -> None:
+    """A boundary alone keeps no force within its clamp: the design's plant must have it."""
+    motor = 'ctrlrange="-0.05 0.05" forcerange="-0.04 0.04"'
+    control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
+    tables = {"rate": 50.0, "initial": {"qvel": (SPEED,), "control": control}, "cost": {"control": 1.0}}
+    setup = spring_setup(tmp_path, motor=motor, boundary={"end": "periodic"}, limits={"enforce": enforce}, **tables)
+    assert setup.enforced
+    lifted = setup.free()
+    designed = lifted.plant.simulate(lifted.theta, setup.control)
+    assert (audit(setup, designed).deviation < SAME) is not enforce
+
+
 def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
     """What is asked of the end does."""
     limits = {"position": {"slide": (-0.1, 0.12)}, "clearance": 0.1, "enforce": False}

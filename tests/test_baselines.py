@@ -226,9 +226,9 @@ def test_the_usual_frequencies_come_first_and_stay_within_the_bandwidth() -> Non
     arena = Arena(Job(pendulum(bandwidth=1.0), "fourier5", 60.0))
     series = fourier(arena, 5)
     first = [next(series) for _ in range(7)]
-    assert [s.name for s in first[:5]] == ["0.1 Hz", "0.15 Hz", "0.2 Hz", "0.4 Hz", "0.8 Hz"]
+    assert [s.name for s in first[:5]] == ["0.2 Hz", "0.1 Hz", "0.4 Hz", "0.8 Hz", "0.15 Hz"]
     t = arena.setup.t
-    for s, frequency, harmonics in zip(first, (0.1, 0.15, 0.2, 0.4, 0.8), (5, 5, 5, 2, 1), strict=False):
+    for s, frequency, harmonics in zip(first, (0.2, 0.1, 0.4, 0.8, 0.15), (5, 5, 2, 1, 5), strict=False):
         waves = fourier_basis(t, 2.0, frequency, harmonics, False, False)
         left = waves - s.basis @ np.linalg.lstsq(s.basis, waves)[0]
         assert np.abs(left).max() < 1e-3
@@ -260,7 +260,8 @@ def test_a_tournament_ends_with_its_budget_and_sharpens_the_best() -> None:
 
     with pytest.raises(Spent):
         tournament(arena, fourier(arena, 5), 5, optimise)
-    assert [name for name, _ in seen[:5]] == ["0.1 Hz", "0.15 Hz", "0.2 Hz", "0.4 Hz", "0.8 Hz"]
+    assert [name for name, _ in seen[:2]] == ["0.2 Hz", "0.1 Hz"]  # the budget does not bear all five
+    assert seen[-1][1] < seen[0][1]
     assert 1.0 <= arena.used < 1.2
     assert arena.attempt.found_by in {name for name, _ in seen}
 

@@ -14,6 +14,7 @@ from numerics import CART_PENDULUM, Array, cart_setup, make_setup, relative_erro
 from test_fence import ARM
 
 import mjfim
+from mjfim import contest
 from mjfim.basis import spline_basis
 from mjfim.bounds import basis_of, fence_of
 from mjfim.contest import Contest
@@ -267,6 +268,18 @@ def test_what_is_not_enforced_may_be_left_while_the_boundary_holds(tmp_path: Pat
     assert len(said) == 1 and "checked, not enforced" in said[0]
 
 
+def test_the_stated_tolerance_ends_the_last_rung_once_the_limits_hold(tmp_path: Path) -> None:
+    """One so wide that any slope will do: the first iterate there that is inside is the last."""
+    setup = cart_inside(tmp_path, descent={"max_iterations": 80, "tolerance": 100.0, "coarse": 1})
+    design = mjfim.design(setup)
+    assert design.status is Status.CONVERGED
+    sharpest = [row for row in design.history if row.mu == design.history[-1].mu]
+    assert design.history[-1].mu == Rungs.last
+    assert [row.margin >= 0.0 for row in sharpest].index(True) == len(sharpest) - 1
+    assert design.slope > 1e-5
+    assert_inside(setup, design.trajectory.ctrl)
+
+
 def test_more_is_held_back_where_a_rung_leaked_and_less_where_it_was_well_inside() -> None:
     held = held_back(
         {"position": 0.1, "control": 0.1, "force": 0.02}, {"position": -0.05, "control": 0.06, "force": 0.5}
@@ -443,21 +456,42 @@ def test_a_bandwidth_near_that_of_the_samples_is_no_trouble(bandwidth: float, tm
     assert_inside(setup, design.trajectory.ctrl)
 
 
+def nearest(setup: Setup, ctrl: Array) -> float:
+    """Smallest distance of the arm to post and floor at any engine step of a plain loop, by MuJoCo's own distances."""
+    model = setup.model
+    data, geoms = mujoco.MjData(model), [model.geom(name).id for name in ("fore", "post", "floor", "upper")]
+    near = []
+    for qpos in played(model, (np.zeros(2), np.zeros(2)), ctrl, setup.substeps)["q"]:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        pairs = ((0, 1), (0, 2), (3, 1), (3, 2))
+        near += [mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 1.0, None) for a, b in pairs]
+    return min(near)
+
+
+@pytest.mark.parametrize("proofs", [0, 3], ids=["unproved", "proved"])
+def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
+    proofs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The barrier looks at distances at the samples, of 50 ms; the audit at every engine step."""
+    monkeypatch.setattr(contest, "PROOFS", proofs)
+    monkeypatch.setattr(contest, "PATIENCE", 12)
+    setup, design = arm_design(
+        tmp_path,
+        rate=20.0,
+        horizon=1.0,
+        limits={"clearance": 0.15, "control_rate": 20.0},
+        descent={"max_iterations": 16, "coarse": 1},
+    )
+    kept = nearest(setup, design.trajectory.ctrl) >= 0.15
+    assert kept is bool(proofs)
+    assert (design.status is Status.INFEASIBLE) is not kept
+    assert design.limits["clearance"] == pytest.approx(nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6)
+
+
 def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
-    """Of the fore-arm to a post and the floor, by MuJoCo's own distances along a plain loop."""
+    """Without the limit the fore-arm comes closer."""
     setup, design = arm_design(tmp_path, limits={"clearance": 0.15})
     free = arm_design(tmp_path)[1]
-    model, least = setup.model, []
-    data, geoms = mujoco.MjData(model), [model.geom(name).id for name in ("fore", "post", "floor", "upper")]
-    for made in (design, free):
-        rows = played(model, (np.zeros(2), np.zeros(2)), made.trajectory.ctrl, setup.substeps)
-        near = []
-        for qpos in rows["q"]:
-            data.qpos[:] = qpos
-            mujoco.mj_kinematics(model, data)
-            pairs = ((0, 1), (0, 2), (3, 1), (3, 2))
-            near += [mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 1.0, None) for a, b in pairs]
-        least.append(min(near))
-    assert least[0] >= 0.15
-    assert least[1] < 0.15  # without the limit it comes closer
-    assert design.limits["clearance"] == pytest.approx(least[0] - 0.15, abs=1e-6)
+    assert nearest(setup, design.trajectory.ctrl) >= 0.15 > nearest(setup, free.trajectory.ctrl)
+    assert design.limits["clearance"] == pytest.approx(nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6)

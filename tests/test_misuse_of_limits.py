@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 from numerics import CART_PENDULUM, make_setup
-from test_cli import misused, names, run, write_experiment
+from test_cli import loads, misused, names, run, write_experiment
 
 import mjfim
+from mjfim import results
 from mjfim.errors import ExperimentError
 from mjfim.experiment import Experiment
 from mjfim.setup import Setup
@@ -200,6 +201,19 @@ def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) 
         ExperimentError, match=r"no control holds the start: joint 'hinge' still accelerates by \d\.\d+ per s²"
     ):
         mjfim.design(setup)
+
+
+def test_limits_that_no_control_can_keep_are_no_misuse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pendulum falls faster than it may: exit code 1 after the work, and said which limit is missed."""
+    monkeypatch.setattr(results, "leave_design", lambda *_: [])
+    hard = "[limits]\nvelocity = { hinge = 0.5 }\ncontrol = { force = [-0.01, 0.01] }"
+    path = write_experiment(tmp_path, max_iterations=f"4\n{hard}")
+    model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
+    (tmp_path / "cart_pendulum.xml").write_text(model.replace("3.141592653589793", "2.0"), encoding="utf-8")
+    result = run("design", path, "-o", tmp_path / "out", "--json")
+    told = loads(result.stdout)
+    assert (result.exit_code, told["status"], told["limits"]["satisfied"]) == (1, "infeasible", False)
+    assert "velocity limits are exceeded by" in result.stderr
 
 
 def test_a_fourier_start_above_the_bandwidth_is_refused(tmp_path: Path) -> None:
