@@ -9,7 +9,8 @@ half of the range: 1 in the middle, where beta is zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -83,7 +84,7 @@ class Hedge:
     """Expansion of the barrier: its derivatives by x and u along the curve, and its Gauss-Newton Hessian.
 
     a: (N+1, nx);  b: (N, nu);  taps: (N, looked-at substeps, w, nx+nu) over the scale of what they show
-    control: (nu,) scale of the control
+    control: (nu,) scale of the control;  step: (nu,) of its change from one sample to the next, infinite where free
     """
 
     a: Array
@@ -91,15 +92,26 @@ class Hedge:
     weights: Weights
     taps: Array
     control: Array
+    step: Array
 
     def times(self, mu: float) -> Hedge:
         """The same of mu times the barrier."""
-        w = self.weights
-        weights = Weights(mu * w.Q, mu * w.S, mu * w.R, mu * w.W)
-        return Hedge(mu * self.a, mu * self.b, weights, self.taps, self.control)
+        return replace(self, a=mu * self.a, b=mu * self.b, weights=self.weights.times(mu))
 
     def motion(self, zeta: TangentCurve) -> float:
         """The largest move along a tangent curve of anything limited, over half of its range."""
         both = np.concatenate([zeta.z[:-1], zeta.v], axis=1)
         moves = np.abs(np.einsum("kswi,ki->ksw", self.taps, both)).max(initial=0.0)
         return float(max(moves, np.abs(zeta.v / self.control).max(initial=0.0)))
+
+    @cached_property
+    def even(self) -> Weights:
+        """The mean square over time of such moves, of the control's changes too: a barrier's Hessian far from all bounds."""
+        N, looked, w, n = self.taps.shape
+        nu = len(self.control)
+        flat = self.taps.reshape(N, looked * w, n)
+        H = np.swapaxes(flat, 1, 2) @ flat / (N * looked)
+        Q, nx = np.zeros((N + 1, n - nu, n - nu)), n - nu
+        Q[:-1] = H[:, :nx, :nx]
+        W = np.where(self.weights.W > 0.0, self.step**-2.0 / N, 0.0)
+        return Weights(Q, H[:, nx:, :nx], H[:, nx:, nx:] + np.diag(self.control**-2.0 / N), W)

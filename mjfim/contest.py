@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.audit import audit
+from mjfim.descent import Stage
 from mjfim.enclosed import Chase, Task, perform, pursue
 from mjfim.ladder import Rungs, held_back
-from mjfim.setup import Setup
 from mjfim.starts import Start
-from mjfim.trajectory import Array, HistoryRow, Status
+from mjfim.trajectory import HistoryRow, Status
 
 HALFWAY = 0.01  # mu down to which all starts compete
 KEPT = 4  # one in so many goes on
@@ -27,23 +27,22 @@ EARLY = 0.5  # share of the iterations and of the time for the first round
 class Contest:
     """What all starts have in common.
 
-    setup: the experiment on its lifted plant;  coarse: the same on a coarse level, or None
-    combinations: (t, s) identifiable ones, or None;  executor: that runs the starts, None: one after the other here
+    fine: the experiment on its lifted plant;  coarse: on a plant that is quicker to step, or smoother, or None
+    executor: that runs the starts, None: one after the other here
     """
 
-    setup: Setup
-    coarse: Setup | None
-    combinations: Array | None
+    fine: Stage
+    coarse: Stage | None
     executor: Executor | None = None
 
     def run(self, starts: Sequence[Start], chases: list[Chase]) -> Iterator[HistoryRow]:
         """Every iterate; `chases` gets one entry per start, the winners' ones after the second round."""
-        d = self.setup.experiment.descent
+        d = self.fine.setup.experiment.descent
         seconds = np.inf if d.seconds is None else d.seconds
         clock = time.perf_counter()
-        first = self.coarse or self.setup
+        first = self.coarse or self.fine
         if len(starts) == 1 and self.coarse is None and starts[0].basis is None:
-            yield from self._round(self.setup, starts, Rungs(), d.max_iterations, seconds, chases)
+            yield from self._round(self.fine, starts, Rungs(), d.max_iterations, seconds, chases)
             return
         share = EARLY * seconds / self._turns(len(starts))
         yield from self._round(first, starts, Rungs(last=HALFWAY), round(EARLY * d.max_iterations), share, chases)
@@ -60,7 +59,7 @@ class Contest:
         done = max((row.iteration for i in kept for row in chases[i].history), default=0)
         second: list[Chase] = []
         try:
-            for row in self._round(self.setup, again, Rungs(first=HALFWAY), d.max_iterations - done, left, second):
+            for row in self._round(self.fine, again, Rungs(first=HALFWAY), d.max_iterations - done, left, second):
                 yield replace(row, iteration=row.iteration + done + 1)
         finally:  # also where the user interrupts
             for i, chase in zip(kept, second, strict=False):
@@ -71,6 +70,7 @@ class Contest:
 
     def prove(self, chases: list[Chase]) -> Iterator[HistoryRow]:
         """Hold back a winner that leaves a limit on the untouched model, between what the barrier looked at; a few times."""
+        setup = self.fine.setup
         for _ in range(PROOFS):
             if not chases or any(chase.status is Status.INTERRUPTED for chase in chases):
                 return
@@ -78,13 +78,13 @@ class Contest:
             best = chases[i]
             if best.control is None or not np.isfinite(best.cost):
                 return
-            found = audit(self.setup, self.setup.plant.simulate(self.setup.theta, best.control))
+            found = audit(setup, setup.plant.simulate(setup.theta, best.control))
             if found.kept or not np.isfinite(found.deviation):
                 return
             held = held_back({}, found.shares)
             again: list[Chase] = []
             yield from self._round(
-                self.setup, [Start(best.name, best.control)], Rungs(first=LATE), PATIENCE, np.inf, again, held
+                self.fine, [Start(best.name, best.control)], Rungs(first=LATE), PATIENCE, np.inf, again, held
             )
             if np.isfinite(again[0].cost):
                 again[0].history = _joined(best.history, again[0].history)
@@ -93,12 +93,15 @@ class Contest:
 
     def _turns(self, count: int) -> int:
         """How many of the tasks run after one another."""
-        workers = 1 if self.executor is None else int(getattr(self.executor, "_max_workers", 1))
-        return -(-max(count, 1) // workers)
+        return -(-max(count, 1) // self._workers)
+
+    @property
+    def _workers(self) -> int:
+        return 1 if self.executor is None else int(getattr(self.executor, "_max_workers", 1))
 
     def _round(
         self,
-        level: Setup,
+        stage: Stage,
         starts: Sequence[Start],
         rungs: Rungs,
         budget: int,
@@ -107,6 +110,7 @@ class Contest:
         held: Mapping[str, float] | None = None,
     ) -> Iterator[HistoryRow]:
         """Every iterate of one descent per start, at most `budget` each."""
+        level, combinations = stage.setup, stage.basis
         stated = level.experiment.descent.tolerance
         common = Task(
             level.experiment,
@@ -114,11 +118,10 @@ class Contest:
             replace(rungs, tolerance=max(rungs.tolerance, stated)),
             max(budget, 1),
             seconds,
-            self.combinations,
+            combinations,
             level.added,
-            level.coarsen,
-            level.stretch,
-            1 if self.executor is not None else level.plant.engine.threads,
+            level.level,
+            max(self._workers // len(starts), 1) if self.executor is not None else level.plant.engine.threads,
             held or {},
         )
         tasks = [replace(common, start=start) for start in starts]

@@ -16,7 +16,7 @@ from mjfim.contest import Contest
 from mjfim.descent import Run, Stage, coarse_level, descend
 from mjfim.earlier import shared
 from mjfim.enclosed import Chase
-from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDiverged, UnidentifiableError
 from mjfim.evaluation import evaluate, fine_point, warnings_of
 from mjfim.experiment import Experiment
 from mjfim.fence import Fence
@@ -30,9 +30,15 @@ from mjfim.survey import Survey, require_designable, survey
 from mjfim.trajectory import Array, Design, HistoryRow, StartResult, Status
 
 Monitor = Callable[[HistoryRow], None]
-HALF = 2  # how many times longer the samples of a coarse level are under hard limits
+LONGER = (
+    5,
+    4,
+    3,
+    2,
+)  # times that the timestep of a coarse level is longer under hard limits, the first one that the model bears
+HALF = 2  # the same where samples become longer too
 COARSEST = 50  # samples at least
-BORNE = 0.05  # relative change of the initial cost that a coarse level may make
+BORNE = 0.5  # relative change of the initial cost that a coarse level may make: all is optimised anew on the stated one
 
 
 def design(
@@ -116,7 +122,7 @@ def _enclosed(
         runs.clear()
     free = setup.free()
     chases: list[Chase] = []
-    contest = Contest(free, _coarser(free, stage.basis), stage.basis, executor)
+    contest = Contest(Stage(free, stage.basis), _easier(Stage(free, stage.basis)), executor)
     starts = list(starts_of(setup, start))
     if inside is not None:  # as far as the first start came without a barrier
         starts[0] = replace(starts[0], control=inside)
@@ -135,22 +141,52 @@ def _weighted(setup: Setup) -> bool:
     return not hard and bool((setup.control_weight > 0.0).all())
 
 
-def _coarser(free: Setup, basis: Array | None) -> Setup | None:
-    """A level with a longer timestep, or longer samples where they are one timestep, if the model bears it.
+def _easier(fine: Stage) -> Stage | None:
+    """A level without dry friction, with a longer timestep, or with longer samples where they are one timestep."""
+    smooth = _smoother(fine) or fine
+    for factor in _factors(smooth.setup):
+        coarse = _coarser(smooth, factor)
+        if coarse is not None:
+            return coarse
+    return None if smooth is fine else smooth
 
-    It bears what changes the initial cost little.
-    """
-    d = free.experiment.descent
-    factor = HALF if d.coarse == "auto" else d.coarse
-    stretch = free.substeps % factor == 0
-    if factor == 1 or not (stretch or (free.samples % factor == 0 and free.samples >= COARSEST * factor)):
+
+def _smoother(fine: Stage) -> Stage | None:
+    """The level without dry friction, if there is any, and something to be seen without."""
+    setup = fine.setup.frictionless()
+    if setup is None:
         return None
     try:
-        coarse = free.stretched(factor) if stretch else free.coarser(factor)
-        here, there = (Stage(level, basis).problem.point(level.initial) for level in (free, coarse))
+        point = setup.problem.point(setup.initial, CENTRAL)
+        if point.trajectory is None or point.sensitivity is None:
+            return None
+        seen = survey(setup, point.trajectory, point.sensitivity)
+        require_designable(setup, seen)
+    except (SimulationDiverged, UnidentifiableError):
+        return None
+    return Stage(setup, seen.basis)
+
+
+def _factors(setup: Setup) -> tuple[int, ...]:
+    """Candidates for the timestep of a coarse level, the longest first."""
+    stated = setup.experiment.descent.coarse
+    if stated != "auto":
+        return () if stated == 1 else (stated,)
+    return tuple(k for k in LONGER if setup.substeps % k == 0) or (HALF,)
+
+
+def _coarser(stage: Stage, factor: int) -> Stage | None:
+    """A level so many times coarser, if the model bears it: its initial cost is about the same."""
+    setup = stage.setup
+    stretch = setup.substeps % factor == 0
+    if not (stretch or (setup.samples % factor == 0 and setup.samples >= COARSEST * factor)):
+        return None
+    try:
+        coarse = Stage(setup.stretched(factor) if stretch else setup.coarser(factor), stage.basis)
+        here, there = (s.problem.point(s.setup.initial) for s in (stage, coarse))
     except (SimulationDiverged, ExperimentError):
         return None
-    return coarse if abs(there.cost - here.cost) <= BORNE * free.problem.size(here) else None
+    return coarse if abs(there.cost - here.cost) <= BORNE * setup.problem.size(here) else None
 
 
 def _settled(stage: Stage, chase: Chase) -> Run:

@@ -1,4 +1,4 @@
-"""Descents under hard limits from one start, as tasks that may run anywhere, and the contest between them."""
+"""Descents under hard limits from one start, as tasks that may run anywhere."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from mjfim.experiment import Experiment
 from mjfim.fence import Fence
 from mjfim.interior import seen
 from mjfim.ladder import Ladder, Rung, Rungs
+from mjfim.level import FREE, Level
 from mjfim.objective import Point
 from mjfim.setup import Setup
 from mjfim.starts import Start
 from mjfim.trajectory import Array, HistoryRow, Status
 
 POWER = 40.0  # of the smooth E-criterion: several of the smallest eigenvalues meet under hard limits
+CALM = 100.0  # growth of deviations from which on feedback is worth the time: steps are short under hard limits
 FAINT = 3e-3  # weight of an eigenvector, over the largest, below which it is left out of the gradient
-HALFWAY = 0.01  # mu down to which all starts compete
-KEPT = 4  # one in so many goes on
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
     """A descent under hard limits. seconds: time it may take;  combinations: (t, s) identifiable ones, or None
 
-    added: (p, p) information of other experiments, or None;  coarsen, stretch: of the level;  held: shares held back
+    added: (p, p) information of other experiments, or None;  level: of the plant;  held: shares held back
     """
 
     experiment: Experiment
@@ -40,8 +40,7 @@ class Task:
     seconds: float = np.inf
     combinations: Array | None = None
     added: Array | None = None
-    coarsen: int = 1
-    stretch: int = 1
+    level: Level = FREE
     threads: int | None = None
     held: Mapping[str, float] = field(default_factory=dict)
 
@@ -63,14 +62,14 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
     """Every iterate of a task, keeping `chase` up to date. setup: of the experiment on its lifted plant, if there is one"""
     clock = time.perf_counter()
     if setup is None:
-        setup = Setup(task.experiment, task.threads, task.coarsen, task.added, True, task.stretch)
+        setup = Setup(task.experiment, task.threads, task.added, task.level)
     begun = setup.plant.engine.steps
     exact = Stage(setup, task.combinations).problem
     smooth = Stage(setup, task.combinations, POWER if task.experiment.cost.criterion == "E" else np.inf).problem
     smooth = replace(smooth, information=replace(smooth.information, faint=FAINT))
     fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
     basis = None if fine is None else independent(setup.averaged(fine))
-    regulate = replace(regulator_for(setup), calm=np.inf) if basis is not None else regulator_for(setup)
+    regulate = replace(regulator_for(setup), calm=CALM if basis is None else np.inf)
     fence = fence_of(setup).tightened(task.held)
     ladder = Ladder(smooth, fence, setup.centre, basis, regulate, task.rungs)
     control = setup.averaged(task.start.control)

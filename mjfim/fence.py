@@ -197,4 +197,5 @@ class Fence:
             wall, nv = self._near(sight.distances).wall(sight.distances, delta, weight), self.space.nv
             a[1:, :nv] += np.einsum("km,kmi->ki", wall.slope, sight.slopes)
             Q[1:, :nv, :nv] += np.swapaxes(sight.slopes * wall.bend[..., None], 1, 2) @ sight.slopes
-        return Hedge(a, b, Weights(Q, S, R, W), rise / self.shown.scale[:, None], self.control.scale)
+        step = np.full(nu, np.inf) if self.rate is None else self.rate.scale * self.dt
+        return Hedge(a, b, Weights(Q, S, R, W), rise / self.shown.scale[:, None], self.control.scale, step)

@@ -14,7 +14,6 @@ from mjfim.barrier import Hedge
 from mjfim.fence import Fence, Sight
 from mjfim.lq import TangentCurve
 from mjfim.objective import DIVERGED, DesignProblem, Point
-from mjfim.plant import DRAFT
 from mjfim.pronto import Expansion
 from mjfim.trajectory import Array
 
@@ -70,7 +69,7 @@ class InteriorProblem:
         barrier = self.fence.value(sight, self.delta)
         if not self.costs:
             return InteriorPoint(sight, None, 0.0, barrier)
-        point = self.base.point(sight.trajectory, DRAFT)
+        point = self.base.point(sight.trajectory, self.base.plant.draft)
         return OUTSIDE if point is DIVERGED else InteriorPoint(sight, point, self._merit(point), barrier)
 
     def again(self, point: InteriorPoint) -> InteriorPoint:
@@ -100,8 +99,8 @@ class InteriorProblem:
         return point.merit + self.mu * point.barrier
 
     def size(self, point: InteriorPoint) -> float:
-        """1, one e-fold of J; without a cost, the barrier."""
-        return 1.0 if self.costs else max(1.0, abs(point.barrier))
+        """One e-fold of J, or the barrier where that is more; without a cost, the barrier in full."""
+        return max(1.0, abs(point.barrier) * (self.mu if self.costs else 1.0))
 
     def expand(self, point: InteriorPoint) -> Expansion:
         """Expansion of the sum; the barrier's share stands apart as well."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ HOLDING = 4e-3  # mu from which on leaks are answered
 SPARE = 1.2  # what was outside at the end of a rung is held back on the next by that much of it
 SLACK = 1.5  # of the time that is left per rung, what one may take
 AGAIN = 3  # times that the last rung is repeated because of leaks, at most
-ROUNDS = 60  # iterations towards the inside
+ROUNDS, FEW = 60, 20  # iterations towards the inside, the latter where shrinking leads there too
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,14 @@ class Rung:
         return all(margin >= 0.0 for margin in self.margins.values())
 
 
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """Where a descent begins. control: (N, nu), or None where all diverge;  iterations: that it took to get there"""
+
+    control: Array | None
+    iterations: int
+
+
 @dataclass
 class Ladder:
     """One descent. base: the cost on the lifted plant;  basis: (N, M) what the control minus centre is made of, or None
@@ -81,19 +89,28 @@ class Ladder:
 
     def climb(self, control: Array, budget: int, until: float = np.inf) -> Iterator[Rung]:
         """Every iterate from a control: (N, nu), at most `budget`, until a time of `time.perf_counter`."""
-        start = self.inside(control)
-        direction = self._direction()
-        if start is None:
-            point = None
-            for rung in self._steered(self._fitted(control), direction, until):
-                yield rung
-                point = rung.iterate.point
-                budget -= 1
-            if point is None:
-                return
-            start = point.ctrl
-            direction = self._direction()
-        yield from self._down(start, direction, budget, until)
+        entry = yield from self._entered(control, min(budget, ROUNDS), until)
+        if entry.control is not None:
+            yield from self._down(entry.control, self._direction(), budget, until, entry.iterations)
+
+    def _entered(self, control: Array, budget: int, until: float) -> Generator[Rung, None, Entry]:
+        """A control inside all limits, shrunk about the centre or steered, whatever costs less; else what comes near."""
+        fitted = self._fitted(control)
+        shrunk = self.inside(fitted)
+        if shrunk is not None and np.array_equal(shrunk, fitted):
+            return Entry(fitted, 0)
+        rung: Rung | None = None
+        for rung in self._steered(fitted, budget if shrunk is None else min(budget, FEW), until):
+            yield rung
+        if rung is None:
+            return Entry(shrunk, 0)
+        steered, taken = rung.iterate.point.ctrl, rung.iterate.index + 1
+        if shrunk is None:
+            return Entry(steered, taken)
+        problem = InteriorProblem(self.base, self.fence, self.rungs.first, WIDEST)
+        entries = [shrunk, steered] if rung.feasible else [shrunk]
+        values = [problem.value(problem.point(ctrl)) for ctrl in entries]
+        return Entry(entries[int(np.argmin(values))], taken)
 
     def _direction(self) -> StructuredBFGS:
         N = len(self.base.running.desired) - 1
@@ -107,32 +124,31 @@ class Ladder:
         return np.asarray(self.centre + self.basis @ np.linalg.lstsq(self.basis, control - self.centre)[0])
 
     def inside(self, control: Array) -> Array | None:
-        """The control shrunk about the centre until all limits hold; None where even the least one leaves them."""
-        fitted = self._fitted(control)
+        """A control shrunk about the centre until all limits hold; None where even the least one leaves them."""
         problem = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False)
         for share in SHRUNK:
-            candidate = self.centre + share * (fitted - self.centre)
+            candidate = control if share == 1.0 else self.centre + share * (control - self.centre)
             point = problem.point(candidate)
             if point.sight is not None and all(m > 0.0 for m in self.fence.margins(point.sight).values()):
                 return np.asarray(candidate)
         return None
 
-    def _steered(self, control: Array, direction: StructuredBFGS, until: float) -> Iterator[Rung]:
+    def _steered(self, control: Array, budget: int, until: float) -> Iterator[Rung]:
         """Iterates towards the inside, without any cost."""
         problem = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False)
         begin = problem.point(control)
         if begin.sight is None:  # it diverges
             return
-        for iterate in optimize(problem, begin, direction, self.regulate, Armijo(), 1e-6, ROUNDS):
+        for iterate in optimize(problem, begin, self._direction(), self.regulate, Armijo(), 1e-6, budget):
             margins = self.fence.margins(seen(iterate.point))
             rung = Rung(iterate, np.inf, margins)
             yield rung
             if all(m > 0.0 for m in margins.values()) or time.perf_counter() > until:
                 return
 
-    def _down(self, control: Array, direction: StructuredBFGS, budget: int, until: float) -> Iterator[Rung]:
-        r, held = self.rungs, dict[str, float]()
-        ladder, done = r.ladder(), 0
+    def _down(self, control: Array, direction: StructuredBFGS, budget: int, until: float, done: int) -> Iterator[Rung]:
+        r, held, budget = self.rungs, dict[str, float](), budget + done
+        ladder = r.ladder()
         point = InteriorProblem(self.base, self.fence, r.first, WIDEST).point(control)
         for i, mu in enumerate([*ladder, *ladder[-1:] * AGAIN]):
             left, last, now = max(len(ladder) - i, 1), i >= len(ladder) - 1, time.perf_counter()

@@ -5,7 +5,6 @@ The linear recursions are unit-triangular banded systems; one BLAS call solves e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -108,6 +107,18 @@ class Weights:
     R: Array
     W: Array
 
+    def plus(self, other: Weights, share: float = 1.0) -> Weights:
+        """The sum of this form and a share of another."""
+        return Weights(*(mine + share * theirs for mine, theirs in zip(self._parts, other._parts, strict=True)))
+
+    def times(self, share: float) -> Weights:
+        """A share of this form."""
+        return Weights(*(share * mine for mine in self._parts))
+
+    @property
+    def _parts(self) -> tuple[Array, Array, Array, Array]:
+        return self.Q, self.S, self.R, self.W
+
     def force(self, zeta: TangentCurve) -> tuple[Array, Array]:
         """(N+1, nx) and (N, nu): half the derivative of the form, so that `<zeta, other> = a.z + b.v`."""
         z, v = zeta.z, zeta.v
@@ -124,45 +135,82 @@ def descent(A: Array, B: Array, a: Array, b: Array, Q: Array, R: Array, terminal
     a: (N+1, nx);  b: (N, nu);  Q, terminal: (nx, nx), the metric on z_k for k < N and on z_N;  R: (nu, nu)
     The paper's problem (8), solved by its Riccati equations.
     """
-    N = len(A)
-    return _riccati(A, B, a, b, [*[Q] * N, terminal], None, [R] * N)
-
-
-def weighted_descent(A: Array, B: Array, a: Array, b: Array, weights: Weights) -> TangentCurve:
-    """The same under weights that vary over time, couple state and control, and hold the control's steps down.
-
-    With weights on the steps, the state of the recursion also carries the control before.
-    """
-    if not weights.W.any():
-        return _riccati(A, B, a, b, list(weights.Q), list(weights.S), list(weights.R))
     N, nx, nu = B.shape
-    wide, drive = np.zeros((N, nx + nu, nx + nu)), np.zeros((N, nx + nu, nu))
-    wide[:, :nx, :nx], drive[:, :nx], drive[:, nx:] = A, B, np.eye(nu)
-    Q, S, steps = np.zeros((N + 1, nx + nu, nx + nu)), np.zeros((N, nu, nx + nu)), np.eye(nu) * weights.W[:, None]
-    Q[:, :nx, :nx], Q[:, nx:, nx:] = weights.Q, steps
-    S[:, :, :nx], S[:, :, nx:] = weights.S, -steps[:-1]
-    linear = np.concatenate([a, np.zeros((N + 1, nu))], axis=1)
-    zeta = _riccati(wide, drive, linear, b, list(Q), list(S), list(weights.R + steps[:-1]))
-    return TangentCurve(zeta.z[:, :nx], zeta.v)
+    held = Weights(np.stack([*[Q] * N, terminal]), np.zeros((N, nu, nx)), np.stack([R] * N), np.zeros((N + 1, nu)))
+    return Riccati.of(A, B, held).descent(a, b)
 
 
-def _riccati(
-    A: Array, B: Array, a: Array, b: Array, Q: Sequence[Array], S: Sequence[Array] | None, R: Sequence[Array]
-) -> TangentCurve:
-    """Minimiser under `sum a'z + b'v + 1/2 z'Qz + v'Sz + 1/2 v'Rv`; Q holds one more, of z_N."""
-    N, nx, nu = len(A), A.shape[1], B.shape[2]
-    K, feedforward = np.empty((N, nu, nx)), np.empty((N, nu))
-    P, r = Q[N], a[N]
-    for k in range(N - 1, -1, -1):
-        BP = B[k].T @ P
-        cross = BP @ A[k] if S is None else BP @ A[k] + S[k]
-        both = _solve(R[k] + BP @ B[k], np.column_stack([cross, b[k] + B[k].T @ r]))
-        K[k], feedforward[k] = both[:, :nx], both[:, nx]
-        closed = A[k] - B[k] @ K[k]
-        r = a[k] + closed.T @ r - K[k].T @ b[k]
-        P = Q[k] + A[k].T @ P @ closed
-        if S is not None:
-            P = P - S[k].T @ K[k]
-        P = 0.5 * (P + P.T)
-    z = Recursion(A - B @ K).forward(np.zeros(nx), -np.einsum("kiu,ku->ki", B, feedforward))
-    return TangentCurve(z, -np.einsum("kui,ki->ku", K, z[:-1]) - feedforward)
+@dataclass(frozen=True, eq=False)
+class Riccati:
+    """The same problem under weights that vary over time, couple state and control, and hold the control's steps down.
+
+    Factored once for any number of costs: only banded systems are left. With weights on the steps, the state of the
+    recursion also carries the control before.
+    K: (N, nu, n) gain;  inverse: (N, nu, nu) of `R + B'PB`;  closed: `A - B K`;  drive: (N, n, nu);  nx: n, or less
+    """
+
+    K: Array
+    inverse: Array
+    closed: Recursion
+    drive: Array
+    nx: int
+
+    @staticmethod
+    def of(A: Array, B: Array, weights: Weights) -> Riccati:
+        """Solve the Riccati equations. Raises LinAlgError where the form is not positive on the controls."""
+        N, nx, nu = B.shape
+        Q, S, R = weights.Q, weights.S, weights.R
+        if weights.W.any():
+            wide, drive, steps = (
+                np.zeros((N, nx + nu, nx + nu)),
+                np.zeros((N, nx + nu, nu)),
+                np.eye(nu) * weights.W[:, None],
+            )
+            wide[:, :nx, :nx], drive[:, :nx], drive[:, nx:] = A, B, np.eye(nu)
+            A, B, R = wide, drive, R + steps[:-1]
+            Q, S = np.zeros((N + 1, nx + nu, nx + nu)), np.zeros((N, nu, nx + nu))
+            Q[:, :nx, :nx], Q[:, nx:, nx:] = weights.Q, steps
+            S[:, :, :nx], S[:, :, nx:] = weights.S, -steps[:-1]
+        K, inverse, P, unit = np.empty_like(S), np.empty_like(R), Q[N], np.eye(nu)
+        for k in range(N - 1, -1, -1):
+            BP = B[k].T @ P
+            both = _solve(R[k] + BP @ B[k], np.concatenate([BP @ A[k] + S[k], unit], axis=1))
+            K[k], inverse[k] = both[:, :-nu], both[:, -nu:]
+            P = Q[k] + A[k].T @ P @ (A[k] - B[k] @ K[k]) - S[k].T @ K[k]
+            P = 0.5 * (P + P.T)
+        return Riccati(K, inverse, Recursion(A - B @ K), B, nx)
+
+    def descent(self, a: Array, b: Array) -> TangentCurve:
+        """The minimiser for the cost `sum a'z + b'v`. a: (N+1, nx);  b: (N, nu)"""
+        wide = np.zeros((len(a), self.drive.shape[1]))
+        wide[:, : self.nx] = a
+        wide[:-1] -= np.einsum("kui,ku->ki", self.K, b)
+        costate = self.closed.adjoint(wide)
+        ahead = np.einsum("kuw,kw->ku", self.inverse, b + np.einsum("kiu,ki->ku", self.drive, costate[1:]))
+        z = self.closed.forward(np.zeros(wide.shape[1]), -np.einsum("kiu,ku->ki", self.drive, ahead))
+        return TangentCurve(z[:, : self.nx], -np.einsum("kui,ki->ku", self.K, z[:-1]) - ahead)
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """Tangent curves in the coordinate `c = u + K x`, in which the projection is affine. A, B of the trajectory; K: gain"""
+
+    A: Array
+    B: Array
+    K: Array
+
+    @cached_property
+    def _closed(self) -> Recursion:
+        return Recursion(self.A - self.B @ self.K)
+
+    def gradient(self, a: Array, b: Array) -> Array:
+        """(N, nu) derivative by the coordinate of a cost `sum a'z + b'v`."""
+        a = np.array(a)
+        a[:-1] -= np.einsum("kui,ku->ki", self.K, b)
+        costate = self._closed.adjoint(a)
+        return np.asarray(b + np.einsum("kiu,ki->ku", self.B, costate[1:]))
+
+    def lift(self, c: Array) -> TangentCurve:
+        """Tangent vector whose coordinate moves by c: (N, nu)."""
+        z = self._closed.forward(np.zeros(self.A.shape[1]), np.einsum("kiu,ku->ki", self.B, c))
+        return TangentCurve(z, c - np.einsum("kui,ki->ku", self.K, z[:-1]))

@@ -159,17 +159,19 @@ class Mocap:
 
 @dataclass(frozen=True)
 class Lifted:
-    """Clamps and stops that are taken out of a private copy, because a design keeps away from them: they hide derivatives.
+    """Clamps and stops that are taken out of a private copy, because a design keeps away from them, or comes to them later:
+    they hide derivatives.
 
     joints: whose ranges;  forces: joints whose actuator force;  actuators: whose force;  controls: whether all control ranges
-    contacts: whether all contacts
+    contacts: whether all contacts;  friction: whether all dry friction
     """
 
-    joints: tuple[int, ...]
-    forces: tuple[int, ...]
-    actuators: tuple[int, ...]
-    controls: bool
-    contacts: bool
+    joints: tuple[int, ...] = ()
+    forces: tuple[int, ...] = ()
+    actuators: tuple[int, ...] = ()
+    controls: bool = False
+    contacts: bool = False
+    friction: bool = False
 
     def out_of(self, model: Any) -> None:
         """Change a model that the caller owns, in place."""
@@ -180,6 +182,9 @@ class Lifted:
             model.actuator_ctrllimited[:] = 0
         if self.contacts:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        if self.friction:
+            model.dof_frictionloss[:] = 0.0
+            model.tendon_frictionloss[:] = 0.0
 
 
 class Source:

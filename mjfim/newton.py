@@ -4,39 +4,46 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from mjfim.barrier import Hedge
-from mjfim.lq import TangentCurve, Weights, weighted_descent
+from mjfim.lq import Chart, Riccati, TangentCurve, Weights
 from mjfim.pronto import Expansion
 from mjfim.trajectory import Array
 
 BENT = 1e-8  # relative curvature of a pair that still counts
+LEAST, MOST = 1e-4, 1.0  # damping that is worth it, in units of mu; that makes steps short which the line search cut
+TRIES, RAISED, LOWERED = 5, (2.0, 10.0), (0.1, 1.0)  # dampings of a step at most, and factors between two of them
+AIM = 1.5  # factor of the damping, over how far a step goes
+CUT = 0.3  # share of a step that was taken below which the next one is damped more, else less if it did not go far
+TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
 class Metric:
     """The quadratic form of the barrier's Gauss-Newton Hessian and a ridge, on what the control may do: anything."""
 
-    expansion: Expansion
-    K: Array
+    chart: Chart
     weights: Weights
+
+    @cached_property
+    def _factored(self) -> Riccati:
+        return Riccati.of(self.chart.A, self.chart.B, self.weights)
 
     def apply(self, s: Array) -> Array:
         """The form's gradient at s: (N, nu)."""
-        e = self.expansion
-        a, b = self.weights.force(e.lift(self.K, s))
-        return Expansion(e.A, e.B, a, b).gradient(self.K)
+        return self.chart.gradient(*self.weights.force(self.chart.lift(s)))
 
     def solve(self, g: Array) -> Array:
         """What apply undoes, by the Riccati equations."""
-        e = self.expansion
-        a = np.zeros((len(g) + 1, e.A.shape[1]))
-        a[:-1] = -np.einsum("kui,ku->ki", self.K, g)
-        zeta = weighted_descent(e.A, e.B, a, -g, self.weights)
-        return np.asarray(zeta.v + np.einsum("kui,ki->ku", self.K, zeta.z[:-1]))
+        K = self.chart.K
+        a = np.zeros((len(g) + 1, K.shape[2]))
+        a[:-1] = -np.einsum("kui,ku->ki", K, g)
+        zeta = self._factored.descent(a, -g)
+        return np.asarray(zeta.v + np.einsum("kui,ki->ku", K, zeta.z[:-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +59,19 @@ class BasisMetric:
         A, B = expansion.A, expansion.B
         N, nx, nu = B.shape
         M = basis.shape[1]
-        drive = np.einsum("km,uw->kumw", basis, np.eye(nu)).reshape(N, nu, M * nu)
-        z, rows = np.zeros((nx, M * nu)), []
+        drive = np.einsum("km,kiu->kimu", basis, B).reshape(N, nx, M * nu)
+        z = np.zeros((N + 1, nx, M * nu))
         for k in range(N):
-            form = np.block([[weights.Q[k], weights.S[k].T], [weights.S[k], weights.R[k]]])
-            rows.append(_root(form) @ np.concatenate([z, drive[k]]))
-            z = A[k] @ z + B[k] @ drive[k]
-        rows.append(_root(weights.Q[N]) @ z)
-        stepped = np.diff(drive, axis=0, prepend=0.0, append=0.0)[:N] * np.sqrt(weights.W[:N, :, None])
-        rows += [stepped.reshape(N * nu, -1), drive[-1] * np.sqrt(weights.W[N, :, None])]
-        X = np.concatenate(rows)
-        H = X.T @ X
+            z[k + 1] = A[k] @ z[k] + drive[k]
+        Qz = (weights.Q @ z).reshape(-1, M * nu)
+        Qz[: N * nx] += 2.0 * np.einsum("km,kui->kimu", basis, weights.S).reshape(N * nx, M * nu)
+        H = Qz.T @ z.reshape(-1, M * nu)
+        pairs = np.einsum("km,kn->kmn", basis, basis).reshape(N, -1)
+        own = (pairs.T @ weights.R.reshape(N, -1)).reshape(M, M, nu, nu)
+        stepped = np.diff(basis, axis=0, prepend=0.0, append=0.0)
+        for u in range(nu):
+            own[:, :, u, u] += stepped.T @ (weights.W[:, u, None] * stepped)
+        H = 0.5 * (H + H.T) + own.swapaxes(1, 2).reshape(M * nu, M * nu)
         return BasisMetric(H, cho_factor(H, lower=True))
 
     def apply(self, s: Array) -> Array:
@@ -72,13 +81,6 @@ class BasisMetric:
     def solve(self, g: Array) -> Array:
         """What apply undoes."""
         return np.asarray(cho_solve(self.factor, g.reshape(-1)).reshape(g.shape))
-
-
-def _root(form: Array) -> Array:
-    """X with `X'X = form` for a symmetric form that is positive up to round-off; only rows that matter."""
-    values, vectors = np.linalg.eigh(form)
-    kept = values > 1e-14 * max(values[-1], 0.0)
-    return np.asarray(np.sqrt(values[kept])[:, None] * vectors[:, kept].T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,12 +95,13 @@ class Learnt:
 class Local:
     """What is known at a point, in the coordinates: (N, nu) controls or (M, nu) coefficients of a basis.
 
+    weights: the barrier's Gauss-Newton Hessian and the ridge
     gradient: of all;  cost: of the cost without limits;  slopes: (m, ...) of the spectral model's coordinates
     """
 
     expansion: Expansion
-    K: Array
-    metric: Metric | BasisMetric
+    chart: Chart
+    weights: Weights
     gradient: Array
     cost: Array
     slopes: Array
@@ -117,36 +120,57 @@ class StructuredBFGS:
     """BFGS of what remains of the cost, on top of the barrier's Gauss-Newton Hessian and the model of the criterion.
 
     Both are exact at every point; pairs hold the remainder alone, so what was learnt outlives a sharper barrier.
+    Steps that go too far are damped by `Hedge.even` (Levenberg & Marquardt): that shortens what nothing holds, and leaves
+    the way back inside as it is.
     ridge: (nu,) weight of the control at every sample;  basis: (N, M) what controls may do, or None
-    reach: largest move of anything limited in one step, over half of its range
+    reach: largest move of anything limited in one step, over half of its range;  damping: of the step to come
     """
 
     ridge: Array
     basis: Array | None = None
     memory: int = 30
     reach: float = 0.5
+    damping: float = 0.0
     _pairs: tuple[Learnt, ...] = ()
     _last: Local | None = field(default=None, repr=False)
+    _told: TangentCurve | None = field(default=None, repr=False)
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """zeta by the two-loop recursion and the model, shortened where it would move too far."""
-        here = self._local(expansion, K)
-        undo = self._inverse(here.metric)
-        model = expansion.spectral
+        """zeta by the two-loop recursion and the model, damped until it does not move too far."""
+        here, hedge = self._local(expansion, K), _hedge(expansion)
+        for left in reversed(range(TRIES)):
+            step = self._step(here)
+            zeta = here.chart.lift(step if self.basis is None else self.basis @ step)
+            far = hedge.motion(zeta) / self.reach
+            if far <= 1.0 or left == 0:
+                break
+            self.damping = max(self.damping, LEAST) * float(np.clip(AIM * far, *RAISED))
+        move = 1.0 / max(far, 1.0)
+        self._told = TangentCurve(move * zeta.z, move * zeta.v)
+        return self._told
+
+    def _step(self, here: Local) -> Array:
+        """The model's minimum, in the coordinates."""
+        undo = self._inverse(self._metric(here))
+        model = here.expansion.spectral
         if model is None:
-            step = -undo(here.gradient)
-        else:
-            m = len(here.slopes)
-            rest = here.gradient - np.tensordot(model.gradient(np.zeros(m)), here.slopes, axes=1)
-            away = -undo(rest)
-            moves = np.stack([undo(slope) for slope in here.slopes])
-            flat = here.slopes.reshape(m, -1)
-            spread = flat @ moves.reshape(m, -1).T
-            w = model.settle(flat @ away.reshape(-1), 0.5 * (spread + spread.T))
-            step = away - np.tensordot(w, moves, axes=1)
-        zeta = expansion.lift(K, step if self.basis is None else self.basis @ step)
-        move = self.reach / max(_hedge(expansion).motion(zeta), self.reach)
-        return TangentCurve(move * zeta.z, move * zeta.v)
+            return -undo(here.gradient)
+        m = len(here.slopes)
+        rest = here.gradient - np.tensordot(model.gradient(np.zeros(m)), here.slopes, axes=1)
+        away = -undo(rest)
+        moves = np.stack([undo(slope) for slope in here.slopes])
+        flat = here.slopes.reshape(m, -1)
+        spread = flat @ moves.reshape(m, -1).T
+        w = model.settle(flat @ away.reshape(-1), 0.5 * (spread + spread.T))
+        return np.asarray(away - np.tensordot(w, moves, axes=1))
+
+    def _metric(self, here: Local) -> Metric | BasisMetric:
+        weights = here.weights
+        if self.damping > 0.0:
+            weights = weights.plus(_hedge(here.expansion).even, self.damping)
+        return (
+            Metric(here.chart, weights) if self.basis is None else BasisMetric.of(here.expansion, weights, self.basis)
+        )
 
     def _inverse(self, metric: Metric | BasisMetric) -> Callable[[Array], Array]:
         """What undoes the Hessian of metric and pairs: BFGS, the two-loop recursion."""
@@ -171,9 +195,15 @@ class StructuredBFGS:
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
         """Learn from the step that led to this expansion what its model left out."""
-        before = self._last
-        if before is None:
+        before, told = self._last, self._told
+        if before is None or told is None:
             return
+        gamma = float(np.vdot(told.v, moved.v)) / max(float(np.vdot(told.v, told.v)), TINY)
+        if gamma > CUT:
+            far = _hedge(before.expansion).motion(told) / self.reach
+            self.damping = self.damping * float(np.clip(AIM * far, *LOWERED)) if self.damping > LEAST else 0.0
+        else:
+            self.damping = max(self.damping, min(RAISED[0] * max(self.damping, LEAST), MOST))
         s = moved.v + np.einsum("kui,ki->ku", K, moved.z[:-1])
         if self.basis is not None:
             s = np.linalg.lstsq(self.basis, s)[0]
@@ -188,20 +218,18 @@ class StructuredBFGS:
 
     def _local(self, expansion: Expansion, K: Array) -> Local:
         """Everything about an expansion, once."""
-        if self._last is None or self._last.expansion is not expansion or self._last.K is not K:
+        if self._last is None or self._last.expansion is not expansion or self._last.chart.K is not K:
             hedge, w = _hedge(expansion), _hedge(expansion).weights
             weights = Weights(w.Q, w.S, w.R + np.diag(self.ridge), w.W)
-            metric: Metric | BasisMetric = Metric(expansion, K, weights)
-            if self.basis is not None:
-                metric = BasisMetric.of(expansion, weights, self.basis)
+            chart = Chart(expansion.A, expansion.B, K)
             forms = [(expansion.a, expansion.b), (expansion.a - hedge.a, expansion.b - hedge.b)]
             if expansion.spectral is not None:
                 forms += list(zip(expansion.spectral.a, expansion.spectral.b, strict=True))
-            found = [Expansion(expansion.A, expansion.B, a, b).gradient(K) for a, b in forms]
+            found = [chart.gradient(a, b) for a, b in forms]
             if self.basis is not None:
                 found = [self.basis.T @ g for g in found]
             slopes = np.stack(found[2:]) if len(found) > 2 else np.zeros((0, *found[0].shape))
-            self._last = Local(expansion, K, metric, found[0], found[1], slopes)
+            self._last = Local(expansion, chart, weights, found[0], found[1], slopes)
         return self._last
 
 

@@ -29,16 +29,27 @@ class Accuracy:
     central: two-sided in state and control, else one-sided
     shared: one-sided also along (psi w, w) and in the parameters, so that all directions share their origin
     delta: state and control step of mixed differences;  epsilon: step along (psi w, w)
+    steepest: mixed differences, over the largest first one, beyond which they straddle a kink (stick and slip) and count as 0
     """
 
     central: bool
     delta: float
     epsilon: float
     shared: bool = False
+    steepest: float = np.inf
+
+    def mixed(self, slope: Array, widths: Array) -> Array:
+        """Differences of slopes (2 c, n, nx) between its halves, over widths (c, 1, 1)."""
+        count = len(widths)
+        found = (slope[:count] - slope[count:]) / widths
+        if np.isfinite(self.steepest):
+            found = np.where(np.abs(found) > self.steepest * np.abs(slope).max(axis=(0, 1)), 0.0, found)
+        return np.asarray(found)
 
 
 FAST = Accuracy(central=False, delta=1e-6, epsilon=3e-3)
 DRAFT = Accuracy(central=False, delta=1e-6, epsilon=1e-3, shared=True)
+KINKED = Accuracy(central=False, delta=1e-6, epsilon=1e-5, shared=True, steepest=5e3)
 CENTRAL = Accuracy(central=True, delta=1e-4, epsilon=1e-3)
 FIRST_DERIVATIVE_STEP = 1e-6
 SENSITIVITY_STEP = 1e-5
@@ -106,6 +117,12 @@ class Plant:
         both = np.concatenate([found.psi, found.G], axis=1) * self.parameters.step
         effect = (np.abs(both).max(axis=0) / size[:, None]).max(axis=0)
         self._reach = np.clip(FAINT / np.maximum(effect, 1e-300), 1.0, LONGEST)
+
+    @property
+    def draft(self) -> Accuracy:
+        """The quickest differences that this plant bears."""
+        model = self.source.model
+        return KINKED if model.dof_frictionloss.any() or model.tendon_frictionloss.any() else DRAFT
 
     @property
     def span(self) -> Array:
@@ -410,7 +427,7 @@ class Plant:
                 rise = np.mean(t[:, :count] - t[:, count:], axis=0) / widths[..., None]
                 tapped = np.moveaxis(rise[:, :-1], 0, 3)
             slope = self.space.minus(pair[0], pair[1]) / (2.0 * epsilon)
-            mixed.append((slope[:count] - slope[count:]) / widths)
+            mixed.append(accuracy.mixed(slope, widths))
             firsts.append(np.mean(self.space.minus(pair[:, :count], pair[:, count:]), axis=0) / widths)
             if sensed is not None:
                 s = sensed.reshape(2, *shape)
@@ -464,7 +481,7 @@ class Plant:
             shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
             out = self.engine.step(self._all((theta + epsilon * w)[None]), self.space.plus(xs, shift), us).states
             slope = self.space.minus(out.reshape(shape), origin) / epsilon
-            mixed.append((slope[:count] - slope[count:]) / widths)
+            mixed.append(accuracy.mixed(slope, widths))
         unit = self._identity(len(states))
         second = None
         if self.outputs.curved:

@@ -13,7 +13,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from mjfim.barrier import Hedge
-from mjfim.lq import Recursion, TangentCurve, growth, regulator
+from mjfim.lq import Chart, TangentCurve, growth, regulator
 from mjfim.spectral import Spectral
 from mjfim.trajectory import Array, Status
 
@@ -45,17 +45,11 @@ class Expansion:
 
     def gradient(self, K: Array) -> Array:
         """(N, nu) derivative of the cost by the curve coordinate `c = u + K x`, i.e. through the projection."""
-        closed = Recursion(self.A - self.B @ K)
-        a = np.array(self.a)
-        a[:-1] -= np.einsum("kui,ku->ki", K, self.b)
-        costate = closed.adjoint(a)
-        return np.asarray(self.b + np.einsum("kiu,ki->ku", self.B, costate[1:]))
+        return Chart(self.A, self.B, K).gradient(self.a, self.b)
 
     def lift(self, K: Array, c: Array) -> TangentCurve:
         """Tangent vector whose curve coordinate moves by c: (N, nu)."""
-        closed = Recursion(self.A - self.B @ K)
-        z = closed.forward(np.zeros(self.A.shape[1]), np.einsum("kiu,ku->ki", self.B, c))
-        return TangentCurve(z, c - np.einsum("kui,ki->ku", K, z[:-1]))
+        return Chart(self.A, self.B, K).lift(c)
 
 
 class Problem(Protocol[P]):

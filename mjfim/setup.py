@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from mjfim.engine import state_space
 from mjfim.errors import ExperimentError, ModelError, SimulationDiverged, unknown
 from mjfim.experiment import Experiment, Signal, by_name
 from mjfim.fisher import Information
+from mjfim.level import STATED, Level
 from mjfim.limits import limits_of
 from mjfim.models import Lifted, Mocap, Source, compile_spec, control_names, coordinates, decoration, load_spec
 from mjfim.objective import DesignProblem, RunningCost
@@ -39,9 +41,7 @@ class Setup:
     spec, model: the user's model, untouched by parameters;  plant: at any theta;  t: (N,) sample times [s]
     added: (p, p) information of other experiments, or None;  earlier: that and what the experiment's `earlier` files hold
     prior: (p, p) earlier information and that of the parameters' priors
-    stretch: 1, or how many times longer the timestep is than stated, and the engine steps of a sample fewer
-    lifted: the plant has no clamps and stops where a design keeps the limits anyway
-    coarsen: 1, or how many times longer timestep and sample period are than stated (coarse-to-fine descent)
+    level: how the plant differs from the user's;  coarsen, stretch: its
     playback_steps: engine steps from one row of design.csv to the next
     """
 
@@ -49,16 +49,13 @@ class Setup:
         self,
         experiment: Experiment,
         threads: int | None = None,
-        coarsen: int = 1,
         added: Array | None = None,
-        lifted: bool = False,
-        stretch: int = 1,
+        level: Level = STATED,
     ) -> None:
         self.experiment = experiment
-        self.coarsen = coarsen
         self.added = added
-        self.lifted = lifted
-        self.stretch = stretch
+        self.level = level
+        self.coarsen, self.stretch = level.coarsen, level.stretch
         try:
             self._build(threads, added)
         except ExperimentError as error:
@@ -321,11 +318,12 @@ class Setup:
     def _private(self) -> Source:
         friction = any("frictionloss" in t.path for p in self.parameters.parameters for t in p.targets)
         anything = friction or any(p.function is not None for p in self.parameters.parameters)
-        longer, lifts = self.coarsen * self.stretch, self.lifted and self.experiment.limits.enforce
-        return self._source(self.outputs.needs_sensors, anything, longer, self._lift() if lifts else None)
+        return self._source(self.outputs.needs_sensors, anything, self.coarsen * self.stretch, self._lifted())
 
-    def _lift(self) -> Lifted:
-        """Whatever the limits of the experiment keep a design away from."""
+    def _lifted(self) -> Lifted | None:
+        """What this level is without: whatever the limits of the experiment keep a design away from, and friction."""
+        if not (self.level.lifted and self.experiment.limits.enforce):
+            return Lifted(friction=True) if self.level.frictionless else None
         named = {
             kind: {limit.name for limit in self.limits if limit.kind == kind} for kind in ("position", "joint_force")
         }
@@ -337,6 +335,7 @@ class Setup:
             tuple(i for i in range(self.model.nactuator) if int(self.model.actuator_outadr[i]) in forced),
             True,
             stated.clearance is not None and not stated.ignored,
+            self.level.frictionless,
         )
 
     def _require_bodies(self, source: Source) -> None:
@@ -444,12 +443,31 @@ class Setup:
 
     def coarser(self, factor: int) -> Setup:
         """The same experiment at a timestep and sample period that are `factor` times longer."""
-        return Setup(self.experiment, self.plant.engine.threads, factor, self.added, self.lifted)
+        return self._at(coarsen=factor)
 
     def free(self) -> Setup:
         """The same experiment on a plant without the clamps and stops that hard limits keep a design away from."""
-        return Setup(self.experiment, self.plant.engine.threads, self.coarsen, self.added, lifted=True)
+        return self._at(lifted=True)
 
     def stretched(self, factor: int) -> Setup:
         """The same experiment at a timestep that is `factor` times longer, its samples as they are."""
-        return Setup(self.experiment, self.plant.engine.threads, self.coarsen, self.added, self.lifted, factor)
+        return self._at(stretch=factor)
+
+    def frictionless(self) -> Setup | None:
+        """The same experiment without dry friction, and without the parameters that are nothing else.
+
+        None where there is no friction, or where something that is stated rests on these parameters.
+        """
+        e, model = self.experiment, self.plant.source.model
+        dry = {
+            p.name for p in self.parameters.parameters if p.targets and all("frictionloss" in t.path for t in p.targets)
+        }
+        kept = {name: stated for name, stated in e.parameters.items() if name not in dry}
+        slippery = not (dry or model.dof_frictionloss.any() or model.tendon_frictionloss.any())
+        if slippery or not kept or e.cost.criterion == "c" or e.earlier or self.added is not None:
+            return None
+        level = replace(self.level, frictionless=True)
+        return Setup(e.model_copy(update={"parameters": kept}), self.plant.engine.threads, None, level)
+
+    def _at(self, **changes: Any) -> Setup:
+        return Setup(self.experiment, self.plant.engine.threads, self.added, replace(self.level, **changes))

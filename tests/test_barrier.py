@@ -109,14 +109,14 @@ def test_a_hedge_tells_the_largest_move_of_anything_over_its_range() -> None:
     taps = np.zeros((N, 1, 2, nx + nu))
     taps[2, 0, 1] = [0.0, 3.0, 1.0]  # what is shown there moves by 3 z_1 + v over its scale
     free = Weights(np.zeros((N + 1, nx, nx)), np.zeros((N, nu, nx)), np.zeros((N, nu, nu)), np.zeros((N + 1, nu)))
-    hedge = Hedge(np.zeros((N + 1, nx)), np.zeros((N, nu)), free, taps, np.array([8.0]))
+    hedge = Hedge(np.zeros((N + 1, nx)), np.zeros((N, nu)), free, taps, np.array([8.0]), np.array([np.inf]))
     z, v = np.zeros((N + 1, nx)), np.zeros((N, nu))
     v[0] = -2.0
     assert hedge.motion(TangentCurve(z, v)) == pytest.approx(0.25)  # the control alone
     z[2], v[2] = [9.0, -0.4], 0.1
     assert hedge.motion(TangentCurve(z, v)) == pytest.approx(1.1)
     a, b, twice = hedge.a + 1.0, hedge.b + 2.0, Weights(free.Q + 1.0, free.S + 2.0, free.R + 3.0, free.W + 4.0)
-    double = Hedge(a, b, twice, taps, hedge.control).times(2.0)
+    double = Hedge(a, b, twice, taps, hedge.control, hedge.step).times(2.0)
     found = [double.a, double.b, double.weights.Q, double.weights.S, double.weights.R, double.weights.W]
     assert [float(array.flat[0]) for array in found] == [2.0, 4.0, 2.0, 4.0, 6.0, 8.0]
     np.testing.assert_array_equal(double.taps, taps)  # ranges, not weights

@@ -32,6 +32,7 @@ ORDER = (
     "units",
     "mjcf",
     "models",
+    "level",
     "parameters",
     "noise",
     "lag",

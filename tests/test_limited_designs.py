@@ -215,7 +215,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     # beside it another start goes on
     chases: list[Chase] = []
     starts = [task.start, Start("initial control", setup.control)]
-    rows = list(Contest(setup.free(), None, None).run(starts, chases))
+    rows = list(Contest(Stage(setup.free(), None), None).run(starts, chases))
     assert rows
     assert np.isfinite(chases[1].cost)
 
@@ -345,7 +345,7 @@ def test_a_fourier_start_is_optimised_as_a_series_before_it_goes_on_freely(tmp_p
     first: dict[str, Array] = {}
     from mjfim.starts import starts_of
 
-    for _ in Contest(setup.free(), None, None).run(list(starts_of(setup, None)), chases):
+    for _ in Contest(Stage(setup.free(), None), None).run(list(starts_of(setup, None)), chases):
         for chase in chases:
             if chase.control is not None and chase.history[-1].mu >= 0.01:
                 first[chase.name] = chase.control

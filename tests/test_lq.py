@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from mjfim.lq import Recursion, TangentCurve, Weights, descent, growth, regulator, weighted_descent
+from mjfim.lq import Recursion, Riccati, TangentCurve, Weights, descent, growth, regulator
 
 
 def random_system(rng: np.random.Generator, N: int, nx: int, nu: int) -> tuple[np.ndarray, np.ndarray]:
@@ -195,13 +195,13 @@ def test_weighted_descent_solves_the_dense_normal_equations(sizes: tuple[int, in
     pairs = np.array([[cost(e + f)[1] for f in units] for e in units])
     H = 0.5 * (pairs - diagonal[:, None] - diagonal)  # by polarisation
     best = -np.linalg.solve(H, g).reshape(N, nu)
-    zeta = weighted_descent(A, B, a, b, weights)
+    zeta = Riccati.of(A, B, weights).descent(a, b)
     np.testing.assert_allclose(zeta.v, best, rtol=0, atol=1e-8 * np.abs(best).max())
     np.testing.assert_allclose(zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0))
     # every weight is seen
     for name in ("S", "W") if steps else ("S",):
         other = Weights(**{**weights.__dict__, name: 0.5 * getattr(weights, name)})
-        assert np.abs(weighted_descent(A, B, a, b, other).v - best).max() > 1e-4 * np.abs(best).max() or (
+        assert np.abs(Riccati.of(A, B, other).descent(a, b).v - best).max() > 1e-4 * np.abs(best).max() or (
             name == "S" and N == 1  # z_0 = 0
         )
 

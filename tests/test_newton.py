@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from test_lq import random_system, random_weights
 
 from mjfim.barrier import Band, Hedge
-from mjfim.lq import Recursion, TangentCurve, Weights
+from mjfim.lq import Chart, Recursion, TangentCurve, Weights
 from mjfim.newton import BasisMetric, Metric, StructuredBFGS
 from mjfim.pronto import Armijo, Expansion, Regulator, optimize
 from mjfim.trajectory import Status
@@ -39,7 +39,7 @@ def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: b
     rng = np.random.default_rng(1)
     expansion, weights = random_expansion(rng)
     K = feedback * 0.3 * rng.normal(size=(N, NU, NX))
-    metric = Metric(expansion, K, weights)
+    metric = Metric(Chart(expansion.A, expansion.B, K), weights)
     H = dense(metric)
     np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(H)[0] > 0.0
@@ -55,7 +55,7 @@ def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: b
 def test_on_an_identity_basis_both_metrics_agree() -> None:
     rng = np.random.default_rng(2)
     expansion, weights = random_expansion(rng)
-    free = Metric(expansion, np.zeros((N, NU, NX)), weights)
+    free = Metric(Chart(expansion.A, expansion.B, np.zeros((N, NU, NX))), weights)
     based = BasisMetric.of(expansion, weights, np.eye(N))
     for _ in range(3):
         s = rng.normal(size=(N, NU))
@@ -71,7 +71,7 @@ def test_on_fewer_curves_the_metric_is_the_projected_one() -> None:
     weights.Q[4:9], weights.S[4:9], weights.W[::2] = 0.0, 0.0, 0.0
     basis = rng.normal(size=(N, 5))
     wide = np.einsum("km,uw->kumw", basis, np.eye(NU)).reshape(N * NU, -1)
-    H = wide.T @ dense(Metric(expansion, np.zeros((N, NU, NX)), weights)) @ wide
+    H = wide.T @ dense(Metric(Chart(expansion.A, expansion.B, np.zeros((N, NU, NX))), weights)) @ wide
     based = BasisMetric.of(expansion, weights, basis)
     assert relative_error(based.H, H) < 1e-9
     g = rng.normal(size=(5, NU))
@@ -156,7 +156,9 @@ class Toy:
             W = wall.bend
         taps = np.zeros((N, 1, 1, NX + NU))
         taps[:, 0, 0, :NX], taps[:, 0, 0, NX:] = A[:, 0], B[:, 0]
-        hedge = Hedge(wall_a, wall_b, Weights(Q, np.zeros((N, NU, NX)), R, W), taps, self.control.scale)
+        hedge = Hedge(
+            wall_a, wall_b, Weights(Q, np.zeros((N, NU, NX)), R, W), taps, self.control.scale, self.rate.scale
+        )
         return Expansion(A, B, a + wall_a, b + wall_b, None, hedge)
 
     def project(self, point: ToyPoint, zeta: TangentCurve, gamma: float, K: Array) -> ToyPoint:
@@ -214,7 +216,7 @@ def test_what_was_learnt_outlives_a_sharper_barrier() -> None:
     for iterate in optimize(blunt, blunt.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-6, 40):
         point = iterate.point
     pairs = direction._pairs
-    assert len(pairs) > 5
+    assert len(pairs) > 2
 
     def gradient(u: Array) -> Array:
         return Toy(0.0).expand(Toy(0.0).point(u)).gradient(np.zeros((N, NU, NX)))
@@ -234,10 +236,37 @@ def test_no_step_moves_anything_limited_too_far() -> None:
     long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(e, K)
     short = StructuredBFGS(np.full(NU, 1e-6), reach=0.25)(e, K)
     assert e.hedge.motion(long) > 1.0
-    assert e.hedge.motion(short) == pytest.approx(0.25)
-    np.testing.assert_allclose(short.v / np.abs(short.v).max(), long.v / np.abs(long.v).max(), rtol=0, atol=1e-12)
+    assert 0.05 < e.hedge.motion(short) <= 0.25
+    assert e.slope(short) < 0.0
     tiny = Expansion(e.A, e.B, 1e-9 * e.a, 1e-9 * e.b, None, e.hedge)
     assert e.hedge.motion(StructuredBFGS(np.full(NU, 1.0))(tiny, K)) < 1e-6  # a short step stays as it is
+
+
+def test_damping_shortens_what_nothing_holds_and_leaves_the_way_back_inside() -> None:
+    """From outside a bound, with a cost that pulls far elsewhere: the damped step gains more than the one scaled down."""
+    toy, outside = Toy(1e-4), np.zeros((N, NU))
+    outside[3, 0] = toy.control.upper[0] + 0.2 * toy.control.scale[0]
+    e = toy.expand(toy.point(outside))
+    assert e.hedge is not None
+    a = e.a + 50.0 * np.random.default_rng(2).normal(size=e.a.shape) * np.array([0.0, 1.0, 1.0])
+    pulled, K = replace(e, a=a), np.zeros((N, NU, NX))
+    long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(pulled, K)
+    far = e.hedge.motion(long) / 0.25
+    assert far > 10.0
+    direction = StructuredBFGS(np.full(NU, 1e-6), reach=0.25)
+    damped = direction(pulled, K)
+    assert direction.damping > 0.0
+    assert e.hedge.motion(damped) <= 0.25 + 1e-12
+    assert pulled.slope(damped) < 0.0
+    assert damped.v[3, 0] < 2.0 * long.v[3, 0] / far < 0.0
+
+
+def test_damping_fades_where_steps_are_short() -> None:
+    toy = Toy(1e-2)
+    direction = StructuredBFGS(np.full(NU, 1e-3), damping=10.0)
+    iterates = list(optimize(toy, toy.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-9, 150))
+    assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
+    assert direction.damping < 1e-3
 
 
 def test_an_expansion_without_limits_is_refused() -> None:

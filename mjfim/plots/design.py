@@ -218,7 +218,7 @@ def convergence(design: Design) -> Figure:
             color=MUTED,
         )
     mus = np.array([row.mu for row in history])
-    for k in np.flatnonzero(np.diff(mus)):
+    for k in np.flatnonzero(mus[1:] != mus[:-1]):
         for axes in top:
             axes.axvline(iterations[k + 1], color=FAINT, linewidth=1.0, linestyle="--", zorder=0)
     names = ("cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]")
