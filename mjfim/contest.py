@@ -5,22 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, wait
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mjfim.audit import audit
+from mjfim.audit import Audit, audit
 from mjfim.descent import Stage
 from mjfim.enclosed import Chase, Task, perform, pursue
-from mjfim.ladder import Rungs, held_back
+from mjfim.ladder import SHRUNK, Rungs, held_back
 from mjfim.starts import Start
-from mjfim.trajectory import HistoryRow, Status
+from mjfim.trajectory import Array, HistoryRow, Status
 
-HALFWAY = 0.01  # mu down to which all starts compete
 KEPT = 4  # one in so many goes on
+HALFWAY, SHARP = 0.01, 1e-3  # mu down to which starts compete, and where they are few, on samples as stated
+SPAN = 3.0  # times mu there with which the second round begins
 PROOFS, LATE, PATIENCE = 3, 1e-3, 60  # repetitions of a winner that leaks, their first mu, their iterations
 GRACE = 5.0  # [s] that interrupted starts get to tell what they have
-EARLY = 0.5  # share of the iterations and of the time for the first round
+EARLY, SPARE = 0.5, 0.05  # share of the iterations and of the time for the first round, and of the time for repetitions
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,18 +35,28 @@ class Contest:
     fine: Stage
     coarse: Stage | None
     executor: Executor | None = None
+    begun: float = field(default_factory=time.perf_counter)
+
+    @property
+    def _seconds(self) -> float:
+        """That are left."""
+        stated = self.fine.setup.experiment.descent.seconds
+        return np.inf if stated is None else max(self.begun + stated - time.perf_counter(), 0.0)
 
     def run(self, starts: Sequence[Start], chases: list[Chase]) -> Iterator[HistoryRow]:
         """Every iterate; `chases` gets one entry per start, the winners' ones after the second round."""
         d = self.fine.setup.experiment.descent
-        seconds = np.inf if d.seconds is None else d.seconds
-        clock = time.perf_counter()
+        reserve = SPARE * (d.seconds or 0.0)
         first = self.coarse or self.fine
         if len(starts) == 1 and self.coarse is None and starts[0].basis is None:
-            yield from self._round(self.fine, starts, Rungs(), d.max_iterations, seconds, chases)
+            yield from self._round(self.fine, starts, Rungs(), d.max_iterations, self._seconds - reserve, chases)
             return
-        share = EARLY * seconds / self._turns(len(starts))
-        yield from self._round(first, starts, Rungs(last=HALFWAY), round(EARLY * d.max_iterations), share, chases)
+        share = EARLY * self._seconds / self._turns(len(starts))
+        same = first.setup.level == replace(
+            self.fine.setup.level, stretch=first.setup.stretch
+        )  # nearly the stated plant
+        last = SHARP if same and len(starts) < KEPT else HALFWAY
+        yield from self._round(first, starts, Rungs(last=last), round(EARLY * d.max_iterations), share, chases)
         order = sorted(range(len(chases)), key=lambda i: chases[i].cost)
         if any(chase.status is Status.INTERRUPTED for chase in chases):
             return
@@ -55,11 +66,18 @@ class Contest:
                 chases[i].status = Status.LEFT
         kept = [i for i in kept if chases[i].control is not None]
         again = [Start(chases[i].name, c) for i in kept if (c := chases[i].control) is not None]
-        left = max(seconds - (time.perf_counter() - clock), 0.0) / self._turns(len(again))
+        left = max(self._seconds - reserve, 0.0) / self._turns(len(again))
         done = max((row.iteration for i in kept for row in chases[i].history), default=0)
         second: list[Chase] = []
         try:
-            for row in self._round(self.fine, again, Rungs(first=HALFWAY), d.max_iterations - done, left, second):
+            for row in self._round(
+                self.fine,
+                again,
+                Rungs(first=SPAN * last if last < HALFWAY else last),
+                d.max_iterations - done,
+                left,
+                second,
+            ):
                 yield replace(row, iteration=row.iteration + done + 1)
         finally:  # also where the user interrupts
             for i, chase in zip(kept, second, strict=False):
@@ -70,26 +88,47 @@ class Contest:
 
     def prove(self, chases: list[Chase]) -> Iterator[HistoryRow]:
         """Hold back a winner that leaves a limit on the untouched model, between what the barrier looked at; a few times."""
-        setup = self.fine.setup
         for _ in range(PROOFS):
-            if not chases or any(chase.status is Status.INTERRUPTED for chase in chases):
-                return
-            i = min(range(len(chases)), key=lambda i: chases[i].cost)
-            best = chases[i]
-            if best.control is None or not np.isfinite(best.cost):
-                return
-            found = audit(setup, setup.plant.simulate(setup.theta, best.control))
-            if found.kept or not np.isfinite(found.deviation):
-                return
-            held = held_back({}, found.shares)
-            again: list[Chase] = []
+            leaking = self._leaking(chases)
+            if leaking is None or self._seconds == 0.0:
+                break
+            i, shares = leaking
+            best, again = chases[i], list[Chase]()
+            start = Start(best.name, np.asarray(best.control))
             yield from self._round(
-                self.fine, [Start(best.name, best.control)], Rungs(first=LATE), PATIENCE, np.inf, again, held
+                self.fine, [start], Rungs(first=LATE), PATIENCE, self._seconds, again, held_back({}, shares)
             )
             if np.isfinite(again[0].cost):
                 again[0].history = _joined(best.history, again[0].history)
                 again[0].steps += best.steps
                 chases[i] = again[0]
+        leaking = self._leaking(chases)
+        if leaking is not None:
+            self._shrink(chases[leaking[0]])
+
+    def _leaking(self, chases: list[Chase]) -> tuple[int, dict[str, float]] | None:
+        """Which one wins and leaves a limit on the untouched model, and its shares; None where there is none."""
+        if not chases or any(chase.status is Status.INTERRUPTED for chase in chases):
+            return None
+        i = min(range(len(chases)), key=lambda i: chases[i].cost)
+        if chases[i].control is None or not np.isfinite(chases[i].cost):
+            return None
+        found = self._audited(np.asarray(chases[i].control))
+        return None if found.kept or not np.isfinite(found.deviation) else (i, found.shares)
+
+    def _audited(self, control: Array) -> Audit:
+        setup = self.fine.setup
+        return audit(setup, setup.plant.simulate(setup.theta, control))
+
+    def _shrink(self, chase: Chase) -> None:
+        """Shrink a control about the centre until no limit is left, if it ever is."""
+        setup = self.fine.setup
+        for share in SHRUNK:
+            control = setup.centre + share * (np.asarray(chase.control) - setup.centre)
+            if self._audited(control).kept:
+                chase.control = control
+                chase.cost = self.fine.problem.point(setup.plant.simulate(setup.theta, control)).cost
+                return
 
     def _turns(self, count: int) -> int:
         """How many of the tasks run after one another."""

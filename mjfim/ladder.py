@@ -23,6 +23,7 @@ HOLDING = 4e-3  # mu from which on leaks are answered
 SPARE = 1.2  # what was outside at the end of a rung is held back on the next by that much of it
 SLACK = 1.5  # of the time that is left per rung, what one may take
 AGAIN = 3  # times that the last rung is repeated because of leaks, at most
+OUTSIDE = 1.0  # of a start beyond its limits, over half of their ranges, that is begun with as it is
 ROUNDS, FEW = 60, 20  # iterations towards the inside, the latter where shrinking leads there too
 
 
@@ -94,11 +95,11 @@ class Ladder:
             yield from self._down(entry.control, self._direction(), budget, until, entry.iterations)
 
     def _entered(self, control: Array, budget: int, until: float) -> Generator[Rung, None, Entry]:
-        """A control inside all limits, shrunk about the centre or steered, whatever costs less; else what comes near."""
+        """A control inside all limits or near them; of those far outside, shrunk about the centre or steered, what costs less."""
         fitted = self._fitted(control)
-        shrunk = self.inside(fitted)
-        if shrunk is not None and np.array_equal(shrunk, fitted):
+        if self._near(fitted):
             return Entry(fitted, 0)
+        shrunk = self.inside(fitted)
         rung: Rung | None = None
         for rung in self._steered(fitted, budget if shrunk is None else min(budget, FEW), until):
             yield rung
@@ -111,6 +112,13 @@ class Ladder:
         entries = [shrunk, steered] if rung.feasible else [shrunk]
         values = [problem.value(problem.point(ctrl)) for ctrl in entries]
         return Entry(entries[int(np.argmin(values))], taken)
+
+    def _near(self, control: Array) -> bool:
+        """What a relaxed barrier brings back inside on its way down: an end that is missed can be any number of its bands off."""
+        point = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False).point(control)
+        if point.sight is None:
+            return False
+        return all(s > -OUTSIDE for kind, s in self.fence.shares(point.sight).items() if not kind.startswith("end_"))
 
     def _direction(self) -> StructuredBFGS:
         N = len(self.base.running.desired) - 1

@@ -15,10 +15,13 @@ from mjfim.pronto import Expansion
 from mjfim.trajectory import Array
 
 BENT = 1e-8  # relative curvature of a pair that still counts
-LEAST, MOST = 1e-4, 1.0  # damping that is worth it, in units of mu; that makes steps short which the line search cut
+LEAST = 1e-4  # damping that is worth it, in units of mu
 TRIES, RAISED, LOWERED = 5, (2.0, 10.0), (0.1, 1.0)  # dampings of a step at most, and factors between two of them
 AIM = 1.5  # factor of the damping, over how far a step goes
 CUT = 0.3  # share of a step that was taken below which the next one is damped more, else less if it did not go far
+WORTH = (
+    0.01  # loss that a step promised below which it is not damped for having been cut: that would look like convergence
+)
 TINY = 1e-300
 
 
@@ -47,32 +50,54 @@ class Metric:
 
 
 @dataclass(frozen=True, eq=False)
+class Curves:
+    """What each coefficient of a basis: (N, M), of every control alike, does to the state: z (N+1, nx, M nu)."""
+
+    basis: Array
+    z: Array
+
+    @staticmethod
+    def of(expansion: Expansion, basis: Array) -> Curves:
+        """Follow the linear recursion."""
+        A, B = expansion.A, expansion.B
+        N, nx, _ = B.shape
+        drive = np.einsum("km,kiu->kimu", basis, B).reshape(N, nx, -1)
+        z = np.zeros((N + 1, *drive.shape[1:]))
+        for k in range(N):
+            z[k + 1] = A[k] @ z[k] + drive[k]
+        return Curves(basis, z)
+
+    def form(self, weights: Weights) -> Array:
+        """(M nu, M nu) the quadratic form on the coefficients, summed over the curves that they make."""
+        N, nu, nx = weights.S.shape
+        M = self.basis.shape[1]
+        Qz = (weights.Q @ self.z).reshape(-1, M * nu)
+        Qz[: N * nx] += 2.0 * np.einsum("km,kui->kimu", self.basis, weights.S).reshape(N * nx, M * nu)
+        H = Qz.T @ self.z.reshape(-1, M * nu)
+        pairs = np.einsum("km,kn->kmn", self.basis, self.basis).reshape(N, -1)
+        own = (pairs.T @ weights.R.reshape(N, -1)).reshape(M, M, nu, nu)
+        stepped = np.diff(self.basis, axis=0, prepend=0.0, append=0.0)
+        for u in range(nu):
+            own[:, :, u, u] += stepped.T @ (weights.W[:, u, None] * stepped)
+        return np.asarray(0.5 * (H + H.T) + own.swapaxes(1, 2).reshape(M * nu, M * nu))
+
+
+@dataclass(frozen=True, eq=False)
 class BasisMetric:
-    """The same on the coefficients of a basis: (N, M), of every control alike; dense.  factor: Cholesky factor of H"""
+    """The same on the coefficients of a basis; dense.  H: (M nu, M nu)"""
 
     H: Array
-    factor: tuple[Array, bool]
 
     @staticmethod
     def of(expansion: Expansion, weights: Weights, basis: Array) -> BasisMetric:
-        """Sums the form over the curves that each coefficient makes."""
-        A, B = expansion.A, expansion.B
-        N, nx, nu = B.shape
-        M = basis.shape[1]
-        drive = np.einsum("km,kiu->kimu", basis, B).reshape(N, nx, M * nu)
-        z = np.zeros((N + 1, nx, M * nu))
-        for k in range(N):
-            z[k + 1] = A[k] @ z[k] + drive[k]
-        Qz = (weights.Q @ z).reshape(-1, M * nu)
-        Qz[: N * nx] += 2.0 * np.einsum("km,kui->kimu", basis, weights.S).reshape(N * nx, M * nu)
-        H = Qz.T @ z.reshape(-1, M * nu)
-        pairs = np.einsum("km,kn->kmn", basis, basis).reshape(N, -1)
-        own = (pairs.T @ weights.R.reshape(N, -1)).reshape(M, M, nu, nu)
-        stepped = np.diff(basis, axis=0, prepend=0.0, append=0.0)
-        for u in range(nu):
-            own[:, :, u, u] += stepped.T @ (weights.W[:, u, None] * stepped)
-        H = 0.5 * (H + H.T) + own.swapaxes(1, 2).reshape(M * nu, M * nu)
-        return BasisMetric(H, cho_factor(H, lower=True))
+        """Of a form on curves."""
+        return BasisMetric(Curves.of(expansion, basis).form(weights))
+
+    @cached_property
+    def factor(self) -> tuple[Array, bool]:
+        """Cholesky factor."""
+        factor, lower = cho_factor(self.H, lower=True)
+        return factor, bool(lower)
 
     def apply(self, s: Array) -> Array:
         """The form's gradient at s: (M, nu)."""
@@ -105,6 +130,23 @@ class Local:
     gradient: Array
     cost: Array
     slopes: Array
+    basis: Array | None
+
+    def metric(self, damping: float) -> Metric | BasisMetric:
+        """Of the weights, and a multiple of even ones."""
+        even = _hedge(self.expansion).even
+        if self.basis is None:
+            return Metric(self.chart, self.weights.plus(even, damping) if damping > 0.0 else self.weights)
+        form, spread = self._forms
+        return BasisMetric(form + damping * spread if damping > 0.0 else form)
+
+    @cached_property
+    def _forms(self) -> tuple[Array, Array]:
+        """The weights' form and the even one, on the coefficients."""
+        if self.basis is None:
+            raise ValueError("no basis, no coefficients")
+        curves = Curves.of(self.expansion, self.basis)
+        return curves.form(self.weights), curves.form(_hedge(self.expansion).even)
 
     def modelled(self, s: Array) -> Array:
         """Gradient of the cost that the model expects after a step s, over that at its start."""
@@ -151,7 +193,7 @@ class StructuredBFGS:
 
     def _step(self, here: Local) -> Array:
         """The model's minimum, in the coordinates."""
-        undo = self._inverse(self._metric(here))
+        undo = self._inverse(here.metric(self.damping))
         model = here.expansion.spectral
         if model is None:
             return -undo(here.gradient)
@@ -163,14 +205,6 @@ class StructuredBFGS:
         spread = flat @ moves.reshape(m, -1).T
         w = model.settle(flat @ away.reshape(-1), 0.5 * (spread + spread.T))
         return np.asarray(away - np.tensordot(w, moves, axes=1))
-
-    def _metric(self, here: Local) -> Metric | BasisMetric:
-        weights = here.weights
-        if self.damping > 0.0:
-            weights = weights.plus(_hedge(here.expansion).even, self.damping)
-        return (
-            Metric(here.chart, weights) if self.basis is None else BasisMetric.of(here.expansion, weights, self.basis)
-        )
 
     def _inverse(self, metric: Metric | BasisMetric) -> Callable[[Array], Array]:
         """What undoes the Hessian of metric and pairs: BFGS, the two-loop recursion."""
@@ -202,8 +236,8 @@ class StructuredBFGS:
         if gamma > CUT:
             far = _hedge(before.expansion).motion(told) / self.reach
             self.damping = self.damping * float(np.clip(AIM * far, *LOWERED)) if self.damping > LEAST else 0.0
-        else:
-            self.damping = max(self.damping, min(RAISED[0] * max(self.damping, LEAST), MOST))
+        elif before.expansion.slope(told) < -WORTH:
+            self.damping = RAISED[0] * max(self.damping, LEAST)
         s = moved.v + np.einsum("kui,ki->ku", K, moved.z[:-1])
         if self.basis is not None:
             s = np.linalg.lstsq(self.basis, s)[0]
@@ -229,7 +263,7 @@ class StructuredBFGS:
             if self.basis is not None:
                 found = [self.basis.T @ g for g in found]
             slopes = np.stack(found[2:]) if len(found) > 2 else np.zeros((0, *found[0].shape))
-            self._last = Local(expansion, chart, weights, found[0], found[1], slopes)
+            self._last = Local(expansion, chart, weights, found[0], found[1], slopes, self.basis)
         return self._last
 
 

@@ -64,12 +64,12 @@ class Case:
         return self.kept and self.gain >= WANTED and self.design <= self.many * (1.0 + 1e-3)
 
 
-def run(arm: str, horizon: float, dry: bool, seconds: float, folder: Path, console: Console) -> Case:
+def run(arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: Console) -> Case:
     """Compare on one arm."""
-    stated = arms.experiment(arm, horizon, dry, folder / "models")
+    stated = arms.experiment(arm, horizon, dry, args.folder / "models")
     experiment = stated.replace(descent={"fourier": [PITCH], "max_iterations": 100_000})
     with ProcessPoolExecutor(cores(), multiprocessing.get_context("spawn")) as executor:
-        found = mjfim.compare(experiment, seconds, methods=(*FEW, *MANY), executor=executor)
+        found = mjfim.compare(experiment, args.seconds, methods=args.methods, executor=executor)
     for row in found.rows:
         console.print(f"  {row.title}: {row.worst:.4g}, {row.outcome.value}, {row.seconds:.0f} s, {row.found_by}")
     ours = found.design
@@ -88,7 +88,7 @@ def run(arm: str, horizon: float, dry: bool, seconds: float, folder: Path, conso
         share,
         ours.sound,
         ours.seconds,
-        seconds,
+        args.seconds,
         ours.found_by,
     )
 
@@ -129,6 +129,7 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=list(arms.ARMS), default=list(arms.ARMS))
     parser.add_argument("--horizons", nargs="+", type=float, default=[5.0, 10.0])
     parser.add_argument("--joints", nargs="+", choices=["smooth", "dry"], default=["smooth", "dry"])
+    parser.add_argument("--methods", nargs="+", choices=[*FEW, *MANY], default=[*FEW, *MANY])
     parser.add_argument("--show", action="store_true", help="only print what was run so far")
     args = parser.parse_args()
     console, cases = Console(highlight=False, width=150), []
@@ -139,7 +140,7 @@ def main() -> None:
                 continue
             console.print(f"{arm}, {joints}, {horizon:g} s")
             args.folder.mkdir(parents=True, exist_ok=True)
-            case = run(arm, horizon, joints == "dry", args.seconds, args.folder, console)
+            case = run(arm, horizon, joints == "dry", args, console)
             file.write_text(json.dumps(asdict(case)), encoding="utf-8")
         cases.append(Case(**json.loads(file.read_text(encoding="utf-8"))))
     if cases:

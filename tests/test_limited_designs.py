@@ -15,6 +15,7 @@ from test_fence import ARM
 
 import mjfim
 from mjfim import contest
+from mjfim import ladder as ladder_module
 from mjfim.basis import spline_basis
 from mjfim.bounds import basis_of, fence_of
 from mjfim.contest import Contest
@@ -174,7 +175,30 @@ def swinging_setup(folder: Path, **tables: Any) -> Setup:
     return make_setup(SWINGING, folder, **{**defaults, **tables})
 
 
-def test_a_start_that_no_shrinking_brings_inside_is_steered(tmp_path: Path) -> None:
+def assert_ends(setup: Setup, design: Design) -> None:
+    """It hangs still where it has to, by a plain loop, within all limits."""
+    assert design.status is not Status.INFEASIBLE
+    rows = played(setup.model, (np.array([0.0, 2.6]), np.array([0.4, 1.0])), design.trajectory.ctrl, setup.substeps)
+    np.testing.assert_allclose(rows["q"][-1], [0.3, np.pi], rtol=0, atol=0.02)
+    np.testing.assert_allclose(rows["v"][-1], 0.0, rtol=0, atol=0.05)
+    assert_inside(setup, design.trajectory.ctrl)
+
+
+def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> None:
+    """The relaxed barrier brings it there, and the cost has its say from the first iterate on."""
+    setup = swinging_setup(tmp_path)
+    free = setup.free()
+    ladder = Ladder(Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free))
+    first = next(ladder.climb(setup.control, 5))
+    assert first.mu == Rungs().first
+    assert not first.feasible
+    np.testing.assert_array_equal(first.iterate.point.ctrl, setup.control)
+    assert_ends(setup, mjfim.design(setup))
+
+
+def test_a_start_that_no_shrinking_brings_inside_is_steered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is too far outside to begin with: here by decree."""
+    monkeypatch.setattr(ladder_module, "OUTSIDE", -np.inf)
     setup = swinging_setup(tmp_path)
     free = setup.free()
     ladder = Ladder(Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free))
@@ -187,11 +211,7 @@ def test_a_start_that_no_shrinking_brings_inside_is_steered(tmp_path: Path) -> N
     steered = mus.count(np.inf)
     assert 1 < steered < 30
     assert mus[:steered] == [np.inf] * steered  # at first, then never again
-    assert design.status is not Status.INFEASIBLE
-    rows = played(setup.model, (np.array([0.0, 2.6]), np.array([0.4, 1.0])), design.trajectory.ctrl, setup.substeps)
-    np.testing.assert_allclose(rows["q"][-1], [0.3, np.pi], rtol=0, atol=0.02)
-    np.testing.assert_allclose(rows["v"][-1], 0.0, rtol=0, atol=0.05)
-    assert_inside(setup, design.trajectory.ctrl)
+    assert_ends(setup, design)
 
 
 def test_what_no_control_can_keep_ends_as_infeasible(tmp_path: Path) -> None:
@@ -469,12 +489,16 @@ def nearest(setup: Setup, ctrl: Array) -> float:
     return min(near)
 
 
-@pytest.mark.parametrize("proofs", [0, 3], ids=["unproved", "proved"])
+@pytest.mark.parametrize(
+    ("proofs", "shrunk"), [(0, False), (0, True), (3, False)], ids=["unproved", "shrunk", "proved"]
+)
 def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
-    proofs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    proofs: int, shrunk: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The barrier looks at distances at the samples, of 50 ms; the audit at every engine step."""
     monkeypatch.setattr(contest, "PROOFS", proofs)
+    if not shrunk:
+        monkeypatch.setattr(contest, "SHRUNK", np.ones(1))
     monkeypatch.setattr(contest, "PATIENCE", 12)
     setup, design = arm_design(
         tmp_path,
@@ -484,7 +508,7 @@ def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
         descent={"max_iterations": 16, "coarse": 1},
     )
     kept = nearest(setup, design.trajectory.ctrl) >= 0.15
-    assert kept is bool(proofs)
+    assert kept is (shrunk or bool(proofs))
     assert (design.status is Status.INFEASIBLE) is not kept
     assert design.limits["clearance"] == pytest.approx(nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6)
 
