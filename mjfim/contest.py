@@ -30,6 +30,7 @@ class Contest:
 
     fine: the experiment on its lifted plant;  coarse: on a plant that is quicker to step, or smoother, or None
     executor: that runs the starts, None: one after the other here
+    begun: when the time began to count, by `time.perf_counter`
     """
 
     fine: Stage
@@ -43,6 +44,14 @@ class Contest:
         stated = self.fine.setup.experiment.descent.seconds
         return np.inf if stated is None else max(self.begun + stated - time.perf_counter(), 0.0)
 
+    @property
+    def _faithful(self) -> bool:
+        """The coarse level differs by its timestep alone: its minima are nearly those of the stated one."""
+        if self.coarse is None:
+            return True
+        level = self.coarse.setup.level
+        return replace(level, stretch=1) == self.fine.setup.level
+
     def run(self, starts: Sequence[Start], chases: list[Chase]) -> Iterator[HistoryRow]:
         """Every iterate; `chases` gets one entry per start, the winners' ones after the second round."""
         d = self.fine.setup.experiment.descent
@@ -52,10 +61,7 @@ class Contest:
             yield from self._round(self.fine, starts, Rungs(), d.max_iterations, self._seconds - reserve, chases)
             return
         share = EARLY * self._seconds / self._turns(len(starts))
-        same = first.setup.level == replace(
-            self.fine.setup.level, stretch=first.setup.stretch
-        )  # nearly the stated plant
-        last = SHARP if same and len(starts) < KEPT else HALFWAY
+        last = SHARP if len(starts) < KEPT and self._faithful else HALFWAY
         yield from self._round(first, starts, Rungs(last=last), round(EARLY * d.max_iterations), share, chases)
         order = sorted(range(len(chases)), key=lambda i: chases[i].cost)
         if any(chase.status is Status.INTERRUPTED for chase in chases):
@@ -73,7 +79,7 @@ class Contest:
             for row in self._round(
                 self.fine,
                 again,
-                Rungs(first=SPAN * last if last < HALFWAY else last),
+                Rungs(first=min(SPAN * last, HALFWAY)),
                 d.max_iterations - done,
                 left,
                 second,
@@ -88,16 +94,16 @@ class Contest:
 
     def prove(self, chases: list[Chase]) -> Iterator[HistoryRow]:
         """Hold back a winner that leaves a limit on the untouched model, between what the barrier looked at; a few times."""
+        held = dict[str, float]()
         for _ in range(PROOFS):
             leaking = self._leaking(chases)
             if leaking is None or self._seconds == 0.0:
                 break
             i, shares = leaking
+            held = held_back(held, shares)
             best, again = chases[i], list[Chase]()
             start = Start(best.name, np.asarray(best.control))
-            yield from self._round(
-                self.fine, [start], Rungs(first=LATE), PATIENCE, self._seconds, again, held_back({}, shares)
-            )
+            yield from self._round(self.fine, [start], Rungs(first=LATE), PATIENCE, self._seconds, again, held)
             if np.isfinite(again[0].cost):
                 again[0].history = _joined(best.history, again[0].history)
                 again[0].steps += best.steps

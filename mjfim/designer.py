@@ -75,7 +75,11 @@ def design(
     first = stage.problem.judged(first)
     runs: list[Run] = []
     with threadpool_limits(1, user_api="blas"):  # small matrices: threads of BLAS only wait for each other
-        rows = _enclosed(stage, first, start, executor, runs) if setup.enforced else _free(stage, first, start, runs)
+        rows = (
+            _enclosed(stage, first, start, executor, runs, clock)
+            if setup.enforced
+            else _free(stage, first, start, runs)
+        )
         try:
             for row in rows:
                 if monitor is not None:
@@ -110,7 +114,7 @@ def _free(
 
 
 def _enclosed(
-    stage: Stage, first: Point, start: Array | None, executor: Executor | None, runs: list[Run]
+    stage: Stage, first: Point, start: Array | None, executor: Executor | None, runs: list[Run], clock: float
 ) -> Generator[HistoryRow, None, None]:
     """Descents inside the limits. Where soft weights alone keep them, there is no barrier to begin with."""
     setup, inside = stage.setup, None
@@ -122,7 +126,7 @@ def _enclosed(
         runs.clear()
     free = setup.free()
     chases: list[Chase] = []
-    contest = Contest(Stage(free, stage.basis), _easier(Stage(free, stage.basis)), executor)
+    contest = Contest(Stage(free, stage.basis), _easier(Stage(free, stage.basis)), executor, clock)
     starts = list(starts_of(setup, start))
     if inside is not None:  # as far as the first start came without a barrier
         starts[0] = replace(starts[0], control=inside)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from mjfim.basis import independent
 from mjfim.bounds import basis_of, fence_of
@@ -112,8 +113,9 @@ def perform(task: Task) -> Chase:
     """A task from beginning to end, for an executor; Ctrl-C ends it with the best so far."""
     chase = Chase(task.start.name)
     try:
-        for _ in pursue(task, chase):
-            pass
+        with threadpool_limits(1, user_api="blas"):
+            for _ in pursue(task, chase):
+                pass
     except KeyboardInterrupt:
         chase.status = Status.INTERRUPTED
     return chase

@@ -9,6 +9,7 @@
 (c) iterations and time beside the paper's metric descent, to the same J
 (d) 1500 Monte-Carlo trials at 100 Hz
 (e) seconds per iteration by number of parameters on a seven-joint arm, where its model is at hand (benchmark_arm.py)
+(f) the hard-limited design beside CasADi + IPOPT with many starts, the same seconds for both (benchmark_limits.py)
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import benchmark_arm
+import benchmark_limits
 import mujoco
 import numpy as np
 from rich.console import Console
@@ -299,6 +301,9 @@ def main() -> None:
             benchmark_arm.cost_table([benchmark_arm.measured(benchmark_arm.ARM, p, 8) for p in (3, 10, 30, 70)])
         )
         console.print(tables[-1])
+    seconds = 10.0 if args.quick else 60.0
+    tables.append(benchmark_limits.table(benchmark_limits.races(seconds, 0), seconds))
+    console.print(tables[-1])
     if args.markdown:
         args.markdown.write_text(markdown(tables, verdicts, threads), encoding="utf-8")
 

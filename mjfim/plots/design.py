@@ -202,7 +202,9 @@ def convergence(design: Design) -> Figure:
     figure = new_figure(10.0, 3.3)
     top = figure.subplots(1, 3)
     draw_history(top[0], iterations, cost)
-    draw_history(top[1], iterations, slope, slope / np.where(cost == 0.0, np.nan, np.abs(cost)))
+    mus = np.array([row.mu for row in history])
+    relative = None if mus.any() else slope / np.where(cost == 0.0, np.nan, np.abs(cost))  # of log J it is that already
+    draw_history(top[1], iterations, slope, relative)
     draw_history(top[2], iterations, smallest)
     rates = np.array([row.rate for row in history])
     for k in np.flatnonzero(np.diff(rates)):
@@ -217,7 +219,6 @@ def convergence(design: Design) -> Figure:
             fontsize=SMALL,
             color=MUTED,
         )
-    mus = np.array([row.mu for row in history])
     for k in np.flatnonzero(mus[1:] != mus[:-1]):
         for axes in top:
             axes.axvline(iterations[k + 1], color=FAINT, linewidth=1.0, linestyle="--", zorder=0)
@@ -229,11 +230,11 @@ def convergence(design: Design) -> Figure:
         Line2D([], [], color=colour, marker="o", linestyle="", label=name)
         for name, colour in (("initial", INITIAL), ("optimized", OPTIMIZED))
     ]
-    line = Line2D([], [], color=MUTED, linestyle=":", label="slope / J")
+    line = [] if relative is None else [Line2D([], [], color=MUTED, linestyle=":", label="slope / J")]
     told = (
         " Dashed: the barrier of the limits gets sharper; slope and cost are then of log J and barrier."
         if mus.any()
         else ""
     )
-    headline(figure, "Convergence", [*dots, line], f"{design.status.value}.{told}")
+    headline(figure, "Convergence", [*dots, *line], f"{design.status.value}.{told}")
     return figure

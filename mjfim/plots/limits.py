@@ -42,7 +42,7 @@ def draw_usage(axes: Axes, curves: list[Usage], one_sided: bool) -> None:
     for rank, curve in enumerate(order):
         strong = rank < CLOSEST
         colour = (OPTIMIZED, "#ee7733", "#aa3377")[rank] if strong else MUTED
-        label = f"{shorten(curve.name, 24)} {100 * float(np.abs(curve.share).max()):.4g} %" if strong else None
+        label = f"{shorten(curve.name, 24)} {100 * float(np.abs(curve.share).max()):.5g} %" if strong else None
         width, alpha = (1.3, 1.0) if strong else (0.7, 0.5)
         axes.plot(curve.t, curve.share, color=colour, label=label, linewidth=width, alpha=alpha, zorder=2 + strong)
     reach = max(1.08, 1.05 * float(np.abs(order[0].share).max()))
