@@ -12,6 +12,7 @@ import numpy as np
 from mjfim.audit import Audit, audit
 from mjfim.descent import Stage
 from mjfim.enclosed import Chase, Task, perform, pursue
+from mjfim.errors import SimulationDiverged
 from mjfim.ladder import SHRUNK, Rungs, held_back
 from mjfim.starts import Start
 from mjfim.trajectory import Array, HistoryRow, Status
@@ -66,12 +67,14 @@ class Contest:
         order = sorted(range(len(chases)), key=lambda i: chases[i].cost)
         if any(chase.status is Status.INTERRUPTED for chase in chases):
             return
-        kept = order[: max(1, len(order) // KEPT)]
-        for i in order:
-            if i not in kept and np.isfinite(chases[i].cost):
+        kept = [i for i in order[: max(1, len(order) // KEPT)] if chases[i].control is not None]
+        again = [Start(chases[i].name, np.asarray(chases[i].control)) for i in kept]
+        for i in set(order) - set(kept):
+            if np.isfinite(chases[i].cost):
                 chases[i].status = Status.LEFT
-        kept = [i for i in kept if chases[i].control is not None]
-        again = [Start(chases[i].name, c) for i in kept if (c := chases[i].control) is not None]
+        if self.coarse is not None:
+            for start, chase in zip(starts, chases, strict=False):
+                self._judge(chase, start)
         left = max(self._seconds - reserve, 0.0) / self._turns(len(again))
         done = max((row.iteration for i in kept for row in chases[i].history), default=0)
         second: list[Chase] = []
@@ -87,10 +90,13 @@ class Contest:
                 yield replace(row, iteration=row.iteration + done + 1)
         finally:  # also where the user interrupts
             for i, chase in zip(kept, second, strict=False):
-                if chase.status is not Status.INTERRUPTED or np.isfinite(chase.cost):
-                    chase.history = _joined(chases[i].history, chase.history)
-                    chase.steps += chases[i].steps
-                    chases[i] = chase
+                if chase.control is not None and not chase.cost > chases[i].cost:
+                    chases[i].control, chases[i].cost = chase.control, chase.cost
+                chases[i].history = _joined(chases[i].history, chase.history)
+                chases[i].steps += chase.steps
+                chases[i].status, chases[i].slope = chase.status, chase.slope
+                if np.isfinite(chases[i].cost) and chase.status is Status.INFEASIBLE:
+                    chases[i].status = Status.MAX_ITERATIONS
 
     def prove(self, chases: list[Chase]) -> Iterator[HistoryRow]:
         """Hold back a winner that leaves a limit on the untouched model, between what the barrier looked at; a few times."""
@@ -121,6 +127,24 @@ class Contest:
             return None
         found = self._audited(np.asarray(chases[i].control))
         return None if found.kept or not np.isfinite(found.deviation) else (i, found.shares)
+
+    def _judge(self, chase: Chase, start: Start) -> None:
+        """Replace a coarse level's cost by that on the stated model, of what was found or of the start if that is better."""
+        found = [control for control in (chase.control, start.control) if control is not None]
+        costs = [self._worth(control) for control in found]
+        best = int(np.argmin(costs))
+        chase.cost = costs[best]
+        if np.isfinite(chase.cost):
+            chase.control = found[best]
+
+    def _worth(self, control: Array) -> float:
+        """J on the stated model, infinite outside the limits."""
+        setup = self.fine.setup
+        try:
+            trajectory = setup.plant.simulate(setup.theta, control)
+        except SimulationDiverged:
+            return np.inf
+        return self.fine.problem.point(trajectory).cost if audit(setup, trajectory).kept else np.inf
 
     def _audited(self, control: Array) -> Audit:
         setup = self.fine.setup
