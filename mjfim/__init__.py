@@ -18,6 +18,7 @@ from mjfim.montecarlo import monte_carlo, simulate
 from mjfim.sequential import sequential
 from mjfim.together import design_together
 from mjfim.trajectory import Design, Estimate, Recording, Study, Trajectory
+from mjfim.workers import Pool
 
 __all__ = [
     "Campaign",
@@ -27,6 +28,7 @@ __all__ = [
     "Estimate",
     "Experiment",
     "MjfimError",
+    "Pool",
     "Recording",
     "Shortest",
     "Study",

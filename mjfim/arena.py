@@ -17,6 +17,7 @@ from mjfim.interior import InteriorPoint, InteriorProblem, seen
 from mjfim.ladder import WIDEST
 from mjfim.setup import Setup
 from mjfim.trajectory import Array, Trajectory
+from mjfim.workers import stopped
 
 SMALLEST = 0.03  # scale that is tried, over the largest
 SCALES = 6  # that are tried at once
@@ -96,7 +97,7 @@ class Arena:
         if self.monitor is not None:
             self.monitor(self.used, self.attempt)
         self.grace -= 1
-        if self.used >= (1.0 if self.grace >= 0 else min(limit, 1.0)):
+        if stopped() or self.used >= (1.0 if self.grace >= 0 else min(limit, 1.0)):
             raise Spent
 
     def finished(self) -> Attempt:

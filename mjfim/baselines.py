@@ -28,7 +28,7 @@ from mjfim.series import (
     splines,
     tournament,
 )
-from mjfim.starts import SWELL
+from mjfim.starts import swell
 from mjfim.trajectory import Array
 
 CYCLES = 40.0  # within the horizon, at most
@@ -96,18 +96,13 @@ class Shaper:
     def __init__(self, arena: Arena) -> None:
         self.arena = arena
         setup, fence = arena.setup, arena.fence
-        e, boundary = setup.experiment, setup.experiment.boundary
+        e = setup.experiment
         fastest = min(e.limits.bandwidth or np.inf, 0.25 * e.rate, CYCLES / e.horizon)
-        jumps = fence.rate is None and e.limits.bandwidth is None and boundary.start != "rest"
+        jumps = fence.rate is None and e.limits.bandwidth is None and e.boundary.start != "rest"
         self.frame = Frame(setup.t, e.horizon, len(setup.controls), min(0.5 / e.horizon, fastest), fastest, jumps)
         self.weighted = bool(setup.control_weight.any() or setup.tracking.any()) or not arena.holds
         self.most = BOUNDED if np.isfinite(fence.control.lower).all() else LARGEST
-        share = setup.t[:, None] / e.horizon
-        self.window = np.ones_like(share)
-        if boundary.start == "rest":
-            self.window = self.window * np.clip(share / SWELL, 0.0, 1.0)
-        if boundary.end == "rest":
-            self.window = self.window * np.clip((1.0 - share) / SWELL - 1.0, 0.0, 1.0)
+        self.window = swell(setup)
         self.basis = basis_of(setup, setup.t)
         self.fit = None if self.basis is None else np.linalg.pinv(self.basis)
 

@@ -9,6 +9,7 @@ from mjfim.basis import spline_basis
 from mjfim.clearance import Clearance, pairs
 from mjfim.engine import Taps
 from mjfim.errors import ExperimentError
+from mjfim.experiment import Experiment
 from mjfim.fence import Fence
 from mjfim.limits import Limit
 from mjfim.setup import Setup
@@ -105,7 +106,11 @@ def basis_of(setup: Setup, t: Array) -> Array | None:
         raise ExperimentError(
             f"limits.bandwidth: {e.limits.bandwidth:g} Hz; a control at {e.rate:g} Hz has {0.5 * e.rate:g} Hz at most"
         )
-    begins, ends = e.boundary.start == "rest", e.boundary.end == "rest"
-    periodic = e.boundary.end == "periodic" and not begins
-    ends = ends or (e.boundary.end == "periodic" and begins)
-    return spline_basis(t, e.horizon, e.limits.bandwidth, begins, ends, periodic)
+    return splines_of(e, t, e.limits.bandwidth)
+
+
+def splines_of(e: Experiment, t: Array, bandwidth: float) -> Array:
+    """(N, M) splines of a bandwidth [Hz] at times t: (N,) that begin and end as the experiment does."""
+    begins, periodic = e.boundary.start == "rest", e.boundary.end == "periodic"
+    ends = e.boundary.end == "rest" or (periodic and begins)
+    return spline_basis(t, e.horizon, bandwidth, begins, ends, periodic and not begins)

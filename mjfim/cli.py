@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import functools
-import multiprocessing
 import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -29,6 +28,7 @@ from mjfim.labels import Labels
 from mjfim.places import check_file, check_folder, experiment_beside, recording_of
 from mjfim.setup import Setup
 from mjfim.trajectory import HistoryRow
+from mjfim.workers import Pool
 
 app = typer.Typer(
     add_completion=False,
@@ -155,7 +155,7 @@ def several(setup: Setup) -> Iterator[Executor | None]:
     if count == 1 or not setup.enforced:
         yield None
         return
-    with ProcessPoolExecutor(min(count, setup.plant.engine.threads), multiprocessing.get_context("spawn")) as pool:
+    with Pool(min(count, setup.plant.engine.threads)) as pool:
         yield pool
 
 

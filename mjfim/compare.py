@@ -20,12 +20,13 @@ from mjfim.evaluation import fine_point
 from mjfim.experiment import Experiment
 from mjfim.ladder import SHRUNK
 from mjfim.limits import saturated
-from mjfim.plant import CENTRAL
 from mjfim.setup import Setup
-from mjfim.survey import require_designable, survey
+from mjfim.survey import designable
 from mjfim.trajectory import Array, HistoryRow, Status
+from mjfim.workers import salvaged, workers_of
 
 OURS = "mjfim's design"
+LATE = 1.2  # share of the seconds after which a design is ended
 PLENTY = 100_000  # iterations of the design: only its budget ends it
 
 
@@ -116,11 +117,7 @@ def chosen_methods(setup: Setup, methods: Sequence[str] | None) -> tuple[str, ..
 
 def _combinations(setup: Setup) -> Array | None:
     """The identifiable combinations, as a design finds them. Raises where nothing can be designed."""
-    first = setup.problem.point(setup.initial, CENTRAL)
-    if first.trajectory is None or first.sensitivity is None:
-        raise SimulationDiverged("the simulation diverges when the parameters move a little along the initial control")
-    seen = survey(setup, first.trajectory, first.sensitivity)
-    require_designable(setup, seen)
+    seen = designable(setup)
     if setup.enforced:
         require_inside(setup)
     return seen.basis
@@ -138,9 +135,14 @@ def _tried(job: Job, executor: Executor | None, tell: Tell) -> Attempt:
     """A baseline's attempt; with an executor the best of as many as it has workers, each with its share of the steps."""
     if executor is None:
         return perform(job, lambda used, attempt: tell(used, attempt.cost))
-    count = int(getattr(executor, "_max_workers", 1))
+    count = workers_of(executor)
     jobs = [replace(job, part=(i, count), steps=job.steps / count, threads=1) for i in range(count)]
-    attempts = list(executor.map(perform, jobs))
+    futures = [executor.submit(perform, each) for each in jobs]
+    try:
+        attempts = [future.result() for future in futures]
+    except KeyboardInterrupt:
+        salvaged(executor, futures)
+        raise
     best = min(attempts, key=lambda attempt: (attempt.cost, -attempt.share))
     return replace(best, seconds=max(a.seconds for a in attempts), steps=sum(a.steps for a in attempts))
 
@@ -178,9 +180,9 @@ class Meter:
         self.last = row.steps
         if not row.margin < 0.0:
             self.cost = min(self.cost, row.cost)
-        used = max(self.seconds / self.job.seconds, self.steps / self.job.steps)
-        self.tell(used, self.cost)
-        if used > 1.0:
+        seconds, steps = self.seconds / self.job.seconds, self.steps / self.job.steps
+        self.tell(max(seconds, steps), self.cost)
+        if seconds > LATE or steps > 1.0:  # a design keeps the time by itself, but for its last iterate
             self.spent = True
             raise KeyboardInterrupt
 

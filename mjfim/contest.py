@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor, wait
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mjfim.audit import Audit, audit
+from mjfim.audit import audit
 from mjfim.descent import Stage
 from mjfim.enclosed import Chase, Task, perform, pursue
 from mjfim.errors import SimulationDiverged
 from mjfim.ladder import SHRUNK, Rungs, held_back
 from mjfim.starts import Start
 from mjfim.trajectory import Array, HistoryRow, Status
+from mjfim.workers import salvaged, workers_of
 
 KEPT = 4  # one in so many goes on
 HALFWAY, SHARP = 0.01, 1e-3  # mu down to which starts compete, and where they are few, on samples as stated
 SPAN = 3.0  # times mu there with which the second round begins
 PROOFS, LATE, PATIENCE = 3, 1e-3, 60  # repetitions of a winner that leaks, their first mu, their iterations
-GRACE = 5.0  # [s] that interrupted starts get to tell what they have
 EARLY, SPARE = 0.5, 0.05  # share of the iterations and of the time for the first round, and of the time for repetitions
 
 
@@ -89,7 +89,9 @@ class Contest:
             ):
                 yield replace(row, iteration=row.iteration + done + 1)
         finally:  # also where the user interrupts
-            for i, chase in zip(kept, second, strict=False):
+            found = {chase.name: chase for chase in second}
+            for i in [i for i in kept if chases[i].name in found]:
+                chase = found[chases[i].name]
                 if chase.control is not None and not chase.cost > chases[i].cost:
                     chases[i].control, chases[i].cost = chase.control, chase.cost
                 chases[i].history = _joined(chases[i].history, chase.history)
@@ -103,17 +105,22 @@ class Contest:
         held = dict[str, float]()
         for _ in range(PROOFS):
             leaking = self._leaking(chases)
-            if leaking is None or self._seconds == 0.0:
+            if leaking is None:
+                return
+            if self._seconds == 0.0:
                 break
             i, shares = leaking
             held = held_back(held, shares)
             best, again = chases[i], list[Chase]()
             start = Start(best.name, np.asarray(best.control))
-            yield from self._round(self.fine, [start], Rungs(first=LATE), PATIENCE, self._seconds, again, held)
-            if np.isfinite(again[0].cost):
-                again[0].history = _joined(best.history, again[0].history)
-                again[0].steps += best.steps
-                chases[i] = again[0]
+            try:
+                yield from self._round(self.fine, [start], Rungs(first=LATE), PATIENCE, self._seconds, again, held)
+            finally:  # also where the user interrupts
+                for chase in again:
+                    if np.isfinite(chase.cost):
+                        chase.history = _joined(best.history, chase.history)
+                        chase.steps += best.steps
+                        chases[i] = chase
         leaking = self._leaking(chases)
         if leaking is not None:
             self._shrink(chases[leaking[0]])
@@ -125,7 +132,8 @@ class Contest:
         i = min(range(len(chases)), key=lambda i: chases[i].cost)
         if chases[i].control is None or not np.isfinite(chases[i].cost):
             return None
-        found = self._audited(np.asarray(chases[i].control))
+        setup = self.fine.setup
+        found = audit(setup, setup.plant.simulate(setup.theta, np.asarray(chases[i].control)))
         return None if found.kept or not np.isfinite(found.deviation) else (i, found.shares)
 
     def _judge(self, chase: Chase, start: Start) -> None:
@@ -146,27 +154,19 @@ class Contest:
             return np.inf
         return self.fine.problem.point(trajectory).cost if audit(setup, trajectory).kept else np.inf
 
-    def _audited(self, control: Array) -> Audit:
-        setup = self.fine.setup
-        return audit(setup, setup.plant.simulate(setup.theta, control))
-
     def _shrink(self, chase: Chase) -> None:
         """Shrink a control about the centre until no limit is left, if it ever is."""
         setup = self.fine.setup
         for share in SHRUNK:
             control = setup.centre + share * (np.asarray(chase.control) - setup.centre)
-            if self._audited(control).kept:
-                chase.control = control
-                chase.cost = self.fine.problem.point(setup.plant.simulate(setup.theta, control)).cost
+            cost = self._worth(control)
+            if np.isfinite(cost):
+                chase.control, chase.cost = control, cost
                 return
 
     def _turns(self, count: int) -> int:
         """How many of the tasks run after one another."""
-        return -(-max(count, 1) // self._workers)
-
-    @property
-    def _workers(self) -> int:
-        return 1 if self.executor is None else int(getattr(self.executor, "_max_workers", 1))
+        return -(-max(count, 1) // workers_of(self.executor))
 
     def _round(
         self,
@@ -190,7 +190,9 @@ class Contest:
             combinations,
             level.added,
             level.level,
-            max(self._workers // len(starts), 1) if self.executor is not None else level.plant.engine.threads,
+            max(workers_of(self.executor) // len(starts), 1)
+            if self.executor is not None
+            else level.plant.engine.threads,
             held or {},
         )
         tasks = [replace(common, start=start) for start in starts]
@@ -204,12 +206,8 @@ class Contest:
             for future in futures:
                 chases.append(future.result())
                 yield from chases[-1].history
-        except KeyboardInterrupt:  # other processes are interrupted as well and soon return what they have
-            told = futures[len(chases) :]
-            for future in told:
-                future.cancel()
-            ended = (f for f in wait(told, timeout=GRACE).done if not f.cancelled())
-            chases += [future.result() for future in ended if future.exception() is None]
+        except (KeyboardInterrupt, GeneratorExit):  # the user's, or what watches the iterates
+            chases += salvaged(self.executor, futures[len(chases) :])
             raise
 
 

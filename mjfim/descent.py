@@ -84,13 +84,18 @@ def regulator_for(setup: Setup) -> Regulator:
     return Regulator(Q, R, Q / setup.dt, calm=CALM)
 
 
+AUTO = 4  # how many times longer the samples of a coarse level are, where the experiment leaves it open
+COARSEST = 50  # samples of a coarse level, at least
+BORNE = 0.05  # relative change of the initial cost that it may make
+
+
 def coarse_level(setup: Setup, first: Point, basis: Array | None) -> Setup | None:
     """The coarse level, where the experiment wants it and the model bears it (the initial cost agrees within 5 %).
 
     Raises ExperimentError where a stated factor does not divide the samples.
     """
     d = setup.experiment.descent
-    factor = 4 if d.coarse == "auto" else d.coarse
+    factor = AUTO if d.coarse == "auto" else d.coarse
     if factor == 1 or d.method != "lbfgs":
         return None
     if d.coarse != "auto" and setup.samples % factor:
@@ -98,14 +103,19 @@ def coarse_level(setup: Setup, first: Point, basis: Array | None) -> Setup | Non
         raise ExperimentError(
             f"descent.coarse: {factor} does not divide the {setup.samples} samples; valid for example: {valid}"
         )
-    if setup.samples % factor or setup.samples < 50 * factor:
+    if setup.samples % factor or setup.samples < COARSEST * factor:
         return None
     coarse = setup.coarser(factor)
+    return coarse if borne(Stage(coarse, basis), first, setup.problem.size(first), BORNE) else None
+
+
+def borne(coarse: Stage, first: Point, size: float, share: float) -> bool:
+    """Whether the initial cost of a coarse level is that of the first point, up to a share of its size."""
     try:
-        cost = Stage(coarse, basis).problem.point(coarse.initial).cost
+        there = coarse.problem.point(coarse.setup.initial)
     except SimulationDiverged:
-        return None
-    return coarse if abs(cost - first.cost) <= 0.05 * setup.problem.size(first) else None
+        return False
+    return abs(there.cost - first.cost) <= share * size
 
 
 COARSE_TOLERANCE = 1e-5

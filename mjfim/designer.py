@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from mjfim.audit import audit, require_inside
 from mjfim.bounds import fence_of
 from mjfim.contest import Contest
-from mjfim.descent import Run, Stage, coarse_level, descend
+from mjfim.descent import COARSEST, Run, Stage, borne, coarse_level, descend
 from mjfim.earlier import shared
 from mjfim.enclosed import Chase
 from mjfim.errors import ExperimentError, SimulationDiverged, UnidentifiableError
@@ -26,19 +26,13 @@ from mjfim.plant import CENTRAL
 from mjfim.roughness import roughness
 from mjfim.setup import Setup
 from mjfim.starts import starts_of
-from mjfim.survey import Survey, require_designable, survey
+from mjfim.survey import Survey, designable, require_designable, survey
 from mjfim.trajectory import Array, Design, HistoryRow, StartResult, Status
 
 Monitor = Callable[[HistoryRow], None]
-LONGER = (
-    5,
-    4,
-    3,
-    2,
-)  # times that the timestep of a coarse level is longer under hard limits, the first one that the model bears
+LONGER = (5, 4, 3, 2)  # times that the timestep is longer on a coarse level under hard limits; the first that is borne
 HALF = 2  # the same where samples become longer too
-COARSEST = 50  # samples at least
-BORNE = 0.5  # relative change of the initial cost that a coarse level may make: all is optimised anew on the stated one
+TOLERATED = 0.5  # relative change of the initial cost that it may make: all is optimised anew on the stated one
 
 
 def design(
@@ -140,16 +134,19 @@ def _enclosed(
 def _weighted(setup: Setup) -> bool:
     """The weights alone bound the design, and nothing but ranges is asked for."""
     e = setup.experiment
-    shaped = e.boundary.start != "given" or e.boundary.end != "free" or e.limits.bandwidth is not None
-    hard = shaped or bool(e.limits.control_rate) or e.limits.clearance is not None
+    hard = setup.shaped or bool(e.limits.control_rate) or e.limits.clearance is not None
     return not hard and bool((setup.control_weight > 0.0).all())
 
 
 def _easier(fine: Stage) -> Stage | None:
     """A level without dry friction, with a longer timestep, or with longer samples where they are one timestep."""
     smooth = _smoother(fine) or fine
+    try:
+        begin = smooth.problem.point(smooth.setup.initial)
+    except SimulationDiverged:
+        return None
     for factor in _factors(smooth.setup):
-        coarse = _coarser(smooth, factor)
+        coarse = _coarser(smooth, begin, factor)
         if coarse is not None:
             return coarse
     return None if smooth is fine else smooth
@@ -157,18 +154,11 @@ def _easier(fine: Stage) -> Stage | None:
 
 def _smoother(fine: Stage) -> Stage | None:
     """The level without dry friction, if there is any, and something to be seen without."""
-    setup = fine.setup.frictionless()
-    if setup is None:
-        return None
     try:
-        point = setup.problem.point(setup.initial, CENTRAL)
-        if point.trajectory is None or point.sensitivity is None:
-            return None
-        seen = survey(setup, point.trajectory, point.sensitivity)
-        require_designable(setup, seen)
-    except (SimulationDiverged, UnidentifiableError):
+        setup = fine.setup.frictionless()
+        return None if setup is None else Stage(setup, designable(setup).basis)
+    except (ExperimentError, SimulationDiverged, UnidentifiableError):
         return None
-    return Stage(setup, seen.basis)
 
 
 def _factors(setup: Setup) -> tuple[int, ...]:
@@ -179,18 +169,17 @@ def _factors(setup: Setup) -> tuple[int, ...]:
     return tuple(k for k in LONGER if setup.substeps % k == 0) or (HALF,)
 
 
-def _coarser(stage: Stage, factor: int) -> Stage | None:
-    """A level so many times coarser, if the model bears it: its initial cost is about the same."""
+def _coarser(stage: Stage, begin: Point, factor: int) -> Stage | None:
+    """A level so many times coarser, if the model bears it. begin: the stage's initial point"""
     setup = stage.setup
     stretch = setup.substeps % factor == 0
     if not (stretch or (setup.samples % factor == 0 and setup.samples >= COARSEST * factor)):
         return None
     try:
         coarse = Stage(setup.stretched(factor) if stretch else setup.coarser(factor), stage.basis)
-        here, there = (s.problem.point(s.setup.initial) for s in (stage, coarse))
-    except (SimulationDiverged, ExperimentError):
+    except ExperimentError:
         return None
-    return coarse if abs(there.cost - here.cost) <= BORNE * setup.problem.size(here) else None
+    return coarse if borne(coarse, begin, setup.problem.size(begin), TOLERATED) else None
 
 
 def _settled(stage: Stage, chase: Chase) -> Run:

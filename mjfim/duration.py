@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from mjfim.bracket import Grid, bracket
+from mjfim.descent import AUTO, COARSEST
 from mjfim.designer import Monitor, design
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.experiment import Experiment, Signal
@@ -25,8 +26,6 @@ from mjfim.trajectory import Array, Design, Status
 
 LONGER = 4.0  # times the stated horizon: how long an experiment may become
 TOLERANCE = 0.02  # of the horizon
-DESCENT_AUTO = 4  # samples of a coarse level's, where the experiment leaves it open
-COARSE_FROM = 50  # samples of a coarse level
 
 
 class OutOfReachError(ExperimentError):
@@ -233,7 +232,7 @@ def _grid(setup: Setup) -> Grid:
     if d.method != "lbfgs":
         return Grid(1, 0)
     if d.coarse == "auto":
-        return Grid(DESCENT_AUTO, COARSE_FROM * DESCENT_AUTO)
+        return Grid(AUTO, COARSEST * AUTO)
     return Grid(d.coarse, 0, max(d.coarse, 2))
 
 

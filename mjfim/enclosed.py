@@ -12,15 +12,17 @@ from threadpoolctl import threadpool_limits
 from mjfim.basis import independent
 from mjfim.bounds import basis_of, fence_of
 from mjfim.descent import Stage, regulator_for
+from mjfim.errors import SimulationDiverged
 from mjfim.experiment import Experiment
 from mjfim.fence import Fence
 from mjfim.interior import seen
 from mjfim.ladder import Ladder, Rung, Rungs
 from mjfim.level import FREE, Level
-from mjfim.objective import Point
+from mjfim.objective import DesignProblem, Point
 from mjfim.setup import Setup
 from mjfim.starts import Start
 from mjfim.trajectory import Array, HistoryRow, Status
+from mjfim.workers import stopped
 
 POWER = 40.0  # of the smooth E-criterion: several of the smallest eigenvalues meet under hard limits
 CALM = 100.0  # growth of deviations from which on feedback is worth the time: steps are short under hard limits
@@ -65,16 +67,14 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
     if setup is None:
         setup = Setup(task.experiment, task.threads, task.added, task.level)
     begun = setup.plant.engine.steps
-    exact = Stage(setup, task.combinations).problem
-    smooth = Stage(setup, task.combinations, POWER if task.experiment.cost.criterion == "E" else np.inf).problem
-    smooth = replace(smooth, information=replace(smooth.information, faint=FAINT))
+    exact, smooth = Stage(setup, task.combinations).problem, smoothed(setup, task.combinations)
     fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
     basis = None if fine is None else independent(setup.averaged(fine))
     regulate = replace(regulator_for(setup), calm=CALM if basis is None else np.inf)
     fence = fence_of(setup).tightened(task.held)
     ladder = Ladder(smooth, fence, setup.centre, basis, regulate, task.rungs)
     control = setup.averaged(task.start.control)
-    for rung in ladder.climb(control, task.budget, clock + task.seconds):
+    for rung in _borne(ladder.climb(control, task.budget, clock + task.seconds)):
         own = rung.iterate.point
         point = None if own.point is None else exact.judged(own.point)
         chase.slope, chase.status = rung.iterate.slope, rung.status or Status.INTERRUPTED
@@ -94,6 +94,21 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
         chase.status = Status.INFEASIBLE
 
 
+def _borne(rungs: Iterator[Rung]) -> Iterator[Rung]:
+    """As far as numbers go: one start that leads where they do not must not end the others."""
+    try:
+        yield from rungs
+    except (SimulationDiverged, np.linalg.LinAlgError):
+        return
+
+
+def smoothed(setup: Setup, combinations: Array | None) -> DesignProblem:
+    """The cost as it is descended under hard limits: smooth where it is E's, without faint directions."""
+    power = POWER if setup.experiment.cost.criterion == "E" else np.inf
+    smooth = Stage(setup, combinations, power).problem
+    return replace(smooth, information=replace(smooth.information, faint=FAINT))
+
+
 def _stated(setup: Setup, ctrl: Array, fine: Array | None) -> Array:
     """A level's control on the stated grid of samples, made of the curves fine: (N * coarsen, M) there, or of anything."""
     if setup.coarsen == 1 or fine is None:
@@ -110,12 +125,13 @@ def _row(rung: Rung, point: Point | None, rate: float, fence: Fence) -> HistoryR
 
 
 def perform(task: Task) -> Chase:
-    """A task from beginning to end, for an executor; Ctrl-C ends it with the best so far."""
+    """A task from beginning to end, for an executor; Ctrl-C, or its pool's word, ends it with the best so far."""
     chase = Chase(task.start.name)
     try:
         with threadpool_limits(1, user_api="blas"):
             for _ in pursue(task, chase):
-                pass
+                if stopped():
+                    raise KeyboardInterrupt
     except KeyboardInterrupt:
         chase.status = Status.INTERRUPTED
     return chase

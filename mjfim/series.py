@@ -15,9 +15,10 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from mjfim.arena import Arena, Spent
-from mjfim.basis import fourier_basis, independent, spline_basis
-from mjfim.descent import Stage, regulator_for
-from mjfim.enclosed import FAINT, POWER, Chase, Task, pursue
+from mjfim.basis import fourier_basis, independent
+from mjfim.bounds import splines_of
+from mjfim.descent import regulator_for
+from mjfim.enclosed import Chase, Task, pursue, smoothed
 from mjfim.errors import SimulationDiverged
 from mjfim.interior import InteriorPoint, InteriorProblem
 from mjfim.ladder import HOLDING, RELAXED, WIDEST, Ladder, Rungs, held_back
@@ -80,11 +81,9 @@ def splines(arena: Arena) -> Iterator[Series]:
     """Uniform cubic B-splines of the usual knots, then of any between."""
     e = arena.setup.experiment
     fastest = e.limits.bandwidth or 0.5 * e.rate
-    begins, periodic = e.boundary.start == "rest", e.boundary.end == "periodic"
-    curves = (begins, e.boundary.end == "rest" or (periodic and begins), periodic and not begins)
 
     def made(bandwidth: float) -> Array:
-        return independent(spline_basis(arena.setup.t, e.horizon, bandwidth, *curves))
+        return independent(splines_of(e, arena.setup.t, bandwidth))
 
     ends = (min(0.5 * KNOTS[0], fastest), min(2.0 * KNOTS[-1], fastest))
     return _any(arena, [f for f in KNOTS if f <= fastest], ends, made)
@@ -177,9 +176,8 @@ def own(arena: Arena, series: Series, last: float, limit: float) -> None:
 
 def scipy_own(arena: Arena, series: Series, last: float, limit: float) -> None:
     """Minimise the experiment's own cost."""
-    smooth = Stage(arena.setup, arena.job.combinations, POWER).problem
-    smooth = replace(smooth, information=replace(smooth.information, faint=FAINT))
-    base = smooth if arena.setup.experiment.cost.criterion == "E" else arena.exact
+    criterion = arena.setup.experiment.cost.criterion
+    base = smoothed(arena.setup, arena.job.combinations) if criterion == "E" else arena.exact
     Descent(arena, series, base, limit).run(Rungs(first=series.mu, last=last))
 
 

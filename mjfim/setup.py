@@ -197,8 +197,13 @@ class Setup:
     def enforced(self) -> bool:
         """True where hard limits hold, or the design has to begin, end or move in a certain way."""
         e = self.experiment
-        shaped = e.boundary.start != "given" or e.boundary.end != "free" or e.limits.bandwidth is not None
-        return shaped or (e.limits.enforce and (bool(self.limits) or e.limits.clearance is not None))
+        return self.shaped or (e.limits.enforce and (bool(self.limits) or e.limits.clearance is not None))
+
+    @property
+    def shaped(self) -> bool:
+        """True where the design has to begin, end or move in a certain way."""
+        e = self.experiment
+        return e.boundary.start != "given" or e.boundary.end != "free" or e.limits.bandwidth is not None
 
     @property
     def rest(self) -> Array:

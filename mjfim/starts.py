@@ -64,23 +64,27 @@ def random_control(setup: Setup, rng: np.random.Generator, least: float, most: f
 
     It swells from what holds the start, and fades, where the experiment begins and ends at rest.
     """
-    boundary = setup.experiment.boundary
     mean = setup.control.mean(axis=0)
     peak = np.abs(setup.control - mean).max(axis=0)
     peak = np.where(peak > 0.0, peak, 1.0)
     wave = multisine(setup.t, len(setup.controls), 1.0 / setup.experiment.horizon, HARMONICS, rng)
     swing = peak * rng.uniform(least, most) * wave
-    share = setup.t[:, None] / setup.experiment.horizon
-    if boundary.start == "rest":
-        mean = setup.hold
-        swing = swing * np.clip(share / SWELL, 0.0, 1.0)
-    if boundary.end == "rest":
-        swing = swing * np.clip((1.0 - share) / SWELL - 1.0, 0.0, 1.0)
-    control = mean + swing
+    control = (setup.hold if setup.experiment.boundary.start == "rest" else mean) + swell(setup) * swing
     for limit in setup.limits:
         if limit.kind == "control":
             control[:, limit.index] = np.clip(control[:, limit.index], limit.lower, limit.upper)
     return np.asarray(control)
+
+
+def swell(setup: Setup) -> Array:
+    """(N, 1) by which a swing about the hold rises from rest and fades to it, where the experiment begins and ends so."""
+    boundary, share = setup.experiment.boundary, setup.t[:, None] / setup.experiment.horizon
+    window = np.ones_like(share)
+    if boundary.start == "rest":
+        window = window * np.clip(share / SWELL, 0.0, 1.0)
+    if boundary.end == "rest":
+        window = window * np.clip((1.0 - share) / SWELL - 1.0, 0.0, 1.0)
+    return np.asarray(window)
 
 
 def probes(setup: Setup, count: int) -> Iterator[Trajectory]:

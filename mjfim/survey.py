@@ -10,7 +10,7 @@ import numpy as np
 from mjfim.errors import SimulationDiverged, UnidentifiableError
 from mjfim.fisher import Information
 from mjfim.identifiability import BLIND, COARSER, SURE, Group, Null, grouped, invisible, listed, rows_of
-from mjfim.plant import SENSITIVITY_STEP
+from mjfim.plant import CENTRAL, SENSITIVITY_STEP
 from mjfim.setup import Setup
 from mjfim.starts import probes
 from mjfim.trajectory import Array, Combined, Sensitivity, Trajectory
@@ -169,6 +169,16 @@ def _pair(setup: Setup, trajectory: Trajectory, fine: Sensitivity) -> tuple[Arra
     J = rows(setup, fine)
     coarse = setup.plant.sensitivity(setup.theta, trajectory, COARSER * SENSITIVITY_STEP)
     return J, np.zeros_like(J) if coarse is None else rows(setup, coarse) - J
+
+
+def designable(setup: Setup) -> Survey:
+    """Look along the initial control. Raises UnidentifiableError or SimulationDiverged where no design can begin there."""
+    first = setup.problem.point(setup.initial, CENTRAL)
+    if first.trajectory is None or first.sensitivity is None:
+        raise SimulationDiverged("the simulation diverges when the parameters move a little along the initial control")
+    seen = survey(setup, first.trajectory, first.sensitivity)
+    require_designable(setup, seen)
+    return seen
 
 
 def require_designable(setup: Setup, seen: Survey) -> None:

@@ -13,9 +13,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
-import multiprocessing
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -68,7 +66,7 @@ def run(arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: 
     """Compare on one arm."""
     stated = arms.experiment(arm, horizon, dry, args.folder / "models")
     experiment = stated.replace(descent={"fourier": [PITCH], "max_iterations": 100_000})
-    with ProcessPoolExecutor(cores(), multiprocessing.get_context("spawn")) as executor:
+    with mjfim.Pool() as executor:
         found = mjfim.compare(experiment, args.seconds, methods=args.methods, executor=executor)
     for row in found.rows:
         console.print(f"  {row.title}: {row.worst:.4g}, {row.outcome.value}, {row.seconds:.0f} s, {row.found_by}")

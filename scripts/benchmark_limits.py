@@ -12,12 +12,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import multiprocessing
 import os
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,7 +53,7 @@ class Race:
 def own(seconds: float, seed: int) -> Race:
     """mjfim: contests of starts, one after the other."""
     clock, history, starts, margin = time.perf_counter(), list[tuple[float, float]](), 0, 0.0
-    with ProcessPoolExecutor(cores(), multiprocessing.get_context("spawn")) as executor:
+    with mjfim.Pool() as executor:
         while (left := seconds - (time.perf_counter() - clock)) > 1.0:
             descent = {"seed": seed, "seconds": left}
             design = mjfim.design(Experiment.from_file(EXPERIMENT).replace(descent=descent), executor=executor)

@@ -38,6 +38,7 @@ ORDER = (
     "lag",
     "outputs",
     "engine",
+    "workers",
     "fence",
     "plant",
     "extended",

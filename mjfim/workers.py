@@ -1,0 +1,59 @@
+"""Processes that search side by side and can be told to stop: what they have found by then is not lost."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Iterable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
+from typing import Any, TypeVar
+
+from mjfim.engine import cores
+
+T = TypeVar("T")
+GRACE = 20.0  # [s] that tasks get to return what they have: they look between iterates
+
+_STOP: list[Any] = []  # a worker's view of its pool's signal
+
+
+class Pool(ProcessPoolExecutor):
+    """Fresh processes, one per core or fewer. Ctrl-C is the parent's to answer: workers go on until they are told to stop.
+
+    Other executors serve as well; their tasks run to their end where nothing interrupts them.
+    """
+
+    def __init__(self, count: int | None = None) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._stop = context.Event()
+        super().__init__(min(count or cores(), cores()), context, _begin, (self._stop,))
+
+    def stop(self) -> None:
+        """Tell all tasks, also those to come, to return what they have."""
+        self._stop.set()
+
+
+def workers_of(executor: Executor | None) -> int:
+    """How many tasks an executor runs at once; 1 without."""
+    return 1 if executor is None else int(getattr(executor, "_max_workers", 1))
+
+
+def stopped() -> bool:
+    """Whether the pool that runs this process was told to stop; False elsewhere."""
+    return bool(_STOP and _STOP[0].is_set())
+
+
+def salvaged(executor: Executor, futures: Iterable[Future[T]]) -> list[T]:
+    """Stop what an executor still runs, and return what its futures, in their order, have found within the grace."""
+    waiting = list(futures)
+    for future in waiting:
+        future.cancel()
+    if isinstance(executor, Pool):
+        executor.stop()
+    done = wait(waiting, timeout=GRACE).done
+    return [f.result() for f in waiting if f in done and not f.cancelled() and f.exception() is None]
+
+
+def _begin(stop: Any) -> None:
+    """A worker's first act."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _STOP[:] = [stop]
