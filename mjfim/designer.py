@@ -16,7 +16,7 @@ from mjfim.contest import Contest
 from mjfim.descent import COARSEST, Run, Stage, borne, coarse_level, descend
 from mjfim.earlier import shared
 from mjfim.enclosed import Chase
-from mjfim.errors import ExperimentError, SimulationDiverged, UnidentifiableError
+from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.evaluation import evaluate, fine_point, warnings_of
 from mjfim.experiment import Experiment
 from mjfim.fence import Fence
@@ -26,7 +26,7 @@ from mjfim.plant import CENTRAL
 from mjfim.roughness import roughness
 from mjfim.setup import Setup
 from mjfim.starts import starts_of
-from mjfim.survey import Survey, designable, require_designable, survey
+from mjfim.survey import Survey, require_designable, survey
 from mjfim.trajectory import Array, Design, HistoryRow, StartResult, Status
 
 Monitor = Callable[[HistoryRow], None]
@@ -139,8 +139,8 @@ def _weighted(setup: Setup) -> bool:
 
 
 def _easier(fine: Stage) -> Stage | None:
-    """A level without dry friction, with a longer timestep, or with longer samples where they are one timestep."""
-    smooth = _smoother(fine) or fine
+    """A level with softened friction, with a longer timestep, or with longer samples where they are one timestep."""
+    smooth = replace(fine, setup=fine.setup.softened()) if fine.setup.level.soft else fine
     try:
         begin = smooth.problem.point(smooth.setup.initial)
     except SimulationDiverged:
@@ -150,15 +150,6 @@ def _easier(fine: Stage) -> Stage | None:
         if coarse is not None:
             return coarse
     return None if smooth is fine else smooth
-
-
-def _smoother(fine: Stage) -> Stage | None:
-    """The level without dry friction, if there is any, and something to be seen without."""
-    try:
-        setup = fine.setup.frictionless()
-        return None if setup is None else Stage(setup, designable(setup).basis)
-    except (ExperimentError, SimulationDiverged, UnidentifiableError):
-        return None
 
 
 def _factors(setup: Setup) -> tuple[int, ...]:

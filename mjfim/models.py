@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjfim.dry import is_dry, soften
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.trajectory import Array
 
@@ -163,7 +164,7 @@ class Lifted:
     they hide derivatives.
 
     joints: whose ranges;  forces: joints whose actuator force;  actuators: whose force;  controls: whether all control ranges
-    contacts: whether all contacts;  friction: whether all dry friction
+    contacts: whether all contacts;  soft: speeds below which dry friction is viscous, empty: as it is (see `dry`)
     """
 
     joints: tuple[int, ...] = ()
@@ -171,7 +172,7 @@ class Lifted:
     actuators: tuple[int, ...] = ()
     controls: bool = False
     contacts: bool = False
-    friction: bool = False
+    soft: tuple[float, ...] = ()
 
     def out_of(self, model: Any) -> None:
         """Change a model that the caller owns, in place."""
@@ -182,9 +183,12 @@ class Lifted:
             model.actuator_ctrllimited[:] = 0
         if self.contacts:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-        if self.friction:
-            model.dof_frictionloss[:] = 0.0
-            model.tendon_frictionloss[:] = 0.0
+        self.settle(model)
+
+    def settle(self, model: Any) -> None:
+        """What rests on numbers that parameters change, in place."""
+        if self.soft:
+            soften(model, self.soft)
 
 
 class Source:
@@ -242,6 +246,17 @@ class Source:
             self._edited[key] = model
         return self._edited[key]
 
+    @property
+    def soft(self) -> bool:
+        """Whether its dry friction is softened."""
+        return self._lifted is not None and bool(self._lifted.soft)
+
+    def settle(self, model: Any) -> Any:
+        """A model of this source after parameters were written into it, in place."""
+        if self._lifted is not None:
+            self._lifted.settle(model)
+        return model
+
     def _compile(self, spec: Any) -> Any:
         model = compile_spec(spec, self._path)
         if self._lifted is not None:
@@ -265,5 +280,4 @@ def unconstrained(model: Any) -> bool:
         model.npair == 0 and not (np.any(model.geom_contype) and np.any(model.geom_conaffinity))
     )
     limited = model.jnt_limited.any() or model.tendon_limited.any()
-    dry = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
-    return bool(no_contact and model.neq == 0 and model.nflex == 0 and not limited and not dry)
+    return bool(no_contact and model.neq == 0 and model.nflex == 0 and not limited and not is_dry(model))

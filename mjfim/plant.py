@@ -29,27 +29,17 @@ class Accuracy:
     central: two-sided in state and control, else one-sided
     shared: one-sided also along (psi w, w) and in the parameters, so that all directions share their origin
     delta: state and control step of mixed differences;  epsilon: step along (psi w, w)
-    steepest: mixed differences, over the largest first one, beyond which they straddle a kink (stick and slip) and count as 0
     """
 
     central: bool
     delta: float
     epsilon: float
     shared: bool = False
-    steepest: float = np.inf
-
-    def mixed(self, slope: Array, widths: Array) -> Array:
-        """Differences of slopes (2 c, n, nx) between its halves, over widths (c, 1, 1)."""
-        count = len(widths)
-        found = (slope[:count] - slope[count:]) / widths
-        if np.isfinite(self.steepest):
-            found = np.where(np.abs(found) > self.steepest * np.abs(slope).max(axis=(0, 1)), 0.0, found)
-        return np.asarray(found)
 
 
 FAST = Accuracy(central=False, delta=1e-6, epsilon=3e-3)
 DRAFT = Accuracy(central=False, delta=1e-6, epsilon=1e-3, shared=True)
-KINKED = Accuracy(central=False, delta=1e-6, epsilon=1e-5, shared=True, steepest=5e3)
+DRY = Accuracy(central=False, delta=1e-6, epsilon=1e-5, shared=True)
 CENTRAL = Accuracy(central=True, delta=1e-4, epsilon=1e-3)
 FIRST_DERIVATIVE_STEP = 1e-6
 SENSITIVITY_STEP = 1e-5
@@ -83,6 +73,7 @@ class Plant:
     """A model, its parameters and its measured outputs.
 
     source: of the private copies that are stepped;  start: (ns,) nominal initial state;  substeps: `mj_step` per sample
+    smooth: the plant that mixed differences are taken on: itself, or where it has kinks one that has none
     """
 
     def __init__(
@@ -93,7 +84,9 @@ class Plant:
         start: Array,
         substeps: int,
         threads: int | None = None,
+        smooth: Plant | None = None,
     ) -> None:
+        self.smooth = self if smooth is None else smooth
         self.parameters = parameters
         self.outputs = outputs
         self.source = source
@@ -121,8 +114,7 @@ class Plant:
     @property
     def draft(self) -> Accuracy:
         """The quickest differences that this plant bears."""
-        model = self.source.model
-        return KINKED if model.dof_frictionloss.any() or model.tendon_frictionloss.any() else DRAFT
+        return DRY if self.smooth.source.soft else DRAFT
 
     @property
     def span(self) -> Array:
@@ -145,7 +137,7 @@ class Plant:
         if key not in self._models:
             if len(self._models) > 64:
                 self._models.clear()
-            self._models[key] = self.parameters.model(self.source, np.asarray(theta))
+            self._models[key] = self.source.settle(self.parameters.model(self.source, np.asarray(theta)))
         return self._models[key]
 
     def trajectory(self, states: Array, ctrl: Array) -> Trajectory:
@@ -182,6 +174,7 @@ class Plant:
             self._pool.append(copy.copy(self.source.model))
         for model, row in zip(self._pool, theta, strict=False):
             self.parameters.write(model, row)
+            self.source.settle(model)
         return self._pool[: len(theta)], sound
 
     def _all(self, theta: Array) -> list[Any]:
@@ -195,7 +188,7 @@ class Plant:
         models, sound = [], np.ones(len(theta), dtype=bool)
         for i, row in enumerate(theta):
             try:
-                models.append(self.parameters.model(self.source, row))
+                models.append(self.source.settle(self.parameters.model(self.source, row)))
             except ModelError:
                 models.append(self.source.model)
                 sound[i] = False
@@ -418,8 +411,8 @@ class Plant:
             epsilon = self._epsilon(accuracy, push, w)
             shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
             both = np.concatenate([self.space.plus(xs, shift), self.space.plus(xs, -shift)])
-            models = self._all(np.stack([theta + epsilon * w, theta - epsilon * w]))
-            stepped = self.engine.step(models, both, np.concatenate([us, us]), taps if r == 0 else None)
+            models = self.smooth._all(np.stack([theta + epsilon * w, theta - epsilon * w]))
+            stepped = self.smooth.engine.step(models, both, np.concatenate([us, us]), taps if r == 0 else None)
             sensed, pair = stepped.sensors, stepped.states.reshape(2, *shape)
             widths = (2.0 if accuracy.central else 1.0) * delta[:, None, None]
             if stepped.tapped is not None:
@@ -427,7 +420,7 @@ class Plant:
                 rise = np.mean(t[:, :count] - t[:, count:], axis=0) / widths[..., None]
                 tapped = np.moveaxis(rise[:, :-1], 0, 3)
             slope = self.space.minus(pair[0], pair[1]) / (2.0 * epsilon)
-            mixed.append(accuracy.mixed(slope, widths))
+            mixed.append((slope[:count] - slope[count:]) / widths)
             firsts.append(np.mean(self.space.minus(pair[:, :count], pair[:, count:]), axis=0) / widths)
             if sensed is not None:
                 s = sensed.reshape(2, *shape)
@@ -471,6 +464,8 @@ class Plant:
         stepped = self.engine.step([self.model(theta)], xs, us, taps)
         origin = stepped.states.reshape(shape)
         first = self.space.minus(origin[:count], origin[count:]) / widths
+        if self.smooth is not self:
+            origin = self.smooth.engine.step([self.smooth.model(theta)], xs, us).states.reshape(shape)
         tapped, mixed = None, []
         if stepped.tapped is not None:
             t = stepped.tapped.reshape(len(moves), len(states), *stepped.tapped.shape[1:])
@@ -479,9 +474,10 @@ class Plant:
             push = psi @ w
             epsilon = self._epsilon(accuracy, push, w)
             shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
-            out = self.engine.step(self._all((theta + epsilon * w)[None]), self.space.plus(xs, shift), us).states
+            models = self.smooth._all((theta + epsilon * w)[None])
+            out = self.smooth.engine.step(models, self.space.plus(xs, shift), us).states
             slope = self.space.minus(out.reshape(shape), origin) / epsilon
-            mixed.append(accuracy.mixed(slope, widths))
+            mixed.append((slope[:count] - slope[count:]) / widths)
         unit = self._identity(len(states))
         second = None
         if self.outputs.curved:

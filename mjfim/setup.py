@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjfim.dry import is_dry, speeds_of
 from mjfim.earlier import information_of
 from mjfim.engine import state_space
 from mjfim.errors import ExperimentError, ModelError, SimulationDiverged, unknown
@@ -97,9 +98,13 @@ class Setup:
             decoration(self.spec, self.model),
             self._mocap,
         )
-        private = self._private()
+        private = self._private(self.level.softened)
         self._require_bodies(private)
-        self.plant = Plant(private, self.parameters, self.outputs, self._start(), self.substeps, threads)
+        common = (self.parameters, self.outputs, self._start(), self.substeps, threads)
+        smooth = None
+        if self.level.soft and not self.level.softened:
+            smooth = Plant(self._private(soft=True), *common)
+        self.plant = Plant(private, *common, smooth)
         self.tracking = self._weights()
         self.control_weight = by_name("cost.control", e.cost.control, self.controls, "actuator")
         bounded = {limit.name for limit in self.limits if limit.kind == "control"} if e.limits.enforce else set()
@@ -320,15 +325,17 @@ class Setup:
         moved = None if self.parameters.compiled.any() else moved_bodies(self.parameters.parameters)
         return Source(self.spec, self.model_path, moved, sensors, friction, coarsen, self._mocap, lifted)
 
-    def _private(self) -> Source:
+    def _private(self, soft: bool) -> Source:
+        """Of the plant, or where derivatives need it of one with softened friction."""
         friction = any("frictionloss" in t.path for p in self.parameters.parameters for t in p.targets)
         anything = friction or any(p.function is not None for p in self.parameters.parameters)
-        return self._source(self.outputs.needs_sensors, anything, self.coarsen * self.stretch, self._lifted())
+        lifted = self._lifted(self.level.soft if soft else ())
+        return self._source(self.outputs.needs_sensors, anything, self.coarsen * self.stretch, lifted)
 
-    def _lifted(self) -> Lifted | None:
-        """What this level is without: whatever the limits of the experiment keep a design away from, and friction."""
+    def _lifted(self, soft: tuple[float, ...]) -> Lifted | None:
+        """What this level is without: whatever the limits of the experiment keep a design away from."""
         if not (self.level.lifted and self.experiment.limits.enforce):
-            return Lifted(friction=True) if self.level.frictionless else None
+            return Lifted(soft=soft) if soft else None
         named = {
             kind: {limit.name for limit in self.limits if limit.kind == kind} for kind in ("position", "joint_force")
         }
@@ -340,7 +347,7 @@ class Setup:
             tuple(i for i in range(self.model.nactuator) if int(self.model.actuator_outadr[i]) in forced),
             True,
             stated.clearance is not None and not stated.ignored,
-            self.level.frictionless,
+            soft,
         )
 
     def _require_bodies(self, source: Source) -> None:
@@ -452,27 +459,26 @@ class Setup:
 
     def free(self) -> Setup:
         """The same experiment on a plant without the clamps and stops that hard limits keep a design away from."""
-        return self._at(lifted=True)
+        return self._at(lifted=True, soft=self._slow())
 
     def stretched(self, factor: int) -> Setup:
         """The same experiment at a timestep that is `factor` times longer, its samples as they are."""
         return self._at(stretch=factor)
 
-    def frictionless(self) -> Setup | None:
-        """The same experiment without dry friction, and without the parameters that are nothing else.
+    def softened(self) -> Setup:
+        """The same experiment with dry friction viscous at low speeds, where this one takes derivatives so."""
+        return self._at(softened=True)
 
-        None where there is no friction, or where something that is stated rests on these parameters.
-        """
-        e, model = self.experiment, self.plant.source.model
-        dry = {
-            p.name for p in self.parameters.parameters if p.targets and all("frictionloss" in t.path for t in p.targets)
-        }
-        kept = {name: stated for name, stated in e.parameters.items() if name not in dry}
-        slippery = not (dry or model.dof_frictionloss.any() or model.tendon_frictionloss.any())
-        if slippery or not kept or e.cost.criterion == "c" or e.earlier or self.added is not None:
-            return None
-        level = replace(self.level, frictionless=True)
-        return Setup(e.model_copy(update={"parameters": kept}), self.plant.engine.threads, None, level)
+    def _slow(self) -> tuple[float, ...]:
+        """Speeds at which dry friction turns viscous for derivatives; empty where there is none."""
+        model = self.model_at(self.theta)
+        if not is_dry(model):
+            return ()
+        fastest = np.abs(self.initial.qvel).max(axis=0)
+        for limit in self.limits:
+            if limit.kind == "velocity":
+                fastest[limit.index] = limit.scale
+        return speeds_of(model, fastest)
 
     def _at(self, **changes: Any) -> Setup:
         return Setup(self.experiment, self.plant.engine.threads, self.added, replace(self.level, **changes))

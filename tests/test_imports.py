@@ -31,6 +31,7 @@ ORDER = (
     "paths",
     "units",
     "mjcf",
+    "dry",
     "models",
     "level",
     "parameters",
