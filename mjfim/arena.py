@@ -80,8 +80,7 @@ class Arena:
         plain = Setup(self.job.experiment, self.job.threads, added=self.job.added)
         self.holds = plain.enforced
         self.setup = plain.free() if self.holds else plain
-        self.engine = self.setup.plant.engine
-        self.begun = self.engine.steps
+        self.begun = self.setup.plant.steps
         self.fence, self.centre = fence_of(self.setup), self.setup.centre
         self.exact = Stage(self.setup, self.job.combinations).problem
         self.rng = np.random.default_rng((self.job.seed, *self.job.part))
@@ -89,7 +88,7 @@ class Arena:
     @property
     def used(self) -> float:
         """Share of the budget."""
-        taken = self.engine.steps - self.begun
+        taken = self.setup.plant.steps - self.begun
         return max((time.perf_counter() - self.clock) / self.job.seconds, taken / self.job.steps)
 
     def require(self, limit: float = 1.0) -> None:
@@ -103,7 +102,7 @@ class Arena:
     def finished(self) -> Attempt:
         """The attempt with what it took."""
         self.attempt.seconds = time.perf_counter() - self.clock
-        self.attempt.steps = self.engine.steps - self.begun
+        self.attempt.steps = self.setup.plant.steps - self.begun
         return self.attempt
 
     @cached_property

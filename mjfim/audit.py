@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 
 from mjfim.bounds import basis_of, fence_of
@@ -98,9 +99,10 @@ def require_inside(setup: Setup) -> None:
         if setup.experiment.limits.enforce:
             for where, state in places.items():
                 _require_inside(setup, fence, where, state)
-            for where, hold in (("boundary.start", fence.before), ("boundary.end", fence.after)):
+            start, end = setup.plant.start(setup.theta), setup.target
+            for where, state, hold in (("boundary.start", start, fence.before), ("boundary.end", end, fence.after)):
                 if hold is not None:
-                    _require_held(setup, where, hold)
+                    _require_held(setup, where, state, hold)
     except ExperimentError as error:
         raise ExperimentError(f"{setup.experiment.source}: {error}") from None
 
@@ -127,10 +129,19 @@ def _require_inside(setup: Setup, fence: Fence, where: str, state: Array) -> Non
             )
 
 
-def _require_held(setup: Setup, where: str, hold: Array) -> None:
+def _require_held(setup: Setup, where: str, state: Array, hold: Array) -> None:
+    model = setup.plant.model(setup.theta)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:] = setup.space.split(state)
+    data.ctrl[:] = hold
+    mujoco.mj_forward(model, data)
+    needed = {"control": hold, "force": data.actuator_force, "joint_force": data.qfrc_actuator}
     for limit in setup.limits:
-        if limit.kind == "control" and not limit.lower <= hold[limit.index] <= limit.upper:
+        if limit.kind in needed and not limit.lower <= needed[limit.kind][limit.index] <= limit.upper:
+            what = (
+                "limits.force or the MJCF's actuatorfrcrange" if limit.kind == "joint_force" else f"limits.{limit.kind}"
+            )
             raise ExperimentError(
-                f"{where}: holding still takes {limit.name} = {hold[limit.index]:.4g}, outside "
-                f"limits.control [{limit.lower:g}, {limit.upper:g}]"
+                f"{where}: holding still takes {limit.name} = {needed[limit.kind][limit.index]:.4g}, outside "
+                f"{what} [{limit.lower:g}, {limit.upper:g}]"
             )

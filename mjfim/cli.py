@@ -151,7 +151,7 @@ def check(
 def several(setup: Setup) -> Iterator[Executor | None]:
     """Processes for the starts of a design under hard limits; None where one start has all threads to itself."""
     d = setup.experiment.descent
-    count = d.starts + len(d.previous) + len(d.fourier)
+    count = d.starts + len(d.previous) + len(d.fourier) + len(d.repeats)
     if count == 1 or not setup.enforced:
         yield None
         return

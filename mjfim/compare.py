@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from mjfim.trajectory import Array, HistoryRow, Status
 from mjfim.workers import salvaged, workers_of
 
 OURS = "mjfim's design"
-LATE = 1.2  # share of the seconds after which a design is ended
+LATE = 1.05  # share of the seconds after which a design is ended
 PLENTY = 100_000  # iterations of the design: only its budget ends it
 
 
@@ -137,10 +137,11 @@ def _tried(job: Job, executor: Executor | None, tell: Tell) -> Attempt:
         return perform(job, lambda used, attempt: tell(used, attempt.cost))
     count = workers_of(executor)
     jobs = [replace(job, part=(i, count), steps=job.steps / count, threads=1) for i in range(count)]
-    futures = [executor.submit(perform, each) for each in jobs]
+    futures: list[Future[Attempt]] = []
     try:
+        futures += [executor.submit(perform, each) for each in jobs]
         attempts = [future.result() for future in futures]
-    except KeyboardInterrupt:
+    except BaseException:
         salvaged(executor, futures)
         raise
     best = min(attempts, key=lambda attempt: (attempt.cost, -attempt.share))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from mjfim.audit import audit
+from mjfim.bounds import fence_of
 from mjfim.descent import Stage
 from mjfim.enclosed import Chase, Task, perform, pursue
-from mjfim.errors import SimulationDiverged
+from mjfim.fence import Fence
 from mjfim.ladder import SHRUNK, Rungs, held_back
 from mjfim.starts import Start
 from mjfim.trajectory import Array, HistoryRow, Status
@@ -39,6 +41,11 @@ class Contest:
     executor: Executor | None = None
     begun: float = field(default_factory=time.perf_counter)
 
+    @cached_property
+    def _fence(self) -> Fence:
+        """The limits on the plant without clamps."""
+        return fence_of(self.fine.setup)
+
     @property
     def _seconds(self) -> float:
         """That are left."""
@@ -58,23 +65,27 @@ class Contest:
         d = self.fine.setup.experiment.descent
         reserve = SPARE * (d.seconds or 0.0)
         first = self.coarse or self.fine
-        if len(starts) == 1 and self.coarse is None and starts[0].basis is None:
+        if len(starts) == 1 and self.coarse is None and starts[0].basis is None and starts[0].repeats == 1:
             yield from self._round(self.fine, starts, Rungs(), d.max_iterations, self._seconds - reserve, chases)
             return
         share = EARLY * self._seconds / self._turns(len(starts))
         last = SHARP if len(starts) < KEPT and self._faithful else HALFWAY
         yield from self._round(first, starts, Rungs(last=last), round(EARLY * d.max_iterations), share, chases)
-        order = sorted(range(len(chases)), key=lambda i: chases[i].cost)
         if any(chase.status is Status.INTERRUPTED for chase in chases):
             return
-        kept = [i for i in order[: max(1, len(order) // KEPT)] if chases[i].control is not None]
-        again = [Start(chases[i].name, np.asarray(chases[i].control)) for i in kept]
-        for i in set(order) - set(kept):
-            if np.isfinite(chases[i].cost):
-                chases[i].status = Status.LEFT
-        if self.coarse is not None:
+        there = [chase.cost for chase in chases]
+        if self.coarse is not None or any(start.repeats > 1 for start in starts):
             for start, chase in zip(starts, chases, strict=False):
                 self._judge(chase, start)
+        promise = [chase.cost if np.isfinite(chase.cost) else cost for chase, cost in zip(chases, there, strict=True)]
+        order = sorted((i for i, chase in enumerate(chases) if chase.control is not None), key=lambda i: promise[i])
+        kept = order[: max(1, len(chases) // KEPT)]
+        if not kept:
+            return
+        again = [Start(chases[i].name, np.asarray(chases[i].control)) for i in kept]
+        for i in order[len(kept) :]:
+            if np.isfinite(promise[i]):
+                chases[i].status = Status.LEFT
         left = max(self._seconds - reserve, 0.0) / self._turns(len(again))
         done = max((row.iteration for i in kept for row in chases[i].history), default=0)
         second: list[Chase] = []
@@ -99,6 +110,9 @@ class Contest:
                 chases[i].status, chases[i].slope = chase.status, chase.slope
                 if np.isfinite(chases[i].cost) and chase.status is Status.INFEASIBLE:
                     chases[i].status = Status.MAX_ITERATIONS
+            best = min(chases, key=lambda chase: chase.cost)
+            if np.isfinite(best.cost) and best.status in (Status.LEFT, Status.INFEASIBLE):  # better after all
+                best.status = Status.MAX_ITERATIONS
 
     def prove(self, chases: list[Chase]) -> Iterator[HistoryRow]:
         """Hold back a winner that leaves a limit on the untouched model, between what the barrier looked at; a few times."""
@@ -138,7 +152,8 @@ class Contest:
 
     def _judge(self, chase: Chase, start: Start) -> None:
         """Replace a coarse level's cost by that on the stated model, of what was found or of the start if that is better."""
-        found = [control for control in (chase.control, start.control) if control is not None]
+        begun = np.tile(start.control, (start.repeats, 1))
+        found = [control for control in (chase.control, begun) if control is not None]
         costs = [self._worth(control) for control in found]
         best = int(np.argmin(costs))
         chase.cost = costs[best]
@@ -146,13 +161,15 @@ class Contest:
             chase.control = found[best]
 
     def _worth(self, control: Array) -> float:
-        """J on the stated model, infinite outside the limits."""
-        setup = self.fine.setup
-        try:
-            trajectory = setup.plant.simulate(setup.theta, control)
-        except SimulationDiverged:
+        """J on the stated model, infinite outside the limits, also where a clamp alone keeps a force inside."""
+        setup, fence = self.fine.setup, self._fence
+        watched = setup.plant.watch(setup.theta, control, fence.taps)
+        if watched is None:
             return np.inf
-        return self.fine.problem.point(trajectory).cost if audit(setup, trajectory).kept else np.inf
+        sight = fence.sight(*watched, slopes=False)
+        if min(fence.margins(sight).values(), default=0.0) < 0.0 or not audit(setup, sight.trajectory).kept:
+            return np.inf
+        return self.fine.problem.point(sight.trajectory).cost
 
     def _shrink(self, chase: Chase) -> None:
         """Shrink a control about the centre until no limit is left, if it ever is."""
@@ -198,15 +215,20 @@ class Contest:
         tasks = [replace(common, start=start) for start in starts]
         if self.executor is None:
             for task in tasks:
+                if chases and self._seconds == 0.0:
+                    return
                 chases.append(Chase(task.start.name))
                 yield from pursue(task, chases[-1], level)
             return
-        futures = [self.executor.submit(perform, task) for task in tasks]
+        futures: list[Future[Chase]] = []
         try:
+            futures += [self.executor.submit(perform, task) for task in tasks]
             for future in futures:
+                if chases and self._seconds == 0.0 and future.cancel():
+                    continue
                 chases.append(future.result())
                 yield from chases[-1].history
-        except (KeyboardInterrupt, GeneratorExit):  # the user's, or what watches the iterates
+        except BaseException:  # the user's Ctrl-C, that of what watches the iterates, or a fault: nothing may run on
             chases += salvaged(self.executor, futures[len(chases) :])
             raise
 

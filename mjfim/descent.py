@@ -101,7 +101,8 @@ def coarse_level(setup: Setup, first: Point, basis: Array | None) -> Setup | Non
     if d.coarse != "auto" and setup.samples % factor:
         valid = ", ".join(str(k) for k in range(1, 17) if setup.samples % k == 0)
         raise ExperimentError(
-            f"descent.coarse: {factor} does not divide the {setup.samples} samples; valid for example: {valid}"
+            f"{setup.experiment.source}: descent.coarse: {factor} does not divide the {setup.samples} samples; "
+            f"valid for example: {valid}"
         )
     if setup.samples % factor or setup.samples < COARSEST * factor:
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Executor
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ from mjfim.objective import Point
 from mjfim.plant import CENTRAL
 from mjfim.roughness import roughness
 from mjfim.setup import Setup
-from mjfim.starts import starts_of
+from mjfim.starts import Start, starts_of
 from mjfim.survey import Survey, require_designable, survey
 from mjfim.trajectory import Array, Design, HistoryRow, StartResult, Status
 
@@ -51,12 +51,13 @@ def design(
     """
     setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
     require_inside(setup)
-    clock, begun = time.perf_counter(), setup.plant.engine.steps
+    clock, begun = time.perf_counter(), setup.plant.steps
     first = setup.problem.point(setup.initial, CENTRAL)
     if start is not None:
         start = np.asarray(start, dtype=np.float64)
         if start.shape != setup.control.shape:
             raise ExperimentError(f"start: shape {start.shape}, wanted (samples, actuators) = {setup.control.shape}")
+    starts = starts_of(setup, start)
     begin = first if start is None else setup.problem.point(setup.plant.simulate(setup.theta, start), CENTRAL)
     if first.information is None or begin.trajectory is None or begin.sensitivity is None:
         why = "when the parameters move a little along the initial control"
@@ -70,9 +71,9 @@ def design(
     runs: list[Run] = []
     with threadpool_limits(1, user_api="blas"):  # small matrices: threads of BLAS only wait for each other
         rows = (
-            _enclosed(stage, first, start, executor, runs, clock)
+            _enclosed(stage, first, starts, executor, runs, clock)
             if setup.enforced
-            else _free(stage, first, start, runs)
+            else _free(stage, first, starts, runs, clock)
         )
         try:
             for row in rows:
@@ -82,53 +83,61 @@ def design(
             rows.close()  # what a monitor interrupts is not yet told
             for run in runs[-1:]:
                 run.status = Status.INTERRUPTED
-    spent = setup.plant.engine.steps - begun + sum(run.steps for run in runs)
+    spent = setup.plant.steps - begun + sum(run.steps for run in runs)
     return _conclude(stage, seen, first, runs, time.perf_counter() - clock, spent)
 
 
 def _free(
-    stage: Stage, first: Point, start: Array | None, runs: list[Run], fence: Fence | None = None
+    stage: Stage, first: Point, starts: Iterable[Start], runs: list[Run], clock: float, fence: Fence | None = None
 ) -> Generator[HistoryRow, None, None]:
-    """Descents without a barrier, from every start; with a fence, until one leaves it."""
-    setup, clock = stage.setup, time.perf_counter()
+    """Descents without a barrier, from every start while there is time; with a fence, until one leaves it."""
+    setup = stage.setup
+    until = clock + (setup.experiment.descent.seconds or np.inf)
     coarse = coarse_level(setup, first, stage.basis)
     levels = (setup,) if coarse is None else (coarse, setup)
-    begun = sum(level.plant.engine.steps for level in levels)
-    for begin in starts_of(setup, start):
+    begun = sum(level.plant.steps for level in levels)
+    for begin in starts:
         runs.append(Run(begin.name))
         elsewhere = sum(run.steps for run in runs)
-        for row in descend([Stage(level, stage.basis) for level in levels], begin.control, runs[-1], fence):
-            spent = sum(level.plant.engine.steps for level in levels) - begun
+        control = np.tile(begin.control, (begin.repeats, 1))
+        for row in descend([Stage(level, stage.basis) for level in levels], control, runs[-1], fence):
+            spent = sum(level.plant.steps for level in levels) - begun
             told = replace(row, seconds=time.perf_counter() - clock, steps=spent)
             runs[-1].history += (told,)
-            runs[-1].steps = 0 if coarse is None else coarse.plant.engine.steps - elsewhere
+            runs[-1].steps = 0 if coarse is None else coarse.plant.steps - elsewhere
             yield told
+            if time.perf_counter() > until:
+                if runs[-1].status is Status.INTERRUPTED:
+                    runs[-1].status = Status.MAX_ITERATIONS
+                return
         if runs[-1].outside:
             return
 
 
 def _enclosed(
-    stage: Stage, first: Point, start: Array | None, executor: Executor | None, runs: list[Run], clock: float
+    stage: Stage, first: Point, starts: Iterable[Start], executor: Executor | None, runs: list[Run], clock: float
 ) -> Generator[HistoryRow, None, None]:
     """Descents inside the limits. Where soft weights alone keep them, there is no barrier to begin with."""
-    setup, inside = stage.setup, None
+    setup, starts, elsewhere = stage.setup, list(starts), 0
     if _weighted(setup):
-        yield from _free(stage, first, start, runs, fence_of(setup))
-        if not any(run.outside for run in runs):
+        yield from _free(stage, first, starts, runs, clock, fence_of(setup))
+        if not runs[-1].outside:
             return
-        inside = runs[0].control
-        runs.clear()
+        left = runs.pop()
+        starts, elsewhere = starts[len(runs) :], left.steps
+        if left.control is not None:  # as far as it came without a barrier
+            starts[0] = Start(starts[0].name, left.control)
     free = setup.free()
     chases: list[Chase] = []
     contest = Contest(Stage(free, stage.basis), _easier(Stage(free, stage.basis)), executor, clock)
-    starts = list(starts_of(setup, start))
-    if inside is not None:  # as far as the first start came without a barrier
-        starts[0] = replace(starts[0], control=inside)
     try:
         yield from contest.run(starts, chases)
         yield from contest.prove(chases)
     finally:
-        runs += [_settled(stage, chase) for chase in chases]
+        cut = any(chase.status is Status.INTERRUPTED for chase in chases)
+        runs += [_settled(stage, chase, cut) for chase in chases]
+        if runs:
+            runs[0].steps += elsewhere
 
 
 def _weighted(setup: Setup) -> bool:
@@ -156,6 +165,11 @@ def _factors(setup: Setup) -> tuple[int, ...]:
     """Candidates for the timestep of a coarse level, the longest first."""
     stated = setup.experiment.descent.coarse
     if stated != "auto":
+        if setup.substeps % stated and setup.samples % stated:
+            raise ExperimentError(
+                f"{setup.experiment.source}: descent.coarse: {stated} divides neither the {setup.substeps} engine steps of a "
+                f"sample nor the {setup.samples} samples"
+            )
         return () if stated == 1 else (stated,)
     return tuple(k for k in LONGER if setup.substeps % k == 0) or (HALF,)
 
@@ -164,7 +178,8 @@ def _coarser(stage: Stage, begin: Point, factor: int) -> Stage | None:
     """A level so many times coarser, if the model bears it. begin: the stage's initial point"""
     setup = stage.setup
     stretch = setup.substeps % factor == 0
-    if not (stretch or (setup.samples % factor == 0 and setup.samples >= COARSEST * factor)):
+    parts = [setup.samples // count for count in (1, *setup.experiment.descent.repeats)]
+    if not (stretch or (all(N % factor == 0 for N in parts) and setup.samples >= COARSEST * factor)):
         return None
     try:
         coarse = Stage(setup.stretched(factor) if stretch else setup.coarser(factor), stage.basis)
@@ -173,12 +188,15 @@ def _coarser(stage: Stage, begin: Point, factor: int) -> Stage | None:
     return coarse if borne(coarse, begin, setup.problem.size(begin), TOLERATED) else None
 
 
-def _settled(stage: Stage, chase: Chase) -> Run:
-    """What came of a start, on the plant as it is."""
+def _settled(stage: Stage, chase: Chase, cut: bool) -> Run:
+    """What came of a start, on the plant as it is. cut: the contest was, before anybody looked at it there"""
     run = Run(chase.name, None, chase.control, chase.status, chase.slope, chase.history, steps=chase.steps)
     if chase.control is not None:
         run.point = fine_point(stage, chase.control)
     run.inside = np.isfinite(chase.cost)
+    if cut:
+        found = None if run.point is None else run.point.trajectory
+        run.inside = found is not None and audit(stage.setup, found).kept
     return run
 
 

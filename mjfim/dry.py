@@ -37,6 +37,7 @@ def soften(model: Any, speeds: tuple[float, ...]) -> None:
     for loss, weight, impedance, reference in _frictions(model):
         s, rest = rest[: len(loss)], rest[len(loss) :]
         on = (loss > 0.0) & (s > 0.0)
+        s = np.maximum(s, loss * weight * model.opt.timestep)  # a longer timestep bears no steeper law
         resistance = (1.0 - SOFT) / SOFT * weight
         impedance[on] = (SOFT, SOFT, 1e-3, 0.5, 2.0)
         reference[on, 0] = -1.0

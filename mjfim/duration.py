@@ -57,8 +57,9 @@ class Tried:
 
 @dataclass(frozen=True, eq=False)
 class Shortest:
-    """The shortest design. experiment: as stated, with its horizon;  design: reaches every wanted σ
+    """The shortest design. experiment: as stated, with its horizon and the repeats that divide it
 
+    design: reaches every wanted σ
     tried: all durations, in their order;  tolerance: [s]
     closed: one that is shorter by no more than the tolerance was tried and does not reach it, or there is none
     """
@@ -158,7 +159,8 @@ class _Hunt:
 
     def at(self, samples: int) -> Experiment:
         """The experiment with so many samples."""
-        return self.experiment.replace(horizon=samples / self.experiment.rate)
+        dividing = tuple(count for count in self.experiment.descent.repeats if samples % count == 0)
+        return self.experiment.replace(horizon=samples / self.experiment.rate, descent={"repeats": dividing})
 
     def ratio(self, samples: int) -> float:
         """Of the worst σ to the wanted one, of the design of so many samples. Raises KeyboardInterrupt where that was one."""

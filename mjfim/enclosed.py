@@ -64,9 +64,11 @@ class Chase:
 def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[HistoryRow]:
     """Every iterate of a task, keeping `chase` up to date. setup: of the experiment on its lifted plant, if there is one"""
     clock = time.perf_counter()
-    if setup is None:
-        setup = Setup(task.experiment, task.threads, task.added, task.level)
-    begun = setup.plant.engine.steps
+    repeats = task.start.repeats
+    if setup is None or repeats > 1:
+        experiment = task.experiment.replace(horizon=task.experiment.horizon / repeats)
+        setup = Setup(experiment, task.threads, task.added, task.level)
+    begun = setup.plant.steps
     exact, smooth = Stage(setup, task.combinations).problem, smoothed(setup, task.combinations)
     fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
     basis = None if fine is None else independent(setup.averaged(fine))
@@ -74,14 +76,14 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
     fence = fence_of(setup).tightened(task.held)
     ladder = Ladder(smooth, fence, setup.centre, basis, regulate, task.rungs)
     control = setup.averaged(task.start.control)
-    for rung in _borne(ladder.climb(control, task.budget, clock + task.seconds)):
+    for rung in _sound(ladder.climb(control, task.budget, clock + task.seconds), chase):
         own = rung.iterate.point
-        point = None if own.point is None else exact.judged(own.point)
+        point = None if own.point is None else exact.judged(_repeated(own.point, repeats))
         chase.slope, chase.status = rung.iterate.slope, rung.status or Status.INTERRUPTED
-        chase.steps = setup.plant.engine.steps - begun
+        chase.steps = setup.plant.steps - begun
         cost = np.inf if point is None or not rung.feasible else point.cost
         if cost <= chase.cost:
-            chase.control, chase.cost = _stated(setup, own.ctrl, fine), cost
+            chase.control, chase.cost = np.tile(_stated(setup, own.ctrl, fine), (repeats, 1)), cost
         if rung.mended:
             continue
         row = _row(rung, point, 1.0 / setup.dt, fence)
@@ -94,12 +96,20 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
         chase.status = Status.INFEASIBLE
 
 
-def _borne(rungs: Iterator[Rung]) -> Iterator[Rung]:
-    """As far as numbers go: one start that leads where they do not must not end the others."""
+def _sound(rungs: Iterator[Rung], chase: Chase) -> Iterator[Rung]:
+    """As far as numbers go: a start that leads beyond must not end the others."""
     try:
         yield from rungs
     except (SimulationDiverged, np.linalg.LinAlgError):
-        return
+        chase.status = Status.STALLED
+
+
+def _repeated(point: Point, count: int) -> Point:
+    """A point as if its trajectory were measured so many times."""
+    if count == 1 or point.information is None:
+        return point
+    others = tuple(_repeated(other, count) for other in point.others)
+    return replace(point, information=count * point.information, others=others)
 
 
 def smoothed(setup: Setup, combinations: Array | None) -> DesignProblem:

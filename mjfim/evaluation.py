@@ -8,6 +8,7 @@ from mjfim.audit import SAME, Audit
 from mjfim.descent import Stage, regulator_for
 from mjfim.errors import SimulationDiverged
 from mjfim.experiment import Experiment
+from mjfim.limits import unwatched
 from mjfim.lq import growth, regulator
 from mjfim.objective import Point
 from mjfim.plant import CENTRAL
@@ -75,10 +76,27 @@ def warnings_of(
                     "this on hardware"
                 )
             yield f"{kind} limits are exceeded by {-margin:.3g}: {advice}"
+    yield from left_open(setup)
     if found.deviation > SAME:
         yield (
             f"played on the untouched model, the design deviates by up to {found.deviation:.2g}: a clamp, stop or contact acts"
         )
+
+
+def left_open(setup: Setup) -> Iterator[str]:
+    """What the limits and boundaries that an experiment states leave open."""
+    e, model = setup.experiment, setup.model
+    rates = {limit.name for limit in setup.limits if limit.kind == "control_rate"} if e.limits.enforce else set()
+    jumps = e.limits.bandwidth is None and not rates.issuperset(setup.controls)
+    if "rest" in (e.boundary.start, e.boundary.end) and jumps:
+        yield (
+            "the control may jump where the design begins and ends at rest: for a smooth start state limits.control_rate or "
+            "limits.bandwidth"
+        )
+    if e.limits.enforce:
+        unseen = unwatched(model)
+        if unseen:
+            yield f"the MJCF's ranges of {', '.join(unseen)} are no limits of the design: the simulation runs into them as it is"
 
 
 def evaluate_trajectory(experiment: Experiment | Setup, trajectory: Trajectory) -> Evaluation:

@@ -210,6 +210,7 @@ class Descent(Section):
     starts: 1 = from the initial control only; more adds random multisines, the best result is kept
     previous: design.csv files to start from as well, repeated where they are shorter
     fourier: [Hz] base frequencies of Fourier series to start from as well, each optimised first
+    repeats: under hard limits, begin also with designs of the horizon divided by these, played as many times
     coarse: descend first at a sample period that many times longer, where it is cheap; 1 = never; auto = 4 where the model
     allows it
     """
@@ -222,6 +223,7 @@ class Descent(Section):
     starts: Annotated[int, Field(ge=1)] = 1
     previous: tuple[str, ...] = ()
     fourier: tuple[Positive, ...] = ()
+    repeats: tuple[Annotated[int, Field(ge=2)], ...] = ()
     coarse: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     seed: Annotated[int, Field(ge=0)] = 0
 

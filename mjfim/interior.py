@@ -6,7 +6,7 @@ The barrier is relaxed: it stays defined outside, and an infeasible start is fir
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -133,7 +133,3 @@ class InteriorProblem:
     def refine(self, point: InteriorPoint) -> InteriorPoint | None:
         """Never: the ladder of mu ends before the differences matter."""
         return None
-
-    def sharper(self, mu: float, delta: float) -> InteriorProblem:
-        """The next stage."""
-        return replace(self, mu=mu, delta=delta)

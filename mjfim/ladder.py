@@ -158,6 +158,8 @@ class Ladder:
         r, held, budget = self.rungs, dict[str, float](), budget + done
         ladder = r.ladder()
         point = InteriorProblem(self.base, self.fence, r.first, WIDEST).point(control)
+        if point.sight is None:  # it diverges where the parameters move a little
+            return
         for i, mu in enumerate([*ladder, *ladder[-1:] * AGAIN]):
             left, last, now = max(len(ladder) - i, 1), i >= len(ladder) - 1, time.perf_counter()
             deadline = until if last else min(until, now + SLACK * (until - now) / left)

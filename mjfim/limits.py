@@ -112,6 +112,20 @@ def _joint_force(model: Any, joints: Mapping[str, Coordinate]) -> dict[str, Rang
     return {name: tuple(model.jnt_actfrcrange[j]) for name, j in limited.items()}
 
 
+def unwatched(model: Any) -> tuple[str, ...]:
+    """What has a range in the MJCF that is not among the limits: ball joints, tendons, activations."""
+
+    def named(kind: Any, rows: Any) -> list[str]:
+        return [mujoco.mj_id2name(model, kind, i) or f"number {i}" for i in np.flatnonzero(rows).tolist()]
+
+    ball = (model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)) & (model.jnt_limited != 0)
+    return (
+        *(f"ball joint {name}" for name in named(mujoco.mjtObj.mjOBJ_JOINT, ball)),
+        *(f"tendon {name}" for name in named(mujoco.mjtObj.mjOBJ_TENDON, model.tendon_limited)),
+        *(f"the activation of {name}" for name in named(mujoco.mjtObj.mjOBJ_ACTUATOR, model.actuator_actlimited)),
+    )
+
+
 def forwarded(model: Any, trajectory: Trajectory, samples: Iterable[int]) -> Iterator[tuple[int, Any]]:
     """Each sample k with MjData at which everything is computed; one MjData serves them all."""
     data = mujoco.MjData(model)

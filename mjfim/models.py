@@ -160,8 +160,7 @@ class Mocap:
 
 @dataclass(frozen=True)
 class Lifted:
-    """Clamps and stops that are taken out of a private copy, because a design keeps away from them, or comes to them later:
-    they hide derivatives.
+    """What hides derivatives and is changed in a private copy: clamps and stops that a design keeps away from, dry friction.
 
     joints: whose ranges;  forces: joints whose actuator force;  actuators: whose force;  controls: whether all control ranges
     contacts: whether all contacts;  soft: speeds below which dry friction is viscous, empty: as it is (see `dry`)
@@ -183,7 +182,6 @@ class Lifted:
             model.actuator_ctrllimited[:] = 0
         if self.contacts:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-        self.settle(model)
 
     def settle(self, model: Any) -> None:
         """What rests on numbers that parameters change, in place."""
@@ -271,7 +269,7 @@ class Source:
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
         if self._mocap is not None:
             self._mocap.put(model, self._mocap.start)
-        return model
+        return self.settle(model)
 
 
 def unconstrained(model: Any) -> bool:

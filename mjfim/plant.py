@@ -7,7 +7,7 @@ coordinates throughout (`StateSpace`).
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -110,6 +110,11 @@ class Plant:
         both = np.concatenate([found.psi, found.G], axis=1) * self.parameters.step
         effect = (np.abs(both).max(axis=0) / size[:, None]).max(axis=0)
         self._reach = np.clip(FAINT / np.maximum(effect, 1e-300), 1.0, LONGEST)
+
+    @property
+    def steps(self) -> int:
+        """MuJoCo steps taken so far, also for differences on the smooth one."""
+        return self.engine.steps + (0 if self.smooth is self else self.smooth.engine.steps)
 
     @property
     def draft(self) -> Accuracy:
@@ -391,19 +396,28 @@ class Plant:
         accuracy: Accuracy,
         taps: Taps | None = None,
     ) -> Bilinear:
-        """Derivatives of `DF[psi w, w]` by (x, u) for each direction w, and A, B from the same steps.
+        """Derivatives of `DF[psi w, w]` by (x, u) for each direction w, and A, B.
 
-        psi: (N+1, nx, p);  directions: (r, p). Mixed differences: the pair +-epsilon along (psi w, w) at every (x, u)
-        perturbed by +-delta (or +delta and none). The means of the pairs give A and B.
+        psi: (N+1, nx, p);  directions: (r, p). Mixed differences are those of the smooth plant, all else is this one's.
         """
+        if accuracy.shared and not self.engine.sensors:
+            return self._drafted(theta, trajectory, psi, directions, accuracy, taps)
+        found = self._paired(theta, trajectory, psi, directions, accuracy, taps)
+        if self.smooth is self:
+            return found
+        smooth = self.smooth._paired(theta, trajectory, psi, directions, accuracy, None)
+        return replace(found, F_mixed=smooth.F_mixed, h_mixed=smooth.h_mixed)
+
+    def _paired(
+        self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array, accuracy: Accuracy, taps: Taps | None
+    ) -> Bilinear:
+        """Pairs +-epsilon along (psi w, w) at every (x, u) moved by +-delta (or +delta and none); their means give A and B."""
         states, ctrl = self._ends(trajectory)
         delta = accuracy.delta * self.steps_of(trajectory)
         count = len(delta)
         moves = np.concatenate([np.diag(delta), -np.diag(delta) if accuracy.central else np.zeros((1, count))])
         xs, us = self._perturbed(states, ctrl, moves)
         shape = (len(moves), len(states), -1)
-        if accuracy.shared and not self.engine.sensors:
-            return self._drafted(theta, trajectory, psi, directions, accuracy, taps)
         firsts, mixed, h_firsts, h_mixed = [], [], [], []
         tapped = None
         for r, w in enumerate(directions):
@@ -411,8 +425,8 @@ class Plant:
             epsilon = self._epsilon(accuracy, push, w)
             shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
             both = np.concatenate([self.space.plus(xs, shift), self.space.plus(xs, -shift)])
-            models = self.smooth._all(np.stack([theta + epsilon * w, theta - epsilon * w]))
-            stepped = self.smooth.engine.step(models, both, np.concatenate([us, us]), taps if r == 0 else None)
+            models = self._all(np.stack([theta + epsilon * w, theta - epsilon * w]))
+            stepped = self.engine.step(models, both, np.concatenate([us, us]), taps if r == 0 else None)
             sensed, pair = stepped.sensors, stepped.states.reshape(2, *shape)
             widths = (2.0 if accuracy.central else 1.0) * delta[:, None, None]
             if stepped.tapped is not None:
@@ -454,7 +468,7 @@ class Plant:
     def _drafted(
         self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array, accuracy: Accuracy, taps: Taps | None
     ) -> Bilinear:
-        """`bilinear` by one-sided differences, for outputs that are no sensors: one batch at the origin serves all directions."""
+        """`bilinear` by one-sided differences, for outputs that are no sensors: a batch at the origin serves all directions."""
         states, ctrl = self._ends(trajectory)
         delta = accuracy.delta * self.steps_of(trajectory)
         count, nx = len(delta), self.space.nx

@@ -59,7 +59,7 @@ def redesigned(
     setup = Setup(moved, threads, added=told)
     found = [design(setup, monitor, executor=executor)]
     if past.last.shape == setup.control.shape and found[0].status is not Status.INTERRUPTED:
-        alone = moved.replace(descent={"starts": 1, "previous": (), "fourier": ()})
+        alone = moved.replace(descent={"starts": 1, "previous": (), "fourier": (), "repeats": ()})
         with suppress(SimulationDiverged):  # the old control may be too much for the new values
             found.append(design(Setup(alone, threads, added=told), monitor, past.last))
     if found[-1].status is Status.INTERRUPTED:

@@ -40,9 +40,7 @@ def leave_check(folder: Path, check: Check) -> None:
 
 def leave_comparison(folder: Path, comparison: Comparison, setup: Setup) -> None:
     """compare.json, a picture, and the control that each method found, `initial.control` of a later experiment."""
-    for stale in list(folder.iterdir()):  # of an earlier run with other methods
-        if re.fullmatch(r"control_[\w-]+\.csv", stale.name):
-            stale.unlink()
+    _clear(folder, r"control_[\w-]+\.csv")
     archive.write_json(folder / "compare.json", archive.comparison_summary(comparison))
     for row in comparison.rows:
         if row.control is not None:
@@ -52,9 +50,7 @@ def leave_comparison(folder: Path, comparison: Comparison, setup: Setup) -> None
 
 def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
     """estimate.json, identified.xml, estimate.rrd and pictures; returns sentences about what could not be written."""
-    for stale in list(folder.iterdir()):  # of an earlier run, by the exact names it could have left
-        if re.fullmatch(r"fit(_\d+)?\.png|identified\.xml", stale.name):
-            stale.unlink()
+    _clear(folder, r"fit(_\d+)?\.png|identified\.xml")
     archive.write_json(folder / "estimate.json", archive.estimate_summary(estimate, setup))
     missing = []
     try:
@@ -81,3 +77,10 @@ def leave_study(folder: Path, study: Study, setup: Setup) -> None:
         safe = re.sub(r"[^\w.-]", "_", name)
         plots.save(plots.histogram(study, i, labels), folder / f"histogram_{safe}.png")
     plots.save(plots.study_table(study, labels), folder / "table_covariance.png")
+
+
+def _clear(folder: Path, names: str) -> None:
+    """Remove what an earlier run could have left, by the exact names."""
+    for stale in list(folder.iterdir()):
+        if re.fullmatch(names, stale.name):
+            stale.unlink()

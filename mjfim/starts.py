@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -20,22 +21,25 @@ SWELL = 0.1  # share of the horizon over which a random start swells from rest a
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A control to begin with. control: (N, nu);  basis: (N, M) what it is optimised within at first, or None: anything"""
+    """A control to begin with. control: (N, nu);  basis: (N, M) what it is optimised within at first, or None: anything
+
+    repeats: times that the horizon is longer than the control, which is optimised alone at first, then played so many times
+    """
 
     name: str
     control: Array
     basis: Array | None = None
+    repeats: int = 1
 
 
 def starts_of(setup: Setup, given: Array | None) -> Iterator[Start]:
-    """The given or initial control, then what the experiment's [descent] asks for."""
+    """The given or initial control, then what the experiment's [descent] asks for. Raises for what is not there at once."""
     e, d = setup.experiment, setup.experiment.descent
-    yield Start("initial control", setup.control) if given is None else Start("given control", given)
-    for path in d.previous:
-        yield Start(f"previous design {path}", previous(setup, path))
+    found = [Start("initial control", setup.control) if given is None else Start("given control", given)]
+    found += [Start(f"previous design {path}", previous(setup, path)) for path in dict.fromkeys(d.previous)]
     begins, ends = e.boundary.start == "rest", e.boundary.end == "rest"
     rng = np.random.default_rng(d.seed)
-    for frequency in d.fourier:
+    for frequency in dict.fromkeys(d.fourier):
         most = e.limits.bandwidth or 0.5 * e.rate
         harmonics = int(min(SERIES, most / frequency))
         if harmonics < 1:
@@ -43,15 +47,35 @@ def starts_of(setup: Setup, given: Array | None) -> Iterator[Start]:
                 f"{e.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of {most:g} Hz"
             )
         series = fourier_basis(setup.t, e.horizon, frequency, harmonics, begins, ends)
-        yield Start(f"Fourier series of {frequency:g} Hz", _random(setup, rng), series)
-    for i in range(1, d.starts):
-        yield Start(f"multisine {i} of {d.starts - 1}", _random(setup, rng))
+        fitted = series @ np.linalg.lstsq(series, _random(setup, rng) - setup.centre)[0]
+        found.append(Start(f"Fourier series of {frequency:g} Hz", setup.centre + fitted, series))
+    for count in dict.fromkeys(d.repeats):
+        found.append(Start(f"{count} times a design of {e.horizon / count:g} s", _part(setup, count), repeats=count))
+    multisines = (Start(f"multisine {i} of {d.starts - 1}", _random(setup, rng)) for i in range(1, d.starts))
+    return chain(found, multisines)
 
 
 def previous(setup: Setup, path: str) -> Array:
     """(N, nu) control of an earlier design's design.csv, repeated where it is shorter."""
     file = setup.experiment.directory / path
     return read_control(file, setup.t, setup.dt, setup.controls, repeat=True)
+
+
+def _part(setup: Setup, count: int) -> Array:
+    """(N / count, nu) first part of the initial control. Raises ExperimentError where it is no part."""
+    source = setup.experiment.source
+    samples = setup.samples // count
+    if setup.samples % count:
+        raise ExperimentError(f"{source}: descent.repeats: {count} does not divide the {setup.samples} samples")
+    if samples < max(2, setup.stride):
+        raise ExperimentError(
+            f"{source}: descent.repeats: {count} leaves {samples} of {setup.samples} samples; needs {max(2, setup.stride)}"
+        )
+    if not setup.enforced:
+        raise ExperimentError(
+            f"{source}: descent.repeats needs hard limits; without, start from a shorter design (previous)"
+        )
+    return np.asarray(setup.centre + swell(setup, samples) * (setup.control[:samples] - setup.centre))
 
 
 def _random(setup: Setup, rng: np.random.Generator) -> Array:
@@ -76,9 +100,13 @@ def random_control(setup: Setup, rng: np.random.Generator, least: float, most: f
     return np.asarray(control)
 
 
-def swell(setup: Setup) -> Array:
-    """(N, 1) by which a swing about the hold rises from rest and fades to it, where the experiment begins and ends so."""
-    boundary, share = setup.experiment.boundary, setup.t[:, None] / setup.experiment.horizon
+def swell(setup: Setup, samples: int | None = None) -> Array:
+    """(N, 1) by which a swing about the hold rises from rest and fades to it, where the experiment begins and ends so.
+
+    samples: N, default: all
+    """
+    boundary, N = setup.experiment.boundary, setup.samples if samples is None else samples
+    share = np.arange(N)[:, None] / N
     window = np.ones_like(share)
     if boundary.start == "rest":
         window = window * np.clip(share / SWELL, 0.0, 1.0)

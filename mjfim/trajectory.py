@@ -202,7 +202,7 @@ class Usage:
 class Design:
     """Result of `mjfim.design`: the designed trajectory beside the one it started from.
 
-    parameters: p names;  units: p units or empty strings;  theta: (p,) where the design was made
+    parameters: p names;  theta: (p,) where the design was made
     slope: last |DJ.zeta|;  steps: MuJoCo steps taken;  seconds: wall time
     limits: worst margin per kind of limit (positive = inside), by kind;  usage: of every limit at every engine step
     warnings: sentences for the user

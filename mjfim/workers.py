@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from mjfim.engine import cores
@@ -27,9 +28,18 @@ class Pool(ProcessPoolExecutor):
         self._stop = context.Event()
         super().__init__(min(count or cores(), cores()), context, _begin, (self._stop,))
 
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """As of any executor. Processes that it starts do not see Ctrl-C, from their first moment on."""
+        with _deaf():
+            return super().submit(fn, *args, **kwargs)
+
     def stop(self) -> None:
         """Tell all tasks, also those to come, to return what they have."""
         self._stop.set()
+
+    def resume(self) -> None:
+        """Take it back, once nothing runs any more."""
+        self._stop.clear()
 
 
 def workers_of(executor: Executor | None) -> int:
@@ -49,8 +59,23 @@ def salvaged(executor: Executor, futures: Iterable[Future[T]]) -> list[T]:
         future.cancel()
     if isinstance(executor, Pool):
         executor.stop()
-    done = wait(waiting, timeout=GRACE).done
+    done, left = wait(waiting, timeout=GRACE)
+    if isinstance(executor, Pool) and not left:
+        executor.resume()
     return [f.result() for f in waiting if f in done and not f.cancelled() and f.exception() is None]
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Ctrl-C waits; what is started meanwhile inherits that, where the system has such masks."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin(stop: Any) -> None:

@@ -16,10 +16,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -30,6 +26,7 @@ import benchmark_arm
 import benchmark_limits
 import mujoco
 import numpy as np
+from aside import aside
 from rich.console import Console
 from rich.table import Table
 
@@ -41,6 +38,18 @@ from mjfim.trajectory import Design
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = ROOT / "models" / "cart_pendulum.toml"
+PEERS = """
+import casadi_peer as p
+found = []
+for use_c in (True, False):
+    built = p.problem(use_c)
+    if use_c and not built.compiled: continue
+    for case in sys.argv[2]:
+        for solve in (p.ipopt, p.lbfgs):
+            r = min((solve(p.CASES[case], use_c) for _ in range(int(sys.argv[1]))), key=lambda r: r.seconds)
+            found.append(dict(case=case, solver=r.name + ("" if use_c else " (VM)"), cost=r.J, seconds=r.seconds,
+                iterations=r.iterations, setup=r.setup_seconds + built.build_seconds, history=r.history))
+"""
 CLOSE = 1e-6
 CASES: dict[str, dict[str, Any]] = {
     "a": {"control": 6e-3, "tracking": {}},
@@ -106,29 +115,9 @@ def mjfim_run(case: str, name: str, **descent: Any) -> tuple[Run, Design]:
 
 
 def peer_runs(cases: Iterable[str], repeats: int) -> list[Run]:
-    """CasADi in a process of its own, where its BLAS is single-threaded from the start."""
-    code = (
-        "import sys, json; sys.path.insert(0, sys.argv[1]); import casadi_peer as p\n"
-        "out = []\n"
-        "for use_c in (True, False):\n"
-        "    built = p.problem(use_c)\n"
-        "    if use_c and not built.compiled: continue\n"
-        "    for case in sys.argv[3]:\n"
-        "        for solve in (p.ipopt, p.lbfgs):\n"
-        "            runs = [solve(p.CASES[case], use_c) for _ in range(int(sys.argv[2]))]\n"
-        "            r = min(runs, key=lambda r: r.seconds)\n"
-        "            out.append(dict(case=case, solver=r.name + ('' if use_c else ' (VM)'), cost=r.J, seconds=r.seconds,\n"
-        "                iterations=r.iterations, setup=r.setup_seconds + built.build_seconds, history=r.history))\n"
-        "print('RUNS ' + json.dumps(out))\n"
-    )
-    command = [sys.executable, "-c", code, str(ROOT / "scripts"), str(repeats), "".join(cases)]
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-    if done.returncode != 0:
-        print(f"peers are left out: {done.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
-        return []
-    line = next(text for text in done.stdout.splitlines() if text.startswith("RUNS "))
-    return [Run(**{**row, "history": tuple((t, J) for t, J in row["history"])}) for row in json.loads(line[5:])]
+    """CasADi's; none where it is missing."""
+    rows = aside(PEERS, repeats, "".join(cases))
+    return [Run(**{**row, "history": tuple((t, J) for t, J in row["history"])}) for row in rows or ()]
 
 
 def table(title: str, *headings: str) -> Table:

@@ -12,24 +12,28 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import os
-import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from aside import aside
 from rich.console import Console
 from rich.table import Table
 
 import mjfim
 from mjfim.engine import cores
 from mjfim.experiment import Experiment
+from mjfim.trajectory import Status
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = ROOT / "models" / "cart_pendulum_limits.toml"
 MARKS = (5.0, 10.0, 20.0, 40.0)  # [s] at which the race is looked at, and at its end
 BEST = 403.4  # lambda_min, the best known
+PEER = """
+import casadi_limits as p
+r = p.limited_starts(float(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
+found = [r.history, len(r.searched), r.build_seconds]
+"""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,8 @@ def own(seconds: float, seed: int) -> Race:
             descent = {"seed": seed, "seconds": left}
             design = mjfim.design(Experiment.from_file(EXPERIMENT).replace(descent=descent), executor=executor)
             value, seed = float(design.final.eigenvalues[0]), seed + 1
+            if design.status is Status.INTERRUPTED:
+                raise KeyboardInterrupt
             starts += len(design.starts)
             if min(design.limits.values()) >= 0.0 and value > max((v for _, v in history), default=0.0):
                 history.append((time.perf_counter() - clock, value))
@@ -66,20 +72,11 @@ def own(seconds: float, seed: int) -> Race:
 
 
 def peer(seconds: float, seed: int) -> Race | None:
-    """CasADi + IPOPT, in a process of its own, where its BLAS is single-threaded from the start; None where it is missing."""
-    code = (
-        "import sys, json; sys.path.insert(0, sys.argv[1]); import casadi_limits as p\n"
-        "r = p.limited_starts(float(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))\n"
-        "print('RACE ' + json.dumps([r.history, len(r.searched), r.build_seconds]))\n"
-    )
-    command = [sys.executable, "-c", code, str(ROOT / "scripts"), str(seconds), str(seed), str(cores())]
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-    line = next((text for text in done.stdout.splitlines() if text.startswith("RACE ")), None)
-    if line is None:
-        print(f"the peer is left out: {done.stderr.strip().splitlines()[-1:]}", file=sys.stderr)
+    """CasADi + IPOPT; None where it is missing."""
+    found = aside(PEER, seconds, seed, cores())
+    if found is None:
         return None
-    history, starts, built = json.loads(line[5:])
+    history, starts, built = found
     return Race("CasADi + IPOPT", tuple((t, value) for t, value in history), starts, built, None)
 
 

@@ -68,7 +68,7 @@ def test_its_slope_is_that_of_simulated_controls(name: str, tmp_path: Path) -> N
     assert hedge is not None
     alone = Expansion(expansion.A, expansion.B, expansion.a - hedge.a, expansion.b - hedge.b)
     assert check(setup, bare, alone) < 5e-3
-    twice = problem.sharper(0.4, 0.05).expand(point).hedge
+    twice = replace(problem, mu=0.4, delta=0.05).expand(point).hedge
     assert twice is not None
     np.testing.assert_allclose(twice.b, 2.0 * hedge.b, rtol=1e-12)
 
@@ -99,7 +99,7 @@ def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
     tight = problem.fence.tightened({"control": 0.1, "position": 0.05, "velocity": 0.2})
     smooth = replace(problem.base, information=replace(problem.base.information, power=10.0))
     for other in (
-        problem.sharper(0.02, 0.006),
+        replace(problem, mu=0.02, delta=0.006),
         replace(problem, fence=tight),
         replace(problem, base=smooth),
         replace(problem, base=smooth, fence=tight, mu=1e-3, delta=3e-4),

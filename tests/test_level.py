@@ -114,6 +114,31 @@ def test_a_design_with_dry_joints_gains_and_keeps_its_limits(tmp_path: Path) -> 
     assert design.parameters == ("mass", "drag", "dry")
 
 
+def test_steps_on_the_softened_copy_are_counted(tmp_path: Path) -> None:
+    setup = arm(tmp_path).free()
+    plant, psi = setup.plant, np.zeros((setup.samples + 1, setup.space.nx, 3))
+    begun, own = plant.steps, plant.engine.steps
+    plant.bilinear(setup.theta, setup.initial, psi, np.eye(3)[:2], plant.draft)
+    batch = (setup.samples + 1) * setup.substeps * (setup.space.nx + len(setup.controls) + 1)
+    assert plant.engine.steps - own == batch  # A and B
+    assert plant.steps - begun == 4 * batch  # and on the copy the origin and two directions
+
+
+def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(tmp_path: Path) -> None:
+    setup = arm(tmp_path).free()
+    level, psi = setup.softened(), np.random.default_rng(0).normal(size=(setup.samples + 1, setup.space.nx, 3))
+    found, soft, own = (
+        plant._paired(setup.theta, setup.initial, psi, np.eye(3)[:1], plant.draft, None)
+        for plant in (setup.plant, level.plant, setup.plant.smooth)
+    )
+    np.testing.assert_allclose(soft.F_mixed, own.F_mixed)
+    careful = replace(setup.plant.draft, shared=False)
+    both = setup.plant.bilinear(setup.theta, setup.initial, psi, np.eye(3)[:1], careful)
+    np.testing.assert_array_equal(both.A, found.A)
+    np.testing.assert_array_equal(both.F_mixed, own.F_mixed)
+    assert np.abs(found.A - own.A).max() > 1e-3
+
+
 # ---- derivatives where joints turn round
 
 

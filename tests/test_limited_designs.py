@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -519,3 +520,34 @@ def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
     free = arm_design(tmp_path)[1]
     assert nearest(setup, design.trajectory.ctrl) >= 0.15 > nearest(setup, free.trajectory.ctrl)
     assert design.limits["clearance"] == pytest.approx(nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6)
+
+
+@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor])
+def test_a_shorter_design_played_twice_is_a_start(tmp_path: Path, executor: type[ThreadPoolExecutor] | None) -> None:
+    """Half of the horizon alone tells about as much per second; together they are judged over all of it."""
+    rest = {"start": "rest", "end": "rest"}
+    descent = {"repeats": (2,), "max_iterations": 60}
+    hanging = {"qpos": (0.0, np.pi), "qvel": (0.0, 0.0)}
+    control = {"kind": "sine", "amplitude": 2.0, "frequency": 0.9}
+    limits = {**HARD, "control_rate": 200.0}
+    setup = cart_inside(
+        tmp_path, horizon=2.0, boundary=rest, descent=descent, limits=limits, initial={**hanging, "control": control}
+    )
+    with executor(2) if executor is not None else nullcontext() as pool:
+        design = mjfim.design(setup, executor=pool)
+    assert [start.name for start in design.starts] == ["initial control", "2 times a design of 1 s"]
+    assert np.isfinite([start.cost for start in design.starts]).all()
+    assert len(design.trajectory.ctrl) == setup.samples
+    assert min(design.limits.values()) >= 0.0
+    assert design.final.cost == min(start.cost for start in design.starts)
+
+
+@pytest.mark.parametrize(("count", "tables"), [(2, {"cost": {"control": 1e-3}}), (4, {"rate": 100.0})])
+def test_and_where_weights_bound_the_design_or_samples_are_odd(
+    tmp_path: Path, count: int, tables: dict[str, Any]
+) -> None:
+    wide = {"control": {"force": (-50.0, 50.0)}, "position": {"slide": (-9.0, 9.0)}}
+    descent = {"repeats": (count,), "max_iterations": 10}
+    design = mjfim.design(cart_inside(tmp_path, limits=wide, descent=descent, **tables))
+    assert design.final.cost < design.initial.cost
+    assert len(design.starts) == 2

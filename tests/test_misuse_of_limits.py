@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import mujoco
 import pytest
 from numerics import CART_PENDULUM, make_setup
 from test_cli import loads, misused, names, run, write_experiment
@@ -12,6 +13,7 @@ import mjfim
 from mjfim import results
 from mjfim.errors import ExperimentError
 from mjfim.experiment import Experiment
+from mjfim.limits import unwatched
 from mjfim.setup import Setup
 
 MOTOR = ('<motor name="force" joint="slide"/>', '<motor name="force" joint="slide" ctrlrange="-4 4"/>')
@@ -87,6 +89,11 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
         '[boundary]\nstart = "rest"\n[limits]\ncontrol = { force = [0.5, 2.0] }',
         ["boundary.start: holding still takes force =", "outside limits.control [0.5, 2]"],
         [],
+    ),
+    "hold beyond the actuator's force": (
+        '[boundary]\nstart = "rest"\n[limits]\nforce = { force = 2.0 }',
+        ["boundary.start: holding still takes force = -5, outside limits.force [-2, 2]"],
+        [('type="slide" axis="1 0 0"', 'type="slide" axis="1 0 0" stiffness="10" springref="0.5"')],
     ),
     "start in collision": (
         "[limits]\nclearance = 0.01",
@@ -222,3 +229,37 @@ def test_a_fourier_start_above_the_bandwidth_is_refused(tmp_path: Path) -> None:
         run("design", path, "-o", tmp_path / "out"),
         "study.toml: descent.fourier: 7 Hz is above the bandwidth of 5 Hz",
     )
+
+
+def test_a_coarse_level_that_divides_nothing_is_refused(tmp_path: Path) -> None:
+    """Its timestep may be a share of a sample, or its samples a share of all."""
+    hard = "[limits]\ncontrol = { force = [-5.0, 5.0] }\ncontrol_rate = 100.0"
+    path = write_experiment(tmp_path, max_iterations=f"3\ncoarse = 7\n{hard}")
+    said = "descent.coarse: 7 divides neither the 1 engine steps of a sample nor the 100 samples"
+    misused(run("design", path, "-o", tmp_path / "out"), "study.toml: ", said)
+
+
+LOOSE = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="a"><joint name="wrist" type="ball" range="0 1"/><geom size="0.1"/>
+      <body name="b" pos="0 0 1"><joint name="elbow" axis="0 1 0" range="-1 1"/><geom size="0.1"/></body></body>
+  </worldbody>
+  <tendon><fixed name="rope" range="-1 1"><joint joint="elbow" coef="1"/></fixed></tendon>
+  <actuator><general name="muscle" joint="elbow" dyntype="filter" dynprm="0.1" actlimited="true" actrange="0 1"/></actuator>
+</mujoco>
+"""
+
+
+def test_ranges_that_are_no_limits_are_named() -> None:
+    model = mujoco.MjModel.from_xml_string(LOOSE)
+    assert unwatched(model) == ("ball joint wrist", "tendon rope", "the activation of muscle")
+
+
+def test_a_jump_at_rest_is_warned_about(tmp_path: Path) -> None:
+    path = write_experiment(tmp_path, max_iterations='2\n[boundary]\nstart = "rest"')
+    jump = "the control may jump where the design begins and ends at rest"
+    assert any(jump in sentence for sentence in mjfim.design(Experiment.from_file(path)).warnings)
+    slow = Experiment.from_file(path).replace(limits={"control_rate": 50.0})
+    assert not any(jump in sentence for sentence in mjfim.design(slow).warnings)

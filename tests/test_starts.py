@@ -107,3 +107,25 @@ def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) ->
     missing = arm(tmp_path, descent={"previous": ("gone.csv",)})
     with pytest.raises(RecordingError, match=r"gone\.csv: no such file"):
         list(starts_of(missing, None))
+
+
+def test_a_repeated_start_is_the_first_part_of_the_initial_control_faded_to_rest(tmp_path: Path) -> None:
+    boundary, limits = {"start": "rest", "end": "rest"}, {"control": RANGE, "control_rate": 5.0}
+    setup = arm(tmp_path, boundary=boundary, limits=limits, descent={"repeats": (2, 4)})
+    half, quarter = list(starts_of(setup, None))[1:]
+    assert (half.name, half.repeats, len(half.control)) == ("2 times a design of 0.5 s", 2, setup.samples // 2)
+    assert (quarter.repeats, len(quarter.control)) == (4, setup.samples // 4)
+    np.testing.assert_allclose(half.control[0], setup.centre)
+    middle = slice(len(half.control) // 10 + 1, 3 * len(half.control) // 4)
+    np.testing.assert_allclose(half.control[middle], setup.control[: len(half.control)][middle])
+    assert np.abs(half.control[-1] - setup.centre).max() < 1e-9
+
+
+def test_repeats_that_do_not_divide_or_lack_limits_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError, match=r"descent\.repeats: 7 does not divide the 100 samples"):
+        starts_of(arm(tmp_path, descent={"repeats": (7,)}), None)
+    with pytest.raises(ExperimentError, match=r"descent\.repeats: 100 leaves 1 of 100 samples; needs 2"):
+        starts_of(arm(tmp_path, descent={"repeats": (100,)}), None)
+    weights = {"limits": {}, "cost": {"control": 1.0}, "descent": {"repeats": (2,)}}
+    with pytest.raises(ExperimentError, match=r"descent\.repeats needs hard limits"):
+        starts_of(arm(tmp_path, **weights), None)

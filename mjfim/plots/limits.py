@@ -26,14 +26,20 @@ def limits(design: Design) -> Figure:
         bottom = i + columns >= len(kinds)
         dress(axes, "time [s]" if bottom else "", "least / distance" if kind == "clearance" else "half ranges")
         margin = design.limits.get(kind, np.nan)
-        said = f"{kind.replace('_', ' ')}: {'kept by' if margin >= 0.0 else 'MISSED by'} {number(abs(margin))}"
-        axes.set_title(said, loc="left", fontsize=SMALL + 1, color=OPTIMIZED if margin < 0.0 else INK, pad=17)
-    ends = [f"{k.replace('_', ' ')} kept by {number(v)}" for k, v in design.limits.items() if k.startswith("end_")]
+        axes.set_title(
+            _said(kind, margin), loc="left", fontsize=SMALL + 1, color=OPTIMIZED if margin < 0.0 else INK, pad=17
+        )
+    ends = [_said(kind, margin) for kind, margin in design.limits.items() if kind.startswith("end_")]
     note = "Every engine step of the untouched model; the grey zones are out of bounds."
     if ends:
         note += f" At the end: {', '.join(ends)}."
     headline(figure, "How much of each limit the design uses", [], note)
     return figure
+
+
+def _said(kind: str, margin: float) -> str:
+    """A margin in words."""
+    return f"{kind.replace('_', ' ')}: {'kept by' if margin >= 0.0 else 'MISSED by'} {number(abs(margin))}"
 
 
 def draw_usage(axes: Axes, curves: list[Usage], one_sided: bool) -> None:
