@@ -211,6 +211,7 @@ class Contest:
             if self.executor is not None
             else level.plant.engine.threads,
             held or {},
+            time.time() - (time.perf_counter() - self.begun),
         )
         tasks = [replace(common, start=start) for start in starts]
         if self.executor is None:
@@ -238,10 +239,5 @@ def _joined(early: tuple[HistoryRow, ...], late: tuple[HistoryRow, ...]) -> tupl
     if not early:
         return late
     end = early[-1]
-    moved = (
-        replace(
-            r, iteration=r.iteration + end.iteration + 1, seconds=r.seconds + end.seconds, steps=r.steps + end.steps
-        )
-        for r in late
-    )
+    moved = (replace(r, iteration=r.iteration + end.iteration + 1, steps=r.steps + end.steps) for r in late)
     return (*early, *moved)

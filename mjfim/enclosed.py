@@ -34,6 +34,7 @@ class Task:
     """A descent under hard limits. seconds: time it may take;  combinations: (t, s) identifiable ones, or None
 
     added: (p, p) information of other experiments, or None;  level: of the plant;  held: shares held back
+    begun: when the design began, by `time.time`
     """
 
     experiment: Experiment
@@ -46,6 +47,7 @@ class Task:
     level: Level = FREE
     threads: int | None = None
     held: Mapping[str, float] = field(default_factory=dict)
+    begun: float = field(default_factory=time.time)
 
 
 @dataclass
@@ -87,7 +89,7 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
         if rung.mended:
             continue
         row = _row(rung, point, 1.0 / setup.dt, fence)
-        row = replace(row, seconds=time.perf_counter() - clock, steps=chase.steps)
+        row = replace(row, seconds=time.time() - task.begun, steps=chase.steps)
         chase.history += (row,)
         yield row
     if chase.status is Status.INTERRUPTED and chase.history:  # the rungs asked for are done
