@@ -13,7 +13,7 @@ from mjfim.comparison import DESIGN, Comparison, Row
 from mjfim.identifiability import Group as Combinations
 from mjfim.trajectory import Design, Estimate, Study
 
-FEW = 4  # parameters up to which each has a column
+FEW = 7  # parameters up to which each has a column
 BEST_CASE = "sigma is the Cramér-Rao bound: a best case, true if model and noise are right."
 
 
@@ -146,28 +146,49 @@ def compare_report(comparison: Comparison) -> RenderableType:
     if np.isfinite(comparison.steps):
         budget += f" or {comparison.steps / 1e6:.3g} million MuJoCo steps"
     table = Table(title=f"{comparison.source}: each method with {budget}", title_justify="left")
-    shown = [j for j in comparison.wanted if len(comparison.wanted) <= FEW]
-    headings = ["method", *(["J"] if comparison.weighted else []), f"φ ({comparison.criterion})", "J against design"]
-    headings += ["worst σ", *(_named(f"σ {comparison.parameters[j]}", comparison.units[j]) for j in shown)]
+    headings = [
+        "method",
+        *(["J"] if comparison.weighted else []),
+        f"φ ({comparison.criterion})",
+        "J over design's",
+        "worst σ",
+    ]
     for heading in (*headings, "time", "steps", "worst margin"):
-        table.add_column(heading, justify="left" if heading == "method" else "right", no_wrap=heading == "method")
+        table.add_column(heading, justify="left" if heading == "method" else "right", no_wrap=True)
     for row in comparison.rows:
-        table.add_row(*_compared(comparison, row, shown), style=_style(comparison, row))
+        table.add_row(*_compared(comparison, row), style=_style(comparison, row))
+    each = [_spreads(comparison)] if len(comparison.wanted) <= FEW else []
     remarks = [f"{row.title}: {'; '.join(_remarks(row))}" for row in comparison.rows if _remarks(row)]
     said = "worst σ: of the worst combination of parameters, relative to their scales; worst margin: over half of its range"
     verdict = [Text(sentence, style="bold" if comparison.ok else "bold yellow") for sentence in comparison.verdict]
-    return Group(table, *(Text(line) for line in remarks), Text(f"{said}. {BEST_CASE}", style="dim"), *verdict)
+    return Group(table, *each, *(Text(line) for line in remarks), Text(f"{said}. {BEST_CASE}", style="dim"), *verdict)
 
 
-def _compared(comparison: Comparison, row: Row, shown: list[int]) -> list[str]:
+def _spreads(comparison: Comparison) -> Table:
+    """Every method's standard deviations."""
+    table = Table(title="σ of each parameter", title_justify="left")
+    table.add_column("method", no_wrap=True)
+    for j in comparison.wanted:
+        table.add_column(_named(comparison.parameters[j], comparison.units[j]), justify="right")
+    for row in comparison.rows:
+        cells = (_number(row.std[j], 3) for j in comparison.wanted)
+        table.add_row(_marked(comparison, row), *cells, style=_style(comparison, row))
+    return table
+
+
+def _marked(comparison: Comparison, row: Row) -> str:
+    """A method's title, the best one's with an arrow."""
+    return ("▶ " if row is comparison.best else "  ") + escape(row.title)
+
+
+def _compared(comparison: Comparison, row: Row) -> list[str]:
     """Cells of one method."""
     ours, (kind, share) = comparison.design, row.tightest
     against = "" if ours is None or row is ours or np.isnan(row.cost) else f"{-100 * comparison.gain(row, ours):+.3g} %"
     first = [*([row.cost] if comparison.weighted else []), row.criterion]
-    cells = [*(_number(n, 4) for n in first), against, _number(row.worst, 4), *(_number(row.std[j], 3) for j in shown)]
+    cells = [*(_number(n, 4) for n in first), against, _number(row.worst, 3)]
     margin = f"{100.0 * share:.2g} % {kind.replace('_', ' ')}" if kind and np.isfinite(share) else "-"
-    mark = "▶ " if row is comparison.best else "  "
-    return [mark + escape(row.title), *cells, f"{row.seconds:.1f} s", f"{row.steps / 1e6:.2f} M", margin]
+    return [_marked(comparison, row), *cells, f"{row.seconds:.1f} s", f"{row.steps / 1e6:.2f} M", margin]
 
 
 def _number(value: float, digits: int) -> str:

@@ -235,8 +235,17 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     again = run("compare", study, "-o", out, "--seconds", 60, "--steps", 20_000, "--methods", "chirp")
     assert again.exit_code == 0, again.stderr
     assert names(out) == {"compare.json", "compare.png", "control_chirp.csv", f"control_{DESIGN}.csv"}
-    for word in ("chirp", "mjfim's design", "worst σ", "σ m (kg)", "million MuJoCo steps", "The design is the best"):
+    for word in (
+        "chirp",
+        "mjfim's design",
+        "worst σ",
+        "σ of each parameter",
+        "m (kg)",
+        "million MuJoCo steps",
+        "The design is the best",
+    ):
         assert word in " ".join(again.stdout.split())
+    assert "…" not in again.stdout  # every number whole
     # a control of it is the initial control of another experiment
     text = study.read_text(encoding="utf-8").replace('"cart_pendulum.csv"', f'"{out / "control_chirp.csv"}"')
     (study.parent / "next.toml").write_text(text, encoding="utf-8")
