@@ -11,7 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from numerics import CART_PENDULUM, Array, cart_setup, make_setup, relative_error
+from numerics import CART_PARAMETERS, CART_PENDULUM, Array, cart_setup, make_setup, relative_error
 from test_fence import ARM
 
 import mjfim
@@ -551,3 +551,23 @@ def test_and_where_weights_bound_the_design_or_samples_are_odd(
     design = mjfim.design(cart_inside(tmp_path, limits=wide, descent=descent, **tables))
     assert design.final.cost < design.initial.cost
     assert len(design.starts) == 2
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"cost": {"control": 0.0, "criterion": "A"}},
+        {"cost": {"control": 0.0, "criterion": "D"}},
+        {"cost": {"control": 0.0, "criterion": "c", "combination": {"m": 1.0, "c": -0.5}}},
+        {"cost": {"control": 0.0}, "robust": {"samples": 3}, "parameters": {"m": {"prior": 0.3}}},
+    ],
+    ids=["A", "D", "c", "robust"],
+)
+def test_every_criterion_gains_within_limits(tmp_path: Path, tables: dict[str, Any]) -> None:
+    known = {name: {**stated, **tables.get("parameters", {}).get(name, {})} for name, stated in CART_PARAMETERS.items()}
+    setup = cart_inside(tmp_path, **{**tables, "parameters": known})
+    design = mjfim.design(setup)
+    first = setup.problem.point(setup.plant.simulate(setup.theta, 0.2 * setup.control)).cost  # inside as well
+    assert design.final.cost < (first - 1.0 if tables["cost"].get("criterion") == "D" else 0.7 * first)
+    assert_inside(setup, design.trajectory.ctrl)
+    assert min(design.limits.values()) >= 0.0
