@@ -28,6 +28,14 @@ EARLY, SPARE = 0.5, 0.05  # share of the iterations and of the time for the firs
 
 
 @dataclass(frozen=True, eq=False)
+class Lead:
+    """What a start goes on with. control: (N, nu) or None;  cost: J, on the stated model where it keeps its limits there"""
+
+    control: Array | None
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
 class Contest:
     """What all starts have in common.
 
@@ -73,18 +81,16 @@ class Contest:
         yield from self._round(first, starts, Rungs(last=last), round(EARLY * d.max_iterations), share, chases)
         if any(chase.status is Status.INTERRUPTED for chase in chases):
             return
-        there = [chase.cost for chase in chases]
+        leads = [Lead(chase.control, chase.cost) for chase in chases]
         if self.coarse is not None or any(start.repeats > 1 for start in starts):
-            for start, chase in zip(starts, chases, strict=False):
-                self._judge(chase, start)
-        promise = [chase.cost if np.isfinite(chase.cost) else cost for chase, cost in zip(chases, there, strict=True)]
-        order = sorted((i for i, chase in enumerate(chases) if chase.control is not None), key=lambda i: promise[i])
+            leads = [self._judge(chase, start) for start, chase in zip(starts, chases, strict=False)]
+        order = sorted((i for i, lead in enumerate(leads) if lead.control is not None), key=lambda i: leads[i].cost)
         kept = order[: max(1, len(chases) // KEPT)]
         if not kept:
             return
-        again = [Start(chases[i].name, np.asarray(chases[i].control)) for i in kept]
+        again = [Start(chases[i].name, np.asarray(leads[i].control)) for i in kept]
         for i in order[len(kept) :]:
-            if np.isfinite(promise[i]):
+            if np.isfinite(leads[i].cost):
                 chases[i].status = Status.LEFT
         left = max(self._seconds - reserve, 0.0) / self._turns(len(again))
         done = max((row.iteration for i in kept for row in chases[i].history), default=0)
@@ -150,8 +156,12 @@ class Contest:
         found = audit(setup, setup.plant.simulate(setup.theta, np.asarray(chases[i].control)))
         return None if found.kept or not np.isfinite(found.deviation) else (i, found.shares)
 
-    def _judge(self, chase: Chase, start: Start) -> None:
-        """Replace a coarse level's cost by that on the stated model, of what was found or of the start if that is better."""
+    def _judge(self, chase: Chase, start: Start) -> Lead:
+        """Replace a coarse level's cost by that on the stated model, of what was found or of the start if that is better.
+
+        Returns what to go on with: that, or what leaks here as the coarse level saw it, since the second round brings it back.
+        """
+        lead = Lead(chase.control, chase.cost)
         begun = np.tile(start.control, (start.repeats, 1))
         found = [control for control in (chase.control, begun) if control is not None]
         costs = [self._worth(control) for control in found]
@@ -159,6 +169,8 @@ class Contest:
         chase.cost = costs[best]
         if np.isfinite(chase.cost):
             chase.control = found[best]
+        leaks = lead.control is not None and np.isinf(costs[0])
+        return lead if leaks else Lead(chase.control, chase.cost)
 
     def _worth(self, control: Array) -> float:
         """J on the stated model, infinite outside the limits, also where a clamp alone keeps a force inside."""

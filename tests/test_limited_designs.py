@@ -571,3 +571,18 @@ def test_every_criterion_gains_within_limits(tmp_path: Path, tables: dict[str, A
     assert design.final.cost < (first - 1.0 if tables["cost"].get("criterion") == "D" else 0.7 * first)
     assert_inside(setup, design.trajectory.ctrl)
     assert min(design.limits.values()) >= 0.0
+
+
+def test_what_leaks_a_little_goes_on_and_the_start_is_kept_beside_it(tmp_path: Path) -> None:
+    free = cart_inside(tmp_path).free()
+    rivals = Contest(Stage(free, None), None)
+    start, leaking, inside = (Start("x", s * free.control) for s in (0.2, 3.0, 0.1))  # here the smaller one tells more
+    chase = Chase("x", leaking.control, 1e-3)
+    lead = rivals._judge(chase, start)
+    assert (lead.control is leaking.control, lead.cost) == (True, 1e-3)
+    assert chase.control is not leaking.control
+    assert chase.cost == pytest.approx(free.problem.point(free.plant.simulate(free.theta, start.control)).cost)
+    chase = Chase("x", inside.control, 1e-3)
+    lead = rivals._judge(chase, start)
+    assert lead.control is chase.control is inside.control
+    assert lead.cost == chase.cost > 1e-3
