@@ -107,15 +107,9 @@ class Contest:
                 yield replace(row, iteration=row.iteration + done + 1)
         finally:  # also where the user interrupts
             found = {chase.name: chase for chase in second}
-            for i in [i for i in kept if chases[i].name in found]:
-                chase = found[chases[i].name]
-                if chase.control is not None and not chase.cost > chases[i].cost:
-                    chases[i].control, chases[i].cost = chase.control, chase.cost
-                chases[i].history = _joined(chases[i].history, chase.history)
-                chases[i].steps += chase.steps
-                chases[i].status, chases[i].slope = chase.status, chase.slope
-                if np.isfinite(chases[i].cost) and chase.status is Status.INFEASIBLE:
-                    chases[i].status = Status.MAX_ITERATIONS
+            for i in kept:
+                if chases[i].name in found:
+                    _continue(chases[i], found[chases[i].name])
             best = min(chases, key=lambda chase: chase.cost)
             if np.isfinite(best.cost) and best.status in (Status.LEFT, Status.INFEASIBLE):  # better after all
                 best.status = Status.MAX_ITERATIONS
@@ -162,8 +156,7 @@ class Contest:
         Returns what to go on with: that, or what leaks here as the coarse level saw it, since the second round brings it back.
         """
         lead = Lead(chase.control, chase.cost)
-        begun = np.tile(start.control, (start.repeats, 1))
-        found = [control for control in (chase.control, begun) if control is not None]
+        found = [control for control in (chase.control, start.whole) if control is not None]
         costs = [self._worth(control) for control in found]
         best = int(np.argmin(costs))
         chase.cost = costs[best]
@@ -244,6 +237,17 @@ class Contest:
         except BaseException:  # the user's Ctrl-C, that of what watches the iterates, or a fault: nothing may run on
             chases += salvaged(self.executor, futures[len(chases) :])
             raise
+
+
+def _continue(chase: Chase, later: Chase) -> None:
+    """Bring a start of the first round to where it came in the second, but for what it had found better before."""
+    if later.control is not None and not later.cost > chase.cost:
+        chase.control, chase.cost = later.control, later.cost
+    chase.history = _joined(chase.history, later.history)
+    chase.steps += later.steps
+    chase.status, chase.slope = later.status, later.slope
+    if np.isfinite(chase.cost) and later.status is Status.INFEASIBLE:
+        chase.status = Status.MAX_ITERATIONS
 
 
 def _joined(early: tuple[HistoryRow, ...], late: tuple[HistoryRow, ...]) -> tuple[HistoryRow, ...]:

@@ -99,8 +99,7 @@ def _free(
     for begin in starts:
         runs.append(Run(begin.name))
         elsewhere = sum(run.steps for run in runs)
-        control = np.tile(begin.control, (begin.repeats, 1))
-        for row in descend([Stage(level, stage.basis) for level in levels], control, runs[-1], fence):
+        for row in descend([Stage(level, stage.basis) for level in levels], begin.whole, runs[-1], fence):
             spent = sum(level.plant.steps for level in levels) - begun
             told = replace(row, seconds=time.perf_counter() - clock, steps=spent)
             runs[-1].history += (told,)

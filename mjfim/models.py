@@ -183,11 +183,6 @@ class Lifted:
         if self.contacts:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
-    def settle(self, model: Any) -> None:
-        """What rests on numbers that parameters change, in place."""
-        if self.soft:
-            soften(model, self.soft)
-
 
 class Source:
     """Where the private copies of a model come from: work that cannot matter is off, bodies that move inside are not 'simple'.
@@ -245,14 +240,14 @@ class Source:
         return self._edited[key]
 
     @property
-    def soft(self) -> bool:
-        """Whether its dry friction is softened."""
-        return self._lifted is not None and bool(self._lifted.soft)
+    def soft(self) -> tuple[float, ...]:
+        """Speeds below which its dry friction is viscous; empty where it is as it is."""
+        return () if self._lifted is None else self._lifted.soft
 
     def settle(self, model: Any) -> Any:
-        """A model of this source after parameters were written into it, in place."""
-        if self._lifted is not None:
-            self._lifted.settle(model)
+        """A model of this source after parameters were written into it: what rests on them is written anew, in place."""
+        if self.soft:
+            soften(model, self.soft)
         return model
 
     def _compile(self, spec: Any) -> Any:

@@ -20,7 +20,7 @@ TRIES, RAISED, LOWERED = 5, (2.0, 10.0), (0.1, 1.0)  # dampings of a step at mos
 AIM = 1.5  # factor of the damping, over how far a step goes
 CUT = 0.3  # share of a step that was taken below which the next one is damped more, else less if it did not go far
 WORTH = (
-    0.01  # loss that a step promised below which it is not damped for having been cut: that would look like convergence
+    0.01  # loss that a step promised from which on it is damped for having been cut; less would look like convergence
 )
 TINY = 1e-300
 

@@ -308,7 +308,7 @@ class ParameterSet:
         """
         own = copy.copy(self.base(base, theta))
         self.write(own, theta)
-        return own
+        return base.settle(own) if isinstance(base, Source) else own
 
     def base(self, source: Source | Any, theta: Array) -> Any:
         """The model into which theta is written in place: compiled anew where theta needs it, then kept."""

@@ -142,7 +142,7 @@ class Plant:
         if key not in self._models:
             if len(self._models) > 64:
                 self._models.clear()
-            self._models[key] = self.source.settle(self.parameters.model(self.source, np.asarray(theta)))
+            self._models[key] = self.parameters.model(self.source, np.asarray(theta))
         return self._models[key]
 
     def trajectory(self, states: Array, ctrl: Array) -> Trajectory:
@@ -193,7 +193,7 @@ class Plant:
         models, sound = [], np.ones(len(theta), dtype=bool)
         for i, row in enumerate(theta):
             try:
-                models.append(self.source.settle(self.parameters.model(self.source, row)))
+                models.append(self.parameters.model(self.source, row))
             except ModelError:
                 models.append(self.source.model)
                 sound[i] = False

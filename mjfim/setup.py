@@ -98,12 +98,12 @@ class Setup:
             decoration(self.spec, self.model),
             self._mocap,
         )
-        private = self._private(self.level.softened)
+        private = self._private(self.level.soft if self.level.softened else ())
         self._require_bodies(private)
         common = (self.parameters, self.outputs, self._start(), self.substeps, threads)
         smooth = None
         if self.level.soft and not self.level.softened:
-            smooth = Plant(self._private(soft=True), *common)
+            smooth = Plant(self._private(self.level.soft), *common)
         self.plant = Plant(private, *common, smooth)
         self.tracking = self._weights()
         self.control_weight = by_name("cost.control", e.cost.control, self.controls, "actuator")
@@ -325,12 +325,11 @@ class Setup:
         moved = None if self.parameters.compiled.any() else moved_bodies(self.parameters.parameters)
         return Source(self.spec, self.model_path, moved, sensors, friction, coarsen, self._mocap, lifted)
 
-    def _private(self, soft: bool) -> Source:
-        """Of the plant, or where derivatives need it of one with softened friction."""
+    def _private(self, soft: tuple[float, ...]) -> Source:
+        """Of a plant with dry friction viscous below some speeds, empty: as it is."""
         friction = any("frictionloss" in t.path for p in self.parameters.parameters for t in p.targets)
         anything = friction or any(p.function is not None for p in self.parameters.parameters)
-        lifted = self._lifted(self.level.soft if soft else ())
-        return self._source(self.outputs.needs_sensors, anything, self.coarsen * self.stretch, lifted)
+        return self._source(self.outputs.needs_sensors, anything, self.coarsen * self.stretch, self._lifted(soft))
 
     def _lifted(self, soft: tuple[float, ...]) -> Lifted | None:
         """What this level is without: whatever the limits of the experiment keep a design away from."""

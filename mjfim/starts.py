@@ -31,6 +31,11 @@ class Start:
     basis: Array | None = None
     repeats: int = 1
 
+    @property
+    def whole(self) -> Array:
+        """(N, nu) over the whole horizon."""
+        return np.tile(self.control, (self.repeats, 1))
+
 
 def starts_of(setup: Setup, given: Array | None) -> Iterator[Start]:
     """The given or initial control, then what the experiment's [descent] asks for. Raises for what is not there at once."""

@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mjfim.audit import require_inside
 from mjfim.experiment import Experiment
 from mjfim.setup import Setup
+from mjfim.starts import starts_of
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -66,6 +68,8 @@ def test_further_tables_extend_it() -> None:
         setup = Setup(Experiment(**merged, directory=ROOT / "models"))
         assert set(tables.get("parameters", {})) < set(setup.parameters.names)
         assert np.isfinite(setup.problem.point(setup.initial).cost)
+        require_inside(setup)
+        assert len(list(starts_of(setup, None))) == len({start.name for start in starts_of(setup, None)})
 
 
 def test_every_example_is_in_the_tour() -> None:
