@@ -277,6 +277,77 @@ class Boundary(Section):
         return self
 
 
+class ColumnSpec(Section):
+    """Where one column of a recording comes from: `scale * raw * unit * factors + offset`.
+
+    column: of the log;  unit: of what the log holds, where it is not the model's (angles, times of angles);  scale, offset
+    signed: bits of an integer that the log holds as unsigned;  period: raw numbers after which a counter begins anew
+    unwrap: angles that jump by a whole turn are made continuous
+    times: further columns or constants of the log that it is multiplied with, as they are
+    """
+
+    column: str
+    unit: Literal["rad", "deg", "rev", "rad/s", "deg/s", "rev/s", "rpm", "m", "cm", "mm", "m/s", "mm/s"] | None = None
+    scale: Finite = 1.0
+    offset: Finite = 0.0
+    signed: Literal[8, 16, 32] | None = None
+    period: Positive | None = None
+    unwrap: bool = False
+    times: tuple[str, ...] = ()
+
+
+class RecordingSpec(Section):
+    """How a robot's log becomes a recording. Without it a log has the columns of mjfim's own CSV.
+
+    time: column of the stamps, in time_unit;  records: where the list of records is in a JSON file (`a.b`)
+    topics: of the bag, where it holds several of joint states;  window: [s] after the first row that is used
+    gap: [s] longest hole, in time or in a column, that is bridged;  columns: of the recording by name
+    """
+
+    time: str = "t"
+    time_unit: Literal["s", "ms", "us", "ns"] = "s"
+    records: str | None = None
+    topics: tuple[str, ...] = ()
+    window: Range | None = None
+    gap: Positive = 0.1
+    columns: dict[str, str | ColumnSpec] = {}
+
+    @model_validator(mode="after")
+    def _forward(self) -> RecordingSpec:
+        if self.window is not None and not 0.0 <= self.window[0] < self.window[1]:
+            raise ValueError(f"window {list(self.window)} needs 0 <= begin < end")
+        return self
+
+    @property
+    def sources(self) -> dict[str, ColumnSpec]:
+        """The columns, however they were written."""
+        return {k: ColumnSpec(column=v) if isinstance(v, str) else v for k, v in self.columns.items()}
+
+
+class FitSpec(Section):
+    """How parameters are estimated from recordings.
+
+    segments: [s] recordings are cut into pieces of that length, each with its own unknown start; default: uncut
+    start: stated: recordings start as `initial` says (and `nuisance.initial` doubts);  measured: at what the log shows, free
+    loss: of a whitened residual, as in scipy.optimize.least_squares;  loss_scale: sigmas at which outliers begin
+    noise: stated: the sigmas of the noise table;  estimated: found by iterated reweighting, from those
+    starts: 1 = from the guess only; more adds random ones within bounds and priors, the best fit is kept
+    blocks: [s] longest time over which residuals may hang together; default: from their autocorrelation
+    bootstrap: replicates of the block bootstrap, 0 = none
+    """
+
+    segments: Positive | None = None
+    start: Literal["stated", "measured"] = "stated"
+    loss: Literal["linear", "huber", "soft_l1", "cauchy"] = "linear"
+    loss_scale: Positive = 3.0
+    noise: Literal["stated", "estimated"] = "stated"
+    starts: Annotated[int, Field(ge=1)] = 1
+    seed: Annotated[int, Field(ge=0)] = 0
+    max_iterations: Annotated[int, Field(ge=1)] = 60
+    blocks: Positive | None = None
+    bootstrap: Annotated[int, Field(ge=0)] = 1000
+
+
 class Experiment(Section):
     """An experiment. Relative paths inside are relative to `directory`, the folder of the experiment file.
 
@@ -300,6 +371,8 @@ class Experiment(Section):
     descent: Descent = Descent()
     limits: Limits = Limits()
     boundary: Boundary = Boundary()
+    recording: RecordingSpec = RecordingSpec()
+    fit: FitSpec = FitSpec()
     directory: Path = Field(default=Path("."), exclude=True)
     source: str = Field(default="experiment", exclude=True)
 
@@ -390,6 +463,7 @@ def _is_branch(part: object) -> bool:
     return "[" in text or text in (
         "Signal",
         "NoiseSpec",
+        "ColumnSpec",
         "str",
         "float",
         "constrained-float",
@@ -413,10 +487,14 @@ def _valid_keys(location: list[Any]) -> list[str]:
         "correlated": Correlated,
         "nuisance": Nuisance,
         "robust": Robust,
+        "recording": RecordingSpec,
+        "fit": FitSpec,
     }
     table = tables.get(str(location[0]))
     if "control" in [str(p) for p in location[1:]] and table is Initial:
         table = Signal
     if "targets" in [str(p) for p in location]:
         table = TargetSpec
+    if "columns" in [str(p) for p in location]:
+        table = ColumnSpec
     return [key for key in table.model_fields if key != "function"] if table else []

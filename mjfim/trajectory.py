@@ -253,10 +253,10 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Measured (or simulated) outputs under a known control.
+    """Measured (or simulated) outputs under a known control, at the times at which they were logged.
 
-    t: (N+1,) [s];  ctrl: (N, nu) held over each sample
-    y: (N+1, ny) measured outputs in the order of `outputs`, NaN where an output was not measured at that sample
+    t: (M,) [s], increasing, at any intervals;  ctrl: (M-1, nu) held from each row to the next
+    y: (M, ny) measured outputs in the order of `outputs`, NaN where an output was not measured at that time
     outputs: ny column names (`qpos:<joint>`, `qvel:<joint>` or a sensor's name);  name: for messages
     """
 
