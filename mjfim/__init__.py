@@ -12,12 +12,14 @@ from mjfim.designer import design
 from mjfim.duration import Shortest, shortest
 from mjfim.errors import MjfimError
 from mjfim.estimate import identify
+from mjfim.estimated import Estimate
 from mjfim.evaluation import evaluate_trajectory
 from mjfim.experiment import Experiment
 from mjfim.montecarlo import monte_carlo, simulate
+from mjfim.prediction import predict
 from mjfim.sequential import sequential
 from mjfim.together import design_together
-from mjfim.trajectory import Design, Estimate, Recording, Study, Trajectory
+from mjfim.trajectory import Design, Recording, Study, Trajectory
 from mjfim.workers import Pool
 
 __all__ = [
@@ -40,6 +42,7 @@ __all__ = [
     "evaluate_trajectory",
     "identify",
     "monte_carlo",
+    "predict",
     "sequential",
     "shortest",
     "simulate",

@@ -16,13 +16,14 @@ import pyarrow.csv
 
 from mjfim.checker import Check
 from mjfim.comparison import Comparison, Row
-from mjfim.errors import RecordingError, unknown
+from mjfim.errors import RecordingError
+from mjfim.estimated import Estimate
 from mjfim.files import replacing
 from mjfim.identifiability import Group
 from mjfim.playback import design_columns, playback_of, reference_columns
+from mjfim.prediction import Errors, Prediction
 from mjfim.setup import Setup
-from mjfim.signals import read_table
-from mjfim.trajectory import Array, Design, Estimate, Evaluation, Recording, Study, Trajectory
+from mjfim.trajectory import Array, Design, Evaluation, Recording, Study, Trajectory
 
 ARRAYS = ("t", "qpos", "qvel", "act", "ctrl", "gain", "sensitivity")
 
@@ -182,30 +183,6 @@ def write_recording(path: Path, recording: Recording, setup: Setup) -> None:
     write_table(path, columns)
 
 
-def read_recording(path: Path, setup: Setup) -> Recording:
-    """A recording from CSV. Raises RecordingError naming file and column."""
-    columns = read_table(path)
-    controls = [f"ctrl:{name}" for name in setup.controls]
-    for key in ("t", *controls):
-        if key not in columns:
-            raise RecordingError(f"{path}: column {key!r} is missing; found: {', '.join(columns)}")
-    known = {*controls, *setup.measurable}
-    for name in columns:
-        if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
-            raise RecordingError(f"{path}: {unknown('column', name, ['t', *sorted(known)])}")
-    measured = [name for name in setup.outputs.names if name in columns]
-    if not measured:
-        strays = ", ".join(c for c in columns if c != "t" and c not in controls) or "none"
-        raise RecordingError(f"{path}: no measured column; {unknown('column', strays, setup.outputs.names)}")
-    t = columns["t"]
-    if len(t) < 3:
-        raise RecordingError(f"{path}: too few rows ({len(t)}); an identification needs at least 3")
-    if not np.isfinite(t).all():
-        raise RecordingError(f"{path}: column 't' holds NaN in data row {int(np.argmax(~np.isfinite(t))) + 1}")
-    ctrl = np.column_stack([columns[key] for key in controls])[:-1]
-    return Recording(t, ctrl, np.column_stack([columns[n] for n in measured]), tuple(measured), str(path))
-
-
 def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
     """Contents of estimate.json."""
     return {
@@ -221,7 +198,28 @@ def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
         "success": estimate.success,
         "iterations": estimate.iterations,
         "residual_rms": estimate.residual_rms,
+        "sigma": estimate.sigma,
         "misfit": estimate.misfit,
+        "reasons": list(estimate.reasons),
+        "worst": None if estimate.worst is None else vars(estimate.worst),
+        "whiteness": [vars(w) for w in estimate.whiteness],
+        "per_recording": estimate.each,
+        "suspects": [vars(s) for s in estimate.suspects],
+        "std_sandwich": estimate.sandwich,
+        "interval": estimate.interval,
+        "between_recordings": estimate.between,
+        "predictions": [
+            {
+                "name": p.name,
+                "held_out": p.held_out,
+                **{key: _by_output(own, values) for key, own, values in _errors(p)},
+                "ratio": p.ratio,
+            }
+            for p in estimate.predictions
+        ],
+        "seconds": estimate.seconds,
+        "steps": estimate.steps,
+        "sloppy": list(estimate.sloppy),
         "at_bound": list(estimate.at_bound),
         "recordings": [r.name for r in estimate.recordings],
         "warnings": list(estimate.warnings),
@@ -229,6 +227,17 @@ def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
         "data": estimate.data,
         "combinations": list(estimate.combinations),
     }
+
+
+def _errors(p: Prediction) -> list[tuple[str, Errors, Array]]:
+    """Names of errors, and where they are."""
+    own, plain = p.identified, p.nominal
+    pairs = [("rms", own, own.rms), ("mae", own, own.mae), ("nominal_rms", plain, plain.rms)]
+    return [*pairs, ("nominal_mae", plain, plain.mae)]
+
+
+def _by_output(errors: Errors, values: Array) -> dict[str, float]:
+    return dict(zip(errors.outputs, values.tolist(), strict=True))
 
 
 def study_summary(study: Study) -> dict[str, Any]:

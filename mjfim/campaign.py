@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from mjfim.estimated import Estimate
 from mjfim.goals import missed
-from mjfim.trajectory import Array, Design, Estimate, Recording, freeze
+from mjfim.trajectory import Array, Design, Recording, freeze
 
 
 class Outcome(Enum):

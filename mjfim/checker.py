@@ -116,11 +116,11 @@ def check(
     curve = setup.initial if trajectory is None else setup.plant.simulate(setup.theta, trajectory.ctrl)
     if recordings:
         fit = Fit(setup, recordings, data_only=True)
-        longest = max(fit.recordings, key=lambda r: len(r.t))
+        longest = max(fit.tracks, key=lambda track: len(track.ctrl))
         curve = setup.plant.simulate(setup.theta, longest.ctrl[: setup.samples])
-        recorded = fit.sensed(setup.theta)
+        recorded = fit.sensed(fit.begin(setup.theta))
         seen = survey_rows(setup, curve, *(np.concatenate(part) for part in zip(*recorded, strict=True)))
-        tells, horizon = [J.T @ J for J, _ in recorded], float(sum(r.t[-1] for r in fit.recordings))
+        tells, horizon = [J.T @ J for J, _ in recorded], float(sum(track.t[-1] for track in fit.tracks))
         source = f"{len(recordings)} recording{'s' if len(recordings) > 1 else ''}"
     problem = setup.problem
     problem = replace(problem, running=replace(problem.running, desired=curve.state))

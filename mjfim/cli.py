@@ -25,6 +25,8 @@ from mjfim.duration import OutOfReachError, Shortest
 from mjfim.errors import ExperimentError, MjfimError, RecordingError
 from mjfim.files import replacing
 from mjfim.labels import Labels
+from mjfim.levenberg import Progress as Progressed
+from mjfim.logs import read_log, read_recording
 from mjfim.places import check_file, check_folder, experiment_beside, recording_of
 from mjfim.setup import Setup
 from mjfim.trajectory import HistoryRow
@@ -115,7 +117,7 @@ def progress() -> Iterator[Progress]:
 def check(
     experiment: ExperimentFile,
     recordings: Annotated[
-        list[Path] | None, typer.Argument(metavar="[RECORDING...]", help="Recordings (CSV) to look at instead.")
+        list[Path] | None, typer.Argument(metavar="[RECORDING...]", help="Logs to look at instead.")
     ] = None,
     design_file: Annotated[
         Path | None, typer.Option("--design", metavar="DESIGN.npz", help="Look at this design instead.")
@@ -128,7 +130,7 @@ def check(
 ) -> None:
     """Say what can be identified, how well, and what only in combination; before any fit."""
     setup = Setup(mjfim.Experiment.from_file(experiment), threads)
-    loaded = [archive.read_recording(path, setup) for path in recordings or []]
+    loaded = [read_recording(path, setup) for path in recordings or []]
     trajectory = None
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]
@@ -279,20 +281,42 @@ def simulate(
 @verb
 def identify(
     experiment: ExperimentFile,
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Recordings (CSV).")],
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Logs of any format that is read.")],
     output: Folder,
+    held_out: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--held-out", metavar="FILE", help="Log that is predicted, not fitted; may be given several times."
+        ),
+    ] = None,
     method: Annotated[str, typer.Option(help="least_squares (with bounds) or newton (the paper's).")] = "least_squares",
     as_json: AsJson = False,
+    threads: Threads = None,
 ) -> None:
-    """Estimate the parameters from recordings."""
+    """Estimate the parameters from recordings, and say how far that is to be trusted."""
     if method not in ("least_squares", "newton"):
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
-    setup = Setup(mjfim.Experiment.from_file(experiment))
-    loaded = [archive.read_recording(path, setup) for path in recordings]
+    setup = Setup(mjfim.Experiment.from_file(experiment), threads)
     check_folder(output)
     with progress() as bar:
-        bar.add_task("fitting", total=None)
-        result = mjfim.identify(setup, loaded, "newton" if method == "newton" else "least_squares")
+        task = bar.add_task("reading", total=None)
+        loaded, kept = ([read_log(path, setup) for path in paths] for paths in (recordings, held_out or []))
+        if not as_json:
+            out.print(report.looks_report([log.look for log in (*loaded, *kept)]))
+
+        def tell(what: str, iterate: Progressed) -> None:
+            text = f"{what}: iteration {iterate.iteration}, half of the squares {iterate.cost:.6g}, step {iterate.size:.2g} σ"
+            bar.update(task, description=text)
+            if not errors.is_terminal and iterate.iteration % 5 == 0:
+                errors.print(text, markup=False)
+
+        result = mjfim.identify(
+            setup,
+            [log.recording for log in loaded],
+            "newton" if method == "newton" else "least_squares",
+            held_out=[log.recording for log in kept],
+            tell=tell,
+        )
     with writing(output) as results:
         for sentence in results.leave_estimate(output, result, setup):
             errors.print(f"warning: {sentence}", markup=False)

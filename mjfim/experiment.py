@@ -79,6 +79,7 @@ class ParameterSpec(Section):
     inertial: name of a body, whose ten coordinates become parameters `<this name>.<coordinate>`
     coordinates: of an inertial, logcholesky (default, always physical) or barycentric (the dynamics are linear in them)
     nuisance: unknown, but the design need not find it out;  wanted: standard deviation aimed at, in the parameter's unit
+    per_recording: a nuisance of which every recording has its own value
     """
 
     target: str | None = None
@@ -93,6 +94,7 @@ class ParameterSpec(Section):
     prior: Positive | None = None
     unit: str = ""
     nuisance: bool = False
+    per_recording: bool = False
     wanted: Positive | None = None
 
     @model_validator(mode="after")
@@ -109,6 +111,8 @@ class ParameterSpec(Section):
                 raise ValueError(f"inertial stands for ten parameters; {', '.join(one)} would fit only one")
         elif self.coordinates is not None:
             raise ValueError("coordinates belongs to inertial")
+        if self.per_recording and not self.nuisance:
+            raise ValueError("per_recording needs nuisance = true: what is wanted is common to all recordings")
         if self.bounds is not None:
             low, high = self.bounds
             if not low < high:
@@ -156,11 +160,13 @@ class Nuisance(Section):
 
     initial: deviation of the start, of all of qpos and qvel or by `qpos:<joint>`, `qvel:<joint>`
     bias: constant bias, of all outputs or by name;  delay: [s] by which all outputs lag
+    per_recording: every recording has its own bias and delay, as it has its own start
     """
 
     initial: Unknown | dict[str, Unknown] | None = None
     bias: Unknown | dict[str, Unknown] | None = None
     delay: Unknown | None = None
+    per_recording: bool = False
 
 
 class Robust(Section):
@@ -278,11 +284,11 @@ class Boundary(Section):
 
 
 class ColumnSpec(Section):
-    """Where one column of a recording comes from: `scale * raw * unit * factors + offset`.
+    """Where one column of a recording comes from: `(scale * unit * raw + offset) * times`.
 
     column: of the log;  unit: of what the log holds, where it is not the model's (angles, times of angles);  scale, offset
     signed: bits of an integer that the log holds as unsigned;  period: raw numbers after which a counter begins anew
-    unwrap: angles that jump by a whole turn are made continuous
+    unwrap: angles that jump by a whole turn are made continuous, once they are in rad
     times: further columns or constants of the log that it is multiplied with, as they are
     """
 

@@ -17,7 +17,7 @@ class Lag:
 
     What was before the start is the start.
 
-    shift: (N+1, N+1) sparse;  slope: (N+1, N+1) sparse, its derivative by d [1/s]
+    shift: (M, N+1) sparse;  slope: (M, N+1) sparse, its derivative by d [1/s];  M = N+1 where every sample is wanted
     """
 
     shift: Any
@@ -26,7 +26,11 @@ class Lag:
     @staticmethod
     def of(samples: int, delay: float, dt: float) -> Lag:
         """samples: N+1;  delay: d [s];  dt: sample period [s]"""
-        wanted = np.arange(samples) - delay / dt
+        return Lag.at(np.arange(samples, dtype=np.float64) - delay / dt, samples, dt)
+
+    @staticmethod
+    def at(wanted: Array, samples: int, dt: float) -> Lag:
+        """Of outputs that were read at other times. wanted: (M,) t/dt - d/dt in samples;  samples: N+1"""
         place = np.clip(wanted, 0.0, samples - 1.0)
         count = min(4, samples)
         first = np.clip(np.floor(place).astype(int) - 1, 0, samples - count)
@@ -34,11 +38,13 @@ class Lag:
         value, slope = _lagrange(place[:, None] - first[:, None], count)
         inside = (wanted >= 0.0) & (wanted <= samples - 1.0)
         slope *= np.where(inside, -1.0 / dt, 0.0)[:, None]
-        rows = np.repeat(np.arange(samples), count)
-        return Lag(*(csr_array((w.ravel(), (rows, nodes.ravel())), shape=(samples, samples)) for w in (value, slope)))
+        rows = np.repeat(np.arange(len(wanted)), count)
+        return Lag(
+            *(csr_array((w.ravel(), (rows, nodes.ravel())), shape=(len(wanted), samples)) for w in (value, slope))
+        )
 
     def apply(self, values: Array) -> Array:
-        """Lagged values. values: (N+1, ...)"""
+        """Lagged values, (M, ...). values: (N+1, ...)"""
         return _apply(self.shift, values)
 
     def rate(self, values: Array) -> Array:
@@ -55,7 +61,7 @@ class Lag:
 
 
 def _apply(operator: Any, values: Array) -> Array:
-    return np.asarray(operator @ values.reshape(len(values), -1)).reshape(values.shape)
+    return np.asarray(operator @ values.reshape(len(values), -1)).reshape(operator.shape[0], *values.shape[1:])
 
 
 def _lagrange(s: Array, count: int) -> tuple[Array, Array]:

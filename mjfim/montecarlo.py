@@ -3,7 +3,7 @@
 Every trial minimises its own squared residual. The way there is shared: a fit of the mean measurement leads from the
 guess to the neighbourhood of all minima, Gauss-Newton steps with the Jacobian expanded to second order about that point
 bring each trial close, and a step with the trial's own Jacobian finishes it. A trial counts as converged when its last
-own step is small against its standard deviation; the few others go one by one through the trust-region solver of
+own step is small against its standard deviation; the few others go one by one through the least-squares solver of
 `identify`, and what that does not solve is a failed trial.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from mjfim.errors import ExperimentError, SimulationDiverged
-from mjfim.estimate import newton_raphson, trust_region
+from mjfim.estimate import least_squares, newton_raphson
 from mjfim.experiment import Experiment
 from mjfim.residuals import Fit
 from mjfim.setup import Setup
@@ -162,7 +162,7 @@ def _exact(setup: Setup, curve: Trajectory) -> tuple[Array, Array]:
 def _shared(setup: Setup, trials: Trials) -> Shared:
     """Fit of the mean measurement from the guess, with its Jacobian and the Jacobian's derivative."""
     fit = Fit(setup, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
-    theta = newton_raphson(fit, setup.parameters.guess).theta
+    theta = newton_raphson(fit, setup.parameters.guess).unknowns.theta
     h = 1e-3 * setup.parameters.step
 
     def jacobian(at: Array) -> Array:
@@ -201,8 +201,8 @@ def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None)
             break
     for i in active:
         fit = Fit(trials.setup, [trials.recording(trials.measured[i])], data_only=True)
-        solution = trust_region(fit, shared.theta)
-        theta[i] = solution.theta if solution.success else np.nan
+        solution = least_squares(fit, shared.theta)
+        theta[i] = solution.unknowns.theta if solution.success else np.nan
     return theta
 
 

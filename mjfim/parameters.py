@@ -49,7 +49,7 @@ class Parameter:
     size: its own order of magnitude, to which difference steps are relative; 0 = the guess's, else the scale
     function: edits an MjSpec in place, `function(spec, theta_j)`, instead of targets
     nuisance: unknown but not wanted: the design does not spend effort on it;  wanted: standard deviation aimed at, or None
-    group: name of the group that it was declared with, or empty
+    group: name of the group that it was declared with, or empty;  per_recording: every recording has its own value
     """
 
     name: str
@@ -65,6 +65,7 @@ class Parameter:
     nuisance: bool = False
     wanted: float | None = None
     group: str = ""
+    per_recording: bool = False
 
 
 def moved_bodies(parameters: Sequence[Parameter]) -> set[str]:
@@ -216,10 +217,15 @@ class ParameterSet:
         return self._any(lambda slot: isinstance(slot, OUTSIDE))
 
     @cached_property
-    def private(self) -> np.ndarray:
-        """(p,) True for nuisance deviations of the start: every experiment and recording has its own."""
+    def deviations(self) -> np.ndarray:
+        """(p,) True for nuisance deviations of the start."""
         nuisance = np.array([p.nuisance for p in self.parameters], dtype=bool)
         return np.asarray(nuisance & self._any(lambda slot: isinstance(slot, StartSlot)))
+
+    @cached_property
+    def private(self) -> np.ndarray:
+        """(p,) True for deviations of the start and what else every experiment and recording has its own value of."""
+        return np.asarray(self.deviations | np.array([p.per_recording for p in self.parameters], dtype=bool))
 
     @cached_property
     def in_model(self) -> np.ndarray:

@@ -7,6 +7,7 @@ coordinates throughout (`StateSpace`).
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,6 +46,21 @@ FIRST_DERIVATIVE_STEP = 1e-6
 SENSITIVITY_STEP = 1e-5
 FAINT = 1e-2  # relative effect of a parameter below which its difference steps are lengthened
 LONGEST = 100.0  # times at most
+CHUNK = 8_000_000  # numbers that the states of many long curves take at once
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Outputs of S curves over some samples and their derivatives. first: sample of the curve at which they begin
+
+    y: (S, n+1, ny);  common: (S, n+1, ny, p) by theta;  private: (S, n+1, ny, k) by directions of the start
+    The derivatives are None where they were not asked for.
+    """
+
+    first: int
+    y: Array
+    common: Array | None
+    private: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +219,69 @@ class Plant:
         """Outputs y: (N+1, ny) and their derivative G: (N+1, ny, p) by central differences; None if one diverged."""
         found = self._differences(theta, self.start(theta), ctrl, step, None)
         return None if found is None else (found[0], found[1].G)
+
+    def responses(
+        self,
+        theta: Array,
+        starts: Array,
+        ctrl: Array,
+        free: Array | None = None,
+        central: bool = True,
+        chunk: int = CHUNK,
+        step: float = SENSITIVITY_STEP,
+        sought: np.ndarray | None = None,
+    ) -> Iterator[Response | None]:
+        """Curves from starts: (S, ns) under ctrl: (S, N, nu), one stretch of time after the other; None where one diverges.
+
+        free: (nx, k) directions of the start by which to differentiate as well, None: no derivatives at all
+        central: two-sided differences;  chunk: numbers that the states of a stretch may take
+        sought: (p,) parameters by which to differentiate, None: all; biases are for nothing. Outputs are without delay
+        """
+        wanted = self.parameters.moving if sought is None else self.parameters.moving & sought
+        moving = np.flatnonzero(wanted & (free is not None))
+        k, p, N = 0 if free is None else free.shape[1], len(theta), ctrl.shape[1]
+        h = (step * self.span)[moving]
+        moves = np.zeros((len(moving) + k, p))
+        moves[np.arange(len(moving)), moving] = h
+        nudges = moves @ self._start_matrix.T
+        if free is not None:
+            nudges[len(moving) :] = step * free.T
+        sides = [np.zeros((1, p)), moves, *([-moves] if central else [])]
+        pushes = [np.zeros((1, nudges.shape[1])), nudges, *([-nudges] if central else [])]
+        models, sound = self._many(np.concatenate([theta + side for side in sides]))
+        now = self.space.plus(starts, np.concatenate(pushes)[:, None])
+        J, S = now.shape[:2]
+        every = [model for model in models for _ in range(S)] if J > 1 else models
+        n = int(np.clip(chunk / (J * S * self.engine.substeps * (1 + now.shape[2])), 1, N))
+        width = np.concatenate([h, np.full(k, step)]) * (2.0 if central else 1.0)
+        for first in range(0, N, n):
+            held = ctrl[:, first : first + n]
+            used = np.broadcast_to(held, (J, *held.shape)).reshape(J * S, *held.shape[1:])
+            out = self.engine.rollout(every, now.reshape(J * S, -1), used)
+            if not (out.finite.all() and sound.all()):
+                yield None
+                return
+            states = out.states.reshape(J, S, held.shape[1] + 1, -1)
+            sensors = None if out.sensors is None else out.sensors.reshape(J, S, held.shape[1] + 1, -1)
+            y = self.outputs(states[0], None if sensors is None else sensors[0]) + self._bias @ theta
+            if free is None:
+                yield Response(first, y, None, None)
+            else:
+                G = self._quotients(states, sensors, width, central)
+                common = np.zeros((*y.shape, p))
+                common[..., moving] = G[..., : len(moving)]
+                yield Response(first, y, common + self._bias, G[..., len(moving) :])
+            now = states[:, :, -1]
+
+    def _quotients(self, states: Array, sensors: Array | None, width: Array, central: bool) -> Array:
+        """(S, n+1, ny, q) differences of outputs from states: (1 + q or 1 + 2q, S, n+1, ns) whose first is the origin."""
+        q, here = len(width), states[0]
+        over = width.reshape(-1, 1, 1, 1)
+        dx = self.space.minus(states[1 : q + 1], states[q + 1 :] if central else here) / over
+        ds = None
+        if sensors is not None:
+            ds = (sensors[1 : q + 1] - (sensors[q + 1 :] if central else sensors[0])) / over
+        return np.moveaxis(self.outputs.tangent(here, dx, ds), 0, 3)
 
     def project(self, theta: Array, base: Trajectory, zeta: TangentCurve, gamma: float, K: Array) -> Trajectory | None:
         """P(xi + gamma zeta) about the base trajectory; None if it diverged. K: (N, nu, nx), all zero = open loop."""

@@ -19,10 +19,11 @@ import numpy as np
 
 from mjfim.designer import Monitor, design
 from mjfim.errors import MjfimError, SimulationDiverged
+from mjfim.estimated import Estimate
 from mjfim.evaluation import evaluate_trajectory
 from mjfim.experiment import Experiment
 from mjfim.setup import Setup
-from mjfim.trajectory import Array, Design, Estimate, Status
+from mjfim.trajectory import Array, Design, Status
 
 INSIDE = 1e-3  # of a parameter's size, or a quarter of its range, that a design keeps from bounds
 KNOWN = 2.5  # standard deviations about the estimate from which a robust redesign draws its samples

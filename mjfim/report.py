@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from rich.console import Group, RenderableType
 from rich.markup import escape
@@ -10,8 +12,10 @@ from rich.text import Text
 
 from mjfim.checker import Check
 from mjfim.comparison import DESIGN, Comparison, Row
+from mjfim.estimated import Estimate
 from mjfim.identifiability import Group as Combinations
-from mjfim.trajectory import Design, Estimate, Study
+from mjfim.logs import Look
+from mjfim.trajectory import Design, Study
 
 FEW = 7  # parameters up to which each has a column
 BEST_CASE = "sigma is the Cramér-Rao bound: a best case, true if model and noise are right."
@@ -51,22 +55,88 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
 
 
 def estimate_report(estimate: Estimate, units: tuple[str, ...]) -> RenderableType:
-    """Estimates with 95 % intervals, residuals against the stated noise."""
+    """Estimates with intervals that allow for residuals which are no noise, the verdict, predictions of what was not fitted."""
     table = Table(title="Estimated parameters", title_justify="left")
-    for heading in ("parameter", "start", "estimate", "formal σ", "95 % interval"):
+    for heading in ("parameter", "start", "estimate", "formal σ", "honest σ", "95 % interval"):
         table.add_column(heading, justify="left" if heading == "parameter" else "right")
-    rows = zip(estimate.parameters, units, estimate.initial_theta, estimate.theta, estimate.std, strict=True)
-    for name, unit, start, value, std in rows:
-        low, high = value - 1.96 * std, value + 1.96 * std
-        told = (f"{std:.2g}", f"{low:.5g} … {high:.5g}") if np.isfinite(std) else ("not alone", "-")
+    columns = (estimate.parameters, units, estimate.initial_theta, estimate.theta, estimate.std, estimate.interval)
+    for name, unit, start, value, std, (low, high) in zip(*columns, strict=True):
+        told = ("not alone", "-", "-")
+        if np.isfinite(std):
+            told = (f"{std:.2g}", f"{0.25 * (high - low):.2g}", f"{low:.5g} … {high:.5g}")
         table.add_row(_named(name, unit), f"{start:.5g}", f"{value:.5g}", *told)
     rms = ", ".join(f"{escape(name)} {value:.3g}" for name, value in estimate.residual_rms.items())
-    lines = [
-        f"χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof} degrees of freedom; residual rms: {rms}",
-        f"{estimate.status} ({estimate.iterations} iterations)",
+    each = [
+        f"{escape(name)} of each recording: {', '.join(f'{value:.3g}' for value in values)}"
+        for name, values in estimate.each.items()
+        if len(values) > 1
     ]
-    note = "formal σ is accuracy only if the model and the stated noise are right."
-    return Group(table, *lines, Text(note, style="dim"), *_warnings(estimate.warnings))
+    lines = [
+        *each,
+        f"χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof:,} degrees of freedom; residual rms: {rms}",
+        f"{estimate.status} ({estimate.iterations} iterations, {estimate.seconds:.1f} s)",
+    ]
+    note = (
+        "formal σ is accuracy only if model and noise are right; honest σ: a quarter of the interval, which allows for residuals "
+        "that are not and for recordings that disagree, but not for what a wrong model does to a parameter."
+    )
+    told_apart = [_predictions(estimate)] if estimate.predictions else []
+    return Group(table, *lines, *told_apart, Text(note, style="dim"), *_warnings(estimate.warnings))
+
+
+def looks_report(looks: Sequence[Look]) -> RenderableType:
+    """What was read: the clock of every log, then the range of its columns."""
+    table = Table(title="What was read", title_justify="left")
+    for heading in ("log", "rows", "time", "rate", "jitter", "longest gap", "left out"):
+        table.add_column(heading, justify="left" if heading == "log" else "right")
+    for own in looks:
+        clock = (
+            f"{own.rate:.5g} Hz",
+            f"{1e3 * own.jitter_std:.2g} ms",
+            f"{1e3 * own.longest:.3g} ms",
+        )
+        left = f"{own.dropped:,} rows" if own.dropped else "-"
+        table.add_row(escape(shortened(own.file, 34)), f"{own.rows:,}", f"{own.duration:.4g} s", *clock, left)
+    ranges = Table(title="Range of its columns (all logs)", title_justify="left")
+    for heading in ("column", "from", "least", "largest", "resolution", "empty"):
+        ranges.add_column(heading, justify="left" if heading in ("column", "from") else "right")
+    for name in dict.fromkeys(column.name for own in looks for column in own.columns):
+        some = [column for own in looks for column in own.columns if column.name == name]
+        low, high = (f([getattr(c, key) for c in some]) for f, key in ((np.nanmin, "minimum"), (np.nanmax, "maximum")))
+        finest = min((c.resolution for c in some if c.resolution > 0.0), default=0.0)
+        empty = float(np.mean([c.empty for c in some]))
+        told = f"{100 * empty:.0f} %" if empty else "-"
+        ranges.add_row(escape(name), escape(some[0].source), f"{low:.4g}", f"{high:.4g}", f"{finest:.2g}", told)
+    return Group(table, ranges)
+
+
+def shortened(path: str, most: int) -> str:
+    """The end of a path, which tells files apart."""
+    name = path.rsplit("/", 1)[-1]
+    return name if len(name) <= most else f"…{name[1 - most :]}"
+
+
+def _predictions(estimate: Estimate) -> Table:
+    """Errors of predictions: identified / nominal."""
+    found = estimate.predictions
+    outputs = found[0].identified.outputs
+    shown = [j for j in range(len(outputs)) if any(np.isfinite(p.identified.rms[j]) for p in found)][:FEW]
+    title = "Prediction of what was not fitted: rms error of the identified / the nominal model"
+    table = Table(title=title, title_justify="left")
+    table.add_column("what")
+    for j in shown:
+        table.add_column(escape(outputs[j]), justify="right")
+    table.add_column("ratio", justify="right")
+    for p in found:
+        cells = (f"{p.identified.rms[j]:.3g} / {p.nominal.rms[j]:.3g}" for j in shown)
+        style = "yellow" if not p.ratio < 1.0 else ""
+        table.add_row(
+            escape(shortened(p.name, 40)) + ("" if p.held_out else " *"), *cells, f"{p.ratio:.2f}", style=style
+        )
+    if not all(p.held_out for p in found):
+        table.caption = "* by a fit to the rest; --held-out keeps recordings out of the fit"
+        table.caption_justify = "left"
+    return table
 
 
 def study_report(study: Study, units: tuple[str, ...]) -> RenderableType:

@@ -9,11 +9,12 @@ from mjfim import archive, plots, rerun_log
 from mjfim.checker import Check
 from mjfim.comparison import Comparison
 from mjfim.errors import ModelError
+from mjfim.estimated import Estimate
 from mjfim.identified import write_identified
 from mjfim.labels import Labels
-from mjfim.residuals import measured_trajectory
 from mjfim.setup import Setup
-from mjfim.trajectory import Design, Estimate, Study
+from mjfim.tracks import measured_trajectory
+from mjfim.trajectory import Design, Study
 
 
 def leave_design(folder: Path, design: Design, setup: Setup) -> None:
@@ -49,23 +50,26 @@ def leave_comparison(folder: Path, comparison: Comparison, setup: Setup) -> None
 
 
 def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
-    """estimate.json, identified.xml, estimate.rrd and pictures; returns sentences about what could not be written."""
-    _clear(folder, r"fit(_\d+)?\.png|identified\.xml")
+    """estimate.json, identified.xml, estimate.rrd and pictures; returns sentences about what is not as it should be."""
+    _clear(folder, r"fit(_\d+)?\.png|identified\.xml|predictions\.png")
     archive.write_json(folder / "estimate.json", archive.estimate_summary(estimate, setup))
     missing = []
     try:
-        write_identified(folder / "identified.xml", setup, estimate.theta)
+        said = write_identified(folder / "identified.xml", setup, estimate.theta)
+        missing += [said] if said else []
     except ModelError as error:
         missing.append(str(error))
     labels = Labels.of(setup)
     for i in range(len(estimate.recordings)):
         name = "fit.png" if len(estimate.recordings) == 1 else f"fit_{i + 1}.png"
-        plots.save(plots.fit(estimate, i, labels, setup.noise.sigma), folder / name)
+        plots.save(plots.fit(estimate, i, labels, list(estimate.sigma.values())), folder / name)
     plots.save(plots.parameter_intervals(estimate, labels), folder / "parameters.png")
-    first = estimate.recordings[0]
-    predicted, measured = setup.plant.simulate(estimate.theta, first.ctrl), measured_trajectory(setup, first)
-    model = setup.model_at(estimate.theta)
-    rerun_log.log_estimate(folder / "estimate.rrd", model, estimate, measured, predicted, labels)
+    plots.save(plots.residual_spectra(estimate, labels), folder / "spectra.png")
+    if estimate.predictions:
+        plots.save(plots.predictions(estimate, labels), folder / "predictions.png")
+    if estimate.motion is not None:
+        measured, model = measured_trajectory(setup, estimate.recordings[0]), setup.model_at(estimate.theta)
+        rerun_log.log_estimate(folder / "estimate.rrd", model, estimate, measured, estimate.motion, labels)
     return missing
 
 

@@ -10,17 +10,17 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 
 import numpy as np
-from scipy.stats import norm
 
 from mjfim.campaign import Campaign, Outcome, Played, Round
 from mjfim.designer import Monitor, design
 from mjfim.errors import ExperimentError, MjfimError, SimulationDiverged
-from mjfim.estimate import MISFIT, identify
+from mjfim.estimate import identify
+from mjfim.estimated import Estimate
 from mjfim.experiment import Experiment
 from mjfim.goals import furthest, require_reachable, wanted_of
 from mjfim.redesign import Past, redesigned, restated
 from mjfim.setup import Setup
-from mjfim.trajectory import Array, Design, Estimate, Recording, Status
+from mjfim.trajectory import Array, Design, Recording, Status
 
 PROGRESS = 0.99  # of the last round's worst σ over the wanted one; a round that leaves more made none
 JUMP = 4.0  # standard deviations that an estimate moves from one round to the next only where something is wrong
@@ -196,32 +196,8 @@ def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Es
 
 def _doubts(estimate: Estimate, wanted: Array) -> Iterator[str]:
     """Why the formal standard deviations of wanted parameters are not to be trusted, besides a misfit."""
-    if not estimate.misfit:
-        yield from _echoes(estimate)
     at = [n for n, w in zip(estimate.parameters, wanted, strict=True) if np.isfinite(w) and n in estimate.at_bound]
     if at:
         yield f"wanted, but at a bound: {', '.join(at)}"
     if not estimate.success and not estimate.combinations and not at:
         yield f"the fit did not succeed: {estimate.status}"
-
-
-def _echoes(estimate: Estimate) -> Iterator[str]:
-    """Outputs whose residuals follow from the sample before: a wrong model shows there before their size tells.
-
-    Of white noise, sqrt(n) times the correlation of n successive residuals is standard normal.
-    """
-    outputs = estimate.recordings[0].outputs
-    least = float(norm.isf(MISFIT / len(outputs)))
-    for i, name in enumerate(outputs):
-        echo, size, count = 0.0, 0.0, 0
-        for recording, predicted in zip(estimate.recordings, estimate.predicted, strict=True):
-            residual = (recording.y - predicted)[1:, i]
-            residual = residual[np.isfinite(residual)]
-            echo, size = echo + float(residual[1:] @ residual[:-1]), size + float(residual @ residual)
-            count += max(len(residual) - 1, 0)
-        z = np.sqrt(count) * echo / size if size > 0.0 else 0.0
-        if z > least:
-            yield (
-                f"residuals of {name} follow one another (correlation {echo / size:.2f}, {z:.1f} σ from none): the model is "
-                "wrong or the noise is not white, and formal σ is not accuracy"
-            )

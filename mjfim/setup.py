@@ -357,7 +357,7 @@ class Setup:
                 makers = dict.fromkeys(p.parameters[j].group or f"{p.parameters[j].name}.{key}" for j in columns)
                 raise ExperimentError(f"{', '.join(f'parameters.{m}' for m in makers)}: {fault}")
 
-    def _impossible(self, theta: Array) -> list[int]:
+    def impossible(self, theta: Array) -> list[int]:
         """Indices of the parameters that make bodies which cannot exist at theta: (p,)."""
         try:
             return sorted({j for columns, _ in self.parameters.impossible(self.plant.source, theta) for j in columns})
@@ -432,7 +432,7 @@ class Setup:
             return None
         if self.experiment.descent.psi_weight:
             raise ExperimentError("robust: descent.psi_weight belongs to a design at one parameter value")
-        thetas = sampled(self.parameters, self.theta, robust.samples, robust.seed, self._impossible)
+        thetas = sampled(self.parameters, self.theta, robust.samples, robust.seed, self.impossible)
         return Pool(thetas, robust.over, self.experiment.cost.criterion == "D")
 
     def _calibrate(self) -> None:

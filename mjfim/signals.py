@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pyarrow
-import pyarrow.csv
 from scipy.signal import chirp
 
 from mjfim.errors import RecordingError, unknown
 from mjfim.experiment import Signal, by_name
+from mjfim.tables.files import read_table as read_table
 from mjfim.trajectory import Array
 
 OF_DESIGN = ("qpos:", "qvel:", "act:", "gain:")  # what a design.csv holds beside t and the control
@@ -49,27 +48,6 @@ def multisine(t: Array, nu: int, frequency: float, harmonics: int, rng: np.rando
     waves = np.sin(2 * np.pi * frequency * t[:, None, None] * order + phases) * weights
     total = waves.sum(axis=2)
     return np.asarray(total / np.abs(total).max(axis=0))
-
-
-def read_table(path: Path) -> dict[str, Array]:
-    """Columns of a numeric CSV file (gzip by its ending). Raises RecordingError naming file, column and row."""
-    try:
-        table = pyarrow.csv.read_csv(path)
-        names = list(table.column_names)
-    except FileNotFoundError:
-        raise RecordingError(f"{path}: no such file") from None
-    except (pyarrow.ArrowInvalid, OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: not a readable CSV table: {error}") from None
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise RecordingError(f"{path}: column {twice!r} stands there more than once")
-    columns = {}
-    for name in names:
-        try:
-            columns[name] = table[name].cast(pyarrow.float64()).to_numpy(zero_copy_only=False)
-        except (pyarrow.ArrowInvalid, pyarrow.ArrowNotImplementedError):
-            raise RecordingError(f"{path}: column {name!r} is not numeric") from None
-    return columns
 
 
 def read_control(path: Path, t: Array, dt: float, names: tuple[str, ...], repeat: bool = False) -> Array:

@@ -23,6 +23,11 @@ def freeze(record: object, *names: str) -> None:
         object.__setattr__(record, name, array)
 
 
+def thinned(count: int, most: int) -> NDArray[np.intp]:
+    """Indices of at most so many of count rows, evenly spread: what a picture can show."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """A feasible curve (x, u) of the plant: `x_{k+1} = F(x_k, u_k, theta)`.
@@ -268,41 +273,6 @@ class Recording:
 
     def __post_init__(self) -> None:
         freeze(self, "t", "ctrl", "y")
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Parameters from recordings.
-
-    theta, std: (p,);  covariance: (p, p) formal (Cramer-Rao at the estimate)
-    chi2: whitened squared residual sum;  dof: its degrees of freedom;  residual_rms: per output, in its unit
-    misfit: True where chi2 is improbable (< 1e-3) for noise of the stated sigma: the formal std is then not accuracy
-    predicted, measured: per recording, (N+1, ny);  initial_theta: the start
-    combinations: groups of parameters that the recordings tell in combination only, in words
-    data: (p, p) information of the recordings, priors left out, private nuisance marginalised
-    """
-
-    parameters: tuple[str, ...]
-    theta: Array
-    std: Array
-    covariance: Array
-    initial_theta: Array
-    chi2: float
-    dof: int
-    status: str
-    success: bool
-    misfit: bool
-    iterations: int
-    residual_rms: dict[str, float]
-    at_bound: tuple[str, ...]
-    predicted: tuple[Array, ...]
-    recordings: tuple[Recording, ...]
-    warnings: tuple[str, ...] = ()
-    combinations: tuple[str, ...] = ()
-    data: Array = field(default_factory=lambda: np.zeros((0, 0)))
-
-    def __post_init__(self) -> None:
-        freeze(self, "theta", "std", "covariance", "initial_theta", "data")
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,6 +76,7 @@ def _single(name: str, spec: ParameterSpec, model: Any, outputs: Sequence[str]) 
         spec.function,
         spec.nuisance,
         spec.wanted,
+        per_recording=spec.per_recording,
     )
 
 
@@ -111,6 +112,7 @@ def _inertial(name: str, spec: ParameterSpec, model: Any) -> Iterator[Parameter]
             size=float(size),
             nuisance=spec.nuisance,
             group=name,
+            per_recording=spec.per_recording,
         )
 
 
@@ -125,9 +127,9 @@ def _nuisance(experiment: Experiment, model: Any, outputs: Sequence[str]) -> Ite
     for label, prior in _by_name("nuisance.initial", stated.initial, list(starts)):
         yield _unwanted(f"{START}{label}", starts[label], prior, unit_of(model, starts[label]), 1.0)
     for label, prior in _by_name("nuisance.bias", stated.bias, outputs):
-        yield _unwanted(f"bias {label}", f"output/{label}:bias", prior, "", 1.0)
+        yield _unwanted(f"bias {label}", f"output/{label}:bias", prior, "", 1.0, stated.per_recording)
     if stated.delay is not None:
-        yield _unwanted("delay", "output:delay", stated.delay, "s", 0.01)
+        yield _unwanted("delay", "output:delay", stated.delay, "s", 0.01, stated.per_recording)
 
 
 def _starts(model: Any) -> Iterator[tuple[str, str]]:
@@ -151,6 +153,16 @@ def _by_name(key: str, stated: Any, names: Sequence[str]) -> Iterator[tuple[str,
         yield name, prior
 
 
-def _unwanted(name: str, path: str, prior: Any, unit: str, size: float) -> Parameter:
+def _unwanted(name: str, path: str, prior: Any, unit: str, size: float, per_recording: bool = False) -> Parameter:
     known = None if prior is True else float(prior)
-    return Parameter(name, (Target(path),), 0.0, scale=size, prior=known, unit=unit, size=size, nuisance=True)
+    return Parameter(
+        name,
+        (Target(path),),
+        0.0,
+        scale=size,
+        prior=known,
+        unit=unit,
+        size=size,
+        nuisance=True,
+        per_recording=per_recording,
+    )

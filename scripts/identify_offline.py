@@ -12,8 +12,8 @@ import argparse
 from pathlib import Path
 
 import mjfim
-from mjfim.archive import read_recording
 from mjfim.identified import write_identified
+from mjfim.logs import read_recording
 from mjfim.setup import Setup
 
 

@@ -23,6 +23,7 @@ import mjfim
 from mjfim.bounds import SHOWN, fence_of
 from mjfim.engine import Engine
 from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.estimated import Estimate
 from mjfim.experiment import Experiment
 from mjfim.fisher import standard_deviations
 from mjfim.limits import Limit
@@ -30,7 +31,7 @@ from mjfim.models import joint_names
 from mjfim.paths import joint_width
 from mjfim.playback import read_playback
 from mjfim.setup import Setup
-from mjfim.trajectory import Array, Estimate, Recording
+from mjfim.trajectory import Array, Recording
 
 LATENCY = 5e-3  # [s]
 DRAWS = 500  # attempts at a robot that can exist

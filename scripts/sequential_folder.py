@@ -12,11 +12,12 @@ import numpy as np
 from rich.console import Console
 from sequential_picture import figure
 
-from mjfim.archive import check_fits, estimate_summary, read_design, read_recording, write_design, write_json
+from mjfim.archive import check_fits, estimate_summary, read_design, write_design, write_json
 from mjfim.campaign import Campaign, Played, Round
 from mjfim.errors import ModelError, RecordingError
 from mjfim.goals import wanted_of
 from mjfim.identified import write_identified
+from mjfim.logs import read_recording
 from mjfim.plots import save, style
 from mjfim.redesign import restated
 from mjfim.setup import Setup

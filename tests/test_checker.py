@@ -108,7 +108,8 @@ def test_recordings_add_up_and_missing_values_do_not_count(tmp_path) -> None:
     thinned[::2] = np.nan
     part = Recording(whole.t, whole.ctrl, thinned, whole.outputs, "half")
     two = check(setup, [whole, part])
-    J = Fit(setup, [whole, part], data_only=True).at(setup.theta).J
+    fit = Fit(setup, [whole, part], data_only=True)
+    J = fit.dense(fit.begin(setup.theta)).J
     assert relative_error(two.information, J.T @ J) < 1e-6
     alone = check(setup, [whole])
     assert relative_error(alone.information, check(setup).information) < 1e-6

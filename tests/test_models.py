@@ -12,7 +12,13 @@ from mjfim import results
 from mjfim.setup import Setup
 
 EXAMPLES = sorted(path.stem for path in MODELS.glob("*.toml") if not path.stem.startswith("cart_pendulum"))
-ROUGH = {"sliding_block", "double_pendulum"}  # contact and dry friction
+ROUGH = {
+    "sliding_block",
+    "double_pendulum",
+    "bam_xl330",
+    "dfki_double_pendulum",
+    "dfki_simple_pendulum",
+}  # contact and dry friction
 TOGETHER = {"double_pendulum", "ball_pendulum"}  # not every parameter can be told alone
 
 

@@ -19,12 +19,12 @@ from matplotlib.text import Text
 
 from mjfim import plots
 from mjfim.errors import MjfimError
+from mjfim.estimated import Estimate
 from mjfim.labels import Labels
 from mjfim.plots.style import INITIAL, OPTIMIZED, number, per, squared, with_error
 from mjfim.trajectory import (
     Array,
     Design,
-    Estimate,
     Evaluation,
     HistoryRow,
     Recording,
@@ -346,7 +346,7 @@ def test_intervals_flag_bounds_and_misfit() -> None:
     text = all_text(plots.parameter_intervals(make_estimate(misfit=True), make_labels(2, 3))).replace("\n", " ")
     assert text.count("N m s/rad   at its bound") == 1
     assert "kg   at its bound" not in text
-    assert "do not read the intervals as accuracy" in text
+    assert "no interval covers what a wrong model does" in text
 
 
 def test_intervals_with_infinite_std(tmp_path: Path) -> None:

@@ -15,11 +15,12 @@ pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
 
 from mjfim.errors import MjfimError, RecordingError
+from mjfim.estimated import Estimate
 from mjfim.labels import Labels, output_label
 from mjfim.rerun_log import documents, log_design, log_estimate, log_trajectories, show
 from mjfim.rerun_log.panels import dof_positions, history_series
 from mjfim.rerun_log.scene import camera, entity, motion
-from mjfim.trajectory import Array, Design, Estimate, Evaluation, HistoryRow, Recording, StartResult, Status, Trajectory
+from mjfim.trajectory import Array, Design, Evaluation, HistoryRow, Recording, StartResult, Status, Trajectory
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "models"
@@ -413,7 +414,7 @@ class TestEstimate:
         log_estimate(path, cart, estimated(cart, trajectory), None, trajectory, Labels.of_model(cart), "see the report")
         assert not [entry for entry in entities(path) if entry.startswith("/robots/measured")]
         text = str(column(path, ("summary",), None, "TextDocument:text")[1][0, 0])
-        assert "more than the stated noise explains" in text
+        assert "no noise: σ is then not accuracy" in text
         assert "see the report" in text
 
 

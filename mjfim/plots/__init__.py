@@ -11,6 +11,7 @@ from mjfim.plots.design import convergence, sensitivity_phase, trajectories
 from mjfim.plots.estimates import fit, histogram
 from mjfim.plots.limits import limits
 from mjfim.plots.parameters import parameter_intervals, std_bars
+from mjfim.plots.residuals import predictions, residual_spectra
 from mjfim.plots.style import save
 from mjfim.plots.tables import design_table, study_table
 
@@ -23,6 +24,8 @@ __all__ = [
     "histogram",
     "limits",
     "parameter_intervals",
+    "predictions",
+    "residual_spectra",
     "save",
     "sensitivity_phase",
     "std_bars",

@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from mjfim.errors import MjfimError
+from mjfim.estimated import Estimate
 from mjfim.labels import Labels, split_unit
 from mjfim.plots.style import (
     FAINT,
@@ -31,9 +32,10 @@ from mjfim.plots.style import (
     squared,
     two_lines,
 )
-from mjfim.trajectory import Array, Estimate, Recording, Study, TrialSet
+from mjfim.trajectory import Array, Recording, Study, TrialSet, thinned
 
 MAX_OUTPUTS = 12
+MAX_ROWS = 6000  # of a recording in a picture
 
 
 def finite_column(trials: TrialSet, index: int) -> Array:
@@ -157,9 +159,10 @@ def shown_outputs(residual: Array, sigma: Array) -> NDArray[np.intp]:
 
 def draw_fit(axes: Axes, recording: Recording, predicted: Array, column: int) -> None:
     """Measured dots and predicted line of one output."""
-    size = float(np.clip(900.0 / len(recording.t), 1.5, 4.0))
-    axes.plot(recording.t, recording.y[:, column], ".", color=MEASURED, markersize=size)
-    axes.plot(recording.t, predicted[:, column], color=INK, linewidth=1.2)
+    rows = thinned(len(recording.t), MAX_ROWS)
+    size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
+    axes.plot(recording.t[rows], recording.y[rows, column], ".", color=MEASURED, markersize=size)
+    axes.plot(recording.t[rows], predicted[rows, column], color=INK, linewidth=1.2)
 
 
 def draw_residual(axes: Axes, t: Array, residual: Array, sigma: float) -> None:
@@ -167,8 +170,9 @@ def draw_residual(axes: Axes, t: Array, residual: Array, sigma: float) -> None:
     known = residual[np.isfinite(residual)]
     axes.axhspan(-2.0 * sigma, 2.0 * sigma, color=FAINT, alpha=0.8, linewidth=0)
     axes.axhline(0.0, color=INK, linewidth=0.8)
-    size = float(np.clip(900.0 / len(t), 1.5, 4.0))
-    axes.plot(t, residual, ".", color=MEASURED, markersize=size)
+    rows = thinned(len(t), MAX_ROWS)
+    size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
+    axes.plot(t[rows], residual[rows], ".", color=MEASURED, markersize=size)
     if not known.size:
         say(axes, "not measured")
         return
@@ -203,7 +207,7 @@ def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] |
     handles = [
         Line2D([], [], color=MEASURED, marker=".", linestyle="", label="measured"),
         Line2D([], [], color=INK, label="predicted"),
-        Patch(color=FAINT, label="±2σ of the stated noise"),
+        Patch(color=FAINT, label="±2σ of the noise"),
     ]
     note = "Residual: measured − predicted; 4.6 % outside ±2σ is expected if the model and the noise are right."
     if len(columns) < len(recording.outputs):

@@ -9,6 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.transforms import Transform
 
+from mjfim.estimated import Estimate
 from mjfim.labels import Labels
 from mjfim.plots.style import (
     BEST_CASE,
@@ -26,7 +27,7 @@ from mjfim.plots.style import (
     shorten,
     with_error,
 )
-from mjfim.trajectory import Array, Design, Estimate
+from mjfim.trajectory import Array, Design
 
 QUANTILE_95 = 1.959964
 ROOMY = 12
@@ -136,20 +137,24 @@ def relative_axis(offset: Array, half: Array) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def draw_interval(axes: Axes, y: int, centre: float, half: float, bound: bool) -> None:
-    """One estimate with its interval; arrows where the interval leaves the axis."""
+def draw_interval(axes: Axes, y: int, centre: float, half: float, wide: tuple[float, float], bound: bool) -> None:
+    """One estimate with its formal interval, thick, in the honest one, thin; arrows where that leaves the axis."""
     low, high = axes.get_xlim()
-    ends = (max(centre - half, low), min(centre + half, high))
-    axes.plot(ends, (y, y), color=OPTIMIZED, linewidth=2.2, solid_capstyle="butt", alpha=0.55)
-    for end, marker, cut in ((ends[0], "<", centre - half < low), (ends[1], ">", centre + half > high)):
+    if np.isfinite(half):
+        inner = (max(centre - half, low), min(centre + half, high))
+        axes.plot(inner, (y, y), color=OPTIMIZED, linewidth=5.0, solid_capstyle="butt", alpha=0.3)
+    ends = (max(wide[0], low), min(wide[1], high))
+    axes.plot(ends, (y, y), color=OPTIMIZED, linewidth=1.4, solid_capstyle="butt")
+    for end, marker, cut in ((ends[0], "<", wide[0] < low), (ends[1], ">", wide[1] > high)):
         axes.plot(end, y, marker if cut else "|", color=OPTIMIZED, markersize=7, clip_on=False)
     face = "white" if bound else OPTIMIZED
     axes.plot(centre, y, "s" if bound else "o", color=OPTIMIZED, markerfacecolor=face, markersize=6.5, zorder=3)
 
 
 def interval_text(estimate: Estimate, j: int, unit: str) -> str:
-    """Guess, estimate and half width in the parameter's unit."""
-    half = QUANTILE_95 * float(estimate.std[j])
+    """Guess, estimate and half width of the honest interval in the parameter's unit."""
+    low, high = estimate.interval[j]
+    half = 0.5 * float(high - low) if np.isfinite(estimate.std[j]) else np.inf
     text = f"{number(float(estimate.initial_theta[j]), 4)} → {with_error(float(estimate.theta[j]), half)} {unit}"
     return text.rstrip() + ("   at its bound" if estimate.parameters[j] in estimate.at_bound else "")
 
@@ -161,13 +166,17 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
     scale = np.where(estimate.initial_theta == 0.0, np.nan, np.abs(estimate.initial_theta)) / 100.0
     offset = (estimate.theta - estimate.initial_theta) / scale
     half = QUANTILE_95 * estimate.std / scale
+    wide = (estimate.interval - estimate.initial_theta[:, None]) / scale[:, None]
+    reach = np.maximum(half, np.abs(wide - offset[:, None]).max(axis=1))
     figure = new_figure(9.5, 1.9 + (0.42 if count <= 12 else 0.27) * count)
     axes = figure.subplots()
-    axes.set(xlim=relative_axis(offset, half), ylim=(count - 0.4, -0.6))
+    axes.set(xlim=relative_axis(offset, reach), ylim=(count - 0.4, -0.6))
     axes.axvline(0.0, color=INITIAL, linewidth=1.6)
     for j in range(count):
         if np.isfinite(offset[j]):
-            draw_interval(axes, j, float(offset[j]), float(half[j]), estimate.parameters[j] in estimate.at_bound)
+            ends = (float(wide[j, 0]), float(wide[j, 1]))
+            bound = estimate.parameters[j] in estimate.at_bound
+            draw_interval(axes, j, float(offset[j]), float(half[j]), ends, bound)
         text = interval_text(estimate, j, labels.parameter_units[j])
         axes.text(1.02, j, text, transform=axes.get_yaxis_transform(), va="center", fontsize=SMALL, color=INK)
     dress(axes, "difference from the guess [% of the guess]")
@@ -175,11 +184,12 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
     handles = [
         Line2D([], [], color=INITIAL, label="guess", linewidth=1.6),
         Line2D([], [], color=OPTIMIZED, marker="o", alpha=0.9, label="estimate, 95 % interval"),
+        Line2D([], [], color=OPTIMIZED, linewidth=5.0, alpha=0.3, label="formal 95 %"),
         Line2D([], [], color=OPTIMIZED, marker="s", markerfacecolor="white", linestyle="", label="at its bound"),
     ]
-    note = "Formal intervals: a best case that holds if the model and the stated noise are right."
+    note = "Formal: a best case that holds if the model and the noise are right. The thin line allows for residuals that are not."
     if estimate.misfit:
-        note += " Here the residuals exceed the stated noise: do not read the intervals as accuracy."
+        note += " Here the residuals are not noise: no interval covers what a wrong model does to the parameters."
     if np.isnan(scale).any():
         note += " A guess of 0 has no relative scale and is given as text only."
     headline(figure, "Estimated parameters", handles, note)

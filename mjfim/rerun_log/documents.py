@@ -14,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mjfim.errors import MjfimError, RecordingError
+from mjfim.estimated import Estimate
 from mjfim.files import replacing
 from mjfim.labels import Labels, output_label
 from mjfim.rerun_log.panels import (
@@ -35,7 +36,7 @@ from mjfim.rerun_log.panels import (
 from mjfim.rerun_log.scene import Camera, Route, camera, entity, has_floor, log_robot, log_trail, motion
 from mjfim.rerun_log.shapes import Look
 from mjfim.rerun_log.text import design_text, estimate_text
-from mjfim.trajectory import Design, Estimate, Recording, Trajectory
+from mjfim.trajectory import Design, Recording, Trajectory, thinned
 
 INITIAL = Look((70, 130, 220))
 OPTIMIZED = Look((220, 60, 60))
@@ -43,6 +44,7 @@ PREDICTED = Look((230, 130, 30))
 MEASURED = Look((125, 135, 150), opacity=0.4)
 OTHERS = (Look((60, 160, 90)), Look((160, 90, 200)), PREDICTED, Look((20, 160, 170)))
 BACKDROP = (214, 219, 226)
+MOST = 20_000  # rows of a recording, or of a motion, in a file
 SHORT, TALL = 1.35, 0.75  # width over height of the robots' region, with and without text below it
 BY_NAME = {"initial": INITIAL, "optimized": OPTIMIZED, "final": OPTIMIZED}
 
@@ -98,6 +100,7 @@ def log_estimate(
 
     measured: as a see-through robot over the simulated one, or None where positions were not measured
     """
+    predicted, measured = _thin(predicted), None if measured is None else _thin(measured)
     robots = {"predicted": (predicted, PREDICTED)} | ({"measured": (measured, MEASURED)} if measured else {})
     motions = {key: motion(model, trajectory.t, trajectory.qpos) for key, (trajectory, _) in robots.items()}
     eye = camera(model, list(motions.values()), views=1, aspect=SHORT)
@@ -112,13 +115,14 @@ def log_estimate(
             log_robot(rec, model, ("robots", key), motions[key], look)
             _log_states(rec, model, trajectory, names, key, look)
         for k, (recording, y) in enumerate(zip(estimate.recordings, estimate.predicted, strict=True)):
+            rows = thinned(len(recording.t), MOST)
+            t = recording.t[rows]
             for column, output in enumerate(recording.outputs):
                 root = (f"recording {k + 1}", output_label(model, output))
-                observed = recording.y[:, column]
-                log_dots(rec, ("outputs", *root, "measured"), recording.t, observed, "measured", MEASURED)
-                log_line(rec, ("outputs", *root, "predicted"), recording.t, y[:, column], "predicted", PREDICTED)
-                residual = observed - y[:, column]
-                log_dots(rec, ("residuals", *root), recording.t, residual, "measured - predicted", MEASURED)
+                observed, told = recording.y[rows, column], y[rows, column]
+                log_dots(rec, ("outputs", *root, "measured"), t, observed, "measured", MEASURED)
+                log_line(rec, ("outputs", *root, "predicted"), t, told, "predicted", PREDICTED)
+                log_dots(rec, ("residuals", *root), t, observed - told, "measured - predicted", MEASURED)
 
 
 def log_trajectories(path: Path, model: mujoco.MjModel, trajectories: Mapping[str, Trajectory], names: Labels) -> None:
@@ -149,6 +153,13 @@ def show(path: Path) -> None:
         raise MjfimError(
             f"the Rerun viewer ended with code {code}; it needs a display, the file {str(path)!r} does not"
         )
+
+
+def _thin(trajectory: Trajectory) -> Trajectory:
+    """At most so many rows, evenly spread."""
+    rows = thinned(len(trajectory.t), MOST)
+    ctrl = trajectory.ctrl[rows[:-1]]
+    return Trajectory(trajectory.t[rows], trajectory.qpos[rows], trajectory.qvel[rows], trajectory.act[rows], ctrl)
 
 
 def _log_text(rec: rr.RecordingStream, text: str) -> None:

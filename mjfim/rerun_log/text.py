@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from mjfim.trajectory import Design, Estimate
+from mjfim.estimated import Estimate
+from mjfim.trajectory import Design
 
 
 def design_text(design: Design, summary: str = "") -> str:
@@ -49,28 +50,34 @@ def design_text(design: Design, summary: str = "") -> str:
 
 def estimate_text(estimate: Estimate, summary: str = "") -> str:
     """Markdown: outcome, estimated parameters, fit per output, warnings."""
+    columns = (estimate.parameters, estimate.initial_theta, estimate.theta, estimate.std, estimate.interval)
     rows = [
         (
             name,
             f"{a:.5g}",
             f"{b:.5g}",
             f"{s:.2g}",
-            f"{abs(s / b):.2g}" if b else "",
+            f"{low:.4g} … {high:.4g}",
             "yes" if name in estimate.at_bound else "",
         )
-        for name, a, b, s in zip(estimate.parameters, estimate.initial_theta, estimate.theta, estimate.std, strict=True)
+        for name, a, b, s, (low, high) in zip(*columns, strict=True)
     ]
-    verdict = (
-        "more than the stated noise explains: σ is then not accuracy" if estimate.misfit else "as the noise explains"
-    )
+    verdict = "no noise: σ is then not accuracy" if estimate.misfit else "as the noise explains"
     return _sections(
         "## Estimated parameters",
         f"**{estimate.status}** ({estimate.iterations} iterations)",
         "Orange: the model with these parameters. Grey: what was measured.",
         *_warnings(estimate.warnings),
-        _table(("parameter", "start", "estimate", "σ", "σ / estimate", "at bound"), rows),
+        _table(("parameter", "start", "estimate", "formal σ", "95 % interval", "at bound"), rows),
         f"Residuals: χ² = {estimate.chi2:.4g} for {estimate.dof} degrees of freedom, {verdict}.",
         _table(("output", "residual rms"), [(k, f"{v:.3g}") for k, v in estimate.residual_rms.items()]),
+        "#### Predictions of what was not fitted" if estimate.predictions else "",
+        _table(
+            ("what", "error over the nominal model's"),
+            [(p.name, f"{p.ratio:.2g}") for p in estimate.predictions],
+        )
+        if estimate.predictions
+        else "",
         summary,
     )
 

@@ -1,0 +1,1 @@
+"""The user's MJCF text with single numbers changed, everything else to the byte as it was."""

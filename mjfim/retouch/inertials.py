@@ -1,0 +1,80 @@
+"""A body's `<inertial>` rewritten: by the numbers that it has, by its matrix, or as a new element beside its geoms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mjfim.inertia import COLUMNS, ROWS
+from mjfim.retouch.sheet import ORIENTATIONS, Sheet, close, digits
+from mjfim.slots import inertial
+from mjfim.trajectory import Array
+
+SLIGHT = 1e-13  # of a body's size or trace of inertia: what is below is rounding of the charts
+IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def weigh(sheet: Sheet, name: str, old: Any, wanted: Any, charted: bool) -> None:
+    """Give a named body the inertia that it has in the wanted model. old: what the text compiles to.
+
+    charted: its matrix is varied as a whole, so that its principal axes may turn
+    """
+    b = int(old.body(name).id)
+    before, after = inertial(old, b), inertial(wanted, b)
+    trace, radius = 10.0 * float(np.trace(before.inertia)), 10.0 * before.radius if before.mass > 0.0 else 0.0
+    turned = not close(before.inertia, after.inertia, trace).all()
+    moved = not close(before.com, after.com, radius).all()
+    if not turned and not moved and close(np.array(before.mass), np.array(after.mass)):
+        return
+    body = sheet.place("body", name)
+    own = next((i for i, tag in enumerate(sheet.tags) if tag.name == "inertial" and tag.parent == body), None)
+    if own is None:
+        matrix = _matrix(after.inertia) if charted and not _watched(old, b) else _principal(wanted, b)
+        sheet.insert(body, "inertial", {"pos": digits(*after.com), "mass": digits(after.mass), **matrix})
+        return
+    sheet.numbers(own, "mass", before.mass, after.mass)
+    sheet.numbers(own, "pos", before.com, after.com, 3, radius)
+    if turned:
+        _turn(sheet, own, b, old, wanted, charted)
+
+
+def _turn(sheet: Sheet, own: int, b: int, old: Any, wanted: Any, charted: bool) -> None:
+    """Write the matrix of an `<inertial>`: in the axes that it has where it is diagonal there."""
+    R = Rotation.from_quat(old.body_iquat[b], scalar_first=True).as_matrix()
+    before, after = inertial(old, b).inertia, inertial(wanted, b).inertia
+    inside, size = R.T @ after @ R, 10.0 * float(np.trace(before))
+    products = np.abs(inside[ROWS[3:], COLUMNS[3:]]).max()
+    full = sheet.attribute(own, "fullinertia") is not None
+    if (charted and _watched(old, b)) or (full and not charted):
+        words = _principal(wanted, b)
+        if any(sheet.attribute(own, turned) is not None for turned in ORIENTATIONS):
+            words["quat"] = digits(*wanted.body_iquat[b])
+        for attribute, value in words.items():
+            sheet.say(own, attribute, value)
+    elif not charted:
+        sheet.numbers(own, "diaginertia", old.body_inertia[b], wanted.body_inertia[b], 3)
+    elif not full and products <= SLIGHT * np.trace(after):
+        sheet.numbers(own, "diaginertia", old.body_inertia[b], np.diag(inside), 3, size)
+    else:
+        sheet.numbers(own, "fullinertia", before[ROWS, COLUMNS], after[ROWS, COLUMNS], 6, size)
+
+
+def _matrix(inertia: Array) -> dict[str, str]:
+    return {"fullinertia": digits(*inertia[ROWS, COLUMNS])}
+
+
+def _principal(model: Any, b: int) -> dict[str, str]:
+    """Moments and axes as they are in a model."""
+    quat = {} if close(model.body_iquat[b], IDENTITY, 1.0).all() else {"quat": digits(*model.body_iquat[b])}
+    return {**quat, "diaginertia": digits(*model.body_inertia[b])}
+
+
+def _watched(model: Any, b: int) -> bool:
+    """True where a sensor reads the axes of the body's inertia, so that they must be those of the model, not only the matrix."""
+    body = int(mujoco.mjtObj.mjOBJ_BODY)
+    of = (model.sensor_objtype == body) & (model.sensor_objid == b)
+    to = (model.sensor_reftype == body) & (model.sensor_refid == b)
+    return bool((of | to).any())

@@ -1,0 +1,184 @@
+"""An experiment and its recordings in the types of `mujoco.sysid`; see export_sysid.py."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from mujoco import sysid
+from sysid_signals import Compared, Layout
+
+from mjfim.errors import ExperimentError, MjfimError, ModelError
+from mjfim.identified import same_dynamics, write_spec
+from mjfim.mjcf import settle
+from mjfim.paths import INERTIAL_FIELDS, PATH, SERVO
+from mjfim.quiet import quiet
+from mjfim.setup import Setup
+from mjfim.tracks import Track, track_of
+from mjfim.trajectory import Array, Recording
+
+REACH = 1e3  # sizes of a parameter from its guess to a bound that is not stated; sysid wants finite ones
+PROBE = 1e-2  # sizes by which parameters are moved to see whether a compile follows
+WHOLE = {*INERTIAL_FIELDS, *SERVO, "rot", "springlength"}  # fields that are written as a whole, as a model has them
+
+
+def require_extra() -> None:
+    """Raise MjfimError where mujoco.sysid lacks what it needs: it imports all the same, but is empty."""
+    if not hasattr(sysid, "ModelSequences"):
+        raise MjfimError("mujoco.sysid is not installed; pip install 'mjfim[sysid]'")
+
+
+@contextmanager
+def hushed() -> Iterator[None]:
+    """No messages of MuJoCo and sysid inside the block."""
+    logger = logging.getLogger("absl")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with quiet():
+            yield
+    finally:
+        logger.setLevel(before)
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """What `sysid.optimize` and `sysid.default_report` take.
+
+    sequences: a ModelSequences;  parameters: a ParameterDict at the guess;  layout: of its TimeSeries
+    notes: sentences about what of the experiment sysid does not get
+    """
+
+    setup: Setup
+    sequences: Any
+    parameters: Any
+    layout: Layout
+    notes: tuple[str, ...] = ()
+
+    def residual(self, weighted: bool) -> Callable[..., Any]:
+        """Residual function. weighted: by the stated noise, priors at the end; else as sysid does, without priors"""
+        h, noise = float(self.setup.model.opt.timestep), self.setup.noise if weighted else None
+        of: Callable[..., Any] = sysid.build_residual_fn
+        data = of(
+            models_sequences=[self.sequences],
+            build_model=build,
+            modify_residual=Compared(self.layout, h, noise),
+            resample_true=False,
+        )
+        p = self.setup.parameters
+        weight = np.sqrt(np.diag(p.prior_information))
+
+        def whole(x: Array, parameters: Any, **options: Any) -> tuple[list[Array], Any, Any]:
+            residuals, predicted, measured = data(x, parameters, **options)
+            priors = (weight * (p.guess - x.T)).T[weight > 0.0]  # x: (p,), or (p, k) for differences
+            return [*residuals, priors], predicted, measured
+
+        return whole if weighted and weight.any() else data
+
+
+def build(parameters: Any, spec: Any) -> Any:
+    """A model of the spec, which stays as it is, with the parameters written into it."""
+    return sysid.apply_param_modifiers(parameters, spec.copy())
+
+
+def export(setup: Setup, recordings: Sequence[Recording]) -> Exported:
+    """An experiment and its recordings. Raises MjfimError for what sysid cannot express."""
+    require_extra()
+    _require_alike(setup)
+    parameters, layout, spec = parameters_of(setup), Layout.of(setup), setup.spec.copy()
+    _require_followed(setup, parameters, spec)
+    tracks = [track_of(setup, recording) for recording in recordings]
+    nq, nv = setup.model.nq, setup.model.nv
+    start = setup.plant.start(setup.parameters.guess)
+    state = sysid.create_initial_state(setup.model, start[:nq], start[nq : nq + nv], start[nq + nv :])
+    with hushed():  # it counts state signals among sensors
+        sequences = sysid.ModelSequences(
+            setup.model_path.stem,
+            spec,
+            [track.name for track in tracks],
+            [state] * len(tracks),
+            [control_of(setup, track) for track in tracks],
+            [layout.series(track.t, track.y) for track in tracks],
+            allow_missing_sensors=True,
+        )
+    return Exported(setup, sequences, parameters, layout, _notes(setup))
+
+
+def control_of(setup: Setup, track: Track) -> Any:
+    """TimeSeries of the control at every engine step, held over each sample.
+
+    sysid drops the last row; another one makes it step past the end, so that sensors there are seen.
+    """
+    steps = np.repeat(track.ctrl, setup.substeps, axis=0)
+    held = np.concatenate([steps, steps[-1:], steps[-1:]])
+    t = np.arange(len(held)) * float(setup.model.opt.timestep)
+    return sysid.TimeSeries(t, held, sysid.TimeSeries.compute_all_control_mapping(setup.model))
+
+
+def parameters_of(setup: Setup) -> Any:
+    """ParameterDict at the guess. What belongs together is written as a whole, so the last modifier writes for all."""
+    p, theta = setup.parameters, np.array(setup.parameters.guess)
+    matches = [PATH.match(target.path) for q in p.parameters for target in q.targets]
+    whole = any(match is not None and match["field"] in WHOLE for match in matches)
+
+    def modifier(j: int) -> Callable[[Any, Any], None]:
+        def write(spec: Any, parameter: Any) -> None:
+            theta[j] = float(parameter.value[0])
+            if j == len(p) - 1:
+                write_spec(spec, setup.model, setup.model_at(theta) if whole else setup.model, p, theta)
+
+        return write
+
+    lower = np.where(np.isfinite(p.lower), p.lower, p.guess - REACH * p.step)
+    upper = np.where(np.isfinite(p.upper), p.upper, p.guess + REACH * p.step)
+    found = sysid.ParameterDict()
+    for j, name in enumerate(p.names):
+        found.add(sysid.Parameter(name, p.guess[j], lower[j], upper[j], modifier=modifier(j)))
+    return found
+
+
+def _require_alike(setup: Setup) -> None:
+    """Raise ExperimentError where sysid could not fit the same problem."""
+    e, p = setup.experiment, setup.parameters
+    if p.outside.any():
+        name = p.names[int(np.argmax(p.outside))]
+        raise ExperimentError(
+            f"{e.source}: {name}: sysid fits numbers of the model only; take starts, biases, delays out"
+        )
+    if e.fit.segments is not None or e.fit.start != "stated":
+        raise ExperimentError(f"{e.source}: fit: sysid takes every start as stated; take segments and start out")
+
+
+def _require_followed(setup: Setup, parameters: Any, spec: Any) -> None:
+    """Make sure that the compile of moved parameters is the model that mjfim simulates. Raises ModelError."""
+    p, moved = setup.parameters, parameters.copy()
+    theta = np.clip(p.guess + PROBE * p.step, p.lower, p.upper)
+    moved.update_from_vector(theta)
+    for settled in (False, True):
+        if settled:
+            settle(spec, setup.model)
+        try:
+            if same_dynamics(build(moved, spec), setup.model_at(theta)):
+                return
+        except ValueError as error:
+            if settled:
+                raise ModelError(f"{setup.model_path}: MuJoCo refuses the parameters a little off: {error}") from None
+    raise ModelError(f"{setup.model_path}: a compile with other parameters gives another model than mjfim simulates")
+
+
+def _notes(setup: Setup) -> tuple[str, ...]:
+    fit, p = setup.experiment.fit, setup.parameters
+    told = [q.name for q in p.parameters if q.prior is not None]
+    unbounded = [n for n, low, high in zip(p.names, p.lower, p.upper, strict=True) if not np.isfinite(high - low)]
+    said = [f"sysid as is gets no priors: {', '.join(told)}"] if told else []
+    if unbounded:
+        said.append(f"sysid wants bounds: {', '.join(unbounded)} within {REACH:g} sizes of the guess")
+    if fit.loss != "linear":
+        said.append(f"sysid minimises squares, mjfim the loss {fit.loss!r}")
+    if fit.noise != "stated":
+        said.append("sysid is weighted by the stated noise, mjfim by the noise that it estimates")
+    return tuple(said)
