@@ -322,7 +322,7 @@ def identify(
             errors.print(f"warning: {sentence}", markup=False)
     _say(as_json, archive.estimate_summary(result, setup), report.estimate_report(result, setup.units))
     errors.print(f"wrote {output}/")
-    raise typer.Exit(0 if result.success and not result.misfit else 1)
+    raise typer.Exit(0 if result.success and not result.misfit and not result.interrupted else 1)
 
 
 @verb

@@ -63,13 +63,6 @@ class Condensed:
         """n."""
         return int(self.blocks.shape[1] - self.common - 1)
 
-    def part(self, pieces: np.ndarray) -> Condensed:
-        """Of some pieces alone, the common rows with them."""
-        at = np.full(self.pieces, -1)
-        at[pieces] = np.arange(len(pieces))
-        kept = at[self.piece] >= 0
-        return Condensed(self.blocks[kept], at[self.piece[kept]], self.inner[pieces], self.outer)
-
     @cached_property
     def triangles(self) -> Array:
         """(P, m, m), one for each piece."""
@@ -130,10 +123,10 @@ class Condensed:
         rest = np.sqrt(squares[:, self.private :].sum(axis=0) + np.sum(self.outer[:, :-1] ** 2, axis=0))
         return np.asarray(np.concatenate([own, rest]))
 
-    def step(self, damping: float, scale: Array, lower: Array, upper: Array, held: bool = False) -> Step:
+    def step(self, damping: float, scale: Array, lower: Array, upper: Array) -> Step:
         """The Levenberg-Marquardt step: `min |J d + r|^2 + damping |scale d|^2` with lower <= d_common <= upper.
 
-        scale: (n+c,);  lower, upper: (c,);  held: the common unknowns stay where they are
+        scale: (n+c,);  lower, upper: (c,)
         """
         n, c = self.private, self.common
         R = np.array(self.triangles)
@@ -145,7 +138,7 @@ class Condensed:
         rows = R[:, n:, n:].reshape(-1, c + 1)
         extra = np.concatenate([np.diag(weight[n:]), np.zeros((c, 1))], axis=1)
         rows = triangle(np.concatenate([rows, self.outer, extra]))
-        d = np.zeros(c) if held or not c else _bounded(rows[:, :-1], -rows[:, -1], lower, upper)
+        d = np.zeros(c) if not c else _bounded(rows[:, :-1], -rows[:, -1], lower, upper)
         own: Array = np.zeros((self.pieces, n))
         if n:
             rhs = R[:, :n, -1] + R[:, :n, n:-1] @ d

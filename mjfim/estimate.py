@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -22,7 +22,7 @@ from mjfim.estimated import Estimate
 from mjfim.experiment import Experiment
 from mjfim.fisher import standard_deviations
 from mjfim.identifiability import Group, Null, grouped, invisible
-from mjfim.levenberg import Progress, Search, Solution, Unknowns, minimise
+from mjfim.levenberg import INTERRUPTED, Progress, Search, Solution, Unknowns, minimise
 from mjfim.logs import doubts
 from mjfim.misfit import Place, reasons, smaller, worst_place
 from mjfim.noise import Noise
@@ -40,12 +40,14 @@ SETTLED = 0.01  # relative change of a sigma that is estimated, below which it i
 ROUNDS = 10  # of estimating sigmas
 FLOOR = 1e-3  # of the stated sigma, below which an estimated one does not fall
 CLOSE = 1e-3  # standard deviations, a step below which is the last
+NUDGES = 2  # iterations for the starts of all pieces of much data, before theta moves again
 BRIEF = 8  # iterations of a further start, before the best goes on
 SAMPLE = 40_000  # samples of a part of the data on which a search over much of it begins
 SLOPPY = 0.25  # half of an interval over the value, from which a parameter is hardly known
 TRADED = 0.5  # correlation from which another parameter can stand in for one
 Method = Literal["least_squares", "newton"]
 Tell = Callable[[str, Progress], None]
+Found = TypeVar("Found")
 
 
 def identify(
@@ -79,10 +81,15 @@ def identify(
 
 
 def least_squares(fit: Fit, start: Array, search: Search | None = None) -> Solution:
-    """Levenberg-Marquardt inside the bounds from theta: (p,). Raises SimulationDiverged where that diverges."""
+    """Levenberg-Marquardt inside the bounds from theta: (p,). Raises SimulationDiverged where that diverges.
+
+    Half a search is none: Ctrl-C is raised anew.
+    """
     found = minimise(fit, fit.begin(start), search or Search())
     if found is None:
         raise SimulationDiverged("the simulation diverges at the start of the fit")
+    if found.interrupted:
+        raise KeyboardInterrupt
     return found
 
 
@@ -111,6 +118,7 @@ class _Identification:
         fit = Fit(setup, recordings)
         self.fit = fit.unbounded() if method == "newton" else fit
         self.held_out = Fit(setup, held_out) if held_out else None
+        self.interrupted = False
         self.stated = setup.experiment.fit.noise == "stated"
         if not self.stated and setup.noise.correlated:
             raise ExperimentError(
@@ -127,7 +135,7 @@ class _Identification:
             )
         null = self._null(fit)
         fit.pin(self.theta0, null)
-        solution = self._settled(self._best(self._placed(begin)))
+        solution = self._settled(self._best(begin))
         return self._report(solution, null)
 
     def _null(self, fit: Fit) -> Null:
@@ -164,35 +172,51 @@ class _Identification:
         return None if tell is None else (lambda progress: tell(what, progress))
 
     def _minimise(self, fit: Fit, at: Unknowns, search: Search, what: str) -> Solution:
+        if self.interrupted:  # where all stands by now, for the report
+            search = replace(search, iterations=0)
         found = minimise(fit, at, search, self._told(what))
+        if found is not None and (found.interrupted or self.interrupted):
+            self.interrupted = True
+            return replace(found, interrupted=True, success=False, status=INTERRUPTED)
         if found is None:
             raise SimulationDiverged(f"the simulation diverges next to the start of the fit ({what})")
         return found
 
-    def _placed(self, begin: Unknowns) -> Unknowns:
+    def _placed(self, fit: Fit, begin: Unknowns, iterations: int) -> Unknowns:
         """Starts that the data show roughly, at their best for theta as it is: far from it, theta would follow their errors."""
-        if not self.fit.measured:
+        if not fit.measured or self.interrupted:
             return begin
-        search = Search(iterations=BRIEF, tolerance=0.1, fresh=False)
-        found = minimise(self.fit.frozen(), begin, search, self._told("where pieces start"))
+        search = Search(iterations=iterations, tolerance=0.1, fresh=False)
+        found = minimise(fit.frozen(), begin, search, self._told("where pieces start"))
+        self.interrupted = found is not None and found.interrupted
         return begin if found is None else found.unknowns
 
     def _best(self, begin: Unknowns) -> Unknowns:
         """Where the search over all data begins: the best end of short searches from several starts, on some of the data."""
-        some = self._sample(self.fit)
-        count = self.setup.experiment.fit.starts
-        if len(some.pieces) == len(self.fit.pieces) and count == 1:
-            return begin
-        found = [self._minimise(some, self._sampled(begin), replace(self._search, fresh=False), "some of the data")]
-        for k, theta in enumerate(self._thetas(count)):
+        some, count = self._sample(self.fit), self.setup.experiment.fit.starts
+        whole = len(some.pieces) == len(self.fit.pieces)
+        placed = self._placed(some, self._sampled(begin), BRIEF)
+        if whole and count == 1:
+            return placed
+        found = [self._minimise(some, placed, replace(self._search, fresh=False), "some of the data")]
+        for k, theta in enumerate([] if self.interrupted else self._thetas(count)):
             search = Search(iterations=BRIEF, tolerance=1e-2, fresh=False)
-            other = minimise(some, some.begin(theta), search, self._told(f"start {k + 2} of {count}"))
+            try:
+                other = minimise(some, some.begin(theta), search, self._told(f"start {k + 2} of {count}"))
+            except KeyboardInterrupt:  # before its first iterate
+                self.interrupted = True
+                break
             if other is not None:
                 found.append(other)
-        best = min(found, key=lambda s: s.cost)
+                self.interrupted = other.interrupted
+            if self.interrupted:
+                break
+        best = min(found, key=lambda s: s.cost).unknowns
+        if whole:
+            return best
         starts = np.array(begin.starts)
-        starts[self._places] = best.unknowns.starts
-        return replace(best.unknowns, starts=starts)
+        starts[self._places] = best.starts
+        return self._placed(self.fit, replace(best, starts=starts), NUDGES)
 
     def _thetas(self, count: int) -> Array:
         """(count - 1, p) random starts."""
@@ -246,11 +270,12 @@ class _Identification:
             raise SimulationDiverged("the simulation diverges near the estimate")
         whitened = self._whitened(values)
         inside = self._inside(whitened)
-        chi2, dof = float(np.nansum(inside**2)), max(int(np.isfinite(inside).sum()) - solution.condensed.rank, 1)
+        chi2 = float(np.nansum(inside**2)) / fit.loss.inliers
+        dof = max(int(np.isfinite(inside).sum()) - solution.condensed.rank, 1)
         white = tuple(whiteness(name, [z[:, j] for z in whitened]) for j, name in enumerate(setup.outputs.names))
         names, times = [Path(t.name).name for t in fit.tracks], [t.t for t in fit.tracks]
         worst = worst_place(setup.outputs.names, names, times, whitened)
-        missing = self._missing(at)
+        missing = self._afterwards(lambda: self._missing(at))
         why = reasons(chi2, dof, self.stated, white, missing)
         near = 1e-6 * p.step
         at_bound = tuple(n for n, d in zip(p.names, self._room(theta), strict=True) if d < 1e-6)
@@ -260,7 +285,13 @@ class _Identification:
         sandwich, interval, between = self._spread(theta, std, honest)
         loose = tuple(_sloppy(setup, theta, interval, covariance))
         singular = not np.isfinite(std[~lumped]).all()
+        predictions = self._afterwards(lambda: predicted(fit, at, self.held_out))
         sentences = [
+            *(
+                ["interrupted after the search: what was not fitted is not predicted"]
+                if self.interrupted and not solution.interrupted
+                else []
+            ),
             *self._warnings(chi2, dof, why, at_bound, singular, outside, groups, honest),
             *_hints(missing, worst if why else None),
             *(f"sloppy: {name} {said}" for name, said in loose),
@@ -295,13 +326,21 @@ class _Identification:
             suspects=missing,
             each=self._each(at),
             worst=worst if why else None,
-            predictions=() if solution.interrupted else predicted(fit, at, self.held_out),
+            predictions=predictions,
             detail=honest,
             motion=fit.motion(at, 0),
-            interrupted=solution.interrupted,
+            interrupted=self.interrupted,
             seconds=time.perf_counter() - self.clock,
             steps=setup.plant.steps - self.steps,
         )
+
+    def _afterwards(self, work: Callable[[], tuple[Found, ...]]) -> tuple[Found, ...]:
+        """What the work says of the estimate; Ctrl-C ends it without costing the estimate."""
+        try:
+            return () if self.interrupted else work()
+        except KeyboardInterrupt:
+            self.interrupted = True
+            return ()
 
     def _missing(self, at: Unknowns) -> tuple[Suspect, ...]:
         """Terms that the model lacks, from recordings, or of much data from pieces of them."""
@@ -348,10 +387,9 @@ class _Identification:
         return out
 
     def _inside(self, whitened: Sequence[Array]) -> Array:
-        """All whitened residuals; with a robust loss without those that it takes for outliers."""
+        """All whitened residuals; with a robust loss without outliers."""
         every = np.concatenate([z.ravel() for z in whitened])
-        spec = self.setup.experiment.fit
-        return every if spec.loss == "linear" else np.where(np.abs(every) <= spec.loss_scale, every, np.nan)
+        return np.where(np.abs(every) <= self.fit.loss.outlier, every, np.nan)
 
     def _honest(self, solution: Solution, times: Sequence[float]) -> Uncertainty | None:
         """What the blocks of the last linearisation say; None where a common unknown is not determined."""
@@ -454,13 +492,14 @@ def _hints(missing: Sequence[Suspect], worst: Place | None) -> Iterator[str]:
 def _sloppy(setup: Setup, theta: Array, interval: Array, covariance: Array) -> Iterator[tuple[str, str]]:
     """Wanted parameters that the data hardly tell, and in words what they may be traded for."""
     p = setup.parameters
-    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    told = np.isfinite(np.diag(covariance))
+    spread = np.sqrt(np.maximum(np.where(told, np.diag(covariance), 1.0), 1e-300))
     for j in p.interest:
         half = 0.5 * float(interval[j, 1] - interval[j, 0])
         size = max(abs(float(theta[j])), 1e-3 * float(p.step[j]))
         if not np.isfinite(half) or half <= SLOPPY * size:
             continue
-        together = covariance[j] / (spread * spread[j])
+        together = np.where(told, covariance[j], 0.0) / (spread * spread[j])
         together[j] = 0.0
         other = int(np.argmax(np.abs(together)))
         traded = f"; it is traded for {p.names[other]} (correlation {together[other]:+.2f})"

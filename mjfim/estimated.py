@@ -22,8 +22,8 @@ class Estimate:
     sandwich: (p,) standard deviations that allow for residuals which follow one another
     interval: (p, 2) 95 %, the hull of formal, sandwich, bootstrap and what recordings disagree by
     between: (p,) standard deviation from recording to recording beyond their own scatter
-    chi2: whitened squared residual sum;  dof: its degrees of freedom;  residual_rms, sigma: per output, in its unit; sigma is
-    the noise that was stated or estimated
+    chi2: whitened squared residual sum; of a robust loss, of those that are no outliers, over what noise has there
+    dof: its degrees of freedom;  residual_rms, sigma: per output, in its unit; sigma is the noise that was stated or estimated
     misfit: residuals are no noise of the stated size: the formal std is then not accuracy;  reasons: why, in sentences
     predicted: per recording, (M, ny);  initial_theta: the start
     combinations: groups of parameters that the recordings tell in combination only, in words

@@ -22,6 +22,7 @@ STILL = (
     1e-6,
     1e-2,
 )  # fall of the cost that is none, over the cost and itself; 1e-2 is a seventh of a standard deviation
+INTERRUPTED = "interrupted by the user; the best estimate so far"
 PATIENCE = 3  # times in turn that it may be none
 FRACTION = 0.3  # standard deviations; a step that short, promised but not found, is the roughness of the simulation
 
@@ -85,14 +86,12 @@ class Solution:
 class Search:
     """How to search. tolerance: standard deviations, a step below which is the last;  damped: False: Gauss-Newton, no bounds
 
-    held: the common unknowns stay where they are, only the private ones are sought
     fresh: linearise once more at the end
     """
 
     iterations: int = 60
     tolerance: float = 1e-4
     damped: bool = True
-    held: bool = False
     fresh: bool = True
 
 
@@ -110,7 +109,7 @@ def minimise(
     except KeyboardInterrupt:
         if loop.best is None:
             raise
-        return loop.ended("interrupted by the user; the best estimate so far", False, interrupted=True)
+        return loop.ended(INTERRUPTED, False, interrupted=True)
 
 
 class _Loop:
@@ -167,7 +166,7 @@ class _Loop:
         if self.search.damped:
             place = self.problem.place(now)
             lower, upper = self.problem.lower - place, self.problem.upper - place
-        return linear.step(damping, scale, lower, upper, self.search.held)
+        return linear.step(damping, scale, lower, upper)
 
     def _promised(self, now: Unknowns, linear: Condensed, scale: Array) -> Step:
         """A step that damping does not shorten: any step is short where it does."""

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.stats import norm
 
 from mjfim.trajectory import Array
+
+RARE = 3.0  # standard deviations
 
 
 @dataclass(frozen=True)
@@ -16,6 +19,18 @@ class Loss:
 
     kind: Literal["linear", "huber", "soft_l1", "cauchy"] = "linear"
     scale: float = 3.0
+
+    @property
+    def outlier(self) -> float:
+        """Standard deviations beyond which a residual says nothing of the noise: normal noise is hardly ever there."""
+        return np.inf if self.kind == "linear" else max(self.scale, RARE)
+
+    @property
+    def inliers(self) -> float:
+        """Mean square of standard normal residuals that are no outliers."""
+        if self.kind == "linear":
+            return 1.0
+        return float(1.0 - 2.0 * self.outlier * norm.pdf(self.outlier) / (1.0 - 2.0 * norm.sf(self.outlier)))
 
     def value(self, r: Array) -> float:
         """Sum over residuals of any shape."""

@@ -14,6 +14,7 @@ from mjfim.whiteness import Whiteness
 MISFIT = 1e-3  # probability below which residuals are not noise
 LARGER = 1.03  # residuals over the stated noise from which that matters
 INFLATED = 1.25  # variance of means over that of white noise from which it matters
+SHOWS = 0.05  # correlation of one residual with the next that is worth telling
 WINDOWS = 25  # of a recording, looked at one by one
 FEWEST = 8  # values of a window, about
 STICKS_OUT = 1.5  # root mean square of a window over that of all
@@ -64,12 +65,19 @@ def reasons(
         said.append(f"residuals are {np.sqrt(chi2 / dof):.2f} x the stated noise")
     hit = coloured(found)
     if hit:
-        names = ", ".join(f"{w.output} ({w.correlation:+.2f} from one to the next)" for w in hit[:4])
+        names = ", ".join(f"{w.output} ({_how(w)})" for w in hit[:4])
         more = f" and {len(hit) - 4} more" if len(hit) > 4 else ""
         said.append(f"residuals follow one another in {names}{more}")
     elif missing:
         said.append("a term that the model lacks explains some of the residuals")
     return tuple(said)
+
+
+def _how(found: Whiteness) -> str:
+    """In which way residuals follow one another: from each to the next, or only over longer runs."""
+    if abs(found.correlation) > SHOWS:
+        return f"{found.correlation:+.2f} from one to the next"
+    return f"means of many scatter {np.sqrt(max(found.inflation, 1.0)):.1f} x as much as those of noise"
 
 
 def worst_place(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.errors import RecordingError
+from mjfim.sensing import states_shown
 from mjfim.setup import Setup
 from mjfim.tracks import Track
 from mjfim.trajectory import Array
@@ -78,7 +79,7 @@ def measured_starts(setup: Setup, track: Track, begins: np.ndarray) -> Array:
     A line through position and velocity of the rows around, a parabola where velocities were not measured.
     """
     states = _nominal(setup, track, begins)
-    place = {o.state: i for i, o in enumerate(setup.outputs.outputs) if o.state is not None and len(track.seen[i])}
+    place = _shown(setup, track)
     space = setup.space
     quaternion = {a for q, _ in space.quaternions for a in range(q, q + 4)}
     velocity = dict(zip(space.scalar_q.tolist(), (space.nq + space.scalar_v).tolist(), strict=True))
@@ -128,12 +129,16 @@ def _nominal(setup: Setup, track: Track, begins: np.ndarray) -> Array:
     """(n, ns) states of the model at the guess from the stated start; the start itself where that diverges or is long."""
     start = setup.plant.start(setup.parameters.guess)
     out = np.tile(start, (len(begins), 1))
-    known = {o.state for i, o in enumerate(setup.outputs.outputs) if len(track.seen[i])}
-    if known.issuperset(range(len(start))) or not begins.any():
+    if set(_shown(setup, track)).issuperset(range(len(start))) or not begins.any():
         return out
     model = setup.plant.model(setup.parameters.guess)
     rolled = setup.plant.engine.rollout([model], start[None], track.ctrl[None, : int(begins.max())])
     return np.array(rolled.states[0][begins]) if rolled.finite[0] else out
+
+
+def _shown(setup: Setup, track: Track) -> dict[int, int]:
+    """Output that shows a component of the state, by its address, where the track has values of it."""
+    return {state: i for state, i in states_shown(setup.model, setup.outputs).items() if len(track.seen[i])}
 
 
 def groups(pieces: Sequence[Piece], most: int) -> Iterator[list[int]]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.experiment import Experiment
-from mjfim.levenberg import Search, Unknowns, minimise
+from mjfim.levenberg import Search, Solution, Unknowns, minimise
 from mjfim.residuals import Fit
 from mjfim.setup import Setup
 from mjfim.trajectory import Array, Recording, freeze
@@ -92,7 +92,7 @@ def _folds(fit: Fit, at: Unknowns, nominal: Array) -> Iterator[Prediction]:
         if not len(some):
             continue
         begin = replace(at, starts=at.starts[some])
-        found = minimise(rest.part(some), begin, Search(iterations=STEPS, tolerance=1e-2, fresh=False))
+        found = _minimised(rest.part(some), begin, Search(iterations=STEPS, tolerance=1e-2, fresh=False))
         if found is not None:
             yield _judged(fit, found.unknowns.theta, nominal, masks, names, False)
 
@@ -136,7 +136,7 @@ def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> E
         # a nuisance start of the fitted recordings says nothing of this one's
         starts = np.zeros_like(now.starts) if fit.measured else np.tile(nominal, (len(fit.pieces), 1))
         search = Search(STEPS, 1e-2, fresh=False)
-        found = minimise(fit.masked(_learned(fit, masks)).frozen(), replace(now, starts=starts), search)
+        found = _minimised(fit.masked(_learned(fit, masks)).frozen(), replace(now, starts=starts), search)
         now = now if found is None else found.unknowns
     values, outputs = fit.predicted(now), fit.setup.outputs.names
     rms, mae = np.full(len(outputs), np.nan), np.full(len(outputs), np.nan)
@@ -146,6 +146,14 @@ def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> E
         if len(error):
             rms[j], mae[j] = np.sqrt(np.mean(error**2)), np.mean(np.abs(error))
     return Errors(name, outputs, rms, mae)
+
+
+def _minimised(fit: Fit, begin: Unknowns, search: Search) -> Solution | None:
+    """None where that diverges. Half a search predicts nothing: Ctrl-C ends all."""
+    found = minimise(fit, begin, search)
+    if found is not None and found.interrupted:
+        raise KeyboardInterrupt
+    return found
 
 
 def _learned(fit: Fit, masks: Sequence[np.ndarray]) -> list[np.ndarray]:

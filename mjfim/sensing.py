@@ -59,6 +59,26 @@ def components(model: Any) -> tuple[Component, ...]:
     return (*positions, *velocities)
 
 
+def states_shown(model: Any, outputs: OutputMap) -> dict[int, int]:
+    """Output that shows a component of the state, by its address: itself, or a sensor of the joint's position or velocity."""
+    shown = {}
+    kinds = {
+        int(mujoco.mjtSensor.mjSENS_JOINTPOS): model.jnt_qposadr,
+        int(mujoco.mjtSensor.mjSENS_JOINTVEL): model.jnt_dofadr,
+    }
+    for i, output in enumerate(outputs.outputs):
+        if output.state is not None:
+            shown[output.state] = i
+    for i, output in enumerate(outputs.outputs):
+        for s in range(model.nsensor if output.sensor is not None else 0):
+            kind = int(model.sensor_type[s])
+            if kind in kinds and int(model.sensor_adr[s]) == output.sensor:
+                address = int(kinds[kind][int(model.sensor_objid[s])])
+                velocity = kind == int(mujoco.mjtSensor.mjSENS_JOINTVEL)
+                shown.setdefault(address + (model.nq if velocity else 0), i)
+    return shown
+
+
 def measurable(model: Any) -> tuple[str, ...]:
     """Everything that a recording may hold column by column: state components and sensors."""
     return (

@@ -189,6 +189,8 @@ def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Es
             found.append(identify(base, recordings, start=begin))
         except SimulationDiverged as error:
             fault = fault or error
+        if found and found[-1].interrupted:
+            raise KeyboardInterrupt  # a round is complete or none
     if not found:
         raise fault or SimulationDiverged("no start of the fit can be simulated")
     return min(found, key=lambda e: e.chi2)

@@ -100,7 +100,8 @@ def suspects(fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: 
             continue
         value, sigmas, share = -score / left / unit[i], abs(score) / np.sqrt(left), score**2 / left / total
         wrong = candidate.positive and candidate.now + value < 0.0
-        if not wrong and sigmas > norm.isf(0.5 * LEVEL / len(tested)) and share > WORTH:
+        # more than all squares: the fit is too far from its minimum for a linear answer
+        if not wrong and sigmas > norm.isf(0.5 * LEVEL / len(tested)) and WORTH < share < 1.0:
             named.append(
                 Suspect(candidate.words, candidate.path, float(value), candidate.unit, float(sigmas), float(share))
             )

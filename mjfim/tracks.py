@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import RecordingError, unknown
-from mjfim.sensing import components
+from mjfim.sensing import states_shown
 from mjfim.setup import Setup
 from mjfim.trajectory import Array, Recording, Trajectory, freeze
 
@@ -126,18 +126,19 @@ def _quaternions(setup: Setup) -> list[list[int]]:
 def measured_trajectory(setup: Setup, recording: Recording) -> Trajectory | None:
     """The recorded motion as a trajectory, where every position was measured at most samples; else None.
 
-    Gaps are bridged linearly; unmeasured velocities are zero. For pictures, not for estimation.
+    Gaps are bridged linearly; velocities are zero. For pictures, not for estimation.
     """
-    positions = [c for c in components(setup.model) if c.state < setup.model.nq]
-    if any(c.name not in recording.outputs for c in positions):
+    shown, nq = states_shown(setup.model, setup.outputs), setup.model.nq
+    names = [setup.outputs.names[shown[q]] if q in shown else "" for q in range(nq)]
+    if any(name not in recording.outputs for name in names):
         return None
-    qpos = np.empty((len(recording.t), setup.model.nq))
-    for component in positions:
-        column = recording.y[:, recording.outputs.index(component.name)]
+    qpos = np.empty((len(recording.t), nq))
+    for q, name in enumerate(names):
+        column = recording.y[:, recording.outputs.index(name)]
         seen = np.isfinite(column)
         if not seen.any():
             return None
-        qpos[:, component.state] = np.interp(recording.t, recording.t[seen], column[seen])
+        qpos[:, q] = np.interp(recording.t, recording.t[seen], column[seen])
     for q, _ in setup.space.quaternions:
         qpos[:, q : q + 4] /= np.maximum(np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True), 1e-12)
     n = len(qpos)

@@ -10,6 +10,7 @@
 (d) 1500 Monte-Carlo trials at 100 Hz
 (e) seconds per iteration by number of parameters on a seven-joint arm, where its model is at hand (benchmark_arm.py)
 (f) the hard-limited design beside CasADi + IPOPT with many starts, the same seconds for both (benchmark_limits.py)
+(g) an hour of two joints at 1 kHz read and fitted, over bare engine time (benchmark_hour.py)
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import benchmark_arm
+import benchmark_hour
 import benchmark_limits
 import mujoco
 import numpy as np
@@ -292,6 +294,8 @@ def main() -> None:
         console.print(tables[-1])
     seconds = 10.0 if args.quick else 60.0
     tables.append(benchmark_limits.table(benchmark_limits.races(seconds, 0), seconds))
+    console.print(tables[-1])
+    tables.append(benchmark_hour.hour_table(benchmark_hour.measured(0.01 if args.quick else 1.0, 0)))
     console.print(tables[-1])
     if args.markdown:
         args.markdown.write_text(markdown(tables, verdicts, threads), encoding="utf-8")

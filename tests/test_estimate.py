@@ -13,8 +13,10 @@ import mjfim
 from mjfim.errors import ExperimentError, RecordingError, SimulationDiverged
 from mjfim.estimate import identify, least_squares, newton_raphson
 from mjfim.experiment import Experiment
+from mjfim.levenberg import Progress
 from mjfim.montecarlo import simulate
 from mjfim.residuals import Fit
+from mjfim.sequential import identified
 from mjfim.setup import Setup
 from mjfim.tracks import track_of
 from mjfim.trajectory import Recording
@@ -173,3 +175,114 @@ def test_unknown_method_and_wrong_start_are_refused(setup: Setup, recording: Rec
         identify(setup, [recording], "lm")  # type: ignore[arg-type]
     with pytest.raises(ExperimentError, match="m, l, c"):
         identify(setup, [recording], start=np.ones(2))
+
+
+def test_interrupted_while_it_searches_it_keeps_the_best_so_far(setup: Setup, recording: Recording) -> None:
+    """Ctrl-C in the second iteration."""
+    costs: list[float] = []
+
+    def tell(what: str, iterate: Progress) -> None:
+        costs.append(iterate.cost)
+        if len(costs) == 2:
+            raise KeyboardInterrupt
+
+    found = identify(setup, [recording], tell=tell)
+    assert found.interrupted and not found.success
+    assert found.status.startswith("interrupted")
+    assert found.chi2 == pytest.approx(2.0 * min(costs), rel=1e-9)
+    assert found.predictions == ()
+
+
+@pytest.mark.parametrize("place", ["estimate.suspects", "prediction.minimise", "prediction._errors"])
+def test_interrupted_after_the_search_the_estimate_stays(
+    setup: Setup, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C while terms are looked for that the model lacks, or while the rest is predicted."""
+    whole = identify(setup, [recording])
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"mjfim.{place}", interrupt)
+    found = identify(setup, [recording])
+    assert whole.predictions and not whole.interrupted
+    assert found.interrupted and found.predictions == ()
+    np.testing.assert_array_equal(found.theta, whole.theta)
+    assert any(sentence.startswith("interrupted after the search") for sentence in found.warnings)
+
+
+def test_half_a_search_is_no_answer(setup: Setup, recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who wants theta alone gets it whole or not at all; so does a round of a campaign."""
+    fit, count = Fit(setup, [recording]), [0]
+    condense = Fit.condense
+
+    def interrupt(self: Fit, at: object) -> object:
+        count[0] += 1
+        if count[0] == 3:
+            raise KeyboardInterrupt
+        return condense(self, at)
+
+    monkeypatch.setattr(Fit, "condense", interrupt)
+    for work in (
+        lambda: least_squares(fit, setup.parameters.guess),
+        lambda: newton_raphson(fit, setup.parameters.guess),
+    ):
+        count[0] = 0
+        with pytest.raises(KeyboardInterrupt):
+            work()
+    count[0] = 0
+    with pytest.raises(KeyboardInterrupt):
+        identified(setup, [recording], setup.parameters.guess)
+    count[0] = 0
+    assert identify(setup, [recording]).interrupted
+
+
+def test_interrupted_where_a_further_start_begins(setup: Setup, recording: Recording) -> None:
+    """The starts before it stay; none comes after it."""
+    several, seen = Setup(setup.experiment.replace(fit={"starts": 6})), list[str]()
+
+    def tell(what: str, iterate: Progress) -> None:
+        seen.append(what)
+        if what.startswith("start 3"):
+            raise KeyboardInterrupt
+
+    found = identify(several, [recording], tell=tell)
+    assert found.interrupted
+    assert not any(what.startswith("start 4") or what == "all data" for what in seen)
+    np.testing.assert_allclose(found.theta, identify(setup, [recording]).theta, rtol=1e-3)
+
+
+def test_interrupted_before_the_last_search_nothing_more_is_searched(setup: Setup, recording: Recording) -> None:
+    pieces = Setup(setup.experiment.replace(fit={"segments": 1.0}))
+    seen: list[str] = []
+
+    def tell(what: str, iterate: Progress) -> None:
+        seen.append(what)
+        if what == "where pieces start":
+            raise KeyboardInterrupt
+
+    found = identify(pieces, [recording], tell=tell)
+    assert found.interrupted and not found.success
+    assert set(seen) == {"where pieces start"}
+    np.testing.assert_array_equal(found.theta, setup.parameters.guess)
+
+
+@pytest.mark.parametrize("scale", [1.0, 3.0])
+def test_a_robust_fit_judges_the_size_of_its_residuals(setup: Setup, recording: Recording, scale: float) -> None:
+    """Right noise is neither too large nor too small, whatever counts as an outlier; noise of three times the size is said."""
+    robust = Setup(setup.experiment.replace(fit={"loss": "soft_l1", "loss_scale": scale}))
+    right = identify(robust, [recording])
+    assert right.chi2 / right.dof == pytest.approx(1.0, abs=0.15)
+    assert not right.misfit
+    assert not any("overstated" in sentence for sentence in right.warnings)
+    truth = noiseless(setup, recording).y
+    loud = Recording(recording.t, recording.ctrl, truth + 3.0 * (recording.y - truth), recording.outputs)
+    assert any("x the stated noise" in reason for reason in identify(robust, [loud]).reasons)
+
+
+def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
+    """Their covariance is infinite; what the others are traded for is told all the same (warnings are errors here)."""
+    setup = Setup(Experiment.from_file(ROOT / "models" / "ball_pendulum.toml"))
+    estimate = identify(setup, [simulate(setup, setup.plant.simulate(setup.theta, setup.initial.ctrl), seed=1)])
+    assert estimate.combinations
+    assert estimate.sloppy

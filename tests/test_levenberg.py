@@ -333,18 +333,6 @@ def test_the_limit_of_iterations_is_kept_and_said() -> None:
     assert p.cost(found.unknowns) == found.cost < p.cost(alone(-1.2, 1.0))
 
 
-def test_held_common_unknowns_stay_and_starts_are_found() -> None:
-    """As if theta were no unknown at all."""
-    p = problem(*decays(), lower=[0.0, -5.0])
-    theta = np.array([1.5, 0.28])
-    found = solved(p, Unknowns(theta, np.zeros((3, 1))), Search(tolerance=1e-9, held=True))
-    np.testing.assert_array_equal(found.unknowns.theta, theta)
-    assert found.success
-    for rows, own in zip(p.pieces, found.unknowns.starts, strict=True):
-        alone_of_it = least_squares(lambda z, rows=rows: rows(theta, z), [0.0], xtol=1e-15, ftol=1e-15, gtol=1e-15)
-        np.testing.assert_allclose(own, alone_of_it.x, rtol=1e-6)
-
-
 def test_the_last_linearisation_is_at_the_solution() -> None:
     """Unless that was not wanted; then it is the one before."""
     start = Unknowns(np.array([0.3, 0.0]), np.ones((3, 1)))

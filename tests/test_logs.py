@@ -394,18 +394,23 @@ def test_range_tells_degrees(read: Read) -> None:
     """Far beyond the joint's range, and inside as degrees."""
     with pytest.raises(RecordingError, match=r"'qpos:stop' goes from -\d+.* from -1\.047\d* to 1\.57\d* rad; .*in deg"):
         read({"qpos:stop": wave(50.0, 6.0)})
-    for fine in (wave(1.5, 6.0), wave(4.0, 6.0), wave(700.0, 6.0)):
+    for fine in (wave(1.5, 6.0), wave(4.0, 6.0), wave(700.0, 0.25)):
         assert len(read({"qpos:stop": fine, "qvel:stop": wave()}).recording.t) == M
     stated = {"qpos:stop": {"column": "s", "unit": "rad"}}
     assert len(read({"s": wave(50.0, 6.0)}, columns=stated).recording.t) == M
 
 
 def test_speed_tells_degrees(read: Read) -> None:
-    """Where nothing else is known: many turns, faster than a robot turns."""
+    """Many turns, faster than a robot turns; also where the velocity is in degrees as well, and so no contradiction."""
     with pytest.raises(RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"):
         read({"qpos:pin": wave(90.0, 6.0)})
     assert len(read({"qpos:pin": 60.0 * T}).recording.t) == M  # a motor that runs
-    assert len(read({"qpos:pin": wave(90.0, 6.0), "qvel:pin": 540.0 * np.cos(6.0 * T)}).recording.t) == M
+    both = {"qpos:pin": wave(90.0, 6.0), "qvel:pin": 540.0 * np.cos(6.0 * T)}
+    with pytest.raises(RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"):
+        read(both)
+    stated = {"qpos:pin": {"column": "q", "unit": "rad"}, "qvel:pin": "v"}
+    fast = dict(zip("qv", both.values(), strict=True))
+    assert len(read(fast, columns=stated).recording.t) == M
 
 
 # ---- the summary

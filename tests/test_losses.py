@@ -77,6 +77,16 @@ def test_outliers_count_less_and_less_and_small_residuals_fully() -> None:
     assert huber.weight(np.array([3.3]))[0] < 1.0
 
 
+@pytest.mark.parametrize("scale", [1.0, 3.0, 4.5])
+def test_the_mean_square_of_what_is_no_outlier(scale: float) -> None:
+    """Of a million normal numbers; a linear loss knows no outliers."""
+    r = np.random.default_rng(2).standard_normal(1_000_000)
+    for kind in KINDS:
+        loss = Loss(kind, scale)
+        assert loss.outlier == (np.inf if kind == "linear" else max(scale, 3.0))
+        assert loss.inliers == pytest.approx(float(np.mean(r[np.abs(r) <= loss.outlier] ** 2)), rel=5e-3)
+
+
 def test_outliers_hardly_move_a_robust_line() -> None:
     """Against many draws: squares are pulled away, the robust ones stay within a few deviations."""
     found = {kind: np.array([reweighted_few(Loss(kind, 1.5), points(seed)) for seed in range(30)]) for kind in KINDS}

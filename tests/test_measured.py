@@ -70,7 +70,7 @@ def test_pendulum_predicts_the_other_file_far_better_than_published(fitted: str,
     assert 0.12 < theta["J"] < 0.24
     assert 0.4 < theta["mc"] / theta["J"] / (0.3042 / 0.14) < 1.6  # the torque constant scales both alike
     low, high = inside["coulomb"]
-    assert low < 0.19 and high > 0.10  # what other rollouts gave
+    assert low < 0.25 and high > 0.10  # what other rollouts gave, and their spread
     honest = 0.25 * (found.interval[:, 1] - found.interval[:, 0])
     assert (honest[:2] > 4.0 * found.std[:2]).all(), "formal deviations of a model that does not fit are no accuracy"
     assert found.misfit

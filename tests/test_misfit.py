@@ -101,9 +101,14 @@ def test_a_place_in_words() -> None:
 
 
 def seen(
-    output: str = "y", p: float = 1.0, inflation: float = 1.0, variance: float = 1.0, time: float = 1.0
+    output: str = "y",
+    p: float = 1.0,
+    inflation: float = 1.0,
+    variance: float = 1.0,
+    time: float = 1.0,
+    correlation: float = 0.3,
 ) -> Whiteness:
-    return Whiteness(output, 1000, variance, 0.3, p, inflation, time)
+    return Whiteness(output, 1000, variance, correlation, p, inflation, time)
 
 
 def test_larger_and_smaller_need_probability_and_size() -> None:
@@ -138,6 +143,8 @@ def test_reasons_in_sentences() -> None:
     assert reasons(4000.0, 1000, False, [seen()], ()) == (), "where sigmas are estimated, size tells nothing"
     said = reasons(1000.0, 1000, False, [seen("speed", 1e-9, 4.0)], ())
     assert said == ("residuals follow one another in speed (+0.30 from one to the next)",)
+    slow = reasons(1000.0, 1000, True, [seen("speed", 1e-9, 16.0, correlation=0.001)], ())
+    assert slow == ("residuals follow one another in speed (means of many scatter 4.0 x as much as those of noise)",)
     assert len(reasons(4000.0, 1000, True, [seen("speed", 1e-9, 4.0)], ())) == 2
     many = reasons(1000.0, 1000, True, [seen(f"y{i}", 1e-9, 9.0 - i) for i in range(6)], ())
     assert "y0 (" in many[0] and "y3 (" in many[0] and "y4" not in many[0] and "and 2 more" in many[0]

@@ -383,3 +383,13 @@ def test_json_of_odd_numbers(tmp_path: Path) -> None:
         (tmp_path / "log.json").write_text(text, encoding="utf-8")
         with pytest.raises(RecordingError, match=r"not readable JSON"):
             read_columns(tmp_path / "log.json", ALL)
+
+
+def test_a_message_never_quotes_what_a_terminal_would_obey(tmp_path: Path) -> None:
+    """A damaged file may hold anything, escape sequences too."""
+    path = tmp_path / "log.csv"
+    path.write_bytes(b"t\n0\n\x1b[2J\x07\xff,1,2\n")
+    with pytest.raises(RecordingError) as refused:
+        read_columns(path, RecordingSpec())
+    assert str(refused.value).isprintable()
+    assert "Expected 1 columns" in str(refused.value)

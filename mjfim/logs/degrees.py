@@ -17,7 +17,7 @@ NEAR = 0.2  # relative distance from the factor that is still the factor
 ALIKE = 0.5  # correlation from which two columns are one motion
 STRETCH = 0.05  # [s] over which positions are differenced, so that resolution and noise do not count
 BEYOND = 3.0  # ranges of a joint that nothing goes beyond
-FAR, FAST = 50.0, 200.0  # [rad, rad/s] where neither a range nor a velocity is known
+FAR, FAST = 50.0, 200.0  # [rad, rad/s] that hardly any joint reaches, where no range is known
 
 
 def check_angles(where: str, model: Any, t: Array, columns: Mapping[str, Array], stated: Collection[str]) -> None:
@@ -34,7 +34,7 @@ def check_angles(where: str, model: Any, t: Array, columns: Mapping[str, Array],
         largest = float(np.nanmax(np.abs(q)))
         if model.jnt_limited[j]:
             _check_range(where, qpos, q, model.jnt_range[j])
-        if v is None and largest > FAR and _fastest(t, q) > FAST:
+        if largest > FAR and _fastest(t, q) > FAST:
             raise RecordingError(
                 f"{where}: column {qpos!r} reaches {largest:g} rad at {_fastest(t, q):.3g} rad/s; {_advice(qpos, 'deg', 'rad')}"
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -212,5 +213,5 @@ def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] |
     note = "Residual: measured − predicted; 4.6 % outside ±2σ is expected if the model and the noise are right."
     if len(columns) < len(recording.outputs):
         note += f" Shown: the {len(columns)} of {len(recording.outputs)} outputs with the largest residual over sigma."
-    headline(figure, f"Fit to {recording.name}", handles, note)
+    headline(figure, f"Fit to {Path(recording.name).name}", handles, note)
     return figure

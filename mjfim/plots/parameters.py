@@ -124,15 +124,15 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     return figure
 
 
-def relative_axis(offset: Array, half: Array) -> tuple[float, float]:
-    """Axis limits [%]: the guess, all estimates, and all intervals unless a few dwarf the rest."""
-    centres = offset[np.isfinite(offset)]
-    halves = half[np.isfinite(offset)]
-    finite = halves[np.isfinite(halves)]
+def relative_axis(offset: Array, ends: Array) -> tuple[float, float]:
+    """Axis limits [%]: the guess, all estimates, and all intervals (p, 2) unless a few dwarf the rest."""
+    known = np.isfinite(offset)
+    centres, reach = offset[known], np.abs(ends - offset[:, None])[known]
+    finite = reach[np.isfinite(reach)]
     widest = 5.0 * float(np.median(finite)) + float(np.abs(centres).max()) if finite.size else 1.0
-    shown = np.minimum(halves, widest)
-    low = min(0.0, float(np.min(centres - shown, initial=0.0)))
-    high = max(0.0, float(np.max(centres + shown, initial=0.0)))
+    shown = np.minimum(reach, widest)
+    low = min(0.0, float(np.min(centres - shown[:, 0], initial=0.0)))
+    high = max(0.0, float(np.max(centres + shown[:, 1], initial=0.0)))
     margin = 0.08 * max(high - low, 1e-6)
     return low - margin, high + margin
 
@@ -167,10 +167,9 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
     offset = (estimate.theta - estimate.initial_theta) / scale
     half = QUANTILE_95 * estimate.std / scale
     wide = (estimate.interval - estimate.initial_theta[:, None]) / scale[:, None]
-    reach = np.maximum(half, np.abs(wide - offset[:, None]).max(axis=1))
     figure = new_figure(9.5, 1.9 + (0.42 if count <= 12 else 0.27) * count)
     axes = figure.subplots()
-    axes.set(xlim=relative_axis(offset, reach), ylim=(count - 0.4, -0.6))
+    axes.set(xlim=relative_axis(offset, wide), ylim=(count - 0.4, -0.6))
     axes.axvline(0.0, color=INITIAL, linewidth=1.6)
     for j in range(count):
         if np.isfinite(offset[j]):

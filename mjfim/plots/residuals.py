@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
 from scipy.signal import welch
 from scipy.stats import chi2
 
@@ -69,12 +70,14 @@ def draw_spectrum(axes: Axes, estimate: Estimate, column: int, sigma: float) -> 
     low, high = chi2.ppf([0.025, 0.975], 2.0 * count) / (2.0 * count)
     axes.axhspan(low, high, color=FAINT, alpha=0.8, linewidth=0)
     axes.axhline(1.0, color=INK, linewidth=0.8)
-    axes.plot(freq[1:], power[1:] / level, color=MEASURED, linewidth=1.1)
+    axes.plot(freq[1:-1], power[1:-1] / level, color=MEASURED, linewidth=1.1)  # the two ends have half the power
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.yaxis.set_minor_formatter(NullFormatter())
     own = estimate.whiteness[column] if column < len(estimate.whiteness) else None
     if own is not None:
-        text = f"one to the next {own.correlation:+.2f},  p(white) {number(own.p, 2)}"
+        chance = "below 10⁻⁶" if own.p < 1e-6 else number(own.p, 2)
+        text = f"one to the next {own.correlation:+.2f},  p(white) {chance}"
         axes.set_title(text, loc="right", fontsize=SMALL, color=MUTED, pad=3)
 
 

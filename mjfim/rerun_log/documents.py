@@ -237,4 +237,4 @@ def _recording_page(model: mujoco.MjModel, index: int, recording: Recording) -> 
     outputs = series_views(("outputs", name), titles, legend=True)
     residuals = [series_view(("residuals", name, title), f"residual of {title}", legend=False) for title in titles]
     parts = grid("outputs", outputs, 2, 6) + grid("residuals", residuals, 2, 6)
-    return stack(parts, name=f"{name}: {recording.name}")
+    return stack(parts, name=f"{name}: {Path(recording.name).name}")

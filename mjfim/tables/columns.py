@@ -67,5 +67,6 @@ def refuse_bomb(path: Path, packed: int, unpacked: int) -> None:
 
 def said(error: Exception) -> str:
     """What a library says, in one line that is not too long."""
-    line = " ".join(str(error).split()) or type(error).__name__
+    printable = "".join(c if c.isprintable() or c.isspace() else "?" for c in str(error))  # it may quote the file
+    line = " ".join(printable.split()) or type(error).__name__
     return line if len(line) <= LONGEST else f"{line[:LONGEST]}..."
