@@ -196,6 +196,7 @@ def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
         "dof": estimate.dof,
         "status": estimate.status,
         "success": estimate.success,
+        "interrupted": estimate.interrupted,
         "iterations": estimate.iterations,
         "residual_rms": estimate.residual_rms,
         "sigma": estimate.sigma,

@@ -15,25 +15,23 @@ from typing import Literal, TypeVar, get_args
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from mjfim.condensed import Condensed
-from mjfim.earlier import marginal
+from mjfim.accuracy import Accuracy, accuracy
 from mjfim.errors import ExperimentError, SimulationDiverged, unknown
 from mjfim.estimated import Estimate
 from mjfim.experiment import Experiment
-from mjfim.fisher import standard_deviations
-from mjfim.identifiability import Group, Null, grouped, invisible
+from mjfim.identifiability import Null, invisible
+from mjfim.left import Left, left
 from mjfim.levenberg import INTERRUPTED, Progress, Search, Solution, Unknowns, minimise
 from mjfim.logs import doubts
-from mjfim.misfit import Place, reasons, smaller, worst_place
+from mjfim.misfit import reasons, smaller
 from mjfim.noise import Noise
+from mjfim.parameters import ParameterSet
 from mjfim.prediction import predicted
 from mjfim.residuals import LARGE, Fit
 from mjfim.robust import sampled
 from mjfim.setup import Setup
 from mjfim.suspects import Suspect, suspects
 from mjfim.trajectory import Array, Recording
-from mjfim.uncertainty import Uncertainty, together, uncertainty
-from mjfim.whiteness import whiteness
 
 NEWTON = Search(iterations=50, tolerance=1e-5, damped=False)
 SETTLED = 0.01  # relative change of a sigma that is estimated, below which it is
@@ -43,8 +41,7 @@ CLOSE = 1e-3  # standard deviations, a step below which is the last
 NUDGES = 2  # iterations for the starts of all pieces of much data, before theta moves again
 BRIEF = 8  # iterations of a further start, before the best goes on
 SAMPLE = 40_000  # samples of a part of the data on which a search over much of it begins
-SLOPPY = 0.25  # half of an interval over the value, from which a parameter is hardly known
-TRADED = 0.5  # correlation from which another parameter can stand in for one
+FAR = 4.0  # prior standard deviations from the guess that are worth a word
 Method = Literal["least_squares", "newton"]
 Tell = Callable[[str, Progress], None]
 Found = TypeVar("Found")
@@ -258,76 +255,46 @@ class _Identification:
 
     def _report(self, solution: Solution, null: Null) -> Estimate:
         setup, fit, at = self.setup, self.fit, solution.unknowns
-        p, theta = setup.parameters, fit.theta(at)
-        covariance, std = self._formal(solution)
-        groups = grouped(null, p.names, p.step, [q.unit for q in p.parameters])
-        lumped = np.isin(p.names, [name for group in groups for name in group.members])
-        std = np.where(lumped, np.inf, std)
-        covariance = np.where(np.logical_or.outer(lumped, lumped), np.inf, covariance)
-        lost = lumped & np.array([not q.group for q in p.parameters])
-        values = fit.predicted(at)
-        if values is None:
-            raise SimulationDiverged("the simulation diverges near the estimate")
-        whitened = self._whitened(values)
-        inside = self._inside(whitened)
-        chi2 = float(np.nansum(inside**2)) / fit.loss.inliers
-        dof = max(int(np.isfinite(inside).sum()) - solution.condensed.rank, 1)
-        white = tuple(whiteness(name, [z[:, j] for z in whitened]) for j, name in enumerate(setup.outputs.names))
-        names, times = [Path(t.name).name for t in fit.tracks], [t.t for t in fit.tracks]
-        worst = worst_place(setup.outputs.names, names, times, whitened)
-        missing = self._afterwards(lambda: self._missing(at))
-        why = reasons(chi2, dof, self.stated, white, missing)
-        near = 1e-6 * p.step
-        at_bound = tuple(n for n, d in zip(p.names, self._room(theta), strict=True) if d < 1e-6)
-        outside = bool(((theta < p.lower - near) | (theta > p.upper + near)).any())
-        rows = sum(len(t.t) for t in fit.tracks)
-        honest = self._honest(solution, [w.time * rows / max(w.count, 1) for w in white])
-        sandwich, interval, between = self._spread(theta, std, honest)
-        loose = tuple(_sloppy(setup, theta, interval, covariance))
-        singular = not np.isfinite(std[~lumped]).all()
+        p, theta, rest = setup.parameters, fit.theta(at), left(fit, solution)
+        missing = self._afterwards(lambda: () if rest.unexplained else self._missing(at))
         predictions = self._afterwards(lambda: predicted(fit, at, self.held_out))
-        sentences = [
-            *(
-                ["interrupted after the search: what was not fitted is not predicted"]
-                if self.interrupted and not solution.interrupted
-                else []
-            ),
-            *self._warnings(chi2, dof, why, at_bound, singular, outside, groups, honest),
-            *_hints(missing, worst if why else None),
-            *(f"sloppy: {name} {said}" for name, said in loose),
-            *(f"poor data in {Path(r.name).name}: {said}" for r in fit.recordings for said in doubts(setup, r)),
-        ]
+        why = reasons(rest.chi2, rest.dof, self.stated, rest.white, missing)
+        known = accuracy(fit, solution, null, rest.times(sum(len(t.t) for t in fit.tracks)))
+        near = 1e-6 * p.step
+        outside = bool(((theta < p.lower - near) | (theta > p.upper + near)).any())
+        touch = np.minimum(theta - p.lower, p.upper - theta) < near
+        at_bound = tuple(name for name, hit in zip(p.names, touch, strict=True) if hit)
         return Estimate(
             parameters=p.names,
             theta=theta,
-            std=std,
-            covariance=covariance,
+            std=known.std,
+            covariance=known.covariance,
             initial_theta=self.theta0,
-            chi2=chi2,
-            dof=dof,
+            chi2=rest.chi2,
+            dof=rest.dof,
             status=solution.status,
-            success=solution.success and not singular and not outside and not lost.any(),
+            success=solution.success and not (known.singular or outside or known.lost),
             misfit=bool(why),
             iterations=solution.iterations,
-            residual_rms=self._rms(values),
+            residual_rms=rest.rms,
             at_bound=at_bound,
-            predicted=tuple(values),
+            predicted=rest.predicted,
             recordings=tuple(self._seen(i) for i in range(len(fit.tracks))),
-            warnings=tuple(sentences),
-            combinations=tuple(str(group) for group in groups),
-            data=self._data(solution.condensed),
-            sandwich=sandwich,
-            interval=interval,
-            between=between,
+            warnings=tuple(self._sentences(solution, rest, known, why, missing, at_bound, outside)),
+            combinations=tuple(str(group) for group in known.groups),
+            data=known.data,
+            sandwich=known.sandwich,
+            interval=known.interval,
+            between=known.between,
             sigma=dict(zip(setup.outputs.names, fit.noise.sigma.tolist(), strict=True)),
             reasons=why,
-            whiteness=white,
-            sloppy=tuple(name for name, _ in loose),
+            whiteness=rest.white,
+            sloppy=tuple(name for name, _ in known.sloppy),
             suspects=missing,
-            each=self._each(at),
-            worst=worst if why else None,
+            each={p.names[j]: tuple(at.own[:, i].tolist()) for i, j in enumerate(fit.layout.own)},
+            worst=rest.worst if why else None,
             predictions=predictions,
-            detail=honest,
+            detail=known.detail,
             motion=fit.motion(at, 0),
             interrupted=self.interrupted,
             seconds=time.perf_counter() - self.clock,
@@ -347,130 +314,41 @@ class _Identification:
         some = self._sample(self.fit)
         return suspects(some, self.fit.recordings, self._places, self._sampled(at))
 
-    def _room(self, theta: Array) -> Array:
-        """(p,) distance to the nearest bound over the parameter's size."""
-        p = self.setup.parameters
-        return np.asarray(np.minimum(theta - p.lower, p.upper - theta) / p.step)
-
-    def _formal(self, solution: Solution) -> tuple[Array, Array]:
-        """(p, p) covariance and (p,) standard deviations; of what recordings have of their own, the first one's."""
-        fit, layout, condensed = self.fit, self.fit.layout, solution.condensed
-        H = condensed.information()
-        std = standard_deviations(H)
-        singular = not np.isfinite(std).all()
-        whole = np.full_like(H, np.inf) if singular else np.linalg.inv(H)
-        p, first = len(self.setup.parameters), layout.first
-        places = layout.places[first]
-        covariance, spread = np.zeros((p, p)), np.zeros(p)
-        covariance[np.ix_(places, places)], spread[places] = whole[np.ix_(first, first)], std[first]
-        private = layout.private
-        n = len(private)
-        if n and not fit.measured:
-            R = condensed.triangles[0, :n, :n]
-            free = np.linalg.matrix_rank(R) == n and not singular
-            C = condensed.eliminated[0]
-            alone = np.linalg.inv(R.T @ R) + C @ whole @ C.T if free else np.full((n, n), np.inf)
-            cross = (C @ whole)[:, first] if free else np.full((n, len(first)), np.inf)
-            covariance[np.ix_(private, private)] = alone
-            covariance[np.ix_(private, places)] = cross
-            covariance[np.ix_(places, private)] = cross.T
-            spread[private] = np.sqrt(np.diag(alone))
-        return covariance, spread
-
-    def _whitened(self, values: Sequence[Array]) -> list[Array]:
-        """(M, ny) whitened measured - predicted of every recording, NaN where nothing counts."""
-        out = []
-        for y, track, mask in zip(values, self.fit.tracks, self.fit.masks, strict=True):
-            z = np.full(y.shape, np.nan)
-            z[mask] = self.fit.noise.whiten_present(np.where(mask, track.y - y, 0.0), mask)
-            out.append(z)
-        return out
-
-    def _inside(self, whitened: Sequence[Array]) -> Array:
-        """All whitened residuals; with a robust loss without outliers."""
-        every = np.concatenate([z.ravel() for z in whitened])
-        return np.where(np.abs(every) <= self.fit.loss.outlier, every, np.nan)
-
-    def _honest(self, solution: Solution, times: Sequence[float]) -> Uncertainty | None:
-        """What the blocks of the last linearisation say; None where a common unknown is not determined."""
-        fit, spec = self.fit, self.setup.experiment.fit
-        if not np.isfinite(standard_deviations(solution.condensed.information())).all():
-            return None
-        recording, rows = fit.blocks
-        total = sum(len(t.t) for t in fit.tracks)
-        length = together(times, total)
-        if spec.blocks is not None:
-            length = spec.blocks * total / sum(float(t.t[-1]) for t in fit.tracks)
-        rng = np.random.default_rng(spec.seed)
-        place = fit.place(solution.unknowns)
-        return uncertainty(solution.condensed, place, recording, rows, length, spec.bootstrap, rng)
-
-    def _spread(self, theta: Array, std: Array, honest: Uncertainty | None) -> tuple[Array, Array, Array]:
-        """(p,) sandwich deviations, (p, 2) intervals, (p,) deviations between recordings; formal ones where there are none."""
-        sandwich, between = np.array(std), np.zeros(len(std))
-        interval = np.column_stack([theta - 1.96 * std, theta + 1.96 * std])
-        layout, p = self.fit.layout, self.setup.parameters
-        if honest is not None:
-            columns = layout.first
-            places = layout.places[columns]
-            known = np.isfinite(std[places])
-            places, columns = places[known], columns[known]
-            sandwich[places], between[places] = honest.sandwich[columns], honest.between[columns]
-            interval[places] = honest.interval[columns]
-        low = np.maximum(interval[:, 0], np.minimum(p.lower, theta))
-        high = np.minimum(interval[:, 1], np.maximum(p.upper, theta))
-        return sandwich, np.column_stack([low, high]), between
-
-    def _data(self, condensed: Condensed) -> Array:
-        """(p, p) information of the recordings alone about what they share, everything else marginalised."""
-        p, layout = self.setup.parameters, self.fit.layout
-        H, places = condensed.information(outer=False), layout.places
-        kept, out = np.arange(len(layout.shared)), np.zeros((len(p), len(p)))
-        prior = p.prior_information[np.ix_(places, places)] * np.eye(len(places))
-        out[np.ix_(layout.shared, layout.shared)] = marginal(H, prior, kept)
-        return out
-
-    def _each(self, at: Unknowns) -> dict[str, tuple[float, ...]]:
-        """What every recording has of its own."""
-        names = self.setup.parameters.names
-        return {names[j]: tuple(at.own[:, i].tolist()) for i, j in enumerate(self.fit.layout.own)}
-
-    def _rms(self, values: Sequence[Array]) -> dict[str, float]:
-        found = {}
-        for j, name in enumerate(self.setup.outputs.names):
-            parts = zip(values, self.fit.tracks, self.fit.masks, strict=True)
-            r = np.concatenate([(y - t.y)[mask[:, j], j] for y, t, mask in parts])
-            if len(r):
-                found[name] = float(np.sqrt(np.mean(r**2)))
-        return found
-
     def _seen(self, i: int) -> Recording:
         """A recording in the order of the outputs, as it was fitted."""
         track = self.fit.tracks[i]
         held = self.fit.recordings[i].ctrl[: len(track.t) - 1]
         return Recording(track.t, held, track.y, self.setup.outputs.names, track.name)
 
-    def _warnings(
+    def _sentences(
         self,
-        chi2: float,
-        dof: int,
+        solution: Solution,
+        rest: Left,
+        known: Accuracy,
         why: Sequence[str],
+        missing: Sequence[Suspect],
         at_bound: tuple[str, ...],
-        singular: bool,
         outside: bool,
-        groups: Sequence[Group],
-        honest: Uncertainty | None,
     ) -> Iterator[str]:
-        yield from (f"the recordings tell {group}; the rest was held at the start" for group in groups)
-        if singular:
+        """What a user should know besides the numbers, the gravest first."""
+        p, fit = self.setup.parameters, self.fit
+        if self.interrupted and not solution.interrupted:
+            yield "interrupted after the search: what was not fitted is not predicted"
+        if rest.unexplained:
+            yield (
+                f"the fit hardly explains {', '.join(rest.unexplained)}: probably a local minimum. Shorter pieces (fit.segments),"
+                " more starts (fit.starts) or a better guess may find a better one"
+            )
+        yield from (f"the recordings tell {group}; the rest was held at the start" for group in known.groups)
+        if known.singular:
             yield "the recordings do not determine all parameters: the information is singular"
         if why:
             wrong = "The model or the noise is" if self.stated else "The model is"
             yield f"misfit: {'; '.join(why)}. {wrong} wrong, and the formal standard errors are not accuracy"
-        elif self.stated and smaller(chi2, dof):
-            yield f"residuals are only {np.sqrt(chi2 / dof):.2f} x the stated noise: sigma is overstated"
-        if honest is not None and honest.apart:
-            names = [self.setup.parameters.names[self.fit.layout.places[j]] for j in honest.apart]
+        elif self.stated and smaller(rest.chi2, rest.dof):
+            yield f"residuals are only {np.sqrt(rest.chi2 / rest.dof):.2f} x the stated noise: sigma is overstated"
+        if known.detail is not None and known.detail.apart:
+            names = [p.names[fit.layout.places[j]] for j in known.detail.apart]
             yield (
                 f"recordings disagree on {', '.join(names)} by more than their own scatter: what differs between them is not "
                 "in the model; the intervals allow for it"
@@ -479,31 +357,19 @@ class _Identification:
             yield f"outside its bounds, which newton does not keep: {', '.join(at_bound)}; use least_squares"
         elif at_bound:
             yield f"at a bound: {', '.join(at_bound)}; the formal standard errors do not hold there"
-
-
-def _hints(missing: Sequence[Suspect], worst: Place | None) -> Iterator[str]:
-    """Where a misfit shows, and what might be behind it."""
-    if worst is not None:
-        yield f"residuals are {worst}"
-    for term in missing:
-        yield f"the residuals look like {term}"
-
-
-def _sloppy(setup: Setup, theta: Array, interval: Array, covariance: Array) -> Iterator[tuple[str, str]]:
-    """Wanted parameters that the data hardly tell, and in words what they may be traded for."""
-    p = setup.parameters
-    told = np.isfinite(np.diag(covariance))
-    spread = np.sqrt(np.maximum(np.where(told, np.diag(covariance), 1.0), 1e-300))
-    for j in p.interest:
-        half = 0.5 * float(interval[j, 1] - interval[j, 0])
-        size = max(abs(float(theta[j])), 1e-3 * float(p.step[j]))
-        if not np.isfinite(half) or half <= SLOPPY * size:
-            continue
-        together = np.where(told, covariance[j], 0.0) / (spread * spread[j])
-        together[j] = 0.0
-        other = int(np.argmax(np.abs(together)))
-        traded = f"; it is traded for {p.names[other]} (correlation {together[other]:+.2f})"
-        known = (
-            f"is known to ±{100 * half / size:.0f} % only" if half < 10 * size else "may be anything in its interval"
+        if why and rest.worst is not None:
+            yield f"residuals are {rest.worst}"
+        yield from (f"the residuals look like {term}" for term in missing)
+        yield from _far(p, fit.theta(solution.unknowns))
+        yield from (f"sloppy: {name} {said}" for name, said in known.sloppy)
+        yield from (
+            f"poor data in {Path(r.name).name}: {said}" for r in fit.recordings for said in doubts(self.setup, r)
         )
-        yield p.names[j], known + (traded if abs(together[other]) > TRADED else "")
+
+
+def _far(p: ParameterSet, theta: Array) -> Iterator[str]:
+    """Estimates that the stated priors hardly allow."""
+    for parameter, value in zip(p.parameters, theta, strict=True):
+        if parameter.prior is not None and abs(value - parameter.guess) > FAR * parameter.prior:
+            times = abs(value - parameter.guess) / parameter.prior
+            yield f"{parameter.name} is {times:.0f} prior standard deviations from its guess: one of them is wrong"

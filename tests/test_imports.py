@@ -91,6 +91,8 @@ ORDER = (
     "whiteness",
     "misfit",
     "uncertainty",
+    "accuracy",
+    "left",
     "prediction",
     "suspects",
     "estimated",
