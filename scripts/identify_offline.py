@@ -2,8 +2,9 @@
 
     python scripts/identify_offline.py models/cart_pendulum.toml recording.csv
 
-The recording has a column `t`, one `ctrl:<actuator>` per actuator, and the measured columns (`qpos:<joint>`,
-`qvel:<joint>` or a sensor's name). `mjfim simulate` writes one to try with.
+A recording of mjfim's own has a column `t`, one `ctrl:<actuator>` per actuator, and the measured columns (`qpos:<joint>`,
+`qvel:<joint>` or a sensor's name); of any other log the experiment's `[recording]` table maps the columns. `mjfim simulate`
+writes one to try with.
 """
 
 from __future__ import annotations
@@ -31,15 +32,17 @@ def main() -> int:
     # Weighted least squares in MuJoCo over all recordings at once.
     estimate = mjfim.identify(setup, recordings)
 
-    for name, value, std, unit in zip(estimate.parameters, estimate.theta, estimate.std, setup.units, strict=True):
-        print(f"{name:>12s} = {value:.5g} ± {1.96 * std:.2g} {unit} (95 %)")
+    # 95 % intervals that allow for residuals which are no white noise
+    rows = zip(estimate.parameters, estimate.theta, estimate.interval, setup.units, strict=True)
+    for name, value, (low, high), unit in rows:
+        print(f"{name:>12s} = {value:.5g} ({low:.5g} ... {high:.5g}) {unit}")
     print(f"chi2 / dof = {estimate.chi2 / estimate.dof:.3f}; {estimate.status}")
     for warning in estimate.warnings:
         print(f"warning: {warning}")
 
     target = args.recordings[0].with_name("identified.xml")
-    write_identified(target, setup, estimate.theta)
-    print(f"wrote {target}")
+    remark = write_identified(target, setup, estimate.theta)
+    print(f"wrote {target}{f' ({remark})' if remark else ''}")
     return 0 if estimate.success and not estimate.misfit else 1
 
 
