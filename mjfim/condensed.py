@@ -16,9 +16,7 @@ from mjfim.trajectory import Array
 
 BATCH = 128  # rows of a pass of a tall QR decomposition
 TALL = 512  # rows from which it goes in passes
-MOST_EXCHANGES = (
-    20  # of active bounds for every unknown; as many as unknowns, scipy's choice, may end short of the minimum
-)
+MOST_EXCHANGES = 20  # of active bounds for every unknown; one for each, scipy's choice, may end short of the minimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +136,7 @@ class Condensed:
         rows = R[:, n:, n:].reshape(-1, c + 1)
         extra = np.concatenate([np.diag(weight[n:]), np.zeros((c, 1))], axis=1)
         rows = triangle(np.concatenate([rows, self.outer, extra]))
-        d = np.zeros(c) if not c else _bounded(rows[:, :-1], -rows[:, -1], lower, upper)
+        d = _bounded(rows[:, :-1], -rows[:, -1], lower, upper)
         own: Array = np.zeros((self.pieces, n))
         if n:
             rhs = R[:, :n, -1] + R[:, :n, n:-1] @ d

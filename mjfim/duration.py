@@ -21,7 +21,7 @@ from mjfim.errors import ExperimentError, MjfimError
 from mjfim.experiment import Experiment, Signal
 from mjfim.goals import furthest, missed, require_reachable, wanted_of
 from mjfim.setup import Setup
-from mjfim.signals import read_table
+from mjfim.tables.files import read_table
 from mjfim.trajectory import Array, Design, Status
 
 LONGER = 4.0  # times the stated horizon: how long an experiment may become

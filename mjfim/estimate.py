@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeVar, get_args
 
@@ -21,7 +22,7 @@ from mjfim.estimated import Estimate
 from mjfim.experiment import Experiment
 from mjfim.identifiability import Null, invisible
 from mjfim.left import Left, left
-from mjfim.levenberg import INTERRUPTED, Progress, Search, Solution, Unknowns, minimise
+from mjfim.levenberg import INTERRUPTED, Progress, Search, Solution, Unknowns, completed, minimise
 from mjfim.logs import doubts
 from mjfim.misfit import reasons, smaller
 from mjfim.noise import Noise
@@ -31,7 +32,7 @@ from mjfim.residuals import LARGE, Fit
 from mjfim.robust import sampled
 from mjfim.setup import Setup
 from mjfim.suspects import Suspect, suspects
-from mjfim.trajectory import Array, Recording
+from mjfim.trajectory import Array, Recording, thinned
 
 NEWTON = Search(iterations=50, tolerance=1e-5, damped=False)
 SETTLED = 0.01  # relative change of a sigma that is estimated, below which it is
@@ -82,11 +83,9 @@ def least_squares(fit: Fit, start: Array, search: Search | None = None) -> Solut
 
     Half a search is none: Ctrl-C is raised anew.
     """
-    found = minimise(fit, fit.begin(start), search or Search())
+    found = completed(fit, fit.begin(start), search or Search())
     if found is None:
         raise SimulationDiverged("the simulation diverges at the start of the fit")
-    if found.interrupted:
-        raise KeyboardInterrupt
     return found
 
 
@@ -144,12 +143,15 @@ class _Identification:
         return invisible(J, error, p.step, p.scale, np.arange(len(p)), np.zeros_like(weight))
 
     def _sample(self, fit: Fit) -> Fit:
-        """Pieces all over the data that are quick to look at; all of them where that is quick."""
-        self._places = np.arange(len(fit.pieces))
-        if fit.samples > SAMPLE and len(fit.pieces) > 1:
-            count = max(int(SAMPLE * len(fit.pieces) / fit.samples), 1)
-            self._places = np.unique(np.linspace(0, len(fit.pieces) - 1, count).astype(int))
+        """Of the pieces that are quick to look at."""
         return fit.part(self._places)
+
+    @cached_property
+    def _places(self) -> np.ndarray:
+        """Pieces all over the data that are quick to look at; all of them where that is quick."""
+        fit, count = self.fit, len(self.fit.pieces)
+        quick = fit.samples <= SAMPLE or count == 1
+        return thinned(count, count if quick else max(int(SAMPLE * count / fit.samples), 1))
 
     def _sampled(self, at: Unknowns) -> Unknowns:
         return replace(at, starts=at.starts[self._places])
@@ -245,9 +247,7 @@ class _Identification:
         if values is None:
             return np.array(fit.noise.sigma)
         sigma, free = np.array(fit.noise.sigma), fit.count / max(fit.count - fit.size, 1)
-        for j in range(len(sigma)):
-            parts = zip(values, fit.tracks, fit.masks, strict=True)
-            r = np.concatenate([(y - t.y)[mask[:, j], j] for y, t, mask in parts])
+        for j, r in enumerate(fit.errors(values)):
             if len(r):
                 spread = 1.4826 * float(np.median(np.abs(r))) if robust else float(np.sqrt(np.mean(r**2) * free))
                 sigma[j] = max(spread, FLOOR * self.setup.noise.sigma[j])

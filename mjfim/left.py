@@ -15,9 +15,8 @@ from mjfim.residuals import Fit
 from mjfim.trajectory import Array
 from mjfim.whiteness import Whiteness, whiteness
 
-HARDLY = (
-    0.5  # residual over what was measured, both root mean squares about the mean, from which a motion is not explained
-)
+# root mean square of residuals over the deviation of what was measured, from which a motion is not explained
+HARDLY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +48,11 @@ def left(fit: Fit, solution: Solution) -> Left:
     inside = _inside(fit, whitened)
     columns = [np.concatenate([z[:, j] for z in whitened]) for j in range(len(names))]
     rms, unexplained = {}, []
-    for j, name in enumerate(names):
-        parts = list(zip(values, fit.tracks, fit.masks, strict=True))
-        r = np.concatenate([(y - t.y)[mask[:, j], j] for y, t, mask in parts])
+    for j, (name, r) in enumerate(zip(names, fit.errors(values), strict=True)):
         if not len(r):
             continue
         rms[name] = float(np.sqrt(np.mean(r**2)))
-        moved = float(np.std(np.concatenate([t.y[mask[:, j], j] for _, t, mask in parts])))
+        moved = float(np.std(np.concatenate([t.y[m[:, j], j] for t, m in zip(fit.tracks, fit.masks, strict=True)])))
         if rms[name] > HARDLY * moved and float(np.nanmean(columns[j] ** 2)) > 1.0 / HARDLY**2:
             unexplained.append(name)
     tracks = fit.tracks

@@ -112,6 +112,14 @@ def minimise(
         return loop.ended(INTERRUPTED, False, interrupted=True)
 
 
+def completed(problem: Problem, start: Unknowns, search: Search) -> Solution | None:
+    """The same where half a search is none: Ctrl-C is raised anew."""
+    found = minimise(problem, start, search)
+    if found is not None and found.interrupted:
+        raise KeyboardInterrupt
+    return found
+
+
 class _Loop:
     def __init__(self, problem: Problem, search: Search, tell: Callable[[Progress], None] | None) -> None:
         self.problem, self.search, self.tell = problem, search, tell
@@ -135,15 +143,15 @@ class _Loop:
                 if self._small(step) or damping > MOST or not self.search.damped:
                     return self._stuck(self._promised(now, linear, scale))
                 damping, growth = max(damping, 1e-12) * growth, 2.0 * growth
-            last = length == 1.0 and damping <= FIRST and self._small(step)
-            last = last and self._small(self._promised(now, linear, scale))
-            hardly = cost - found <= min(STILL[0] * cost, STILL[1], 0.1 * self._promised(now, linear, scale).gain)
+            promised = self._promised(now, linear, scale)
+            last = length == 1.0 and damping <= FIRST and self._small(step) and self._small(promised)
+            hardly = cost - found <= min(STILL[0] * cost, STILL[1], 0.1 * promised.gain)
             still = still + 1 if hardly else 0
             if still == PATIENCE:
                 self.best = (trial, linear, found)
-                return self._stuck(self._promised(now, linear, scale))
+                return self._stuck(promised)
             if not self.search.fresh and length == 1.0:
-                last = last or self._nearly(self._promised(now, linear, scale), step, before)
+                last = last or self._nearly(promised, step, before)
             before = step.size
             now, cost = trial, found
             self.best = (now, linear, cost)

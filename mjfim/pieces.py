@@ -87,9 +87,7 @@ def measured_starts(setup: Setup, track: Track, begins: np.ndarray) -> Array:
         t0 = begin * track.dt
         for q in range(space.nq):
             if q in place and q not in quaternion:
-                position, speed = _local(track, place[q], t0, 2)
-                states[k, q] = position
-                states[k, velocity[q]] = speed if np.isfinite(speed) else states[k, velocity[q]]
+                states[k, q], states[k, velocity[q]] = _local(track, place[q], t0, 2)
         for v in range(space.nq, space.nq + space.nv):
             if v in place:
                 states[k, v] = _local(track, place[v], t0, 1)[0]
@@ -101,10 +99,8 @@ def measured_starts(setup: Setup, track: Track, begins: np.ndarray) -> Array:
 
 
 def _local(track: Track, column: int, t0: float, degree: int) -> tuple[float, float]:
-    """Value and slope at t0 of a polynomial through the rows around; NaN where nothing was measured."""
+    """Value and slope at t0 of a polynomial through the rows around that hold a value of a column."""
     seen = track.seen[column]
-    if not len(seen):
-        return np.nan, np.nan
     middle = int(np.searchsorted(seen, np.searchsorted(track.t, t0)))
     rows = seen[max(middle - NEAR, 0) : middle + NEAR]
     s, y = track.t[rows] - t0, track.y[rows, column]
@@ -118,15 +114,13 @@ def _local(track: Track, column: int, t0: float, degree: int) -> tuple[float, fl
 def _nearest(track: Track, columns: Sequence[int], t0: float) -> Array:
     """The measured values of some columns nearest to t0."""
     seen = track.seen[columns[0]]  # components of one quaternion are measured together
-    if not len(seen):
-        return np.array([1.0, 0.0, 0.0, 0.0])
     after = int(np.clip(np.searchsorted(seen, np.searchsorted(track.t, t0)), 0, len(seen) - 1))
     near = min((seen[max(after - 1, 0)], seen[after]), key=lambda row: abs(track.t[row] - t0))
     return np.asarray(track.y[near][list(columns)])
 
 
 def _nominal(setup: Setup, track: Track, begins: np.ndarray) -> Array:
-    """(n, ns) states of the model at the guess from the stated start; the start itself where that diverges or is long."""
+    """(n, ns) states of the model at the guess from the stated start; the start itself where that diverges."""
     start = setup.plant.start(setup.parameters.guess)
     out = np.tile(start, (len(begins), 1))
     if set(_shown(setup, track)).issuperset(range(len(start))) or not begins.any():

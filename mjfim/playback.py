@@ -18,7 +18,7 @@ from mjfim.limits import forwarded
 from mjfim.models import actuator_names
 from mjfim.sensing import components
 from mjfim.setup import Setup
-from mjfim.signals import read_table
+from mjfim.tables.files import read_table
 from mjfim.trajectory import Array, Trajectory, freeze
 
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.experiment import Experiment
-from mjfim.levenberg import Search, Solution, Unknowns, minimise
+from mjfim.levenberg import Search, Unknowns, completed
 from mjfim.residuals import Fit
 from mjfim.setup import Setup
-from mjfim.trajectory import Array, Recording, freeze
+from mjfim.trajectory import Array, Recording, freeze, thinned
 
 FOLDS = 5  # at most
 REST = 0.25  # of a single recording that is predicted from what comes before
@@ -83,16 +83,15 @@ def predicted(fit: Fit, at: Unknowns, held_out: Fit | None) -> tuple[Prediction,
 def _folds(fit: Fit, at: Unknowns, nominal: Array) -> Iterator[Prediction]:
     """What the rest says of each part; of much data, pieces all over it."""
     if fit.samples > MANY and len(fit.pieces) > 1:
-        count = max(MANY * len(fit.pieces) // fit.samples, 2)
-        places = np.unique(np.linspace(0, len(fit.pieces) - 1, count).astype(np.intp))
+        places = thinned(len(fit.pieces), max(MANY * len(fit.pieces) // fit.samples, 2))
         fit, at = fit.part(places), replace(at, starts=at.starts[places])
     for names, masks in _parts(fit):
         rest = fit.masked([~mask for mask in masks])
-        some = np.array([i for i, p in enumerate(rest.pieces) if rest.masks[p.track][p.rows].any()], dtype=np.intp)
+        some = rest.occupied
         if not len(some):
             continue
         begin = replace(at, starts=at.starts[some])
-        found = _minimised(rest.part(some), begin, Search(iterations=STEPS, tolerance=1e-2, fresh=False))
+        found = completed(rest.part(some), begin, Search(iterations=STEPS, tolerance=1e-2, fresh=False))
         if found is not None:
             yield _judged(fit, found.unknowns.theta, nominal, masks, names, False)
 
@@ -129,31 +128,20 @@ def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> E
 
     Unknown starts are found from what else a piece measures, or from those values where they are all it has.
     """
-    pieces = [i for i, p in enumerate(fit.pieces) if (masks[p.track] & fit.masks[p.track])[p.rows].any()]
-    fit = fit.part(np.array(pieces, dtype=np.intp))
+    fit = fit.part(fit.masked(masks).occupied)
     now, nominal = fit.begin(theta), fit.setup.parameters.guess[fit.layout.private]
     if fit.size > len(fit.layout.shared):
         # a nuisance start of the fitted recordings says nothing of this one's
         starts = np.zeros_like(now.starts) if fit.measured else np.tile(nominal, (len(fit.pieces), 1))
         search = Search(STEPS, 1e-2, fresh=False)
-        found = _minimised(fit.masked(_learned(fit, masks)).frozen(), replace(now, starts=starts), search)
+        found = completed(fit.masked(_learned(fit, masks)).frozen(), replace(now, starts=starts), search)
         now = now if found is None else found.unknowns
     values, outputs = fit.predicted(now), fit.setup.outputs.names
     rms, mae = np.full(len(outputs), np.nan), np.full(len(outputs), np.nan)
-    for j in range(len(outputs) if values is not None else 0):
-        parts = zip(values or (), fit.tracks, fit.masks, masks, strict=True)
-        error = np.concatenate([(y - t.y)[own[:, j] & mask[:, j], j] for y, t, own, mask in parts])
+    for j, error in enumerate([] if values is None else fit.masked(masks).errors(values)):
         if len(error):
             rms[j], mae[j] = np.sqrt(np.mean(error**2)), np.mean(np.abs(error))
     return Errors(name, outputs, rms, mae)
-
-
-def _minimised(fit: Fit, begin: Unknowns, search: Search) -> Solution | None:
-    """None where that diverges. Half a search predicts nothing: Ctrl-C ends all."""
-    found = minimise(fit, begin, search)
-    if found is not None and found.interrupted:
-        raise KeyboardInterrupt
-    return found
 
 
 def _learned(fit: Fit, masks: Sequence[np.ndarray]) -> list[np.ndarray]:

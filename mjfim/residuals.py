@@ -86,7 +86,7 @@ class Fit:
             raise RecordingError("the recordings hold no measured value after t = 0")
         self.layout = Layout.of(p, len(self.tracks), self.measured, not data_only)
         self.pins, self.pinned_at = np.zeros((0, len(p))), np.array(p.guess)
-        self._offsets, self._fine = self._partition()
+        self._offsets = self._partition()
 
     def _require_free(self) -> None:
         """Raises ExperimentError where deviations of the stated start are asked for though it is measured."""
@@ -112,12 +112,12 @@ class Fit:
             mask[0] = False
         return mask
 
-    def _partition(self) -> tuple[np.ndarray, int]:
-        """First block of every piece, and rows of a block."""
+    def _partition(self) -> np.ndarray:
+        """First block of every piece, and the number of all blocks."""
         total = sum(len(t.t) for t in self.tracks)
         fine = max(FINE, -(-total // BLOCKS))
         counts = [max(round((p.rows.stop - p.rows.start) / fine), 1) for p in self.pieces]
-        return np.concatenate([[0], np.cumsum(counts)]), fine
+        return np.concatenate([[0], np.cumsum(counts)])
 
     # what is sought
 
@@ -130,6 +130,12 @@ class Fit:
     def count(self) -> int:
         """Number of measured values."""
         return int(sum(mask.sum() for mask in self.masks))
+
+    @property
+    def occupied(self) -> np.ndarray:
+        """Places of the pieces that hold a measured value."""
+        hold = [i for i, piece in enumerate(self.pieces) if self.masks[piece.track][piece.rows].any()]
+        return np.array(hold, dtype=np.intp)
 
     @property
     def size(self) -> int:
@@ -195,7 +201,7 @@ class Fit:
         other.masks = [np.zeros_like(mask) for mask in self.masks]
         for piece in other.pieces:
             other.masks[piece.track][piece.rows] = self.masks[piece.track][piece.rows]
-        other._offsets, other._fine = other._partition()
+        other._offsets = other._partition()
         return other
 
     def masked(self, masks: Sequence[np.ndarray]) -> Fit:
@@ -220,6 +226,14 @@ class Fit:
                 return None
             found[self.pieces[rows.piece].track][rows.rows] = rows.y
         return found
+
+    def errors(self, values: Sequence[Array]) -> list[Array]:
+        """Predicted - measured of every output, those of all tracks in one row. values: (M, ny) of every track"""
+        parts = list(zip(values, self.tracks, self.masks, strict=True))
+        return [
+            np.concatenate([(y - track.y)[mask[:, j], j] for y, track, mask in parts])
+            for j in range(len(self.setup.outputs))
+        ]
 
     def motion(self, at: Unknowns, track: int) -> Trajectory | None:
         """The fitted motion of one track on its grid, jumps between pieces and all; None where it diverges."""

@@ -9,7 +9,7 @@ from scipy.signal import chirp
 
 from mjfim.errors import RecordingError, unknown
 from mjfim.experiment import Signal, by_name
-from mjfim.tables.files import read_table as read_table
+from mjfim.tables.files import read_table
 from mjfim.trajectory import Array
 
 OF_DESIGN = ("qpos:", "qvel:", "act:", "gain:")  # what a design.csv holds beside t and the control

@@ -193,7 +193,7 @@ def test_interrupted_while_it_searches_it_keeps_the_best_so_far(setup: Setup, re
     assert found.predictions == ()
 
 
-@pytest.mark.parametrize("place", ["estimate.suspects", "prediction.minimise", "prediction._errors"])
+@pytest.mark.parametrize("place", ["estimate.suspects", "prediction.completed", "prediction._errors"])
 def test_interrupted_after_the_search_the_estimate_stays(
     setup: Setup, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment import Experiment, Signal
 from mjfim.setup import Setup
-from mjfim.signals import generate, multisine, read_control, read_table
+from mjfim.signals import generate, multisine, read_control
+from mjfim.tables.files import read_table
 
 Array = NDArray[np.float64]
 Read = Callable[..., Array]

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import RecordingError
+from mjfim.logs.ways import ways
 from mjfim.models import joint_names
 from mjfim.trajectory import Array
 
@@ -68,10 +69,7 @@ def _ratio(t: Array, q: Array, v: Array) -> float:
     t, q, v = t[both], q[both], v[both]
     if len(t) < 3:
         return float("nan")
-    steps = np.diff(t)
-    lag = int(np.clip(round(STRETCH / float(np.median(steps))), 1, max(1, len(t) // 10)))
-    way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * steps)])
-    dq, dv = q[lag:] - q[:-lag], way[lag:] - way[:-lag]
+    dq, dv, _ = ways(t, q, v, STRETCH, max(1, len(t) // 10))
     square = float(dv @ dv)
     together = float(dq @ dv)
     if square <= 0.0 or together < ALIKE * np.sqrt(square * float(dq @ dq)):

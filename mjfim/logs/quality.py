@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.signal import medfilt
 
+from mjfim.logs.ways import ways
 from mjfim.models import coordinates
 from mjfim.setup import Setup
 from mjfim.trajectory import Array, Recording
@@ -80,9 +81,7 @@ def _contradictions(setup: Setup, t: Array, recording: Recording) -> Iterator[st
         if both.sum() < 4 * RUN:
             continue
         at, q, v = t[both], q[both], v[both]
-        way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(at))])
-        lag = int(np.clip(round(STRETCH / float(np.median(np.diff(at)))), 1, len(at) // 4))
-        dq, dv = q[lag:] - q[:-lag], way[lag:] - way[:-lag]
+        dq, dv, lag = ways(at, q, v, STRETCH, len(at) // 4)
         size = float(np.std(dq))
         apart = float(np.std(dq - dv)) / size if size > 0.0 else 0.0
         sigmas = dict(zip(setup.outputs.names, setup.noise.sigma.tolist(), strict=True))
