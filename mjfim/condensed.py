@@ -208,5 +208,10 @@ def _bounded(A: Array, b: Array, lower: Array, upper: Array) -> Array:
     A, unit = A[:, ~thin] / unit[~thin], unit[~thin]
     box = (low[~thin] * unit, high[~thin] * unit)
     solved = lsq_linear(A, b, box, method="bvls", tol=1e-14, max_iter=MOST_EXCHANGES * len(unit))
-    out[~thin] = np.clip(solved.x / unit, low[~thin], high[~thin])
+    # An unknown that the solver holds at a bound lies exactly there, whatever rounding the scaling by `unit` leaves.
+    within = np.clip(solved.x / unit, low[~thin], high[~thin])
+    within = np.where(solved.active_mask < 0, low[~thin], within)
+    within = np.where(solved.active_mask > 0, high[~thin], within)
+
+    out[~thin] = within
     return out

@@ -14,6 +14,7 @@ from mjfim.slots import inertial
 from mjfim.trajectory import Array
 
 SLIGHT = 1e-13  # of a body's size or trace of inertia: what is below is rounding of the charts
+DIGITS = 15  # significant decimal digits of a matrix that was rotated, counted from its trace; the next one is rounding
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -59,11 +60,26 @@ def _turn(sheet: Sheet, own: int, b: int, old: Any, wanted: Any, charted: bool) 
     elif not full and products <= SLIGHT * np.trace(after):
         sheet.numbers(own, "diaginertia", old.body_inertia[b], np.diag(inside), 3, size)
     else:
-        sheet.numbers(own, "fullinertia", before[ROWS, COLUMNS], after[ROWS, COLUMNS], 6, size)
+        sheet.numbers(own, "fullinertia", before[ROWS, COLUMNS], _rounded(after), 6, size)
 
 
 def _matrix(inertia: Array) -> dict[str, str]:
-    return {"fullinertia": digits(*inertia[ROWS, COLUMNS])}
+    return {"fullinertia": digits(*_rounded(inertia))}
+
+
+def _rounded(inertia: Array) -> Array:
+    """(6,) entries of `fullinertia` without the rounding errors of the rotation out of the principal axes.
+
+    These errors are about 1e-16 of the trace and depend on the processor's linear algebra kernel, so that 0.013 would be
+    written as 0.01299999999999999 on some machines.
+    """
+    entries = inertia[ROWS, COLUMNS]
+    trace = float(np.trace(inertia))
+    if trace <= 0.0:  # a body without inertia has nothing to round
+        return np.asarray(entries)
+
+    decimals = DIGITS - 1 - int(np.floor(np.log10(trace)))
+    return np.array([round(float(entry), decimals) for entry in entries])
 
 
 def _principal(model: Any, b: int) -> dict[str, str]:
