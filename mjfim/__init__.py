@@ -4,23 +4,28 @@
 parameters from recordings, `monte_carlo` holds the estimator against the Cramer-Rao bound.
 """
 
-from mjfim.campaign import Campaign
-from mjfim.checker import Check, check
-from mjfim.compare import compare
-from mjfim.comparison import Comparison
-from mjfim.designer import design
-from mjfim.duration import Shortest, shortest
 from mjfim.errors import MjfimError
-from mjfim.estimate import identify
-from mjfim.estimated import Estimate
-from mjfim.evaluation import evaluate_trajectory
-from mjfim.experiment import Experiment
-from mjfim.montecarlo import monte_carlo, simulate
-from mjfim.prediction import predict
-from mjfim.sequential import sequential
-from mjfim.together import design_together
-from mjfim.trajectory import Design, Recording, Study, Trajectory
-from mjfim.workers import Pool
+from mjfim.excitation.design import design
+from mjfim.excitation.evaluation import evaluate_trajectory
+from mjfim.excitation.joint_design import design_together
+from mjfim.excitation.shortest_horizon import Shortest, shortest
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.simulate import simulate
+from mjfim.identification.cross_validation import predict
+from mjfim.identification.identify import identify
+from mjfim.parallel import Pool
+from mjfim.records.campaign import Campaign
+from mjfim.records.check import Check
+from mjfim.records.comparison import Comparison
+from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate
+from mjfim.records.monte_carlo import Study
+from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Trajectory
+from mjfim.studies.campaign import sequential
+from mjfim.studies.check import check
+from mjfim.studies.compare import compare
+from mjfim.studies.monte_carlo import monte_carlo
 
 __all__ = [
     "Campaign",

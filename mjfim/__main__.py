@@ -1,6 +1,6 @@
 """`python -m mjfim`."""
 
-from mjfim.cli import main
+from mjfim.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -39,12 +39,13 @@ from mujoco.batch import Batch
 from rich.console import Console
 from rich.table import Table
 
-from mjfim.engine import cores
-from mjfim.experiment import Experiment
-from mjfim.setup import Setup
+from mjfim.arrays import Array
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.information.identifiability import survey
+from mjfim.parallel import cores
+from mjfim.records.trajectory import Sensitivity
 from mjfim.signals import multisine
-from mjfim.survey import survey
-from mjfim.trajectory import Array, Sensitivity
 
 MODELS = Path(__file__).resolve().parents[2] / "shared" / "models"
 RATE, MEASURED = 100.0, 50.0  # [Hz] control updates, measurements

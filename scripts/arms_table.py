@@ -21,8 +21,8 @@ import arms
 from rich.console import Console
 
 import mjfim
-from mjfim.comparison import Comparison, Row
-from mjfim.engine import cores
+from mjfim.parallel import cores
+from mjfim.records.comparison import Comparison, Row
 
 FEW, MANY = ("fourier5", "fourier5-mjfim"), ("fourier15-mjfim",)
 PITCH = 0.2  # [Hz] of the series that is among the design's starts

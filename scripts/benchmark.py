@@ -33,10 +33,10 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.engine import cores
-from mjfim.experiment import Experiment
-from mjfim.setup import Setup
-from mjfim.trajectory import Design
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.parallel import cores
+from mjfim.records.design import Design
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = ROOT / "models" / "cart_pendulum.toml"

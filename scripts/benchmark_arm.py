@@ -18,12 +18,12 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.descent import Stage
-from mjfim.engine import cores
-from mjfim.experiment import Experiment
-from mjfim.plant import FAST
-from mjfim.setup import Setup
-from mjfim.survey import survey
+from mjfim.excitation.unconstrained import Stage
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.information.identifiability import survey
+from mjfim.parallel import cores
+from mjfim.plant.plant import FAST
 
 ARM = Path(__file__).resolve().parents[2] / "shared" / "models" / "menagerie_panda" / "panda_nohand_nomesh.xml"
 COUNTS = (3, 10, 30, 70)

@@ -23,11 +23,11 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.archive import write_recording
-from mjfim.engine import cores
-from mjfim.setup import Setup
+from mjfim.experiment.system import Setup
+from mjfim.output.archive import write_recording
+from mjfim.parallel import cores
+from mjfim.records.recording import Recording
 from mjfim.signals import multisine
-from mjfim.trajectory import Recording
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = ROOT / "models" / "two_joint_arm.toml"
@@ -37,7 +37,7 @@ clock = time.perf_counter()
 from pathlib import Path
 import mjfim
 from mjfim.logs import read_recording
-from mjfim.setup import Setup
+from mjfim.experiment.system import Setup
 setup = Setup(mjfim.Experiment.from_file(sys.argv[1]))
 clock = time.perf_counter()
 read_recording(Path(sys.argv[2]), setup)

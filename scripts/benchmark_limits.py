@@ -21,9 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.engine import cores
-from mjfim.experiment import Experiment
-from mjfim.trajectory import Status
+from mjfim.experiment.schema import Experiment
+from mjfim.parallel import cores
+from mjfim.records.design import Status
 
 ROOT = Path(__file__).resolve().parents[1]
 EXPERIMENT = ROOT / "models" / "cart_pendulum_limits.toml"

@@ -29,14 +29,14 @@ from rich.table import Table
 from sysid_sequences import Exported, build, export, hushed, require_extra
 
 import mjfim
-from mjfim.archive import write_json
+from mjfim.arrays import Array
+from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
-from mjfim.estimated import Estimate
-from mjfim.files import replacing
-from mjfim.logs import read_recording
-from mjfim.places import check_folder
-from mjfim.setup import Setup
-from mjfim.trajectory import Array
+from mjfim.experiment.system import Setup
+from mjfim.output.archive import write_json
+from mjfim.output.folders import check_folder
+from mjfim.recordings.read import read_recording
+from mjfim.records.estimate import Estimate
 
 ITERATIONS = 200
 HEADINGS = ("parameter", "true", "start", "mjfim", "formal σ", "95 % interval", "sysid\nweighted", "sysid\nas is")

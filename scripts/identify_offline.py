@@ -13,9 +13,9 @@ import argparse
 from pathlib import Path
 
 import mjfim
-from mjfim.identified import write_identified
-from mjfim.logs import read_recording
-from mjfim.setup import Setup
+from mjfim.experiment.system import Setup
+from mjfim.output.mjcf.write import write_identified
+from mjfim.recordings.read import read_recording
 
 
 def main() -> int:

@@ -31,11 +31,11 @@ from rich.console import Console
 from rich.markup import escape
 
 import mjfim
-from mjfim.archive import write_design, write_json
-from mjfim.engine import cores
 from mjfim.errors import ExperimentError, MjfimError, unknown
-from mjfim.experiment import Experiment
-from mjfim.setup import Setup
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.output.archive import write_design, write_json
+from mjfim.parallel import cores
 
 MODEL = Path(__file__).resolve().parents[1] / "models" / "servo_arm.toml"
 KINDS = ("position", "velocity", "acceleration", "control", "control_rate", "force", "clearance")

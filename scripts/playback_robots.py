@@ -20,18 +20,19 @@ from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 import mjfim
-from mjfim.bounds import SHOWN, fence_of
-from mjfim.engine import Engine
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDiverged
-from mjfim.estimated import Estimate
-from mjfim.experiment import Experiment
-from mjfim.fisher import standard_deviations
-from mjfim.limits import Limit
-from mjfim.models import joint_names
-from mjfim.paths import joint_width
-from mjfim.playback import read_playback
-from mjfim.setup import Setup
-from mjfim.trajectory import Array, Recording
+from mjfim.excitation.constraints import SHOWN, fence_of
+from mjfim.excitation.limits import Limit
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.information.marginal import standard_deviations
+from mjfim.model.loading import joint_names
+from mjfim.model.paths import joint_width
+from mjfim.plant.batch import Engine
+from mjfim.recordings.design_table import read_playback
+from mjfim.records.estimate import Estimate
+from mjfim.records.recording import Recording
 
 LATENCY = 5e-3  # [s]
 DRAWS = 500  # attempts at a robot that can exist

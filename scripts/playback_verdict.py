@@ -16,8 +16,8 @@ from rich.markup import escape
 from rich.table import Table
 from scipy.stats import binom, chi2
 
-from mjfim.plots import style
-from mjfim.trajectory import Array
+from mjfim.arrays import Array
+from mjfim.output.plots import style
 
 CONFIDENCE, WANTED = 0.95, 0.90  # of the intervals;  share of the runs whose interval must hold the true value
 HALF = 1.959964  # standard deviations of such an interval to either side

@@ -26,10 +26,11 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.engine import cores
-from mjfim.files import replacing
-from mjfim.setup import Setup
-from mjfim.trajectory import Array, Recording
+from mjfim.arrays import Array
+from mjfim.atomic_io import replacing
+from mjfim.experiment.system import Setup
+from mjfim.parallel import cores
+from mjfim.records.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[1]
 STEP = 0.0005  # [s] of the robot

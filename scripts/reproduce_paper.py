@@ -17,12 +17,16 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim import plots, rerun_log
-from mjfim.archive import study_summary, write_design, write_json
-from mjfim.labels import Labels
-from mjfim.plant import CENTRAL
-from mjfim.setup import Setup
-from mjfim.trajectory import Array, Design, Study, Trajectory
+from mjfim.arrays import Array
+from mjfim.experiment.system import Setup
+from mjfim.output import plots
+from mjfim.output import rerun as rerun_log
+from mjfim.output.archive import study_summary, write_design, write_json
+from mjfim.output.labels import Labels
+from mjfim.plant.plant import CENTRAL
+from mjfim.records.design import Design
+from mjfim.records.monte_carlo import Study
+from mjfim.records.trajectory import Trajectory
 
 EXPERIMENT = Path(__file__).resolve().parents[1] / "models" / "cart_pendulum.toml"
 

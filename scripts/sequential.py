@@ -26,14 +26,16 @@ from rich.table import Table
 from sequential_folder import Folder, told
 
 import mjfim
-from mjfim.archive import write_recording
-from mjfim.campaign import Campaign, Outcome
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, RecordingError
-from mjfim.experiment import Experiment
-from mjfim.goals import wanted_of
-from mjfim.places import check_folder
-from mjfim.setup import Setup
-from mjfim.trajectory import Array, Design, Recording
+from mjfim.excitation.target_accuracy import wanted_of
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.output.archive import write_recording
+from mjfim.output.folders import check_folder
+from mjfim.records.campaign import Campaign, Outcome
+from mjfim.records.design import Design
+from mjfim.records.recording import Recording
 
 say = Console(highlight=False, soft_wrap=True)
 

@@ -12,16 +12,17 @@ import numpy as np
 from rich.console import Console
 from sequential_picture import figure
 
-from mjfim.archive import check_fits, estimate_summary, read_design, write_design, write_json
-from mjfim.campaign import Campaign, Played, Round
 from mjfim.errors import ModelError, RecordingError
-from mjfim.goals import wanted_of
-from mjfim.identified import write_identified
-from mjfim.logs import read_recording
-from mjfim.plots import save, style
-from mjfim.redesign import restated
-from mjfim.setup import Setup
-from mjfim.trajectory import Design
+from mjfim.excitation.target_accuracy import wanted_of
+from mjfim.experiment.system import Setup
+from mjfim.output.archive import check_fits, estimate_summary, read_design, write_design, write_json
+from mjfim.output.mjcf.write import write_identified
+from mjfim.output.plots import style
+from mjfim.output.plots.style import save
+from mjfim.recordings.read import read_recording
+from mjfim.records.campaign import Campaign, Played, Round
+from mjfim.records.design import Design
+from mjfim.studies.redesign import restated
 
 told = Console(stderr=True, highlight=False, soft_wrap=True)
 

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from mjfim.campaign import Campaign
-from mjfim.plots import style
-from mjfim.setup import Setup
+from mjfim.experiment.system import Setup
+from mjfim.output.plots import style
+from mjfim.records.campaign import Campaign
 
 SHOWN = 8  # parameters, the wanted ones first
 

@@ -12,14 +12,15 @@ import numpy as np
 from mujoco import sysid
 from sysid_signals import Compared, Layout
 
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, ModelError
-from mjfim.identified import same_dynamics, write_spec
-from mjfim.mjcf import settle
-from mjfim.paths import INERTIAL_FIELDS, PATH, SERVO
-from mjfim.quiet import quiet
-from mjfim.setup import Setup
-from mjfim.tracks import Track, track_of
-from mjfim.trajectory import Array, Recording
+from mjfim.experiment.system import Setup
+from mjfim.identification.aligned_recording import Track, track_of
+from mjfim.model.mujoco_log import quiet
+from mjfim.model.paths import INERTIAL_FIELDS, PATH, SERVO
+from mjfim.model.spec_writer import settle
+from mjfim.output.mjcf.write import same_dynamics, write_spec
+from mjfim.records.recording import Recording
 
 REACH = 1e3  # sizes of a parameter from its guess to a bound that is not stated; sysid wants finite ones
 PROBE = 1e-2  # sizes by which parameters are moved to see whether a compile follows

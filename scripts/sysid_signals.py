@@ -14,10 +14,10 @@ import numpy as np
 from mujoco import sysid
 from scipy.interpolate import CubicSpline
 
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.noise import Noise
-from mjfim.setup import Setup
-from mjfim.trajectory import Array
+from mjfim.experiment.system import Setup
+from mjfim.plant.noise import Noise
 
 ON_STEP = 1e-6  # of an engine step: times that close to it are meant to be on it
 

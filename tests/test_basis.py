@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from mjfim.basis import fourier_basis, independent, spline_basis
+from mjfim.signals import fourier_basis, independent, spline_basis
 
 HORIZON = 2.0
 BANDWIDTH = 4.0

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjfim.audit import require_inside
-from mjfim.experiment import Experiment
-from mjfim.setup import Setup
-from mjfim.starts import starts_of
+from mjfim.excitation.initial_controls import starts_of
+from mjfim.excitation.verification import require_inside
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -11,10 +11,11 @@ import pytest
 from numpy.typing import NDArray
 
 from mjfim.errors import ExperimentError, RecordingError
-from mjfim.experiment import Experiment, Signal
-from mjfim.setup import Setup
-from mjfim.signals import generate, multisine, read_control
-from mjfim.tables.files import read_table
+from mjfim.experiment.schema import Experiment, Signal
+from mjfim.experiment.system import Setup
+from mjfim.recordings.control_table import read_control
+from mjfim.recordings.formats.read import read_table
+from mjfim.signals import generate, multisine
 
 Array = NDArray[np.float64]
 Read = Callable[..., Array]

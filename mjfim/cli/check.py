@@ -1,0 +1,52 @@
+"""`mjfim check`: what can be identified, and how well."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import mjfim
+from mjfim.cli.common import AsJson, ExperimentFile, Threads, _say, errors, progress, verb, writing
+from mjfim.experiment.system import Setup
+from mjfim.output import archive
+from mjfim.output import text as report
+from mjfim.output.folders import check_folder
+from mjfim.recordings.read import read_recording
+
+
+@verb
+def check(
+    experiment: ExperimentFile,
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(metavar="[RECORDING...]", help="Logs to look at instead.")
+    ] = None,
+    design_file: Annotated[
+        Path | None, typer.Option("--design", metavar="DESIGN.npz", help="Look at this design instead.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder for check.json and check.png.")
+    ] = None,
+    as_json: AsJson = False,
+    threads: Threads = None,
+) -> None:
+    """Say what can be identified, how well, and what only in combination; before any fit."""
+    setup = Setup(mjfim.Experiment.from_file(experiment), threads)
+    loaded = [read_recording(path, setup) for path in recordings or []]
+    trajectory = None
+    if design_file is not None:
+        trajectory = archive.read_design(design_file)["final"]
+        archive.check_fits(design_file, trajectory, setup)
+    if output is not None:
+        check_folder(output)
+    with progress() as bar:
+        bar.add_task("looking", total=None)
+        result = mjfim.check(setup, loaded, trajectory)
+    if output is not None:
+        with writing(output) as results:
+            results.leave_check(output, result)
+    _say(as_json, archive.check_summary(result), report.check_report(result))
+    if output is not None:
+        errors.print(f"wrote {output}/")
+    raise typer.Exit(0 if result.ok else 1)

@@ -1,0 +1,55 @@
+"""`mjfim replay`: results in the Rerun viewer."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import mjfim
+from mjfim.atomic_io import replacing
+from mjfim.cli.common import errors, verb
+from mjfim.errors import RecordingError
+from mjfim.experiment.system import Setup
+from mjfim.output import archive
+from mjfim.output.folders import check_file, experiment_beside, recording_of
+from mjfim.output.labels import Labels
+
+
+@verb
+def replay(
+    source: Annotated[Path, typer.Argument(metavar="DIR | FILE.rrd | DESIGN.npz", help="What to show.")],
+    save: Annotated[
+        Path | None, typer.Option(metavar="FILE.rrd", help="Write a file instead of opening the viewer.")
+    ] = None,
+    experiment: Annotated[
+        Path | None, typer.Option(help="Experiment of a DESIGN.npz that has no design.json beside it.")
+    ] = None,
+) -> None:
+    """Show a result in the Rerun viewer."""
+    from mjfim.output import rerun as rerun_log
+
+    if save is not None and save.suffix != ".rrd":
+        raise RecordingError(f"--save {save}: a Rerun file ends in .rrd")
+    target = save or Path(tempfile.mkdtemp(prefix="mjfim-")) / "replay.rrd"
+    if save is not None:
+        check_file(save)
+    if source.suffix == ".npz":
+        setup = Setup(mjfim.Experiment.from_file(experiment or experiment_beside(source)))
+        named = archive.read_design(source)
+        for trajectory in named.values():
+            archive.check_fits(source, trajectory, setup)
+        rerun_log.log_trajectories(target, setup.model_at(setup.theta), named, Labels.of(setup))
+    else:
+        found = recording_of(source)
+        if save is not None:
+            with replacing(save) as temporary:
+                shutil.copyfile(found, temporary)
+        target = save or found
+    if save is None:
+        rerun_log.show(target)
+    else:
+        errors.print(f"wrote {target}")

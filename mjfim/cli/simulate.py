@@ -1,0 +1,68 @@
+"""`mjfim simulate` and `mjfim montecarlo`: synthetic recordings and the accuracy that they lead to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import mjfim
+from mjfim.cli.common import AsJson, DesignFile, ExperimentFile, Folder, _say, errors, progress, verb, writing
+from mjfim.experiment.system import Setup
+from mjfim.output import archive
+from mjfim.output import text as report
+from mjfim.output.folders import check_file, check_folder
+
+
+@verb
+def simulate(
+    experiment: ExperimentFile,
+    design_file: DesignFile,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.csv", help="Recording to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+) -> None:
+    """Play a design on the model at its `true` values, with noise: a synthetic recording."""
+    setup = Setup(mjfim.Experiment.from_file(experiment))
+    check_file(output)
+    trajectory = archive.read_design(design_file)["final"]
+    archive.check_fits(design_file, trajectory, setup)
+    archive.write_recording(output, mjfim.simulate(setup, trajectory, seed), setup)
+    errors.print(f"wrote {output}")
+
+
+@verb
+def montecarlo(
+    experiment: ExperimentFile,
+    design_file: DesignFile,
+    output: Folder,
+    trials: Annotated[int, typer.Option(min=2, help="Trials per trajectory.")] = 1500,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+    measure_rate: Annotated[
+        float | None, typer.Option(min=0.0, help="Measurement rate [Hz]; divides the rate.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Hold the estimator against the Cramér-Rao bound, on the initial and the designed trajectory."""
+    stated = mjfim.Experiment.from_file(experiment)
+    setup = Setup(stated if measure_rate is None else stated.replace(measure_rate=measure_rate))
+    named = archive.read_design(design_file)
+    for trajectory in named.values():
+        archive.check_fits(design_file, trajectory, setup)
+    check_folder(output)
+    with progress() as bar:
+        tasks = {name: bar.add_task(f"{trials} trials, {name}", total=1.0) for name in named}
+
+        def tell(name: str, share: float) -> None:
+            bar.update(tasks[name], completed=share)
+            if not errors.is_terminal:
+                errors.print(f"{name}: {100 * share:.0f} %")
+
+        study = mjfim.monte_carlo(setup, named, trials, seed, progress=tell)
+    with writing(output) as results:
+        results.leave_study(output, study, setup)
+    _say(as_json, archive.study_summary(study), report.study_report(study, setup.units))
+    errors.print(f"wrote {output}/")
+    if len(study.sets) < len(named):
+        errors.print(f"mjfim: interrupted; only {', '.join(study.sets)} is finished")
+    raise typer.Exit(0 if len(study.sets) == len(named) and all(s.failed == 0 for s in study.sets.values()) else 1)

@@ -1,0 +1,1 @@
+"""Optimal design of excitation trajectories, with and without limits."""

@@ -1,0 +1,148 @@
+"""Descents under hard limits from one start, as tasks that may run anywhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from mjfim.arrays import Array
+from mjfim.errors import SimulationDiverged
+from mjfim.excitation.constraints import Fence, basis_of, fence_of
+from mjfim.excitation.initial_controls import Start
+from mjfim.excitation.interior_point import Ladder, Rung, Rungs, seen
+from mjfim.excitation.objective import DesignProblem, Point
+from mjfim.excitation.unconstrained import Stage, regulator_for
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.model.variants import FREE, Level
+from mjfim.parallel import stopped
+from mjfim.records.design import HistoryRow, Status
+from mjfim.signals import independent
+
+POWER = 40.0  # of the smooth E-criterion: several of the smallest eigenvalues meet under hard limits
+CALM = 100.0  # growth of deviations from which on feedback is worth the time: steps are short under hard limits
+FAINT = 3e-3  # weight of an eigenvector, over the largest, below which it is left out of the gradient
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A descent under hard limits. seconds: time it may take;  combinations: (t, s) identifiable ones, or None
+
+    added: (p, p) information of other experiments, or None;  level: of the plant;  held: shares held back
+    begun: when the design began, by `time.time`
+    """
+
+    experiment: Experiment
+    start: Start
+    rungs: Rungs
+    budget: int
+    seconds: float = np.inf
+    combinations: Array | None = None
+    added: Array | None = None
+    level: Level = FREE
+    threads: int | None = None
+    held: Mapping[str, float] = field(default_factory=dict)
+    begun: float = field(default_factory=time.time)
+
+
+@dataclass
+class Chase:
+    """Where a task has come to. control: (N, nu) the best inside all limits, else the last;  cost: J there, infinite outside"""
+
+    name: str
+    control: Array | None = None
+    cost: float = np.inf
+    status: Status = Status.INTERRUPTED
+    slope: float = np.inf
+    history: tuple[HistoryRow, ...] = ()
+    steps: int = 0
+
+
+def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[HistoryRow]:
+    """Every iterate of a task, keeping `chase` up to date. setup: of the experiment on its lifted plant, if there is one"""
+    clock = time.perf_counter()
+    repeats = task.start.repeats
+    if setup is None or repeats > 1:
+        experiment = task.experiment.replace(horizon=task.experiment.horizon / repeats)
+        setup = Setup(experiment, task.threads, task.added, task.level)
+    begun = setup.plant.steps
+    exact, smooth = Stage(setup, task.combinations).problem, smoothed(setup, task.combinations)
+    fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
+    basis = None if fine is None else independent(setup.averaged(fine))
+    regulate = replace(regulator_for(setup), calm=CALM if basis is None else np.inf)
+    fence = fence_of(setup).tightened(task.held)
+    ladder = Ladder(smooth, fence, setup.centre, basis, regulate, task.rungs)
+    control = setup.averaged(task.start.control)
+    for rung in _sound(ladder.climb(control, task.budget, clock + task.seconds), chase):
+        own = rung.iterate.point
+        point = None if own.point is None else exact.judged(_repeated(own.point, repeats))
+        chase.slope, chase.status = rung.iterate.slope, rung.status or Status.INTERRUPTED
+        chase.steps = setup.plant.steps - begun
+        cost = np.inf if point is None or not rung.feasible else point.cost
+        if cost <= chase.cost:
+            chase.control, chase.cost = np.tile(_stated(setup, own.ctrl, fine), (repeats, 1)), cost
+        if rung.mended:
+            continue
+        row = _row(rung, point, 1.0 / setup.dt, fence)
+        row = replace(row, seconds=time.time() - task.begun, steps=chase.steps)
+        chase.history += (row,)
+        yield row
+    if chase.status is Status.INTERRUPTED and chase.history:  # the rungs asked for are done
+        chase.status = Status.MAX_ITERATIONS
+    if not np.isfinite(chase.cost):
+        chase.status = Status.INFEASIBLE
+
+
+def _sound(rungs: Iterator[Rung], chase: Chase) -> Iterator[Rung]:
+    """As far as numbers go: a start that leads beyond must not end the others."""
+    try:
+        yield from rungs
+    except (SimulationDiverged, np.linalg.LinAlgError):
+        chase.status = Status.STALLED
+
+
+def _repeated(point: Point, count: int) -> Point:
+    """A point as if its trajectory were measured so many times."""
+    if count == 1 or point.information is None:
+        return point
+    others = tuple(_repeated(other, count) for other in point.others)
+    return replace(point, information=count * point.information, others=others)
+
+
+def smoothed(setup: Setup, combinations: Array | None) -> DesignProblem:
+    """The cost as it is descended under hard limits: smooth where it is E's, without faint directions."""
+    power = POWER if setup.experiment.cost.criterion == "E" else np.inf
+    smooth = Stage(setup, combinations, power).problem
+    return replace(smooth, information=replace(smooth.information, faint=FAINT))
+
+
+def _stated(setup: Setup, ctrl: Array, fine: Array | None) -> Array:
+    """A level's control on the stated grid of samples, made of the curves fine: (N * coarsen, M) there, or of anything."""
+    if setup.coarsen == 1 or fine is None:
+        return np.repeat(ctrl, setup.coarsen, axis=0)
+    return np.asarray(setup.centre + fine @ np.linalg.lstsq(setup.averaged(fine), ctrl - setup.centre)[0])
+
+
+def _row(rung: Rung, point: Point | None, rate: float, fence: Fence) -> HistoryRow:
+    criterion = None if point is None else point.criterion
+    value, smallest = (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
+    cost, i = (np.inf if point is None else point.cost), rung.iterate
+    margin = min(fence.shares(seen(i.point)).values(), default=np.nan)
+    return HistoryRow(i.index, cost, value, smallest, i.slope, i.gamma, 0.0, 0, rate, rung.mu, margin)
+
+
+def perform(task: Task) -> Chase:
+    """A task from beginning to end, for an executor; Ctrl-C, or its pool's word, ends it with the best so far."""
+    chase = Chase(task.start.name)
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            for _ in pursue(task, chase):
+                if stopped():
+                    raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        chase.status = Status.INTERRUPTED
+    return chase

@@ -1,0 +1,111 @@
+"""What a trajectory tells, and the words of warning about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from mjfim.arrays import Array
+from mjfim.errors import SimulationDiverged
+from mjfim.excitation.limits import unwatched
+from mjfim.excitation.objective import Point
+from mjfim.excitation.unconstrained import Stage, regulator_for
+from mjfim.excitation.verification import SAME, Audit
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.information.identifiability import survey
+from mjfim.optimize.lq import growth, regulator
+from mjfim.plant.plant import CENTRAL
+from mjfim.records.check import Roughness
+from mjfim.records.design import Evaluation
+from mjfim.records.trajectory import Trajectory
+
+
+def fine_point(stage: Stage, control: Array) -> Point | None:
+    """A coarse level's control at the stated rate; None where it diverges."""
+    try:
+        return stage.problem.point(stage.setup.plant.simulate(stage.setup.theta, control))
+    except SimulationDiverged:
+        return None
+
+
+def evaluate(stage: Stage, point: Point) -> Evaluation:
+    """Everything that a trajectory tells, with the regulator about it."""
+    setup, information = stage.setup, stage.problem.information
+    if point.trajectory is None or point.sensitivity is None or point.information is None or point.criterion is None:
+        raise SimulationDiverged("the trajectory diverges")
+    A, B, _, _ = setup.plant.jacobians(setup.theta, point.trajectory)
+    r = regulator_for(setup)
+    return Evaluation(
+        trajectory=point.trajectory,
+        gain=regulator(A, B, r.Q, r.R, r.terminal),
+        sensitivity=point.sensitivity.psi,
+        information=point.information,
+        eigenvalues=point.criterion.eigenvalues,
+        std=information.std(point.information),
+        min_eigenvalue=information.accumulated(point.sensitivity),
+        criterion=point.criterion.value,
+        cost=point.cost,
+        growth=growth(A),
+    )
+
+
+UNSTABLE = 1e3
+
+
+def warnings_of(
+    final: Evaluation, found: Audit, setup: Setup, clamped: tuple[str, ...], rough: Roughness | None
+) -> Iterator[str]:
+    """What a user must know about a design before running it. found: its limits at every engine step"""
+    if rough is not None:
+        yield str(rough)
+    if clamped:
+        yield (
+            f"forcerange clamps {', '.join(clamped)} along the design: its derivatives do not hold there, it may rest on "
+            "information that the clamp feigns, and the descent may have stopped early; raise cost.control or start more gently"
+        )
+    if final.growth > UNSTABLE:
+        yield (
+            f"a small disturbance grows up to {final.growth:.1e}-fold along this trajectory when its control is played "
+            "open loop; the predicted sigma assumes that there is none. Play it with the gains of design.npz, or raise "
+            "cost.control"
+        )
+    for kind, margin in found.margins.items():
+        if margin < 0.0:
+            advice = "widen it, start more gently, or give the design more time"
+            if kind in found.told:
+                advice = (
+                    "they are checked, not enforced; raise cost.control or cost.tracking until they hold before running "
+                    "this on hardware"
+                )
+            yield f"{kind} limits are exceeded by {-margin:.3g}: {advice}"
+    yield from left_open(setup)
+    if found.deviation > SAME:
+        yield (
+            f"played on the untouched model, the design deviates by up to {found.deviation:.2g}: a clamp, stop or contact acts"
+        )
+
+
+def left_open(setup: Setup) -> Iterator[str]:
+    """What the limits and boundaries that an experiment states leave open."""
+    e, model = setup.experiment, setup.model
+    rates = {limit.name for limit in setup.limits if limit.kind == "control_rate"} if e.limits.enforce else set()
+    jumps = e.limits.bandwidth is None and not rates.issuperset(setup.controls)
+    if "rest" in (e.boundary.start, e.boundary.end) and jumps:
+        yield (
+            "the control may jump where the design begins and ends at rest: for a smooth start state limits.control_rate or "
+            "limits.bandwidth"
+        )
+    if e.limits.enforce:
+        unseen = unwatched(model)
+        if unseen:
+            yield f"the MJCF's ranges of {', '.join(unseen)} are no limits of the design: the simulation runs into them as it is"
+
+
+def evaluate_trajectory(experiment: Experiment | Setup, trajectory: Trajectory) -> Evaluation:
+    """What a given trajectory's control tells about the parameters at the experiment's theta."""
+    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
+    point = setup.problem.point(setup.plant.simulate(setup.theta, trajectory.ctrl), CENTRAL)
+    if point.trajectory is None or point.sensitivity is None:
+        raise SimulationDiverged("the trajectory diverges when the parameters move a little")
+    stage = Stage(setup, survey(setup, point.trajectory, point.sensitivity).basis)
+    return evaluate(stage, stage.problem.judged(point))

@@ -1,0 +1,337 @@
+"""Designs under hard limits: `log J + mu * barrier`, mu falling in stages (Hauser & Saccon 2006).
+
+The logarithm makes the cost free of scale, so that one ladder of mu fits every experiment; its minima are those of J.
+The barrier is relaxed: it stays defined outside, and an infeasible start is first driven inside without any cost.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.excitation.constraints import Fence, Sight
+from mjfim.excitation.objective import DIVERGED, DesignProblem, Point
+from mjfim.optimize.barrier import Hedge
+from mjfim.optimize.lq import TangentCurve
+from mjfim.optimize.projection_operator import Armijo, Expansion, Iterate, Regulator, optimize
+from mjfim.optimize.structured_bfgs import StructuredBFGS
+from mjfim.records.design import Status
+
+
+@dataclass(frozen=True, eq=False)
+class InteriorPoint:
+    """A trajectory with its cost and its limits. A diverged trial has no sight and infinite value.
+
+    point: with the cost J, or None where only the limits are looked at;  merit: log J, 0 without
+    barrier: its value, mu left out
+    """
+
+    sight: Sight | None
+    point: Point | None
+    merit: float
+    barrier: float
+
+    @property
+    def ctrl(self) -> Array:
+        """(N, nu)"""
+        return seen(self).trajectory.ctrl
+
+
+DIVERGED_POINT = InteriorPoint(None, None, np.inf, np.inf)
+
+
+def seen(point: InteriorPoint) -> Sight:
+    """What its limits look at. Raises ValueError for a diverged trial."""
+    if point.sight is None:
+        raise ValueError("a diverged trial has no trajectory")
+    return point.sight
+
+
+@dataclass(frozen=True, eq=False)
+class InteriorProblem:
+    """`log J + mu B` as Algorithm 1 wants it; D-optimality has its logarithm in it already and is counted per parameter.
+
+    costs: False where only the limits are to be met;  delta: relaxation of the barrier
+    """
+
+    base: DesignProblem
+    fence: Fence
+    mu: float
+    delta: float
+    costs: bool = True
+
+    def point(self, ctrl: Array) -> InteriorPoint:
+        """Evaluate along the open-loop trajectory of a control."""
+        watched = self.base.plant.watch(self.base.theta, ctrl, self.fence.taps)
+        if watched is None:
+            return DIVERGED_POINT
+        sight = self.fence.sight(*watched, slopes=False)
+        barrier = self.fence.value(sight, self.delta)
+        if not self.costs:
+            return InteriorPoint(sight, None, 0.0, barrier)
+        point = self.base.point(sight.trajectory, self.base.plant.draft)
+        return DIVERGED_POINT if point is DIVERGED else InteriorPoint(sight, point, self._merit(point), barrier)
+
+    def again(self, point: InteriorPoint) -> InteriorPoint:
+        """A point of a problem that differs from this one in criterion, mu, delta or the fence's bounds."""
+        if point.sight is None or point.point is None:
+            return point
+        judged = self.base.judged(point.point)
+        return InteriorPoint(point.sight, judged, self._merit(judged), self.fence.value(point.sight, self.delta))
+
+    def _merit(self, point: Point) -> float:
+        if self.base.information.criterion == "D":
+            return point.cost / self._nats(point)
+        return float(np.log(point.cost)) if point.cost > 0.0 and np.isfinite(point.cost) else np.inf
+
+    def _share(self, point: InteriorPoint) -> float:
+        """dJ over the change of the merit."""
+        if point.point is None:
+            return 1.0
+        return self._nats(point.point) if self.base.information.criterion == "D" else point.point.cost
+
+    def _nats(self, point: Point) -> float:
+        count = 1 if point.criterion is None else len(point.criterion.eigenvalues)
+        return self.base.information.weight * count
+
+    def value(self, point: InteriorPoint) -> float:
+        """`log J + mu B`."""
+        return point.merit + self.mu * point.barrier
+
+    def size(self, point: InteriorPoint) -> float:
+        """One e-fold of J, or the barrier where that is more; without a cost, the barrier in full."""
+        return max(1.0, abs(point.barrier) * (self.mu if self.costs else 1.0))
+
+    def expand(self, point: InteriorPoint) -> Expansion:
+        """Expansion of the sum; the barrier's share stands apart as well."""
+        sight = seen(point)
+        sight = self.fence.sight(sight.trajectory, sight.tapped, slopes=True)
+        if point.point is None:
+            A, B, rise = self.base.plant.tapped(self.base.theta, sight.trajectory, self.fence.taps)
+            e = Expansion(A, B, np.zeros((len(A) + 1, A.shape[1])), np.zeros((len(A), B.shape[2])))
+        else:
+            e, found = self.base.tapped(point.point, self.fence.taps)
+            if found is None:
+                raise ValueError("an expansion along a criterion without directions")
+            rise = found
+        share = self._share(point)
+        hedge: Hedge = self.fence.expand(sight, rise, self.delta).times(self.mu)
+        return Expansion(e.A, e.B, e.a / share + hedge.a, e.b / share + hedge.b, None, hedge, e.spectral)
+
+    def project(self, point: InteriorPoint, zeta: TangentCurve, gamma: float, K: Array) -> InteriorPoint:
+        """P(xi + gamma zeta), evaluated."""
+        trajectory = seen(point).trajectory
+        if not K.any():
+            return self.point(trajectory.ctrl + gamma * zeta.v)
+        moved = self.base.plant.project(self.base.theta, trajectory, zeta, gamma, K)
+        return DIVERGED_POINT if moved is None else self.point(moved.ctrl)
+
+    def difference(self, new: InteriorPoint, old: InteriorPoint) -> TangentCurve:
+        """(x_new - x_old, u_new - u_old)."""
+        return self.base.plant.difference(seen(new).trajectory, seen(old).trajectory)
+
+    def refine(self, point: InteriorPoint) -> InteriorPoint | None:
+        """Never: the ladder of mu ends before the differences matter."""
+        return None
+
+
+FACTOR = 3.0  # between rungs
+RELAXED = 0.3  # delta over mu
+WIDEST = 0.1  # delta at most
+SHRUNK = np.concatenate([[1.0, 0.997, 0.99, 0.97, 0.94, 0.9], 0.8 ** np.arange(1, 24)])  # of a start, tried in turn
+HOLDING = 4e-3  # mu from which on leaks are answered
+SPARE = 1.2  # what was outside at the end of a rung is held back on the next by that much of it
+SLACK = 1.5  # of the time that is left per rung, what one may take
+AGAIN = 3  # times that the last rung is repeated because of leaks, at most
+FARTHEST_START = 1.0  # of a start beyond its limits, over half of their ranges, that is begun with as it is
+
+
+ROUNDS, FEW = 60, 20  # iterations towards the inside, the latter where shrinking leads there too
+
+
+@dataclass(frozen=True)
+class Rungs:
+    """first, last: mu;  patience: iterations per rung at most, twice as many on the last
+
+    settled: progress over `window` iterations, over mu, below which a rung is done;  tolerance: slope at which the last is
+    """
+
+    first: float = 0.1
+    last: float = 1e-4
+    patience: int = 40
+    settled: float = 2.0
+    window: int = 8
+    tolerance: float = 1e-5
+
+    def ladder(self) -> list[float]:
+        """Every mu, from the first to the last."""
+        count = max(round(np.log(self.first / self.last) / np.log(FACTOR)), 1)
+        return [float(mu) for mu in np.geomspace(self.first, self.last, count + 1)]
+
+
+@dataclass(frozen=True, eq=False)
+class Rung:
+    """An iterate on the ladder. margins: worst of each kind;  status: set on the very last one
+
+    mended: no iterate, but the one before shrunk until it kept all limits
+    """
+
+    iterate: Iterate[InteriorPoint]
+    mu: float
+    margins: dict[str, float]
+    status: Status | None = None
+    mended: bool = False
+
+    @property
+    def feasible(self) -> bool:
+        """Inside all limits."""
+        return all(margin >= 0.0 for margin in self.margins.values())
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """Where a descent begins. control: (N, nu), or None where all diverge;  iterations: that it took to get there"""
+
+    control: Array | None
+    iterations: int
+
+
+@dataclass
+class Ladder:
+    """One descent. base: the cost on the lifted plant;  basis: (N, M) what the control minus centre is made of, or None
+
+    centre: (nu,) control about which a start is shrunk until it is inside
+    """
+
+    base: DesignProblem
+    fence: Fence
+    centre: Array
+    basis: Array | None
+    regulate: Regulator
+    rungs: Rungs = Rungs()
+
+    def climb(self, control: Array, budget: int, until: float = np.inf) -> Iterator[Rung]:
+        """Every iterate from a control: (N, nu), at most `budget`, until a time of `time.perf_counter`."""
+        entry = yield from self._entered(control, min(budget, ROUNDS), until)
+        if entry.control is not None:
+            yield from self._down(entry.control, self._direction(), budget, until, entry.iterations)
+
+    def _entered(self, control: Array, budget: int, until: float) -> Generator[Rung, None, Entry]:
+        """A control inside all limits or near them; of those far outside, shrunk about the centre or steered, what costs less."""
+        fitted = self._fitted(control)
+        if self._near(fitted):
+            return Entry(fitted, 0)
+        shrunk = self.inside(fitted)
+        rung: Rung | None = None
+        for rung in self._steered(fitted, budget if shrunk is None else min(budget, FEW), until):
+            yield rung
+        if rung is None:
+            return Entry(shrunk, 0)
+        steered, taken = rung.iterate.point.ctrl, rung.iterate.index + 1
+        if shrunk is None:
+            return Entry(steered, taken)
+        problem = InteriorProblem(self.base, self.fence, self.rungs.first, WIDEST)
+        entries = [shrunk, steered] if rung.feasible else [shrunk]
+        values = [problem.value(problem.point(ctrl)) for ctrl in entries]
+        return Entry(entries[int(np.argmin(values))], taken)
+
+    def _near(self, control: Array) -> bool:
+        """What a relaxed barrier brings back inside on its way down: an end that is missed can be any number of its bands off."""
+        point = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False).point(control)
+        if point.sight is None:
+            return False
+        return all(
+            s > -FARTHEST_START for kind, s in self.fence.shares(point.sight).items() if not kind.startswith("end_")
+        )
+
+    def _direction(self) -> StructuredBFGS:
+        N = len(self.base.running.desired) - 1
+        ridge = 0.03 / N / self.fence.control.scale**2
+        return StructuredBFGS(ridge, self.basis)
+
+    def _fitted(self, control: Array) -> Array:
+        """The nearest control that the basis can make."""
+        if self.basis is None:
+            return control
+        return np.asarray(self.centre + self.basis @ np.linalg.lstsq(self.basis, control - self.centre)[0])
+
+    def inside(self, control: Array) -> Array | None:
+        """A control shrunk about the centre until all limits hold; None where even the least one leaves them."""
+        problem = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False)
+        for share in SHRUNK:
+            candidate = control if share == 1.0 else self.centre + share * (control - self.centre)
+            point = problem.point(candidate)
+            if point.sight is not None and all(m > 0.0 for m in self.fence.margins(point.sight).values()):
+                return np.asarray(candidate)
+        return None
+
+    def _steered(self, control: Array, budget: int, until: float) -> Iterator[Rung]:
+        """Iterates towards the inside, without any cost."""
+        problem = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False)
+        begin = problem.point(control)
+        if begin.sight is None:  # it diverges
+            return
+        for iterate in optimize(problem, begin, self._direction(), self.regulate, Armijo(), 1e-6, budget):
+            margins = self.fence.margins(seen(iterate.point))
+            rung = Rung(iterate, np.inf, margins)
+            yield rung
+            if all(m > 0.0 for m in margins.values()) or time.perf_counter() > until:
+                return
+
+    def _down(self, control: Array, direction: StructuredBFGS, budget: int, until: float, done: int) -> Iterator[Rung]:
+        r, held, budget = self.rungs, dict[str, float](), budget + done
+        ladder = r.ladder()
+        point = InteriorProblem(self.base, self.fence, r.first, WIDEST).point(control)
+        if point.sight is None:  # it diverges where the parameters move a little
+            return
+        for i, mu in enumerate([*ladder, *ladder[-1:] * AGAIN]):
+            left, last, now = max(len(ladder) - i, 1), i >= len(ladder) - 1, time.perf_counter()
+            deadline = until if last else min(until, now + SLACK * (until - now) / left)
+            patience = min(r.patience * (2 if last else 1), -(-(budget - done) // left) if left > 1 else budget - done)
+            fence = self.fence.tightened(held)
+            problem = InteriorProblem(self.base, fence, mu, min(WIDEST, RELAXED * mu))
+            point = problem.again(point)
+            values: list[float] = []
+            tight = min(r.tolerance, Rungs.tolerance)  # what leaks is mended by less slope than many a stated tolerance
+            for iterate in optimize(problem, point, direction, self.regulate, Armijo(), tight, patience):
+                point, margins = iterate.point, self.fence.margins(seen(iterate.point))
+                kept = all(m >= 0.0 for m in margins.values())
+                status = Status.CONVERGED if iterate.slope <= r.tolerance else iterate.status
+                status = status if last and kept else None
+                yield Rung(replace(iterate, index=done + iterate.index), mu, margins, status)
+                if status is Status.CONVERGED:
+                    return
+                values.append(iterate.value)
+                settled = len(values) > r.window and values[-1 - r.window] - values[-1] < r.settled * mu
+                if time.perf_counter() > deadline or (settled and not last):
+                    break
+            done += iterate.index
+            over = done >= budget or time.perf_counter() > until
+            if not kept:
+                yield from self._mended(problem, iterate, mu, done)
+            if over or (last and kept):
+                return
+            if mu <= HOLDING:
+                held = held_back(held, self.fence.shares(seen(point)))
+
+    def _mended(
+        self, problem: InteriorProblem, iterate: Iterate[InteriorPoint], mu: float, done: int
+    ) -> Iterator[Rung]:
+        """An iterate that leaks, shrunk until it does not: the best so far in case that nothing follows."""
+        control = self.inside(iterate.point.ctrl)
+        if control is not None:
+            point = replace(problem, fence=self.fence).point(control)
+            if point.sight is not None:
+                own = replace(iterate, index=done, point=point, value=problem.value(point), gamma=0.0, status=None)
+                yield Rung(own, mu, self.fence.margins(point.sight), mended=True)
+
+
+def held_back(held: Mapping[str, float], shares: Mapping[str, float]) -> dict[str, float]:
+    """How far each kind is held back from its bounds next: more where it was outside, less where it was well inside."""
+    return {
+        kind: max(0.0, held.get(kind, 0.0) - share * (SPARE if share < 0.0 else 0.5)) for kind, share in shares.items()
+    }

@@ -1,0 +1,69 @@
+"""Several experiments about the same parameters, whose information adds up, designed together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.excitation.design import Monitor, design
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.information.identifiability import survey
+from mjfim.information.marginal import shared
+from mjfim.plant.plant import CENTRAL
+from mjfim.records.design import Design
+
+
+def design_together(
+    experiments: Sequence[Experiment],
+    monitor: Monitor | None = None,
+    rounds: int = 5,
+    tolerance: float = 1e-3,
+    threads: int | None = None,
+) -> tuple[Design, ...]:
+    """Design each experiment in turn, given what the others tell, until none improves the criterion by more than tolerance.
+
+    The designs depend on each other through the sum of their information alone, so where no single one can improve, none
+    of them together can to first order. `final.information` of each design holds all of it; deviations of the start are
+    each experiment's own, all other nuisance is common. The experiments state the same parameters in the same order;
+    raises ExperimentError where they do not. See also `design`.
+    """
+    setups = [Setup(experiment, threads) for experiment in experiments]
+    names = [setup.parameters.names for setup in setups]
+    if len(setups) < 2 or any(own != names[0] for own in names):
+        told = "; ".join(", ".join(own) for own in names)
+        raise ExperimentError(
+            f"design_together takes two or more experiments with the same parameters in one order: {told}"
+        )
+    tells = [_data(setup) for setup in setups]
+    controls: list[Array | None] = [None] * len(setups)
+    designs: list[Design] = []
+    last = np.inf
+    for _ in range(rounds):
+        designs = []
+        for i, setup in enumerate(setups):
+            others = sum((tells[j] for j in range(len(setups)) if j != i), start=np.zeros_like(tells[0]))
+            found = design(Setup(setup.experiment, threads, added=others), monitor, controls[i])
+            controls[i] = found.trajectory.ctrl
+            tells[i] = found.data
+            designs.append(found)
+        reached = designs[-1].final.criterion
+        if last - reached <= tolerance * abs(reached):
+            break
+        last = reached
+    return tuple(designs)
+
+
+def _data(setup: Setup) -> Array:
+    """What the initial control tells about the parameters that all experiments share."""
+    point = setup.problem.point(setup.initial, CENTRAL)
+    if point.information is None or point.sensitivity is None:
+        raise SimulationDiverged("the simulation diverges when the parameters move a little along the initial control")
+    seen = survey(setup, setup.initial, point.sensitivity)
+    information = replace(setup.information, basis=seen.here.basis if seen.here.count else None)
+    p = setup.parameters
+    return shared(information.visible(point.information - setup.information.prior), p.prior_information, p.private)

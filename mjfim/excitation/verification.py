@@ -1,0 +1,148 @@
+"""The limits at every engine step of the model as the user wrote it: clamps, stops, contacts and all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError
+from mjfim.excitation.constraints import Fence, Sight, basis_of, fence_of
+from mjfim.experiment.system import Setup
+from mjfim.plant.batch import Engine
+from mjfim.records.design import Usage
+from mjfim.records.trajectory import Trajectory
+
+SAME = 1e-6  # deviation of a state, in its unit, up to which two simulations are the same
+
+
+@dataclass(frozen=True)
+class Audit:
+    """margins: worst of each kind over all engine steps, in its unit, negative outside
+
+    deviation: largest difference of a state at the samples from the trajectory that was designed
+    shares: the margins over half of each range;  told: kinds that are checked, not enforced
+    usage: of every limit over time
+    """
+
+    margins: dict[str, float]
+    shares: dict[str, float]
+    deviation: float
+    told: frozenset[str] = frozenset()
+    usage: tuple[Usage, ...] = ()
+
+    @property
+    def kept(self) -> bool:
+        """Every limit that is enforced holds."""
+        return all(margin >= 0.0 for kind, margin in self.margins.items() if kind not in self.told)
+
+
+def audit(setup: Setup, trajectory: Trajectory) -> Audit:
+    """Play a trajectory's control open loop on the untouched model at the design's theta."""
+    fence = fence_of(setup, every=True)
+    told = frozenset() if setup.experiment.limits.enforce else {"clearance", *(limit.kind for limit in setup.limits)}
+    model = setup.model_at(setup.theta)
+    engine = Engine(model, setup.substeps)
+    out = engine.rollout([model], setup.plant.start(setup.theta)[None], trajectory.ctrl[None], fence.taps)
+    if not out.finite[0] or out.tapped is None:
+        lost = dict.fromkeys((*fence.kinds, "simulation"), -np.inf)
+        return Audit(lost, lost, np.inf, frozenset(told))
+    played = setup.plant.trajectory(out.states[0], trajectory.ctrl)
+    sight = replace(fence, clearance=None).sight(played, out.tapped[0], slopes=False)
+    margins, shares = fence.margins(sight), fence.shares(sight)
+    usage = [*_usage(setup, fence, sight)]
+    if fence.clearance is not None:
+        positions = _positions(setup, engine, played)
+        distance, _, pair = fence.clearance.nearest(positions)
+        margins["clearance"] = distance - fence.least
+        over = np.maximum(fence.clearance(positions, slopes=False).d.min(axis=1), 1e-9)
+        t = np.arange(1, len(positions) + 1) * setup.dt / setup.substeps
+        usage.append(Usage("clearance", pair.name, t, fence.least / over))
+        shares["clearance"] = margins["clearance"] / fence.least
+    deviation = float(np.abs(setup.space.minus(played.state, trajectory.state)).max())
+    return Audit(margins, shares, deviation, frozenset(told), tuple(usage))
+
+
+def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[Usage]:
+    """Of whatever has a range, within samples at every engine step."""
+    N, substeps, w = sight.tapped.shape
+    tapped, ctrl = sight.tapped.reshape(N * substeps, w), sight.trajectory.ctrl
+    t = np.arange(1, len(tapped) + 1) * setup.dt / setup.substeps
+    for kind, name, share in zip(fence.kinds, fence.names, fence.shown.share(tapped).T, strict=True):
+        yield Usage(kind, name, t, share)
+    bands = [("control", fence.control, ctrl, setup.t)]
+    if fence.rate is not None:
+        bands.append(("control_rate", fence.rate, fence.rates(ctrl), np.append(setup.t, setup.t[-1] + setup.dt)))
+    for kind, band, values, times in bands:
+        for i, name in enumerate(setup.controls):
+            if np.isfinite(band.lower[i]) or np.isfinite(band.upper[i]):
+                yield Usage(kind, name, times, band.share(values)[:, i])
+
+
+def _positions(setup: Setup, engine: Engine, played: Trajectory) -> Array:
+    """(N * substeps, nq) positions at every engine step."""
+    fine = Engine(engine.model, 1)
+    held = np.repeat(played.ctrl, setup.substeps, axis=0)
+    return np.asarray(fine.rollout([engine.model], played.state[:1], held[None]).states[0][1:, : setup.space.nq])
+
+
+def require_inside(setup: Setup) -> None:
+    """Raise ExperimentError where limits cannot be, exclude the start or the end, or either cannot be held at rest."""
+    try:
+        fence = fence_of(setup, every=True)
+        basis_of(setup, setup.stated_times)
+        places = {"the start": setup.plant.start(setup.theta)}
+        if setup.experiment.boundary.end == "rest":
+            places["the end"] = setup.target
+        if setup.experiment.limits.enforce:
+            for where, state in places.items():
+                _require_inside(setup, fence, where, state)
+            start, end = setup.plant.start(setup.theta), setup.target
+            for where, state, hold in (("boundary.start", start, fence.before), ("boundary.end", end, fence.after)):
+                if hold is not None:
+                    _require_held(setup, where, state, hold)
+    except ExperimentError as error:
+        raise ExperimentError(f"{setup.experiment.source}: {error}") from None
+
+
+def _require_inside(setup: Setup, fence: Fence, where: str, state: Array) -> None:
+    qpos, qvel, _ = setup.space.split(state)
+    units = {c.name: c.unit for c in setup.coordinates}
+    for limit in setup.limits:
+        if limit.kind in ("position", "velocity"):
+            value = float((qpos if limit.kind == "position" else qvel)[limit.index])
+            if not limit.lower <= value <= limit.upper:
+                unit = units[limit.name] + ("/s" if limit.kind == "velocity" else "")
+                raise ExperimentError(
+                    f"limits.{limit.kind}.{limit.name}: {where} is at {value:g} {unit}, outside "
+                    f"[{limit.lower:g}, {limit.upper:g}]; widen the limit (where it is the MJCF's, there) or move {where}"
+                )
+    if fence.clearance is not None:
+        distance, _, pair = fence.clearance.nearest(state[None, : setup.space.nq])
+        if distance < fence.least:
+            what = "in collision" if distance < 0.0 else "too close"
+            raise ExperimentError(
+                f"limits.clearance: {where} is {what}: {pair.name} are {distance:.3g} m apart, wanted {fence.least:g} m; "
+                f"move {where}, lower the clearance, or list the pair's bodies in limits.ignored"
+            )
+
+
+def _require_held(setup: Setup, where: str, state: Array, hold: Array) -> None:
+    model = setup.plant.model(setup.theta)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:] = setup.space.split(state)
+    data.ctrl[:] = hold
+    mujoco.mj_forward(model, data)
+    needed = {"control": hold, "force": data.actuator_force, "joint_force": data.qfrc_actuator}
+    for limit in setup.limits:
+        if limit.kind in needed and not limit.lower <= needed[limit.kind][limit.index] <= limit.upper:
+            what = (
+                "limits.force or the MJCF's actuatorfrcrange" if limit.kind == "joint_force" else f"limits.{limit.kind}"
+            )
+            raise ExperimentError(
+                f"{where}: holding still takes {limit.name} = {needed[limit.kind][limit.index]:.4g}, outside "
+                f"{what} [{limit.lower:g}, {limit.upper:g}]"
+            )

@@ -1,0 +1,1 @@
+"""What the user states (schema), and the system that it resolves to."""

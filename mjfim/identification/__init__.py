@@ -1,0 +1,1 @@
+"""Parameter estimation from recordings by multiple shooting, and its diagnostics."""

@@ -1,0 +1,376 @@
+"""Batch least squares in MuJoCo: `min_theta sum_k |Sigma^-1/2 (y~_k - y_k(theta))|^2` over one or several recordings.
+
+The Jacobian is the sensitivity G = dy/dtheta. `newton` is the paper's Newton-Raphson with the Hessian of its Fisher
+information (Gauss-Newton); the default is Levenberg-Marquardt inside the bounds.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, TypeVar, get_args
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from mjfim.arrays import Array, thinned
+from mjfim.errors import ExperimentError, SimulationDiverged, unknown
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.identification.accuracy import Accuracy, accuracy
+from mjfim.identification.cross_validation import predicted
+from mjfim.identification.fit_quality import Left, left
+from mjfim.identification.missing_terms import suspects
+from mjfim.identification.residual_tests import reasons, smaller
+from mjfim.identification.residuals import LARGE, Fit
+from mjfim.information.null_space import Null, invisible
+from mjfim.model.parameter_samples import sampled
+from mjfim.model.parameters import ParameterSet
+from mjfim.optimize.levenberg_marquardt import INTERRUPTED, Progress, Search, Solution, Unknowns, completed, minimise
+from mjfim.plant.noise import Noise
+from mjfim.recordings.plausibility import doubts
+from mjfim.records.estimate import Estimate, Suspect
+from mjfim.records.recording import Recording
+
+NEWTON = Search(iterations=50, tolerance=1e-5, damped=False)
+SETTLED = 0.01  # relative change of a sigma that is estimated, below which it is
+ROUNDS = 10  # of estimating sigmas
+FLOOR = 1e-3  # of the stated sigma, below which an estimated one does not fall
+CLOSE = 1e-3  # standard deviations, a step below which is the last
+NUDGES = 2  # iterations for the starts of all pieces of much data, before theta moves again
+BRIEF = 8  # iterations of a further start, before the best goes on
+SAMPLE = 40_000  # samples of a part of the data on which a search over much of it begins
+FAR = 4.0  # prior standard deviations from the guess that are worth a word
+Method = Literal["least_squares", "newton"]
+Tell = Callable[[str, Progress], None]
+Found = TypeVar("Found")
+
+
+def identify(
+    experiment: Experiment | Setup,
+    recordings: Sequence[Recording],
+    method: Method = "least_squares",
+    start: Array | None = None,
+    held_out: Sequence[Recording] = (),
+    tell: Tell | None = None,
+) -> Estimate:
+    """Estimate the parameters from recordings, starting at the guess (or `start`: (p,)), as the table `fit` says.
+
+    The stated std is formal: it is accuracy only if the model and the noise are right; `misfit` says when they are not, and
+    `interval` is honest where residuals follow one another.
+    held_out: recordings that are predicted, not fitted;  tell: called with every iterate, and what it belongs to
+    Ctrl-C ends the search with the best so far. Raises RecordingError for unusable recordings, SimulationDiverged where the
+    model diverges at the start.
+    """
+    if method not in get_args(Method):
+        raise ExperimentError(unknown("method", method, get_args(Method)))
+    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
+    theta0 = setup.parameters.guess if start is None else np.asarray(start, dtype=np.float64)
+    if theta0.shape != setup.parameters.guess.shape:
+        raise ExperimentError(
+            f"start: {theta0.shape} numbers, wanted one per parameter: {', '.join(setup.parameters.names)}"
+        )
+    if method == "least_squares":
+        theta0 = np.clip(theta0, setup.parameters.lower, setup.parameters.upper)
+    with threadpool_limits(1, user_api="blas"):  # small matrices: threads of BLAS only wait for each other
+        return _Identification(setup, recordings, method, theta0, held_out, tell).run()
+
+
+def least_squares(fit: Fit, start: Array, search: Search | None = None) -> Solution:
+    """Levenberg-Marquardt inside the bounds from theta: (p,). Raises SimulationDiverged where that diverges.
+
+    Half a search is none: Ctrl-C is raised anew.
+    """
+    found = completed(fit, fit.begin(start), search or Search())
+    if found is None:
+        raise SimulationDiverged("the simulation diverges at the start of the fit")
+    return found
+
+
+def newton_raphson(fit: Fit, start: Array) -> Solution:
+    """The paper's iterator `theta - (J'J)^-1 J'r`, its step halved while the residual would grow. Bounds are not used.
+
+    Stops when a step is below 1e-5 standard deviations. Raises SimulationDiverged where the start diverges.
+    """
+    return least_squares(fit.unbounded(), start, NEWTON)
+
+
+class _Identification:
+    """One call of `identify`. fit: with the noise as known by now"""
+
+    def __init__(
+        self,
+        setup: Setup,
+        recordings: Sequence[Recording],
+        method: Method,
+        theta0: Array,
+        held_out: Sequence[Recording],
+        tell: Tell | None,
+    ) -> None:
+        self.clock, self.steps = time.perf_counter(), setup.plant.steps
+        self.setup, self.method, self.theta0, self.tell = setup, method, theta0, tell
+        fit = Fit(setup, recordings)
+        self.fit = fit.unbounded() if method == "newton" else fit
+        self.held_out = Fit(setup, held_out) if held_out else None
+        self.interrupted = False
+        self.stated = setup.experiment.fit.noise == "stated"
+        if not self.stated and setup.noise.correlated:
+            raise ExperimentError(
+                f'{setup.experiment.source}: fit.noise = "estimated" takes outputs as uncorrelated; take `correlated` out'
+            )
+
+    def run(self) -> Estimate:
+        """From the start to the report."""
+        fit, setup = self.fit, self.setup
+        begin = fit.begin(self.theta0)
+        if not np.isfinite(self._sample(fit).cost(self._sampled(begin))):
+            raise SimulationDiverged(
+                f"the simulation diverges at the start {dict(zip(setup.parameters.names, self.theta0, strict=True))}"
+            )
+        null = self._null(fit)
+        fit.pin(self.theta0, null)
+        solution = self._settled(self._best(begin))
+        return self._report(solution, null)
+
+    def _null(self, fit: Fit) -> Null:
+        """Directions of theta that neither the recordings nor the priors tell, at the start of the search."""
+        p, some = self.setup.parameters, self._sample(fit)
+        J, error = (np.concatenate(part) for part in zip(*some.sensed(some.begin(self.theta0)), strict=True))
+        weight = np.sqrt(np.diag(np.diag(p.prior_information)))
+        J, error = np.concatenate([J, weight]), np.concatenate([error, np.zeros_like(weight)])
+        return invisible(J, error, p.step, p.scale, np.arange(len(p)), np.zeros_like(weight))
+
+    def _sample(self, fit: Fit) -> Fit:
+        """Of the pieces that are quick to look at."""
+        return fit.part(self._places)
+
+    @cached_property
+    def _places(self) -> np.ndarray:
+        """Pieces all over the data that are quick to look at; all of them where that is quick."""
+        fit, count = self.fit, len(self.fit.pieces)
+        quick = fit.samples <= SAMPLE or count == 1
+        return thinned(count, count if quick else max(int(SAMPLE * count / fit.samples), 1))
+
+    def _sampled(self, at: Unknowns) -> Unknowns:
+        return replace(at, starts=at.starts[self._places])
+
+    @property
+    def _search(self) -> Search:
+        """What the user stated; much data is not linearised more often than is needed."""
+        if self.method == "newton":
+            return NEWTON
+        search = Search(iterations=self.setup.experiment.fit.max_iterations, tolerance=CLOSE)
+        if self.fit.samples * 2 * len(self.setup.parameters) >= LARGE * 10:
+            return replace(search, tolerance=1e-2, fresh=False)
+        return search
+
+    def _told(self, what: str) -> Callable[[Progress], None] | None:
+        tell = self.tell
+        return None if tell is None else (lambda progress: tell(what, progress))
+
+    def _minimise(self, fit: Fit, at: Unknowns, search: Search, what: str) -> Solution:
+        if self.interrupted:  # where all stands by now, for the report
+            search = replace(search, iterations=0)
+        found = minimise(fit, at, search, self._told(what))
+        if found is not None and (found.interrupted or self.interrupted):
+            self.interrupted = True
+            return replace(found, interrupted=True, success=False, status=INTERRUPTED)
+        if found is None:
+            raise SimulationDiverged(f"the simulation diverges next to the start of the fit ({what})")
+        return found
+
+    def _placed(self, fit: Fit, begin: Unknowns, iterations: int) -> Unknowns:
+        """Starts that the data show roughly, at their best for theta as it is: far from it, theta would follow their errors."""
+        if not fit.measured or self.interrupted:
+            return begin
+        search = Search(iterations=iterations, tolerance=0.1, fresh=False)
+        found = minimise(fit.frozen(), begin, search, self._told("where pieces start"))
+        self.interrupted = found is not None and found.interrupted
+        return begin if found is None else found.unknowns
+
+    def _best(self, begin: Unknowns) -> Unknowns:
+        """Where the search over all data begins: the best end of short searches from several starts, on some of the data."""
+        some, count = self._sample(self.fit), self.setup.experiment.fit.starts
+        whole = len(some.pieces) == len(self.fit.pieces)
+        placed = self._placed(some, self._sampled(begin), BRIEF)
+        if whole and count == 1:
+            return placed
+        found = [self._minimise(some, placed, replace(self._search, fresh=False), "some of the data")]
+        for k, theta in enumerate([] if self.interrupted else self._thetas(count)):
+            search = Search(iterations=BRIEF, tolerance=1e-2, fresh=False)
+            try:
+                other = minimise(some, some.begin(theta), search, self._told(f"start {k + 2} of {count}"))
+            except KeyboardInterrupt:  # before its first iterate
+                self.interrupted = True
+                break
+            if other is not None:
+                found.append(other)
+                self.interrupted = other.interrupted
+            if self.interrupted:
+                break
+        best = min(found, key=lambda s: s.cost).unknowns
+        if whole:
+            return best
+        starts = np.array(begin.starts)
+        starts[self._places] = best.starts
+        return self._placed(self.fit, replace(best, starts=starts), NUDGES)
+
+    def _thetas(self, count: int) -> Array:
+        """(count - 1, p) random starts."""
+        if count == 1:
+            return np.zeros((0, len(self.theta0)))
+        setup = self.setup
+        seed = setup.experiment.fit.seed
+        return sampled(setup.parameters, self.theta0, count, seed, setup.impossible)[1:]
+
+    def _settled(self, begin: Unknowns) -> Solution:
+        """The minimum, with sigmas that agree with the residuals where they are to be estimated."""
+        solution = self._minimise(self.fit, begin, self._search, "all data")
+        for _ in range(0 if self.stated else ROUNDS):
+            if solution.interrupted:
+                break
+            before = self.fit.noise.sigma
+            sigma = self._sigma(solution.unknowns)
+            self.fit = self.fit.reweighted(Noise(np.diag(sigma**2), self.fit.noise.strides))
+            change = float(np.abs(sigma / before - 1.0).max())
+            solution = self._minimise(self.fit, solution.unknowns, self._search, "all data, sigmas estimated")
+            if change < SETTLED:
+                break
+        return solution
+
+    def _sigma(self, at: Unknowns) -> Array:
+        """(ny,) of the residuals; with a robust loss from their median, which outliers hardly move."""
+        fit, robust = self.fit, self.setup.experiment.fit.loss != "linear"
+        values = fit.predicted(at)
+        if values is None:
+            return np.array(fit.noise.sigma)
+        sigma, free = np.array(fit.noise.sigma), fit.count / max(fit.count - fit.size, 1)
+        for j, r in enumerate(fit.errors(values)):
+            if len(r):
+                spread = 1.4826 * float(np.median(np.abs(r))) if robust else float(np.sqrt(np.mean(r**2) * free))
+                sigma[j] = max(spread, FLOOR * self.setup.noise.sigma[j])
+        return sigma
+
+    def _report(self, solution: Solution, null: Null) -> Estimate:
+        setup, fit, at = self.setup, self.fit, solution.unknowns
+        p, theta, rest = setup.parameters, fit.theta(at), left(fit, solution)
+        missing = self._afterwards(lambda: () if rest.unexplained else self._missing(at))
+        predictions = self._afterwards(lambda: predicted(fit, at, self.held_out))
+        why = reasons(rest.chi2, rest.dof, self.stated, rest.white, missing)
+        known = accuracy(fit, solution, null, rest.times(sum(len(t.t) for t in fit.tracks)))
+        near = 1e-6 * p.step
+        outside = bool(((theta < p.lower - near) | (theta > p.upper + near)).any())
+        touch = np.minimum(theta - p.lower, p.upper - theta) < near
+        at_bound = tuple(name for name, hit in zip(p.names, touch, strict=True) if hit)
+        return Estimate(
+            parameters=p.names,
+            theta=theta,
+            std=known.std,
+            covariance=known.covariance,
+            initial_theta=self.theta0,
+            chi2=rest.chi2,
+            dof=rest.dof,
+            status=solution.status,
+            success=solution.success and not (known.singular or outside or known.lost),
+            misfit=bool(why),
+            iterations=solution.iterations,
+            residual_rms=rest.rms,
+            at_bound=at_bound,
+            predicted=rest.predicted,
+            recordings=tuple(self._seen(i) for i in range(len(fit.tracks))),
+            warnings=tuple(self._sentences(solution, rest, known, why, missing, at_bound, outside)),
+            combinations=tuple(str(group) for group in known.groups),
+            data=known.data,
+            sandwich=known.sandwich,
+            interval=known.interval,
+            between=known.between,
+            sigma=dict(zip(setup.outputs.names, fit.noise.sigma.tolist(), strict=True)),
+            reasons=why,
+            whiteness=rest.white,
+            sloppy=tuple(name for name, _ in known.sloppy),
+            suspects=missing,
+            each={p.names[j]: tuple(at.own[:, i].tolist()) for i, j in enumerate(fit.layout.own)},
+            worst=rest.worst if why else None,
+            predictions=predictions,
+            detail=known.detail,
+            motion=fit.motion(at, 0),
+            interrupted=self.interrupted,
+            seconds=time.perf_counter() - self.clock,
+            steps=setup.plant.steps - self.steps,
+        )
+
+    def _afterwards(self, work: Callable[[], tuple[Found, ...]]) -> tuple[Found, ...]:
+        """What the work says of the estimate; Ctrl-C ends it without costing the estimate."""
+        try:
+            return () if self.interrupted else work()
+        except KeyboardInterrupt:
+            self.interrupted = True
+            return ()
+
+    def _missing(self, at: Unknowns) -> tuple[Suspect, ...]:
+        """Terms that the model lacks, from recordings, or of much data from pieces of them."""
+        some = self._sample(self.fit)
+        return suspects(some, self.fit.recordings, self._places, self._sampled(at))
+
+    def _seen(self, i: int) -> Recording:
+        """A recording in the order of the outputs, as it was fitted."""
+        track = self.fit.tracks[i]
+        held = self.fit.recordings[i].ctrl[: len(track.t) - 1]
+        return Recording(track.t, held, track.y, self.setup.outputs.names, track.name)
+
+    def _sentences(
+        self,
+        solution: Solution,
+        rest: Left,
+        known: Accuracy,
+        why: Sequence[str],
+        missing: Sequence[Suspect],
+        at_bound: tuple[str, ...],
+        outside: bool,
+    ) -> Iterator[str]:
+        """What a user should know besides the numbers, the gravest first."""
+        p, fit = self.setup.parameters, self.fit
+        if self.interrupted and not solution.interrupted:
+            yield "interrupted after the search: what was not fitted is not predicted"
+        if rest.unexplained:
+            yield (
+                f"the fit hardly explains {', '.join(rest.unexplained)}: probably a local minimum. Shorter pieces (fit.segments),"
+                " more starts (fit.starts) or a better guess may find a better one"
+            )
+        yield from (f"the recordings tell {group}; the rest was held at the start" for group in known.groups)
+        if known.singular:
+            yield "the recordings do not determine all parameters: the information is singular"
+        if why:
+            wrong = "The model or the noise is" if self.stated else "The model is"
+            yield f"misfit: {'; '.join(why)}. {wrong} wrong, and the formal standard errors are not accuracy"
+        elif self.stated and smaller(rest.chi2, rest.dof):
+            yield f"residuals are only {np.sqrt(rest.chi2 / rest.dof):.2f} x the stated noise: sigma is overstated"
+        if known.detail is not None and known.detail.apart:
+            names = [p.names[fit.layout.places[j]] for j in known.detail.apart]
+            yield (
+                f"recordings disagree on {', '.join(names)} by more than their own scatter: what differs between them is not "
+                "in the model; the intervals allow for it"
+            )
+        if outside:
+            yield f"outside its bounds, which newton does not keep: {', '.join(at_bound)}; use least_squares"
+        elif at_bound:
+            yield f"at a bound: {', '.join(at_bound)}; the formal standard errors do not hold there"
+        if why and rest.worst is not None:
+            yield f"residuals are {rest.worst}"
+        yield from (f"the residuals look like {term}" for term in missing)
+        yield from _far(p, fit.theta(solution.unknowns))
+        yield from (f"sloppy: {name} {said}" for name, said in known.sloppy)
+        yield from (
+            f"poor data in {Path(r.name).name}: {said}" for r in fit.recordings for said in doubts(self.setup, r)
+        )
+
+
+def _far(p: ParameterSet, theta: Array) -> Iterator[str]:
+    """Estimates that the stated priors hardly allow."""
+    for parameter, value in zip(p.parameters, theta, strict=True):
+        if parameter.prior is not None and abs(value - parameter.guess) > FAR * parameter.prior:
+            times = abs(value - parameter.guess) / parameter.prior
+            yield f"{parameter.name} is {times:.0f} prior standard deviations from its guess: one of them is wrong"

@@ -1,0 +1,1 @@
+"""The Fisher information of a trajectory, its criteria, and what it cannot see."""

@@ -1,0 +1,1 @@
+"""MuJoCo models: load, vary, read and write parameters by path."""

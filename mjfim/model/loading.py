@@ -1,0 +1,109 @@
+"""Load and compile MJCF models, and read the names of their elements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.errors import ModelError
+from mjfim.model.smooth_friction import is_dry
+
+
+def load_spec(path: Path) -> Any:
+    """MjSpec of an MJCF (or URDF) file. Raises ModelError with MuJoCo's message."""
+    if not path.is_file():
+        raise ModelError(f"{path}: no such model file")
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ModelError(f"{path}: MuJoCo cannot read the model: {str(error).strip()}") from None
+
+
+def compile_spec(spec: Any, path: Path) -> Any:
+    """MjModel of a spec. Raises ModelError with MuJoCo's message."""
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise ModelError(f"{path}: MuJoCo cannot compile the model: {str(error).strip()}") from None
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A scalar joint: its name, unit and place. joint: id;  q: qpos address;  v: dof address."""
+
+    name: str
+    unit: str
+    joint: int
+    q: int
+    v: int
+
+
+def coordinates(model: Any) -> tuple[Coordinate, ...]:
+    """All slide and hinge joints, in order."""
+    found, names = [], joint_names(model)
+    for j in range(model.njnt):
+        if int(model.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)):
+            unit = "m" if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
+            found.append(Coordinate(names[j], unit, j, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])))
+    return tuple(found)
+
+
+def joint_names(model: Any) -> tuple[str, ...]:
+    """njnt names; unnamed joints are called by their number."""
+    return _names(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt, "joint")
+
+
+def actuator_names(model: Any) -> tuple[str, ...]:
+    """nactuator names; unnamed actuators are called by their number."""
+    return _names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nactuator, "actuator")
+
+
+def _names(model: Any, kind: Any, count: int, fallback: str) -> tuple[str, ...]:
+    """Names of all objects of a kind, no two alike: a number that another one is called by gets underscores."""
+    given = [mujoco.mj_id2name(model, kind, i) for i in range(count)]
+    taken = {name for name in given if name}
+    for i in range(count):
+        if not given[i]:
+            name = f"{fallback}{i}"
+            while name in taken:
+                name += "_"
+            given[i] = name
+    return tuple(given)
+
+
+def control_names(model: Any) -> tuple[str, ...]:
+    """nu names; an actuator with several controls gets one name per control."""
+    names: list[str] = []
+    for i, name in enumerate(actuator_names(model)):
+        count = int(model.actuator_ctrlnum[i])
+        names += [name] if count == 1 else [f"{name}[{c}]" for c in range(count)]
+    return tuple(names)
+
+
+def decoration(spec: Any, model: Any) -> frozenset[str]:
+    """Names of geoms that neither collide nor give their body its inertia: their size and place move nothing else."""
+    forced = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    return frozenset(
+        geom.name
+        for geom in spec.geoms
+        if geom.name
+        and geom.name not in paired
+        and not (model.geom_contype[geom.id] or model.geom_conaffinity[geom.id])
+        and not geom.fluid_ellipsoid
+        and (geom.mass == 0.0 or (geom.parent.explicitinertial and not forced))
+        and not geom.meshname
+    )
+
+
+def unconstrained(model: Any) -> bool:
+    """True where no constraint can ever be active, so that switching the solver off changes nothing."""
+    no_contact = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)) or (
+        model.npair == 0 and not (np.any(model.geom_contype) and np.any(model.geom_conaffinity))
+    )
+    limited = model.jnt_limited.any() or model.tendon_limited.any()
+    return bool(no_contact and model.neq == 0 and model.nflex == 0 and not limited and not is_dry(model))

@@ -1,0 +1,1 @@
+"""Optimisers that know arrays only: neither MuJoCo nor Fisher information."""

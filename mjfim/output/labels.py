@@ -1,0 +1,75 @@
+"""Names with units for axes and panels, such as `slide [m]`, made from a model and an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import mujoco
+
+from mjfim.errors import MjfimError
+from mjfim.experiment.system import Setup
+from mjfim.model.coordinates import JOINT_DOFS, _control_labels, _coordinates, _joint_name, output_label
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What each column is called, unit included.
+
+    qpos: nq, one per coordinate;  positions, velocities: nv, one per degree of freedom;  controls: nu
+    parameters: p names without unit;  parameter_units: p units, empty where dimensionless
+    outputs: `name [unit]` by output column (`qpos:<joint>`, sensor name);  missing ones show the column name
+    """
+
+    qpos: tuple[str, ...]
+    positions: tuple[str, ...]
+    velocities: tuple[str, ...]
+    controls: tuple[str, ...]
+    parameters: tuple[str, ...] = ()
+    parameter_units: tuple[str, ...] = ()
+    outputs: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        names, units = len(self.parameters), len(self.parameter_units)
+        if names != units:
+            raise MjfimError(f"labels name {names} parameters but {units} units; give one unit (or '') per parameter")
+
+    @classmethod
+    def of_model(cls, model: mujoco.MjModel) -> Labels:
+        """Names of joints and actuators; rotations of ball and free joints are rotation vectors."""
+        dofs = [
+            (_joint_name(model, joint) + suffix, unit)
+            for joint in range(model.njnt)
+            for suffix, unit in JOINT_DOFS[mujoco.mjtJoint(int(model.jnt_type[joint]))]
+        ]
+        positions = tuple(f"{name} [{unit}]" for name, unit in dofs)
+        return cls(
+            qpos=positions if model.nq == model.nv else _coordinates(model),
+            positions=positions,
+            velocities=tuple(f"{name} velocity [{unit}/s]" for name, unit in dofs),
+            controls=tuple(label for actuator in range(model.nactuator) for label in _control_labels(model, actuator)),
+        )
+
+    @classmethod
+    def of(cls, setup: Setup) -> Labels:
+        """Names of an experiment: its model's, its parameters' and its outputs'."""
+        base = cls.of_model(setup.model)
+        outputs = {name: output_label(setup.model, name) for name in setup.outputs.names}
+        return cls(
+            base.qpos, base.positions, base.velocities, base.controls, setup.parameters.names, setup.units, outputs
+        )
+
+    def parameter(self, j: int) -> str:
+        """`name [unit]` of parameter j."""
+        return f"{self.parameters[j]} [{self.parameter_units[j] or 'model unit'}]"
+
+    def output(self, column: str) -> str:
+        """`name [unit]` of an output column."""
+        return self.outputs.get(column, f"{column} [model unit]")
+
+    def check(self, **sizes: int) -> None:
+        """Raise unless each named field has the given length."""
+        for name, size in sizes.items():
+            have = len(getattr(self, name))
+            if have != size:
+                raise MjfimError(f"labels.{name} has {have} entries, the data has {size}; give exactly {size}")

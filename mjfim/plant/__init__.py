@@ -1,0 +1,1 @@
+"""The model as discrete-time dynamics with outputs, noise, delay and derivatives."""

@@ -1,0 +1,1 @@
+"""Frozen arrays that verbs take and return, each with names and units."""

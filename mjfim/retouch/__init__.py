@@ -1,1 +1,0 @@
-"""The user's MJCF text with single numbers changed, everything else to the byte as it was."""

@@ -1,0 +1,1 @@
+"""Workflows over designs and estimates: check, compare, Monte Carlo, campaigns."""

@@ -1,0 +1,1 @@
+"""Parametric excitations that the design is compared with."""

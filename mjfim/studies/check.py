@@ -1,0 +1,216 @@
+"""`mjfim.check`: what an experiment, or recordings that are there already, can tell about the parameters, before any fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import RecordingError, SimulationDiverged
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.identification.residuals import Fit
+from mjfim.information.fisher import Information
+from mjfim.information.identifiability import Survey, survey, survey_rows
+from mjfim.information.marginal import shared
+from mjfim.plant.plant import CENTRAL
+from mjfim.records.check import CONFOUNDED, Check, Pair, Row, SelfTest
+from mjfim.records.combinations import Group, listed
+from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Trajectory
+from mjfim.studies.derivative_test import self_test
+
+DEFAULT_WANTED = 0.05  # of a parameter's own size, where none is stated
+MOST = 1_000_000_000
+LONGEST_LINE = 400
+
+
+def check(
+    experiment: Experiment | Setup,
+    recordings: Sequence[Recording] = (),
+    trajectory: Trajectory | None = None,
+    threads: int | None = None,
+) -> Check:
+    """Look at an experiment's initial trajectory, at a given one (a design), or at recordings, at the design's theta.
+
+    Raises SimulationDiverged where that cannot be simulated, RecordingError for unusable recordings.
+    """
+    setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
+    if recordings and trajectory is not None:
+        raise RecordingError("check either recordings or a designed trajectory, not both")
+    curve = setup.initial if trajectory is None else setup.plant.simulate(setup.theta, trajectory.ctrl)
+    if recordings:
+        fit = Fit(setup, recordings, data_only=True)
+        longest = max(fit.tracks, key=lambda track: len(track.ctrl))
+        curve = setup.plant.simulate(setup.theta, longest.ctrl[: setup.samples])
+        recorded = fit.sensed(fit.begin(setup.theta))
+        seen = survey_rows(setup, curve, *(np.concatenate(part) for part in zip(*recorded, strict=True)))
+        tells, horizon = [J.T @ J for J, _ in recorded], float(sum(track.t[-1] for track in fit.tracks))
+        source = f"{len(recordings)} recording{'s' if len(recordings) > 1 else ''}"
+    problem = setup.problem
+    problem = replace(problem, running=replace(problem.running, desired=curve.state))
+    point = problem.point(curve, CENTRAL)
+    if point.information is None or point.sensitivity is None:
+        raise SimulationDiverged("the simulation diverges when the parameters move a little")
+    if not recordings:
+        seen = survey(setup, curve, point.sensitivity)
+        tells, horizon = [point.information - setup.information.prior], float(curve.t[-1])
+        source = "the initial control" if trajectory is None else "the given trajectory"
+    judged = replace(problem, information=replace(problem.information, basis=seen.basis))
+    tested = self_test(setup, judged, judged.judged(point))
+    p = setup.parameters
+    common = sum((shared(each, p.prior_information, p.private) for each in tells), start=np.zeros_like(setup.prior))
+    return _concluded(setup, seen, common, horizon, source, tested)
+
+
+def _concluded(setup: Setup, seen: Survey, data: Array, horizon: float, source: str, tested: SelfTest) -> Check:
+    """data: (p, p) of all that was looked at, each start's own nuisance marginalised"""
+    p = setup.parameters
+    information = replace(setup.information, prior=setup.prior, basis=seen.here.basis if seen.here.count else None)
+    total = data + setup.prior
+    covariance = information.covariance(total)
+    std = np.full(len(p), np.inf)
+    std[p.interest] = np.nan_to_num(np.sqrt(np.diag(covariance)), nan=np.inf)
+    rows = tuple(_rows(setup, information, data, std, horizon))
+    spread = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(spread, spread)
+    confounded = tuple(_pairs(seen.names, correlation))
+    criterion = setup.information
+    visible = replace(criterion, basis=seen.basis)
+    never, more = seen.groups_always, seen.here.count > seen.always.count
+    known = {str(g) for g in never}
+    not_here = tuple(g for g in seen.groups_here if str(g) not in known) if more else ()
+    eigenvalues = np.maximum(visible.evaluate(data + criterion.prior).eigenvalues, 0.0)
+    verdict = tuple(_verdict(rows, never, not_here, confounded, tested, source))
+    combined = () if not_here else seen.combined(information, setup.theta[p.interest], total, total)
+    return Check(
+        source,
+        horizon,
+        rows,
+        seen.names,
+        total,
+        eigenvalues,
+        correlation,
+        confounded,
+        never,
+        not_here,
+        tested,
+        verdict,
+        combined,
+    )
+
+
+def _rows(setup: Setup, information: Information, data: Array, std: Array, horizon: float) -> Iterator[Row]:
+    p = setup.parameters
+    for j, parameter in enumerate(p.parameters):
+        value = float(setup.theta[j])
+        plain = parameter.size == abs(parameter.guess) and value != 0.0
+        size = abs(value) if plain else float(p.step[j])
+        stated = parameter.wanted is not None
+        wanted = parameter.wanted or DEFAULT_WANTED * size
+        needed = 0 if parameter.nuisance else _repetitions(information, data, setup.prior, j, wanted)
+        yield Row(
+            parameter.name,
+            parameter.unit,
+            value,
+            parameter.nuisance,
+            size,
+            float(std[j]),
+            float(std[j] / size),
+            wanted,
+            stated,
+            needed,
+            needed * horizon,
+        )
+
+
+def _repetitions(information: Information, data: Array, prior: Array, parameter: int, wanted: float) -> int:
+    """Least number of repetitions whose information, with the prior, brings a parameter to the wanted sigma; 0: none do."""
+    t = np.arange(len(data)) if information.interest is None else information.interest
+    place = int(np.flatnonzero(t == parameter)[0])
+
+    def reached(n: int) -> bool:
+        """True where n repetitions are enough."""
+        variance = information.covariance(n * data + prior)[place, place]
+        return bool(variance <= wanted**2)
+
+    low, high = 0, 1
+    while not reached(high):
+        low, high = high, 2 * high
+        if high > MOST:
+            return 0
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if reached(middle) else (middle, high)
+    return high
+
+
+def _pairs(names: Sequence[str], correlation: Array) -> Iterator[Pair]:
+    """Confounded pairs, the worst first."""
+    found = [
+        Pair(names[i], names[j], float(correlation[i, j]))
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(correlation[i, j]) > CONFOUNDED
+    ]
+    yield from sorted(found, key=lambda pair: -abs(pair.correlation))
+
+
+def _brief(groups: Sequence[Group]) -> str:
+    """Groups in words, or only how many where that would fill a page."""
+    said = "; ".join(str(group) for group in groups)
+    if len(said) <= LONGEST_LINE:
+        return said
+    members = sum(len(group.members) for group in groups)
+    return f"{members} parameters in {len(groups)} groups (listed under combinations)"
+
+
+def _verdict(
+    rows: Sequence[Row],
+    never: Sequence[Group],
+    not_here: Sequence[Group],
+    confounded: Sequence[Pair],
+    tested: SelfTest,
+    source: str,
+) -> Iterator[str]:
+    """Sentences that a person can act on, the gravest first."""
+    if tested.rough is not None:
+        yield f"{tested.rough}"
+    elif not tested.passed:
+        yield (
+            f"derivatives do not agree (psi recursion {tested.recursion:.1e}, slope {tested.slope:.1e}); {tested.suspect}. "
+            "Shorten horizon or timestep, or smooth the switch, before trusting numbers here"
+        )
+    known = {row.name for row in rows if np.isfinite(row.std)}
+    open_ = [group for group in never if not set(group.members) <= known]
+    settled = [group for group in never if set(group.members) <= known]
+    if open_:
+        yield (
+            f"no control from this start tells apart (nor did random ones): {_brief(open_)}. Take out or fix one of each group, "
+            "give it a prior, or measure something else; a design works on the combinations"
+        )
+    if settled:
+        yield f"told apart by priors only, not by data: {'; '.join(listed(group.members) for group in settled)}"
+    if not_here:
+        yield f"not visible from {source}, but another control would show: {_brief(not_here)}. Move those joints more"
+    wanted = [row for row in rows if not row.nuisance]
+    alone = [row for row in wanted if np.isfinite(row.std)]
+    late = [row for row in alone if row.repetitions != 1]
+    if not alone:
+        yield "nothing can be identified from this"
+        return
+    worst = max(alone, key=lambda row: row.std / row.wanted)
+    if not late and tested.passed and not open_ and not not_here:
+        yield f"all that can be told alone reaches its wanted sigma from {source}: nothing more is needed"
+    elif late:
+        reach = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s)" if worst.repetitions else "no repetition"
+        yield (
+            f"not known to the wanted sigma from {source} alone: {len(late)} of {len(alone)} parameters, above all "
+            f"{worst.name}: {reach} for {worst.wanted:.3g}. An excitation that is designed (`mjfim design`) tells more"
+        )
+    if confounded:
+        said = ", ".join(f"{p.first} / {p.second} ({p.correlation:+.3f})" for p in confounded[:5])
+        more = f" and {len(confounded) - 5} more pairs" if len(confounded) > 5 else ""
+        yield f"hardly told apart (correlation): {said}{more}; fixing one of a pair sharpens the other"

@@ -1,0 +1,255 @@
+"""`mjfim.compare`: a design against what else the same budget could have found, all judged alike."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, SimulationDiverged, unknown
+from mjfim.excitation.design import design, designable
+from mjfim.excitation.evaluation import fine_point
+from mjfim.excitation.interior_point import SHRUNK
+from mjfim.excitation.unconstrained import Stage
+from mjfim.excitation.verification import SAME, audit, require_inside
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.parallel import salvaged, workers_of
+from mjfim.plant.active_constraints import saturated
+from mjfim.records.comparison import DESIGN, Comparison, Outcome, Row
+from mjfim.records.design import HistoryRow, Status
+from mjfim.studies.baselines.budget import Attempt, Job
+from mjfim.studies.baselines.methods import METHODS, perform
+
+OURS = "mjfim's design"
+LATE = 1.05  # share of the seconds after which a design is ended
+PLENTY = 100_000  # iterations of the design: only its budget ends it
+
+
+@dataclass(frozen=True)
+class Glance:
+    """How far a comparison is. title: of the method;  place, count: its number among all;  used: share of its budget
+
+    cost: the lowest J so far, infinite without any
+    """
+
+    title: str
+    place: int
+    count: int
+    used: float
+    cost: float
+
+
+Monitor = Callable[[Glance], None]
+Tell = Callable[[float, float], None]  # share of the budget, J
+
+
+def compare(
+    experiment: Experiment | Setup,
+    seconds: float = 60.0,
+    steps: float | None = None,
+    seed: int = 0,
+    methods: Sequence[str] | None = None,
+    executor: Executor | None = None,
+    monitor: Monitor | None = None,
+    threads: int | None = None,
+) -> Comparison:
+    """Run baselines, then the design, on an experiment: each for so many seconds and MuJoCo steps, whichever end first.
+
+    methods: keys of `baselines.METHODS`, default: all that make sense;  seed: of the baselines
+    executor: of `concurrent.futures`, among whose workers each method is shared out;  monitor: called during the searches
+    All look for a control under the same limits, by the same J, and are judged on the untouched model at every engine step.
+    Ctrl-C returns the methods that are finished. Raises as `design` does.
+    """
+    setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
+    if not (seconds > 0.0 and np.isfinite(seconds)) or not (steps is None or steps > 0.0):
+        raise ExperimentError("compare: seconds and steps must be positive")
+    chosen = (*chosen_methods(setup, methods), DESIGN)
+    judge = Judge(setup, _combinations(setup))
+    most = np.inf if steps is None else float(steps)
+    job = Job(setup.experiment, DESIGN, seconds, most, seed, (0, 1), judge.stage.basis, setup.added, threads)
+    rows: list[Row] = []
+    interrupted = False
+    try:
+        for i, method in enumerate(chosen):
+            title = OURS if method == DESIGN else METHODS[method].title
+            tell = _teller(monitor, title, i, len(chosen))
+            if method == DESIGN:
+                row, interrupted = _designed(judge, job, executor, tell)
+            else:
+                row = judge.row(method, title, _tried(replace(job, method=method), executor, tell))
+            rows.append(row)
+    except KeyboardInterrupt:
+        interrupted = True
+    p = setup.parameters
+    return Comparison(
+        source=setup.experiment.source,
+        criterion=setup.experiment.cost.criterion,
+        nats=judge.nats,
+        parameters=p.names,
+        units=setup.units,
+        scale=p.scale,
+        nuisance=tuple(q.name for q in p.parameters if q.nuisance),
+        rows=tuple(rows),
+        seconds=seconds,
+        steps=most,
+        seed=seed,
+        weighted=bool(setup.control_weight.any() or setup.tracking.any()),
+        interrupted=interrupted,
+    )
+
+
+def chosen_methods(setup: Setup, methods: Sequence[str] | None) -> tuple[str, ...]:
+    """Keys of the baselines that are to run. Raises ExperimentError for others."""
+    if methods is None:
+        return tuple(key for key, baseline in METHODS.items() if setup.enforced or not baseline.limited)
+    for key in methods:
+        if key not in METHODS and key != DESIGN:
+            raise ExperimentError(f"methods: {unknown('method', key, [*METHODS, DESIGN])}")
+        if key in METHODS and METHODS[key].limited and not setup.enforced:
+            raise ExperimentError(f"methods: {key} needs hard limits; {setup.experiment.source} has none that hold")
+    return tuple(key for key in dict.fromkeys(methods) if key != DESIGN)
+
+
+def _combinations(setup: Setup) -> Array | None:
+    """The identifiable combinations, as a design finds them. Raises where nothing can be designed."""
+    seen = designable(setup)
+    if setup.enforced:
+        require_inside(setup)
+    return seen.basis
+
+
+def _teller(monitor: Monitor | None, title: str, place: int, count: int) -> Tell:
+    def tell(used: float, cost: float) -> None:
+        if monitor is not None:
+            monitor(Glance(title, place, count, used, cost))
+
+    return tell
+
+
+def _tried(job: Job, executor: Executor | None, tell: Tell) -> Attempt:
+    """A baseline's attempt; with an executor the best of as many as it has workers, each with its share of the steps."""
+    if executor is None:
+        return perform(job, lambda used, attempt: tell(used, attempt.cost))
+    count = workers_of(executor)
+    jobs = [replace(job, part=(i, count), steps=job.steps / count, threads=1) for i in range(count)]
+    futures: list[Future[Attempt]] = []
+    try:
+        futures += [executor.submit(perform, each) for each in jobs]
+        attempts = [future.result() for future in futures]
+    except BaseException:
+        salvaged(executor, futures)
+        raise
+    best = min(attempts, key=lambda attempt: (attempt.cost, -attempt.share))
+    return replace(best, seconds=max(a.seconds for a in attempts), steps=sum(a.steps for a in attempts))
+
+
+def _designed(judge: Judge, job: Job, executor: Executor | None, tell: Tell) -> tuple[Row, bool]:
+    """The design with the same budget, and whether the user interrupted it."""
+    d = job.experiment.descent
+    stated = job.experiment.replace(descent={"seconds": job.seconds, "max_iterations": max(d.max_iterations, PLENTY)})
+    meter = Meter(job, tell)
+    try:
+        found = design(Setup(stated, job.threads, added=job.added), meter, executor=executor)
+    except SimulationDiverged:
+        return judge.row(DESIGN, OURS, Attempt(seconds=meter.seconds, steps=meter.steps)), False
+    attempt = Attempt(found.trajectory.ctrl, found.final.cost, 0.0, found.found_by, found.seconds, found.steps)
+    row = judge.row(DESIGN, OURS, attempt, "" if meter.spent else found.status.value.split(":")[0].split(";")[0])
+    return row, found.status is Status.INTERRUPTED and not meter.spent
+
+
+class Meter:
+    """Watches a design's iterates and ends it, as Ctrl-C would, where its budget is used up."""
+
+    def __init__(self, job: Job, tell: Tell) -> None:
+        self.job, self.tell = job, tell
+        self.clock, self.steps, self.last, self.cost = time.perf_counter(), 0, 0, np.inf
+        self.spent = False
+
+    @property
+    def seconds(self) -> float:
+        """Since the start."""
+        return time.perf_counter() - self.clock
+
+    def __call__(self, row: HistoryRow) -> None:
+        """Count a row's steps, which begin anew with every task of a design."""
+        self.steps += row.steps - (self.last if row.steps >= self.last else 0)
+        self.last = row.steps
+        if not row.margin < 0.0:
+            self.cost = min(self.cost, row.cost)
+        seconds, steps = self.seconds / self.job.seconds, self.steps / self.job.steps
+        self.tell(max(seconds, steps), self.cost)
+        if seconds > LATE or steps > 1.0:  # a design keeps the time by itself, but for its last iterate
+            self.spent = True
+            raise KeyboardInterrupt
+
+
+class Judge:
+    """Looks at every method's control in the same way: at the stated rate, on the user's model.
+
+    nats: see `Comparison`
+    """
+
+    def __init__(self, setup: Setup, combinations: Array | None) -> None:
+        self.setup, self.stage = setup, Stage(setup, combinations)
+        e, p = setup.experiment, setup.parameters
+        count = len(p.interest) if combinations is None else combinations.shape[1]
+        self.nats = e.cost.information * count if e.cost.criterion == "D" else 0.0
+
+    def row(self, method: str, title: str, attempt: Attempt, note: str = "") -> Row:
+        """What an attempt is worth. A baseline's control that leaves the limits after all is shrunk until it does not."""
+        if attempt.control is None:
+            return self._nothing(method, title, attempt, note)
+        first: Row | None = None
+        for share in [1.0] if method == DESIGN or not np.isfinite(attempt.cost) else SHRUNK.tolist():
+            control = self.setup.centre + share * (attempt.control - self.setup.centre)
+            told = note if share == 1.0 else f"shrunk to {100.0 * share:.3g} %"
+            found = self._looked(method, title, replace(attempt, control=control), told)
+            if found is not None and found.outcome is not Outcome.OUTSIDE:
+                return found
+            first = first or found
+        return first or self._nothing(method, title, attempt, note)
+
+    def _looked(self, method: str, title: str, attempt: Attempt, note: str) -> Row | None:
+        """None where the simulation diverges."""
+        setup = self.setup
+        point = None if attempt.control is None else fine_point(self.stage, attempt.control)
+        if point is None or point.trajectory is None or point.criterion is None or point.information is None:
+            return None
+        found = audit(setup, point.trajectory)
+        outcome = Outcome.INSIDE if found.kept else Outcome.OUTSIDE
+        if outcome is Outcome.OUTSIDE and not np.isfinite(attempt.cost):
+            outcome = Outcome.NOTHING
+        clamped = saturated(setup.model_at(setup.theta), point.trajectory)
+        if outcome is Outcome.INSIDE and clamped:
+            outcome, note = Outcome.CLAMPED, f"forcerange clamps {', '.join(clamped)}"
+        elif found.deviation > SAME:
+            note = f"a clamp, stop or contact acts: deviates by {found.deviation:.2g}"
+        smallest = float(point.criterion.eigenvalues[0])
+        return Row(
+            method=method,
+            title=title,
+            outcome=outcome,
+            control=attempt.control,
+            cost=point.cost,
+            criterion=point.criterion.value,
+            std=self.stage.problem.information.std(point.information),
+            smallest=smallest,
+            worst=(smallest * setup.measure_rate) ** -0.5 if smallest > 0.0 else np.inf,
+            seconds=attempt.seconds,
+            steps=attempt.steps,
+            margins=found.margins,
+            shares=found.shares,
+            found_by=attempt.found_by,
+            note=note,
+        )
+
+    def _nothing(self, method: str, title: str, attempt: Attempt, note: str) -> Row:
+        outcome = Outcome.NONE if attempt.control is None else Outcome.NOTHING
+        blank = np.full(len(self.setup.parameters), np.nan)
+        taken = (attempt.seconds, attempt.steps)
+        return Row(method, title, outcome, None, np.nan, np.nan, blank, np.nan, np.nan, *taken, {}, {}, "", note)

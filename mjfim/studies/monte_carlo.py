@@ -1,0 +1,234 @@
+"""Monte-Carlo studies of the estimator against the Cramer-Rao bound, all trials stepped together.
+
+Every trial minimises its own squared residual. The way there is shared: a fit of the mean measurement leads from the
+guess to the neighbourhood of all minima, Gauss-Newton steps with the Jacobian expanded to second order about that point
+bring each trial close, and a step with the trial's own Jacobian finishes it. A trial counts as converged when its last
+own step is small against its standard deviation; the few others go one by one through the least-squares solver of
+`identify`, and what that does not solve is a failed trial.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.identification.identify import least_squares, newton_raphson
+from mjfim.identification.residuals import Fit
+from mjfim.information.identifiability import require_visible
+from mjfim.records.monte_carlo import Study, TrialSet
+from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Trajectory
+
+CONVERGED = 0.03
+SHARED_STEPS = 3
+OWN_STEPS = 12
+CHUNK_BYTES = 1e8  # of one Jacobian of all trials of a chunk
+Progress = Callable[[str, float], None]
+
+
+def monte_carlo(
+    experiment: Experiment | Setup,
+    trajectory: Trajectory | Mapping[str, Trajectory],
+    trials: int = 1500,
+    seed: int = 0,
+    measure_rate: float | None = None,
+    progress: Progress | None = None,
+) -> Study:
+    """Estimate the parameters from many noisy repetitions of one or several trajectories (name -> trajectory).
+
+    Parameters are searched without bounds and priors: the study holds the data's information alone. Ctrl-C returns the
+    sets that are finished. Raises ExperimentError for fewer than two trials, UnidentifiableError where a parameter does
+    not show in the data.
+    """
+    if trials < 2:
+        raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
+    if measure_rate is not None:
+        base = experiment.experiment if isinstance(experiment, Setup) else experiment
+        experiment = base.replace(measure_rate=measure_rate)
+    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
+    named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
+    for curve in named.values():
+        _exact(setup, curve)
+    sets, information = {}, {}
+    try:
+        for rng, (name, curve) in zip(np.random.default_rng(seed).spawn(len(named)), named.items(), strict=True):
+            tell = None if progress is None else (lambda share, name=name: progress(name, share))
+            sets[name], information[name] = _trial_set(setup, curve, trials, rng, tell)
+    except KeyboardInterrupt:
+        if not sets:
+            raise
+    return Study(setup.parameters.names, setup.parameters.true, setup.measure_rate, sets, information)
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """What all trials share, at the fit of the mean measurement.
+
+    theta: (p,);  J: (n, p) whitened Jacobian;  bend: (p, n, p) its derivative by theta;  std: (p,)
+    """
+
+    theta: Array
+    J: Array
+    bend: Array
+    std: Array
+
+    def jacobian(self, theta: Array) -> Array:
+        """(m, n, p) second-order Jacobians at theta: (m, p)."""
+        return np.asarray(self.J + np.tensordot(theta - self.theta, self.bend, axes=(1, 0)))
+
+
+class Trials:
+    """Many repetitions of one control with their own noise. measured: (m, n) whitened measurements of all trials."""
+
+    def __init__(self, setup: Setup, ctrl: Array, measured: Array) -> None:
+        self.setup, self.ctrl, self.measured = setup, ctrl, measured
+
+    def outputs(self, theta: Array) -> tuple[Array, np.ndarray]:
+        """Whitened predictions (m, n) at theta: (m, p), and which of them are finite."""
+        y, finite = self.setup.plant.measure(theta, self.ctrl)
+        return self.setup.noise.rows(np.moveaxis(y, 0, -1)).T, finite
+
+    def recording(self, measured: Array) -> Recording:
+        """One trial, (n,) whitened, as a recording."""
+        noise = self.setup.noise
+        mask = noise.measured(len(self.ctrl)) > 0
+        y = np.zeros(mask.shape)
+        y[mask] = measured
+        y = np.where(mask, y @ noise.factor.T, np.nan)
+        return Recording(
+            np.arange(len(y), dtype=np.float64) * self.setup.dt, self.ctrl, y, self.setup.outputs.names, "trial"
+        )
+
+    def jacobian(self, theta: Array, predicted: Array, relative: float = 1e-6) -> Array:
+        """(m, n, p) by one-sided differences about predictions already made."""
+        steps = relative * self.setup.parameters.step
+        columns = []
+        for j, h in enumerate(steps):
+            moved = np.array(theta)
+            moved[:, j] += h
+            columns.append((self.outputs(moved)[0] - predicted) / h)
+        return np.stack(columns, axis=2)
+
+
+def _trial_set(
+    setup: Setup, curve: Trajectory, count: int, rng: np.random.Generator, tell: Callable[[float], None] | None
+) -> tuple[TrialSet, Array]:
+    clock = time.perf_counter()
+    y, G = _exact(setup, curve)
+    J = setup.noise.rows(G)
+    information = np.asarray(J.T @ J)
+    require_visible(setup, J)
+    estimates = []
+    chunk = max(64, int(CHUNK_BYTES / (8 * J.size)))
+    for first in range(0, count, chunk):
+        m = min(chunk, count - first)
+        whitened = setup.noise.rows(y) + rng.standard_normal((m, J.shape[0]))
+        trials = Trials(setup, curve.ctrl, whitened)
+        estimates.append(_solve(trials, _shared(setup, trials), tell))
+    every = np.concatenate(estimates)
+    return _statistics(every, np.asarray(np.linalg.inv(information)), time.perf_counter() - clock), information
+
+
+def _exact(setup: Setup, curve: Trajectory) -> tuple[Array, Array]:
+    """Noise-free outputs (N+1, ny) at the true values and their derivative (N+1, ny, p)."""
+    exact = setup.plant.predict(setup.parameters.true, curve.ctrl)
+    if exact is None:
+        raise SimulationDiverged("the simulation diverges at the true parameters under this control")
+    return exact
+
+
+def _shared(setup: Setup, trials: Trials) -> Shared:
+    """Fit of the mean measurement from the guess, with its Jacobian and the Jacobian's derivative."""
+    fit = Fit(setup, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
+    theta = newton_raphson(fit, setup.parameters.guess).unknowns.theta
+    h = 1e-3 * setup.parameters.step
+
+    def jacobian(at: Array) -> Array:
+        predicted = setup.plant.predict(at, trials.ctrl)
+        if predicted is None:
+            raise SimulationDiverged("the simulation diverges near the fit of the mean measurement")
+        return setup.noise.rows(predicted[1])
+
+    J = jacobian(theta)
+    bend = np.stack([(jacobian(theta + e) - jacobian(theta - e)) / (2 * e.max()) for e in np.diag(h)])
+    return Shared(theta, J, bend, np.sqrt(np.diag(np.linalg.inv(J.T @ J))))
+
+
+def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None) -> Array:
+    """(m, p) estimates; NaN where a trial failed."""
+    m = len(trials.measured)
+    theta = shared.theta + (trials.measured - trials.outputs(shared.theta[None])[0]) @ np.linalg.pinv(shared.J).T
+    for k in range(SHARED_STEPS - 1):
+        predicted, finite = trials.outputs(theta)
+        step = _gauss_newton(shared.jacobian(theta), trials.measured - predicted)
+        theta = np.where(finite[:, None], theta + step, shared.theta)
+        if tell is not None:
+            tell((k + 1) / (SHARED_STEPS + 3))
+    active = np.arange(m)
+    for k in range(OWN_STEPS):
+        own = Trials(trials.setup, trials.ctrl, trials.measured[active])
+        predicted, finite = own.outputs(theta[active])
+        step = _gauss_newton(own.jacobian(theta[active], predicted), own.measured - predicted)
+        step[~finite] = np.nan
+        theta[active] = np.where(np.isfinite(step), theta[active] + step, shared.theta)
+        small = np.nan_to_num(np.abs(step) / shared.std, nan=np.inf).max(axis=1) < CONVERGED
+        active = active[~small]
+        if tell is not None:
+            tell(1.0 if not len(active) else (SHARED_STEPS + k + 1) / (SHARED_STEPS + k + 2))
+        if not len(active):
+            break
+    for i in active:
+        fit = Fit(trials.setup, [trials.recording(trials.measured[i])], data_only=True)
+        solution = least_squares(fit, shared.theta)
+        theta[i] = solution.unknowns.theta if solution.success else np.nan
+    return theta
+
+
+def _gauss_newton(J: Array, r: Array) -> Array:
+    """(m, p) steps `(J'J)^-1 J'r`; J: (m, n, p), r: (m, n)."""
+    JT = np.swapaxes(J, 1, 2)
+    gram, rhs = JT @ J, JT @ r[:, :, None]
+    usable = np.isfinite(gram).all(axis=(1, 2)) & np.isfinite(rhs).all(axis=(1, 2))
+    step = np.full((len(J), J.shape[2]), np.nan)
+    step[usable] = (np.linalg.pinv(gram[usable], hermitian=True) @ rhs[usable])[:, :, 0]
+    return step
+
+
+def _statistics(estimates: Array, crlb: Array, seconds: float) -> TrialSet:
+    good = estimates[np.isfinite(estimates).all(axis=1)]
+    n, p = len(good), estimates.shape[1]
+    if n < 2:
+        blank = np.full(p, np.nan)
+        return TrialSet(
+            estimates,
+            blank,
+            np.full((p, p), np.nan),
+            crlb,
+            blank,
+            np.full((p, 2), np.nan),
+            len(estimates),
+            len(estimates) - n,
+            seconds,
+        )
+    covariance = np.atleast_2d(np.cov(good, rowvar=False))
+    efficiency = np.diag(crlb) / np.diag(covariance)
+    interval = efficiency[:, None] * chi2_distribution.ppf([0.025, 0.975], n - 1) / (n - 1)
+    return TrialSet(
+        estimates,
+        good.mean(axis=0),
+        covariance,
+        crlb,
+        efficiency,
+        interval,
+        len(estimates),
+        len(estimates) - n,
+        seconds,
+    )

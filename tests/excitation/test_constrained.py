@@ -1,0 +1,588 @@
+"""Designs under hard limits, from start to end: what a plain loop around mj_step says of them."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from excitation.test_constraints import ARM
+from support.numerics import CART_PARAMETERS, CART_PENDULUM, Array, cart_setup, make_setup, relative_error
+
+import mjfim
+from mjfim.excitation import interior_point as ladder_module
+from mjfim.excitation import multistart as contest
+from mjfim.excitation.constrained import Chase, Task, perform
+from mjfim.excitation.constraints import basis_of, fence_of
+from mjfim.excitation.initial_controls import Start
+from mjfim.excitation.interior_point import SHRUNK, Ladder, Rungs, held_back
+from mjfim.excitation.multistart import Contest
+from mjfim.excitation.unconstrained import Stage, regulator_for
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.records.design import Design, HistoryRow, Status
+from mjfim.signals import spline_basis
+
+MODELS = Path(__file__).parents[2] / "models"
+
+
+def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -> dict[str, Array]:
+    """Positions, velocities, accelerations and actuator forces at every engine step of a plain loop around mj_step."""
+    data, rows = mujoco.MjData(model), {key: [] for key in ("q", "v", "a", "f")}
+    data.qpos[:], data.qvel[:] = start
+    for held in ctrl:
+        data.ctrl[:] = held
+        for _ in range(substeps):
+            before = data.qvel.copy()
+            mujoco.mj_step(model, data)
+            now = (data.qpos, data.qvel, (data.qvel - before) / model.opt.timestep, data.actuator_force)
+            for key, value in zip(rows, now, strict=True):
+                rows[key].append(np.array(value))
+    return {key: np.array(value) for key, value in rows.items()}
+
+
+# ---- the requirement
+
+
+@pytest.fixture(scope="module")
+def paper() -> Design:
+    """The paper's study at its true values, within 5 N and 1 m, without any weight on control or position."""
+    experiment = Experiment.from_file(MODELS / "cart_pendulum.toml")
+    hard = {"control": {"force": [-5.0, 5.0]}, "position": {"slide": [-1.0, 1.0]}}
+    return mjfim.design(experiment.replace(cost={"control": 0.0, "tracking": {}}, limits=hard))
+
+
+def test_the_paper_s_study_under_hard_limits_tells_more_than_a_solver_made_for_them(paper: Design) -> None:
+    assert paper.status is Status.CONVERGED
+    assert paper.success
+    assert paper.final.eigenvalues[0] >= 399.0
+    assert paper.warnings == ()
+    # not by what the package says of itself: differences of plain loops
+    model, ctrl, sigma, h = (
+        mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml")),
+        paper.trajectory.ctrl,
+        0.05,
+        1e-5,
+    )
+    start = (model.key("hanging").qpos.copy(), np.zeros(2))
+    bob, columns = model.body("bob").id, []
+    for array, place in ((model.body_mass, bob), (model.body_pos, (bob, 2)), (model.dof_damping, 1)):
+        ends, value = [], float(array[place])
+        for moved in (value + h, value - h):
+            array[place] = moved
+            rows = played(model, start, ctrl, 1)
+            ends.append(np.concatenate([rows["q"], rows["v"]], axis=1))
+        array[place] = value
+        columns.append((ends[0] - ends[1]).reshape(-1) / (2 * h * sigma))
+    G = np.array(columns).T
+    told = np.linalg.eigvalsh(G.T @ G) / 100.0  # per second
+    assert told[0] >= 399.0
+    np.testing.assert_allclose(told, paper.final.eigenvalues, rtol=1e-4)
+
+
+def test_and_no_engine_step_leaves_them(paper: Design) -> None:
+    model = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
+    rows = played(model, (model.key("hanging").qpos.copy(), np.zeros(2)), paper.trajectory.ctrl, 1)
+    assert np.abs(paper.trajectory.ctrl).max() <= 5.0
+    assert np.abs(rows["q"][:, 0]).max() <= 1.0
+    # both are used to the full, and told
+    margins = {"control": 5.0 - np.abs(paper.trajectory.ctrl).max(), "position": 1.0 - np.abs(rows["q"][:, 0]).max()}
+    assert paper.limits == pytest.approx(margins, abs=1e-9)
+    assert max(margins.values()) < 0.01
+    assert [row.mu for row in paper.history] == sorted((row.mu for row in paper.history), reverse=True)
+    assert paper.history[-1].margin >= 0.0
+
+
+# ---- ways to the inside
+
+HARD = {"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}, "velocity": {"hinge": 3.0}}
+
+
+def cart_inside(folder: Path, **tables: Any) -> Setup:
+    """The cart-pendulum for a second within limits, no weights."""
+    defaults: dict[str, Any] = {
+        "horizon": 1.0,
+        "cost": {"control": 0.0},
+        "limits": HARD,
+        "descent": {"max_iterations": 30},
+    }
+    return cart_setup(folder, **{**defaults, **tables})
+
+
+def assert_inside(setup: Setup, ctrl: Array) -> None:
+    """Every range of the experiment on a cart-pendulum holds at every engine step of a plain loop."""
+    start = setup.space.split(setup.plant.nominal_start)[:2]
+    rows, places = (
+        played(setup.model, start, ctrl, setup.substeps),
+        {"position": "q", "velocity": "v", "acceleration": "a"},
+    )
+    for limit in setup.limits:
+        values = ctrl if limit.kind == "control" else rows[places.get(limit.kind, "f")]
+        assert limit.lower <= values[:, limit.index].min(), limit
+        assert values[:, limit.index].max() <= limit.upper, limit
+
+
+def test_a_start_that_leaves_the_limits_is_driven_inside(tmp_path: Path) -> None:
+    wild = {"kind": "sine", "amplitude": 40.0, "frequency": 1.0}
+    setup = cart_inside(tmp_path, control=wild)
+    outside = fence_of(setup)
+    watched = setup.plant.watch(setup.theta, setup.control, outside.taps)
+    assert watched is not None
+    assert set(outside.margins(outside.sight(*watched, slopes=False))) == {"control", "position", "velocity"}
+    assert max(outside.margins(outside.sight(*watched, slopes=False)).values()) < 0.0
+    design = mjfim.design(setup)
+    assert design.limits == pytest.approx({k: max(v, 0.0) for k, v in design.limits.items()})
+    assert_inside(setup, design.trajectory.ctrl)
+    # it begins with as much of the start as keeps them
+    free = setup.free()
+    ladder = Ladder(Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free))
+    begun = ladder.inside(setup.control)
+    assert begun is not None
+    share = float(begun[10, 0] / setup.control[10, 0])
+    np.testing.assert_allclose(begun, free.centre + share * (setup.control - free.centre), rtol=1e-9)
+    assert_inside(setup, begun)
+    tried = sorted(SHRUNK.tolist())
+    larger = free.centre + tried[tried.index(pytest.approx(share)) + 1] * (setup.control - free.centre)
+    with pytest.raises(AssertionError):
+        assert_inside(setup, larger)
+    first = setup.problem.point(setup.plant.simulate(setup.theta, begun))
+    assert design.final.cost < 0.5 * first.cost
+
+
+SWINGING = CART_PENDULUM.format(integrator="RK4").replace(
+    "</mujoco>", '<keyframe><key name="rest" qpos="0.3 3.141592653589793"/></keyframe></mujoco>'
+)
+
+
+def swinging_setup(folder: Path, **tables: Any) -> Setup:
+    """A pendulum that swings at first and has to hang still elsewhere after 1.5 s."""
+    first = {"qpos": (0.0, 2.6), "qvel": (0.4, 1.0), "control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.7}}
+    defaults: dict[str, Any] = {
+        "horizon": 1.5,
+        "rate": 50.0,
+        "parameters": {"m": {"target": "body/bob:mass"}, "c": {"target": "joint/hinge:damping"}},
+        "noise": {"state": 0.05},
+        "initial": first,
+        "cost": {"control": 0.0},
+        "limits": {"control": {"force": (-25.0, 25.0)}, "position": {"slide": (-1.0, 1.0)}},
+        "boundary": {"end": "rest", "keyframe": "rest", "position": 0.02, "velocity": 0.05},
+        "descent": {"max_iterations": 40, "coarse": 1},
+    }
+    return make_setup(SWINGING, folder, **{**defaults, **tables})
+
+
+def assert_ends(setup: Setup, design: Design) -> None:
+    """It hangs still where it has to, by a plain loop, within all limits."""
+    assert design.status is not Status.INFEASIBLE
+    rows = played(setup.model, (np.array([0.0, 2.6]), np.array([0.4, 1.0])), design.trajectory.ctrl, setup.substeps)
+    np.testing.assert_allclose(rows["q"][-1], [0.3, np.pi], rtol=0, atol=0.02)
+    np.testing.assert_allclose(rows["v"][-1], 0.0, rtol=0, atol=0.05)
+    assert_inside(setup, design.trajectory.ctrl)
+
+
+def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> None:
+    """The relaxed barrier brings it there, and the cost has its say from the first iterate on."""
+    setup = swinging_setup(tmp_path)
+    free = setup.free()
+    ladder = Ladder(Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free))
+    first = next(ladder.climb(setup.control, 5))
+    assert first.mu == Rungs().first
+    assert not first.feasible
+    np.testing.assert_array_equal(first.iterate.point.ctrl, setup.control)
+    assert_ends(setup, mjfim.design(setup))
+
+
+def test_a_start_that_no_shrinking_brings_inside_is_steered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is too far outside to begin with: here by decree."""
+    monkeypatch.setattr(ladder_module, "FARTHEST_START", -np.inf)
+    setup = swinging_setup(tmp_path)
+    free = setup.free()
+    ladder = Ladder(Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free))
+    assert ladder.inside(setup.control) is None
+    first = next(ladder.climb(setup.control, 5))
+    assert first.mu == np.inf
+    assert not first.feasible
+    design = mjfim.design(setup)
+    mus = [row.mu for row in design.history]
+    steered = mus.count(np.inf)
+    assert 1 < steered < 30
+    assert mus[:steered] == [np.inf] * steered  # at first, then never again
+    assert_ends(setup, design)
+
+
+def test_what_no_control_can_keep_ends_as_infeasible(tmp_path: Path) -> None:
+    """The pendulum falls faster than it may, whatever the weak motor does: said, and no success."""
+    weak = {**HARD, "control": {"force": (-0.05, 0.05)}, "velocity": {"hinge": 0.41}}
+    setup = cart_inside(tmp_path, horizon=0.3, limits=weak, descent={"max_iterations": 15})
+    design = mjfim.design(setup)
+    assert design.status is Status.INFEASIBLE
+    assert not design.success
+    assert design.limits["velocity"] < 0.0
+    assert any("velocity limits are exceeded by" in sentence for sentence in design.warnings)
+    assert not any("checked, not enforced" in sentence for sentence in design.warnings)
+
+
+def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path: Path) -> None:
+    setup = cart_inside(tmp_path, descent={"max_iterations": 4})
+    task = Task(setup.experiment, Start("wild", 1e9 * np.ones((100, 1)) * np.sin(9.0 * setup.t)[:, None]), Rungs(), 4)
+    chase = perform(task)
+    assert chase.status is Status.INFEASIBLE
+    assert chase.cost == np.inf
+    # beside it another start goes on
+    chases: list[Chase] = []
+    starts = [task.start, Start("initial control", setup.control)]
+    rows = list(Contest(Stage(setup.free(), None), None).run(starts, chases))
+    assert rows
+    assert np.isfinite(chases[1].cost)
+
+
+def test_where_weights_keep_the_limits_there_is_no_barrier(tmp_path: Path) -> None:
+    """The design is that without limits; one that leaves them goes on from where it was still inside."""
+    heavy = {"cost": {"control": 0.05}, "descent": {"max_iterations": 60}}
+    wide = {"control": {"force": (-30.0, 30.0)}, "position": {"slide": (-3.0, 3.0)}}
+    kept = mjfim.design(cart_inside(tmp_path, limits=wide, **heavy))
+    free = mjfim.design(cart_inside(tmp_path, limits={}, **heavy))
+    assert kept.final.cost == free.final.cost
+    assert {row.mu for row in kept.history} == {0.0}
+    assert np.isnan(kept.history[-1].margin)
+    left = mjfim.design(cart_inside(tmp_path, **{**heavy, "cost": {"control": 1e-3}, "descent": {"max_iterations": 6}}))
+    assert left.history[-1].mu > 0.0
+    assert left.found_by == "initial control"
+    assert min(left.limits.values()) >= 0.0
+
+
+def test_a_design_does_not_rest_on_a_clamp(tmp_path: Path) -> None:
+    """What clamps a force keeps it at its range, whatever the control: not as a limit is kept."""
+    weak = CART_PENDULUM.format(integrator="RK4").replace('joint="slide"/>', 'joint="slide" forcerange="-1.5 1.5"/>')
+    for cost in ({"control": 1e-3}, {"control": {"force": 1e-5}}):
+        setup = make_setup(
+            weak,
+            tmp_path,
+            horizon=1.0,
+            parameters={"m": {"target": "body/bob:mass"}, "c": {"target": "joint/hinge:damping"}},
+            noise={"state": 0.05},
+            initial={"qpos": (0.0, 3.0), "control": {"kind": "sine", "amplitude": 1.0, "frequency": 0.9}},
+            cost=cost,
+            descent={"max_iterations": 25},
+        )
+        design = mjfim.design(setup)
+        rows = played(setup.model, (np.array([0.0, 3.0]), np.zeros(2)), design.trajectory.ctrl, setup.substeps)
+        assert 1.2 < np.abs(rows["f"]).max() < 1.5
+        assert 0.0 < design.limits["force"] < 0.3
+        assert not any("clamp" in sentence for sentence in design.warnings)
+
+
+def test_what_is_not_enforced_may_be_left_while_the_boundary_holds(tmp_path: Path) -> None:
+    tables = {"limits": {"position": {"slide": (-0.01, 1.0)}, "control": {"force": (-3.0, 3.0)}, "enforce": False}}
+    setup = swinging_setup(tmp_path, **tables, cost={"control": 1e-4}, descent={"max_iterations": 12, "coarse": 1})
+    design = mjfim.design(setup)
+    assert design.status is not Status.INFEASIBLE
+    assert min(design.limits["end_position"], design.limits["end_velocity"]) >= 0.0
+    assert design.limits["control"] < 0.0
+    assert not design.success
+    said = [sentence for sentence in design.warnings if "control limits are exceeded" in sentence]
+    assert len(said) == 1 and "checked, not enforced" in said[0]
+
+
+def test_the_stated_tolerance_ends_the_last_rung_once_the_limits_hold(tmp_path: Path) -> None:
+    """One so wide that any slope will do: the first iterate there that is inside is the last."""
+    setup = cart_inside(tmp_path, descent={"max_iterations": 80, "tolerance": 100.0, "coarse": 1})
+    design = mjfim.design(setup)
+    assert design.status is Status.CONVERGED
+    sharpest = [row for row in design.history if row.mu == design.history[-1].mu]
+    assert design.history[-1].mu == Rungs.last
+    assert [row.margin >= 0.0 for row in sharpest].index(True) == len(sharpest) - 1
+    assert design.slope > 1e-5
+    assert_inside(setup, design.trajectory.ctrl)
+
+
+def test_more_is_held_back_where_a_rung_leaked_and_less_where_it_was_well_inside() -> None:
+    held = held_back(
+        {"position": 0.1, "control": 0.1, "force": 0.02}, {"position": -0.05, "control": 0.06, "force": 0.5}
+    )
+    assert held == pytest.approx({"position": 0.16, "control": 0.07, "force": 0.0})
+    assert held_back({}, {"velocity": -0.1}) == pytest.approx({"velocity": 0.12})
+
+
+# ---- several starts
+
+
+def several(folder: Path, **tables: Any) -> Setup:
+    """Four starts on a short cart-pendulum."""
+    descent = {"max_iterations": 16, "starts": 4, "seed": 2}
+    return cart_inside(folder, horizon=0.6, **{"descent": descent, **tables})
+
+
+@pytest.mark.parametrize("criterion", ["E", "D"])
+def test_starts_in_parallel_find_what_they_find_one_after_the_other(criterion: str, tmp_path: Path) -> None:
+    setup = several(tmp_path, cost={"control": 0.0, "criterion": criterion})
+    alone = mjfim.design(setup)
+    with ThreadPoolExecutor(2) as executor:
+        together = mjfim.design(setup, executor=executor)
+    assert together.found_by == alone.found_by
+    assert [(s.name, s.status, s.iterations) for s in together.starts] == [
+        (s.name, s.status, s.iterations) for s in alone.starts
+    ]
+    assert [s.cost for s in together.starts] == pytest.approx([s.cost for s in alone.starts], rel=1e-9)
+    np.testing.assert_allclose(together.trajectory.ctrl, alone.trajectory.ctrl, rtol=0, atol=1e-9)
+    assert together.limits == pytest.approx(alone.limits, abs=1e-9)
+    # one of four goes on, the others are left behind; the best one won
+    names = {"initial control", *(f"multisine {i} of 3" for i in (1, 2, 3))}
+    assert {s.name for s in alone.starts} == names
+    assert sum(s.status is Status.LEFT for s in alone.starts) == 3
+    assert alone.final.cost == min(s.cost for s in alone.starts)
+    assert_inside(setup, alone.trajectory.ctrl)
+
+
+def test_an_interrupted_contest_keeps_the_best_so_far(tmp_path: Path) -> None:
+    """Also in its second round, also where the monitor interrupts: no worse than what was told before."""
+    setup = several(tmp_path)
+    told: list[HistoryRow] = []
+
+    def stop(row: HistoryRow) -> None:
+        told.append(row)
+        if row.mu < 0.01 and row.margin > 0.0:
+            raise KeyboardInterrupt
+
+    design = mjfim.design(setup, stop)
+    assert design.status is Status.INTERRUPTED
+    feasible = [row.cost for row in told if row.margin >= 0.0]
+    assert design.final.cost <= told[-1].cost * (1 + 1e-6)
+    assert design.final.cost < 1.2 * min(feasible)
+    assert_inside(setup, design.trajectory.ctrl)
+    early = mjfim.design(setup, lambda row: stop(replace(row, mu=0.0, margin=1.0)))
+    assert early.status is Status.INTERRUPTED
+    assert len(early.starts) == 1
+
+
+def test_a_fourier_start_is_optimised_as_a_series_before_it_goes_on_freely(tmp_path: Path) -> None:
+    setup = several(tmp_path, descent={"max_iterations": 12, "fourier": (2.0,)})
+    chases: list[Chase] = []
+    first: dict[str, Array] = {}
+    from mjfim.excitation.initial_controls import starts_of
+
+    for _ in Contest(Stage(setup.free(), None), None).run(list(starts_of(setup, None)), chases):
+        for chase in chases:
+            if chase.control is not None and chase.history[-1].mu >= 0.01:
+                first[chase.name] = chase.control
+    assert list(first) == ["initial control", "Fourier series of 2 Hz"]
+    waves = [f(2 * np.pi * 2.0 * k * setup.t) for k in range(1, 16) for f in (np.sin, np.cos)]
+    series = np.column_stack(waves)
+    control = first["Fourier series of 2 Hz"] - setup.centre
+    assert relative_error(series @ np.linalg.lstsq(series, control)[0], control) < 1e-6
+    assert np.isfinite(min(chase.cost for chase in chases))
+
+
+# ---- how a design begins, ends and moves
+
+
+def arm_design(folder: Path, **tables: Any) -> tuple[Setup, Design]:
+    """The arm of two servos for half a second, from a standstill that its motors have to hold against gravity."""
+    defaults: dict[str, Any] = {
+        "horizon": 0.5,
+        "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/elbow:damping"}},
+        "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},
+        "control": {"kind": "sine", "amplitude": 0.1, "frequency": 2.0},
+        "cost": {"control": 0.0},
+        "descent": {"max_iterations": 24, "coarse": 1},
+    }
+    limits = {
+        "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
+        "control_rate": 6.0,
+        **tables.pop("limits", {}),
+    }
+    setup = make_setup(ARM, folder, **{**defaults, **tables, "limits": limits})
+    return setup, mjfim.design(setup)
+
+
+def assert_arm(setup: Setup, design: Design, before: Array | None, after: Array | None) -> dict[str, Array]:
+    """Ranges and rates of the control, by hand; returns what a plain loop shows."""
+    ctrl, dt = design.trajectory.ctrl, setup.dt
+    assert np.abs(ctrl).max() <= 1.0
+    assert np.abs(np.diff(ctrl, axis=0)).max() / dt <= 6.0
+    for end, other in ((ctrl[0], before), (ctrl[-1], after)):
+        if other is not None:
+            assert np.abs(end - other).max() / dt <= 6.0
+    assert design.final.cost < design.initial.cost
+    return played(setup.model, (np.zeros(2), np.zeros(2)), ctrl, setup.substeps)
+
+
+def standstill(setup: Setup) -> Array:
+    """Control that holds the arm at zero, by inverse dynamics: (2,)."""
+    data = mujoco.MjData(setup.model)
+    mujoco.mj_inverse(setup.model, data)
+    return np.array(data.qfrc_inverse) / np.array([40.0, 25.0])
+
+
+def test_a_design_from_rest_to_rest_begins_and_ends_at_what_holds(tmp_path: Path) -> None:
+    tight = {"start": "rest", "end": "rest", "position": 0.005, "velocity": 0.03}
+    setup, design = arm_design(tmp_path, boundary=tight)
+    hold = standstill(setup)
+    np.testing.assert_allclose(setup.hold, hold, rtol=0, atol=1e-6)
+    assert np.abs(hold).min() > 0.01
+    rows = assert_arm(setup, design, hold, hold)
+    assert np.abs(rows["q"][-1]).max() <= 0.005
+    assert np.abs(rows["v"][-1]).max() <= 0.03
+    assert np.abs(rows["q"]).max() > 0.1  # it moved
+    assert design.limits["end_position"] == pytest.approx(0.005 - np.abs(rows["q"][-1]).max(), abs=1e-8)
+    assert design.limits["end_velocity"] == pytest.approx(0.03 - np.abs(rows["v"][-1]).max(), abs=1e-7)
+
+
+def test_a_periodic_design_can_be_repeated(tmp_path: Path) -> None:
+    """Its control has no jump at the seam, its state comes back."""
+    setup, design = arm_design(tmp_path, boundary={"end": "periodic", "position": 0.005, "velocity": 0.05})
+    ctrl = design.trajectory.ctrl
+    rows = assert_arm(setup, design, None, ctrl[0])
+    assert np.abs(rows["q"][-1]).max() <= 0.005
+    assert np.abs(rows["v"][-1]).max() <= 0.05
+    twice = played(setup.model, (np.zeros(2), np.zeros(2)), np.concatenate([ctrl, ctrl]), setup.substeps)["q"]
+    assert np.abs(twice[len(rows["q"]) :] - rows["q"]).max() < 0.05
+
+
+@pytest.mark.parametrize("coarse", [1, "auto"])
+def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_path: Path) -> None:
+    """On the stated samples, from the coarse level as well; from rest its first control is what holds, without a slope."""
+    boundary = {"start": "rest", "end": "rest", "position": 0.02, "velocity": 0.1}
+    setup, design = arm_design(
+        tmp_path, boundary=boundary, limits={"bandwidth": 9.0}, descent={"max_iterations": 24, "coarse": coarse}
+    )
+    hold, ctrl = standstill(setup), design.trajectory.ctrl
+    basis = spline_basis(setup.t, 0.5, 9.0, True, True, False)
+    assert basis.shape[1] == 8
+    swing = ctrl - setup.hold
+    assert relative_error(basis @ np.linalg.lstsq(basis, swing)[0], swing) < 1e-9
+    np.testing.assert_allclose(ctrl[0], hold, rtol=0, atol=1e-6)
+    assert np.abs(ctrl[1] - ctrl[0]).max() < 0.05 * np.ptp(ctrl)
+    rows = assert_arm(setup, design, hold, hold)
+    assert np.abs(rows["q"][-1]).max() <= 0.02
+    assert np.abs(rows["v"][-1]).max() <= 0.1
+    power = np.abs(np.fft.rfft(swing, axis=0)) ** 2
+    f = np.fft.rfftfreq(len(swing), setup.dt)
+    assert power[f > 18.0].sum() < 1e-2 * power.sum()
+
+
+@pytest.mark.parametrize("bandwidth", [30.0, 50.0])
+def test_a_bandwidth_near_that_of_the_samples_is_no_trouble(bandwidth: float, tmp_path: Path) -> None:
+    """There are then as many splines as samples or more, of a coarse level twice as many."""
+    setup = cart_inside(tmp_path, limits={**HARD, "bandwidth": bandwidth}, descent={"max_iterations": 6, "coarse": 2})
+    fine = basis_of(setup, setup.t)
+    assert fine is not None and fine.shape[1] > 0.6 * setup.samples
+    design = mjfim.design(setup)
+    assert design.final.cost < design.initial.cost
+    assert_inside(setup, design.trajectory.ctrl)
+
+
+def nearest(setup: Setup, ctrl: Array) -> float:
+    """Smallest distance of the arm to post and floor at any engine step of a plain loop, by MuJoCo's own distances."""
+    model = setup.model
+    data, geoms = mujoco.MjData(model), [model.geom(name).id for name in ("fore", "post", "floor", "upper")]
+    near = []
+    for qpos in played(model, (np.zeros(2), np.zeros(2)), ctrl, setup.substeps)["q"]:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        pairs = ((0, 1), (0, 2), (3, 1), (3, 2))
+        near += [mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 1.0, None) for a, b in pairs]
+    return min(near)
+
+
+@pytest.mark.parametrize(
+    ("proofs", "shrunk"), [(0, False), (0, True), (3, False)], ids=["unproved", "shrunk", "proved"]
+)
+def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
+    proofs: int, shrunk: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The barrier looks at distances at the samples, of 50 ms; the audit at every engine step."""
+    monkeypatch.setattr(contest, "PROOFS", proofs)
+    if not shrunk:
+        monkeypatch.setattr(contest, "SHRUNK", np.ones(1))
+    monkeypatch.setattr(contest, "PATIENCE", 12)
+    setup, design = arm_design(
+        tmp_path,
+        rate=20.0,
+        horizon=1.0,
+        limits={"clearance": 0.15, "control_rate": 20.0},
+        descent={"max_iterations": 16, "coarse": 1},
+    )
+    kept = nearest(setup, design.trajectory.ctrl) >= 0.15
+    assert kept is (shrunk or bool(proofs))
+    assert (design.status is Status.INFEASIBLE) is not kept
+    assert design.limits["clearance"] == pytest.approx(nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6)
+
+
+def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
+    """Without the limit the fore-arm comes closer."""
+    setup, design = arm_design(tmp_path, limits={"clearance": 0.15})
+    free = arm_design(tmp_path)[1]
+    assert nearest(setup, design.trajectory.ctrl) >= 0.15 > nearest(setup, free.trajectory.ctrl)
+    assert design.limits["clearance"] == pytest.approx(nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6)
+
+
+@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor])
+def test_a_shorter_design_played_twice_is_a_start(tmp_path: Path, executor: type[ThreadPoolExecutor] | None) -> None:
+    """Half of the horizon alone tells about as much per second; together they are judged over all of it."""
+    rest = {"start": "rest", "end": "rest"}
+    descent = {"repeats": (2,), "max_iterations": 60}
+    hanging = {"qpos": (0.0, np.pi), "qvel": (0.0, 0.0)}
+    control = {"kind": "sine", "amplitude": 2.0, "frequency": 0.9}
+    limits = {**HARD, "control_rate": 200.0}
+    setup = cart_inside(
+        tmp_path, horizon=2.0, boundary=rest, descent=descent, limits=limits, initial={**hanging, "control": control}
+    )
+    with executor(2) if executor is not None else nullcontext() as pool:
+        design = mjfim.design(setup, executor=pool)
+    assert [start.name for start in design.starts] == ["initial control", "2 times a design of 1 s"]
+    assert np.isfinite([start.cost for start in design.starts]).all()
+    assert len(design.trajectory.ctrl) == setup.samples
+    assert min(design.limits.values()) >= 0.0
+    assert design.final.cost == min(start.cost for start in design.starts)
+
+
+@pytest.mark.parametrize(("count", "tables"), [(2, {"cost": {"control": 1e-3}}), (4, {"rate": 100.0})])
+def test_and_where_weights_bound_the_design_or_samples_are_odd(
+    tmp_path: Path, count: int, tables: dict[str, Any]
+) -> None:
+    wide = {"control": {"force": (-50.0, 50.0)}, "position": {"slide": (-9.0, 9.0)}}
+    descent = {"repeats": (count,), "max_iterations": 10}
+    design = mjfim.design(cart_inside(tmp_path, limits=wide, descent=descent, **tables))
+    assert design.final.cost < design.initial.cost
+    assert len(design.starts) == 2
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"cost": {"control": 0.0, "criterion": "A"}},
+        {"cost": {"control": 0.0, "criterion": "D"}},
+        {"cost": {"control": 0.0, "criterion": "c", "combination": {"m": 1.0, "c": -0.5}}},
+        {"cost": {"control": 0.0}, "robust": {"samples": 3}, "parameters": {"m": {"prior": 0.3}}},
+    ],
+    ids=["A", "D", "c", "robust"],
+)
+def test_every_criterion_gains_within_limits(tmp_path: Path, tables: dict[str, Any]) -> None:
+    known = {name: {**stated, **tables.get("parameters", {}).get(name, {})} for name, stated in CART_PARAMETERS.items()}
+    setup = cart_inside(tmp_path, **{**tables, "parameters": known})
+    design = mjfim.design(setup)
+    first = setup.problem.point(setup.plant.simulate(setup.theta, 0.2 * setup.control)).cost  # inside as well
+    assert design.final.cost < (first - 1.0 if tables["cost"].get("criterion") == "D" else 0.7 * first)
+    assert_inside(setup, design.trajectory.ctrl)
+    assert min(design.limits.values()) >= 0.0
+
+
+def test_what_leaks_a_little_goes_on_and_the_start_is_kept_beside_it(tmp_path: Path) -> None:
+    free = cart_inside(tmp_path).free()
+    rivals = Contest(Stage(free, None), None)
+    start, leaking, inside = (Start("x", s * free.control) for s in (0.2, 3.0, 0.1))  # here the smaller one tells more
+    chase = Chase("x", leaking.control, 1e-3)
+    lead = rivals._judge(chase, start)
+    assert (lead.control is leaking.control, lead.cost) == (True, 1e-3)
+    assert chase.control is not leaking.control
+    assert chase.cost == pytest.approx(free.problem.point(free.plant.simulate(free.theta, start.control)).cost)
+    chase = Chase("x", inside.control, 1e-3)
+    lead = rivals._judge(chase, start)
+    assert lead.control is chase.control is inside.control
+    assert lead.cost == chase.cost > 1e-3

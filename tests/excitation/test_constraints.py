@@ -1,0 +1,294 @@
+"""Hard limits along a trajectory: margins by hand, the expansion of the barrier against differences of simulations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from plant.test_substep_observations import floating_setup
+from support.numerics import Array, directional_check, make_setup
+
+from mjfim.excitation.constraints import END_WEIGHT, Sight, fence_of
+from mjfim.excitation.interior_point import InteriorProblem, seen
+from mjfim.experiment.system import Setup
+from mjfim.optimize.barrier import Band
+from mjfim.optimize.lq import TangentCurve
+
+# A planar arm of two torque-controlled servos over a floor, with a post in its way.
+ARM = """
+<mujoco model="arm">
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 0.1" pos="0 0 -0.42"/>
+    <geom name="post" type="sphere" size="0.05" pos="0.56 0 -0.3"/>
+    <body name="upper" pos="0 0 0">
+      <joint name="shoulder" axis="0 1 0" damping="0.3" armature="0.02"/>
+      <geom name="upper" type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.8"/>
+      <body name="fore" pos="0.3 0 0">
+        <joint name="elbow" axis="0 1 0" damping="0.2" armature="0.01"/>
+        <geom name="fore" type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.4"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="shoulder" joint="shoulder" kp="40" kv="1"/>
+    <general name="elbow" joint="elbow" gainprm="25" biastype="affine" biasprm="0 -25 -0.5"/>
+  </actuator>
+</mujoco>
+"""
+WIDE = {"position": 0.5, "velocity": 5.0}  # so that an end that is missed does not drown everything else
+# tight enough that the swing below is outside some and close to others
+ALONE: dict[str, dict[str, Any]] = {
+    "position": {"limits": {"position": {"shoulder": (-0.3, 0.7), "elbow": (-0.3, 0.5)}}},
+    "velocity": {"limits": {"velocity": {"shoulder": 4.6, "elbow": (-5.0, 4.8)}}},
+    "acceleration": {"limits": {"acceleration": 300.0}},
+    "control": {"limits": {"control": {"shoulder": (-0.3, 0.4), "elbow": (-0.1, 0.7)}}},
+    "control_rate": {"limits": {"control_rate": {"shoulder": 2.5, "elbow": (-3.0, 5.0)}}},
+    "force": {"limits": {"force": {"shoulder": 11.0, "elbow": (-4.0, 4.5)}}},
+    "clearance": {"limits": {"clearance": 0.03}},
+    "end": {"boundary": {"end": "periodic", "position": 0.1, "velocity": 2.0}},
+    "rest": {"boundary": {"start": "rest", "end": "rest", **WIDE}, "limits": {"control_rate": 4.0}},
+    "seam": {
+        "boundary": {"end": "periodic", **WIDE},
+        "limits": {"control_rate": {"elbow": 2.0, "shoulder": (-9.0, 2.0)}},
+    },
+    "rest and seam": {"boundary": {"start": "rest", "end": "periodic", **WIDE}, "limits": {"control_rate": 4.0}},
+}
+EVERY = {key: value for name in list(ALONE)[:7] for key, value in ALONE[name]["limits"].items()}
+TOGETHER: dict[str, dict[str, Any]] = {
+    "every kind, anywhere": {"limits": EVERY},
+    "every kind, rest to rest": {"limits": EVERY, "boundary": {"start": "rest", "end": "rest", **WIDE}},
+    "every kind, periodic": {"limits": EVERY, "boundary": {"end": "periodic", **WIDE}},
+}
+KINDS = {"position", "velocity", "acceleration", "control", "control_rate", "force", "clearance"}
+
+
+def arm_setup(folder: Path, **tables: Any) -> Setup:
+    """The arm from a standstill, swung by sines of 1.5 Hz for 0.4 s, on its lifted plant."""
+    swing = {"shoulder": 0.25, "elbow": 0.35}
+    defaults: dict[str, Any] = {
+        "horizon": 0.4,
+        "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/elbow:damping"}},
+        "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},
+        "control": {"kind": "sine", "amplitude": swing, "offset": {"shoulder": 0.1, "elbow": 0.2}, "frequency": 1.5},
+    }
+    return make_setup(ARM, folder, **{**defaults, **tables}).free()
+
+
+def directions_of(setup: Setup, count: int, seed: int = 0) -> Array:
+    """(count, N, nu) random changes of the control, smooth ones and rough ones."""
+    rng, t = np.random.default_rng(seed), setup.t[:, None] / setup.experiment.horizon
+    nu = setup.control.shape[1]
+    smooth = [np.sin(2 * np.pi * rng.uniform(0.5, 3.0, nu) * t + rng.uniform(0, 6, nu)) for _ in range(count // 2)]
+    return np.array([*smooth, *rng.normal(size=(count - count // 2, *setup.control.shape))])
+
+
+def barrier_check(setup: Setup, delta: float, h: float = 2e-5) -> float:
+    """Largest relative error of the slope of the barrier along random controls, against differences of simulations."""
+    problem = InteriorProblem(setup.problem, fence_of(setup), 1.0, delta, costs=False)
+    expansion = problem.expand(problem.point(setup.control))
+    open_loop = np.zeros((setup.samples, len(setup.controls), setup.space.nx))
+    gradient = expansion.gradient(open_loop)
+    sizes = np.abs(setup.control - setup.centre).max(axis=0)
+    ways = directions_of(setup, 6) * sizes
+    curves = [lambda s, way=way: problem.point(setup.control + s * way).barrier for way in ways]
+    return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
+
+
+@pytest.mark.parametrize("delta", [0.1, 3e-3])
+@pytest.mark.parametrize("name", [*ALONE, *TOGETHER])
+def test_the_slope_of_the_barrier_is_that_of_simulated_controls(name: str, delta: float, tmp_path: Path) -> None:
+    setup = arm_setup(tmp_path, **{**ALONE, **TOGETHER}[name])
+    fence = fence_of(setup)
+    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    assert watched is not None
+    margins = fence.margins(fence.sight(*watched, slopes=False))
+    if name in KINDS:
+        assert set(margins) == {name}
+    elif name in TOGETHER:
+        assert set(margins) >= KINDS
+        assert min(margins.values()) < 0.0 < max(margins.values())
+    assert barrier_check(setup, delta) < 2e-3
+
+
+def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -> None:
+    """Half a turn away the difference of rotations bends; a floating hull comes nowhere near its start."""
+    wild = {
+        "initial": {"qvel": (0.1, 0.0, 0.2, 3.5, -2.4, 4.3, 1.0, -2.0), "control": {"kind": "sine", "amplitude": 0.3}}
+    }
+    setup = floating_setup(tmp_path, boundary={"end": "periodic", "position": 0.5, "velocity": 50.0}, **wild).free()
+    rotation = setup.space.minus(setup.initial.state[-1], setup.target)[3:6]
+    assert np.linalg.norm(rotation) > 1.0
+    assert barrier_check(setup, 0.1) < 2e-3
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: Path) -> None:
+    """Along any tangent curve it is the sum of squares of all that is looked at, weighted by the barriers' curvatures."""
+    setup = arm_setup(tmp_path, **TOGETHER[name])
+    fence, delta = fence_of(setup), 0.05
+    problem = InteriorProblem(setup.problem, fence, 1.0, delta, costs=False)
+    point = problem.point(setup.control)
+    expansion = problem.expand(point)
+    assert expansion.hedge is not None
+    w, rng = expansion.hedge.weights, np.random.default_rng(4)
+    for k in range(setup.samples):
+        form = np.block([[w.Q[k], w.S[k].T], [w.S[k], w.R[k]]])
+        values = np.linalg.eigvalsh(0.5 * (form + form.T))
+        assert values[0] > -1e-10 * values[-1]
+        np.testing.assert_allclose(form, form.T, rtol=0, atol=1e-9 * values[-1])
+    assert (np.linalg.eigvalsh(w.Q[-1]) >= -1e-12 * np.abs(w.Q[-1]).max()).all()
+    assert (w.W >= 0.0).all()
+    free = fence.before is None, fence.after is None and not fence.seam
+    assert ((w.W[0] == 0.0).all(), (w.W[-1] == 0.0).all()) == free
+    assert (w.W[1:-1] > 0.0).all()
+    # its own: the squares of what every limited number moves by, times the curvature of its barrier
+    sight, N = fence.sight(seen(point).trajectory, seen(point).tapped, slopes=True), setup.samples
+    _, _, rise = setup.plant.tapped(setup.theta, sight.trajectory, fence.taps)
+    looked, ctrl = np.array(fence.taps.substeps) - 1, setup.control
+    assert sight.distances is not None and sight.slopes is not None and fence.rate is not None
+    assert fence.clearance is not None
+    m, least = sight.distances.shape[1], np.full(sight.distances.shape[1], 0.03)
+    near = Band(least, np.full(m, np.inf), fence.clearance.reach - least)
+    bends = [
+        fence.shown.wall(sight.tapped[:, looked], delta, 1.0 / N / len(looked)).bend,
+        fence.control.wall(ctrl, delta, 1.0 / N).bend,
+        fence.rate.wall(fence.rates(ctrl), delta, 1.0 / N).bend,
+        near.wall(sight.distances, delta, 1.0 / N).bend,
+    ]
+    for way in rng.normal(size=(3, *ctrl.shape)):
+        way[0] = 0.0  # with a seam the metric leaves the move of the first control out
+        zeta = expansion.lift(np.zeros((N, 2, setup.space.nx)), way)
+        moves = [
+            np.einsum("kswi,ki->ksw", rise, np.concatenate([zeta.z[:-1], zeta.v], axis=1)),
+            zeta.v,
+            fence.rates(ctrl + zeta.v) - fence.rates(ctrl),
+            np.einsum("kmi,ki->km", sight.slopes, zeta.z[1:, : setup.space.nv]),
+        ]
+        wanted = [float(np.sum(bend * move**2)) for bend, move in zip(bends, moves, strict=True)]
+        if fence.end is not None and fence.target is not None:
+            ended = setup.space.minus(sight.trajectory.state[-1], fence.target)
+            wanted.append(float(np.sum(fence.end.wall(ended, delta, END_WEIGHT).bend * zeta.z[-1] ** 2)))
+        assert min(wanted) > 1e-6 * sum(wanted)
+        a, b = w.force(zeta)
+        assert float(np.sum(a * zeta.z) + np.sum(b * zeta.v)) == pytest.approx(sum(wanted), rel=1e-9)
+    # and of what is linear in the control it is the curvature of the barrier itself
+    endless = np.full(len(fence.kinds), np.inf)
+    narrow = replace(fence, shown=replace(fence.shown, lower=-endless, upper=endless), clearance=None, end=None)
+    problem = InteriorProblem(setup.problem, narrow, 1.0, delta, costs=False)
+    hedge = problem.expand(problem.point(ctrl)).hedge
+    assert hedge is not None
+    _, b = hedge.weights.force(TangentCurve(np.zeros((N + 1, setup.space.nx)), 1e-5 * way))
+    here, up, down = (problem.point(ctrl + s * way).barrier for s in (0.0, 1e-5, -1e-5))
+    assert float(np.sum(b * 1e-5 * way)) == pytest.approx(up + down - 2 * here, rel=1e-3)
+
+
+def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> None:
+    """Over half of each range; the largest at any looked-at engine step."""
+    setup = arm_setup(tmp_path, limits=EVERY)
+    fence = fence_of(setup)
+    problem = InteriorProblem(setup.problem, fence, 1.0, 0.1, costs=False)
+    expansion = problem.expand(problem.point(setup.control))
+    assert expansion.hedge is not None
+    for way in 1e-4 * directions_of(setup, 4, seed=2):
+        zeta = expansion.lift(np.zeros((setup.samples, 2, setup.space.nx)), way)
+        up, down = (seen(problem.point(setup.control + s * way)).tapped for s in (1.0, -1.0))
+        moved = (0.5 * np.abs(up - down) / fence.shown.scale)[:, np.array(fence.taps.substeps) - 1].max()
+        wanted = max(moved, np.abs(way / fence.control.scale).max())
+        assert expansion.hedge.motion(zeta) == pytest.approx(wanted, rel=1e-3)
+
+
+def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> None:
+    """Every kind at once, in its own unit, at every engine step; shares are the same over half of the range."""
+    setup = arm_setup(
+        tmp_path, limits=EVERY, boundary={"start": "rest", "end": "rest", "position": 0.2, "velocity": 3.0}
+    )
+    fence, model, limits = fence_of(setup), mujoco.MjModel.from_xml_string(ARM), setup.limits
+    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    assert watched is not None
+    data, rows, near = mujoco.MjData(model), {kind: [] for kind in KINDS}, []
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    geoms = [model.geom(name).id for name in ("fore", "post", "floor", "upper")]
+    for held in setup.control:
+        data.ctrl[:] = held
+        for _ in range(setup.substeps):
+            before = data.qvel.copy()
+            mujoco.mj_step(model, data)
+            now = {
+                "position": data.qpos,
+                "velocity": data.qvel,
+                "acceleration": (data.qvel - before) / 0.002,
+                "force": data.actuator_force,
+            }
+            for kind, values in now.items():
+                rows[kind].append(values.copy())
+        mujoco.mj_kinematics(model, data)
+        for a, b in ((0, 1), (0, 2), (3, 1)):
+            near.append(mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 1.0, None))
+    held = setup.final_hold  # the start is the end
+    rows["control"] = list(setup.control)
+    rows["control_rate"] = list(np.diff(setup.control, axis=0, prepend=setup.hold[None], append=held[None]) / 0.01)
+    wanted, shares = {}, {}
+    for kind in KINDS - {"clearance"}:
+        found = [
+            (m, m / (0.5 * (x.upper - x.lower)))
+            for x in limits
+            if x.kind == kind
+            for m in np.minimum(np.array(rows[kind])[:, x.index] - x.lower, x.upper - np.array(rows[kind])[:, x.index])
+        ]
+        wanted[kind], shares[kind] = (min(column) for column in zip(*found, strict=True))
+    wanted["clearance"] = min(near) - 0.03
+    shares["clearance"] = wanted["clearance"] / 0.03
+    wanted["end_position"], wanted["end_velocity"] = 0.2 - np.abs(data.qpos).max(), 3.0 - np.abs(data.qvel).max()
+    shares["end_position"], shares["end_velocity"] = wanted["end_position"] / 0.2, wanted["end_velocity"] / 3.0
+    sight = fence.sight(*watched, slopes=False)
+    assert fence.margins(sight) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
+    assert fence.shares(sight) == pytest.approx(shares, rel=1e-5, abs=1e-7)
+
+
+def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> None:
+    setup = arm_setup(tmp_path, limits=EVERY, boundary={"end": "periodic", "position": 0.2, "velocity": 3.0})
+    fence = fence_of(setup)
+    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    assert watched is not None
+    sight = fence.sight(*watched, slopes=False)
+    shares = {kind: 0.01 * (i + 1) for i, kind in enumerate(sorted(fence.margins(sight)))}
+    tighter = {kind: fence.shares(sight)[kind] - share for kind, share in shares.items()}
+    found = fence.tightened(shares).shares(sight)
+    least = 0.03 * (1.0 + shares["clearance"])  # its share is of the least distance, which is raised
+    assert fence.tightened(shares).least == pytest.approx(least)
+    assert sight.distances is not None
+    tighter["clearance"] = float(sight.distances.min()) / least - 1.0
+    assert found == pytest.approx(tighter, abs=1e-12)
+    assert fence.tightened({}).shares(sight) == pytest.approx(fence.shares(sight))
+    # not so far that nothing is left between the least distance and where it no longer matters
+    far = fence.tightened({"clearance": 50.0})
+    assert far.clearance is not None and far.least < far.clearance.reach
+    assert far.value(sight, 0.1) > fence.value(sight, 0.1)
+
+
+def test_rates_begin_and_end_where_the_boundary_says(tmp_path: Path) -> None:
+    setup = arm_setup(tmp_path, limits={"control_rate": 9.0})
+    fence, ctrl = fence_of(setup), setup.control
+    inner = np.diff(ctrl, axis=0) / 0.01
+    np.testing.assert_allclose(fence.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
+    before, after = np.array([0.7, 0.1]), np.array([-0.2, 0.3])
+    rested = replace(fence, before=before, after=after).rates(ctrl)
+    np.testing.assert_allclose(rested[[0, -1]], [(ctrl[0] - before) / 0.01, (after - ctrl[-1]) / 0.01])
+    np.testing.assert_allclose(replace(fence, seam=True).rates(ctrl)[[0, -1]], [[0, 0], (ctrl[0] - ctrl[-1]) / 0.01])
+
+
+def test_without_enforcement_only_the_boundary_is_left(tmp_path: Path) -> None:
+    """What is checked and reported is all of them."""
+    setup = arm_setup(tmp_path, limits={**EVERY, "enforce": False}, boundary={"end": "periodic"})
+    for every, kinds in ((False, set()), (True, KINDS)):
+        fence = fence_of(setup, every=every)
+        watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+        assert watched is not None
+        sight = fence.sight(*watched, slopes=False)
+        assert isinstance(sight, Sight)
+        assert set(fence.margins(sight)) == kinds | {"end_position", "end_velocity"}

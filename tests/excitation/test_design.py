@@ -1,0 +1,200 @@
+"""What a design says about itself: warnings, refusals, starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.numerics import CART_PARAMETERS, cart_setup
+
+import mjfim
+from mjfim.errors import ExperimentError, ModelError, UnidentifiableError
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.records.design import Status
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def experiment() -> Experiment:
+    return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+
+
+def altered(tmp_path: Path, experiment: Experiment, old: str, new: str, **tables: Any) -> Experiment:
+    """The cart-pendulum with a change in its MJCF."""
+    text = (ROOT / "models" / "cart_pendulum.xml").read_text()
+    assert old in text
+    (tmp_path / "cart_pendulum.xml").write_text(text.replace(old, new))
+    (tmp_path / "cart_pendulum.csv").write_bytes((ROOT / "models" / "cart_pendulum.csv").read_bytes())
+    values = experiment.replace(**tables).model_dump(exclude_unset=True)
+    return Experiment(**values, directory=tmp_path)
+
+
+def test_scale_does_not_change_the_predicted_deviation(experiment: Experiment) -> None:
+    relative = {name: {"scale": "guess"} for name in ("m", "l", "c")}
+    large = {name: {"scale": 1e4} for name in ("m", "l", "c")}
+    stds = []
+    for table in (relative, large):
+        setup = Setup(experiment.replace(parameters=table))
+        stds.append(mjfim.evaluate_trajectory(setup, setup.initial).std)
+    np.testing.assert_allclose(stds[0], stds[1], rtol=1e-9)
+
+
+def test_actuator_delays_are_refused(experiment: Experiment, tmp_path: Path) -> None:
+    late = altered(
+        tmp_path,
+        experiment,
+        '<motor name="force" joint="slide"/>',
+        '<motor name="force" joint="slide" delay="0.05" nsample="8"/>',
+    )
+    with pytest.raises(ModelError, match="delays"):
+        Setup(late)
+
+
+def test_saturation_is_said(experiment: Experiment, tmp_path: Path) -> None:
+    old, new = 'joint="slide"/>', 'joint="slide" forcelimited="true" forcerange="-1.5 1.5"/>'
+    # hard limits, the default now, keep a design off the clamp: only what is not enforced can rest on it
+    tables = {"descent": {"max_iterations": 8}, "limits": {"enforce": False}}
+    weak = altered(tmp_path, experiment, f'<motor name="force" {old}', f'<motor name="force" {new}', **tables)
+    design = mjfim.design(weak)
+    assert any("forcerange clamps force" in sentence for sentence in design.warnings)
+    assert not any("forcerange" in sentence for sentence in mjfim.design(experiment).warnings)
+
+
+def test_instability_is_said(experiment: Experiment) -> None:
+    # D-optimality with this little effort balances the pendulum upright, where every sensitivity explodes
+    wild = mjfim.design(experiment.replace(cost={"criterion": "D"}, descent={"max_iterations": 60}))
+    assert wild.final.growth > 1e3
+    assert any("disturbance" in sentence for sentence in wild.warnings)
+    steady = mjfim.design(experiment)
+    assert steady.final.growth < 1e2
+    assert not any("disturbance" in sentence for sentence in steady.warnings)
+
+
+def test_limits_that_are_left_are_said_and_no_success(experiment: Experiment) -> None:
+    # by default limits hold now; here they are only to be checked
+    tight = experiment.replace(limits={"control": {"force": [-1.0, 1.0]}, "enforce": False})
+    design = mjfim.design(tight)
+    assert design.limits["control"] < 0
+    assert not design.success
+    assert any("control limits are exceeded" in sentence for sentence in design.warnings)
+
+
+def test_own_start_is_checked(experiment: Experiment) -> None:
+    with pytest.raises(ExperimentError, match=r"\(400, 1\)"):
+        mjfim.design(experiment, start=np.zeros(400))
+    with pytest.raises(UnidentifiableError, match="excites nothing"):
+        mjfim.design(experiment, start=np.zeros((400, 1)))
+    t = np.arange(400) * 0.01
+    design = mjfim.design(experiment, start=np.sin(5 * t)[:, None])
+    assert design.found_by == "given control"
+    assert design.final.cost == pytest.approx(0.01741324, rel=1e-4)
+
+
+def test_metric_weight_on_psi_needs_the_metric_descent(experiment: Experiment) -> None:
+    with pytest.raises(ExperimentError, match="psi_weight"):
+        experiment.replace(descent={"psi_weight": 1.0})
+
+
+def test_monitor_sees_levels_and_growing_numbers(experiment: Experiment) -> None:
+    rows: list[mjfim.trajectory.HistoryRow] = []
+    design = mjfim.design(experiment, monitor=rows.append)
+    assert [row.iteration for row in rows] == list(range(len(rows)))
+    assert [row.rate for row in rows] == sorted(row.rate for row in rows)
+    assert {row.rate for row in rows} == {25.0, 100.0}
+    assert rows[-1].steps <= design.steps
+
+
+def test_units_come_from_the_path_where_none_is_stated(experiment: Experiment) -> None:
+    values = experiment.model_dump(exclude_unset=True)
+    for table in values["parameters"].values():
+        table.pop("unit")
+    setup = Setup(Experiment(**values, directory=ROOT / "models"))
+    assert setup.units == ("kg", "m", "N m s/rad")
+
+
+def test_where_the_smallest_eigenvalues_meet_the_descent_goes_on_smoothly(tmp_path: Path) -> None:
+    setup = cart_setup(tmp_path, horizon=1.0, cost={"control": 1e-4})
+    made = mjfim.design(setup)
+    assert made.status is Status.SMOOTHED
+    assert made.success
+    first, second = made.final.eigenvalues[:2]
+    assert second < 1.2 * first
+    # what is reported is the exact criterion, and the best that any iterate had
+    assert made.final.criterion == pytest.approx(1.0 / first, rel=1e-9)
+    assert made.final.cost == pytest.approx(1.0 / first + setup.problem.running.value(made.trajectory), rel=1e-9)
+    fine = [row.cost for row in made.history if row.rate == 100.0]
+    assert made.final.cost == pytest.approx(min(fine), rel=1e-12)
+    assert [row.iteration for row in made.history] == list(range(len(made.history)))
+    # no small change of the control is much better
+    rng, here = np.random.default_rng(0), made.trajectory.ctrl
+    for _ in range(10):
+        wave = np.sin(2 * np.pi * rng.uniform(0.5, 4.0) * setup.t + rng.uniform(0.0, 6.3))[:, None]
+        for size in (-0.3, 0.3):
+            moved = setup.problem.point(setup.plant.simulate(setup.theta, here + size * wave))
+            assert moved.cost > 0.99 * made.final.cost
+
+
+def test_a_design_that_knows_of_its_nuisances_beats_one_that_does_not(tmp_path: Path) -> None:
+    shared = {"horizon": 1.0, "cost": {"control": 1e-3}}
+    unsure = cart_setup(tmp_path, **shared, nuisance={"initial": True, "bias": 0.2})
+    aware, naive = mjfim.design(unsure), mjfim.design(cart_setup(tmp_path, **shared))
+    assert naive.nuisance == ()
+    assert aware.nuisance[0] == "initial qpos:slide"
+    assert len(aware.nuisance) == 8
+    assert aware.final.eigenvalues.shape == (3,)
+    there = mjfim.evaluate_trajectory(unsure, naive.trajectory)
+    assert aware.final.cost < 0.95 * there.cost
+    # the trajectory is judged by the block of the full inverse that belongs to the wanted parameters
+    block = np.linalg.inv(aware.final.information)[:3, :3] / np.outer(unsure.theta[:3], unsure.theta[:3])
+    seen = np.sort(1.0 / np.linalg.eigvalsh(block)) / unsure.measure_rate
+    np.testing.assert_allclose(aware.final.eigenvalues, seen, rtol=1e-6)
+
+
+def test_a_design_for_one_combination_tells_it_better_than_one_for_all(tmp_path: Path) -> None:
+    wanted = {"criterion": "c", "combination": {"m": 1.0, "l": -1.0}, "control": 1e-3}
+    setup = cart_setup(tmp_path, horizon=1.0, cost=wanted)
+    made, general = mjfim.design(setup), mjfim.design(cart_setup(tmp_path, horizon=1.0))
+    assert made.final.cost < 0.9 * mjfim.evaluate_trajectory(setup, general.trajectory).cost
+    c = np.array([1.0, -1.0, 0.0])
+    variance = c @ np.linalg.inv(made.final.information) @ c
+    assert made.final.criterion == pytest.approx(variance * setup.measure_rate, rel=1e-9)
+
+
+RATED = {"state": 0.05, "qpos:hinge": {"sigma": 0.01, "rate": 20.0}}
+LEVELS = {
+    "plain": {},
+    "sensors at their own rates": {"noise": RATED},
+    "nuisances": {"nuisance": {"initial": 0.1, "bias": 0.05, "delay": 0.01}},
+    "priors": {"parameters": {name: {**target, "prior": 0.01} for name, target in CART_PARAMETERS.items()}},
+    "slow": {"measure_rate": 20.0, "noise": {"state": 0.05}},
+}
+
+
+@pytest.mark.parametrize("case", LEVELS)
+def test_a_coarser_level_costs_about_the_same(case: str, tmp_path: Path) -> None:
+    setup = cart_setup(tmp_path, horizon=4.0, **LEVELS[case])
+    fine, coarse = (s.problem.point(s.initial) for s in (setup, setup.coarser(4)))
+    assert coarse.criterion.value == pytest.approx(fine.criterion.value, rel=0.03)
+    assert coarse.cost == pytest.approx(fine.cost, rel=0.03)
+
+
+def test_the_choice_of_a_group_needs_no_error_where_members_are_invisible(tmp_path: Path) -> None:
+    parameters = {"bob": {"inertial": "bob", "coordinates": "barycentric"}}
+    made = mjfim.design(cart_setup(tmp_path, parameters=parameters, descent={"max_iterations": 3}))
+    # a point on a planar pendulum shows its mass, two first moments and the inertia about the hinge
+    assert made.combinations[-1].endswith("no effect on anything that is measured")
+    assert len(made.final.eigenvalues) < 10
+    assert np.isinf(made.final.std).sum() >= 10 - len(made.final.eigenvalues)
+    assert made.final.cost < made.initial.cost
+
+
+def test_a_coarse_factor_that_does_not_divide_the_samples_is_refused(tmp_path: Path) -> None:
+    """By default it is just not used."""
+    tables = {"horizon": 4.06, "descent": {"max_iterations": 1}}
+    with pytest.raises(ExperimentError, match=r"descent\.coarse: 4 does not divide the 406 samples; .*: 1, 2, 7, 14$"):
+        mjfim.design(cart_setup(tmp_path, **{**tables, "descent": {"max_iterations": 1, "coarse": 4}}))
+    mjfim.design(cart_setup(tmp_path, **tables))

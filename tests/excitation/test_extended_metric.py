@@ -1,0 +1,200 @@
+"""Problem (8) with psi among the states: the same direction where psi has no weight, the right linearisation where it has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.numerics import Array, Loop, body_setup, cart_setup, relative_error
+
+from mjfim.excitation.design import design
+from mjfim.excitation.objective import extend
+from mjfim.excitation.unconstrained import Stage, direction_for
+from mjfim.experiment.system import Setup
+from mjfim.information.fisher import Information
+from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
+from mjfim.optimize.lq import Recursion, TangentCurve
+from mjfim.optimize.projection_operator import Expansion
+from mjfim.plant.noise import Noise
+from mjfim.plant.plant import CENTRAL, Bilinear
+from mjfim.records.trajectory import Sensitivity
+
+TRACKING = {"tracking": {"slide": 0.3, "hinge": 0.1}, "control": 1e-2}
+SENSED = {"angle": 0.01, "acc": 0.3, "drive": 0.1}
+
+CORRELATED = ({"outputs": ("angle", "drive"), "covariance": ((1e-4, 5e-4), (5e-4, 0.01))},)
+
+
+def expanded(setup: Setup) -> Expansion:
+    """Expansion of J about the initial trajectory, psi among the states."""
+    problem = replace(setup.problem, extended=True)
+    return problem.expand(problem.point(setup.initial, CENTRAL))
+
+
+def both_directions(setup: Setup, psi_weight: float) -> tuple[Expansion, TangentCurve, TangentCurve]:
+    """Expansion, metric descent, extended metric descent with a weight on psi."""
+    dt, p, nx = setup.dt, len(setup.theta), setup.space.nx
+    Q, R = np.diag(setup.tracking + 0.02) * dt, np.diag(setup.control_weight) * dt
+    wide = np.zeros((nx * (1 + p), nx * (1 + p)))
+    wide[:nx, :nx] = Q
+    wide[nx:, nx:] = psi_weight * dt * np.eye(nx * p)
+    expansion, K = expanded(setup), np.zeros((setup.samples, setup.plant.nu, nx))
+    return expansion, MetricDescent(Q, R, 3.0 * Q)(expansion, K), extended_direction(expansion, K, wide, R, 3.0 * wide)
+
+
+def extended_direction(e: Expansion, K: Array, Q: Array, R: Array, terminal: Array) -> TangentCurve:
+    """zeta of the extended problem."""
+    return ExtendedMetricDescent(Q, R, terminal)(e, K)
+
+
+CASES = {
+    "cart E": lambda f: cart_setup(f, cost=TRACKING),
+    "cart A": lambda f: cart_setup(f, cost={**TRACKING, "criterion": "A"}),
+    "cart D sensors": lambda f: cart_setup(f, "Euler", noise=SENSED, cost={**TRACKING, "criterion": "D"}),
+    "cart, correlated, nuisances": lambda f: cart_setup(
+        f, noise=SENSED, correlated=CORRELATED, nuisance={"initial": 0.05, "bias": 0.1, "delay": 0.02}
+    ),
+    "free body": body_setup,
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_without_weight_on_psi_the_extended_direction_is_that_of_metric_descent(case: str, tmp_path) -> None:
+    _, plain, wide = both_directions(CASES[case](tmp_path), 0.0)
+    assert relative_error(wide.v, plain.v) < 5e-6  # the accuracy of the mixed differences of both
+    assert relative_error(wide.z, plain.z) < 5e-6
+
+
+def test_with_weight_on_psi_the_extended_direction_is_another_descent_direction(tmp_path) -> None:
+    expansion, plain, wide = both_directions(CASES["cart E"](tmp_path), 1.0)
+    assert relative_error(wide.v, plain.v) > 1e-2
+    assert expansion.slope(wide) < 0.0
+
+
+@pytest.mark.parametrize("criterion", ["E", "A", "D"])
+def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None:
+    rng, (N, nx, nu, ny, p) = np.random.default_rng(2), (9, 3, 2, 2, 3)
+    A, B = 0.5 * rng.normal(size=(N, nx, nx)), rng.normal(size=(N, nx, nu))
+    C, D = rng.normal(size=(N + 1, ny, nx)), rng.normal(size=(N + 1, ny, nu))
+    unit = Bilinear(A, B, C, D, rng.normal(size=(p, N, nx + nu, nx)), rng.normal(size=(p, N + 1, nx + nu, ny)))
+    S = Sensitivity(rng.normal(size=(N + 1, nx, p)), rng.normal(size=(N + 1, ny, p)))
+    noise = Noise.independent([0.3, 2.0])
+    made = Information(noise, 20.0, np.array([1.0, 0.5, 3.0]), np.zeros((p, p)), criterion)
+    found = made.evaluate(made.matrix(S))
+    F, h = (np.einsum("rj,jkzx->rkzx", found.directions, m) for m in (unit.F_mixed, unit.h_mixed))
+    a, b = made.gradient(found, S, Bilinear(A, B, C, D, F, h))
+    a_psi, a_h, b_h = made.partials(found, S, unit)
+    wide = extend(unit, a_h, b_h, a_psi)
+    v = rng.normal(size=(N, nu))
+    z = Recursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
+    full = Recursion(wide.A).forward(np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v))
+    reduced, slope = Expansion(A, B, a, b).slope(TangentCurve(z, v)), wide.slope(TangentCurve(full, v))
+    assert slope == pytest.approx(reduced, rel=1e-10)
+    R, Q = np.eye(nu), np.diag([1.0, 2.0, 0.0])
+    plain = MetricDescent(Q, R, Q)(Expansion(A, B, a, b), np.zeros((N, nu, nx)))
+    wide_Q = np.zeros((nx * (1 + p), nx * (1 + p)))
+    wide_Q[:nx, :nx] = Q
+    same = extended_direction(Expansion(A, B, a, b, wide), np.zeros((N, nu, nx)), wide_Q, R, wide_Q)
+    assert relative_error(same.v, plain.v) < 1e-10
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_extended_slope_is_the_reduced_slope(case: str, tmp_path) -> None:
+    setup = CASES[case](tmp_path)
+    e, rng = expanded(setup), np.random.default_rng(1)
+    wide = e.extended
+    for _ in range(3):
+        v = rng.normal(size=setup.control.shape)
+        z = Recursion(e.A).forward(np.zeros(e.A.shape[1]), np.einsum("kij,kj->ki", e.B, v))
+        full = Recursion(wide.A).forward(np.zeros(wide.A.shape[1]), np.einsum("kij,kj->ki", wide.B, v))
+        np.testing.assert_allclose(full[:, : z.shape[1]], z, rtol=1e-5, atol=1e-5 * np.abs(z).max())
+        assert wide.slope(TangentCurve(full, v)) == pytest.approx(e.slope(TangentCurve(z, v)), rel=1e-4)
+        partial = np.zeros_like(full)
+        partial[:, : z.shape[1]] = z
+        assert wide.slope(TangentCurve(partial, v)) != pytest.approx(e.slope(TangentCurve(z, v)), rel=0.1)
+
+
+@pytest.mark.parametrize("case", ["cart E", "free body"])
+def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_trajectories(
+    case: str, tmp_path
+) -> None:
+    setup = CASES[case](tmp_path)
+    wide, nx, p = expanded(setup).extended, setup.space.nx, len(setup.theta)
+    v, h = np.cos(9.0 * setup.t)[:, None] * np.ones(setup.plant.nu), 1e-2
+    full = Recursion(wide.A).forward(np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v))
+    up, down = (setup.plant.simulate(setup.theta, setup.control + s * h * v) for s in (1, -1))
+    psi = [setup.plant.sensitivity(setup.theta, curve).psi for curve in (up, down)]
+    change = np.swapaxes(psi[0] - psi[1], 1, 2).reshape(setup.samples + 1, p, nx) / (2 * h)
+    moved = full[:, nx:].reshape(setup.samples + 1, p, nx)
+    for j in range(p):
+        assert relative_error(moved[:, j], change[:, j]) < 1e-3
+
+
+def psi_step(setup: Setup, thetas: tuple[Loop, Loop], h: float, x: Array, u: Array, psi: Array, j: int) -> Array:
+    """psi_{k+1} of parameter j as a function of (x, u, psi): a plain difference of two steps at theta_j +- h."""
+    up, down = thetas
+    ahead, back = up.plus(x, h * psi), up.plus(x, -h * psi)
+    return up.minus(up.F(ahead, u), down.F(back, u)) / (2 * h)
+
+
+@pytest.mark.parametrize("case", ["cart E", "free body"])
+def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tmp_path) -> None:
+    setup = CASES[case](tmp_path)
+    wide, nx, p, nu = expanded(setup).extended, setup.space.nx, len(setup.theta), setup.plant.nu
+    curve, S = setup.initial, setup.plant.sensitivity(setup.theta, setup.initial)
+    d = 1e-3
+    for k, j in ((11, 0), (37, p - 1)):
+        h = 1e-3 * abs(setup.theta[j])
+        shift = h * np.eye(p)[j]
+        pair = tuple(
+            Loop(setup.parameters.model(setup.plant.source.model, setup.theta + s * shift), 1) for s in (1, -1)
+        )
+        x, u, psi, loop = curve.state[k], curve.ctrl[k], S.psi[k][:, j], pair[0]
+        columns = []
+        for i in range(nx + nu):
+            e = d * np.eye(nx + nu)[i]
+            moved = [psi_step(setup, pair, h, loop.plus(x, s * e[:nx]), u + s * e[nx:], psi, j) for s in (1, -1)]
+            columns.append((moved[0] - moved[1]) / (2 * d))
+        by_psi = [
+            (psi_step(setup, pair, h, x, u, psi + s, j) - psi_step(setup, pair, h, x, u, psi - s, j)) / 2
+            for s in np.eye(nx)
+        ]
+        rows = slice(nx * (1 + j), nx * (2 + j))
+        mixed = np.array(columns).T
+        assert relative_error(wide.A[k, rows, :nx], mixed[:, :nx]) < 1e-4
+        assert np.abs(wide.B[k, rows] - mixed[:, nx:]).max() < 1e-4 * np.abs(mixed).max()
+        assert relative_error(wide.A[k, rows, rows], np.array(by_psi).T) < 1e-5
+        others = [c for c in range(nx, nx * (1 + p)) if not rows.start <= c < rows.stop]
+        np.testing.assert_array_equal(wide.A[k, rows][:, others], 0.0)  # one parameter's psi does not see another's
+
+
+def test_x_does_not_depend_on_psi_in_the_extended_system(tmp_path) -> None:
+    setup = CASES["cart E"](tmp_path)
+    wide = expanded(setup).extended
+    np.testing.assert_array_equal(wide.A[:, :4, 4:], 0.0)
+    L = setup.plant.linearize(setup.theta, setup.initial)
+    assert relative_error(wide.A[:, :4, :4], L.A) < 1e-5
+    assert relative_error(wide.B[:, :4], L.B) < 1e-5
+
+
+def test_an_expansion_without_psi_is_refused(tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    plain = setup.problem.expand(setup.problem.point(setup.initial, CENTRAL))
+    assert plain.extended is None
+    with pytest.raises(ValueError, match="extended"):
+        extended_direction(plain, np.zeros((50, 1, 4)), np.eye(16), np.eye(1), np.eye(16))
+
+
+def test_the_experiment_chooses_the_extended_metric_and_it_lowers_the_cost(tmp_path: Path) -> None:
+    setup = cart_setup(tmp_path, descent={"method": "metric", "psi_weight": 1e-4, "max_iterations": 3})
+    direction, problem = direction_for(Stage(setup, None))
+    assert isinstance(direction, ExtendedMetricDescent)
+    assert problem.extended
+    assert direction.Q.shape == (16, 16)
+    assert np.count_nonzero(np.diag(direction.Q)[4:] == 1e-4 * setup.dt) == 12
+    result = design(setup)
+    costs = [row.cost for row in result.history]
+    assert len(costs) == 4
+    assert (np.diff(costs) < 0).all()

@@ -1,0 +1,164 @@
+"""`log J + mu B`: its slope against simulated controls for every criterion, and points that are judged anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from excitation.test_constraints import directions_of
+from support.numerics import Array, cart_setup, directional_check
+
+from mjfim.excitation.constraints import fence_of
+from mjfim.excitation.interior_point import DIVERGED_POINT, InteriorProblem, seen
+from mjfim.experiment.system import Setup
+from mjfim.optimize.projection_operator import Expansion
+
+LIMITS = {
+    "control": {"force": (-5.0, 4.5)},
+    "position": {"slide": (-0.4, 0.35), "hinge": (1.0, 6.0)},
+    "velocity": 3.0,
+    "control_rate": 60.0,
+}
+COSTS: dict[str, dict[str, Any]] = {
+    "E": {},
+    "smooth E": {},
+    "A": {"cost": {"criterion": "A", "control": 1e-2}},
+    "D": {"cost": {"criterion": "D", "control": 1e-2}},
+    "D, heavier": {"cost": {"criterion": "D", "information": 3.0, "tracking": {"slide": 0.5}}},
+    "c": {"cost": {"criterion": "c", "combination": {"m": 1.0, "l": -1.0}}},
+    "robust": {
+        "robust": {"samples": 2},
+        "cost": {"criterion": "A"},
+        "parameters": {
+            "m": {"target": "body/bob:mass", "prior": 0.2},
+            "c": {"target": "joint/hinge:damping", "prior": 0.1},
+        },
+    },
+}
+
+
+def problem_of(name: str, folder: Path, **tables: Any) -> tuple[Setup, InteriorProblem]:
+    """The cart-pendulum within limits, some of which its initial control leaves."""
+    setup = cart_setup(folder, limits=LIMITS, **{**COSTS[name], **tables}).free()
+    base = setup.problem
+    if name == "smooth E":
+        base = replace(base, information=replace(base.information, power=40.0))
+    return setup, InteriorProblem(base, fence_of(setup), 0.2, 0.05)
+
+
+def check(setup: Setup, problem: InteriorProblem, expansion: Expansion, h: float = 2e-4) -> float:
+    """Largest relative error of the slope of the problem's value along random controls."""
+    gradient = expansion.gradient(np.zeros((setup.samples, 1, setup.space.nx)))
+    ways = directions_of(setup, 4)
+    curves = [lambda s, way=way: problem.value(problem.point(setup.control + s * way)) for way in ways]
+    return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
+
+
+@pytest.mark.parametrize("name", COSTS)
+def test_its_slope_is_that_of_simulated_controls(name: str, tmp_path: Path) -> None:
+    """With the barrier, whose share stands apart, and of the logarithm of the cost alone."""
+    setup, problem = problem_of(name, tmp_path)
+    point = problem.point(setup.control)
+    expansion = problem.expand(point)
+    assert check(setup, problem, expansion) < 5e-3
+    bare, hedge = replace(problem, mu=0.0), expansion.hedge
+    assert hedge is not None
+    alone = Expansion(expansion.A, expansion.B, expansion.a - hedge.a, expansion.b - hedge.b)
+    assert check(setup, bare, alone) < 5e-3
+    twice = replace(problem, mu=0.4, delta=0.05).expand(point).hedge
+    assert twice is not None
+    np.testing.assert_allclose(twice.b, 2.0 * hedge.b, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", COSTS)
+def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> None:
+    """The logarithm of J; of D-optimality, which is one, J per nat: one for each parameter and its weight."""
+    setup, problem = problem_of(name, tmp_path)
+    point = problem.point(setup.control)
+    assert point.point is not None
+    J = setup.problem.point(setup.initial).cost
+    if name == "smooth E":
+        assert point.point.cost > J  # at most p^(1/q) above it
+        J = point.point.cost
+    expected = np.log(J) if "D" not in name else J / (3 * (3.0 if "heavier" in name else 1.0))
+    assert point.merit == pytest.approx(expected, rel=1e-4)
+    sight = problem.fence.sight(seen(point).trajectory, seen(point).tapped, slopes=False)
+    assert point.barrier == problem.fence.value(sight, 0.05)
+    assert problem.value(point) == pytest.approx(point.merit + 0.2 * point.barrier, rel=1e-12)
+    assert problem.size(point) == 1.0
+    np.testing.assert_array_equal(point.ctrl, setup.control)
+
+
+def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
+    """Without a step of the model: another mu, delta, fence or criterion."""
+    setup, problem = problem_of("E", tmp_path)
+    point = problem.point(setup.control)
+    tight = problem.fence.tightened({"control": 0.1, "position": 0.05, "velocity": 0.2})
+    smooth = replace(problem.base, information=replace(problem.base.information, power=10.0))
+    for other in (
+        replace(problem, mu=0.02, delta=0.006),
+        replace(problem, fence=tight),
+        replace(problem, base=smooth),
+        replace(problem, base=smooth, fence=tight, mu=1e-3, delta=3e-4),
+    ):
+        begun = setup.plant.engine.steps
+        again = other.again(point)
+        assert setup.plant.engine.steps == begun
+        fresh = other.point(setup.control)
+        assert setup.plant.engine.steps > begun
+        assert (again.merit, again.barrier) == (fresh.merit, fresh.barrier)
+        assert other.value(again) == other.value(fresh) != problem.value(point)
+        e, f = other.expand(again), other.expand(fresh)
+        np.testing.assert_allclose(e.a, f.a, rtol=1e-9)
+        np.testing.assert_allclose(e.b, f.b, rtol=1e-9)
+
+
+def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
+    setup, problem = problem_of("E", tmp_path)
+    inward = replace(problem, mu=1.0, costs=False)
+    begun = setup.plant.engine.steps
+    point = inward.point(setup.control)
+    assert setup.plant.engine.steps - begun == setup.samples * setup.substeps  # one rollout, no sensitivity
+    assert (point.point, point.merit) == (None, 0.0)
+    assert inward.value(point) == point.barrier == problem.point(setup.control).barrier
+    assert inward.size(point) == max(1.0, abs(point.barrier))
+    expansion = inward.expand(point)
+    assert expansion.hedge is not None
+    np.testing.assert_array_equal(expansion.a, expansion.hedge.a)
+    assert check(setup, inward, expansion) < 2e-3
+    assert inward.again(point) is point
+
+
+def test_a_trial_that_diverges_is_outside_everything(tmp_path: Path) -> None:
+    setup, problem = problem_of("E", tmp_path)
+    for own in (problem, replace(problem, costs=False)):
+        point = own.point(1e12 * setup.control)
+        assert point is DIVERGED_POINT
+        assert own.value(point) == np.inf
+        with pytest.raises(ValueError, match="diverged"):
+            seen(point)
+        with pytest.raises(ValueError, match="diverged"):
+            own.expand(point)
+
+
+def test_a_projected_point_is_one_that_is_played_open_loop(tmp_path: Path) -> None:
+    """Feedback makes another control out of a tangent curve; the point is that control's, with or without."""
+    setup, problem = problem_of("E", tmp_path)
+    point = problem.point(setup.control)
+    expansion = problem.expand(point)
+    way, N = np.sin(7.0 * setup.t)[:, None], setup.samples
+    open_loop, gains = np.zeros((N, 1, 4)), np.tile([[1.0, 0.5, 0.3, 0.2]], (N, 1, 1))
+    for K in (open_loop, gains):
+        zeta = expansion.lift(K, way)
+        moved = problem.project(point, zeta, 0.1, K)
+        assert problem.value(moved) == problem.value(problem.point(moved.ctrl))
+        change: Array = moved.ctrl - setup.control - 0.1 * zeta.v
+        assert bool(np.abs(change).max() < 1e-12) is (K is open_loop)
+        assert np.abs(change).max() < 0.05
+        difference = problem.difference(moved, point)
+        np.testing.assert_allclose(difference.v, moved.ctrl - setup.control, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(difference.z, seen(moved).trajectory.state - setup.initial.state, rtol=0, atol=1e-12)
+    assert problem.refine(point) is None

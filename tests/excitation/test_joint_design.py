@@ -1,0 +1,67 @@
+"""Several experiments whose information adds up: designed in turn, never worse than apart, seeing what one alone does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.numerics import CART_PARAMETERS, cart_setup, relative_error
+
+import mjfim
+from mjfim.errors import ExperimentError, UnidentifiableError
+from mjfim.experiment.system import Setup
+
+NEAR = {"qpos": (0.0, 3.0), "qvel": (0.0, 0.0), "control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.6}}
+FAR = {"qpos": (0.2, 1.5), "qvel": (0.3, 0.0), "control": {"kind": "sine", "amplitude": 3.0, "frequency": 1.1}}
+
+
+def pair(folder, **tables) -> list[mjfim.Experiment]:
+    """Two starts of the cart-pendulum, briefly descended."""
+    common = {"descent": {"max_iterations": 8}, **tables}
+    return [cart_setup(folder, initial=start, **common).experiment for start in (NEAR, FAR)]
+
+
+def own(design: mjfim.Design) -> np.ndarray:
+    """Information of a design's own data."""
+    return design.final.information - design.prior
+
+
+def test_the_sum_is_at_least_as_good_as_that_of_separate_designs(tmp_path) -> None:
+    experiments = pair(tmp_path)
+    setup = Setup(experiments[0])
+    together = mjfim.design_together(experiments, rounds=2)
+    apart = [mjfim.design(e) for e in experiments]
+    phi = [setup.information.evaluate(sum(own(d) for d in designs)).value for designs in (together, apart)]
+    assert phi[0] <= 1.0001 * phi[1]
+
+
+def test_each_design_holds_the_information_of_all(tmp_path) -> None:
+    together = mjfim.design_together(pair(tmp_path), rounds=1)
+    assert relative_error(together[1].final.information, own(together[0]) + own(together[1])) < 1e-6
+    assert relative_error(together[1].prior, own(together[0])) < 1e-6
+
+
+def test_what_one_experiment_cannot_see_another_may(tmp_path) -> None:
+    still = {"qpos": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
+    blind, seeing = cart_setup(tmp_path, initial=still), cart_setup(tmp_path, initial=FAR)
+    with pytest.raises(UnidentifiableError):
+        mjfim.design(blind)
+    told = seeing.problem.point(seeing.initial).information
+    helped = mjfim.design(Setup(blind.experiment.replace(descent={"max_iterations": 2}), added=told))
+    assert np.isfinite(helped.final.std).all()
+
+
+def test_nuisance_of_one_experiment_is_not_that_of_the_other(tmp_path) -> None:
+    experiments = pair(tmp_path, nuisance={"initial": 0.05})
+    together = mjfim.design_together(experiments, rounds=1)
+    j = together[1].parameters.index("initial qpos:slide")
+    assert not together[1].prior[j, :3].any()
+    assert together[1].prior[j, j] == pytest.approx(0.05**-2)  # its own prior alone
+
+
+def test_other_parameters_are_refused(tmp_path) -> None:
+    one = cart_setup(tmp_path).experiment
+    other = cart_setup(tmp_path, parameters={"m": CART_PARAMETERS["m"]}).experiment
+    with pytest.raises(ExperimentError, match="same parameters"):
+        mjfim.design_together([one, other])
+    with pytest.raises(ExperimentError, match="two or more"):
+        mjfim.design_together([one])

@@ -1,0 +1,239 @@
+"""Limits: the model's ranges and the file's, both hold where there are both; and the worst margin of a trajectory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from support.numerics import make_setup
+
+from mjfim.errors import ExperimentError
+from mjfim.excitation.constraints import Sight, fence_of
+from mjfim.excitation.limits import Limit, limits_of
+from mjfim.experiment.schema import Limits
+from mjfim.model.loading import control_names, coordinates
+from mjfim.output.labels import Labels
+from mjfim.plant.active_constraints import saturated
+from mjfim.records.trajectory import Trajectory
+
+# A ball joint first, so that addresses of positions, velocities and joints all differ.
+XML = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <worldbody>
+    <body><joint name="ball" type="ball"/><geom size=".1"/>
+      <body pos="0 0 1"><joint name="lift" type="slide" range="-0.5 0.25"/><geom size=".1"/>
+        <body pos="0 0 1"><joint name="turn" type="hinge"/><geom size=".1"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push" joint="lift" ctrlrange="-2 3"/>
+    <motor name="twist" joint="turn"/>
+  </actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    """Ball, slide with a range, hinge without; one actuator of two with a range."""
+    return mujoco.MjModel.from_xml_string(XML)
+
+
+def limits(model: mujoco.MjModel, **tables: object) -> tuple[Limit, ...]:
+    """Limits of the model with tables of the file."""
+    return limits_of(model, coordinates(model), control_names(model), Limits(**tables))
+
+
+def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajectory:
+    """Three samples at rest but for the named columns."""
+    arrays = {"qpos": np.zeros((3, model.nq)), "qvel": np.zeros((3, model.nv)), "ctrl": np.zeros((2, model.nu))}
+    for name, (index, values) in columns.items():
+        arrays[name][:, index] = values
+    return Trajectory(np.arange(3) * 0.1, arrays["qpos"], arrays["qvel"], np.zeros((3, 0)), arrays["ctrl"])
+
+
+def test_model_ranges_are_the_default(model: mujoco.MjModel) -> None:
+    """Ranges of joints and controls; what has none is free. Columns skip the ball joint."""
+    assert limits(model) == (Limit("position", "lift", 4, -0.5, 0.25), Limit("control", "push", 0, -2.0, 3.0))
+
+
+def test_file_narrows_and_adds(model: mujoco.MjModel) -> None:
+    """A single velocity is a symmetric range. On purpose the file no longer replaces the MJCF's range: both hold."""
+    found = limits(
+        model,
+        position={"lift": (-0.1, 0.1), "turn": (-1, 2)},
+        velocity={"lift": 2.0, "turn": (-1.0, 4.0)},
+        control={"twist": (-5, 5), "push": (-9, 1)},
+    )
+    assert set(found) == {
+        Limit("position", "lift", 4, -0.1, 0.1),
+        Limit("position", "turn", 5, -1.0, 2.0),
+        Limit("velocity", "lift", 3, -2.0, 2.0),
+        Limit("velocity", "turn", 4, -1.0, 4.0),
+        Limit("control", "push", 0, -2.0, 1.0),
+        Limit("control", "twist", 1, -5.0, 5.0),
+    }
+
+
+def test_one_number_stands_for_all_names(model: mujoco.MjModel) -> None:
+    """Of joints with one degree of freedom, of actuators, of actuators with one force."""
+    found = limits(model, velocity=2.0, acceleration=9.0, control_rate=7.0, force=1.5)
+    joints, places = (("lift", 3), ("turn", 4)), (("push", 0), ("twist", 1))
+    assert set(found) - set(limits(model)) == {
+        *(Limit(kind, name, v, -b, b) for kind, b in (("velocity", 2.0), ("acceleration", 9.0)) for name, v in joints),
+        *(Limit(kind, name, u, -b, b) for kind, b in (("control_rate", 7.0), ("force", 1.5)) for name, u in places),
+    }
+    assert limits(model, force={"push": (-1.0, 2.0)})[-1] == Limit("force", "push", 0, -1.0, 2.0)
+
+
+def test_every_range_of_the_model_is_a_limit() -> None:
+    """Of positions, controls, forces of actuators and forces of actuators on joints, at their own places."""
+    text = XML.replace('name="turn" type="hinge"', 'name="turn" type="hinge" actuatorfrcrange="-6 7"')
+    text = text.replace('joint="turn"/>', 'joint="turn" forcerange="-1 8"/>')
+    found = limits(mujoco.MjModel.from_xml_string(text), force=5.0)
+    assert {x for x in found if "force" in x.kind} == {
+        Limit("force", "push", 0, -5.0, 5.0),
+        Limit("force", "twist", 1, -1.0, 5.0),
+        Limit("joint_force", "turn", 4, -6.0, 7.0),
+    }
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"position": {"ball": (-1, 1)}}, r"limits\.position: unknown joint 'ball'.*; valid: lift, turn"),
+        ({"velocity": {"turm": 1.0}}, r"limits\.velocity: unknown joint 'turm' \(did you mean 'turn'\?\)"),
+        ({"control": {"lift": (-1, 1)}}, r"limits\.control: unknown actuator 'lift'; valid: push, twist"),
+        ({"position": {"lift": (1, -1)}}, r"limits\.position\.lift: \[1, -1\] is inverted; needs lower < upper"),
+        ({"velocity": {"turn": (1.0, 1.0)}}, r"limits\.velocity\.turn: \[1, 1\]"),
+        ({"control": {"push": (0.0, float("nan"))}}, r"limits\.control\.push: \[0, nan\]"),
+        (
+            {"position": {"lift": (0.3, 1.0)}},
+            r"limits\.position\.lift: \[0\.3, 1\] and the MJCF's range \[-0\.5, 0\.25\] excl",
+        ),
+        ({"acceleration": {"ball": 1.0}}, r"limits\.acceleration: unknown joint 'ball'; valid: lift, turn"),
+        ({"control_rate": {"lift": 1.0}}, r"limits\.control_rate: unknown actuator 'lift'; valid: push, twist"),
+        ({"force": {"turn": 1.0}}, r"limits\.force: unknown actuator 'turn'.*; valid: push, twist"),
+    ],
+)
+def test_misuse(model: mujoco.MjModel, tables: dict[str, object], message: str) -> None:
+    """Key, fault and what would be right."""
+    with pytest.raises(ExperimentError, match=message):
+        limits(model, **tables)
+
+
+def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -> dict[str, float]:
+    """Worst margins of a curve, looked at once per sample, by the fence of an experiment on a model."""
+    setup = make_setup(
+        text,
+        folder,
+        parameters={"damping": {"target": "joint/turn:damping", "scale": 1.0}},
+        noise={"qpos:turn": 0.01},
+        control={"kind": "constant", "amplitude": 0.0},
+        limits=tables,
+    )
+    fence = fence_of(setup)
+    assert not len(fence.taps.f)
+    shown = fence.taps.rows(trajectory.qpos[1:], trajectory.qvel[1:], trajectory.qvel[:-1], dict[str, np.ndarray]().get)
+    return fence.margins(Sight(trajectory, shown[:, None]))
+
+
+def test_no_limits_no_margins(model: mujoco.MjModel, tmp_path: Path) -> None:
+    """Nothing stated, nothing reported."""
+    free = XML.replace('range="-0.5 0.25"', "").replace('ctrlrange="-2 3"', "")
+    assert margins(free, tmp_path, curve(model)) == {}
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        ({}, {"position": 0.25, "control": 2.0}),
+        ({"qpos": (4, [0.0, 0.2, 0.1])}, {"position": 0.05, "control": 2.0}),
+        ({"qpos": (4, [0.0, 0.3, 0.0])}, {"position": -0.05, "control": 2.0}),
+        ({"qpos": (4, [0.0, 0.0, -0.75])}, {"position": -0.25, "control": 2.0}),
+        ({"qpos": (5, [9.0, 9.0, 9.0])}, {"position": 0.25, "control": 2.0}),
+        ({"ctrl": (0, [-2.0, 2.5])}, {"position": 0.25, "control": 0.0}),
+        ({"ctrl": (0, [0.0, 3.5])}, {"position": 0.25, "control": -0.5}),
+    ],
+)
+def test_margins(
+    model: mujoco.MjModel, columns: dict[str, tuple[int, list[float]]], expected: dict[str, float], tmp_path: Path
+) -> None:
+    """The worst distance over samples and over both ends, negative outside; zero on the limit."""
+    assert margins(XML, tmp_path, curve(model, **columns)) == pytest.approx(expected)
+
+
+def test_margin_is_the_worst_of_its_kind(model: mujoco.MjModel, tmp_path: Path) -> None:
+    """Two joints, the tighter one counts whichever comes first."""
+    for tight, loose in (("lift", "turn"), ("turn", "lift")):
+        moving = curve(model, qvel=({"lift": 3, "turn": 4}[tight], [0.0, 1.5, 0.0]))
+        found = margins(XML, tmp_path, moving, velocity={tight: 1.0, loose: 10.0})
+        assert found["velocity"] == pytest.approx(-0.5)
+
+
+def test_accelerations_and_rates_of_the_control_are_changes_over_their_time(model: mujoco.MjModel, tmp_path) -> None:
+    """Of the velocity over an engine step (2 ms), of the control over a sample (10 ms); the first control may be any."""
+    moving = curve(model, qvel=(4, [0.0, 0.01, -0.02]), ctrl=(1, [0.5, 0.2]))
+    found = margins(XML, tmp_path, moving, acceleration={"turn": 10.0}, control_rate={"twist": 40.0, "push": 1.0})
+    assert found["acceleration"] == pytest.approx(10.0 - 0.03 / 0.002)
+    assert found["control_rate"] == pytest.approx(1.0)  # the other one stands still
+    quick = margins(XML, tmp_path, moving, control_rate={"twist": 20.0})
+    assert quick["control_rate"] == pytest.approx(20.0 - 30.0)
+
+
+# An actuator with three controls and three forces before one with one of each.
+SERVOED = """
+<mujoco>
+  <option gravity="0 0 0"/>
+  <worldbody>
+    <body><joint name="ball" type="ball"/><geom size=".1"/>
+      <body pos="0 0 1"><joint name="turn" type="hinge"/><geom size=".1"/></body>
+    </body>
+  </worldbody>
+  <actuator>
+    <orientation name="aim" joint="ball" kp="10" ctrlrange="-1 1" forcerange="0 2"/>
+    <motor joint="turn" ctrlrange="-5 5" forcerange="-3 4"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def test_every_control_of_an_actuator_has_its_range() -> None:
+    """MuJoCo keeps ranges of controls per control. The range of a single force is a limit too, that of a norm is none."""
+    found = limits(mujoco.MjModel.from_xml_string(SERVOED))
+    aims = [Limit("control", f"aim[{i}]", i, -1.0, 1.0) for i in range(3)]
+    assert found == (*aims, Limit("control", "actuator1", 3, -5.0, 5.0), Limit("force", "actuator1", 3, -3.0, 4.0))
+
+
+@pytest.mark.parametrize(
+    ("ctrl", "names"),
+    [
+        ([0.1, 0.1, 0.1, 2.0], ()),
+        ([0.15, 0.15, 0.0, -2.0], ("aim",)),  # the norm of three forces is clamped, none of them alone is that large
+        ([0.1, 0.1, 0.1, -3.5], ("actuator1",)),
+        ([-0.5, 0.0, 0.0, 4.5], ("aim", "actuator1")),
+    ],
+)
+def test_clamped_forces_are_found_beside_actuators_with_several(ctrl: list[float], names: tuple[str, ...]) -> None:
+    model = mujoco.MjModel.from_xml_string(SERVOED)
+    still = Trajectory(
+        np.arange(3) * 0.1, np.tile(model.qpos0, (3, 1)), np.zeros((3, 4)), np.zeros((3, 0)), np.array([ctrl] * 2)
+    )
+    assert saturated(model, still) == names
+
+
+def test_every_control_has_its_label_also_where_an_actuator_has_several() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """
+        <mujoco><worldbody><body name="b"><joint name="ball" type="ball"/><geom size="0.1"/>
+          <body><joint name="h" axis="0 1 0"/><geom size="0.1"/></body></body></worldbody>
+        <actuator><orientation name="o" joint="ball" kp="4"/><motor joint="h"/></actuator></mujoco>
+        """
+    )
+    labels = Labels.of_model(model)
+    assert len(labels.controls) == model.nu == model.nactuator + 2
+    assert labels.controls == ("o[0] (control)", "o[1] (control)", "o[2] (control)", "actuator1 [N m]")

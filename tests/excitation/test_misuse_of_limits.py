@@ -1,0 +1,265 @@
+"""Hard limits and boundaries that cannot be: one message with file and key, exit code 2, before any work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import pytest
+from cli.test_cli import loads, misused, names, run, write_experiment
+from support.numerics import CART_PENDULUM, make_setup
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.excitation.limits import unwatched
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.output import folders as results
+
+MOTOR = ('<motor name="force" joint="slide"/>', '<motor name="force" joint="slide" ctrlrange="-4 4"/>')
+SIDE = ("</keyframe>", '<key name="side" qpos="0 1"/><key name="far" qpos="2.5 3.141592653589793"/></keyframe>')
+SOLID = ('contype="0" conaffinity="0" mass="0"', 'mass="0"')
+
+# name: lines at the end of the file, what the message must hold; edits of the model
+FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
+    "start outside": (
+        "[limits]\nposition = { hinge = [-1.0, 1.0] }",
+        ["limits.position.hinge: the start is at 3.14159 rad, outside [-1, 1]; widen the limit", "or move the start"],
+        [],
+    ),
+    "start outside the model's range": (
+        "",
+        ["limits.position.slide: the start is at 0 m, outside [0.5, 2]", "where it is the MJCF's, there"],
+        [('type="slide" axis="1 0 0"', 'type="slide" axis="1 0 0" range="0.5 2"')],
+    ),
+    "start too slow": (
+        "[limits]\nvelocity = { slide = [0.5, 1.0] }",
+        ["limits.velocity.slide: the start is at 0 m/s, outside [0.5, 1]"],
+        [],
+    ),
+    "ranges that exclude each other": (
+        "[limits]\ncontrol = { force = [5.0, 9.0] }",
+        ["limits.control.force: [5, 9] and the MJCF's range [-4, 4] exclude each other"],
+        [MOTOR],
+    ),
+    "inverted range": (
+        "[limits]\nforce = { force = [2.0, -2.0] }",
+        ["limits.force.force: [2, -2] is inverted; needs lower < upper"],
+        [],
+    ),
+    "start that falls": (
+        '[boundary]\nstart = "rest"',
+        [
+            "boundary.start: no control holds the start: joint 'hinge' still accelerates by 7.59 per s²",
+            "an equilibrium",
+        ],
+        [("3.141592653589793", "2.0")],
+    ),
+    "start that moves": (
+        '[boundary]\nstart = "rest"',
+        ["boundary.start: no control holds the start: joint 'slide' moves at 0.5 per s"],
+        [('qpos="0 3.141592653589793"', 'qpos="0 3.141592653589793" qvel="0.5 0"')],
+    ),
+    "end that falls": (
+        '[boundary]\nend = "rest"\nkeyframe = "side"',
+        ["boundary.end: no control holds the end: joint 'hinge' still accelerates by 6.38 per s²"],
+        [SIDE],
+    ),
+    "end outside": (
+        '[boundary]\nend = "rest"\nkeyframe = "far"\n[limits]\nposition = { slide = [-1.0, 1.0] }',
+        ["limits.position.slide: the end is at 2.5 m, outside [-1, 1]", "or move the end"],
+        [SIDE],
+    ),
+    "unknown end": (
+        '[boundary]\nend = "rest"\nkeyframe = "hangin"',
+        ["boundary.keyframe: unknown keyframe 'hangin' (did you mean 'hanging'?); valid: hanging"],
+        [],
+    ),
+    "end of nothing": (
+        '[boundary]\nkeyframe = "hanging"',
+        ['boundary: keyframe says where a design with end = "rest" comes to rest'],
+        [],
+    ),
+    "unknown way to end": (
+        '[boundary]\nend = "still"',
+        ["boundary.end:", "'free', 'rest' or 'periodic'", "'still'"],
+        [],
+    ),
+    "hold outside the control's range": (
+        '[boundary]\nstart = "rest"\n[limits]\ncontrol = { force = [0.5, 2.0] }',
+        ["boundary.start: holding still takes force =", "outside limits.control [0.5, 2]"],
+        [],
+    ),
+    "hold beyond the actuator's force": (
+        '[boundary]\nstart = "rest"\n[limits]\nforce = { force = 2.0 }',
+        ["boundary.start: holding still takes force = -5, outside limits.force [-2, 2]"],
+        [('type="slide" axis="1 0 0"', 'type="slide" axis="1 0 0" stiffness="10" springref="0.5"')],
+    ),
+    "start in collision": (
+        "[limits]\nclearance = 0.01",
+        ["limits.clearance: the start is in collision: cart - rail are -0.", "wanted 0.01 m", "limits.ignored"],
+        [SOLID],
+    ),
+    "start too close": (
+        '[limits]\nclearance = 3.0\nignored = [["cart", "world"], ["pendulum", "world"]]',
+        ["limits.clearance: the start is too close: bob - rail are 0.885 m apart, wanted 3 m"],
+        [SOLID, ('<geom name="rod" type', '<geom name="rod" contype="0" conaffinity="0" type')],
+    ),
+    "nothing that could collide": (
+        "[limits]\nclearance = 0.01",
+        ["limits.clearance: no two geoms can come near each other", "contype and conaffinity"],
+        [],
+    ),
+    "unknown body": (
+        '[limits]\nclearance = 0.01\nignored = [["bob", "carts"]]',
+        ["limits.ignored: unknown body 'carts' (did you mean 'cart'?); valid: bob, cart, pendulum, world"],
+        [],
+    ),
+    "a body and itself": (
+        '[limits]\nclearance = 0.01\nignored = [["bob", "bob"]]',
+        ["limits.ignored: ['bob'] is no pair of bodies"],
+        [],
+    ),
+    "three bodies": ('[limits]\nignored = [["bob", "cart", "world"]]', ["limits.ignored.0"], []),
+    "unknown body, not even enforced": (
+        '[limits]\nclearance = 0.01\nenforce = false\nignored = [["bob", "carts"]]',
+        ["limits.ignored: unknown body 'carts'"],
+        [SOLID],
+    ),
+    "bandwidth above that of the samples": (
+        "[limits]\nbandwidth = 60.0",
+        ["limits.bandwidth: 60 Hz; a control at 100 Hz has 50 Hz at most"],
+        [],
+    ),
+    "no bandwidth": ("[limits]\nbandwidth = 0.0", ["limits.bandwidth: ", "greater than 0"], []),
+    "unknown joint of an acceleration": (
+        "[limits]\nacceleration = { hing = 1.0 }",
+        ["limits.acceleration: unknown joint 'hing' (did you mean 'hinge'?); valid: hinge, slide"],
+        [],
+    ),
+    "unknown actuator of a rate": (
+        "[limits]\ncontrol_rate = { forc = 1.0 }",
+        ["limits.control_rate: unknown actuator 'forc'", "valid: force"],
+        [],
+    ),
+    "unknown actuator of a force": (
+        "[limits]\nforce = { slide = 1.0 }",
+        ["limits.force: unknown actuator 'slide'", "valid: force"],
+        [],
+    ),
+    "negative rate": ("[limits]\ncontrol_rate = -1.0", ["limits.control_rate: ", "greater than 0"], []),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_said_with_file_and_key_before_any_work(name: str, tmp_path: Path) -> None:
+    lines, fragments, edits = FAULTS[name]
+    path = write_experiment(tmp_path)
+    path.write_text(f"{path.read_text(encoding='utf-8')}\n{lines}\n", encoding="utf-8")
+    model = tmp_path / "cart_pendulum.xml"
+    text = model.read_text(encoding="utf-8")
+    for old, new in edits:
+        assert text.count(old) >= 1
+        text = text.replace(old, new)
+    model.write_text(text, encoding="utf-8")
+    result = run("design", path, "-o", tmp_path / "out")
+    misused(result, "study.toml: ", *fragments)
+    assert "iteration" not in result.stderr
+    assert names(tmp_path) == {"study.toml", "cart_pendulum.xml", "cart_pendulum.csv"}
+
+
+def with_control_weight(folder: Path, lines: str) -> Path:
+    """The study without weight on its control."""
+    path = write_experiment(folder)
+    text = path.read_text(encoding="utf-8").replace("control = 1e-3", "control = 0.0")
+    path.write_text(f"{text}\n{lines}\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("lines", ["", "[limits]\ncontrol = { force = [-5.0, 5.0] }\nenforce = false"])
+def test_a_control_with_neither_weight_nor_hard_range_is_refused(lines: str, tmp_path: Path) -> None:
+    path = with_control_weight(tmp_path, lines)
+    said = "cost.control: actuator 'force' has neither a weight nor a range"
+    misused(run("design", path, "-o", tmp_path / "out"), "study.toml: ", said, "limits.control.force = [lower, upper]")
+
+
+def test_a_hard_range_stands_for_the_weight(tmp_path: Path) -> None:
+    """The file's, or the model's own."""
+    path = with_control_weight(tmp_path, "[limits]\ncontrol = { force = [-5.0, 5.0] }")
+    assert Setup(Experiment.from_file(path)).control_weight.tolist() == [0.0]
+    model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
+    (tmp_path / "cart_pendulum.xml").write_text(model.replace(*MOTOR), encoding="utf-8")
+    assert Setup(Experiment.from_file(with_control_weight(tmp_path, ""))).control_weight.tolist() == [0.0]
+
+
+@pytest.mark.parametrize("rate", [100.0, 2000.0])
+def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) -> None:
+    """However little it falls within a sample."""
+    setup = make_setup(
+        CART_PENDULUM.format(integrator="RK4").replace('timestep="0.01"', 'timestep="0.0005"'),
+        tmp_path,
+        rate=rate,
+        parameters={"m": {"target": "body/bob:mass"}},
+        noise={"state": 0.01},
+        initial={"qpos": (0.0, 2.0), "control": {"kind": "sine"}},
+        boundary={"start": "rest"},
+    )
+    with pytest.raises(
+        ExperimentError, match=r"no control holds the start: joint 'hinge' still accelerates by \d\.\d+ per s²"
+    ):
+        mjfim.design(setup)
+
+
+def test_limits_that_no_control_can_keep_are_no_misuse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pendulum falls faster than it may: exit code 1 after the work, and said which limit is missed."""
+    monkeypatch.setattr(results, "leave_design", lambda *_: [])
+    hard = "[limits]\nvelocity = { hinge = 0.5 }\ncontrol = { force = [-0.01, 0.01] }"
+    path = write_experiment(tmp_path, max_iterations=f"4\n{hard}")
+    model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
+    (tmp_path / "cart_pendulum.xml").write_text(model.replace("3.141592653589793", "2.0"), encoding="utf-8")
+    result = run("design", path, "-o", tmp_path / "out", "--json")
+    told = loads(result.stdout)
+    assert (result.exit_code, told["status"], told["limits"]["satisfied"]) == (1, "infeasible", False)
+    assert "velocity limits are exceeded by" in result.stderr
+
+
+def test_a_fourier_start_above_the_bandwidth_is_refused(tmp_path: Path) -> None:
+    path = write_experiment(tmp_path, max_iterations="3\nfourier = [7.0]\n[limits]\nbandwidth = 5.0")
+    misused(
+        run("design", path, "-o", tmp_path / "out"),
+        "study.toml: descent.fourier: 7 Hz is above the bandwidth of 5 Hz",
+    )
+
+
+def test_a_coarse_level_that_divides_nothing_is_refused(tmp_path: Path) -> None:
+    """Its timestep may be a share of a sample, or its samples a share of all."""
+    hard = "[limits]\ncontrol = { force = [-5.0, 5.0] }\ncontrol_rate = 100.0"
+    path = write_experiment(tmp_path, max_iterations=f"3\ncoarse = 7\n{hard}")
+    said = "descent.coarse: 7 divides neither the 1 engine steps of a sample nor the 100 samples"
+    misused(run("design", path, "-o", tmp_path / "out"), "study.toml: ", said)
+
+
+LOOSE = """
+<mujoco>
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="a"><joint name="wrist" type="ball" range="0 1"/><geom size="0.1"/>
+      <body name="b" pos="0 0 1"><joint name="elbow" axis="0 1 0" range="-1 1"/><geom size="0.1"/></body></body>
+  </worldbody>
+  <tendon><fixed name="rope" range="-1 1"><joint joint="elbow" coef="1"/></fixed></tendon>
+  <actuator><general name="muscle" joint="elbow" dyntype="filter" dynprm="0.1" actlimited="true" actrange="0 1"/></actuator>
+</mujoco>
+"""
+
+
+def test_ranges_that_are_no_limits_are_named() -> None:
+    model = mujoco.MjModel.from_xml_string(LOOSE)
+    assert unwatched(model) == ("ball joint wrist", "tendon rope", "the activation of muscle")
+
+
+def test_a_jump_at_rest_is_warned_about(tmp_path: Path) -> None:
+    path = write_experiment(tmp_path, max_iterations='2\n[boundary]\nstart = "rest"')
+    jump = "the control may jump where the design begins and ends at rest"
+    assert any(jump in sentence for sentence in mjfim.design(Experiment.from_file(path)).warnings)
+    slow = Experiment.from_file(path).replace(limits={"control_rate": 50.0})
+    assert not any(jump in sentence for sentence in mjfim.design(slow).warnings)

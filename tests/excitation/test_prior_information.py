@@ -1,0 +1,143 @@
+"""Information of earlier experiments: summed by name, the rest marginalised, no prior counted twice."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.numerics import Array, cart_setup
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.excitation.prior_information import information_of
+from mjfim.output import archive
+
+
+def information(seed: int, size: int) -> Array:
+    """A well-conditioned information matrix."""
+    root = np.random.default_rng(seed).standard_normal((2 * size, size))
+    return np.asarray(root.T @ root)
+
+
+def design_file(path: Path, names: list[str], matrix: Array, prior: Array | None = None) -> Path:
+    """What `earlier` reads of a design.json."""
+    values: dict[str, Any] = {"parameters": names, "final": {"information": matrix.tolist()}}
+    if prior is not None:
+        values["prior"] = prior.tolist()
+    path.write_text(json.dumps(values), encoding="utf-8")
+    return path
+
+
+def test_designs_and_estimates_add_up_by_name(tmp_path: Path) -> None:
+    """In any order of names; a design tells its information, an estimate its covariance."""
+    first, second = information(0, 2), information(1, 2)
+    design = design_file(tmp_path / "design.json", ["b", "a"], first)
+    estimate = tmp_path / "estimate.json"
+    values = {"parameters": ["c", "a"], "covariance": np.linalg.inv(second).tolist()}
+    estimate.write_text(json.dumps(values), encoding="utf-8")
+    wanted = np.zeros((3, 3))
+    wanted[np.ix_([1, 0], [1, 0])] += first
+    wanted[np.ix_([2, 0], [2, 0])] += second
+    np.testing.assert_allclose(information_of([design, estimate], ("a", "b", "c")), wanted, rtol=1e-12)
+    assert not information_of([], ("a", "b")).any()
+
+
+def test_what_the_file_knows_besides_is_marginalised(tmp_path: Path) -> None:
+    """The covariance of the shared parameters stays what the file says, not what it would be were the rest known."""
+    matrix = information(2, 4)
+    path = design_file(tmp_path / "design.json", ["x", "a", "y", "b"], matrix)
+    found = information_of([path], ("a", "b"))
+    np.testing.assert_allclose(np.linalg.inv(found), np.linalg.inv(matrix)[np.ix_([1, 3], [1, 3])], rtol=1e-11)
+    assert np.abs(found - matrix[np.ix_([1, 3], [1, 3])]).max() > 0.1, "nothing to marginalise: a weak test"
+
+
+def test_what_cannot_be_told_apart_from_the_rest_is_not_known(tmp_path: Path) -> None:
+    """A singular rest: only the sum of a and x is known, so nothing of a; of b everything."""
+    matrix = np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.0], [0.0, 0.0, 9.0]])
+    path = design_file(tmp_path / "design.json", ["a", "x", "b"], matrix)
+    np.testing.assert_allclose(information_of([path], ("a", "b")), np.diag([0.0, 9.0]), atol=1e-12)
+
+
+def test_the_files_own_prior_is_left_out(tmp_path: Path) -> None:
+    """Else it would be counted once more with every file; priors on what is marginalised stay, they belong to the file."""
+    data = information(3, 3)
+    prior = np.diag([5.0, 0.0, 7.0])
+    path = design_file(tmp_path / "design.json", ["a", "b", "x"], data + prior, prior)
+    np.testing.assert_allclose(information_of([path], ("a", "b", "x")), data, rtol=1e-12)
+    joint = data + np.diag([0.0, 0.0, 7.0])
+    wanted = np.linalg.inv(np.linalg.inv(joint)[:2, :2])
+    found = information_of([path], ("a", "b"))
+    np.testing.assert_allclose(found, wanted, rtol=1e-11)
+    unknown = np.linalg.inv(np.linalg.inv(data)[:2, :2])
+    assert np.abs(found - unknown).max() > 0.1, "the prior on the rest does not matter: a weak test"
+
+
+def test_deviations_of_the_start_belong_to_one_experiment(tmp_path: Path) -> None:
+    """The same name in the next experiment is another number; biases are the sensor's and stay."""
+    names = ["a", "initial qpos:slide", "bias acc"]
+    data, prior = information(4, 3), np.diag([0.0, 100.0, 0.0])
+    path = design_file(tmp_path / "design.json", names, data + prior, prior)
+    found = information_of([path], tuple(names))
+    assert not found[1].any() and not found[:, 1].any()
+    marginal = np.linalg.inv(np.linalg.inv(data + prior)[np.ix_([0, 2], [0, 2])])
+    np.testing.assert_allclose(found[np.ix_([0, 2], [0, 2])], marginal, rtol=1e-11)
+
+
+FAULTS: dict[str, tuple[str, str]] = {
+    "not JSON": ("{", "neither a design.json nor an estimate.json"),
+    "a list": ("[1, 2]", "neither a design.json nor an estimate.json"),
+    "no parameters": ('{"covariance": [[1.0]]}', "neither a design.json nor an estimate.json"),
+    "a study": ('{"parameters": ["a"], "theta": [1.0]}', "neither a design.json nor an estimate.json"),
+    "no information": ('{"parameters": ["a"], "final": {}}', "neither a design.json nor an estimate.json"),
+    "final is no table": ('{"parameters": ["a"], "final": 3}', "neither a design.json nor an estimate.json"),
+    "singular covariance": ('{"parameters": ["a"], "covariance": [[0.0]]}', "neither a design.json nor an estimate"),
+    "text": ('{"parameters": ["a"], "final": {"information": [["many"]]}}', "neither a design.json nor"),
+    "ragged": ('{"parameters": ["a", "b"], "final": {"information": [[1.0], [1.0, 2.0]]}}', "neither a design.json"),
+    "unknown": ('{"parameters": ["a"], "covariance": [[null]]}', "not 1 x 1 finite numbers"),
+    "infinite": ('{"parameters": ["a"], "final": {"information": [[null]]}}', "not 1 x 1 finite numbers"),
+    "wrong size": ('{"parameters": ["a", "b"], "final": {"information": [[1.0]]}}', "not 2 x 2 finite numbers"),
+    "wrong prior": ('{"parameters": ["a"], "final": {"information": [[1.0]]}, "prior": [1, 2]}', "not 1 x 1 finite"),
+    "strangers": ('{"parameters": ["x", "y"], "final": {"information": [[1, 0], [0, 1]]}}', r"knows x, y, but .* a, b"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_unusable_files_are_named(name: str, tmp_path: Path) -> None:
+    """The file and what is wrong with it."""
+    text, message = FAULTS[name]
+    path = tmp_path / "odd.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ExperimentError, match=rf"earlier: .*odd\.json: .*{message}"):
+        information_of([path], ("a", "b"))
+
+
+def test_missing_files_are_named(tmp_path: Path) -> None:
+    """No file, a folder."""
+    with pytest.raises(ExperimentError, match=r"gone\.json: cannot read: No such file"):
+        information_of([tmp_path / "gone.json"], ("a",))
+    with pytest.raises(ExperimentError, match="cannot read: Is a directory"):
+        information_of([tmp_path], ("a",))
+
+
+def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
+    """Its data's information becomes part of the next experiment's prior, and of that one's file no more than its own."""
+    tables = {"descent": {"max_iterations": 1}, "cost": {"criterion": "A"}}
+    priors = {"m": {"target": "body/bob:mass", "prior": 0.1}, "c": {"target": "joint/hinge:damping"}}
+    first = cart_setup(tmp_path, parameters=priors, **tables)
+    design = mjfim.design(first)
+    archive.write_design(tmp_path / "one", design, first)
+    own = design.final.information - np.diag([100.0, 0.0])
+    earlier = str(tmp_path / "one" / "design.json")
+    turned = {"c": {"target": "joint/hinge:damping", "prior": 2.0}, "m": {"target": "body/bob:mass"}}
+    second = cart_setup(tmp_path, parameters=turned, earlier=(earlier,), **tables)
+    np.testing.assert_allclose(second.prior, own[::-1, ::-1] + np.diag([0.25, 0.0]), rtol=1e-9)
+    again = mjfim.design(second)
+    archive.write_design(tmp_path / "two", again, second)
+    late = str(tmp_path / "two" / "design.json")
+    total = information_of([Path(earlier), Path(late)], ("c", "m"))
+    np.testing.assert_allclose(total, again.final.information - np.diag([0.25, 0.0]), rtol=1e-8)
+    with pytest.raises(ExperimentError, match=r"experiment: earlier: .*gone\.json"):
+        cart_setup(tmp_path, earlier=("gone.json",))

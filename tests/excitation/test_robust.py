@@ -1,0 +1,208 @@
+"""Samples of the parameters, pooled criteria against differences, and a design for the worst of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+from support.numerics import CART_PARAMETERS, Array, body_setup, cart_setup
+
+from mjfim.errors import ExperimentError
+from mjfim.excitation.design import design
+from mjfim.excitation.evaluation import evaluate_trajectory
+from mjfim.excitation.robust import Pool
+from mjfim.experiment.system import Setup
+from mjfim.model.parameter_samples import sampled
+from mjfim.model.parameters import Parameter, ParameterSet
+
+KINDS = {"mean": ("mean", False), "worst": ("worst", False), "worst D": ("worst", True), "mean D": ("mean", True)}
+
+
+def pool(kind: str, count: int = 4) -> Pool:
+    """Over any parameter values."""
+    return Pool(np.zeros((count, 1)), *KINDS[kind])
+
+
+def unknowns(*parameters: dict) -> ParameterSet:
+    """Parameters without targets."""
+    built = tuple(Parameter(f"p{i}", (), **{"guess": 0.0, **p}) for i, p in enumerate(parameters))
+    return ParameterSet(built, ((),) * len(built))
+
+
+@pytest.mark.parametrize("size", [1e-12, 1.0, 1e9])
+@pytest.mark.parametrize("kind", KINDS)
+def test_weights_are_the_derivative_of_the_pooled_value(kind: str, size: float) -> None:
+    size = 1.0 if KINDS[kind][1] else size  # the logarithm of D has no scale
+    phi, made = size * np.array([1.0, 1.05, 0.7, 1.1]), pool(kind)
+    for j, weight in enumerate(made.weights(phi)):
+        h = 1e-5 * size * np.eye(4)[j]
+        measured = (made.value(phi + h) - made.value(phi - h)) / (2e-5 * size)
+        assert weight == pytest.approx(measured, rel=1e-6)
+        assert 1.01 * weight != pytest.approx(measured, rel=1e-3)
+
+
+def test_the_mean_is_the_mean_and_the_worst_lies_just_below_the_largest() -> None:
+    phi = np.array([1.0, 2.0, 10.0, 3.0])
+    assert pool("mean").value(phi) == 4.0
+    np.testing.assert_array_equal(pool("mean").weights(phi), 0.25)
+    assert pool("worst").value(phi) == pytest.approx(4.0 ** (-1.0 / 20.0) * 10.0, rel=1e-9)
+    assert pool("worst").weights(phi) @ phi == pytest.approx(pool("worst").value(phi))  # homogeneous in phi
+    assert pool("worst").weights(phi)[2] > 0.9
+    # D is a logarithm, so its pool is that of exp(phi)
+    expected = pool("worst").value(np.exp(phi))
+    assert pool("worst D").value(phi) == pytest.approx(np.log(expected), rel=1e-9)
+    assert pool("worst D").weights(phi).sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_samples_that_agree_pool_to_what_they_are_and_one_that_is_blind_makes_all_blind(kind: str) -> None:
+    assert pool(kind).value(np.full(4, 3.0)) == pytest.approx(3.0)
+    assert pool(kind).weights(np.full(4, 3.0)) == pytest.approx(0.25)
+    assert pool(kind).value([1.0, np.inf, 2.0, 3.0]) == np.inf
+    assert pool(kind).value([1.0, np.nan, 2.0, 3.0]) == np.inf
+
+
+def test_pooling_a_logarithm_below_zero_works_and_does_not_overflow() -> None:
+    for shift in (-900.0, 900.0):
+        phi = shift + np.array([0.0, 0.5, 1.0, 0.2])
+        assert pool("worst D").value(phi) - shift == pytest.approx(pool("worst D").value(phi - shift), rel=1e-9)
+        np.testing.assert_allclose(pool("worst D").weights(phi), pool("worst D").weights(phi - shift), rtol=1e-9)
+
+
+def test_samples_fill_bounds_evenly_and_begin_with_the_guess() -> None:
+    parameters = unknowns({"bounds": (1.0, 3.0), "guess": 2.5}, {"bounds": (-1e6, 1e6)}, {"guess": 7.0})
+    theta = np.array([2.5, 0.0, 7.0])
+    drawn = sampled(parameters, theta, 21, seed=3)
+    assert drawn.shape == (21, 3)
+    np.testing.assert_array_equal(drawn[0], theta)
+    np.testing.assert_array_equal(drawn[:, 2], 7.0)  # neither prior nor bounds: it stays
+    for column, (low, high) in enumerate([(1.0, 3.0), (-1e6, 1e6)]):
+        strata = np.floor((drawn[1:, column] - low) / (high - low) * 20).astype(int)
+        assert sorted(strata) == list(range(20))  # one in each twentieth: a Latin hypercube
+    assert abs(np.corrcoef(drawn[1:, 0], drawn[1:, 1])[0, 1]) < 0.7
+
+
+def test_samples_of_a_prior_are_normal_and_keep_within_bounds_and_reason() -> None:
+    parameters = unknowns({"prior": 0.5, "guess": 2.0}, {"prior": 1.0, "bounds": (-0.2, np.inf)}, {"prior": 1e3})
+    theta = np.array([2.0, 0.0, 0.0])
+    drawn = sampled(parameters, theta, 2001, seed=0)[1:]
+    z = (drawn - theta) / [0.5, 1.0, 1e3]
+    assert np.abs(z).max() == 2.5
+    assert drawn[:, 1].min() == -0.2
+    inside = np.abs(z[:, 0]) < 2.5
+    strata = np.floor(norm.cdf(z[inside, 0]) * 2000).astype(int)
+    assert len(set(strata)) == inside.sum()
+    assert z[:, 0].std() == pytest.approx(1.0, rel=0.03)
+
+
+def test_the_seed_decides_the_samples() -> None:
+    parameters = unknowns({"bounds": (0.0, 1.0)}, {"prior": 1.0})
+    a, b, c = (sampled(parameters, np.zeros(2), 5, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(a, c)
+    np.testing.assert_array_equal(sampled(parameters, np.zeros(2), 1, 0), np.zeros((1, 2)))
+
+
+def test_parameters_without_prior_and_bounds_cannot_be_sampled(tmp_path) -> None:
+    for half in ({}, {"bounds": (0.0, np.inf)}):
+        with pytest.raises(ExperimentError, match="prior or bounds"):
+            sampled(unknowns(half), np.zeros(1), 3, 0)
+    with pytest.raises(ExperimentError, match="robust: no parameter has"):
+        cart_setup(tmp_path, robust={"samples": 3})
+    with pytest.raises(ExperimentError, match="samples"):
+        cart_setup(tmp_path, robust={"samples": 1})
+    bounded = {"m": {**CART_PARAMETERS["m"], "bounds": (1.0, 2.0)}}
+    with pytest.raises(ExperimentError, match="psi_weight"):
+        cart_setup(tmp_path, parameters=bounded, robust={}, descent={"method": "metric", "psi_weight": 1.0})
+
+
+# The pendulum's length is known to a factor of two only: what swings it well at one length does not at another.
+VAGUE = {
+    "m": {**CART_PARAMETERS["m"], "bounds": (1.0, 2.2)},
+    "l": {**CART_PARAMETERS["l"], "bounds": (0.5, 1.4)},
+    "c": {**CART_PARAMETERS["c"], "bounds": (0.2, 0.8)},
+}
+
+
+def vague_setup(folder: Path, **tables: object) -> Setup:
+    """Cart-pendulum for two seconds."""
+    shared = {"parameters": VAGUE, "horizon": 2.0, "cost": {"control": 1e-4}}
+    return cart_setup(folder, **{**shared, **tables})
+
+
+def phis(setup: Setup, control: Array, thetas: Array) -> Array:
+    """The criterion of the guess's experiment at other parameter values, each with its own trajectory."""
+    found = []
+    for theta in thetas:
+        sensitivity = setup.plant.sensitivity(theta, setup.plant.simulate(theta, control))
+        found.append(setup.information.evaluate(setup.information.matrix(sensitivity)).value)
+    return np.array(found)
+
+
+def test_the_cost_is_the_pooled_criterion_of_separate_experiments_at_the_samples(tmp_path) -> None:
+    setup = vague_setup(tmp_path, robust={"over": "worst", "samples": 5, "seed": 2})
+    thetas = setup.pool.thetas
+    assert thetas.shape == (5, 3)
+    assert (thetas >= setup.parameters.lower).all() and (thetas <= setup.parameters.upper).all()
+    point = setup.problem.point(setup.initial)
+    alone = []
+    for theta in thetas:
+        there = {
+            n: {**VAGUE[n], "guess": float(v), "scale": float(s)}
+            for n, v, s in zip("mlc", theta, thetas[0], strict=True)
+        }
+        single = vague_setup(tmp_path, parameters=there)
+        alone.append(evaluate_trajectory(single, single.initial).criterion)
+    np.testing.assert_allclose(point.phi, alone, rtol=1e-6)
+    running = setup.problem.running.value(setup.initial)
+    assert point.cost == pytest.approx(setup.pool.value(alone) + running, rel=1e-6)
+
+
+@pytest.mark.parametrize(("over", "pooled"), [("worst", np.max), ("mean", np.mean)])
+def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
+    over: str, pooled: Callable[[Array], float], tmp_path
+) -> None:
+    robust, nominal = vague_setup(tmp_path, robust={"over": over, "samples": 5, "seed": 2}), vague_setup(tmp_path)
+    plain = design(nominal)
+    made = design(robust, start=plain.trajectory.ctrl)
+    assert plain.status.success and made.status.success
+    ours, theirs = (phis(nominal, d.trajectory.ctrl, robust.pool.thetas) for d in (made, plain))
+    assert pooled(ours) < 0.9 * pooled(theirs)
+    # each is the better one by its own cost
+    crossed = [
+        s.problem.point(s.plant.simulate(s.theta, d.trajectory.ctrl)) for s, d in ((robust, plain), (nominal, made))
+    ]
+    assert made.final.cost < 0.9 * crossed[0].cost
+    assert plain.final.cost < 0.9 * crossed[1].cost
+    # samples that neither has seen profit as well
+    fresh = sampled(robust.parameters, robust.theta, 9, seed=7)[1:]
+    ours, theirs = (phis(nominal, d.trajectory.ctrl, fresh) for d in (made, plain))
+    assert pooled(ours) < 0.9 * pooled(theirs)
+
+
+def test_samples_are_halved_until_their_bodies_can_exist() -> None:
+    parameters = unknowns({"bounds": (0.0, 8.0), "guess": 1.0}, {"bounds": (0.0, 8.0), "guess": 1.0})
+    theta, free = np.ones(2), sampled(unknowns({"bounds": (0.0, 8.0)}, {"bounds": (0.0, 8.0)}), np.ones(2), 9, 0)
+    drawn = sampled(parameters, theta, 9, 0, lambda row: [0] if row[0] > 2.0 else [])
+    np.testing.assert_array_equal(drawn[:, 1], free[:, 1])
+    assert (free[:, 0] > 2.0).sum() >= 4
+    times = np.log2((free[1:, 0] - 1.0) / (drawn[1:, 0] - 1.0))
+    np.testing.assert_allclose(times, np.ceil(np.log2(np.maximum(free[1:, 0] - 1.0, 1.0))), atol=1e-9)
+    assert (drawn[:, 0] <= 2.0).all()
+    # where no halving helps they end at the guess, even those that are never right
+    np.testing.assert_array_equal(sampled(parameters, theta, 3, 0, lambda row: [0, 1]), 1.0)
+
+
+def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
+    table = {"B": {"inertial": "hull", "coordinates": "barycentric", "prior": 0.5}}
+    setup = body_setup(tmp_path, parameters=table, robust={"samples": 8})
+    assert setup.pool is not None
+    moments = np.array([setup.plant.model(theta).body("hull").inertia for theta in setup.pool.thetas])
+    assert (moments > 0.0).all()
+    assert (2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)).all()
+    free = sampled(setup.parameters, setup.theta, 8, 0)
+    assert any(setup.parameters.impossible(setup.plant.source, theta) for theta in free)
+    assert len(np.unique(setup.pool.thetas, axis=0)) == 8

@@ -1,0 +1,236 @@
+"""The shortest experiment: the search on known laws, designs that reach what is wanted and would not if they were shorter."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.numerics import MODELS
+from typer.testing import CliRunner
+
+import mjfim
+from mjfim.cli import main as cli
+from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.excitation.shortest_horizon import OutOfReachError, Tried, fitted
+from mjfim.excitation.target_accuracy import furthest, wanted_of
+from mjfim.experiment.system import Setup
+from mjfim.optimize.bracketing import Grid, bracket
+from mjfim.records.design import HistoryRow
+
+STUDY = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
+    horizon=1.5,
+    initial={"control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.8}},
+    descent={"starts": 1, "tolerance": 1e-4, "max_iterations": 30},
+)
+SIGMA = {"m": 0.0115, "l": 0.02, "c": 0.0125}  # wanted: reached at about one second
+
+
+def wanting(sigma: dict[str, float], **tables: object) -> mjfim.Experiment:
+    """The study with standard deviations to aim at."""
+    return STUDY.replace(parameters={name: {"wanted": value} for name, value in sigma.items()}, **tables)
+
+
+def worst(experiment: mjfim.Experiment) -> float:
+    """Of a design's predicted σ over the wanted ones."""
+    setup = Setup(experiment)
+    return furthest(mjfim.design(setup).final.std, wanted_of(setup))[0]
+
+
+LAWS: dict[str, Callable[[int], float]] = {
+    "square root": lambda n: (173 / n) ** 0.5,
+    "steep": lambda n: (173 / n) ** 4,
+    "knee": lambda n: max((173 / n) ** 0.5, (150 / n) ** 6),
+    "nothing when short": lambda n: np.inf if n < 173 else 0.4,
+    "step": lambda n: 1.3 if n < 173 else 0.99,
+    "hardly falling": lambda n: 1.0 + 1e-3 * (173 - n) / 173,
+}
+
+
+@pytest.mark.parametrize("first", [60, 172, 173, 174, 500])
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("grid", [Grid(1, 0), Grid(4, 0, 4), Grid(4, 120)])
+def test_the_search_ends_at_the_smallest_that_is_enough(first: int, law: str, grid: Grid) -> None:
+    asked: list[int] = []
+
+    def ratio(n: int) -> float:
+        asked.append(n)
+        return LAWS[law](n)
+
+    def slack(n: int) -> int:
+        return max(n // 50, n - grid.down(n - 1))
+
+    high, low = bracket(ratio, grid.up(first), grid.down(700), grid, slack)
+    assert high is not None and low is not None
+    assert LAWS[law](high) <= 1.0 < LAWS[law](low)
+    assert 0 < high - low <= slack(high)
+    assert len(asked) == len(set(asked)) <= 20
+    assert all(grid.up(n) == n for n in asked)
+    if law == "square root":
+        assert len(asked) <= 5, "the secant does not help"
+
+
+def test_the_search_ends_at_either_end_of_what_is_allowed() -> None:
+    grid = Grid(1, 0, 3)
+    assert bracket(lambda n: 0.5, 40, 100, grid, lambda n: 1) == (3, None)
+    assert bracket(lambda n: 2.0, 40, 100, grid, lambda n: 1) == (None, 100)
+
+
+def test_grid_keeps_what_a_coarse_level_divides() -> None:
+    grid = Grid(4, 200)
+    assert [grid.down(n) for n in (1, 7.5, 199, 200, 203, 204)] == [2, 7, 199, 200, 200, 204]
+    assert [grid.up(n) for n in (1, 7.5, 199, 200, 201)] == [2, 8, 199, 200, 204]
+
+
+@pytest.fixture(scope="module")
+def shorter() -> mjfim.Shortest:
+    """Shorter than stated."""
+    return mjfim.shortest(wanting(SIGMA), tolerance=0.05)
+
+
+def test_it_reaches_what_is_wanted(shorter: mjfim.Shortest) -> None:
+    assert 0.5 < shorter.horizon < 1.4 and shorter.closed
+    setup = Setup(shorter.experiment)
+    assert shorter.design.trajectory.samples == setup.samples
+    told = mjfim.evaluate_trajectory(setup, shorter.design.trajectory)
+    assert furthest(told.std, wanted_of(setup))[0] <= 1.0
+    best = next(t for t in shorter.tried if t.horizon == shorter.horizon)
+    assert best.reached and best.ratio == pytest.approx(furthest(told.std, wanted_of(setup))[0], rel=1e-6)
+    assert shorter.summary()["horizon"] == shorter.horizon
+
+
+def test_a_tolerance_shorter_does_not(shorter: mjfim.Shortest) -> None:
+    """By a design of its own, from the initial control."""
+    below = shorter.missed
+    assert below is not None and 0.0 < shorter.horizon - below.horizon <= shorter.tolerance + 1e-9
+    less = round(shorter.horizon - shorter.tolerance, 6)
+    assert worst(shorter.experiment.replace(horizon=less)) > 1.0
+    assert below.ratio > 1.0 and f"{below.horizon:g} s" in str(shorter)
+
+
+def test_longer_than_stated_where_it_takes_longer(shorter: mjfim.Shortest) -> None:
+    """Begun from too short it ends at about the same."""
+    seen: list[Tried] = []
+    found = mjfim.shortest(wanting(SIGMA, horizon=0.8), tolerance=0.05, report=seen.append)
+    assert found.horizon > 0.8 and abs(found.horizon - shorter.horizon) < 0.11
+    assert tuple(seen) == found.tried and not seen[0].reached and seen[0].horizon == 0.8
+
+
+def test_what_is_out_of_reach_is_said_with_numbers() -> None:
+    hard = wanting({"m": 1e-3, "l": 0.02, "c": 0.0125}, horizon=0.6)
+    with pytest.raises(OutOfReachError, match=r"0\.8 s is not enough: it does not tell m \(σ 0\.\d+, wanted 0\.001\)"):
+        mjfim.shortest(hard, longest=0.8)
+
+
+def test_default_longest_is_what_a_table_covers(tmp_path: Path) -> None:
+    """The four seconds of a CSV are not extrapolated; a design.csv's last row has no control."""
+    for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
+        shutil.copy(MODELS / name, tmp_path)
+    text = (tmp_path / "cart_pendulum.csv").read_text(encoding="utf-8").splitlines()
+    (tmp_path / "half.csv").write_text("\n".join(["t,ctrl:force", *text[1:61], "0.60,"]) + "\n", encoding="utf-8")
+    table = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").model_dump(exclude_unset=True)
+    table = {**table, "horizon": 0.4, "initial": {"keyframe": "hanging", "control": "half.csv"}}
+    hard = mjfim.Experiment(**table, directory=tmp_path).replace(
+        parameters={"m": {"wanted": 1e-4}}, descent={"starts": 1, "max_iterations": 2}
+    )
+    with pytest.raises(OutOfReachError, match=r"even 0\.6 s"):
+        mjfim.shortest(hard)
+
+
+def test_faulty_requests_say_what_is_right() -> None:
+    with pytest.raises(ExperimentError, match=r"parameters\.m\.wanted"):
+        mjfim.shortest(STUDY)
+    with pytest.raises(ExperimentError, match="tolerance"):
+        mjfim.shortest(wanting(SIGMA), tolerance=0.0)
+    with pytest.raises(ExperimentError, match="longest"):
+        mjfim.shortest(wanting(SIGMA), longest=0.01)
+
+
+def test_interrupted_it_returns_the_shortest_so_far() -> None:
+    horizons: list[float] = []
+
+    def monitor(row: HistoryRow) -> None:
+        if len(horizons) == 1:
+            raise KeyboardInterrupt
+
+    found = mjfim.shortest(
+        wanting(SIGMA), tolerance=0.05, monitor=monitor, report=lambda tried: horizons.append(tried.horizon)
+    )
+    assert found.horizon == 1.5 and not found.closed and "interrupted" in str(found)
+    with pytest.raises(KeyboardInterrupt):
+        mjfim.shortest(wanting(SIGMA), report=_stop)
+
+
+def _stop(tried: Tried) -> None:
+    raise KeyboardInterrupt
+
+
+def test_a_duration_that_cannot_be_simulated_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Except the stated one: there the fault is the user's to see."""
+    real = mjfim.excitation.shortest_horizon.design  # type: ignore[attr-defined]
+
+    def faulty(setup: Setup, *rest: object, **more: object) -> mjfim.Design:
+        if setup.samples < 140:
+            raise SimulationDiverged("too short")
+        return real(setup, *rest, **more)
+
+    monkeypatch.setattr(mjfim.excitation.shortest_horizon, "design", faulty)
+    found = mjfim.shortest(wanting(SIGMA), tolerance=0.05)
+    assert 1.4 <= found.horizon <= 1.45 and found.missed is not None and found.missed.why == "too short"
+    with pytest.raises(SimulationDiverged):
+        mjfim.shortest(wanting(SIGMA, horizon=1.0))
+
+
+def test_control_of_another_duration(tmp_path: Path) -> None:
+    """Cut and repeated where anything may happen at the end, else stretched."""
+    control = np.arange(4.0)[:, None]
+
+    def made(samples: int, **tables: object) -> list[float]:
+        return fitted(Setup(STUDY.replace(horizon=samples / 100.0, **tables)), control).ravel().tolist()
+
+    limited = {"limits": {"control": {"force": (-5.0, 5.0)}}}
+    assert made(3) == [0.0, 1.0, 2.0] and made(4) == [0.0, 1.0, 2.0, 3.0]
+    assert made(6) == [0.0, 1.0, 2.0, 3.0, 0.0, 1.0]
+    assert made(3, **limited) == [0.0, 1.0, 2.0]
+    assert made(8, **limited) == [0.0, 0.25, 0.75, 1.25, 1.75, 2.25, 2.75, 3.0]
+    assert made(2, boundary={"end": "periodic"}) == [0.5, 2.5]
+
+
+def test_the_command_line(tmp_path: Path) -> None:
+    """Everything as usual at the horizon found, which it prints and keeps; 1 where none is long enough."""
+    for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
+        shutil.copy(MODELS / name, tmp_path)
+    text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
+    for old, new in (
+        ("horizon = 4.0", "horizon = 1.0"),
+        ("max_iterations = 200", "max_iterations = 10"),
+        ("tolerance = 1e-7", "tolerance = 1e-2"),
+        ("[parameters.m] ", "[parameters.m]\nwanted = 0.03\n#"),
+    ):
+        assert old in text
+        text = text.replace(old, new, 1)
+    study = tmp_path / "study.toml"
+    study.write_text(text, encoding="utf-8")
+    folder = tmp_path / "out"
+
+    def run(*words: object) -> int:
+        done = CliRunner().invoke(cli.app, [str(word) for word in words])
+        run.output = done.output  # type: ignore[attr-defined]
+        return done.exit_code
+
+    assert run("design", study, "-o", folder, "--shortest") == 0, run.output  # type: ignore[attr-defined]
+    kept = json.loads((folder / "shortest.json").read_text(encoding="utf-8"))
+    assert kept["closed"] and kept["horizon"] < 1.0
+    assert f"shortest horizon: {kept['horizon']:g} s" in run.output  # type: ignore[attr-defined]
+    arrays = np.load(folder / "design.npz", allow_pickle=False)
+    assert arrays["t"][-1] == pytest.approx(kept["horizon"])
+    hard = text.replace("wanted = 0.03", "wanted = 1e-9").replace("horizon = 1.0", "horizon = 4.0")
+    study.write_text(hard, encoding="utf-8")
+    assert run("design", study, "-o", folder, "--shortest") == 1
+    assert "not enough" in run.output  # type: ignore[attr-defined]
+    study.write_text(text.replace("wanted = 0.03", ""), encoding="utf-8")
+    assert run("design", study, "-o", folder, "--shortest") == 2
+    assert "wanted" in run.output  # type: ignore[attr-defined]

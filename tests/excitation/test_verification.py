@@ -1,0 +1,158 @@
+"""The audit of a design on the model as the user wrote it: between the samples, with clamps and stops, or lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.numerics import CART_PENDULUM, make_setup
+
+from mjfim.excitation.constraints import fence_of
+from mjfim.excitation.verification import SAME, audit
+from mjfim.experiment.system import Setup
+
+# A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
+SPRING = """
+<mujoco model="spring">
+  <option timestep="0.001" integrator="{integrator}" gravity="0 0 0"><flag contact="disable"/></option>
+  <worldbody>
+    <geom name="wall" type="box" size="0.01 1 1" pos="0.3 0 0"/>
+    <body name="ball">
+      <joint name="slide" type="slide" axis="1 0 0" stiffness="3947.84176043574" {joint}/>
+      <geom name="ball" type="sphere" size="0.1" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="slide" {motor}/></actuator>
+</mujoco>
+"""
+SWING = 0.15  # [m]
+SPEED = SWING * 2 * np.pi * 10.0
+
+
+def spring_setup(folder: Path, joint: str = "", motor: str = "", **tables: Any) -> Setup:
+    """A second of it, at 10 Hz, from the middle at full speed, hardly pushed."""
+    defaults: dict[str, Any] = {
+        "rate": 10.0,
+        "horizon": 1.0,
+        "parameters": {"m": {"target": "body/ball:mass"}},
+        "noise": {"state": 0.01},
+        "initial": {"qvel": (SPEED,), "control": {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0}},
+    }
+    text = SPRING.format(joint=joint, motor=motor, integrator="RK4")
+    return make_setup(text, folder, **{**defaults, **tables})
+
+
+def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
+    """At every sample the ball is in the middle, at full speed and without acceleration; in between it is anywhere."""
+    limits = {
+        "position": {"slide": (-0.1, 0.12)},
+        "velocity": {"slide": (0.9 * SPEED, 2 * SPEED)},
+        "acceleration": 300.0,
+    }
+    setup = spring_setup(tmp_path, limits=limits)
+    samples = setup.initial
+    assert setup.substeps == 100
+    assert np.abs(samples.qpos).max() < 0.01
+    assert samples.qvel.min() > 0.98 * SPEED
+    found = audit(setup, samples)
+    assert not found.kept
+    # by hand: a harmonic of 10 Hz
+    assert found.margins["position"] == pytest.approx(0.1 - SWING, rel=1e-3)
+    assert found.margins["velocity"] == pytest.approx(-1.9 * SPEED, rel=1e-3)
+    assert found.margins["acceleration"] == pytest.approx(300.0 - SWING * (2 * np.pi * 10.0) ** 2, rel=3e-3)
+    assert found.deviation < SAME
+    # what a fence at the samples alone would have said
+    fence = fence_of(setup)
+    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    assert watched is not None
+    trajectory, tapped = watched
+    at_samples = fence.margins(fence.sight(trajectory, tapped[:, -1:], slopes=False))
+    assert min(at_samples.values()) > 0.0
+    assert fence.margins(fence.sight(trajectory, tapped, slopes=False)) == pytest.approx(found.margins)
+
+
+def test_clearance_between_the_samples_counts(tmp_path: Path) -> None:
+    """The wall is 0.19 m from the ball in the middle, and 0.15 m nearer where it turns."""
+    setup = spring_setup(tmp_path, limits={"clearance": 0.1})
+    fence = fence_of(setup)
+    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    assert watched is not None
+    assert fence.margins(fence.sight(*watched, slopes=False))["clearance"] > 0.05
+    found = audit(setup, setup.initial)
+    assert found.margins["clearance"] == pytest.approx(0.19 - SWING - 0.1, abs=1e-4)
+    assert not found.kept
+    assert audit(spring_setup(tmp_path, limits={"clearance": 0.035}), setup.initial).kept
+
+
+def test_what_keeps_all_limits_is_kept_to_the_last_digit(tmp_path: Path) -> None:
+    """Just above the swing, just below it."""
+    for edge, kept in ((1.001, True), (0.999, False)):
+        limits = {"position": {"slide": (-edge * SWING, 1.0)}}
+        setup = spring_setup(tmp_path, limits=limits)
+        assert audit(setup, setup.initial).kept is kept
+
+
+@pytest.mark.parametrize("clamp", ["stop", "force", "joint force", "control"])
+def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path: Path) -> None:
+    """A design on the plant without them: played on the model with them it goes elsewhere."""
+    words = {
+        "stop": {"joint": 'range="-0.1 0.1" limited="true" solreflimit="0.004 1"'},
+        "force": {"motor": 'forcerange="-0.05 0.05"'},
+        "joint force": {"joint": 'actuatorfrcrange="-0.05 0.05"'},
+        "control": {"motor": 'ctrlrange="-0.05 0.05"'},
+    }[clamp]
+    control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
+    tables = {"rate": 50.0, "initial": {"qvel": (SPEED,), "control": control}}
+    setup = spring_setup(tmp_path, **words, **tables)
+    lifted = setup.free()
+    designed = lifted.plant.simulate(lifted.theta, setup.control)
+    found = audit(setup, designed)
+    assert found.deviation > 10 * SAME
+    free = audit(spring_setup(tmp_path, **tables), designed)
+    assert free.deviation < SAME
+    if clamp in ("stop", "control"):
+        assert not found.kept
+    else:  # the clamp keeps the force at its range
+        assert found.margins[clamp.replace(" ", "_")] == 0.0
+
+
+@pytest.mark.parametrize("enforce", [True, False])
+def test_only_enforced_limits_take_the_clamps_out_of_the_plant(enforce: bool, tmp_path: Path) -> None:
+    """A boundary alone keeps no force within its clamp: the design's plant must have it."""
+    motor = 'ctrlrange="-0.05 0.05" forcerange="-0.04 0.04"'
+    control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
+    tables = {"rate": 50.0, "initial": {"qvel": (SPEED,), "control": control}, "cost": {"control": 1.0}}
+    setup = spring_setup(tmp_path, motor=motor, boundary={"end": "periodic"}, limits={"enforce": enforce}, **tables)
+    assert setup.enforced
+    lifted = setup.free()
+    designed = lifted.plant.simulate(lifted.theta, setup.control)
+    assert (audit(setup, designed).deviation < SAME) is not enforce
+
+
+def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
+    """What is asked of the end does."""
+    limits = {"position": {"slide": (-0.1, 0.12)}, "clearance": 0.1, "enforce": False}
+    for boundary, kept in (({}, True), ({"end": "periodic"}, True), ({"end": "periodic", "position": 1e-7}, False)):
+        setup = spring_setup(tmp_path, limits=limits, boundary=boundary)
+        found = audit(setup, setup.initial)
+        assert found.margins["position"] < 0.0
+        assert found.margins["clearance"] < 0.0
+        assert found.kept is kept
+
+
+def test_a_control_that_the_model_does_not_survive_keeps_nothing(tmp_path: Path) -> None:
+    limits = {"position": {"slide": (-3.0, 3.0)}, "control": {"force": (-1e13, 1e13)}}
+    setup = make_setup(
+        CART_PENDULUM.format(integrator="RK4"),
+        tmp_path,
+        parameters={"m": {"target": "body/bob:mass"}},
+        noise={"state": 0.01},
+        limits=limits,
+    )
+    wild = setup.plant.trajectory(setup.initial.state, np.full_like(setup.control, 1e12))
+    found = audit(setup, wild)
+    assert not found.kept
+    assert found.deviation == np.inf
+    assert set(found.margins.values()) == {-np.inf}

@@ -1,0 +1,791 @@
+"""The experiment file: DESIGN.md's contract parses, and every fault names the file, the key and what would be right."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
+from mjfim.experiment.schema import Correlated, Cost, Descent, Experiment, Limits, NoiseSpec, Nuisance, Robust, Signal
+from mjfim.experiment.system import Setup
+
+MODELS = Path(__file__).parents[2] / "models"
+
+# All keys of the contract.
+CONTRACT = """
+model = "cart_pendulum.xml"
+rate = 100.0
+measure_rate = 50.0
+horizon = 1.0
+
+[initial]
+keyframe = "hanging"
+control = "cart_pendulum.csv"
+
+[parameters.m]
+target = "body/bob:mass"
+guess = 2.5
+true = 2.0
+bounds = [0.1, 10.0]
+scale = 1.0
+prior = 0.5
+unit = "kg"
+
+[parameters.l]
+targets = [
+  { path = "body/bob:pos[2]", scale = -1.0, offset = 0.25 },
+  { path = "geom/rod:pos[2]", scale = 0.5 },
+]
+guess = -0.75
+scale = "guess"
+
+[parameters.c]
+target = "joint/hinge:damping"
+
+[noise]
+state = 0.05
+hinge_angle = 0.01
+
+[cost]
+criterion = "A"
+information = 2.0
+control = { force = 1e-2 }
+tracking = { slide = 0.05 }
+tracking_velocity = { hinge = 0.1 }
+linearize_at = "true"
+
+[descent]
+method = "metric"
+tolerance = 1e-5
+max_iterations = 20
+
+[limits]
+position = { slide = [-1.0, 1.0] }
+velocity = { hinge = 8.0 }
+control = { force = [-5.0, 5.0] }
+"""
+
+# The least that makes an experiment.
+LEAST = """
+model = "cart_pendulum.xml"
+rate = 100.0
+horizon = 1.0
+[initial]
+keyframe = "hanging"
+control = { kind = "sine" }
+[parameters.m]
+target = "body/bob:mass"
+[cost]
+[noise]
+state = 0.05
+"""
+
+BAR = '<body name="bar"><joint name="j"/><geom size=".1" pos=".1 0 0"/></body>'
+BAD_MODELS = {
+    "text.xml": "this is not XML",
+    "schema.xml": "<mujoco><worldbdy/></mujoco>",
+    "massless.xml": '<mujoco><worldbody><body name="thin"><joint/></body></worldbody></mujoco>',
+    "passive.xml": f"<mujoco><worldbody>{BAR}</worldbody></mujoco>",
+}
+BAD_TABLES = {
+    "columns.csv": b"t,forc\n0,1\n0.5,1\n1,1\n",
+    "stray.csv": b"t,force,torque\n0,1,1\n0.5,1,1\n1,1,1\n",
+    "timeless.csv": b"force\n1\n1\n1\n",
+    "nan.csv": b"t,force\n0,1\n0.5,nan\n1,1\n",
+    "hole.csv": b"t,force\n0,1\n0.5,1\n0.7,\n1,1\n",
+    "short.csv": b"t,force\n0,1\n0.1,1\n0.2,1\n",
+    "late.csv": b"t,force\n0.5,1\n1,1\n1.5,1\n",
+    "repeated.csv": b"t,force\n0,1\n0.5,1\n0.5,1\n1,1\n",
+    "backward.csv": b"t,force\n0,1\n0.5,1\n0.4,1\n1,1\n",
+    "text.csv": b"t,force\n0,1\n0.5,strong\n1,1\n",
+    "header.csv": b"t,force\n",
+    "empty.csv": b"",
+    "twice.csv": b"t,force,force\n0,1,1\n1,1,1\n",
+    "latin.csv": b"t,force,\xe4\n0,1,1\n1,1,1\n",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The cart-pendulum's files beside faulty models and tables."""
+    home = tmp_path_factory.mktemp("experiments")
+    for source in MODELS.iterdir():
+        shutil.copy(source, home)
+    for name, text in BAD_MODELS.items():
+        (home / name).write_text(text, encoding="utf-8")
+    for name, data in BAD_TABLES.items():
+        (home / name).write_bytes(data)
+    return home
+
+
+@pytest.fixture
+def resolve(folder: Path) -> Callable[[str], Setup]:
+    """Read a text as the file bad.toml and resolve it."""
+
+    def run(text: str) -> Setup:
+        (folder / "bad.toml").write_text(text, encoding="utf-8")
+        return Setup(Experiment.from_file(folder / "bad.toml"))
+
+    return run
+
+
+def edited(old: str, new: str) -> str:
+    """LEAST with one change."""
+    if LEAST.count(old) != 1:
+        raise ValueError(f"{old!r} does not stand exactly once in the text")
+    return LEAST.replace(old, new)
+
+
+def parameter(lines: str) -> str:
+    """LEAST with other lines in its parameter table."""
+    return edited('target = "body/bob:mass"', lines)
+
+
+def target(path: str) -> str:
+    """LEAST with another parameter path."""
+    return parameter(f'target = "{path}"')
+
+
+def control(value: str) -> str:
+    """LEAST with another initial control."""
+    return edited('{ kind = "sine" }', value)
+
+
+def test_contract_parses(folder: Path) -> None:
+    """Every key of DESIGN.md, with the value that was written."""
+    path = folder / "contract.toml"
+    path.write_text(CONTRACT, encoding="utf-8")
+    e = Experiment.from_file(path)
+    assert (e.model, e.rate, e.measure_rate, e.horizon) == ("cart_pendulum.xml", 100.0, 50.0, 1.0)
+    assert (e.initial.keyframe, e.initial.control) == ("hanging", "cart_pendulum.csv")
+    assert list(e.parameters) == ["m", "l", "c"]
+    m, rod, _ = e.parameters.values()
+    assert (m.target, m.guess, m.true, m.bounds, m.scale, m.prior, m.unit) == (
+        "body/bob:mass",
+        2.5,
+        2.0,
+        (0.1, 10.0),
+        1.0,
+        0.5,
+        "kg",
+    )
+    assert [(t.path, t.scale, t.offset) for t in rod.targets] == [
+        ("body/bob:pos[2]", -1.0, 0.25),
+        ("geom/rod:pos[2]", 0.5, 0.0),
+    ]
+    assert e.noise == {"state": 0.05, "hinge_angle": 0.01}
+    assert e.cost == Cost(
+        criterion="A",
+        information=2.0,
+        control={"force": 1e-2},
+        tracking={"slide": 0.05},
+        tracking_velocity={"hinge": 0.1},
+        linearize_at="true",
+    )
+    assert e.descent == Descent(method="metric", tolerance=1e-5, max_iterations=20)
+    assert e.limits == Limits(position={"slide": (-1.0, 1.0)}, velocity={"hinge": 8.0}, control={"force": (-5.0, 5.0)})
+    assert (e.directory, e.source) == (folder, str(path))
+
+
+# What a file can say beyond the paper: correlated noise, rates, nuisance, inertial groups, other criteria.
+EXTENDED = """
+model = "cart_pendulum.xml"
+rate = 100.0
+horizon = 1.0
+
+[initial]
+keyframe = "hanging"
+control = { kind = "sine", offset = { force = 0.5 } }
+
+[parameters.bob]
+inertial = "bob"
+coordinates = "barycentric"
+prior = 0.2
+nuisance = true
+
+[parameters.c]
+target = "joint/hinge:damping"
+wanted = 0.01
+
+[noise]
+state = { covariance = [[4.0, 1.0, 0.0, 0.0], [1.0, 4.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], rate = 50.0 }
+hinge_angle = { sigma = [0.01] }
+slide_position = 0.02
+
+[[correlated]]
+outputs = ["hinge_angle", "slide_position"]
+covariance = [[1e-4, 1e-5], [1e-5, 4e-4]]
+
+[nuisance]
+initial = { "qpos:slide" = 0.01, "qvel:hinge" = true }
+bias = true
+delay = 0.005
+
+[cost]
+criterion = "c"
+subset = ["c"]
+control_about = { force = 1.5 }
+
+[robust]
+over = "worst"
+samples = 3
+seed = 4
+
+[descent]
+starts = 3
+coarse = 2
+seed = 5
+"""
+
+
+def test_extended_contract_parses_and_resolves(resolve: Callable[[str], Setup]) -> None:
+    """Each table arrives with the values that were written, and the numbers where they act."""
+    setup = resolve(EXTENDED)
+    e = setup.experiment
+    assert e.noise["hinge_angle"] == NoiseSpec(sigma=(0.01,)) and e.noise["slide_position"] == 0.02
+    assert e.correlated == (
+        Correlated(outputs=("hinge_angle", "slide_position"), covariance=((1e-4, 1e-5), (1e-5, 4e-4))),
+    )
+    assert e.nuisance == Nuisance(initial={"qpos:slide": 0.01, "qvel:hinge": True}, bias=True, delay=0.005)
+    assert e.robust == Robust(over="worst", samples=3, seed=4)
+    assert (e.parameters["c"].wanted, e.parameters["bob"].coordinates) == (0.01, "barycentric")
+    assert (e.descent.starts, e.descent.coarse, e.descent.seed) == (3, 2, 5)
+    assert setup.noise.strides.tolist() == [2] * 4 + [1] * 2
+    assert setup.noise.covariance[0, 1] == 1.0 and setup.noise.covariance[4, 5] == 1e-5
+    names = setup.parameters.names
+    assert names[:2] == ("bob.mass", "bob.mx") and names[10] == "c"
+    assert names[11:13] == ("initial qpos:slide", "initial qvel:hinge")
+    assert names[13:-1] == tuple(f"bias {n}" for n in setup.outputs.names) and names[-1] == "delay"
+    assert setup.parameters.interest.tolist() == [10]
+    assert setup.control[0] == pytest.approx(0.5)
+    assert Experiment(**e.model_dump(), directory=e.directory, source=e.source) == e
+    assert e.replace(noise={"hinge_angle": 0.3}).noise == {**e.noise, "hinge_angle": 0.3}
+
+
+def test_contract_resolves(resolve: Callable[[str], Setup]) -> None:
+    """The numbers arrive where they act."""
+    setup = resolve(CONTRACT)
+    assert setup.parameters.names == ("m", "l", "c")
+    assert setup.parameters.guess.tolist() == [2.5, -0.75, 1.0]  # c: the model's own damping
+    assert setup.parameters.true.tolist() == [2.0, -0.75, 1.0]
+    assert setup.parameters.scale.tolist() == [1.0, 0.75, 1.0]
+    assert setup.parameters.lower.tolist() == [0.1, -np.inf, -np.inf]
+    assert setup.parameters.prior_information.tolist() == np.diag([4.0, 0.0, 0.0]).tolist()
+    assert (setup.substeps, setup.stride, setup.samples, setup.measure_rate) == (1, 2, 100, 50.0)
+    sigma = dict(zip(setup.outputs.names, setup.noise.sigma, strict=True))
+    assert sigma == {
+        "qpos:slide": 0.05,
+        "qpos:hinge": 0.05,
+        "qvel:slide": 0.05,
+        "qvel:hinge": 0.05,
+        "hinge_angle": 0.01,
+    }
+    assert setup.tracking.tolist() == [0.05, 0.0, 0.0, 0.1]
+    assert setup.control_weight.tolist() == [1e-2]
+    assert setup.theta.tolist() == setup.parameters.true.tolist()
+    assert setup.plant.nominal_start.tolist() == [0.0, np.pi, 0.0, 0.0]
+    assert setup.control.shape == (100, 1)
+    assert {(x.kind, x.name, x.lower, x.upper) for x in setup.limits} == {
+        ("position", "slide", -1.0, 1.0),
+        ("velocity", "hinge", -8.0, 8.0),
+        ("control", "force", -5.0, 5.0),
+    }
+
+
+def test_defaults(resolve: Callable[[str], Setup]) -> None:
+    """What a file need not say, as DESIGN.md promises it."""
+    setup = resolve(LEAST)
+    e = setup.experiment
+    assert (e.cost.criterion, e.cost.information, e.cost.control, e.cost.linearize_at) == ("E", 1.0, 1e-3, "guess")
+    assert (e.descent.method, e.descent.tolerance, e.descent.max_iterations) == ("lbfgs", 1e-7, 200)
+    assert setup.measure_rate == e.rate
+    assert setup.parameters.guess.tolist() == setup.parameters.true.tolist() == setup.parameters.scale.tolist() == [2.0]
+    assert not setup.tracking.any()
+    assert setup.limits == ()
+
+
+def test_mjcf_noise_is_the_default(resolve: Callable[[str], Setup]) -> None:
+    """Without a noise table the sensors that state their noise are measured."""
+    setup = resolve(edited("state = 0.05", ""))
+    assert setup.outputs.names == ("slide_position", "hinge_angle", "slide_velocity", "hinge_velocity")
+    assert setup.noise.sigma.tolist() == [0.05] * 4
+
+
+def test_start_from_qpos(resolve: Callable[[str], Setup]) -> None:
+    """Positions and velocities stand for themselves, what is missing is the model's."""
+    setup = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
+    assert setup.plant.nominal_start.tolist() == [0.5, 3.0, 0.0, -1.0]
+    assert resolve(edited('keyframe = "hanging"', "")).plant.nominal_start.tolist() == [0.0, 0.0, 0.0, 0.0]
+
+
+def test_rate_below_the_timestep(resolve: Callable[[str], Setup]) -> None:
+    """Several engine steps per sample."""
+    setup = resolve(edited("rate = 100.0", "rate = 20.0"))
+    assert (setup.substeps, setup.samples) == (5, 20)
+    assert setup.dt == pytest.approx(0.05)
+
+
+def test_python_says_what_toml_says(folder: Path) -> None:
+    """The same names, the same experiment."""
+    (folder / "contract.toml").write_text(CONTRACT, encoding="utf-8")
+    e = Experiment.from_file(folder / "contract.toml")
+    again = Experiment(**e.model_dump(), directory=folder, source=e.source)
+    assert again == e
+
+
+def test_replace_merges_and_checks(folder: Path) -> None:
+    """Tables merge, the rest is kept, the old experiment too; faults are caught as in a file."""
+    e = Experiment.from_file(folder / "cart_pendulum.toml")
+    new = e.replace(horizon=1.0, cost={"control": 1e-2}, initial={"control": {"kind": "chirp"}})
+    assert (new.horizon, new.cost.control, new.initial.control) == (1.0, 1e-2, Signal(kind="chirp"))
+    assert (new.cost.tracking, new.initial.keyframe) == (e.cost.tracking, "hanging")
+    assert (new.parameters, new.directory, new.source) == (e.parameters, e.directory, e.source)
+    assert (e.horizon, e.cost.control) == (4.0, 1e-3)
+    with pytest.raises(ExperimentError, match=r"cart_pendulum\.toml: cost\.contrl: unknown key .* valid: .*control"):
+        e.replace(cost={"contrl": 1.0})
+    with pytest.raises(ExperimentError, match=r"horizon: .*greater than 0"):
+        e.replace(horizon=-1.0)
+
+
+def test_experiments_are_immutable(folder: Path) -> None:
+    """Changes go through `replace`."""
+    e = Experiment.from_file(folder / "cart_pendulum.toml")
+    with pytest.raises(ValueError, match="frozen"):
+        e.rate = 50.0
+
+
+@pytest.mark.parametrize("name", ["cart_pendulum.toml", "cart_pendulum_guess.toml"])
+def test_shipped_experiments_resolve(name: str) -> None:
+    """They are the paper's study: at the true values, and as a user meets it."""
+    setup = Setup(Experiment.from_file(MODELS / name))
+    assert setup.samples == 400
+    assert setup.parameters.true.tolist() == [2.0, 1.0, 1.0]
+    assert setup.theta.tolist() == ([2.5, 1.4, 1.4] if "guess" in name else [2.0, 1.0, 1.0])
+    t = np.arange(400) * 0.01
+    assert np.allclose(setup.control[:, 0], (1 + t / 4) * np.sin(2 * t), rtol=0, atol=1e-12)
+
+
+E, M, R = ExperimentError, ModelError, RecordingError
+HOME = "bad.toml"
+
+# name: text, error, what the message must hold. The first fragment is the file.
+FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
+    # keys
+    "top-level key": ("modle = 1\n" + LEAST, E, [HOME, "modle", "unknown key", "'model'", "valid:", "horizon"]),
+    "nested key": (edited("[cost]", "[cost]\ncontrl = 1"), E, [HOME, "cost.contrl", "'control'", "tracking"]),
+    "initial key": (edited("keyframe =", "keyfrme ="), E, [HOME, "initial.keyfrme", "'keyframe'", "qpos"]),
+    "signal key": (control('{ kind = "sine", amp = 1 }'), E, [HOME, "initial.control.amp", "amplitude, "]),
+    "parameter key": (
+        parameter('target = "body/bob:mass"\ngues = 1'),
+        E,
+        [HOME, "parameters.m.gues", "'guess'", "bounds"],
+    ),
+    "target key": (
+        parameter('targets = [{ path = "body/bob:mass", scal = 1 }]'),
+        E,
+        [HOME, "parameters.m.targets.0.scal", "offset, path, scale"],
+    ),
+    "limits key": (
+        LEAST + "[limits]\nspeed = 1\n",
+        E,
+        [
+            HOME,
+            "limits.speed",
+            "acceleration, bandwidth, clearance, control, control_rate, enforce, force, ignored, position, velocity",
+        ],
+    ),
+    "boundary key": (
+        LEAST + "[boundary]\nbegin = 1\n",
+        E,
+        [HOME, "boundary.begin", "end, keyframe, position, start, velocity"],
+    ),
+    "descent key": (
+        LEAST + "[descent]\niterations = 1\n",
+        E,
+        [HOME, "descent.iterations", "unknown key", "max_iterations"],
+    ),
+    "reserved key": ('source = "x"\n' + LEAST, E, [HOME, "source", "valid:", "model"]),
+    "missing key": (edited("rate = 100.0", ""), E, [HOME, "rate", "required"]),
+    # names
+    "tracking joint": (edited("[cost]", "[cost]\ntracking = { slid = 1 }"), E, [HOME, "cost.tracking", "hinge, slide"]),
+    "velocity joint": (
+        edited("[cost]", "[cost]\ntracking_velocity = { slid = 1 }"),
+        E,
+        [HOME, "cost.tracking_velocity", "'slid'", "hinge, slide"],
+    ),
+    "limit joint": (
+        LEAST + "[limits]\nposition = { slid = [-1, 1] }\n",
+        E,
+        [HOME, "limits.position", "joint 'slid'", "hinge, slide"],
+    ),
+    "limit actuator": (
+        LEAST + "[limits]\ncontrol = { motor = [-1, 1] }\n",
+        E,
+        [HOME, "limits.control", "actuator 'motor'", "force"],
+    ),
+    "cost actuator": (
+        edited("[cost]", "[cost]\ncontrol = { motor = 1 }"),
+        E,
+        [HOME, "cost.control", "actuator 'motor'", "force"],
+    ),
+    "signal actuator": (
+        control('{ kind = "sine", amplitude = { motor = 1 } }'),
+        E,
+        [HOME, "initial.control.amplitude", "'motor'", "force"],
+    ),
+    "sensor": (
+        edited("state =", "angle ="),
+        E,
+        [HOME, "noise", "sensor 'angle'", "hinge_angle", "qpos:hinge", "state"],
+    ),
+    "keyframe": (edited('"hanging"', '"hangin"'), E, [HOME, "initial.keyframe", "'hangin'", "did you mean 'hanging'"]),
+    # parameter paths
+    "path form": (target("body/bob"), E, [HOME, "parameters.m", "'body/bob'", "kind/name:field[index]"]),
+    "path kind": (
+        target("bdy/bob:mass"),
+        E,
+        [HOME, "parameters.m", "kind 'bdy'", "actuator, body, geom, initial, joint, option, output, site, tendon"],
+    ),
+    "path name": (target("body/bo:mass"), E, [HOME, "parameters.m", "body 'bo'", "'bob'", "cart, pendulum"]),
+    "path field": (
+        target("body/bob:mas"),
+        E,
+        [HOME, "parameters.m", "field 'mas'", "'mass'", "inertia, ipos, logcholesky, mass"],
+    ),
+    "path index": (target("body/bob:pos[3]"), E, [HOME, "parameters.m", "index 3", "0 to 2"]),
+    "path index of a scalar": (target("joint/hinge:damping[1]"), E, [HOME, "parameters.m", "index 1", "0 to 0"]),
+    "path without a name": (target("body:mass"), E, [HOME, "parameters.m", "bob, cart, pendulum"]),
+    "option field": (target("option:grav"), E, [HOME, "parameters.m", "'grav'", "gravity"]),
+    # model
+    "model missing": (edited("cart_pendulum.xml", "gone.xml"), M, ["gone.xml", "no such model file"]),
+    "model not XML": (edited("cart_pendulum.xml", "text.xml"), M, ["text.xml", "MuJoCo cannot read", "XML"]),
+    "model schema": (edited("cart_pendulum.xml", "schema.xml"), M, ["schema.xml", "MuJoCo cannot read", "worldbdy"]),
+    "model not compiling": (
+        edited("cart_pendulum.xml", "massless.xml"),
+        M,
+        ["massless.xml", "MuJoCo cannot compile", "mass and inertia", "thin"],
+    ),
+    "no actuator": (edited("cart_pendulum.xml", "passive.xml"), M, ["passive.xml", "no actuator", "at least one"]),
+    # time
+    "rate": (edited("rate = 100.0", "rate = 30.0"), E, [HOME, "rate: 30 Hz", "0.01 s", "100, 50, 25"]),
+    "rate above the timestep": (edited("rate = 100.0", "rate = 200.0"), E, [HOME, "rate: 200 Hz", "100, 50, 25"]),
+    "rate negative": (edited("rate = 100.0", "rate = -1.0"), E, [HOME, "rate", "greater than 0", "-1.0"]),
+    "measure rate": ("measure_rate = 30.0" + LEAST, E, [HOME, "measure_rate: 30 Hz", "100 Hz", "50, 25"]),
+    "measure rate above": ("measure_rate = 200.0" + LEAST, E, [HOME, "measure_rate: 200 Hz", "100 Hz", "50, 25"]),
+    "horizon": (edited("horizon = 1.0", "horizon = 1.005"), E, [HOME, "horizon: 1.005 s", "whole number", "samples"]),
+    "horizon of one sample": (edited("horizon = 1.0", "horizon = 0.01"), E, [HOME, "horizon: 0.01 s", ">= 2"]),
+    "horizon infinite": (edited("horizon = 1.0", "horizon = inf"), E, [HOME, "horizon", "finite", "inf"]),
+    # parameter values
+    "bounds inverted": (
+        parameter('target = "body/bob:mass"\nbounds = [5, 1]'),
+        E,
+        [HOME, "parameters.m", "bounds", "[5.0, 1.0]", "lower < upper"],
+    ),
+    "guess outside": (
+        parameter('target = "body/bob:mass"\nbounds = [1, 5]\nguess = 6'),
+        E,
+        [HOME, "parameters.m", "guess 6.0", "[1.0, 5.0]"],
+    ),
+    "model's value outside": (
+        parameter('target = "body/bob:mass"\nbounds = [3, 5]'),
+        E,
+        [HOME, "parameters.m.guess", "the model's own value 2", "[3.0, 5.0]"],
+    ),
+    "true outside": (
+        parameter('target = "body/bob:mass"\nbounds = [1, 5]\ntrue = 0.5'),
+        E,
+        [HOME, "parameters.m", "true 0.5", "[1.0, 5.0]"],
+    ),
+    "guess zero": (
+        parameter('target = "joint/slide:damping"'),
+        E,
+        [HOME, "parameters.m.scale", "is 0: state a guess, or a scale"],
+    ),
+    "guess not a number": (
+        parameter('target = "body/bob:mass"\nguess = nan'),
+        E,
+        [HOME, "parameters.m.guess", "finite", "nan"],
+    ),
+    "prior zero": (
+        parameter('target = "body/bob:mass"\nprior = 0'),
+        E,
+        [HOME, "parameters.m.prior", "greater than 0"],
+    ),
+    "scale word": (
+        parameter('target = "body/bob:mass"\nscale = "gues"'),
+        E,
+        [HOME, "parameters.m.scale", "'guess'", "'gues'"],
+    ),
+    "no target": (parameter("guess = 1"), E, [HOME, "parameters.m", "exactly one of target and targets"]),
+    "target and targets": (
+        parameter('target = "body/bob:mass"\ntargets = [{ path = "body/bob:mass" }]'),
+        E,
+        [HOME, "parameters.m", "exactly one of target and targets"],
+    ),
+    "dead target": (
+        parameter('targets = [{ path = "body/bob:mass", scale = 0 }]'),
+        E,
+        [HOME, "parameters.m", "scale 0 never changes"],
+    ),
+    # noise and weights
+    "sigma zero": (edited("state = 0.05", "state = 0"), E, [HOME, "noise.state", "greater than 0"]),
+    "sigma negative": (edited("state = 0.05", "state = -0.1"), E, [HOME, "noise.state", "greater than 0", "-0.1"]),
+    "sigma nan": (edited("state = 0.05", "state = nan"), E, [HOME, "noise.state", "finite", "nan"]),
+    "sigma inf": (edited("state = 0.05", "state = inf"), E, [HOME, "noise.state", "finite", "inf"]),
+    "sigma text": (edited("state = 0.05", 'state = "loud"'), E, [HOME, "noise.state", "number", "'loud'"]),
+    "information weight": (edited("[cost]", "[cost]\ninformation = -1"), E, [HOME, "cost.information", "-1"]),
+    "tracking weight": (
+        edited("[cost]", "[cost]\ntracking = { slide = -1 }"),
+        E,
+        [HOME, "cost.tracking.slide", "greater than or equal to 0"],
+    ),
+    # a weight of 0 is for controls with a hard range; without one it is the fault after this one
+    "control weight": (
+        edited("[cost]", "[cost]\ncontrol = -1"),
+        E,
+        [HOME, "cost.control", "greater than or equal to 0", "-1"],
+    ),
+    "no control weight": (
+        edited("[cost]", "[cost]\ncontrol = {}"),
+        E,
+        [HOME, "cost.control", "actuator 'force' has neither a weight nor a range", "limits.control.force"],
+    ),
+    "criterion": (
+        edited("[cost]", '[cost]\ncriterion = "F"'),
+        E,
+        [HOME, "cost.criterion", "'E', 'A', 'D' or 'c'", "'F'"],
+    ),
+    "criterion c alone": (
+        edited("[cost]", '[cost]\ncriterion = "c"'),
+        E,
+        [HOME, "cost", "exactly one of combination and subset"],
+    ),
+    "combination of another criterion": (
+        edited("[cost]", "[cost]\ncombination = { m = 1 }"),
+        E,
+        [HOME, "cost", "no other criterion takes one"],
+    ),
+    "combination of nothing": (
+        edited("[cost]", '[cost]\ncriterion = "c"\ncombination = { m = 0 }'),
+        E,
+        [HOME, "cost", "no coefficient other than 0"],
+    ),
+    "combination of a stranger": (
+        edited("[cost]", '[cost]\ncriterion = "c"\ncombination = { l = 1 }'),
+        E,
+        [HOME, "cost.combination", "wanted parameter 'l'", "valid: m"],
+    ),
+    "subset of nothing": (
+        edited("[cost]", '[cost]\ncriterion = "c"\nsubset = []'),
+        E,
+        [HOME, "cost.subset", "empty", "valid: m"],
+    ),
+    "metric weight without the metric": (
+        LEAST + "[descent]\npsi_weight = 1\n",
+        E,
+        [HOME, "descent", "psi_weight belongs to method"],
+    ),
+    "coarse word": (LEAST + '[descent]\ncoarse = "no"\n', E, [HOME, "descent.coarse", "integer", "'no'"]),
+    # further tables
+    "function in a file": (
+        parameter('function = "f"\nguess = 1'),
+        E,
+        [HOME, "parameters.m.function", "given in Python, not in a file"],
+    ),
+    "noise key": (
+        edited("state = 0.05", "state = { sigm = 1 }"),
+        E,
+        [HOME, "noise.state.sigm", "covariance, rate, sigma"],
+    ),
+    "noise of both": (
+        edited("state = 0.05", "state = { sigma = 1, covariance = [[1]] }"),
+        E,
+        [HOME, "noise.state", "exactly one of sigma and covariance"],
+    ),
+    "noise rate": (edited("state = 0.05", "state = { sigma = 1, rate = 0 }"), E, [HOME, "noise.state.rate", "greater"]),
+    "noise infinite": (
+        edited("state = 0.05", "hinge_angle = { covariance = [[inf]] }"),
+        E,
+        [HOME, "noise.hinge_angle.covariance.0.0", "finite"],
+    ),
+    "correlated key": (
+        LEAST + "[[correlated]]\noutput = []\n",
+        E,
+        [HOME, "correlated.0.output", "covariance, outputs"],
+    ),
+    "nuisance key": (LEAST + "[nuisance]\nstart = true\n", E, [HOME, "nuisance.start", "bias, delay, initial"]),
+    "nuisance false": (LEAST + "[nuisance]\ndelay = false\n", E, [HOME, "nuisance.delay", "True"]),
+    "robust key": (LEAST + "[robust]\ncount = 3\n", E, [HOME, "robust.count", "over, samples, seed"]),
+    "robust over": (LEAST + '[robust]\nover = "best"\n', E, [HOME, "robust.over", "'mean' or 'worst'", "'best'"]),
+    "robust of one": (LEAST + "[robust]\nsamples = 1\n", E, [HOME, "robust.samples", "greater than or equal to 2"]),
+    "robust without knowledge": (LEAST + "[robust]\n", E, [HOME, "robust", "state `prior` or `bounds`"]),
+    "earlier": ('earlier = ["gone.json"]\n' + LEAST, E, [HOME, "earlier", "gone.json", "cannot read"]),
+    "earlier that is no file of ours": (
+        'earlier = ["cart_pendulum.csv"]\n' + LEAST,
+        E,
+        [HOME, "earlier", "cart_pendulum.csv", "neither a design.json"],
+    ),
+    # limits
+    "position limits inverted": (
+        LEAST + "[limits]\nposition = { slide = [1, -1] }\n",
+        E,
+        [HOME, "limits.position.slide", "[1, -1]", "lower < upper"],
+    ),
+    "control limits inverted": (
+        LEAST + "[limits]\ncontrol = { force = [1, -1] }\n",
+        E,
+        [HOME, "limits.control.force", "[1, -1]", "lower < upper"],
+    ),
+    "velocity limit negative": (
+        LEAST + "[limits]\nvelocity = { hinge = -8 }\n",
+        E,
+        [HOME, "limits.velocity.hinge", "greater than 0", "-8"],
+    ),
+    # start
+    "qpos length": (
+        edited('keyframe = "hanging"', "qpos = [0, 0, 0]"),
+        E,
+        [HOME, "initial.qpos", "3 numbers", "the model has 2"],
+    ),
+    "act of a model without": (
+        edited('keyframe = "hanging"', "act = [0]"),
+        E,
+        [HOME, "initial.act", "1 numbers", "the model has 0"],
+    ),
+    "keyframe and qpos": (
+        edited('keyframe = "hanging"', 'keyframe = "hanging"\nqpos = [0, 0]'),
+        E,
+        [HOME, "initial", "either keyframe or qpos"],
+    ),
+    "signal kind": (
+        control('{ kind = "noise" }'),
+        E,
+        [HOME, "initial.control", "'constant', 'sine', 'chirp'", "noise"],
+    ),
+    # control tables
+    "table missing": (control('"gone.csv"'), R, ["gone.csv", "no such file"]),
+    "table empty": (control('"empty.csv"'), R, ["empty.csv", "Empty"]),
+    "table columns": (control('"columns.csv"'), R, ["columns.csv", "'force'", "wanted columns: t, force", "t, forc"]),
+    "table stray column": (control('"stray.csv"'), R, ["stray.csv", "'torque'", "force, t"]),
+    "table without t": (control('"timeless.csv"'), R, ["timeless.csv", "'t' is missing", "force"]),
+    "table NaN": (control('"nan.csv"'), R, ["nan.csv", "NaN", "row 2", "finite"]),
+    "table hole": (control('"hole.csv"'), R, ["hole.csv", "NaN", "row 3", "finite"]),
+    "table too short": (control('"short.csv"'), R, ["short.csv", "too few rows", "3 rows", "0 ... 1 s", "100 samples"]),
+    "table starts late": (control('"late.csv"'), R, ["late.csv", "0.5 ...", "0 ... 1 s"]),
+    "table repeats t": (control('"repeated.csv"'), R, ["repeated.csv", "'t' must increase"]),
+    "table runs backward": (control('"backward.csv"'), R, ["backward.csv", "'t' must increase"]),
+    "table with text": (control('"text.csv"'), R, ["text.csv", "column 'force'", "not numeric"]),
+    "table without rows": (control('"header.csv"'), R, ["header.csv", "at least two rows"]),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_are_named(name: str, resolve: Callable[[str], Setup]) -> None:
+    """File, key, what was wrong, the valid choices."""
+    text, kind, fragments = FAULTS[name]
+    with pytest.raises(kind) as caught:
+        resolve(text)
+    message = str(caught.value)
+    assert fragments[0] in message.splitlines()[0].split(": ")[0]
+    assert [f for f in fragments if f not in message] == []
+
+
+def test_a_free_control_is_named_by_its_actuator(resolve: Callable[[str], Setup]) -> None:
+    """At the latest where the cost is built."""
+    with pytest.raises(ExperimentError, match=r"cost\.control_about: .*actuator 'motor'.*force"):
+        _ = resolve(edited("[cost]", "[cost]\ncontrol_about = { motor = 1 }")).problem
+
+
+def test_least_is_sound(resolve: Callable[[str], Setup]) -> None:
+    """Every fault above is the only one in its file."""
+    assert resolve(LEAST).samples == 100
+
+
+@pytest.mark.parametrize(
+    ("data", "fragment"),
+    [
+        (b"model = \n", "Invalid value"),
+        (b'model = "a.xml"\nmodel = "b.xml"\n', "Cannot overwrite a value"),
+        (b'model = "\xff.xml"\n', "utf-8"),
+    ],
+)
+def test_not_toml(data: bytes, fragment: str, tmp_path: Path) -> None:
+    """Wrong syntax and wrong encoding name the file and the place."""
+    path = tmp_path / "broken.toml"
+    path.write_bytes(data)
+    with pytest.raises(ExperimentError) as caught:
+        Experiment.from_file(path)
+    assert str(caught.value).startswith(f"{path}: not valid TOML: ")
+    assert fragment in str(caught.value)
+
+
+def test_no_file(tmp_path: Path) -> None:
+    """A path to nothing, a path to a folder."""
+    with pytest.raises(ExperimentError, match=r"gone\.toml: cannot read the experiment file: No such file"):
+        Experiment.from_file(tmp_path / "gone.toml")
+    with pytest.raises(ExperimentError, match=r"cannot read the experiment file: Is a directory"):
+        Experiment.from_file(tmp_path)
+
+
+def test_all_faults_at_once(resolve: Callable[[str], Setup]) -> None:
+    """One line per fault, each with the file and the key."""
+    with pytest.raises(ExperimentError) as caught:
+        resolve(edited("rate = 100.0", "rate = -1.0").replace("state = 0.05", "state = 0").replace("[cost]", "[cst]"))
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 3
+    assert all(HOME in line for line in lines)
+    assert {"rate", "noise.state", "cst"} == {line.split(": ")[1] for line in lines}
+
+
+ONE_LINE: dict[str, str] = {
+    "signal kind": control('{ kind = "noise" }'),
+    "signal key": control('{ kind = "sine", amp = 1 }'),
+    "control weight": edited("[cost]", "[cost]\ncontrol = -1"),
+    "velocity limit": LEAST + "[limits]\nvelocity = { hinge = -8 }\n",
+    "scale": parameter('target = "body/bob:mass"\nscale = 0.0'),
+}
+
+
+@pytest.mark.parametrize("name", ONE_LINE)
+def test_one_fault_one_line(name: str, resolve: Callable[[str], Setup]) -> None:
+    """The branches of a union are the program's business, not the user's."""
+    with pytest.raises(ExperimentError) as caught:
+        resolve(ONE_LINE[name])
+    assert len(str(caught.value).splitlines()) == 1
+
+
+MISUSE: dict[str, tuple[str, list[str]]] = {
+    "dead target with a guess": (
+        parameter('guess = 1.0\ntargets = [{ path = "body/bob:mass", scale = 0 }]'),
+        ["parameters.m", "scale 0 never changes"],
+    ),
+    "two parameters for one number": (
+        LEAST + '[parameters.n]\ntarget = "body/bob:mass"\n',
+        ["parameters.n", "body/bob:mass"],
+    ),
+    "negative signal seed": (control('{ kind = "multisine", seed = -1 }'), ["initial.control.seed", "-1"]),
+    "negative descent seed": (LEAST + "[descent]\nseed = -1\n", ["descent.seed", "-1"]),
+    "column twice": (control('"twice.csv"'), ["twice.csv", "force"]),
+    "table not UTF-8": (control('"latin.csv"'), ["latin.csv"]),
+}
+
+
+@pytest.mark.parametrize("name", MISUSE)
+def test_misuse_is_not_accepted(name: str, resolve: Callable[[str], Setup]) -> None:
+    """Mistakes that would otherwise pass silently or end in a traceback."""
+    text, fragments = MISUSE[name]
+    with pytest.raises(MjfimError) as caught:
+        resolve(text)
+    assert [f for f in fragments if f not in str(caught.value)] == []
+
+
+@pytest.mark.parametrize("values", [{}, {"parameters": {}}, {"model": 3}])
+def test_python_faults_are_the_same_kind(values: dict[str, Any]) -> None:
+    """Without a file the message names the experiment."""
+    with pytest.raises(ExperimentError, match=r"^experiment: model: "):
+        Experiment(**values)

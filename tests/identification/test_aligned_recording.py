@@ -1,0 +1,231 @@
+"""A recording on the grid: the control keeps its impulse, the measured values are left alone, faults are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.numerics import Array, body_setup, cart_setup
+
+from mjfim.errors import RecordingError
+from mjfim.experiment.system import Setup
+from mjfim.identification.aligned_recording import Track, held, measured_trajectory, track_of
+from mjfim.plant.delay import Lag
+from mjfim.records.recording import Recording
+
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory: pytest.TempPathFactory) -> Setup:
+    return cart_setup(tmp_path_factory.mktemp("cart"))
+
+
+@pytest.fixture(scope="module")
+def body(tmp_path_factory: pytest.TempPathFactory) -> Setup:
+    return body_setup(tmp_path_factory.mktemp("body"), noise={"state": 0.01})
+
+
+def stamps(rng: np.random.Generator, mean: float) -> Array:
+    """Random times from 0, some of them a hair apart, with a hole here and there."""
+    gaps = mean * rng.choice([0.001, 0.3, 1.0, 1.0, 1.0, 1.7, 9.0], rng.integers(2, 60)) * rng.uniform(0.5, 1.5)
+    return np.concatenate([[0.0], np.cumsum(gaps)])
+
+
+def reference(t: Array, ctrl: Array, edges: Array) -> Array:
+    """Integral of the held control up to each edge, hold by hold; the last is held on."""
+    total = np.zeros((len(edges), ctrl.shape[1]))
+    for i, value in enumerate(ctrl):
+        end = t[i + 1] if i < len(ctrl) - 1 else np.inf
+        total += np.clip(edges - t[i], 0.0, end - t[i])[:, None] * value
+    return total
+
+
+@pytest.mark.parametrize("mean", [0.11 * DT, 0.5 * DT, DT, 2.3 * DT, 17.0 * DT])
+def test_every_sample_holds_the_mean_of_the_control(mean: float) -> None:
+    """So every integral of the log from the start to a sample, and the impulse of all of it, is kept."""
+    rng = np.random.default_rng(round(mean / DT * 100))
+    for _ in range(60):
+        t = stamps(rng, mean)
+        ctrl = rng.uniform(-5.0, 5.0, (len(t) - 1, 2)) + 100.0
+        found = held(t, ctrl, DT)
+        edges = np.arange(len(found) + 1) * DT
+        assert edges[-1] >= t[-1] - 0.01 * DT
+        assert len(found) == 1 or edges[-2] < t[-1]
+        integral = np.concatenate([np.zeros((1, 2)), np.cumsum(found, axis=0) * DT])
+        np.testing.assert_allclose(integral, reference(t, ctrl, edges), rtol=1e-10, atol=1e-10)
+        assert (found >= ctrl.min(axis=0) - 1e-9).all()
+        assert (found <= ctrl.max(axis=0) + 1e-9).all()
+
+
+def test_on_the_grid_the_control_is_itself() -> None:
+    """To the last bit, after a million samples too; rows that are several samples apart hold over all of them."""
+    rng = np.random.default_rng(0)
+    for count in (2, 7, 200_000):
+        ctrl = rng.standard_normal((count, 3))
+        np.testing.assert_array_equal(held(np.arange(count + 1) * DT, ctrl, DT), ctrl)
+    rows = rng.standard_normal((40, 1))
+    np.testing.assert_array_equal(held(np.arange(41) * 5 * DT, rows, DT), np.repeat(rows, 5, axis=0))
+    fine = held(np.arange(41) * DT / 4, rows, DT)
+    np.testing.assert_allclose(fine, rows.reshape(10, 4, 1).mean(axis=1), rtol=0, atol=1e-14)
+
+
+def log(setup: Setup, **changes: Any) -> Recording:
+    """A plain recording with something replaced."""
+    N, ny = 30, len(setup.outputs)
+    rng = np.random.default_rng(0)
+    ctrl = rng.standard_normal((N, len(setup.controls)))
+    values = {
+        "t": np.arange(N + 1) * setup.dt,
+        "ctrl": ctrl,
+        "y": rng.standard_normal((N + 1, ny)),
+        "outputs": setup.outputs.names,
+        "name": "x.csv",
+    }
+    return Recording(**{**values, **changes})
+
+
+def test_a_recording_on_the_grid_is_taken_as_it_is(setup: Setup) -> None:
+    """Stamps from anywhere, within a hundredth of a sample; columns in any order, some absent; a last control too much."""
+    plain = log(setup)
+    jitter = np.random.default_rng(1).uniform(-4e-5, 4e-5, len(plain.t))
+    for t in (plain.t, plain.t + 1.7e9, plain.t + jitter):
+        track = track_of(setup, log(setup, t=t))
+        assert track.even
+        np.testing.assert_allclose(track.t, plain.t, rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(track.ctrl, plain.ctrl)
+        np.testing.assert_array_equal(track.y, plain.y)
+    swapped = log(setup, y=plain.y[:, [3, 0]], outputs=("qvel:hinge", "qpos:slide"))
+    track = track_of(setup, swapped)
+    np.testing.assert_array_equal(track.y[:, [3, 0]], swapped.y)
+    assert np.isnan(track.y[:, 1:3]).all()
+    assert track.measured.sum() == 2 * len(plain.t)
+    more = log(setup, ctrl=np.concatenate([plain.ctrl, np.full((1, 1), np.nan)]))
+    np.testing.assert_array_equal(track_of(setup, more).ctrl, plain.ctrl)
+
+
+def test_a_recording_between_the_samples_keeps_its_times(setup: Setup) -> None:
+    """And its values; only the control is averaged. Missing rows of an even log leave it even."""
+    plain = log(setup)
+    t = np.sort(np.random.default_rng(2).uniform(0.0, 0.3, len(plain.t)))
+    track = track_of(setup, log(setup, t=t + 5.0))
+    assert not track.even
+    np.testing.assert_allclose(track.t, t - t[0], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(track.y, plain.y)
+    np.testing.assert_allclose(track.ctrl, held(t - t[0], plain.ctrl, setup.dt), rtol=0, atol=1e-9)
+    kept = np.delete(np.arange(31), [4, 5, 20])
+    sparse = track_of(setup, log(setup, t=plain.t[kept], ctrl=plain.ctrl[kept[:-1]], y=plain.y[kept]))
+    assert sparse.even
+    np.testing.assert_array_equal(sparse.ctrl[3:6], np.repeat(plain.ctrl[3:4], 3, axis=0))
+    np.testing.assert_array_equal(sparse.ctrl[6:20], plain.ctrl[6:20])
+    assert len(sparse.ctrl) == 30
+
+
+def test_two_rows_of_one_sample_do_not_shift_the_control(setup: Setup) -> None:
+    """A doubled stamp beside a missing row: as many rows as samples, and yet not one for each."""
+    plain = log(setup)
+    t = np.array(plain.t)
+    t[8] = t[7] + 0.005 * setup.dt
+    track = track_of(setup, log(setup, t=t))
+    np.testing.assert_allclose(track.ctrl[8], plain.ctrl[8], rtol=0, atol=0.05)
+    np.testing.assert_allclose(track.ctrl[7], plain.ctrl[8], rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"t": np.arange(2) * DT, "ctrl": np.zeros((1, 1)), "y": np.zeros((2, 4))}, "too few rows.*2.*at least 3"),
+        ({"t": np.append(np.arange(30), 28.0) * DT}, "'t' does not increase in data row 31"),
+        ({"t": np.where(np.arange(31) == 12, np.nan, np.arange(31)) * DT}, "'t' does not increase in data row 13"),
+        ({"ctrl": np.zeros((20, 1))}, r"control has shape \(20, 1\), wanted 30 rows of 1"),
+        ({"ctrl": np.zeros((30, 2))}, "wanted 30 rows of 1"),
+        ({"ctrl": np.where(np.arange(30) == 4, np.nan, 0.0)[:, None]}, "control in data row 5 is NaN"),
+        ({"outputs": ("a", "b", "c", "d")}, "no measured column.*qpos:hinge"),
+    ],
+)
+def test_faults_are_named(setup: Setup, changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(RecordingError, match=rf"x\.csv: .*{words}"):
+        track_of(setup, log(setup, **changes))
+
+
+def test_quaternions_get_the_sign_of_the_model(body: Setup) -> None:
+    """A log that flips signs as it likes, with gaps, is the continuous curve that the model predicts."""
+    ctrl = body.control
+    y = body.plant.measure(body.parameters.guess[None], ctrl)[0][0]
+    names, flipped = body.outputs.names, np.array(y)
+    rng = np.random.default_rng(0)
+    for joint in ("float", "ball"):
+        columns = [names.index(f"qpos:{joint}.q{a}") for a in "wxyz"]
+        flipped[:, columns] *= rng.choice([-1.0, 1.0], (len(y), 1))
+        flipped[10:20, columns] = np.nan
+    track = track_of(body, Recording(np.arange(len(y)) * body.dt, ctrl, flipped, names, "x.csv"))
+    seen = np.isfinite(flipped)
+    np.testing.assert_array_equal(track.y[seen], y[seen])
+    assert np.isnan(track.y[~seen]).all()
+
+
+def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
+    """One component alone crosses zero as it likes: whether q or -q was logged cannot be told from it."""
+    some = body_setup(tmp_path, noise={"qpos:float.qx": 0.01, "qpos:ball.qy": 0.01}, horizon=3.0)
+    y = some.plant.measure(some.parameters.guess[None], some.control)[0][0]
+    assert (np.ptp(np.sign(y), axis=0) == 2.0).any(), "nothing crosses zero"
+    track = track_of(some, Recording(np.arange(len(y)) * some.dt, some.control, y, some.outputs.names))
+    np.testing.assert_array_equal(track.y, y)
+
+
+def test_pictures_of_what_was_measured(setup: Setup, body: Setup) -> None:
+    """All positions, gaps bridged; nothing where one was never measured."""
+    plain = log(setup)
+    y = np.array(plain.y)
+    y[10:13, 1] = np.nan
+    shown = measured_trajectory(setup, log(setup, y=y))
+    assert shown is not None
+    np.testing.assert_array_equal(shown.qpos[:, 0], y[:, 0])
+    np.testing.assert_allclose(shown.qpos[11, 1], 0.5 * (y[9, 1] + y[13, 1]))
+    y[:, 1] = np.nan
+    assert measured_trajectory(setup, log(setup, y=y)) is None
+    assert measured_trajectory(setup, log(setup, y=y[:, :1], outputs=("qpos:slide",))) is None
+    turned = measured_trajectory(body, log(body))
+    assert turned is not None
+    np.testing.assert_allclose(np.linalg.norm(turned.qpos[:, 3:7], axis=1), 1.0)
+
+
+def test_reading_between_samples_is_exact_for_cubics() -> None:
+    """At any times, in any order, several at one sample; values and slopes. A quartic shows that the test can fail."""
+    rng = np.random.default_rng(0)
+    wanted = rng.uniform(0.0, 29.0, 200)
+    wanted[:3] = 0.0, 29.0, 14.0
+    lag, grid = Lag.at(wanted, 30, DT), np.arange(30.0)
+    for degree in range(5):
+        curve = np.polynomial.Polynomial(rng.standard_normal(degree + 1), domain=[0, 29])
+        values, size = curve(grid), np.abs(curve(grid)).max()
+        error = np.abs(lag.apply(values) - curve(wanted)).max() / size
+        slope = np.abs(lag.rate(values) + curve.deriv()(wanted) / DT)[2:].max() * DT / size
+        assert (max(error, slope) < 1e-11) == (degree <= 3)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4 * DT, 3.7 * DT, -1.2 * DT])
+def test_reading_at_the_samples_is_the_lag_of_all_of_them(delay: float) -> None:
+    """`of` is `at` every sample, and any rows of it are `at` those; before the start is the start, without a slope."""
+    all_of_them, y = Lag.of(40, delay, DT), np.random.default_rng(0).standard_normal((40, 2))
+    some = np.array([0, 3, 4, 17, 38, 39])
+    lag = Lag.at(some - delay / DT, 40, DT)
+    np.testing.assert_allclose(lag.apply(y), all_of_them.apply(y)[some], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(lag.rate(y), all_of_them.rate(y)[some], rtol=0, atol=1e-9)
+    early = Lag.at(np.array([-7.0, -0.01]), 40, DT)
+    np.testing.assert_array_equal(early.apply(y), y[[0, 0]])
+    assert not early.rate(y).any()
+    v = np.random.default_rng(1).standard_normal((6, 2))
+    assert np.sum(v * lag.apply(y)) == pytest.approx(np.sum(lag.apply_transposed(v) * y), rel=1e-12)
+
+
+def test_a_track_does_not_change(setup: Setup) -> None:
+    """Its arrays are read-only, and the recording's are left as they were."""
+    plain = log(setup)
+    before = np.array(plain.y)
+    track: Track = track_of(setup, plain)
+    with pytest.raises(ValueError, match="read-only"):
+        track.y[0, 0] = 1.0
+    np.testing.assert_array_equal(plain.y, before)

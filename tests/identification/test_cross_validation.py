@@ -1,0 +1,107 @@
+"""Predictions of what was not fitted, parameters that every recording has its own of, and doubts about the data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.experiment.system import Setup
+from mjfim.identification.residuals import Fit
+from mjfim.recordings.plausibility import doubts
+from mjfim.records.recording import Recording
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def base() -> mjfim.Experiment:
+    return mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(fit={"bootstrap": 0})
+
+
+def recorded(setup: Setup, seed: int, swing: float = 1.0) -> Recording:
+    """One recording at the true values."""
+    trajectory = setup.plant.simulate(setup.theta, swing * setup.control)
+    return mjfim.simulate(setup, trajectory, seed)
+
+
+def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.Experiment) -> None:
+    setup = Setup(base)
+    found = mjfim.identify(setup, [recorded(setup, 0)], held_out=[recorded(setup, 1, 1.5)])
+    (prediction,) = found.predictions
+    assert prediction.held_out
+    np.testing.assert_allclose(prediction.identified.rms, 0.05, rtol=0.12)
+    assert (prediction.nominal.rms > 1.5 * prediction.identified.rms).any()
+    assert prediction.ratio < 0.8
+    alone = mjfim.predict(setup, found.theta, [recorded(setup, 1, 1.5)])
+    np.testing.assert_allclose(alone[0].rms, prediction.identified.rms, rtol=1e-9)
+    assert (alone[0].mae < alone[0].rms).all()
+
+
+def test_without_held_out_recordings_each_is_predicted_by_the_others(base: mjfim.Experiment) -> None:
+    setup = Setup(base)
+    recordings = [recorded(setup, seed) for seed in range(3)]
+    spoilt = Recording(recordings[2].t, recordings[2].ctrl, recordings[2].y + 0.2, recordings[2].outputs, "spoilt")
+    found = mjfim.identify(setup, [*recordings[:2], spoilt])
+    assert [p.name for p in found.predictions] == ["simulated", "simulated", "spoilt"]
+    assert not any(p.held_out for p in found.predictions)
+    assert (found.predictions[2].identified.rms > 0.15).all()  # the others know nothing of what spoils it
+
+
+def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
+    setup = Setup(base)
+    recording = recorded(setup, 0)
+    late = np.array(recording.y)
+    late[320:] += 1.0
+    (prediction,) = mjfim.identify(setup, [Recording(recording.t, recording.ctrl, late, recording.outputs)]).predictions
+    assert prediction.name.startswith("last 25 %")
+    np.testing.assert_allclose(prediction.identified.rms[0], np.sqrt(0.8 + 0.05**2), rtol=0.1)  # 80 of 100 rows
+
+
+def test_every_recording_has_its_own_bias(base: mjfim.Experiment) -> None:
+    own = base.replace(nuisance={"bias": {"qpos:hinge": True}, "per_recording": True})
+    setup, plain = Setup(own), Setup(base)
+    biases = (0.1, -0.2, 0.0)
+    recordings = []
+    for seed, bias in enumerate(biases):
+        clean = recorded(plain, seed)
+        shift = bias * (np.arange(4) == clean.outputs.index("qpos:hinge"))
+        recordings.append(Recording(clean.t, clean.ctrl, clean.y + shift, clean.outputs))
+    found = mjfim.identify(setup, recordings)
+    np.testing.assert_allclose(found.each["bias qpos:hinge"], biases, atol=0.02)
+    j = found.parameters.index("bias qpos:hinge")
+    assert found.theta[j] == found.each["bias qpos:hinge"][0]
+    assert np.all(np.abs(found.theta[:3] - setup.parameters.true[:3]) < 4.0 * found.std[:3])
+    assert not found.misfit
+    assert mjfim.identify(Setup(base.replace(nuisance={"bias": {"qpos:hinge": True}})), recordings).misfit
+    alone = mjfim.identify(setup, recordings[:1])
+    assert alone.theta[j] == pytest.approx(found.theta[j], abs=0.01)
+    fit = Fit(setup, recordings)
+    H = fit.dense(fit.begin(found.theta)).J
+    order = [*range(3), 3]  # m, l, c, the first recording's bias
+    covariance = np.linalg.inv(H.T @ H)
+    np.testing.assert_allclose(found.std, np.sqrt(np.diag(covariance))[order], rtol=0.02)
+
+
+def test_per_recording_belongs_to_nuisance(base: mjfim.Experiment) -> None:
+    with pytest.raises(mjfim.MjfimError, match="nuisance = true"):
+        base.replace(parameters={"m": {"per_recording": True}})
+
+
+def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experiment) -> None:
+    setup = Setup(base)
+    good = recorded(setup, 0)
+    assert doubts(setup, good) == ()
+    rng = np.random.default_rng(0)
+    y = np.array(good.y)
+    y[:, 3] += rng.normal(0.0, 2.0, len(y))
+    noisy = Recording(good.t, good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape), y, good.outputs, "x")
+    said = " ".join(doubts(setup, noisy))
+    assert "jumps from row to row" in said and "qvel:hinge is rough" in said
+    swung = recorded(setup, 0, 20.0)
+    assert doubts(setup, swung) == ()
+    y = np.array(swung.y)
+    y[:, 3] *= 2.0
+    assert any("part by" in s for s in doubts(setup, Recording(swung.t, swung.ctrl, y, swung.outputs, "x")))

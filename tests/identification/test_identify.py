@@ -1,0 +1,288 @@
+"""Least squares against theory and against a brute-force minimiser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+import mjfim
+from mjfim.errors import ExperimentError, RecordingError, SimulationDiverged
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.simulate import simulate
+from mjfim.experiment.system import Setup
+from mjfim.identification.aligned_recording import track_of
+from mjfim.identification.identify import identify, least_squares, newton_raphson
+from mjfim.identification.residuals import Fit
+from mjfim.optimize.levenberg_marquardt import Progress
+from mjfim.records.recording import Recording
+from mjfim.studies.campaign import identified
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    return Setup(Experiment.from_file(ROOT / "models" / "cart_pendulum.toml"))
+
+
+@pytest.fixture(scope="module")
+def design(setup: Setup) -> mjfim.Design:
+    return mjfim.design(setup)
+
+
+@pytest.fixture(scope="module")
+def recording(setup: Setup, design: mjfim.Design) -> Recording:
+    return simulate(setup, design.trajectory, seed=3)
+
+
+def noiseless(setup: Setup, recording: Recording) -> Recording:
+    y, _ = setup.plant.measure(setup.parameters.true[None], recording.ctrl)
+    return Recording(recording.t, recording.ctrl, y[0], recording.outputs)
+
+
+@pytest.mark.parametrize("method", ["least_squares", "newton"])
+def test_noise_free_data_give_the_true_parameters(setup: Setup, recording: Recording, method: str) -> None:
+    estimate = identify(setup, [noiseless(setup, recording)], method)
+    np.testing.assert_allclose(estimate.theta, setup.parameters.true, rtol=1e-7)
+    assert estimate.success
+
+
+def test_both_methods_find_the_minimum_of_the_weighted_squares(setup: Setup, recording: Recording) -> None:
+    fit = Fit(setup, [recording])
+
+    def cost(theta: np.ndarray) -> float:
+        y, _ = setup.plant.measure(theta[None], recording.ctrl)
+        return float(np.sum(((y[0, 1:] - recording.y[1:]) / 0.05) ** 2))
+
+    start = setup.parameters.true
+    slow = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-10, "maxiter": 400})
+    for solve in (least_squares, newton_raphson):
+        solution = solve(fit, setup.parameters.guess)
+        assert solution.success
+        theta = solution.unknowns.theta
+        assert cost(theta) <= slow.fun + 1e-5
+        np.testing.assert_allclose(theta, slow.x, atol=1e-5)
+
+
+def test_jacobian_agrees_with_independent_differences(setup: Setup, recording: Recording) -> None:
+    fit, theta = Fit(setup, [recording]), np.array([2.2, 1.1, 1.2])
+    value = fit.dense(fit.begin(theta))
+    assert value is not None
+    for j in range(3):
+        h = np.zeros(3)
+        h[j] = 3e-4
+        plus, minus = fit.dense(fit.begin(theta + h)), fit.dense(fit.begin(theta - h))
+        assert plus is not None
+        assert minus is not None
+        numeric = (plus.r - minus.r) / 6e-4
+        assert np.linalg.norm(value.J[:, j] - numeric) < 1e-5 * np.linalg.norm(numeric)
+        assert np.linalg.norm(1.001 * value.J[:, j] - numeric) > 5e-4 * np.linalg.norm(numeric)
+
+
+def test_covariance_is_the_cramer_rao_bound_at_the_estimate(
+    setup: Setup, design: mjfim.Design, recording: Recording
+) -> None:
+    estimate = identify(setup, [recording])
+    np.testing.assert_allclose(estimate.std, design.final.std, rtol=0.05)
+    np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), estimate.std, rtol=1e-8)
+
+
+def test_chi_square_and_misfit(setup: Setup, recording: Recording) -> None:
+    right = identify(setup, [recording])
+    assert right.dof == 400 * 4 - 3
+    assert 0.001 < chi2.sf(right.chi2, right.dof) < 0.999
+    assert not right.misfit
+    drag = np.array(recording.y)
+    drag[:, 0] += 0.1 * np.sin(3 * recording.t)  # a structured error that no parameter explains
+    wrong = identify(setup, [Recording(recording.t, recording.ctrl, drag, recording.outputs)])
+    assert wrong.misfit
+    assert any("not accuracy" in sentence for sentence in wrong.warnings)
+
+
+def test_overstated_noise_is_said(setup: Setup, recording: Recording) -> None:
+    estimate = identify(setup, [noiseless(setup, recording)])
+    assert any("overstated" in sentence for sentence in estimate.warnings)
+
+
+def test_two_recordings_carry_twice_the_information(setup: Setup, design: mjfim.Design, recording: Recording) -> None:
+    again = simulate(setup, design.trajectory, seed=4)
+    one, two = identify(setup, [recording]), identify(setup, [recording, again])
+    np.testing.assert_allclose(two.std, one.std / np.sqrt(2), rtol=0.03)
+    assert len(two.predicted) == 2
+
+
+def test_bounds_are_kept_and_named(design: mjfim.Design, recording: Recording) -> None:
+    base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    tight = {**base.model_dump(exclude_unset=True)["parameters"]}
+    tight["m"] = {**tight["m"], "bounds": [2.2, 3.0], "true": 2.4}
+    estimate = identify(base.replace(parameters=tight), [recording])
+    assert estimate.theta[0] == pytest.approx(2.2, abs=1e-4)
+    assert estimate.at_bound == ("m",)
+
+
+def test_prior_pulls_the_estimate_and_shrinks_its_deviation(design: mjfim.Design, recording: Recording) -> None:
+    base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    parameters = base.model_dump(exclude_unset=True)["parameters"]
+    parameters["m"] = {**parameters["m"], "prior": 1e-4}
+    estimate = identify(base.replace(parameters=parameters), [recording])
+    assert estimate.theta[0] == pytest.approx(2.5, abs=1e-3)
+    assert estimate.std[0] < 1.01e-4
+
+
+def test_recording_with_fewer_outputs_and_gaps_still_fits(setup: Setup, recording: Recording) -> None:
+    y = np.array(recording.y[:, :2])
+    y[50:80, 1] = np.nan
+    estimate = identify(setup, [Recording(recording.t, recording.ctrl, y, recording.outputs[:2])])
+    assert estimate.dof == 2 * 400 - 30 - 3
+    assert np.all(np.abs(estimate.theta - setup.parameters.true) < 5 * estimate.std)
+
+
+def test_unusable_recordings_are_named(setup: Setup, recording: Recording) -> None:
+    t, ctrl, y, names = recording.t, recording.ctrl, recording.y, recording.outputs
+    with pytest.raises(RecordingError, match="too few rows"):
+        track_of(setup, Recording(t[:2], ctrl[:1], y[:2], names, "x.csv"))
+    with pytest.raises(RecordingError, match=r"x\.csv.*does not increase in data row 2"):
+        track_of(setup, Recording(-t, ctrl, y, names, "x.csv"))
+    bad = np.array(ctrl)
+    bad[7] = np.nan
+    with pytest.raises(RecordingError, match="data row 8"):
+        track_of(setup, Recording(t, bad, y, names, "x.csv"))
+    with pytest.raises(RecordingError, match="qpos:slide"):
+        track_of(setup, Recording(t, ctrl, y, ("a", "b", "c", "d"), "x.csv"))
+    with pytest.raises(RecordingError, match="at least one"):
+        identify(setup, [])
+
+
+def test_divergence_at_the_start_is_an_error(setup: Setup, recording: Recording) -> None:
+    with pytest.raises(SimulationDiverged, match="diverges at the start"):
+        identify(setup, [recording], "newton", start=np.array([2.0, 1.0, -1e6]))
+
+
+def test_newton_outside_the_bounds_is_no_success(recording: Recording) -> None:
+    base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    tight = base.replace(parameters={"c": {"bounds": [1.2, 10.0], "true": 1.3}})
+    estimate = identify(tight, [recording], "newton")
+    assert not estimate.success
+    assert any("outside its bounds" in sentence for sentence in estimate.warnings)
+
+
+def test_unknown_method_and_wrong_start_are_refused(setup: Setup, recording: Recording) -> None:
+    with pytest.raises(ExperimentError, match="least_squares"):
+        identify(setup, [recording], "lm")  # type: ignore[arg-type]
+    with pytest.raises(ExperimentError, match="m, l, c"):
+        identify(setup, [recording], start=np.ones(2))
+
+
+def test_interrupted_while_it_searches_it_keeps_the_best_so_far(setup: Setup, recording: Recording) -> None:
+    """Ctrl-C in the second iteration."""
+    costs: list[float] = []
+
+    def tell(what: str, iterate: Progress) -> None:
+        costs.append(iterate.cost)
+        if len(costs) == 2:
+            raise KeyboardInterrupt
+
+    found = identify(setup, [recording], tell=tell)
+    assert found.interrupted and not found.success
+    assert found.status.startswith("interrupted")
+    assert found.chi2 == pytest.approx(2.0 * min(costs), rel=1e-9)
+    assert found.predictions == ()
+
+
+@pytest.mark.parametrize("place", ["identify.suspects", "cross_validation.completed", "cross_validation._errors"])
+def test_interrupted_after_the_search_the_estimate_stays(
+    setup: Setup, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C while terms are looked for that the model lacks, or while the rest is predicted."""
+    whole = identify(setup, [recording])
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"mjfim.identification.{place}", interrupt)
+    found = identify(setup, [recording])
+    assert whole.predictions and not whole.interrupted
+    assert found.interrupted and found.predictions == ()
+    np.testing.assert_array_equal(found.theta, whole.theta)
+    assert any(sentence.startswith("interrupted after the search") for sentence in found.warnings)
+
+
+def test_half_a_search_is_no_answer(setup: Setup, recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who wants theta alone gets it whole or not at all; so does a round of a campaign."""
+    fit, count = Fit(setup, [recording]), [0]
+    condense = Fit.condense
+
+    def interrupt(self: Fit, at: object) -> object:
+        count[0] += 1
+        if count[0] == 3:
+            raise KeyboardInterrupt
+        return condense(self, at)
+
+    monkeypatch.setattr(Fit, "condense", interrupt)
+    for work in (
+        lambda: least_squares(fit, setup.parameters.guess),
+        lambda: newton_raphson(fit, setup.parameters.guess),
+    ):
+        count[0] = 0
+        with pytest.raises(KeyboardInterrupt):
+            work()
+    count[0] = 0
+    with pytest.raises(KeyboardInterrupt):
+        identified(setup, [recording], setup.parameters.guess)
+    count[0] = 0
+    assert identify(setup, [recording]).interrupted
+
+
+def test_interrupted_where_a_further_start_begins(setup: Setup, recording: Recording) -> None:
+    """The starts before it stay; none comes after it."""
+    several, seen = Setup(setup.experiment.replace(fit={"starts": 6})), list[str]()
+
+    def tell(what: str, iterate: Progress) -> None:
+        seen.append(what)
+        if what.startswith("start 3"):
+            raise KeyboardInterrupt
+
+    found = identify(several, [recording], tell=tell)
+    assert found.interrupted
+    assert not any(what.startswith("start 4") or what == "all data" for what in seen)
+    np.testing.assert_allclose(found.theta, identify(setup, [recording]).theta, rtol=1e-3)
+
+
+def test_interrupted_before_the_last_search_nothing_more_is_searched(setup: Setup, recording: Recording) -> None:
+    pieces = Setup(setup.experiment.replace(fit={"segments": 1.0}))
+    seen: list[str] = []
+
+    def tell(what: str, iterate: Progress) -> None:
+        seen.append(what)
+        if what == "where pieces start":
+            raise KeyboardInterrupt
+
+    found = identify(pieces, [recording], tell=tell)
+    assert found.interrupted and not found.success
+    assert set(seen) == {"where pieces start"}
+    np.testing.assert_array_equal(found.theta, setup.parameters.guess)
+
+
+@pytest.mark.parametrize("scale", [1.0, 3.0])
+def test_a_robust_fit_judges_the_size_of_its_residuals(setup: Setup, recording: Recording, scale: float) -> None:
+    """Right noise is neither too large nor too small, whatever counts as an outlier; noise of three times the size is said."""
+    robust = Setup(setup.experiment.replace(fit={"loss": "soft_l1", "loss_scale": scale}))
+    right = identify(robust, [recording])
+    assert right.chi2 / right.dof == pytest.approx(1.0, abs=0.15)
+    assert not right.misfit
+    assert not any("overstated" in sentence for sentence in right.warnings)
+    truth = noiseless(setup, recording).y
+    loud = Recording(recording.t, recording.ctrl, truth + 3.0 * (recording.y - truth), recording.outputs)
+    assert any("x the stated noise" in reason for reason in identify(robust, [loud]).reasons)
+
+
+def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
+    """Their covariance is infinite; what the others are traded for is told all the same (warnings are errors here)."""
+    setup = Setup(Experiment.from_file(ROOT / "models" / "ball_pendulum.toml"))
+    estimate = identify(setup, [simulate(setup, setup.plant.simulate(setup.theta, setup.initial.ctrl), seed=1)])
+    assert estimate.combinations
+    assert estimate.sloppy

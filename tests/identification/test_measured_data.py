@@ -1,0 +1,123 @@
+"""Measured data of others: what is identified from some recordings predicts the others, and poor data are named.
+
+The data are not in the repository; without them, these tests are skipped.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.experiment.system import Setup
+from mjfim.recordings.read import read_recording
+from mjfim.records.estimate import Estimate
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT.parent / "shared" / "data"
+PENDULUM, DOUBLE, SERVO = DATA / "dfki_simple_pendulum", DATA / "dfki_double_pendulum", DATA / "bam_xl330" / "raw"
+
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the measured recordings are not beside the repository")
+
+# J, m c, viscous and Coulomb friction as published; atan(100 qd) levels off at pi/2
+PUBLISHED_PENDULUM = {"J": 0.06259, "mc": 0.1022, "damping": 0.04707, "coulomb": 0.1839 * np.pi / 2}
+# p1, p2, m2r2, I2, gear^2 Ir of design A.0, model 2.0
+PUBLISHED_DOUBLE = {
+    "p1": 0.1678 + 0.6043 * 0.3,
+    "p2": 0.05347 + 0.6043 * 0.3**2 + 36 * 7.66e-5,
+    "m2r2": 0.1111,
+    "I2": 0.02392,
+    "rotor": 36 * 7.66e-5,
+}
+
+
+def servo_values(kt: float, R: float, armature: float, offset: float, base: float, viscous: float) -> dict[str, float]:
+    """BAM's parameters as those of models/bam_xl330.toml."""
+    values = {"gain": kt / R, "brake": kt**2 / R, "damping": viscous, "coulomb": base, "armature": armature}
+    return {**values, "mounting": offset}
+
+
+PUBLISHED_SERVO = servo_values(0.32321, 4.76365, 0.00164322, 0.0179525, 0.00696597, 0.0104948)
+HEAD_SERVO = servo_values(0.3866957, 4.0171292, 0.00181417, 0.030871, 0.01283272, 0.00366167)
+
+
+def experiment(name: str, guess: dict[str, float] | None = None, **fit: object) -> mjfim.Experiment:
+    """An experiment of models/, its guesses moved."""
+    found = mjfim.Experiment.from_file(ROOT / "models" / f"{name}.toml")
+    return found.replace(parameters={key: {"guess": value} for key, value in (guess or {}).items()}, fit=dict(fit))
+
+
+def identified(stated: mjfim.Experiment, files: list[Path], held_out: list[Path]) -> Estimate:
+    """Read, fit, predict."""
+    setup = Setup(stated)
+    fitted, kept = ([read_recording(path, setup) for path in paths] for paths in (files, held_out))
+    return mjfim.identify(setup, fitted, held_out=kept)
+
+
+@pytest.mark.parametrize(
+    ("fitted", "held_out"), [("dircol", "energy_shaping"), ("energy_shaping", "dircol")], ids=["dircol", "energy"]
+)
+def test_pendulum_predicts_the_other_file_far_better_than_published(fitted: str, held_out: str) -> None:
+    files = [PENDULUM / f"{name}_measured.csv" for name in (fitted, held_out)]
+    found = identified(experiment("dfki_simple_pendulum", PUBLISHED_PENDULUM, bootstrap=300), files[:1], files[1:])
+    (prediction,) = found.predictions
+    assert prediction.held_out
+    assert (prediction.identified.rms < 0.5 * prediction.nominal.rms).all()
+    theta = dict(zip(found.parameters, found.theta, strict=True))
+    inside = dict(zip(found.parameters, found.interval, strict=True))
+    assert 0.12 < theta["J"] < 0.24
+    assert 0.4 < theta["mc"] / theta["J"] / (0.3042 / 0.14) < 1.6  # the torque constant scales both alike
+    low, high = inside["coulomb"]
+    assert low < 0.25 and high > 0.10  # what other rollouts gave, and their spread
+    honest = 0.25 * (found.interval[:, 1] - found.interval[:, 0])
+    assert (honest[:2] > 4.0 * found.std[:2]).all(), "formal deviations of a model that does not fit are no accuracy"
+    assert found.misfit
+
+
+def test_the_two_files_agree_within_honest_intervals() -> None:
+    files = [PENDULUM / f"{name}_measured.csv" for name in ("dircol", "energy_shaping")]
+    one, two = (identified(experiment("dfki_simple_pendulum", bootstrap=300), [file], []) for file in files)
+    for name in ("J", "mc", "coulomb"):
+        j = one.parameters.index(name)
+        assert max(one.interval[j, 0], two.interval[j, 0]) <= min(one.interval[j, 1], two.interval[j, 1]), name
+
+
+def test_poor_data_are_named() -> None:
+    poor = identified(experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "sysid_measured.csv"], [])
+    said = [s for s in poor.warnings if s.startswith("poor data in sysid_measured.csv")]
+    assert any("jumps from row to row" in s and "'torque'" in s for s in said)
+    assert any("speed is rough" in s for s in said)
+    assert any("ctrlrange" in s for s in said)
+    good = identified(experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "dircol_measured.csv"], [])
+    assert not any(s.startswith("poor data") for s in good.warnings)
+
+
+def test_double_pendulum_in_base_parameters_and_its_held_out_file() -> None:
+    files = [DOUBLE / f"A0_0{i}.csv.gz" for i in range(3)]
+    stated = experiment("dfki_double_pendulum", bootstrap=300, max_iterations=10)
+    found = identified(stated, files, [])
+    for name, published in PUBLISHED_DOUBLE.items():
+        j = found.parameters.index(name)
+        low, high = found.interval[j]
+        assert abs(found.theta[j] / published - 1.0) < 0.15 or not low <= published <= high, name
+    assert len(found.each["bias elbow_angle"]) == 3  # the encoder's zero differs from log to log
+    assert np.ptp(found.each["bias elbow_angle"]) > 0.1
+    assert [p.name for p in found.predictions] == [str(file) for file in files]
+    assert all(p.ratio < 1.15 for p in found.predictions)
+    assert sum(p.ratio < 0.95 for p in found.predictions) >= 2
+
+
+def test_servo_predicts_held_out_logs_as_well_as_published() -> None:
+    """Two logs at each gain of the firmware; mean absolute errors of whole rollouts."""
+    stem = "2026-01-15_10h"
+    fitted = [SERVO / f"{stem}{t}.json" for t in ("28m10", "28m17", "28m57", "29m04")]
+    others = [SERVO / f"{stem}{t}.json" for t in ("28m24", "28m32", "28m42", "28m49")]
+    found = identified(experiment("bam_xl330", bootstrap=300), fitted, others)
+    mine = np.mean([p.identified.mae[0] for p in found.predictions])
+    for published in (PUBLISHED_SERVO, HEAD_SERVO):
+        setup = Setup(experiment("bam_xl330", published))
+        errors = mjfim.predict(setup, setup.theta, [read_recording(path, setup) for path in others])
+        assert mine < 1.05 * np.mean([e.mae[0] for e in errors])
+    assert "coulomb" in found.sloppy

@@ -1,0 +1,152 @@
+"""Where residuals are worst and what is said of them: planted faults are found, noise is left in peace."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from support.numerics import Array
+
+from mjfim.identification.residual_tests import coloured, larger, reasons, smaller, worst_place
+from mjfim.records.estimate import Place, Whiteness
+
+NAMES = ("angle", "speed", "force")
+
+
+def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
+    """Times and whitened residuals of three recordings of different length and rate."""
+    rng = np.random.default_rng(seed)
+    times = [np.arange(1000) * 0.01, np.sort(rng.uniform(0.0, 4.0, 600)), np.arange(250) * 0.02]
+    return times, [rng.standard_normal((len(t), 3)) for t in times]
+
+
+def place(times: list[Array], z: list[Array]) -> Place:
+    """The worst of the three recordings a, b, c."""
+    found = worst_place(NAMES, "abc", times, z)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(("recording", "output"), [(0, 2), (1, 0), (2, 1)])
+def test_a_planted_burst_is_found(recording: int, output: int) -> None:
+    """Its output, its recording, and its time to within two windows; size and share are those of the window."""
+    times, z = white()
+    t = times[recording]
+    begin, end = 0.55 * t[-1], 0.67 * t[-1]
+    burst = (t >= begin) & (t < end)
+    z[recording][burst, output] += 8.0 * np.sin(40.0 * t[burst] + 1.0)
+    worst = place(times, z)
+    assert (worst.output, worst.recording) == (NAMES[output], "abc"[recording])
+    window = t[-1] / 25
+    assert worst.begin == pytest.approx(begin, abs=1.5 * window)
+    assert worst.end == pytest.approx(end, abs=1.5 * window)
+    inside = (t >= worst.begin) & (t < worst.end)
+    squares = np.sum(z[recording][inside, output] ** 2)
+    assert worst.size == pytest.approx(np.sqrt(squares / inside.sum()), rel=1e-9)
+    assert worst.share == pytest.approx(squares / sum(np.sum(part**2) for part in z), rel=1e-9)
+
+
+def test_an_output_that_is_wrong_all_along_is_named_as_a_whole() -> None:
+    """Not the window in which it happens to be largest."""
+    times, z = white()
+    z[1][:, 2] *= 3.0
+    worst = place(times, z)
+    assert (worst.output, worst.recording) == ("force", "b")
+    assert worst.begin == times[1][0]
+    assert worst.end == pytest.approx(times[1][-1])
+    assert worst.size == pytest.approx(3.0, rel=0.1)
+
+
+def test_gaps_and_outputs_that_are_not_measured() -> None:
+    """Nothing of them counts; a burst beside them is found."""
+    times, z = white()
+    z[0][:, 1] = np.nan
+    z[0][200:700, 0] = np.nan
+    z[0][720:780, 0] += 7.0
+    worst = place(times, z)
+    assert (worst.output, worst.recording) == ("angle", "a")
+    assert worst.begin <= 7.2 + 0.4
+    assert worst.end >= 7.8 - 0.4
+    assert worst_place(NAMES, "abc", times, [np.full(part.shape, np.nan) for part in z]) is None
+    assert worst_place(NAMES, "", [], []) is None
+
+
+def test_one_value_is_no_place() -> None:
+    """A rarely measured output, one value of which is large by chance, does not outdo a burst of a hundred values."""
+    for seed in range(20):
+        times, z = white(seed)
+        sparse = np.full(1000, np.nan)
+        sparse[:300:40] = z[0][:300:40, 1]
+        sparse[:100] = z[0][:100, 1]
+        sparse[700] = 3.6
+        z[0][:, 1] = sparse
+        z[0][500:600, 0] += 2.5
+        assert place(times, z).output == "angle"
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 9])
+def test_short_recordings(count: int) -> None:
+    """All of it is the place."""
+    times, z = [np.arange(count) * 0.1 + 0.5], [np.tile([0.1, 2.0, 0.1], (count, 1))]
+    worst = worst_place(NAMES, ["x"], times, z)
+    assert worst is not None
+    assert (worst.output, worst.begin) == ("speed", 0.5)
+    assert worst.size == pytest.approx(2.0)
+
+
+def test_a_place_in_words() -> None:
+    """What, when, where, how much."""
+    said = str(Place("angle", "run.csv", 1.25, 2.5, 7.93, 0.412))
+    assert said == "worst in angle, 1.25 to 2.5 s of run.csv: 7.9 sigmas, 41 % of all squares"
+
+
+def seen(
+    output: str = "y",
+    p: float = 1.0,
+    inflation: float = 1.0,
+    variance: float = 1.0,
+    time: float = 1.0,
+    correlation: float = 0.3,
+) -> Whiteness:
+    return Whiteness(output, 1000, variance, correlation, p, inflation, time)
+
+
+def test_larger_and_smaller_need_probability_and_size() -> None:
+    """Chi-square beyond its 0.1 % tail, and a ratio that matters; with much data the tail alone is not enough."""
+    for dof in (10, 300, 10_000):
+        top, bottom = chi2.isf(1e-3, dof), chi2.ppf(1e-3, dof)
+        assert larger(1.01 * top, dof) == (np.sqrt(1.01 * top / dof) > 1.03)
+        assert not larger(0.99 * top, dof)
+        assert smaller(0.99 * bottom, dof) == (np.sqrt(0.99 * bottom / dof) < 1 / 1.03)
+        assert not smaller(1.01 * bottom, dof)
+        assert not (larger(dof, dof) or smaller(dof, dof))
+    assert larger(1.07 * 1e5, 100_000)
+    assert not larger(1.02 * 1e5, 100_000)
+    assert smaller(0.9 * 1e5, 100_000)
+    assert not smaller(0.98 * 1e5, 100_000)
+
+
+def test_noise_that_follows_itself_matters_where_it_is_large_enough() -> None:
+    """Improbable, corrected for the number of outputs, and more than the noise hides; the worst first."""
+    assert [w.output for w in coloured([seen("a", 1e-9, 2.0), seen("b", 1e-9, 5.0), seen("c", 0.1, 9.0)])] == ["b", "a"]
+    assert not coloured([seen(p=1e-9, inflation=1.1)])
+    assert not coloured([seen(p=1e-9, inflation=5.0, variance=0.01)]), "far below the stated noise"
+    assert coloured([seen(p=1e-9, inflation=1.0, time=3.0)])
+    assert coloured([seen(p=5e-4, inflation=2.0)])
+    assert not coloured([seen(p=5e-4, inflation=2.0), seen("z")])
+
+
+def test_reasons_in_sentences() -> None:
+    """Each cause one sentence; of noise that is as stated there is nothing to say."""
+    assert reasons(1000.0, 1000, True, [seen()], ()) == ()
+    assert reasons(4000.0, 1000, True, [seen()], ()) == ("residuals are 2.00 x the stated noise",)
+    assert reasons(4000.0, 1000, False, [seen()], ()) == (), "where sigmas are estimated, size tells nothing"
+    said = reasons(1000.0, 1000, False, [seen("speed", 1e-9, 4.0)], ())
+    assert said == ("residuals follow one another in speed (+0.30 from one to the next)",)
+    slow = reasons(1000.0, 1000, True, [seen("speed", 1e-9, 16.0, correlation=0.001)], ())
+    assert slow == ("residuals follow one another in speed (means of many scatter 4.0 x as much as those of noise)",)
+    assert len(reasons(4000.0, 1000, True, [seen("speed", 1e-9, 4.0)], ())) == 2
+    many = reasons(1000.0, 1000, True, [seen(f"y{i}", 1e-9, 9.0 - i) for i in range(6)], ())
+    assert "y0 (" in many[0] and "y3 (" in many[0] and "y4" not in many[0] and "and 2 more" in many[0]
+    lacking = reasons(1000.0, 1000, True, [seen()], ["dry friction"])
+    assert len(lacking) == 1 and "model lacks" in lacking[0]

@@ -1,0 +1,82 @@
+"""What a model lacks, told from its residuals; nothing where it lacks nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.experiment.system import Setup
+from mjfim.records.recording import Recording
+
+ROOT = Path(__file__).resolve().parents[2]
+CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
+
+
+def stated(**tables: object) -> mjfim.Experiment:
+    """The cart-pendulum, swung about."""
+    base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
+    return base.replace(initial={"control": CONTROL}, fit={"bootstrap": 0}, **tables)
+
+
+def robot(folder: Path, old: str, new: str, seed: int = 0, **tables: object) -> Recording:
+    """A recording of a robot whose model differs in one place."""
+    text = (ROOT / "models" / "cart_pendulum.xml").read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    (folder / "cart_pendulum.xml").write_text(text.replace(old, new), encoding="utf-8")
+    other = mjfim.Experiment(**{**stated(**tables).model_dump(exclude_unset=True), "directory": folder})
+    setup = Setup(other)
+    return mjfim.simulate(setup, setup.initial, seed)
+
+
+@pytest.mark.parametrize(
+    ("added", "path", "amount"),
+    [
+        ('damping="0.6"', "joint/slide:damping", 0.6),
+        ('frictionloss="0.5"', "joint/slide:frictionloss", 0.5),
+        ('stiffness="2"', "joint/slide:stiffness", 2.0),
+        ('armature="0.5"', "joint/slide:armature", 0.5),
+    ],
+)
+def test_the_missing_term_comes_first_and_in_about_its_size(
+    tmp_path: Path, added: str, path: str, amount: float
+) -> None:
+    recording = robot(tmp_path, 'axis="1 0 0"/>', f'axis="1 0 0" {added}/>')
+    found = mjfim.identify(stated(), [recording])
+    assert found.misfit
+    rank = [s.path for s in found.suspects].index(path)
+    assert rank == 0 or path.endswith("armature")  # the bob's inertia does nearly the same
+    first = found.suspects[rank]
+    assert first.sigmas > 5.0
+    assert amount / 2.0 < first.value < 2.0 * amount
+    assert any(path in sentence for sentence in found.warnings)
+
+
+def test_a_bias_and_a_lag_are_told(tmp_path: Path) -> None:
+    setup = Setup(stated())
+    clean = mjfim.simulate(setup, setup.initial, seed=1)
+    off = np.array(clean.y)
+    off[:, 3] += 0.03
+    biased = mjfim.identify(setup, [Recording(clean.t, clean.ctrl, off, clean.outputs)])
+    assert biased.suspects[0].path == "output/qvel:hinge:bias"
+    assert biased.suspects[0].value == pytest.approx(0.03, rel=0.4)
+    late = Recording(clean.t[2:] - clean.t[2], clean.ctrl[2:], clean.y[:-2], clean.outputs)
+    lagging = mjfim.identify(setup, [late])
+    assert "output:delay" in [s.path for s in lagging.suspects]
+
+
+def test_a_right_model_lacks_nothing() -> None:
+    setup = Setup(stated())
+    found = [mjfim.identify(setup, [mjfim.simulate(setup, setup.initial, seed)]) for seed in range(12)]
+    assert not any(e.suspects or e.misfit for e in found)
+
+
+def test_what_is_sought_already_is_no_suspect(tmp_path: Path) -> None:
+    recording = robot(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="0.5"/>')
+    friction = {"f": {"target": "joint/slide:frictionloss", "guess": 0.1, "bounds": [0.0, 5.0]}}
+    found = mjfim.identify(stated(parameters=friction), [recording])
+    assert not found.misfit
+    f = found.parameters.index("f")
+    assert abs(found.theta[f] - 0.5) < 4.0 * found.std[f]

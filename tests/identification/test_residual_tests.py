@@ -1,0 +1,155 @@
+"""Tests of whiteness against theory: how often white noise is accused, and what they see that is not white."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom, chi2
+from support.numerics import Array
+
+from mjfim.identification.residual_tests import LAGS, whiteness
+from mjfim.records.estimate import Whiteness
+
+N = 4000
+
+
+def autoregressive(phi: float, count: int, rng: np.random.Generator) -> Array:
+    """AR(1) noise of unit variance, from its stationary distribution."""
+    e = rng.standard_normal(count) * np.sqrt(1.0 - phi**2)
+    e[0] = rng.standard_normal()
+    return np.asarray(lfilter([1.0], [1.0, -phi], e))
+
+
+def seen(seed: int, extra: Array | float = 0.0, phi: float = 0.0, count: int = N) -> Whiteness:
+    """Verdict on one series of noise with something added."""
+    rng = np.random.default_rng(seed)
+    return whiteness("y", [autoregressive(phi, count, rng) + extra])
+
+
+@pytest.mark.parametrize("lengths", [(40,), (400,), (3000,), (700, 90, 1300), tuple([60] * 30)])
+def test_white_noise_is_rarely_accused(lengths: tuple[int, ...]) -> None:
+    """At each level no more often than the level says, within what chance allows for so many draws."""
+    rng = np.random.default_rng(len(lengths))
+    draws = 400
+    p = np.array([whiteness("y", [3.0 * rng.standard_normal(n) for n in lengths]).p for _ in range(draws)])
+    for level in (0.2, 0.05, 0.01):
+        assert (p < level).sum() <= binom.ppf(0.999, draws, level), f"at {level}"
+    if max(lengths) > 1000:  # and not for want of looking
+        assert (p < 0.2).mean() > 0.05
+
+
+def test_gaps_do_not_make_white_noise_coloured() -> None:
+    """Half of the values are missing, at random and in long stretches."""
+    rng = np.random.default_rng(2)
+    p = []
+    for _ in range(200):
+        y = rng.standard_normal(2000)
+        y[rng.random(2000) < 0.3] = np.nan
+        y[600:1000] = np.nan
+        p.append(whiteness("y", [y, np.full(50, np.nan), rng.standard_normal(300)]).p)
+    assert (np.array(p) < 0.05).sum() <= binom.ppf(0.999, 200, 0.05)
+    assert whiteness("y", [y]).count == np.isfinite(y).sum()
+
+
+@pytest.mark.parametrize("phi", [0.15, -0.15, 0.5, 0.95])
+def test_correlated_noise_is_seen(phi: float) -> None:
+    """Also of small correlation, which is reported."""
+    found = [seen(seed, phi=phi) for seed in range(20)]
+    assert sum(w.p < 1e-3 for w in found) >= 19
+    assert np.mean([w.correlation for w in found]) == pytest.approx(phi, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        pytest.param(np.linspace(-0.3, 0.3, N), id="slow drift"),
+        pytest.param(0.2 * np.sin(2 * np.pi * np.arange(N) / 1500), id="slow sinusoid"),
+        pytest.param(0.3 * np.sin(2 * np.pi * np.arange(N) / 37), id="sinusoid"),
+        pytest.param(0.5 * np.sin(2 * np.pi * np.arange(N) / 5.3), id="fast sinusoid"),
+        pytest.param(0.15, id="offset"),
+        pytest.param(np.where(np.arange(N) % 400 < 30, 0.7, 0.0), id="bursts"),
+    ],
+)
+def test_what_noise_hides_from_the_eye_is_seen(extra: Array | float) -> None:
+    """All are small against the noise, so small that short lags alone would miss the slow ones."""
+    assert sum(seen(seed, extra).p < 1e-3 for seed in range(20)) >= 18
+    assert seen(0, extra).variance < 1.2
+
+
+def test_long_runs_see_what_short_lags_do_not() -> None:
+    """A drift far below the noise: the runs bring it out, and their inflation says how much averaging is lost."""
+    drift = 0.15 * np.sign(np.sin(2 * np.pi * np.arange(N) / 2000))
+    found = [seen(seed, drift) for seed in range(20)]
+    assert sum(w.p < 1e-3 for w in found) >= 18
+    run = 256  # the longest of which there are more than a few
+    assert np.median([w.inflation for w in found]) == pytest.approx(1.0 + run * 0.15**2, rel=0.5)
+
+
+def test_several_recordings_are_seen_together() -> None:
+    """Each too short to tell by itself, all with the same correlation, or each with an offset of its own."""
+    rng = np.random.default_rng(7)
+    parts = [autoregressive(0.3, 60, rng) for _ in range(40)]
+    assert whiteness("y", parts).p < 1e-4
+    assert sum(whiteness("y", [part]).p < 1e-4 for part in parts) <= 4
+    moved = [rng.standard_normal(70) + 0.35 * rng.standard_normal() for _ in range(40)]
+    assert whiteness("y", moved).p < 1e-4
+
+
+def test_borders_of_recordings_are_not_crossed() -> None:
+    """Products reach from one value to another of the same recording only."""
+    a, b = np.array([1.0, 2.0, -1.0, 0.5] * 5), np.array([3.0, -2.0, 1.0, 4.0] * 5)
+    rho = (np.sum(a[1:] * a[:-1]) + np.sum(b[1:] * b[:-1])) / (a @ a + b @ b)
+    assert whiteness("y", [a, b]).correlation == pytest.approx(rho, rel=1e-10)
+
+
+def test_the_statistic_is_that_of_ljung_and_box() -> None:
+    """From its formula, in plain sums; p is its tail, times the number of looks. A fast oscillation leaves means small."""
+    rng = np.random.default_rng(0)
+    for phi in (-0.06, -0.1):
+        y = autoregressive(phi, 600, rng)
+        n = len(y)
+        rho = [sum(y[i] * y[i + k] for i in range(n - k)) / sum(v * v for v in y) for k in range(LAGS + 1)]
+        statistic = n * (n + 2) * sum(rho[k] ** 2 / (n - k) for k in range(1, LAGS + 1))
+        looks = 1 + sum(n // w >= 8 for w in (4, 16, 64))
+        tails = [chi2.sf(statistic, LAGS)]
+        for w in (4, 16, 64):
+            means = y[: n // w * w].reshape(-1, w).mean(axis=1)
+            if len(means) >= 8:
+                tails.append(chi2.sf(w * np.sum(means**2) / np.mean(y**2), len(means)))
+        found = whiteness("y", [y])
+        assert found.p == pytest.approx(min(looks * min(tails), 1.0), rel=1e-8)
+        assert found.correlation == pytest.approx(rho[1], rel=1e-10)
+
+
+@pytest.mark.parametrize("phi", [0.3, 0.7, 0.9, 0.97])
+def test_the_integrated_time_is_that_of_theory(phi: float) -> None:
+    """(1 + phi) / (1 - phi), in the mean over draws."""
+    times = [seen(seed, phi=phi, count=30_000).time for seed in range(12)]
+    assert np.mean(times) == pytest.approx((1.0 + phi) / (1.0 - phi), rel=0.12)
+
+
+def test_white_and_alternating_noise_has_no_memory() -> None:
+    """No more than one row hangs together."""
+    assert np.mean([seen(seed).time for seed in range(20)]) == pytest.approx(1.0, abs=0.02)
+    assert seen(0, phi=-0.6).time == 1.0
+
+
+def test_variance_and_inflation() -> None:
+    """In squares of the sigmas; the inflation of white noise is not far from one."""
+    rng = np.random.default_rng(0)
+    found = whiteness("speed", [2.0 * rng.standard_normal(20_000)])
+    assert found.output == "speed"
+    assert found.variance == pytest.approx(4.0, rel=0.05)
+    assert 1.0 <= found.inflation < 2.5
+    slow = whiteness("y", [autoregressive(0.9, 50_000, rng)])
+    assert slow.inflation > 10.0  # 19 in the limit of long runs
+
+
+@pytest.mark.parametrize(
+    "parts", [[], [np.zeros(0)], [np.full(9, np.nan)], [np.ones(5)], [np.zeros(100)], [np.ones(1)] * 50]
+)
+def test_too_little_to_tell_accuses_nobody(parts: list[Array]) -> None:
+    """No values, few, or none but zeros."""
+    found = whiteness("y", parts)
+    assert (found.p, found.inflation, found.time) == (1.0, 1.0, 1.0)

@@ -1,0 +1,260 @@
+"""How far an estimate is off, against what many repetitions of a simulated experiment show.
+
+Linear models: the truth is known, and everything that `uncertainty` says of one repetition can be held against the spread of all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+from support.numerics import Array
+
+from mjfim.identification.robust_covariance import merge, together, uncertainty
+from mjfim.optimize.condensed_least_squares import Condensed
+from mjfim.records.estimate import Uncertainty
+
+FINE = 8  # rows of a block
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Recordings of `y = X theta + noise`. X: (K, N, c);  own: recordings start from an offset of their own"""
+
+    X: Array
+    own: bool = False
+    prior: float = np.inf
+
+    def fitted(self, y: Array) -> tuple[Array, Condensed]:
+        """Estimate from y: (K, N), and the blocks there."""
+        K, N, c = self.X.shape
+        n = int(self.own)
+        ahead = np.kron(np.eye(K), np.ones((N, 1))) if n else np.zeros((K * N, 0))
+        wide = np.concatenate([ahead, self.X.reshape(K * N, c)], axis=1)
+        rows = np.eye(wide.shape[1])[K * n :] / self.prior
+        found = np.linalg.lstsq(np.concatenate([wide, rows]), np.append(y.ravel(), np.zeros(c)))[0]
+        r = (wide @ found - y.ravel()).reshape(K, N, 1)
+        stacked = np.concatenate([np.ones((K, N, n)), self.X, r], axis=2).reshape(-1, FINE, n + c + 1)
+        blocks = np.linalg.qr(np.pad(stacked, ((0, 0), (0, c), (0, 0))), mode="r")
+        owner = np.repeat(np.arange(K), N // FINE)
+        theta = found[K * n :]
+        known = np.column_stack([np.eye(c), theta])[: c * bool(np.isfinite(self.prior))] / self.prior
+        return theta, Condensed(blocks, owner, np.zeros((K, 0, n + c + 1)), known)
+
+    def judged(self, y: Array, length: float, draws: int = 0) -> tuple[Array, Array, Uncertainty]:
+        """Estimate, its formal deviations and what is said of it."""
+        theta, condensed = self.fitted(y)
+        rows = np.full(len(condensed.piece), float(FINE))
+        formal = np.sqrt(np.diag(np.linalg.inv(condensed.information())))
+        said = uncertainty(condensed, theta, condensed.piece, rows, length, draws, np.random.default_rng(0))
+        return theta, formal, said
+
+
+def waves(K: int, N: int, c: int, slow: float = 3.0) -> Array:
+    """(K, N, c) slow regressors, where noise that hangs together hurts."""
+    t = np.arange(N) / N
+    return np.stack([[np.cos(2 * np.pi * slow * (j + 1) * t + j + k) for j in range(c)] for k in range(K)]).swapaxes(
+        1, 2
+    )
+
+
+def noise(phi: float, shape: tuple[int, int], rng: np.random.Generator) -> Array:
+    """AR(1) of unit variance along the last axis."""
+    e = rng.standard_normal(shape) * np.sqrt(1.0 - phi**2)
+    e[:, 0] /= np.sqrt(1.0 - phi**2)
+    return np.asarray(lfilter([1.0], [1.0, -phi], e))
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Many repetitions. theta, formal, sandwich, bootstrap: (n, c);  covered: (n, c) the interval holds the truth, 0"""
+
+    theta: Array
+    formal: Array
+    sandwich: Array
+    bootstrap: Array
+    covered: Array
+    apart: Array
+
+
+@cache
+def study(phi: float, own: bool = False, prior: float = np.inf, repetitions: int = 150) -> Study:
+    """One recording or, with offsets of their own, four."""
+    K, N = (4, 480) if own else (1, 1600)
+    model, rng = Linear(waves(K, N, 2), own, prior), np.random.default_rng(11)
+    length = together([(1 + phi) / (1 - phi)], K * N)
+    found = []
+    for _ in range(repetitions):
+        truth = prior * rng.standard_normal(2) if np.isfinite(prior) else np.zeros(2)
+        offsets = 3.0 * rng.standard_normal((K, 1)) * own
+        theta, formal, said = model.judged(model.X @ truth + offsets + noise(phi, (K, N), rng), length, draws=150)
+        low, high = said.interval.T
+        covered = (low <= truth) & (truth <= high)
+        found.append((theta - truth, formal, said.sandwich, said.draws.std(axis=0), covered, bool(said.apart)))
+    return Study(*(np.array(column) for column in zip(*found, strict=True)))
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_with_correlated_noise_the_sandwich_is_right_and_the_formal_deviation_is_not(own: bool) -> None:
+    """Against the spread of the estimates themselves: the formal one is several times too small."""
+    s = study(0.9, own)
+    true = s.theta.std(axis=0)
+    assert (s.formal.mean(axis=0) < 0.4 * true).all()
+    np.testing.assert_allclose(s.sandwich.mean(axis=0), true, rtol=0.25)
+    np.testing.assert_allclose(s.bootstrap.mean(axis=0), true, rtol=0.25)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_with_white_noise_all_deviations_agree(own: bool) -> None:
+    """Formal, sandwich, bootstrap and the spread of the estimates."""
+    s = study(0.0, own)
+    true = s.theta.std(axis=0)
+    for said in (s.formal, s.sandwich, s.bootstrap):
+        np.testing.assert_allclose(said.mean(axis=0), true, rtol=0.15)
+    np.testing.assert_allclose(s.sandwich.mean(axis=0), s.formal.mean(axis=0), rtol=0.05)
+
+
+@pytest.mark.parametrize(("phi", "own"), [(0.0, False), (0.0, True), (0.6, False), (0.9, False), (0.9, True)])
+def test_the_interval_covers_the_truth(phi: float, own: bool) -> None:
+    """Nearly as often as 95 % and not always; without the allowance it would not."""
+    s = study(phi, own)
+    draws = s.covered.size
+    assert s.covered.sum() >= binom.ppf(0.001, draws, 0.92)
+    naive = (np.abs(s.theta) < 1.96 * s.formal).mean()
+    assert naive > 0.9 if phi == 0.0 else naive < 0.8
+    assert not s.covered.all(), "an interval that is never wrong is too wide"
+    assert s.apart.sum() <= 3
+
+
+def test_a_prior_is_scatter_too() -> None:
+    """Truths drawn from the prior: sandwich and bootstrap are the spread about them, not the spread of the data alone."""
+    s = study(0.0, prior=0.03)
+    true = s.theta.std(axis=0)
+    assert (true < 0.03).all()
+    for said in (s.formal, s.sandwich, s.bootstrap):
+        np.testing.assert_allclose(said.mean(axis=0), true, rtol=0.15)
+
+
+def test_recordings_that_differ_are_told_apart() -> None:
+    """The spread between them is found; the interval allows for it. Equal ones are not accused."""
+    rng, K, N = np.random.default_rng(5), 8, 480
+    model = Linear(waves(K, N, 2))
+    apart, between, equal = [], [], []
+    for _ in range(60):
+        truth = np.array([0.4, 0.0]) * rng.standard_normal((K, 2))
+        y = np.einsum("knc,kc->kn", model.X, truth)
+        for other, found in ((0.0, equal), (1.0, apart)):
+            theta, _, said = model.judged(other * y + noise(0.5, (K, N), rng), together([3.0], K * N))
+            found.append(said.apart)
+            if other:
+                between.append(said.between)
+                own = np.linalg.lstsq(model.X[3], (y + 0.0)[3])[0]
+                assert abs(said.each[3, 0] - own[0]) < 1.0
+                assert said.interval[0, 1] - theta[0] >= 1.95 * said.between[0]
+    assert sum(0 in names for names in apart) >= 58
+    assert sum(1 in names for names in apart) <= 3
+    assert sum(bool(names) for names in equal) <= 3
+    assert np.mean(np.array(between)[:, 0] ** 2) == pytest.approx(0.16, rel=0.25)
+    assert np.mean(np.array(between)[:, 1]) < 0.02
+
+
+def test_a_few_blocks_of_each_recording_accuse_nobody() -> None:
+    """Strongly coloured noise leaves five or so blocks a recording, whose own scatter is often small by chance."""
+    rng, K, N = np.random.default_rng(6), 10, 480
+    model = Linear(waves(K, N, 3, slow=1.0))
+    said = [model.judged(noise(0.92, (K, N), rng), together([24.0], K * N))[2] for _ in range(150)]
+    assert max(s.blocks for s in said) <= 50
+    assert sum(bool(s.apart) for s in said) <= 7
+
+
+def test_what_sets_recordings_apart_does_not_hide_itself() -> None:
+    """At the common estimate the difference is in all residuals; it must not pass for the scatter of each recording."""
+    rng, K, N = np.random.default_rng(8), 5, 1200
+    model = Linear(waves(K, N, 3, slow=0.7))
+    apart = 0
+    for _ in range(40):
+        truth = 0.5 * rng.standard_normal((K, 3))
+        y = np.einsum("knc,kc->kn", model.X, truth) + noise(0.0, (K, N), rng)
+        apart += bool(model.judged(y, together([60.0], K * N))[2].apart)
+    assert apart >= 39
+
+
+def test_what_every_recording_says_is_its_own_fit() -> None:
+    """Of a linear model to the last digit; one that tells nothing says nothing."""
+    rng = np.random.default_rng(1)
+    X = waves(4, 240, 3)
+    X[2, :, 1] = X[2, :, 0]
+    y = rng.standard_normal((4, 240))
+    _, _, said = Linear(X).judged(y, 16.0)
+    for k in (0, 1, 3):
+        np.testing.assert_allclose(said.each[k], np.linalg.lstsq(X[k], y[k])[0], rtol=1e-6)
+    assert np.isnan(said.each[2]).all()
+
+
+def test_units_of_the_unknowns_do_not_matter() -> None:
+    """Twenty orders of magnitude between two of them: all deviations and draws follow."""
+    unit = np.array([1e10, 1.0, 1e-10])
+    X, y = waves(3, 480, 3), noise(0.8, (3, 480), np.random.default_rng(2))
+    _, _, one = Linear(X).judged(y, 36.0, draws=50)
+    theta, condensed = Linear(X).fitted(y)
+    wide = np.append(unit, 1.0)
+    other = Condensed(condensed.blocks * wide, condensed.piece, condensed.inner * wide, condensed.outer * wide)
+    rows = np.full(len(condensed.piece), float(FINE))
+    two = uncertainty(other, theta / unit, other.piece, rows, 36.0, 50, np.random.default_rng(0))
+    np.testing.assert_allclose(two.sandwich * unit, one.sandwich, rtol=1e-6)
+    np.testing.assert_allclose(two.interval * unit[:, None], one.interval, rtol=1e-6)
+    np.testing.assert_allclose(two.each * unit, one.each, rtol=1e-6)
+    assert len(two.draws) == len(one.draws) == 50
+    np.testing.assert_allclose(two.draws * unit, one.draws, rtol=1e-6)
+
+
+def test_the_interval_is_the_hull() -> None:
+    """Of the formal one, and of the 2.5 and 97.5 % draws."""
+    y = noise(0.9, (1, 1600), np.random.default_rng(4))
+    theta, formal, said = Linear(waves(1, 1600, 2)).judged(y, 80.0, draws=400)
+    low, high = said.interval.T
+    tails = np.quantile(said.draws, [0.025, 0.975], axis=0)
+    low, high = low - 1e-12, high + 1e-12
+    assert (low <= np.minimum(theta - 1.96 * said.sandwich, np.minimum(theta - 1.959 * formal, tails[0]))).all()
+    assert (high >= np.maximum(theta + 1.96 * said.sandwich, np.maximum(theta + 1.959 * formal, tails[1]))).all()
+    assert said.blocks == 20
+    assert said.draws.shape == (400, 2)
+    np.testing.assert_array_equal(said.between, 0.0)
+
+
+def test_blocks_are_as_long_as_residuals_hang_together() -> None:
+    """Four times that, one row where they are white, and never more than a twentieth of the data."""
+    assert together([1.0, 1.2], 10_000) == 1.0
+    assert together([2.0, 9.0], 10_000) == 36.0
+    assert together([1000.0], 10_000) == 500.0
+    assert together([], 10_000) == 1.0
+    assert together([5.0], 3) == 1.0
+
+
+def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
+    """Random recordings: nothing crossed, nothing torn apart, as short as may be."""
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        counts = rng.integers(1, 12, rng.integers(1, 6))
+        recording = np.repeat(np.flatnonzero(rng.random(2 * len(counts)) < 2.0)[: len(counts)], counts)
+        rows, length = rng.integers(1, 20, counts.sum()).astype(float), float(rng.integers(1, 60))
+        merged = merge(recording, rows, length)
+        assert merged[0] == 0
+        assert set(np.diff(merged).tolist()) <= {0, 1}, "runs, numbered in order"
+        for label in range(merged[-1] + 1):
+            mine = merged == label
+            assert len(set(recording[mine].tolist())) == 1
+            total, whole = rows[mine].sum(), rows[recording == recording[mine][0]].sum()
+            last = np.flatnonzero(mine)[-1] + 1
+            final = last == len(rows) or recording[last] != recording[last - 1]
+            assert total >= min((0.5 if final else 1.0) * length, whole)
+            if not final:
+                assert total - rows[mine][-1] < length, "longer than needed"
+            else:
+                assert total < 1.5 * length + 20.0
+    assert merge(np.zeros(0, int), np.zeros(0), 5.0).shape == (0,)
+    np.testing.assert_array_equal(merge(np.array([0, 0, 1, 1]), np.ones(4), 1.0), [0, 1, 2, 3])

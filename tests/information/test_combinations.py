@@ -1,0 +1,150 @@
+"""Parameters that show in combination only, all the way: design, several experiments, earlier ones, estimates, criteria."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.numerics import make_setup, relative_error
+
+import mjfim
+from mjfim.errors import UnidentifiableError
+from mjfim.experiment.system import Setup
+from mjfim.output import archive
+
+# A double pendulum whose first link holds a mass that no motion tells from the second one's.
+PENDULUM = """
+<mujoco>
+  <option timestep="0.005" integrator="RK4"/>
+  <worldbody>
+    <body name="upper">
+      <inertial pos="0 0 -0.2" mass="0.6" diaginertia="0.01 0.01 0.002"/>
+      <joint name="shoulder" axis="0 1 0" damping="0.1"/>
+      <body name="lower" pos="0 0 -0.3">
+        <inertial pos="0 0 -0.15" mass="0.5" diaginertia="0.008 0.008 0.001"/>
+        <joint name="elbow" axis="0 1 0" damping="0.05"/>
+        <site name="tip" pos="0 0 -0.2"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="shoulder" joint="shoulder"/><motor name="elbow" joint="elbow"/></actuator>
+  <sensor><framequat name="tip" objtype="site" objname="tip"/></sensor>
+</mujoco>
+"""
+PARAMETERS = {
+    "m1r1": {"target": "body/upper:firstmoment[2]"},
+    "I1": {"target": "body/upper:origininertia[1]"},
+    "m2": {"target": "body/lower:mass"},
+    "m2r2": {"target": "body/lower:firstmoment[2]"},
+    "d": {"target": "joint/shoulder:damping"},
+}
+SINE = {"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}
+
+
+def pendulum(folder: Path, **tables) -> Setup:
+    """One second of it, all states measured."""
+    defaults = {
+        "parameters": PARAMETERS,
+        "noise": {"state": 0.01},
+        "horizon": 1.0,
+        "control": SINE,
+        "cost": {"control": 1e-3},
+        "descent": {"max_iterations": 5},
+    }
+    return make_setup(PENDULUM, folder, **{**defaults, **tables})
+
+
+def lost(names: tuple[str, ...], std: np.ndarray) -> set[str]:
+    """Parameters without a finite standard deviation."""
+    return {name for name, value in zip(names, std, strict=True) if not np.isfinite(value)}
+
+
+def test_experiments_together_do_not_take_round_off_for_information(tmp_path) -> None:
+    first = pendulum(tmp_path).experiment
+    second = pendulum(tmp_path, initial={"qpos": (0.5, -0.4), "control": SINE}).experiment
+    for design in mjfim.design_together([first, second], rounds=1):
+        assert lost(design.parameters, design.final.std) == {"m1r1", "I1", "m2"}
+        assert len(design.combined) == 2
+        assert len(design.final.eigenvalues) == 4
+    direction = np.array([-0.3, 0.09, -1.0, 0.0, 0.0])  # m1r1 along -z
+    assert direction @ design.data @ direction < 1e-9 * np.abs(design.data).max()
+
+
+def test_earlier_information_of_a_design_leaves_every_sigma_known(tmp_path) -> None:
+    setup = pendulum(tmp_path)
+    design = mjfim.design(setup)
+    archive.write_design(tmp_path, design, setup)
+    again = Setup(setup.experiment.replace(earlier=[str(tmp_path / "design.json")]))
+    told = mjfim.check(again, trajectory=design.trajectory)
+    alone = mjfim.check(setup, trajectory=design.trajectory)
+    ratio = np.array([b.std / a.std for a, b in zip(alone.rows, told.rows, strict=True) if np.isfinite(a.std)])
+    np.testing.assert_allclose(ratio, np.sqrt(0.5), rtol=1e-4)  # twice the same data
+    assert {row.name for row in told.rows if not np.isfinite(row.std)} == {"m1r1", "I1", "m2"}
+
+
+def test_an_estimate_holds_what_no_recording_shows_and_knows_the_rest(tmp_path) -> None:
+    parameters = {**PARAMETERS, "d": {"target": "joint/shoulder:damping", "guess": 0.15, "true": 0.1}}
+    setup = pendulum(tmp_path, parameters=parameters)
+    recording = mjfim.simulate(setup, setup.initial, seed=3)
+    estimate = mjfim.identify(setup, [recording])
+    assert lost(estimate.parameters, estimate.std) == {"m1r1", "I1", "m2"}
+    assert not estimate.success  # declared one by one, not all of them can be told
+    assert "m1r1" in estimate.combinations[0]
+    assert not estimate.misfit
+    assert abs(estimate.theta[4] - 0.1) < 4.0 * estimate.std[4]
+    away = np.abs(estimate.theta[:3] - setup.parameters.guess[:3]) / np.abs(setup.parameters.guess[:3])
+    assert away.max() < 0.1  # not run away along what is invisible
+    told = mjfim.check(setup, [recording])
+    np.testing.assert_allclose(estimate.std[3:], [row.std for row in told.rows[3:]], rtol=0.3)  # there at the guess
+
+
+def test_an_estimate_of_combinations_serves_as_earlier_information(tmp_path) -> None:
+    setup = pendulum(tmp_path)
+    estimate = mjfim.identify(setup, [mjfim.simulate(setup, setup.initial, seed=3)])
+    archive.write_json(tmp_path / "estimate.json", archive.estimate_summary(estimate, setup))
+    again = Setup(setup.experiment.replace(earlier=[str(tmp_path / "estimate.json")]))
+    assert relative_error(again.earlier, estimate.data) < 1e-12
+    assert {row.name for row in mjfim.check(again).rows if np.isfinite(row.std)} == {"m2r2", "d"}
+
+
+def test_criterion_c_refuses_what_cannot_be_identified(tmp_path) -> None:
+    with pytest.raises(UnidentifiableError, match=r"m1r1 .* m2"):
+        mjfim.design(pendulum(tmp_path, cost={"criterion": "c", "subset": ["m2"]}))
+    visible = {"criterion": "c", "combination": {"I1": 1.0, "m2": 0.09}}
+    design = mjfim.design(pendulum(tmp_path, cost=visible))
+    known = {c.words.split()[0]: c for c in design.combined}
+    assert design.final.criterion == pytest.approx(known["I1"].final ** 2 * 100.0, rel=1e-6)  # per second, 100 Hz
+
+
+def test_nothing_visible_is_a_verdict_not_a_crash(tmp_path) -> None:
+    found = mjfim.check(pendulum(tmp_path, parameters={"wind": {"target": "option:wind[0]", "guess": 1.0}}))
+    assert not found.ok
+    assert any("nothing can be identified" in sentence for sentence in found.verdict)
+
+
+def test_a_prior_on_one_member_tells_the_group_apart(tmp_path) -> None:
+    parameters = {**PARAMETERS, "m2": {"target": "body/lower:mass", "prior": 0.01}}
+    found = mjfim.check(pendulum(tmp_path, parameters=parameters))
+    assert all(np.isfinite(row.std) for row in found.rows)
+    assert found.rows[2].std == pytest.approx(0.01, rel=1e-3)
+    assert found.ok
+    assert any("by priors only" in sentence for sentence in found.verdict)
+
+
+def test_starts_are_each_recordings_own_for_check_as_for_identify(tmp_path) -> None:
+    setup = pendulum(tmp_path, parameters={"d": PARAMETERS["d"]}, nuisance={"initial": 0.05})
+    recordings = [mjfim.simulate(setup, setup.initial, seed=s) for s in range(3)]
+    told, estimate = mjfim.check(setup, recordings), mjfim.identify(setup, recordings)
+    assert told.rows[0].std == pytest.approx(estimate.std[0], rel=0.02)
+    single = mjfim.check(setup, recordings[:1]).rows[0].std
+    assert told.rows[0].std == pytest.approx(single / np.sqrt(3.0), rel=1e-6)
+
+
+def test_a_quaternion_sensor_may_come_with_either_sign(tmp_path) -> None:
+    setup = pendulum(tmp_path, noise={"tip": 0.005}, parameters={"d": PARAMETERS["d"]})
+    recording = mjfim.simulate(setup, setup.initial, seed=1)
+    turned = mjfim.Recording(recording.t, recording.ctrl, -recording.y, recording.outputs, "turned")
+    right, other = (mjfim.identify(setup, [r]) for r in (recording, turned))
+    np.testing.assert_allclose(other.theta, right.theta, rtol=1e-6)
+    assert not other.misfit

@@ -1,0 +1,358 @@
+"""Fisher information against its sum, nuisance and combinations against the full inverse, and what cannot be identified."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.numerics import CART_PARAMETERS, cart_setup, relative_error, richardson
+
+from mjfim.errors import UnidentifiableError
+from mjfim.excitation.design import design
+from mjfim.excitation.evaluation import evaluate_trajectory
+from mjfim.experiment.simulate import simulate
+from mjfim.identification.identify import identify
+from mjfim.information.criteria import CRITERIA
+from mjfim.information.fisher import Information
+from mjfim.information.marginal import standard_deviations
+from mjfim.plant.noise import Noise
+from mjfim.records.trajectory import Sensitivity
+
+SIGMA = np.array([0.1, 0.5, 2.0])
+
+
+def random_sensitivity(seed: int, N: int = 12, p: int = 4, nx: int = 5) -> Sensitivity:
+    """Any psi and G."""
+    rng = np.random.default_rng(seed)
+    return Sensitivity(rng.normal(size=(N + 1, nx, p)), rng.normal(size=(N + 1, 3, p)))
+
+
+def information(stride: int = 1, criterion: str = "E", **changes) -> Information:
+    """Three outputs, four parameters of different scale, no prior."""
+    noise = Noise.independent(SIGMA, stride)
+    base = Information(noise, 50.0, np.array([1.0, 2.0, 0.1, 5.0]), np.zeros((4, 4)), criterion, 1.0)
+    return replace(base, **changes)
+
+
+def spread_matrix(rng: np.random.Generator, p: int = 4) -> np.ndarray:
+    """Symmetric positive definite with well separated eigenvalues."""
+    Q, _ = np.linalg.qr(rng.normal(size=(p, p)))
+    return Q @ np.diag(3.0 ** np.arange(p)) @ Q.T
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4, 5, 12])
+def test_information_is_the_sum_over_measured_samples(stride: int) -> None:
+    S, prior = random_sensitivity(1), np.diag([4.0, 0.0, 1.0, 0.0])
+    total = prior.copy()
+    for k in range(1, 13):
+        if k % stride == 0:
+            total += S.G[k].T @ np.diag(SIGMA**-2) @ S.G[k]
+    made = information(stride, prior=prior)
+    assert relative_error(made.matrix(S), total) < 1e-14
+    assert made.noise.measured(12).sum() == 3 * (12 // stride)
+
+
+def test_information_leaves_out_the_known_start() -> None:
+    S = random_sensitivity(2)
+    G = np.array(S.G)
+    G[0] += 100.0
+    np.testing.assert_array_equal(information().matrix(Sensitivity(S.psi, G)), information().matrix(S))
+    G[1] += 100.0
+    assert np.abs(information().matrix(Sensitivity(S.psi, G)) - information().matrix(S)).max() > 1.0
+
+
+@pytest.mark.parametrize("criterion", ["E", "A", "D"])
+def test_criterion_is_that_of_the_scaled_information_per_second(criterion: str) -> None:
+    made, matrix = information(criterion=criterion, weight=3.0), spread_matrix(np.random.default_rng(3))
+    S = np.diag(made.scale)
+    values = np.linalg.eigvalsh(S @ matrix @ S / 50.0)
+    expected = {"E": 1 / values[0], "A": np.sum(1 / values), "D": -np.sum(np.log(values))}[criterion]
+    found = made.evaluate(matrix)
+    assert found.value == pytest.approx(3.0 * expected, rel=1e-12)
+    np.testing.assert_allclose(found.eigenvalues, values, rtol=1e-12)
+
+
+@pytest.mark.parametrize("criterion", ["E", "A", "D"])
+def test_criterion_derivative_is_that_of_differences_in_random_symmetric_directions(criterion: str) -> None:
+    rng, made = np.random.default_rng(4), information(criterion=criterion, weight=2.0)
+    matrix = spread_matrix(rng)
+    found = made.evaluate(matrix)
+    M = np.einsum("r,ri,rj->ij", found.weights, found.directions, found.directions) / made.measure_rate
+    for _ in range(8):
+        d = rng.normal(size=(4, 4))
+        d = 0.01 * (d + d.T)
+        measured = richardson(lambda t, d=d: made.evaluate(matrix + t * d).value, 0.1)
+        assert np.sum(M * d) == pytest.approx(measured, rel=1e-7)
+        assert np.sum(1.001 * M * d) != pytest.approx(measured, rel=1e-4)
+
+
+NUISANCE = {"interest": np.array([0, 2])}
+TILTED = np.linalg.qr(np.random.default_rng(12).normal(size=(2, 1)))[0]
+SEEN = {
+    "nuisance": NUISANCE,
+    "combinations": {"basis": np.linalg.qr(np.random.default_rng(11).normal(size=(4, 2)))[0]},
+    "both": {**NUISANCE, "basis": TILTED},
+}
+PHI = {
+    "E": {},
+    "E smooth": {"power": 3.0},
+    "A": {"criterion": "A"},
+    "D": {"criterion": "D"},
+    "c": {"criterion": "c"},
+}
+
+
+def seeing(phi: str, seen: str) -> Information:
+    """A criterion that sees less than all."""
+    wanted = 4 if seen == "combinations" else 2
+    contrast = {"contrast": np.arange(1.0, 2 * wanted + 1).reshape(wanted, 2)} if phi == "c" else {}
+    return information(weight=2.0, **PHI[phi], **SEEN[seen], **contrast)
+
+
+@pytest.mark.parametrize("seen", SEEN)
+@pytest.mark.parametrize("phi", PHI)
+def test_derivative_through_nuisance_and_combinations_is_that_of_differences(phi: str, seen: str) -> None:
+    rng, made = np.random.default_rng(4), seeing(phi, seen)
+    matrix = spread_matrix(rng)
+    found = made.evaluate(matrix)
+    M = np.einsum("r,ri,rj->ij", found.weights, found.directions, found.directions) / made.measure_rate
+    for _ in range(6):
+        d = rng.normal(size=(4, 4))
+        d = 0.01 * (d + d.T)
+        measured = richardson(lambda t, d=d: made.evaluate(matrix + t * d).value, 0.1)
+        assert np.sum(M * d) == pytest.approx(measured, rel=1e-7)
+        assert np.sum(1.001 * M * d) != pytest.approx(measured, rel=1e-4)
+
+
+def test_nuisance_leaves_the_block_of_the_full_inverse() -> None:
+    matrix, t = spread_matrix(np.random.default_rng(13)), NUISANCE["interest"]
+    made = information(**NUISANCE)
+    scaled = made.scaled(matrix)
+    R, P = made.reduced(matrix)
+    block = np.linalg.inv(scaled)[np.ix_(t, t)]
+    np.testing.assert_allclose(R, np.linalg.inv(block), rtol=1e-10)
+    np.testing.assert_allclose(R, P @ scaled @ P.T, rtol=1e-10)
+    np.testing.assert_allclose(made.covariance(matrix), np.linalg.inv(matrix)[np.ix_(t, t)], rtol=1e-10)
+    assert np.linalg.norm(R - scaled[np.ix_(t, t)]) > 0.1 * np.linalg.norm(R)  # forgetting the nuisance would be seen
+
+
+def test_a_nuisance_known_exactly_is_none_and_an_unknown_one_always_costs() -> None:
+    matrix, t = spread_matrix(np.random.default_rng(14)), NUISANCE["interest"]
+    without = information(scale=np.array([1.0, 0.1])).evaluate(matrix[np.ix_(t, t)])
+    known, made = np.diag([0.0, 1.0, 0.0, 1.0]), information(**NUISANCE)
+    values = [made.evaluate(matrix + prior * known).value for prior in (1e16, 100.0, 1.0, 0.0)]
+    assert values[0] == pytest.approx(without.value, rel=1e-9)
+    assert (np.diff(values) > 0.0).all()
+
+
+def test_nuisances_that_cannot_be_told_from_each_other_do_not_matter() -> None:
+    rng = np.random.default_rng(15)
+    J = rng.normal(size=(20, 3))
+    same = np.column_stack(
+        [J[:, 0], J[:, 1], 1e3 * J[:, 1], J[:, 2], np.zeros(20)]
+    )  # twice one nuisance, and one of no effect
+    base = {"prior": np.zeros((5, 5)), "scale": np.ones(5), "interest": np.array([0, 3])}
+    plain = information(prior=np.zeros((3, 3)), scale=np.ones(3), interest=np.array([0, 2])).evaluate(J.T @ J)
+    found = information(**base).evaluate(same.T @ same)
+    assert found.value == pytest.approx(plain.value, rel=1e-7)
+    assert np.isfinite(found.directions).all()
+
+
+def test_a_wanted_parameter_that_a_nuisance_imitates_costs_infinity() -> None:
+    J = np.random.default_rng(16).normal(size=(20, 3))
+    J[:, 1] = 2.0 * J[:, 2]
+    made = information(prior=np.zeros((3, 3)), scale=np.ones(3), interest=np.array([0, 1]))
+    assert made.evaluate(J.T @ J).value == np.inf
+    assert np.isnan(made.covariance(J.T @ J)).all()
+
+
+def test_combinations_project_the_information_and_tell_who_stands_alone() -> None:
+    rng = np.random.default_rng(17)
+    J = rng.normal(size=(30, 3)) @ np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    scale, half = np.array([1.0, 2.0, 2.0, 5.0]), np.sqrt(0.5)
+    basis = np.array([[1.0, 0.0, 0.0], [0.0, half, 0.0], [0.0, half, 0.0], [0.0, 0.0, 1.0]])
+    made, matrix = information(basis=basis, scale=scale), J.T @ J
+    # the same experiment, written in the three numbers that it can tell
+    told = J[:, [0, 1, 3]]
+    exact = np.linalg.inv(told.T @ told)
+    covariance = made.covariance(matrix)
+    np.testing.assert_allclose(covariance[np.ix_([0, 3], [0, 3])], exact[np.ix_([0, 2], [0, 2])], rtol=1e-9)
+    assert np.isnan(covariance[1:3]).all()
+    np.testing.assert_allclose(made.std(matrix)[[0, 3]], np.sqrt(np.diag(exact))[[0, 2]], rtol=1e-9)
+    assert np.isinf(made.std(matrix)[1:3]).all()
+    with_prior = replace(made, prior=np.diag([0.0, 4.0, 0.0, 0.0]))
+    total = matrix + with_prior.prior
+    np.testing.assert_allclose(with_prior.covariance(total), np.linalg.inv(total), rtol=1e-7, atol=1e-12)
+
+
+def test_correlated_noise_at_several_rates_weighs_every_sample_with_its_own_covariance() -> None:
+    S, strides = random_sensitivity(18), np.array([2, 2, 3])
+    covariance = np.array([[0.01, 0.03, 0.0], [0.03, 0.25, 0.0], [0.0, 0.0, 4.0]])
+    total = np.zeros((4, 4))
+    for k in range(1, 13):
+        rows = np.flatnonzero(k % strides == 0)
+        total += S.G[k][rows].T @ np.linalg.inv(covariance[np.ix_(rows, rows)]) @ S.G[k][rows]
+    made = replace(information(), noise=Noise(covariance, strides))
+    assert relative_error(made.matrix(S), total) < 1e-13
+    assert made.accumulated(S)[-1] == pytest.approx(made.evaluate(total).eigenvalues[0], rel=1e-9)
+    alone = replace(made, noise=Noise(np.diag(np.diag(covariance)), strides))
+    assert relative_error(alone.matrix(S), total) > 0.1
+
+
+def test_criterion_c_without_a_contrast_is_refused() -> None:
+    with pytest.raises(ValueError, match="contrast"):
+        information(criterion="c").evaluate(np.eye(4))
+
+
+EXACT = {"initial": 1e-9, "bias": 1e-9, "delay": 1e-9}
+VAGUE = {"initial": 0.1, "bias": 0.1, "delay": 0.01}
+
+
+def test_exactly_known_nuisances_change_neither_design_criterion_nor_estimate(tmp_path) -> None:
+    plain, exact, vague = (cart_setup(tmp_path, **t) for t in ({}, {"nuisance": EXACT}, {"nuisance": VAGUE}))
+    here = [evaluate_trajectory(s, s.initial) for s in (plain, exact, vague)]
+    assert here[1].criterion == pytest.approx(here[0].criterion, rel=1e-6)
+    np.testing.assert_allclose(here[1].std[:3], here[0].std, rtol=1e-6)
+    np.testing.assert_allclose(here[1].std[3:], 1e-9, rtol=1e-6)
+    assert here[2].criterion > 1.1 * here[0].criterion
+    recording = simulate(plain, plain.initial, seed=4)
+    found = [identify(s, [recording]) for s in (plain, exact, vague)]
+    np.testing.assert_allclose(found[1].theta[:3], found[0].theta, atol=1e-4 * found[0].std.min())
+    np.testing.assert_allclose(found[1].std[:3], found[0].std, rtol=1e-5)
+    assert (found[2].std[:3] > 1.01 * found[0].std).all()
+
+
+@pytest.mark.parametrize("criterion", ["E", "A", "D"])
+def test_more_information_never_costs_more(criterion: str) -> None:
+    rng, made = np.random.default_rng(5), information(criterion=criterion)
+    matrix = spread_matrix(rng)
+    for _ in range(10):
+        g = 0.1 * rng.normal(size=4)
+        assert made.evaluate(matrix + np.outer(g, g)).value <= made.evaluate(matrix).value
+
+
+@pytest.mark.parametrize(("criterion", "rank"), [("E", 1), ("A", 4), ("D", 4)])
+def test_criterion_says_how_many_directions_its_gradient_needs(criterion: str, rank: int) -> None:
+    found = CRITERIA[criterion](spread_matrix(np.random.default_rng(6)))
+    assert found.weights.shape == (rank,)
+    assert found.directions.shape == (rank, 4)
+    assert (found.weights < 0).all()  # information only ever lowers the cost
+
+
+@pytest.mark.parametrize("criterion", ["E", "A", "D"])
+def test_singular_information_costs_infinity_without_a_warning(criterion: str) -> None:
+    for matrix in (np.zeros((4, 4)), np.diag([0.0, 1.0, 2.0, 3.0]), np.diag([-1e-9, 1.0, 1.0, 1.0])):
+        assert information(criterion=criterion).evaluate(matrix).value == np.inf
+
+
+def test_accumulated_smallest_eigenvalue_is_monotone_and_ends_at_the_whole() -> None:
+    for stride in (1, 3):
+        S, made = random_sensitivity(7), information(stride)
+        series = made.accumulated(S)
+        assert series.shape == (13,)
+        assert (np.diff(series) >= -1e-12 * series[-1]).all()
+        assert series[0] == 0.0
+        assert series[-1] == pytest.approx(made.evaluate(made.matrix(S)).eigenvalues[0], rel=1e-10)
+        half = replace(made, prior=np.zeros((4, 4))).matrix(Sensitivity(S.psi[:7], S.G[:7]))
+        assert series[6] == pytest.approx(np.linalg.eigvalsh(made.scaled(half))[0], rel=1e-9, abs=1e-12)
+
+
+def test_accumulated_starts_at_the_prior() -> None:
+    prior = np.diag([9.0, 4.0, 400.0, 1.0])
+    made = information(prior=prior)
+    assert made.accumulated(random_sensitivity(8))[0] == pytest.approx(4.0 / 50.0)
+
+
+def test_the_stated_rate_divides_the_sum_so_that_weights_mean_the_same_at_every_rate(tmp_path) -> None:
+    (tmp_path / "b").mkdir()
+    dense, thin = cart_setup(tmp_path), cart_setup(tmp_path / "b", measure_rate=25.0)
+    a, b = (s.problem.point(s.initial) for s in (dense, thin))
+    assert relative_error(a.information, b.information) > 1.0  # four times the samples
+    assert b.criterion.value == pytest.approx(a.criterion.value, rel=0.3)
+
+
+def test_information_of_a_real_experiment_is_the_sum_with_its_noise_and_scale(tmp_path) -> None:
+    setup = cart_setup(tmp_path, noise={"angle": 0.01, "acc": 0.3}, measure_rate=50.0)
+    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    sigma = np.array([0.01, 0.3, 0.3, 0.3])
+    total = sum(S.G[k].T @ np.diag(sigma**-2) @ S.G[k] for k in range(2, 51, 2))
+    evaluation = evaluate_trajectory(setup, setup.initial)
+    assert relative_error(evaluation.information, total) < 1e-12
+    scaled = total * np.outer(setup.theta, setup.theta) / 50.0  # relative to the guess by default
+    assert relative_error(evaluation.eigenvalues, np.linalg.eigvalsh(scaled)) < 1e-9
+    assert evaluation.criterion == pytest.approx(1.0 / np.linalg.eigvalsh(scaled)[0], rel=1e-9)
+    assert relative_error(evaluation.std, np.sqrt(np.diag(np.linalg.inv(total)))) < 1e-8
+
+
+def test_noise_of_sensors_defaults_to_the_mjcf(tmp_path) -> None:
+    setup = cart_setup(tmp_path, noise={})
+    assert setup.outputs.names == ("angle", "rate", "acc[0]", "acc[1]", "acc[2]", "drive")
+    np.testing.assert_array_equal(setup.noise.sigma, [0.01, 0.05, 0.3, 0.3, 0.3, 0.1])
+
+
+def test_standard_deviations_survive_parameters_of_very_different_size() -> None:
+    rng = np.random.default_rng(9)
+    unit = spread_matrix(rng)
+    scale = np.array([1.0, 1e6, 1e-6, 1.0])
+    expected = np.sqrt(np.diag(np.linalg.inv(unit))) / scale
+    np.testing.assert_allclose(standard_deviations(unit * np.outer(scale, scale)), expected, rtol=1e-9)
+    assert np.isinf(standard_deviations(np.diag([0.0, 1.0]))).all()
+
+
+PRODUCT = {
+    "gear": {"target": "actuator/force:gear[0]"},
+    "gain": {"target": "actuator/force:gainprm[0]"},
+    "mass": {"target": "body/bob:mass"},
+}
+
+
+SHORT = {"max_iterations": 4}
+
+
+def test_a_product_is_designed_on_what_can_be_identified_of_it(tmp_path) -> None:
+    setup = cart_setup(tmp_path, parameters=PRODUCT, descent=SHORT)
+    result = design(setup)
+    assert result.combinations == ("gear and gain only as gear + gain",)
+    assert result.final.cost < 0.9 * result.initial.cost
+    assert np.isinf(result.final.std[:2]).all()
+    # one factor alone tells as much about the mass as both
+    alone = {name: PRODUCT[name] for name in ("gain", "mass")}
+    single = evaluate_trajectory(cart_setup(tmp_path, parameters=alone), result.trajectory)
+    assert result.final.std[2] == pytest.approx(single.std[1], rel=1e-5)
+    # the criterion sees (gear + gain) / sqrt(2) and the mass, in units of their guesses
+    T = np.array([[np.sqrt(0.5), 0.0], [np.sqrt(0.5), 0.0], [0.0, 1.5]])
+    seen = np.linalg.eigvalsh(T.T @ result.final.information @ T / setup.measure_rate)
+    np.testing.assert_allclose(result.final.eigenvalues, seen, rtol=1e-6)
+
+
+def test_coefficients_of_a_combination_are_in_the_parameters_own_units(tmp_path) -> None:
+    changed = {**PRODUCT, "gear": {"target": "actuator/force:gear[0]", "guess": 4.0}}
+    result = design(cart_setup(tmp_path, parameters=changed, descent={"max_iterations": 0}))
+    assert result.combinations == ("gear and gain only as gear + 4 gain",)  # d(gear gain) = d gear + 4 d gain
+
+
+def test_a_prior_on_one_factor_of_the_product_gives_both_a_deviation(tmp_path) -> None:
+    known = {**PRODUCT, "gear": {"target": "actuator/force:gear[0]", "prior": 0.01}}
+    result = design(cart_setup(tmp_path, parameters=known, descent={"max_iterations": 0}))
+    exact = np.sqrt(np.diag(np.linalg.inv(result.final.information)))
+    np.testing.assert_allclose(result.final.std, exact, rtol=1e-4)
+    assert result.final.std[0] == pytest.approx(0.01, rel=1e-3)  # the data add nothing about the gear
+
+
+@pytest.mark.parametrize("others", [{}, {"m": CART_PARAMETERS["m"]}], ids=["alone", "beside a mass"])
+def test_a_parameter_that_changes_nothing_is_an_error_that_names_it(others: dict, tmp_path) -> None:
+    blind = {"depth": {"target": "body/bob:pos[1]", "guess": 0.1}, **others}
+    with pytest.raises(UnidentifiableError, match=r"parameters\.depth changes nothing") as caught:
+        design(cart_setup(tmp_path, parameters=blind))
+    assert "parameters.m" not in str(caught.value)
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi], ids=["upright", "hanging, rounded"])
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_start_at_rest_without_control_is_unidentifiable(count: int, angle: float, tmp_path) -> None:
+    rest = {"qpos": (0.0, angle), "control": {"kind": "constant", "amplitude": 0.0}}
+    parameters = dict(list(CART_PARAMETERS.items())[-count:])
+    setup = cart_setup(tmp_path, initial=rest, parameters=parameters, descent={"max_iterations": 5})
+    with pytest.raises(UnidentifiableError, match="the start excites nothing"):
+        design(setup)

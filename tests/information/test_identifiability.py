@@ -1,0 +1,230 @@
+"""What an experiment can see: along its own start, along any control, and what is refused because nothing shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.numerics import CART_PARAMETERS, Array, cart_setup, make_setup
+
+import mjfim.information.identifiability
+from mjfim.errors import SimulationDiverged, UnidentifiableError
+from mjfim.excitation.design import design, require_designable
+from mjfim.excitation.initial_controls import probes
+from mjfim.experiment.system import Setup
+from mjfim.information.identifiability import PROBES, Survey, require_visible, rows, survey
+
+PRODUCT = {
+    "gear": {"target": "actuator/force:gear[0]"},
+    "gain": {"target": "actuator/force:gainprm[0]"},
+    "mass": {"target": "body/bob:mass"},
+}
+REST = {"qpos": (0.0, np.pi), "control": {"kind": "constant", "amplitude": 0.0}}
+
+TWO = """
+<mujoco model="two">
+  <option timestep="0.01" integrator="implicitfast" gravity="0 0 0"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="left">
+      <joint name="left" type="slide" axis="1 0 0" damping="0.3"/>
+      <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+    </body>
+    <body name="right">
+      <joint name="right" type="slide" axis="1 0 0" damping="0.2"/>
+      <inertial pos="0 0 0" mass="2" diaginertia="0.01 0.01 0.01"/>
+    </body>
+    <body name="post"><inertial pos="0 0 0.1" mass="3" diaginertia="0.1 0.1 0.1"/></body>
+  </worldbody>
+  <actuator>
+    <motor name="left" joint="left" ctrlrange="-1 1" ctrllimited="true"/>
+    <motor name="right" joint="right"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def two_setup(folder: Path, **tables: Any) -> Setup:
+    """Two sliders, of which the initial control moves the left one only."""
+    control = {"kind": "sine", "amplitude": {"left": 0.8, "right": 0.0}, "frequency": 1.0}
+    masses = {name: {"target": f"body/{name}:mass"} for name in ("left", "right")}
+    defaults = {"parameters": masses, "noise": {"state": 0.01}, "initial": {"control": control}}
+    return make_setup(TWO, folder, **{**defaults, **tables})
+
+
+def look(setup: Setup) -> Survey:
+    """Survey along the initial control."""
+    return survey(setup, setup.initial, setup.plant.sensitivity(setup.theta, setup.initial))
+
+
+def test_an_experiment_that_shows_everything_needs_no_random_controls(tmp_path, monkeypatch) -> None:
+    def refused(setup: Setup, count: int) -> None:
+        raise AssertionError("not needed")
+
+    monkeypatch.setattr(mjfim.information.identifiability, "probes", refused)
+    seen = look(cart_setup(tmp_path))
+    assert seen.basis is None
+    assert (seen.here.count, seen.always.count) == (0, 0)
+    assert (seen.groups_here, seen.groups_always) == ((), ())
+    with pytest.raises(AssertionError, match="not needed"):
+        look(cart_setup(tmp_path, parameters=PRODUCT))
+
+
+def test_a_start_that_moves_half_of_the_model_is_told_from_what_never_shows(tmp_path) -> None:
+    setup = two_setup(tmp_path)
+    seen = look(setup)
+    assert (seen.here.silent, seen.always.count) == ((1,), 0)
+    assert seen.basis is None
+    with pytest.raises(UnidentifiableError, match="start excites nothing") as caught:
+        require_designable(setup, seen)
+    assert "right" in str(caught.value)
+    assert "left" not in str(caught.value)
+
+
+def test_at_rest_nothing_shows_here_and_everything_elsewhere(tmp_path) -> None:
+    seen = look(cart_setup(tmp_path, initial=REST))
+    assert seen.here.basis.shape == (3, 0)
+    assert seen.always.count == 0
+
+
+def test_what_no_control_shows_is_the_same_here_and_always(tmp_path) -> None:
+    setup = cart_setup(tmp_path, parameters=PRODUCT)
+    seen = look(setup)
+    assert (seen.here.count, seen.always.count) == (1, 1)
+    assert seen.basis.shape == (3, 2)
+    require_designable(setup, seen)  # a combination can be designed for
+    J = rows(setup, setup.plant.sensitivity(setup.theta, setup.initial)) * setup.parameters.scale
+    hidden = np.linalg.qr(seen.basis, mode="complete")[0][:, 2]
+    assert np.linalg.norm(J @ hidden) < 1e-6 * np.linalg.norm(J)
+
+
+def test_a_combination_hidden_at_the_start_alone_is_refused_with_a_way_out(tmp_path) -> None:
+    """A slider that coasts shows damping over mass alone; pushed, it shows both."""
+    parameters = {"mass": {"target": "body/left:mass"}, "drag": {"target": "joint/left:damping"}}
+    coasting = {"qvel": (1.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
+    setup = two_setup(tmp_path, parameters=parameters, initial=coasting)
+    seen = look(setup)
+    assert (seen.here.count, seen.here.silent, seen.always.count) == (1, (), 0)
+    (group,) = seen.groups_here
+    assert group.members == ("mass", "drag")
+    # d(drag / mass) = 0 along (mass, drag) = (1, 0.3): what remains is drag - 0.3 mass, or mass - drag / 0.3
+    coefficients = dict(zip(group.combinations[0].members, group.combinations[0].coefficients, strict=True))
+    assert coefficients["mass"] / coefficients["drag"] == pytest.approx(-0.3, rel=1e-5)
+    with pytest.raises(UnidentifiableError, match=r"start excites nothing .* mass and drag only as .* multisine"):
+        require_designable(setup, seen)
+
+
+@pytest.mark.parametrize("sigma", [0.05, 1e-7], ids=["coarse", "fine sensor"])
+def test_a_wanted_parameter_that_a_nuisance_imitates_is_named(sigma: float, tmp_path) -> None:
+    """Where the cart starts and what its position sensor adds are the same to every measurement."""
+    wanted = {"offset": {"target": "output/qpos:slide:bias"}}
+    noise = {"qpos:slide": sigma, "qvel:slide": sigma}
+    setup = cart_setup(tmp_path, parameters=wanted, noise=noise, nuisance={"initial": {"qpos:slide": True}})
+    with pytest.raises(UnidentifiableError, match=r"parameters\.offset changes nothing"):
+        require_designable(setup, look(setup))
+    known = cart_setup(tmp_path, parameters=wanted, noise=noise, nuisance={"initial": {"qpos:slide": 0.1}})
+    require_designable(known, look(known))
+
+
+def test_members_of_an_inertia_may_be_invisible_but_not_all_of_them(tmp_path) -> None:
+    moving = two_setup(tmp_path, parameters={"left": {"inertial": "left"}})
+    seen = look(moving)
+    require_designable(moving, seen)
+    assert seen.basis.shape == (10, 1)  # a slider shows its mass, nothing else
+    assert seen.groups_always[-1].combinations == ()
+    welded = two_setup(tmp_path, parameters={"post": {"inertial": "post"}})
+    with pytest.raises(UnidentifiableError, match="none of the parameters shows"):
+        require_designable(welded, look(welded))
+
+
+def test_several_dead_parameters_are_all_named(tmp_path) -> None:
+    dead = {"y": {"target": "body/bob:pos[1]", "guess": 0.1}, "i": {"target": "body/cart:inertia[0]"}}
+    setup = cart_setup(tmp_path, parameters={**CART_PARAMETERS, **dead})
+    with pytest.raises(UnidentifiableError, match=r"parameters\.y, parameters\.i change nothing .* take them out"):
+        require_designable(setup, look(setup))
+
+
+COLLISION = """
+<mujoco model="collision">
+  <option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/>
+  <worldbody>
+    <geom name="wall" type="plane" size="5 5 0.1" solref="-40000 -100"/>
+    <body name="ball">
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom name="ball" type="sphere" size="0.1" mass="1" solref="-40000 -100"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="z"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_contact_shorter_than_a_sample_period_shows_its_stiffness(tmp_path) -> None:
+    parameters = {"k": {"target": "geom/ball:solref[0]"}, "m": {"target": "body/ball:mass"}}
+    control = {"kind": "sine", "amplitude": 0.1, "frequency": 3.0}
+    initial = {"qpos": (0.9,), "qvel": (-1.0,), "control": control}
+    for horizon in (3.3, 3.7, 5.0):  # wherever the looked-at samples fall
+        setup = make_setup(
+            COLLISION, tmp_path, horizon=horizon, parameters=parameters, noise={"state": 0.01}, initial=initial
+        )
+        assert np.sum(setup.initial.qpos[:, 0] < 0.1) <= 2
+        assert np.abs(setup.plant.sensitivity(setup.theta, setup.initial).G[..., 0]).max() * 40000.0 > 0.1
+        assert look(setup).here.count == 0
+
+
+def controls(setup: Setup) -> list[Array]:
+    """Controls of the random trajectories."""
+    return [probe.ctrl for probe in probes(setup, PROBES)]
+
+
+def test_random_controls_keep_to_the_actuators_and_about_the_initial_one(tmp_path) -> None:
+    control = {"kind": "sine", "amplitude": {"left": 0.8, "right": 3.0}, "offset": {"left": 0.1, "right": 5.0}}
+    setup = two_setup(tmp_path, initial={"control": {**control, "frequency": 2.0}})
+    made = controls(setup)
+    assert len(made) == PROBES
+    left, right = np.array(made).transpose(2, 0, 1)
+    assert np.abs(left).max() == 1.0  # the range is reached, and kept
+    assert np.abs(right.mean(axis=1) - 5.0).max() < 1.5
+    assert (np.ptp(right, axis=1) > 3.0).all()
+    assert len({c.tobytes() for c in made}) == len(made)
+
+
+def test_the_seed_decides_the_random_controls(tmp_path) -> None:
+    same, again, other = (controls(two_setup(tmp_path, descent={"seed": seed})) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(same, again)
+    assert not np.array_equal(same, other)
+
+
+def test_random_controls_that_diverge_are_left_out(tmp_path, monkeypatch) -> None:
+    setup = cart_setup(tmp_path, parameters=PRODUCT)
+    curve, found = setup.initial, setup.plant.sensitivity(setup.theta, setup.initial)
+
+    def diverges(theta: Array, ctrl: Array) -> None:
+        raise SimulationDiverged("too fast")
+
+    monkeypatch.setattr(setup.plant, "simulate", diverges)
+    seen = survey(setup, curve, found)
+    assert (seen.here.count, seen.always.count) == (1, 1)
+
+
+def test_data_must_show_every_parameter_nuisance_and_prior_or_not(tmp_path) -> None:
+    plain = cart_setup(tmp_path)
+    require_visible(plain, rows(plain, plain.plant.sensitivity(plain.theta, plain.initial)))
+    sure = {**PRODUCT, "gear": {**PRODUCT["gear"], "nuisance": True, "prior": 1e-6}}
+    for parameters in (PRODUCT, sure):
+        setup = cart_setup(tmp_path, parameters=parameters)
+        J = rows(setup, setup.plant.sensitivity(setup.theta, setup.initial))
+        with pytest.raises(UnidentifiableError, match="gear and gain only as gear"):
+            require_visible(setup, J)
+
+
+def test_the_design_refuses_before_it_spends_anything(tmp_path) -> None:
+    setup = two_setup(tmp_path)
+    told: list[object] = []
+    with pytest.raises(UnidentifiableError, match="start excites nothing"):
+        design(setup, monitor=told.append)
+    assert told == []
+    start = np.stack([np.sin(5.0 * setup.t), np.cos(4.0 * setup.t)], axis=1)
+    result = design(two_setup(tmp_path, descent={"max_iterations": 1}), start=start)
+    assert np.isfinite(result.final.std).all()

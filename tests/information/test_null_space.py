@@ -1,0 +1,241 @@
+"""Invisible directions of synthetic sensitivities and of a double pendulum whose base parameters are known in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.numerics import Array, make_setup
+
+from mjfim.excitation.evaluation import evaluate_trajectory
+from mjfim.experiment.system import Setup
+from mjfim.information.identifiability import survey
+from mjfim.information.null_space import Null, grouped, invisible
+
+SIZES = np.array([1e-6, 1e-3, 1.0, 1e3, 1e6])
+
+
+def rows(null: Array, seed: int = 0, n: int = 60) -> Array:
+    """Random (n, p) whose null space, with parameters in units of their sizes, is spanned by the columns of null: (p, k)."""
+    p, k = null.shape
+    seen = np.linalg.qr(null, mode="complete")[0][:, k:]
+    return np.random.default_rng(seed).normal(size=(n, p - k)) @ seen.T
+
+
+def look(J: Array, error: Array | None = None, size: Array = SIZES, **changes) -> Null:
+    """Invisible directions of rows whose parameters have these sizes and nothing known before."""
+    p = len(size)
+    given = {"scale": size, "interest": np.arange(p), "prior": np.zeros((p, p)), **changes}
+    return invisible(J, error, size, **given)
+
+
+def same_span(found: Array, expected: Array) -> bool:
+    """Two matrices span one space."""
+    a, b = np.linalg.qr(found)[0], np.linalg.qr(expected)[0]
+    return a.shape == b.shape and np.linalg.svd(a.T @ b)[1].min() > 1.0 - 1e-9
+
+
+NULLS = {
+    "one pair": np.array([[1.0, 0.0, 0.0, 0.0, -1.0]]).T,
+    "one of all": np.array([[1.0, -2.0, 0.5, 3.0, -1.0]]).T,
+    "two": np.array([[1.0, -1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0, -1.0]]).T,
+    "three that share members": np.random.default_rng(1).normal(size=(5, 3)),
+}
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-11], ids=["exact", "round-off"])
+@pytest.mark.parametrize("case", NULLS)
+def test_a_known_null_space_is_found_whatever_the_parameters_sizes(case: str, noise: float) -> None:
+    null = NULLS[case]
+    J = rows(null) / SIZES
+    rng = np.random.default_rng(2)
+    error = noise * rng.normal(size=J.shape) / SIZES
+    found = look(J + error, 4.0 * error)
+    assert found.count == null.shape[1]
+    assert same_span(found.directions / SIZES[:, None], null)
+    assert found.basis.shape == (5, 5 - found.count)
+    np.testing.assert_allclose(found.basis.T @ found.basis, np.eye(5 - found.count), atol=1e-12)
+    np.testing.assert_allclose(found.basis.T @ null, 0.0, atol=1e-8)  # the scales here are the sizes
+    assert np.linalg.matrix_rank(J * SIZES @ found.basis, tol=1e-6) == 5 - found.count
+
+
+def test_the_basis_is_in_scaled_units_whatever_the_scale() -> None:
+    null, scale = NULLS["one of all"], np.array([2.0, 1e-5, 3.0, 7.0, 1e3])
+    found = look(rows(null) / SIZES, scale=scale)
+    np.testing.assert_allclose(
+        found.basis.T @ (null[:, 0] * SIZES / scale / np.abs(SIZES / scale).max()), 0.0, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("weak", [1e-3, 1e-5])
+def test_a_weak_but_visible_parameter_is_not_called_invisible(weak: float) -> None:
+    J = np.random.default_rng(3).normal(size=(60, 5)) * [1.0, 1e3, 1.0, weak, 1.0] / SIZES
+    rng = np.random.default_rng(4)
+    # the differences of a strong parameter are in error by more than the weak one does at all
+    error = rng.normal(size=J.shape) * np.abs(J).max(axis=0) * 1e-9
+    found = look(J + error, error)
+    assert found.count == 0
+    assert found.smallest > 0.5
+
+
+def test_nearly_alike_columns_are_visible_down_to_the_error_of_the_differences() -> None:
+    rng = np.random.default_rng(5)
+    J = rng.normal(size=(60, 2))
+    J[:, 1] = J[:, 0] + 1e-6 * J[:, 1]
+    exact, vague = (look(J, e * rng.normal(size=J.shape), np.ones(2)) for e in (1e-12, 1e-6))
+    assert (exact.count, vague.count) == (0, 1)
+    assert exact.smallest < 1e-5
+    np.testing.assert_allclose(vague.directions[0], -vague.directions[1], rtol=1e-4)
+
+
+@pytest.mark.parametrize("alive", [0, 1, 4])
+def test_parameters_that_change_nothing_are_silent(alive: int) -> None:
+    J = np.zeros((60, 5))
+    J[:, :alive] = np.random.default_rng(6).normal(size=(60, alive)) / SIZES[:alive]
+    found = look(J)
+    assert found.silent == tuple(range(alive, 5))
+    assert found.count == 5 - alive
+    assert found.basis.shape == (5, alive)
+    assert np.abs(found.basis[alive:]).max(initial=0.0) < 1e-12
+    assert (found.smallest > 0.5) == (alive > 0)
+
+
+def test_round_off_beside_strong_parameters_is_silent_and_a_clean_faint_effect_is_not() -> None:
+    rng = np.random.default_rng(7)
+    J = np.column_stack([1e5 * rng.normal(size=60), 1e-4 * rng.normal(size=60)])
+    assert look(J, np.column_stack([np.zeros(60), J[:, 1]]), np.ones(2)).silent == (1,)  # it changes with the step
+    assert look(J, np.column_stack([np.zeros(60), 1e-3 * J[:, 1]]), np.ones(2)).silent == ()
+
+
+def test_a_nuisance_hides_what_it_imitates_unless_it_is_known() -> None:
+    J = rows(NULLS["one pair"]) / SIZES
+    kept = {"interest": np.array([0, 1, 2, 3])}
+    hidden = look(J, **kept)
+    assert hidden.silent == (0,)
+    assert hidden.basis.shape == (4, 3)
+    known = look(J, **kept, prior=np.diag([0.0, 0.0, 0.0, 0.0, 1e-10]))
+    assert known.count == 0
+
+
+@pytest.mark.parametrize("strength", [1.0, 1e5], ids=["weak", "strong"])
+def test_a_lone_wanted_parameter_that_a_nuisance_imitates_to_round_off_is_hidden(strength: float) -> None:
+    rng = np.random.default_rng(8)
+    wanted = strength * rng.normal(size=60)
+    J = np.column_stack([wanted, -3.0 * wanted + 1e-11 * strength * rng.normal(size=60)])
+    error = 1e-11 * strength * rng.normal(size=J.shape)
+    for known in (None, error):
+        assert look(J, known, np.ones(2), interest=np.array([0])).silent == (0,)
+    J[:, 1] += 1e-3 * strength * rng.normal(size=60)
+    seen = look(J, error, np.ones(2), interest=np.array([0]))
+    assert seen.count == 0
+    assert seen.smallest < 1e-3  # little is left of it: a doubt that deserves a second look
+
+
+def test_a_direction_known_to_be_invisible_stays_so_however_large_the_round_off() -> None:
+    rng = np.random.default_rng(10)
+    chaotic = rng.normal(size=(60, 5)) / SIZES  # everything seems to show
+    direction = NULLS["one of all"] * SIZES[:, None]
+    found = look(chaotic, known=direction)
+    assert found.count == 1
+    assert same_span(found.directions / SIZES[:, None], NULLS["one of all"])
+    assert found.silent == ()
+    single = look(chaotic, known=np.eye(5)[:, [1]])
+    assert single.silent == (1,)
+    # what the rows do not show is added to what is known
+    both = look(rows(NULLS["two"][:, :1]) / SIZES, known=NULLS["two"][:, 1:] * SIZES[:, None])
+    assert same_span(both.directions / SIZES[:, None], NULLS["two"])
+    again = look(rows(NULLS["two"]) / SIZES, known=NULLS["two"][:, 1:] * SIZES[:, None])
+    assert again.count == 2
+
+
+def words(null: Array, units: tuple[str, ...] = ("",) * 5, size: Array = SIZES) -> list[str]:
+    """Groups of parameters a to e in words."""
+    return [str(g) for g in grouped(look(rows(null) / size, size=size), "abcde", size, units)]
+
+
+def test_groups_name_their_members_and_what_remains_of_them() -> None:
+    said = words(NULLS["two"], size=np.ones(5))
+    assert len(said) == 2
+    assert said[0] == "a and b only as a + b"
+    assert said[1].startswith("c, d and e only as ")
+
+
+@pytest.mark.parametrize("case", NULLS)
+def test_what_remains_in_words_is_blind_to_every_invisible_direction(case: str) -> None:
+    found = look(rows(NULLS[case]) / SIZES)
+    groups = grouped(found, "abcde", SIZES, [""] * 5)
+    assert sum(len(g.members) - len(g.combinations) for g in groups) == found.count
+    for group in groups:
+        for combination in group.combinations:
+            assert set(combination.members) <= set(group.members)
+            assert combination.coefficients[0] == 1.0
+            at = ["abcde".index(name) for name in combination.members]
+            terms = np.array(combination.coefficients)[:, None] * found.directions[at]
+            np.testing.assert_allclose(terms.sum(axis=0), 0.0, atol=1e-7 * np.abs(terms).max())
+
+
+def test_nothing_invisible_gives_no_groups_and_silent_ones_are_said_once() -> None:
+    assert grouped(look(np.random.default_rng(9).normal(size=(60, 5)) / SIZES), "abcde", SIZES, [""] * 5) == ()
+    J = np.random.default_rng(9).normal(size=(60, 5)) / SIZES
+    J[:, [1, 3]] = 0.0
+    (group,) = grouped(look(J), "abcde", SIZES, [""] * 5)
+    assert str(group) == "b and d: no effect on anything that is measured"
+
+
+LENGTH = 0.7
+DOUBLE = """
+<mujoco model="double">
+  <option timestep="0.01" integrator="RK4"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="a">
+      <joint name="ja" type="hinge" axis="0 1 0" damping="0.1"/>
+      <inertial pos="0.05 0.02 0.3" mass="1.5" fullinertia="0.05 0.06 0.02 0.001 0.002 -0.001"/>
+      <body name="b" pos="0 0 0.7">
+        <joint name="jb" type="hinge" axis="0 1 0" damping="0.1"/>
+        <inertial pos="-0.03 0.01 0.25" mass="0.8" fullinertia="0.02 0.025 0.01 0.0005 -0.001 0.001"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="ta" joint="ja"/><motor name="tb" joint="jb"/></actuator>
+</mujoco>
+"""
+
+
+def double_pendulum(folder: Path, coordinates: str) -> Setup:
+    """Both inertias unknown, both joints driven and measured."""
+    parameters = {name: {"inertial": name, "coordinates": coordinates} for name in "ab"}
+    control = {"kind": "multisine", "amplitude": 2.0, "frequency": 1.0}
+    initial = {"qpos": (0.4, 0.5), "control": control}
+    return make_setup(DOUBLE, folder, parameters=parameters, noise={"state": 1e-3}, initial=initial, horizon=1.0)
+
+
+def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
+    setup = double_pendulum(tmp_path, "barycentric")
+    seen = survey(setup, setup.initial, setup.plant.sensitivity(setup.theta, setup.initial))
+    assert (seen.here.count, seen.always.count) == (14, 14)
+    assert seen.basis.shape == (20, 6)
+    lumped, silent = seen.groups_always
+    # first moment m1 r1 + l m2 and inertia J1 + l^2 m2 about the first hinge, each a textbook base parameter
+    assert lumped.members == ("a.mz", "a.Jyy", "b.mass")
+    (first, inertia) = lumped.combinations
+    assert first.members == ("a.mz", "b.mass")
+    assert first.coefficients == pytest.approx((1.0, LENGTH), rel=1e-5)
+    assert inertia.members == ("a.Jyy", "b.mass")
+    assert inertia.coefficients == pytest.approx((1.0, LENGTH**2), rel=1e-5)
+    visible = {"a.mx", "b.mx", "b.mz", "b.Jyy"}
+    assert set(silent.members) == set(seen.names) - visible - set(lumped.members)
+    assert silent.combinations == ()
+
+
+def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_motion(tmp_path) -> None:
+    setup = double_pendulum(tmp_path, "logcholesky")
+    seen = survey(setup, setup.initial, setup.plant.sensitivity(setup.theta, setup.initial))
+    assert seen.basis.shape == (20, 6)
+    # a step along an invisible direction moves nothing measured, to second order
+    for n in (seen.always.directions / np.linalg.norm(seen.always.directions, axis=0)).T:
+        y, _ = setup.plant.measure(setup.theta + np.outer([0.0, 1e-4, -1e-4], n), setup.control)
+        assert np.abs(y[1] - y[2]).max() < 1e-8
+    evaluation = evaluate_trajectory(setup, setup.initial)
+    assert len(evaluation.eigenvalues) == 6
+    assert evaluation.eigenvalues[0] > 0.0

@@ -1,0 +1,474 @@
+"""Clearance: which geoms count, distances against MuJoCo and by hand, slopes against differences, nothing near is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations_with_replacement
+
+import mujoco
+import numpy as np
+import pytest
+from support.numerics import Array, directional_check
+
+from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.model import geom_distance as clearance
+from mjfim.model.geom_distance import Clearance, Distances, pairs
+
+ROCK = " ".join(f"{v:.3f}" for v in np.random.default_rng(5).normal(scale=0.1, size=60))
+ASSETS = f'<asset><mesh name="rock" vertex="{ROCK}"/><hfield name="hills" nrow="3" ncol="3" size="1 1 .2 .1"/></asset>'
+KINDS = {
+    "sphere": 'type="sphere" size="0.1"',
+    "capsule": 'type="capsule" size="0.05 0.2"',
+    "ellipsoid": 'type="ellipsoid" size="0.05 0.1 0.2"',
+    "cylinder": 'type="cylinder" size="0.1 0.15"',
+    "box": 'type="box" size="0.1 0.05 0.2"',
+    "mesh": 'type="mesh" mesh="rock"',
+}
+FLOOR = '<geom name="floor" type="plane" size="1 1 0.1" pos="0.1 0 -0.1" euler="20 -10 0"/>'
+
+# Two arms over a tilted floor, by all kinds of joints and of geoms; some bodies have two geoms.
+ARMS = f"""
+<mujoco>
+  {ASSETS}
+  <worldbody>
+    {FLOOR}
+    <body name="left" pos="0 0 0.3"><joint type="hinge" axis="0 1 0"/><geom {KINDS["capsule"]}/>
+      <body name="elbow" pos="0 0 0.4"><joint type="ball"/><geom {KINDS["box"]}/>
+        <body name="wrist" pos="0.1 0 0.3"><joint type="hinge" axis="1 0 0"/><geom {KINDS["cylinder"]}/>
+          <geom {KINDS["sphere"]} pos="0 0 0.2"/></body></body></body>
+    <body name="right" pos="0.5 0 0.3"><joint type="slide" axis="1 0 1"/><geom {KINDS["ellipsoid"]}/>
+      <body name="hand" pos="0 0 0.4"><joint type="ball"/><geom {KINDS["capsule"]}/></body></body>
+    <body name="stone" pos="0.2 0.2 0.8"><freejoint/><geom {KINDS["mesh"]}/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def two(first: str, second: str) -> mujoco.MjModel:
+    """Two geoms, a and b: a on a hinge and a ball joint, b free."""
+    return mujoco.MjModel.from_xml_string(
+        f"""
+        <mujoco>{ASSETS}<worldbody>
+          <body name="up" pos="0 0 0.5"><joint type="hinge" axis="1 1 0"/><geom size="0.01" contype="0" conaffinity="0"/>
+            <body name="A" pos="0.1 0 0.1"><joint type="ball"/><geom name="a" {first} pos="0.05 0 0.1"/></body></body>
+          <body name="B" pos="0.1 0 0.6"><freejoint/><geom name="b" {second} pos="0 0.02 0"/></body>
+        </worldbody></mujoco>
+        """
+    )
+
+
+def on_floor(kind: str) -> mujoco.MjModel:
+    """One free geom over a tilted floor. Contacts are found within 10 m."""
+    body = f'<body name="B"><freejoint/><geom name="b" {kind} margin="10"/></body>'
+    return mujoco.MjModel.from_xml_string(f"<mujoco>{ASSETS}<worldbody>{FLOOR}{body}</worldbody></mujoco>")
+
+
+def moved(model: mujoco.MjModel, qpos: Array, dq: Array) -> Array:
+    """Qpos along a tangent vector."""
+    out = qpos.copy()
+    mujoco.mj_integratePos(model, out, np.ascontiguousarray(dq), 1.0)
+    return out
+
+
+def scattered(model: mujoco.MjModel, count: int, spread: float, seed: int = 0) -> Array:
+    """Random configurations about qpos0: (count, nq)."""
+    rng = np.random.default_rng(seed)
+    size = np.full(model.nv, 2.0)
+    for j in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
+        size[model.jnt_dofadr[j] : model.jnt_dofadr[j] + 3] = spread
+    size[model.dof_jntid[np.isin(model.jnt_type[model.dof_jntid], int(mujoco.mjtJoint.mjJNT_SLIDE))]] = spread
+    return np.array([moved(model, model.qpos0, size * rng.normal(size=model.nv)) for _ in range(count)])
+
+
+def asked(model: mujoco.MjModel, chosen: Clearance, qpos: Array, limit: float) -> Array:
+    """Distances by `mj_geomDistance` for every pair at every configuration, nothing left out: (n, p)."""
+    data, out = mujoco.MjData(model), np.empty((len(qpos), len(chosen.pairs)))
+    for k, now in enumerate(qpos):
+        data.qpos[:] = now
+        mujoco.mj_kinematics(model, data)
+        out[k] = [mujoco.mj_geomDistance(model, data, p.first, p.second, limit, None) for p in chosen.pairs]
+    return out
+
+
+def between(model: mujoco.MjModel, reach: float, grouped: bool = False) -> Clearance:
+    """Clearance of all pairs of a model."""
+    return Clearance(model, pairs(model, ()), reach, grouped)
+
+
+def slope_errors(model: mujoco.MjModel, measured: Callable[[Array], Distances], qpos: Array, h: float = 2e-4) -> Array:
+    """Largest error of slopes of the first column against differences along every dof, of each configuration: (n,)."""
+    slope = measured(qpos).slope
+    assert slope is not None
+    worst = []
+    for now, claimed in zip(qpos, slope[:, 0], strict=True):
+        curves = [
+            lambda t, now=now, e=e: float(measured(moved(model, now, t * e)[None]).d[0, 0]) for e in np.eye(model.nv)
+        ]
+        worst.append(directional_check(claimed, curves, h))
+    return np.array(worst)
+
+
+# Everything overlaps, so that MuJoCo's contacts show which pairs it selects.
+CROWD = """
+<mujoco>
+  <option><flag {flag}/></option>
+  <default><geom type="sphere" size="5"/></default>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body name="base"><geom name="base"/><geom name="seen" contype="0" conaffinity="0"/>
+      <body name="one" pos="0 0 0.1"><joint axis="1 0 0"/><geom name="one"/><geom name="one_seen" contype="0" conaffinity="0"/>
+        <body name="plate" pos="0 0 0.1"><geom name="plate"/>
+          <body name="two" pos="0 0 0.1"><joint axis="0 1 0"/><geom name="two"/>
+            <body name="three" pos="0 0 0.1"><joint/><geom name="three" contype="2" conaffinity="1"/>
+              <body name="tip" pos="0 0 0.1"><joint/><geom name="tip" contype="4" conaffinity="2"/></body>
+            </body></body></body></body></body>
+    <body name="ball" pos="0 0.1 0"><freejoint/><geom name="ball"/><geom name="ball_two"/></body>
+    <body name="cart" pos="0 0.2 0"><joint type="slide"/><geom name="cart" contype="0" conaffinity="1"/></body>
+  </worldbody>
+  <contact>
+    <exclude body1="two" body2="ball"/><exclude body1="cart" body2="ball"/>
+    <pair geom1="cart" geom2="ball_two"/><pair geom1="tip" geom2="three"/><pair geom1="one_seen" geom2="cart"/>
+  </contact>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("flag", ['filterparent="enable"', 'filterparent="disable"'])
+def test_pairs_are_those_that_mujoco_lets_collide(flag: str) -> None:
+    """Welded bodies, parents and children, excluded bodies, collision bits, explicit pairs, the world's exception."""
+    model = mujoco.MjModel.from_xml_string(CROWD.format(flag=flag))
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    contacts = {frozenset(map(int, geoms)) for geoms in data.contact.geom}
+    found = pairs(model, ())
+    assert {frozenset((p.first, p.second)) for p in found} == contacts
+    assert len(found) == len(contacts)
+    names = {p.name for p in found}
+    assert {"one - base", "one - floor", "three - tip", "ball_two - cart"} <= names
+    assert {n for n in names if "seen" in n} == {"one_seen - cart"}  # by its explicit pair
+    assert ("plate - two" in names) == ("disable" in flag)
+
+
+def test_pairs_are_found_where_contacts_are_off() -> None:
+    """The flag says what is simulated, not what may touch."""
+    off, on = (mujoco.MjModel.from_xml_string(CROWD.format(flag=f'contact="{x}"')) for x in ("disable", "enable"))
+    assert pairs(off, ()) == pairs(on, ())
+
+
+def test_what_no_joint_moves_has_no_pairs_with_itself() -> None:
+    """Mocap bodies and the world stay where they are."""
+    model = mujoco.MjModel.from_xml_string(
+        """
+        <mujoco><worldbody><geom name="wall" size="1"/>
+          <body name="m" mocap="true"><geom size="1"/></body>
+          <body name="r"><freejoint/><geom name="r" size="1"/></body>
+        </worldbody></mujoco>
+        """
+    )
+    assert [p.name for p in pairs(model, ())] == ["r - wall", "r - m geom 1"]
+
+
+def test_ignored_bodies_are_left_out() -> None:
+    """All geoms of both, whichever comes first; the world has its name."""
+    model = mujoco.MjModel.from_xml_string(ARMS)
+    every = {p.name for p in pairs(model, ())}
+    left = {p.name for p in pairs(model, {frozenset(("world", "wrist")), frozenset(("wrist", "hand"))})}
+    assert every - left == {
+        "wrist geom 3 - floor",
+        "wrist geom 4 - floor",
+        "wrist geom 3 - hand geom 6",
+        "wrist geom 4 - hand geom 6",
+    }
+    assert left < every
+
+
+@pytest.mark.parametrize(
+    ("ignored", "message"),
+    [
+        (
+            ("wirst", "hand"),
+            r"unknown body 'wirst' \(did you mean 'wrist'\?\); valid: elbow, hand, left, right, stone, w",
+        ),
+        (("hand",), r"\['hand'\] is no pair of bodies; needs two different names"),
+    ],
+)
+def test_misuse_of_ignored(ignored: tuple[str, ...], message: str) -> None:
+    """Fault and what would be right."""
+    with pytest.raises(ExperimentError, match=message):
+        pairs(mujoco.MjModel.from_xml_string(ARMS), {frozenset(ignored)})
+
+
+def test_height_fields_are_refused_unless_ignored() -> None:
+    """MuJoCo's distances to them depend on how far one asks."""
+    model = mujoco.MjModel.from_xml_string(
+        f"""
+        <mujoco>{ASSETS}<worldbody><geom name="hills" type="hfield" hfield="hills"/>
+          <body name="b"><freejoint/><geom name="b" size="0.1"/></body></worldbody></mujoco>
+        """
+    )
+    with pytest.raises(ExperimentError, match=r"hills is a height field, .* ignore the bodies 'b' and 'world', or use"):
+        pairs(model, ())
+    assert pairs(model, {frozenset(("b", "world"))}) == ()
+
+
+def test_misuse_of_clearance() -> None:
+    """Nothing to keep apart is no clearance."""
+    model = mujoco.MjModel.from_xml_string(ARMS)
+    with pytest.raises(ExperimentError, match="no two geoms can come near each other"):
+        Clearance(model, (), 0.1)
+    with pytest.raises(ExperimentError, match="reach 0 m; needs a positive, finite distance"):
+        between(model, 0.0)
+    with pytest.raises(ExperimentError, match="reach inf m"):
+        between(model, np.inf)
+
+
+@pytest.mark.parametrize("reach", [0.02, 0.1, 0.5, 5.0])
+def test_nothing_within_reach_is_lost(reach: float) -> None:
+    """Against `mj_geomDistance` for every pair at random configurations; the rest is reach itself."""
+    model = mujoco.MjModel.from_xml_string(ARMS)
+    chosen, qpos = between(model, reach), scattered(model, 200, 0.4)
+    model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-10, 200
+    d, expected = chosen(qpos, False).d, asked(model, chosen, qpos, reach)
+    shapes = [{int(model.geom_type[g]) for g in (p.first, p.second)} for p in chosen.pairs]
+    trusted = (d > -0.05) | np.array([s != {clearance.CAPSULE, clearance.BOX} for s in shapes])  # see below
+    assert trusted.mean() > 0.99
+    np.testing.assert_allclose(d[trusted], expected[trusted], rtol=0, atol=1e-8)
+    assert (d[expected == reach] == reach).all()
+    assert d.max() <= reach
+    assert (d < 0.0).any() and ((d > 0.0) & (d < reach)).any() and (reach > 1.0 or (d == reach).any())
+
+
+def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many configurations are cut into pieces; none at all have empty arrays."""
+    model = mujoco.MjModel.from_xml_string(ARMS)
+    chosen, qpos = between(model, 0.3), scattered(model, 11, 0.4)
+    whole = chosen(qpos, True)
+    monkeypatch.setattr(clearance, "BLOCK", 3 * len(chosen.pairs))
+    cut, none = chosen(qpos, True), chosen(qpos[:0], True)
+    np.testing.assert_array_equal(cut.d, whole.d)
+    np.testing.assert_array_equal(cut.slope, whole.slope)
+    assert none.d.shape == (0, len(chosen.columns)) and none.slope.shape == (0, len(chosen.columns), model.nv)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "place", "expected"),
+    [
+        ("sphere", "sphere", (0.3, 0.4, 0.0), 0.5 - 0.2),
+        ("sphere", "sphere", (0.09, 0.12, 0.0), 0.15 - 0.2),
+        ("sphere", "capsule", (0.0, 0.3, 0.15), 0.3 - 0.15),
+        ("sphere", "capsule", (0.3, 0.0, 0.6), 0.5 - 0.15),
+        ("capsule", "capsule", (0.12, 0.0, 0.35), 0.12 - 0.1),
+        ("capsule", "capsule", (0.3, 0.0, 0.8), 0.5 - 0.1),
+        ("sphere", "box", (0.2, 0.0, 0.1), 0.1 - 0.1),
+        ("box", "box", (0.0, 0.35, 0.1), 0.25),
+        ("cylinder", "sphere", (0.5, 0.0, 0.55), 0.4 * 2**0.5 - 0.1),
+        ("ellipsoid", "ellipsoid", (0.0, 0.0, 0.45), 0.05),
+        ("capsule", "box", (0.0, 0.12, 0.0), 0.12 - 0.05 - 0.05),
+        ("capsule", "box", (0.0, 0.02, 0.0), -0.05 - 0.05 + 0.02),
+    ],
+)
+def test_distances_by_hand(first: str, second: str, place: tuple[float, float, float], expected: float) -> None:
+    """Upright geoms at a displacement, both ways round."""
+    for a, b, shift in ((first, second, np.array(place)), (second, first, -np.array(place))):
+        model = mujoco.MjModel.from_xml_string(
+            f"""
+            <mujoco>{ASSETS}<worldbody><body><freejoint/><geom {KINDS[a]}/></body>
+            <body><freejoint/><geom {KINDS[b]}/></body></worldbody></mujoco>
+            """
+        )
+        qpos = model.qpos0.copy()
+        qpos[7:10] += shift
+        assert between(model, 2.0)(qpos[None], False).d[0, 0] == pytest.approx(expected, abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_planes_agree_with_contacts(kind: str) -> None:
+    """The deepest of the contacts that MuJoCo's collision detection makes with a margin of ten metres."""
+    model = on_floor(KINDS[kind])
+    chosen, qpos, data = between(model, 9.0), scattered(model, 200, 1.0), mujoco.MjData(model)
+    d, deepest = chosen(qpos, False).d[:, 0], []
+    for now in qpos:
+        data.qpos[:] = now
+        mujoco.mj_fwdPosition(model, data)
+        deepest.append(data.contact.dist.min())
+    assert d.min() < -0.3 and d.max() > 0.3
+    np.testing.assert_allclose(d, deepest, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("eighths", range(8))
+def test_a_box_may_stand_on_its_edge(eighths: int) -> None:
+    """`mj_geomDistance` misses the lowest corners of a cube that is turned by 225 degrees."""
+    model = mujoco.MjModel.from_xml_string(
+        """
+        <mujoco><worldbody><geom type="plane" size="1 1 1"/>
+          <body pos="0 0 0.3"><joint axis="1 0 0"/><geom type="box" size="0.1 0.1 0.1"/></body></worldbody></mujoco>
+        """
+    )
+    found = between(model, 1.0)(np.array([[eighths * np.pi / 4]]), False).d[0, 0]
+    assert found == pytest.approx(0.3 - 0.1 * (2**0.5 if eighths % 2 else 1.0), abs=1e-12)
+
+
+def test_a_capsule_deep_in_a_box_is_in_it() -> None:
+    """Against the same box as a mesh, through which MuJoCo sees capsules in another way."""
+    corners = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.05, 0.05) for z in (-0.2, 0.2))
+    model = mujoco.MjModel.from_xml_string(
+        f"""
+        <mujoco><asset><mesh name="box" vertex="{corners}"/></asset><worldbody>
+          <body><freejoint/><geom {KINDS["capsule"]}/></body>
+          <body><freejoint/><geom {KINDS["box"]}/><geom type="mesh" mesh="box" mass="0"/></body></worldbody></mujoco>
+        """
+    )
+    chosen, qpos = between(model, 1.0), scattered(model, 500, 0.06)
+    d = chosen(qpos, False).d
+    assert (d[:, 0] < -0.06).mean() > 0.5
+    np.testing.assert_allclose(d[:, 0], d[:, 1], rtol=0, atol=2e-8)
+    worst = asked(model, chosen, qpos, 1.0)[:, 0] - d[:, 0]
+    assert worst.max() > 0.05  # what is avoided
+
+
+SMOOTH = [(a, b) for a, b in combinations_with_replacement(KINDS, 2)]
+
+
+@pytest.mark.parametrize(("first", "second"), SMOOTH)
+def test_slopes_agree_with_differences(first: str, second: str) -> None:
+    """By hinge, ball and free joints, near and far."""
+    model = two(KINDS[first], KINDS[second])
+    chosen, qpos = between(model, 2.0), scattered(model, 16, 0.4)
+    qpos = qpos[chosen(qpos, False).d[:, 0] > 0.02]
+    assert len(qpos) > 5
+    errors = slope_errors(model, lambda q: chosen(q, True), qpos)
+    assert np.quantile(errors, 0.75) < 1e-6
+    assert errors.max() < 1e-4  # the surface bends where another edge or face becomes the nearest
+
+
+def test_the_check_of_slopes_can_fail() -> None:
+    """A slope with the wrong sign, one of another configuration and one with a dof left out."""
+    model = two(KINDS["capsule"], KINDS["box"])
+    chosen, qpos = between(model, 2.0), scattered(model, 2, 0.4)
+
+    def wrong(change: Callable[[Array], Array]) -> float:
+        return slope_errors(model, lambda q: Distances(chosen(q, True).d, change(chosen(q, True).slope)), qpos).min()
+
+    assert wrong(lambda s: s) < 1e-6
+    assert wrong(lambda s: -s) > 1.0
+    assert wrong(lambda s: s[::-1]) > 0.1
+    assert wrong(lambda s: s * (np.arange(model.nv) != 4)) > 1e-3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_slopes_to_the_floor_agree_with_differences(kind: str) -> None:
+    """Above and below a tilted plane."""
+    model = on_floor(KINDS[kind])
+    chosen, qpos = between(model, 9.0), scattered(model, 8, 1.0)
+    d = chosen(qpos, False).d
+    assert d.min() < -0.1 and d.max() > 0.1
+    assert slope_errors(model, lambda q: chosen(q, True), qpos).max() < 1e-6
+
+
+# Depths of boxes and meshes have many edges, at which no slope is the right one.
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [("sphere", k) for k in KINDS] + [("capsule", k) for k in KINDS] + [("cylinder", "cylinder"), ("ellipsoid", "box")],
+)
+def test_slopes_in_penetration_agree_with_differences(first: str, second: str) -> None:
+    """Distances are negative, slopes point out all the same; curved surfaces are found to fewer digits inside."""
+    model = two(KINDS[first], KINDS[second])
+    chosen, qpos = between(model, 2.0), scattered(model, 60, 0.1, seed=3)
+    d = chosen(qpos, False).d[:, 0]
+    qpos = qpos[(d < -0.01) & (d > -0.04)][:6]
+    assert len(qpos) > 2
+    assert slope_errors(model, lambda q: chosen(q, True), qpos).max() < 1e-4
+
+
+@pytest.mark.parametrize("offset", [1e-6, 1e-10, 0.0, -1e-10, -1e-6])
+@pytest.mark.parametrize("second", ["sphere", "capsule", "ellipsoid", "cylinder"])
+def test_slopes_are_there_where_geoms_touch(second: str, offset: float) -> None:
+    """A sphere is brought to an offset along the slope of the distance; nearest points no longer tell the normal."""
+    model = two(KINDS["sphere"], KINDS[second])
+    chosen, qpos = between(model, 2.0), scattered(model, 1, 0.4)[0]
+    start = model.joint(2).qposadr[0]
+    for _ in range(40):
+        found = chosen(qpos[None], True)
+        out = found.slope[0, 0, -6:-3]
+        assert np.linalg.norm(out) == pytest.approx(1.0, abs=1e-9)
+        qpos[start : start + 3] -= (found.d[0, 0] - offset) * out
+    assert chosen(qpos[None], False).d[0, 0] == pytest.approx(offset, abs=2e-11)
+    assert slope_errors(model, lambda q: chosen(q, True), qpos[None]).max() < 2e-4
+
+
+def test_slopes_are_zero_beyond_reach() -> None:
+    """Where d is reach, and there only; without slopes there are none."""
+    model = mujoco.MjModel.from_xml_string(ARMS)
+    chosen, qpos = between(model, 0.2, grouped=True), scattered(model, 100, 0.4)
+    found = chosen(qpos, True)
+    assert ((found.slope != 0.0).any(axis=2) == (found.d < 0.2)).all()
+    assert found.slope.shape == (100, len(chosen.columns), model.nv)
+    plain = chosen(qpos, False)
+    np.testing.assert_array_equal(plain.d, found.d)
+    assert plain.slope is None
+
+
+def test_columns_are_pairs_of_bodies() -> None:
+    """Their smallest distance, with the slope that belongs to it."""
+    model = mujoco.MjModel.from_xml_string(ARMS)
+    chosen, single = between(model, 0.5, grouped=True), between(model, 0.5)
+    qpos = scattered(model, 50, 0.4)
+    bodies, geoms = chosen(qpos, True), single(qpos, True)
+    names = [" - ".join(model.body(model.geom_bodyid[g]).name for g in (p.first, p.second)) for p in single.pairs]
+    assert set(names) == set(chosen.columns) and len(set(chosen.columns)) == len(chosen.columns) < len(names)
+    assert single.columns == tuple(p.name for p in single.pairs)
+    for i, column in enumerate(chosen.columns):
+        own = [j for j, name in enumerate(names) if name == column]
+        least = geoms.d[:, own].argmin(axis=1)
+        np.testing.assert_array_equal(bodies.d[:, i], geoms.d[:, own].min(axis=1))
+        np.testing.assert_array_equal(bodies.slope[:, i], geoms.slope[np.arange(50), np.array(own)[least]])
+
+
+@pytest.mark.parametrize("spread", [0.4, 4.0])
+def test_nearest_is_the_smallest_of_all(spread: float) -> None:
+    """Near and farther than reach, its row and geoms with it."""
+    model = mujoco.MjModel.from_xml_string(ARMS)
+    stone = [p for p in pairs(model, ()) if "stone" in p.name and "floor" not in p.name]
+    chosen, qpos = Clearance(model, stone, 0.01), scattered(model, 40, spread)
+    if spread > 1.0:
+        qpos = qpos[(chosen(qpos, False).d == 0.01).all(axis=1)]
+    model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-10, 200
+    every = asked(model, chosen, qpos, 100.0)
+    row, column = np.unravel_index(every.argmin(), every.shape)
+    distance, where, pair = chosen.nearest(qpos)
+    assert distance == pytest.approx(every.min(), abs=1e-8)
+    assert (where, pair) == (row, chosen.pairs[column])
+    assert (distance > 0.01) == (spread > 1.0)
+
+
+def test_nearest_may_be_the_floor() -> None:
+    """Planes need no call of MuJoCo."""
+    model = on_floor(KINDS["cylinder"])
+    chosen, qpos = between(model, 0.1), scattered(model, 20, 1.0)
+    d = between(model, 50.0)(qpos, False).d[:, 0]
+    assert chosen.nearest(qpos) == (d.min(), d.argmin(), chosen.pairs[0])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_diverged_configurations_are_not_called_clear(value: float) -> None:
+    """Their distances are NaN; the smallest of them is none."""
+    model = mujoco.MjModel.from_xml_string(ARMS)
+    chosen, qpos = between(model, 0.5, grouped=True), scattered(model, 5, 0.4)
+    qpos[3, 1] = value
+    found = chosen(qpos, True)
+    assert np.isnan(found.d[3]).all() and np.isfinite(np.delete(found.d, 3, axis=0)).all()
+    with pytest.raises(SimulationDiverged, match="configuration 3 is not finite"):
+        chosen.nearest(qpos)
+
+
+def test_models_are_left_alone() -> None:
+    """Options of the collider are set on a copy, and what becomes of the model later is not seen."""
+    model = mujoco.MjModel.from_xml_string(ARMS)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+    sizes, kinds, options = model.geom_size.copy(), model.geom_type.copy(), str(model.opt)
+    chosen, qpos = between(model, 0.5), scattered(model, 20, 0.4)
+    before = chosen(qpos, False).d
+    np.testing.assert_array_equal(before, between(mujoco.MjModel.from_xml_string(ARMS), 0.5)(qpos, False).d)
+    assert (model.geom_size == sizes).all() and (model.geom_type == kinds).all() and str(model.opt) == options
+    model.geom_size *= 2.0
+    np.testing.assert_array_equal(chosen(qpos, False).d, before)

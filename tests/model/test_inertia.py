@@ -1,0 +1,215 @@
+"""Charts of a body's inertia: there and back, what they mean in the dynamics, what they refuse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mjfim.model.inertia import CHARTS, PAIRS, Inertial, barycentric, from_barycentric, from_logcholesky, logcholesky
+
+Array = NDArray[np.float64]
+
+# A chain of a hinge, a ball joint and a slide with an offset body at its end.
+CHAIN = """
+<mujoco>
+  <option gravity="1 -2 -9.81"/>
+  <worldbody>
+    <body name="base">
+      <joint type="hinge" axis="0 .6 .8"/>
+      <inertial pos=".1 0 .2" mass="1" diaginertia=".1 .12 .11"/>
+      <body name="middle" pos=".2 .1 .5" euler="20 40 10">
+        <joint type="ball"/>
+        <inertial pos="0 .1 .2" mass=".7" diaginertia=".05 .04 .03"/>
+        <body name="tip" pos=".1 -.2 .3" euler="-50 10 70">
+          <joint type="slide" axis=".6 0 .8"/><joint type="hinge" axis="1 0 0" pos=".1 0 0"/>
+          <inertial pos="{com}" mass="{mass}" fullinertia="{inertia}"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def solids(count: int, seed: int) -> list[Inertial]:
+    """Bodies of random points: physical by construction."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(count):
+        weights = rng.uniform(0.1, 1.0, 6)
+        points = rng.standard_normal((6, 3)) * rng.uniform(0.1, 1.0, 3) + rng.uniform(-0.5, 0.5, 3)
+        com = weights @ points / weights.sum()
+        about = points - com
+        found.append(
+            Inertial(
+                float(weights.sum()),
+                com,
+                sum(w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, about, strict=True)),
+            )
+        )
+    return found
+
+
+def compiled(body: Inertial) -> Any:
+    """The chain with this body at its end, compiled by MuJoCo, which refuses bodies that cannot be."""
+    tensor = [body.inertia[pair] for pair in PAIRS]
+    text = CHAIN.format(com=spelled(body.com), mass=repr(body.mass), inertia=spelled(tensor))
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def spelled(numbers: Any) -> str:
+    """Numbers of an MJCF attribute with every digit."""
+    return " ".join(repr(float(n)) for n in numbers)
+
+
+def dynamics(body: Inertial) -> Array:
+    """Mass matrix, bias forces and energies of the chain in some pose and motion, as one vector."""
+    model = compiled(body)
+    data, M = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    rng = np.random.default_rng(5)
+    mujoco.mj_integratePos(model, data.qpos, rng.standard_normal(model.nv), 1.0)
+    data.qvel[:] = rng.standard_normal(model.nv)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, M)
+    mujoco.mj_energyPos(model, data)
+    mujoco.mj_energyVel(model, data)
+    return np.concatenate([M.ravel(), data.qfrc_bias, data.energy])
+
+
+@pytest.mark.parametrize("chart", CHARTS)
+def test_there_and_back(chart: str) -> None:
+    """Ten numbers are the body, and the body is ten numbers."""
+    for body in solids(20, 0):
+        v = CHARTS[chart].of(body)
+        again = CHARTS[chart].back(v)
+        assert v.shape == (10,)
+        assert again.mass == pytest.approx(body.mass, rel=1e-12)
+        np.testing.assert_allclose(again.com, body.com, rtol=1e-11, atol=1e-13)
+        np.testing.assert_allclose(again.inertia, body.inertia, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(CHARTS[chart].of(again), v, rtol=1e-9, atol=1e-11)
+
+
+def test_principal_axes_are_mujocos() -> None:
+    """Descending moments in a right-handed frame, as the compiler writes them; and back."""
+    for body in solids(20, 1):
+        found = compiled(body).body("tip")
+        moments, quaternion = body.axes()
+        np.testing.assert_allclose(moments, found.inertia, rtol=1e-10)
+        assert moments[0] >= moments[1] >= moments[2] > 0.0
+        R = np.zeros(9)
+        mujoco.mju_quat2Mat(R, quaternion)
+        R = R.reshape(3, 3)
+        assert np.linalg.det(R) == pytest.approx(1.0)
+        np.testing.assert_allclose(R @ np.diag(moments) @ R.T, body.inertia, rtol=1e-9, atol=1e-12)
+        again = Inertial.principal(found.mass[0], found.ipos, found.inertia, found.iquat)
+        np.testing.assert_allclose(again.inertia, body.inertia, rtol=1e-9, atol=1e-12)
+
+
+def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
+    """Point by point from their definition."""
+    rng = np.random.default_rng(2)
+    weights, points = rng.uniform(0.1, 1.0, 5), rng.standard_normal((5, 3))
+    com = weights @ points / weights.sum()
+    about = sum(w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, points - com, strict=True))
+    origin = sum(w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, points, strict=True))
+    v = barycentric(Inertial(float(weights.sum()), com, about))
+    np.testing.assert_allclose(v, [weights.sum(), *(weights @ points), *(origin[p] for p in PAIRS)], rtol=1e-12)
+
+
+def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
+    """MuJoCo's mass matrix, bias forces and energies of a mixture are the mixture of those; not so in the others."""
+    first, second = solids(2, 3)
+    ends = dynamics(first), dynamics(second)
+    errors = {}
+    for name, chart in CHARTS.items():
+        mixed = dynamics(chart.back(0.4 * chart.of(first) + 0.6 * chart.of(second)))
+        errors[name] = np.abs(mixed - (0.4 * ends[0] + 0.6 * ends[1])).max() / np.abs(mixed).max()
+    assert errors["barycentric"] < 1e-12
+    assert errors["logcholesky"] > 1e-3 and errors["central"] > 1e-3, "a weak test"
+
+
+def test_every_barycentric_coordinate_has_a_regressor_of_its_own() -> None:
+    """Eleven bodies tell the regressor; a twelfth is predicted to round-off."""
+    bodies = solids(12, 4)
+    V = np.array([np.append(barycentric(b), 1.0) for b in bodies])
+    Y = np.array([dynamics(b) for b in bodies])
+    regressor = np.linalg.solve(V[:11], Y[:11])
+    np.testing.assert_allclose(V[11] @ regressor, Y[11], rtol=0, atol=1e-9 * np.abs(Y).max())
+
+
+def test_log_cholesky_is_physical_for_every_vector() -> None:
+    """MuJoCo compiles each of them, triangle inequality included; ten numbers at random in the central chart mostly fail."""
+    rng = np.random.default_rng(6)
+    failed = 0
+    for v in rng.standard_normal((100, 10)):
+        body = from_logcholesky(v)
+        moments, _ = body.axes()
+        assert body.mass > 0.0 and moments[2] > 0.0 and moments[1] + moments[2] > moments[0]
+        assert compiled(body).body("tip").mass[0] == pytest.approx(body.mass)
+        try:
+            compiled(CHARTS["central"].back(np.append(abs(v[0]), v[1:])))
+        except ValueError:
+            failed += 1
+    assert failed > 90
+
+
+def test_log_cholesky_is_the_factor_of_the_pseudo_inertia() -> None:
+    """`J = U U'`, U by the ten numbers of the paper, J from points."""
+    rng = np.random.default_rng(7)
+    v = 0.5 * rng.standard_normal(10)
+    a, d1, d2, d3, s12, s23, s13, t1, t2, t3 = v
+    U = np.exp(a) * np.array(
+        [[np.exp(d1), s12, s13, t1], [0, np.exp(d2), s23, t2], [0, 0, np.exp(d3), t3], [0, 0, 0, 1.0]]
+    )
+    body = from_logcholesky(v)
+    J, h = U @ U.T, body.mass * body.com
+    S = body.second + np.outer(h, h) / body.mass
+    np.testing.assert_allclose(
+        J, np.block([[S, h[:, None]], [h[None], np.array([[body.mass]])]]), rtol=1e-12, atol=1e-14
+    )
+
+
+@pytest.mark.parametrize(
+    "moments", [(0.0, 0.0, 0.0), (0.1, 0.1, 0.0), (0.3, 0.2, 0.1), (0.3 * (1 + 1e-12), 0.2, 0.1), (0.5, 0.2, 0.1)]
+)
+def test_points_rods_and_plates_have_no_log_cholesky(moments: tuple[float, ...]) -> None:
+    """A singular pseudo-inertia, or one that nothing has; anything thicker is taken."""
+    turned = solids(1, 8)[0].axes()[1]
+    body = Inertial.principal(2.0, np.array([0.1, 0.2, 0.3]), np.array(moments), turned)
+    with pytest.raises(ValueError, match=r"a point, a rod or a plate"):
+        logcholesky(body)
+    for chart in ("central", "barycentric"):
+        assert np.isfinite(CHARTS[chart].of(body)).all()
+    thick = Inertial.principal(2.0, np.array([0.1, 0.2, 0.3]), np.array([0.3 * (1 - 1e-6), 0.2, 0.1]), turned)
+    np.testing.assert_allclose(from_logcholesky(logcholesky(thick)).inertia, thick.inertia, rtol=1e-8, atol=1e-12)
+
+
+def test_magnitudes_follow_the_units() -> None:
+    """In other units of mass and length they are the same magnitudes: a scale of comparison has no unit of its own."""
+    body = solids(1, 9)[0]
+    kilo, centi = 1000.0, 100.0
+    other = Inertial(kilo * body.mass, centi * body.com, kilo * centi**2 * body.inertia)
+    factor = {"kg": kilo, "kg m": kilo * centi, "kg m²": kilo * centi**2, "m": centi, "": 1.0}
+    for chart in CHARTS.values():
+        assert len(chart.names) == len(set(chart.names)) == len(chart.units) == 10
+        np.testing.assert_allclose(chart.size(other), chart.size(body) * [factor[u] for u in chart.units], rtol=1e-12)
+        assert (chart.size(body) > 0.0).all()
+
+
+def test_radius_of_gyration_is_about_the_bodys_origin() -> None:
+    """Of points: the root of the mean square distance."""
+    points = np.random.default_rng(10).standard_normal((7, 3))
+    com, about = points.mean(axis=0), points - points.mean(axis=0)
+    body = Inertial(7.0, com, sum(r @ r * np.eye(3) - np.outer(r, r) for r in about))
+    assert body.radius == pytest.approx(np.sqrt(np.mean(np.sum(points**2, axis=1))), rel=1e-12)
+
+
+def test_first_moments_at_the_origin_do_not_move_with_the_mass() -> None:
+    """What makes the chart barycentric: mass alone changes the centre and the inertia about it, not about the origin."""
+    v = barycentric(solids(1, 11)[0])
+    heavier = from_barycentric(np.append(2.0 * v[0], v[1:]))
+    np.testing.assert_allclose(heavier.com, 0.5 * v[1:4] / v[0], rtol=1e-13)
+    np.testing.assert_allclose(barycentric(heavier), np.append(2.0 * v[0], v[1:]), rtol=1e-12)

@@ -1,0 +1,52 @@
+"""Every example of the repository goes through `check` and `design`, pictures and Rerun file included."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from cli.test_cli import DESIGN, MODELS, names, read, run
+
+import mjfim
+from mjfim.experiment.system import Setup
+from mjfim.output import folders as results
+
+EXAMPLES = sorted(path.stem for path in MODELS.glob("*.toml") if not path.stem.startswith("cart_pendulum"))
+ROUGH = {
+    "sliding_block",
+    "double_pendulum",
+    "bam_xl330",
+    "dfki_double_pendulum",
+    "dfki_simple_pendulum",
+}  # contact and dry friction
+TOGETHER = {"double_pendulum", "ball_pendulum"}  # not every parameter can be told alone
+
+
+def test_every_model_has_an_experiment() -> None:
+    assert {path.stem for path in MODELS.glob("*.xml")} == {*EXAMPLES, "cart_pendulum"}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_check_says_what_the_example_is_about(name: str, tmp_path: Path) -> None:
+    result = run("check", MODELS / f"{name}.toml", "-o", tmp_path / "out")
+    assert result.exit_code in (0, 1), result.output
+    told = read(tmp_path / "out" / "check.json")
+    assert told["self_test"]["passed"] == (name not in ROUGH)
+    if name in ROUGH:
+        assert told["self_test"]["rough"]["sample"] > 0
+        assert any("friction" in cause or "contact" in cause for cause in told["self_test"]["rough"]["causes"])
+    assert bool(told["combinations"]) == (name in TOGETHER)
+    assert told["not_excited"] == []
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_short_design_improves_and_leaves_everything(name: str, tmp_path: Path) -> None:
+    setup = Setup(mjfim.Experiment.from_file(MODELS / f"{name}.toml").replace(descent={"max_iterations": 3}))
+    design = mjfim.design(setup)
+    assert design.final.cost < design.initial.cost
+    results.leave_design(tmp_path, design, setup)
+    assert names(tmp_path) == DESIGN | ({"limits.png"} if design.usage else set())
+    told = read(tmp_path / "design.json")
+    assert len(told["final"]["std"]) == len(told["parameters"])
+    assert [c["words"] for c in told["combined"]] == [c.words for c in design.combined]
+    assert bool(design.combined) == (name in TOGETHER)

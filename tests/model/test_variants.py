@@ -1,0 +1,180 @@
+"""Levels of a descent: the same experiment on plants that are quicker to step or smoother, and what they leave alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from support.numerics import make_setup
+
+import mjfim
+from mjfim.arrays import Array
+from mjfim.experiment.system import Setup
+from mjfim.model.smooth_friction import SLOW
+from mjfim.model.variants import FREE, STATED
+from mjfim.plant.plant import DRAFT
+from mjfim.plant.plant import DRY as DRY_DIFFERENCES
+from mjfim.records.design import Status
+
+ARM = """
+<mujoco model="dry">
+  <compiler angle="radian"/>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body name="upper">
+      <joint name="shoulder" axis="0 1 0" damping="0.1" armature="0.02" frictionloss="{friction}" range="-2 2"/>
+      <inertial pos="0 0 -0.2" mass="0.6" diaginertia="0.004 0.004 0.001"/>
+      <body name="fore" pos="0 0 -0.4">
+        <joint name="elbow" axis="0 1 0" damping="0.05" armature="0.01" frictionloss="{friction}"/>
+        <inertial pos="0 0 -0.15" mass="0.4" diaginertia="0.002 0.002 0.001"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="shoulder" joint="shoulder" kp="30" kv="1" ctrlrange="-1 1"/>
+    <position name="elbow" joint="elbow" kp="20" kv="0.5" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+DRY: dict[str, Any] = {
+    "mass": {"target": "body/fore:mass"},
+    "drag": {"target": "joint/elbow:damping"},
+    "dry": {"target": "joint/elbow:frictionloss"},
+}
+
+
+def arm(folder: Path, friction: float = 0.1, **tables: Any) -> Setup:
+    """Two links with servos and dry joints, for a second."""
+    stated: dict[str, Any] = {
+        "horizon": 1.0,
+        "rate": 100.0,
+        "parameters": DRY,
+        "noise": {"state": 0.01},
+        "initial": {"control": {"kind": "sine", "amplitude": 0.4, "frequency": 1.0}},
+        "cost": {"control": 0.0},
+        "limits": {"control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)}},
+    }
+    return make_setup(ARM.format(friction=friction), folder, **{**stated, **tables})
+
+
+def test_only_dry_plants_have_speeds_at_which_friction_turns_viscous(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    smooth = arm(tmp_path, 0.0, parameters={name: DRY[name] for name in ("mass", "drag")}).free()
+    assert smooth.level == FREE
+    assert smooth.plant.smooth is smooth.plant
+    assert smooth.plant.draft is DRAFT
+    limits = {"control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)}, "velocity": {"elbow": 20.0}}
+    setup = arm(tmp_path / "a", limits=limits).free()
+    fastest = np.abs(setup.initial.qvel[:, 0]).max()
+    assert setup.level.soft[1] == pytest.approx(SLOW * 20.0)
+    assert setup.level.soft[0] >= SLOW * fastest
+    assert setup.plant.draft is DRY_DIFFERENCES
+    assert not setup.plant.source.soft
+    assert setup.plant.smooth.source.soft
+    assert setup.softened().plant.source.soft
+
+
+def test_a_plant_with_dry_friction_moves_as_the_model_does_and_its_softened_level_nearly(tmp_path: Path) -> None:
+    setup = arm(tmp_path)
+    model = mujoco.MjModel.from_xml_string(ARM.format(friction=0.1))
+    model.opt.tolerance, data = 1e-14, mujoco.MjData(model)
+    for u in setup.control:
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data, setup.substeps)
+    free = setup.free()
+    own = free.plant.simulate(setup.theta, setup.control).qpos[-1]
+    np.testing.assert_allclose(own, data.qpos, rtol=0, atol=1e-6)
+    level = free.softened()
+    softened = level.plant.simulate(setup.theta, setup.control).qpos[-1]
+    assert 1e-5 < np.abs(softened - own).max() < 0.02
+
+
+def test_a_longer_timestep_keeps_the_samples_and_stays_near(tmp_path: Path) -> None:
+    setup = arm(tmp_path, 0.0, parameters={"mass": DRY["mass"]})
+    long = setup.stretched(5)
+    assert (long.samples, long.dt, long.substeps) == (setup.samples, setup.dt, 1)
+    assert (setup.level, long.level) == (STATED, replace(STATED, stretch=5))
+    assert long.plant.source.model.opt.timestep == pytest.approx(0.01)
+    near, far = (s.plant.simulate(s.theta, s.control).qpos for s in (setup, long))
+    assert 1e-6 < np.abs(near - far).max() < 0.05
+    with pytest.raises(ValueError, match="do not divide by 3"):
+        setup.stretched(3)
+
+
+def test_a_design_with_dry_joints_gains_and_keeps_its_limits(tmp_path: Path) -> None:
+    limits = {"control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)}, "control_rate": 20.0, "velocity": 6.0}
+    setup = arm(tmp_path, limits=limits, descent={"max_iterations": 60})
+    design = mjfim.design(setup)
+    assert design.status is not Status.INFEASIBLE
+    assert min(design.limits.values()) >= 0.0
+    assert design.final.cost < 0.5 * design.initial.cost
+    assert design.parameters == ("mass", "drag", "dry")
+
+
+def test_steps_on_the_softened_copy_are_counted(tmp_path: Path) -> None:
+    setup = arm(tmp_path).free()
+    plant, psi = setup.plant, np.zeros((setup.samples + 1, setup.space.nx, 3))
+    begun, own = plant.steps, plant.engine.steps
+    plant.bilinear(setup.theta, setup.initial, psi, np.eye(3)[:2], plant.draft)
+    batch = (setup.samples + 1) * setup.substeps * (setup.space.nx + len(setup.controls) + 1)
+    assert plant.engine.steps - own == batch  # A and B
+    assert plant.steps - begun == 4 * batch  # and on the copy the origin and two directions
+
+
+def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(tmp_path: Path) -> None:
+    setup = arm(tmp_path).free()
+    level, psi = setup.softened(), np.random.default_rng(0).normal(size=(setup.samples + 1, setup.space.nx, 3))
+    found, soft, own = (
+        plant._paired(setup.theta, setup.initial, psi, np.eye(3)[:1], plant.draft, None)
+        for plant in (setup.plant, level.plant, setup.plant.smooth)
+    )
+    np.testing.assert_allclose(soft.F_mixed, own.F_mixed)
+    careful = replace(setup.plant.draft, shared=False)
+    both = setup.plant.bilinear(setup.theta, setup.initial, psi, np.eye(3)[:1], careful)
+    np.testing.assert_array_equal(both.A, found.A)
+    np.testing.assert_array_equal(both.F_mixed, own.F_mixed)
+    assert np.abs(found.A - own.A).max() > 1e-3
+
+
+# ---- derivatives where joints turn round
+
+
+def test_the_gradient_of_the_softened_level_is_that_of_its_cost(tmp_path: Path) -> None:
+    """Over moves that shift where joints turn round by several engine steps, and over short ones."""
+    setup = arm(tmp_path).free().softened()
+    wave = np.sin(np.pi * setup.t)[:, None] ** 2 * np.array([1.0, -0.5])
+    found = slope(setup, wave)
+    for h in (1e-5, 1e-3, 3e-3):
+        assert found == pytest.approx(difference(setup, wave, h), rel=0.15)
+
+
+@pytest.mark.parametrize("amplitudes", [(1.0, -0.5), (0.5, 1.0), (1.0, 1.0)])
+def test_and_of_the_stated_one_it_points_where_long_moves_lead(tmp_path: Path, amplitudes: tuple[float, float]) -> None:
+    """Its cost jumps with every engine step that a joint sticks for: no size is right, and short moves mislead."""
+    setup = arm(tmp_path).free()
+    wave = np.sin(np.pi * setup.t)[:, None] ** 2 * np.array(amplitudes)
+    found = slope(setup, wave)
+    wide = [difference(setup, wave, h) for h in (0.02, 0.03, 0.05, 0.1)]
+    assert np.sign(found) == np.sign(np.mean(wide))
+    local = [difference(setup, wave, h) for h in (1e-6, 3e-4, 1e-3, 3e-3)]
+    assert np.std(local) > 3.0 * np.std(wide)
+
+
+def slope(setup: Setup, wave: Array) -> float:
+    """Change of log J per unit of a control's change."""
+    point = setup.problem.point(setup.initial, setup.plant.draft)
+    open_loop = np.zeros((setup.samples, len(setup.controls), setup.space.nx))
+    return float(np.sum(setup.problem.expand(point).gradient(open_loop) * wave)) / point.cost
+
+
+def difference(setup: Setup, wave: Array, h: float) -> float:
+    """The same by two evaluations."""
+    there, back = (
+        setup.problem.point(setup.plant.simulate(setup.theta, setup.control + s * wave), setup.plant.draft).cost
+        for s in (h, -h)
+    )
+    return float(np.log(there / back) / (2.0 * h))

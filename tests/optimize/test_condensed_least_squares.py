@@ -1,0 +1,292 @@
+"""Condensed least squares against the full stacked Jacobian, brought to its answer by dense linear algebra."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.linalg import lstsq
+from scipy.optimize import lsq_linear
+from support.numerics import Array
+
+from mjfim.optimize.condensed_least_squares import Condensed, Step
+
+
+@dataclass(frozen=True, eq=False)
+class Dense:
+    """The same problem twice. J: (rows, P n + c), r: (rows,) of everything;  blocks: rows `[private, common, r]` of each"""
+
+    condensed: Condensed
+    J: Array
+    r: Array
+    blocks: list[Array]
+    P: int
+    n: int
+    c: int
+
+    @property
+    def starts(self) -> Array:
+        """Columns of the private unknowns."""
+        return self.J[:, : self.P * self.n]
+
+    @property
+    def shared(self) -> Array:
+        """Columns of the common unknowns."""
+        return self.J[:, self.P * self.n :]
+
+    def halves(self, step: Step) -> float:
+        """Half of the squares after a step."""
+        left = self.J @ np.concatenate([step.private.ravel(), step.common]) + self.r
+        return 0.5 * float(left @ left)
+
+
+def condense(rows: Array) -> Array:
+    """(m, m) with the inner products of (k, m) rows, by singular values where the package takes QR."""
+    m = rows.shape[1]
+    _, s, V = np.linalg.svd(rows, full_matrices=True)
+    out = np.zeros((m, m))
+    out[: len(s)] = s[:, None] * V[: len(s)]
+    out[:, ~rows.any(axis=0)] = 0.0  # to the last bit, as QR leaves it
+    return out
+
+
+def spread(rows: Array, piece: int, P: int, n: int) -> Array:
+    """(k, P n + c) of rows `[private, common]` of one piece among all unknowns."""
+    wide = np.zeros((len(rows), P * n + rows.shape[1] - n))
+    wide[:, piece * n : (piece + 1) * n] = rows[:, :n]
+    wide[:, P * n :] = rows[:, n:]
+    return wide
+
+
+def problem(seed: int, P: int = 4, n: int = 2, c: int = 3, inner: int = 1, outer: int = 2, lame: bool = False) -> Dense:
+    """Random pieces of one to three blocks in shuffled order, with priors. lame: the last private unknown is never seen"""
+    rng = np.random.default_rng(seed)
+    m = n + c + 1
+    owner = rng.permutation(np.concatenate([np.full(rng.integers(1, 4), i) for i in range(P)]))
+    units = 10.0 ** rng.uniform(-2, 2, m)
+    units[-1] = 1.0
+    blocks = [rng.standard_normal((rng.integers(1, 9), m)) * units for _ in owner]
+    inside, outside = rng.standard_normal((P, inner, m)) * units, rng.standard_normal((outer, c + 1)) * units[n:]
+    if lame and n:
+        inside[:, :, n - 1] = 0.0
+        for block in blocks:
+            block[:, n - 1] = 0.0
+    condensed = Condensed(np.stack([condense(b) for b in blocks]), owner, inside, outside)
+    every = [spread(b[:, :-1], i, P, n) for b, i in zip(blocks, owner, strict=True)]
+    every += [spread(own[:, :-1], i, P, n) for i, own in enumerate(inside)]
+    J = np.concatenate([*every, np.pad(outside[:, :-1], ((0, 0), (P * n, 0)))])
+    r = np.concatenate([*(b[:, -1] for b in blocks), inside[:, :, -1].ravel(), outside[:, -1]])
+    return Dense(condensed, J, r, blocks, P, n, c)
+
+
+SHAPES = [(4, 2, 3), (1, 3, 2), (5, 0, 3), (3, 4, 1), (6, 1, 5)]
+FREE = np.inf
+
+
+def close(value: Array, wanted: Array, rtol: float = 1e-7) -> None:
+    """Equal up to round-off of the largest entry."""
+    assert value.shape == wanted.shape
+    np.testing.assert_allclose(value, wanted, rtol=rtol, atol=rtol * max(float(np.abs(wanted).max(initial=0.0)), 1e-12))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("damping", [0.0, 1e-3, 10.0])
+def test_a_step_is_that_of_the_full_stacked_problem(shape: tuple[int, int, int], damping: float) -> None:
+    """`min |J d + r|^2 + damping |scale d|^2`, the damping a further row of each unknown."""
+    for seed in range(6):
+        dense = problem(seed, *shape, inner=shape[1] + 1, outer=shape[2] + 1)
+        scale = np.random.default_rng(seed).uniform(0.5, 2.0, dense.n + dense.c)
+        wide = np.concatenate([np.tile(scale[: dense.n], dense.P), scale[dense.n :]])
+        rows = np.concatenate([dense.J, np.sqrt(damping) * np.diag(wide)])
+        wanted = lstsq(rows, -np.concatenate([dense.r, np.zeros(len(wide))]))[0]
+        step = dense.condensed.step(damping, scale, np.full(dense.c, -FREE), np.full(dense.c, FREE))
+        unit = np.linalg.norm(rows, axis=0)
+        close(np.concatenate([step.private.ravel(), step.common]) * unit, wanted * unit)
+        assert step.gain == pytest.approx(0.5 * float(dense.r @ dense.r) - dense.halves(step), rel=1e-8)
+        assert dense.condensed.pieces == dense.P
+        assert (dense.condensed.private, dense.condensed.common) == (dense.n, dense.c)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int]) -> None:
+    """Against scipy's other method on the full problem, where only the common unknowns are bounded."""
+    active = 0
+    for seed in range(10):
+        dense = problem(seed, *shape, inner=shape[1] + 1, outer=shape[2] + 1)
+        free = np.full(dense.c, FREE)
+        best = dense.condensed.step(0.0, np.ones(dense.n + dense.c), -free, free).common
+        rng = np.random.default_rng(seed)
+        lower, upper = -np.abs(best) * rng.uniform(0.0, 1.5, dense.c), np.abs(best) * rng.uniform(0.0, 1.5, dense.c)
+        lower[0] *= dense.c == 1  # at a bound already
+        step = dense.condensed.step(0.0, np.ones(dense.n + dense.c), lower, upper)
+        assert (step.common >= lower).all()
+        assert (step.common <= upper).all()
+        unit = np.linalg.norm(dense.J, axis=0)
+        none = np.full(dense.P * dense.n, FREE)
+        wide = (np.concatenate([-none, lower]) * unit, np.concatenate([none, upper]) * unit)
+        wanted = lsq_linear(dense.J / unit, -dense.r, wide, method="trf", tol=1e-15, lsq_solver="exact", max_iter=500)
+        assert dense.halves(step) <= wanted.cost * (1 + 1e-9)
+        np.testing.assert_allclose(step.common * unit[-dense.c :], wanted.x[-dense.c :], rtol=1e-4, atol=1e-5)
+        active += int(((step.common == lower) | (step.common == upper)).sum())
+    assert active > 5, "bounds that never bind show nothing"
+
+
+def test_many_bounds_are_sorted_out() -> None:
+    """The conditions of optimality, with strongly correlated unknowns of which most end at a bound."""
+    for seed in (4, 1188, 1211, *range(100, 140)):  # the first three take more exchanges than there are unknowns
+        rng = np.random.default_rng(seed)
+        c = int(rng.integers(2, 20))
+        A = np.triu(rng.standard_normal((c + 1, c)))
+        rng.standard_normal((c, c))
+        A = A @ (np.eye(c) + rng.choice([0, 1, 5]) * np.outer(rng.standard_normal(c), rng.standard_normal(c)))
+        b = rng.standard_normal(c + 1) * 10
+        lower = -rng.uniform(0, 2, c) * (rng.random(c) < 0.7)
+        upper = rng.uniform(0, 2, c) * (rng.random(c) < 0.7)
+        condensed = Condensed(
+            np.column_stack([A, -b])[None], np.zeros(1, int), np.zeros((1, 0, c + 1)), np.zeros((0, c + 1))
+        )
+        d = condensed.step(0.0, np.ones(c), lower, upper).common
+        slope = A.T @ (A @ d - b) / (np.abs(A).sum(axis=0) * np.linalg.norm(b))
+        assert ((d >= lower) & (d <= upper)).all()
+        assert slope[d > lower + 1e-12].max(initial=0.0) < 1e-8, "could go further down"
+        assert slope[d < upper - 1e-12].min(initial=0.0) > -1e-8, "could go further up"
+
+
+def test_a_common_unknown_that_cannot_move_stays() -> None:
+    """Both bounds at zero; the others go where they would without its column."""
+    dense = problem(3, inner=3, outer=4)
+    lower, upper = np.array([-FREE, 0.0, -FREE]), np.array([FREE, 0.0, FREE])
+    step = dense.condensed.step(0.0, np.ones(5), lower, upper)
+    kept = np.delete(np.arange(dense.J.shape[1]), dense.P * dense.n + 1)
+    wanted = lstsq(dense.J[:, kept], -dense.r)[0]
+    assert step.common[1] == 0.0
+    close(step.common[[0, 2]], wanted[-2:])
+    none = np.zeros(3)
+    still = dense.condensed.step(0.0, np.ones(5), none, none)
+    close(still.private.ravel(), lstsq(dense.starts, -dense.r)[0])
+    assert not still.common.any()
+    assert still.size == 0.0
+
+
+@pytest.mark.parametrize("lame", [False, True])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_what_is_left_of_the_private_unknowns(shape: tuple[int, int, int], lame: bool) -> None:
+    """Elimination, information, profile: the Schur complement of the full normal matrix."""
+    for seed in range(4):
+        dense = problem(seed, *shape, lame=lame)
+        C, P, n, c = dense.condensed, dense.P, dense.n, dense.c
+        inverse = np.linalg.pinv(dense.starts / (unit := np.maximum(np.linalg.norm(dense.starts, axis=0), 1e-30)))
+        follow = -(inverse / unit[:, None]) @ dense.shared
+        left = dense.shared + dense.starts @ follow
+        close(C.information(), left.T @ left)
+        outer = C.outer[:, :-1]
+        close(C.information(outer=False), left.T @ left - outer.T @ outer, rtol=1e-6)
+        rows = np.concatenate([C.profile(), C.outer])
+        rest = dense.r - dense.starts @ (inverse / unit[:, None]) @ dense.r
+        both = np.column_stack([left, rest])
+        close(rows.T @ rows, both.T @ both)
+        rank = np.linalg.matrix_rank(dense.starts / unit) if n else 0
+        if rank == P * n:
+            close(C.eliminated, follow.reshape(P, n, c), rtol=1e-6)
+
+
+def test_lengths_are_those_of_the_columns() -> None:
+    """Of private ones the root mean square over pieces, of common ones the norm, priors with them."""
+    dense = problem(1)
+    norms = np.linalg.norm(dense.J, axis=0)
+    own = np.sqrt(np.mean(norms[: dense.P * dense.n].reshape(dense.P, dense.n) ** 2, axis=0))
+    close(dense.condensed.lengths, np.concatenate([own, norms[dense.P * dense.n :]]))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_scores_and_grams_of_the_blocks_sum_to_gradient_and_information(shape: tuple[int, int, int]) -> None:
+    """Block by block against the rows themselves; all together with the priors, against the full problem."""
+    for seed in range(4):
+        dense = problem(seed, *shape, inner=shape[1] + 1)
+        C, n = dense.condensed, dense.n
+        for b, rows in enumerate(dense.blocks):
+            J = rows[:, n:-1] + rows[:, :n] @ C.eliminated[C.piece[b]]
+            scale = np.abs(C.scores).max()
+            np.testing.assert_allclose(C.scores[b], J.T @ rows[:, -1], rtol=1e-7, atol=1e-9 * scale)
+            np.testing.assert_allclose(C.grams[b], J.T @ J, rtol=1e-7, atol=1e-9 * np.abs(C.grams).max())
+        known = np.concatenate([C.known.reshape(-1, dense.c + 1), C.outer])
+        gradient = C.scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
+        fitted = dense.starts @ np.linalg.lstsq(dense.starts, -dense.r)[0] if n else 0.0
+        wanted = dense.shared.T @ (dense.r + fitted)
+        if n:
+            basis = np.linalg.qr(dense.starts)[0]
+            wanted = (dense.shared - basis @ (basis.T @ dense.shared)).T @ dense.r
+        close(gradient, wanted, rtol=1e-6)
+        close(C.grams.sum(axis=0) + known[:, :-1].T @ known[:, :-1], C.information(), rtol=1e-6)
+
+
+def test_the_gradient_is_the_slope_of_the_squares_with_the_private_unknowns_following() -> None:
+    """By differences of the minimum over the private unknowns."""
+    dense = problem(5, inner=3)
+    C = dense.condensed
+
+    def half(d: Array) -> float:
+        r = dense.r + dense.shared @ d
+        left = r - dense.starts @ np.linalg.lstsq(dense.starts, r)[0]
+        return 0.5 * float(left @ left)
+
+    known = np.concatenate([C.known.reshape(-1, dense.c + 1), C.outer])
+    gradient = C.scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
+    for j in range(dense.c):
+        e = np.eye(dense.c)[j] * 1e-3 / np.linalg.norm(dense.shared[:, j])
+        assert gradient[j] == pytest.approx((half(e) - half(-e)) / (2 * e[j]), rel=1e-5)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-6])
+def test_pieces_that_do_not_tell_their_start_do_not_break_the_step(damping: float) -> None:
+    """One private unknown is in no row at all; one piece has fewer rows than unknowns."""
+    for seed in range(5):
+        dense = problem(seed, P=3, n=3, c=2, inner=0, outer=3, lame=True)
+        scale = np.maximum(dense.condensed.lengths, 0.0)
+        step = dense.condensed.step(damping, scale, np.full(2, -FREE), np.full(2, FREE))
+        assert np.isfinite(step.private).all()
+        assert np.abs(step.private[:, 2]).max() == 0.0
+        best = lstsq(dense.J, -dense.r)[0]
+        least = 0.5 * float(np.sum((dense.J @ best + dense.r) ** 2))
+        assert dense.halves(step) == pytest.approx(least, rel=1e-4, abs=1e-4)
+        assert np.isfinite(dense.condensed.information()).all()
+
+
+def test_only_private_unknowns() -> None:
+    """No common one: every piece goes its own way."""
+    dense = problem(2, P=3, n=2, c=0, inner=2, outer=0)
+    none = np.zeros(0)
+    step = dense.condensed.step(0.0, np.ones(2), none, none)
+    close(step.private.ravel(), lstsq(dense.J, -dense.r)[0])
+    assert step.size == 0.0
+    assert dense.condensed.information().shape == (0, 0)
+    assert dense.condensed.scores.shape == (len(dense.blocks), 0)
+
+
+def test_size_and_each_are_standard_deviations() -> None:
+    """A common step by the information that is left of it; private steps by what fixes them at a held theta."""
+    dense = problem(4, inner=3)
+    C = dense.condensed
+    step = C.step(0.0, np.ones(5), np.full(3, -FREE), np.full(3, FREE))
+    basis = np.linalg.qr(dense.starts)[0]
+    left = dense.shared - basis @ (basis.T @ dense.shared)
+    assert step.size == pytest.approx(float(np.linalg.norm(left @ step.common)), rel=1e-8)
+    squares = np.linalg.norm(dense.starts @ step.private.ravel()) ** 2
+    assert step.each == pytest.approx(np.sqrt(squares / step.private.size), rel=1e-8)
+
+
+def test_units_of_the_unknowns_do_not_matter() -> None:
+    """Columns ten orders of magnitude apart give the same step in their own units."""
+    dense = problem(9, inner=3, outer=4)
+    unit = np.array([1e6, 1e-4, 1e-5, 1.0, 1e5, 1.0])
+    C = dense.condensed
+    other = Condensed(C.blocks * unit, C.piece, C.inner * unit, C.outer * unit[2:])
+    for lower in (-FREE, -0.01):
+        bound = np.full(3, lower)
+        one = C.step(1e-4, C.lengths, bound, -bound)
+        two = other.step(1e-4, other.lengths, bound / unit[2:-1], -bound / unit[2:-1])
+        close(two.common * unit[2:-1], one.common, rtol=1e-6)
+        close(two.private * unit[:2], one.private, rtol=1e-6)
+        assert two.size == pytest.approx(one.size, rel=1e-6)
+    close(other.information(), C.information() * np.outer(unit[2:-1], unit[2:-1]), rtol=1e-6)

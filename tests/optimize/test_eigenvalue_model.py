@@ -1,0 +1,137 @@
+"""The model of the smooth E-criterion: its derivatives, where it comes from, and its proximal step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, logm
+from scipy.optimize import minimize
+from support.numerics import Array, cart_setup, relative_error
+
+from mjfim.excitation.constraints import fence_of
+from mjfim.experiment.system import Setup
+from mjfim.information.criteria import smooth_e_optimality
+from mjfim.optimize.eigenvalue_model import Spectral, coordinates, divided, matrix
+
+VALUES = {"apart": [0.5, 0.85, 2.0], "meeting": [0.5, 0.5 + 5e-10, 0.525]}
+
+
+def model_of(values: list[float], power: float = 12.0, share: float = 0.6) -> Spectral:
+    """A model without slopes."""
+    m = len(values) * (len(values) + 1) // 2
+    return Spectral(np.array(values), power, share, np.zeros((m, 2, 1)), np.zeros((m, 1, 1)))
+
+
+def test_coordinates_keep_scalar_products() -> None:
+    rng = np.random.default_rng(0)
+    for r in (1, 2, 4):
+        d, e = rng.normal(size=(2, r * (r + 1) // 2))
+        np.testing.assert_allclose(coordinates(matrix(d, r)), d)
+        np.testing.assert_array_equal(matrix(d, r), matrix(d, r).T)
+        assert np.sum(matrix(d, r) * matrix(e, r)) == pytest.approx(d @ e)
+
+
+@pytest.mark.parametrize("values", VALUES)
+def test_the_model_is_the_criterion_of_moved_information(values: str) -> None:
+    """`log phi` of an information whose logarithm moves by B; its share of the cost."""
+    rng, model = np.random.default_rng(1), model_of(VALUES[values])
+
+    def wanted(d: Array) -> float:
+        moved = np.diag(np.log(model.values)) + matrix(d, 3)
+        return model.share * float(np.log(smooth_e_optimality(np.asarray(expm(moved)), model.power).value))
+
+    zero = np.zeros(6)
+    assert model.value(zero) == 0.0
+    for size in (1e-3, 0.3, 3.0):
+        d = size * rng.normal(size=6)
+        assert model.value(d) == pytest.approx(wanted(d) - wanted(zero), rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("values", VALUES)
+def test_its_gradient_is_its_slope_and_it_is_convex(values: str) -> None:
+    rng, h, model = np.random.default_rng(2), 1e-5, model_of(VALUES[values])
+    for size in (0.0, 0.05, 1.0):
+        d = size * rng.normal(size=6)
+        slopes = [(model.value(d + h * e) - model.value(d - h * e)) / (2 * h) for e in np.eye(6)]
+        assert relative_error(model.gradient(d), np.array(slopes)) < 1e-6
+        e = rng.normal(size=6)
+        assert model.value(d + e) + model.value(d - e) >= 2 * model.value(d) - 1e-12
+
+
+@pytest.mark.parametrize("values", VALUES)
+def test_the_settled_gradient_belongs_to_the_minimum_of_the_proximal_problem(values: str) -> None:
+    """Also where the spread is singular: coordinates that no step can move stay where they are put."""
+    rng, model = np.random.default_rng(3), model_of(VALUES[values][:2])
+    for rank in (3, 1):
+        root = rng.normal(size=(3, rank))
+        spread, d0 = root @ root.T, 0.2 * rng.normal(size=3)
+
+        def cost(y: Array, root: Array = root, d0: Array = d0) -> float:
+            return model.value(d0 + root @ y) + 0.5 * float(y @ y)
+
+        w = model.settle(d0, spread)
+        best = minimize(cost, np.zeros(rank), method="BFGS", options={"gtol": 1e-10})
+        np.testing.assert_allclose(d0 - spread @ w, d0 + root @ best.x, rtol=0, atol=1e-5)
+
+
+def test_divided_differences_turn_a_change_into_one_of_the_logarithm() -> None:
+    values, rng = np.array([0.5, 0.5 * (1 + 1e-9), 2.0]), np.random.default_rng(4)
+    change = rng.normal(size=(3, 3))
+    change = 1e-6 * (change + change.T)
+    slope = (logm(np.diag(values) + change) - logm(np.diag(values) - change)) / 2.0
+    np.testing.assert_allclose(divided(values) * change, slope, rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize("information", ["plain", "nuisance", "delay and sensors"])
+def test_slopes_are_those_of_the_logarithm_of_simulated_information(information: str, tmp_path: Path) -> None:
+    """Off the diagonal too: along random controls, in the eigenvectors of the point."""
+    tables = {
+        "plain": {},
+        "nuisance": {"nuisance": {"initial": {"qpos:slide": 0.05}}},
+        "delay and sensors": {
+            "nuisance": {"delay": 0.02},
+            "noise": {"angle": 0.05, "acc": 0.3},
+            "measure_rate": 50.0,
+        },
+    }[information]
+    limits = {"control": {"force": (-9.0, 9.0)}}
+    setup: Setup = cart_setup(tmp_path, limits=limits, **tables).free()
+    problem = setup.problem
+    problem = replace(problem, information=replace(problem.information, power=3.0, faint=0.0))
+    point = problem.point(setup.initial)
+    expansion, _ = problem.tapped(point, fence_of(setup).taps)
+    model = expansion.spectral
+    assert model is not None and point.information is not None
+    assert len(model.values) == 3
+    reduced, _ = problem.information.reduced(point.information)
+    vectors = np.linalg.eigh(reduced)[1]
+
+    def logarithm(ctrl: Array) -> Array:
+        moved = problem.point(setup.plant.simulate(setup.theta, ctrl))
+        assert moved.information is not None
+        inside, _ = problem.information.reduced(moved.information)
+        return coordinates(np.real(vectors.T @ logm(inside) @ vectors))
+
+    rng, open_loop = np.random.default_rng(5), np.zeros((setup.samples, 1, 4))
+    for _ in range(3):
+        way = np.cos(2 * np.pi * rng.uniform(0.3, 3.0) * setup.t + rng.uniform(0, 6))[:, None]
+        zeta = expansion.lift(open_loop, way)
+        found = np.einsum("mki,ki->m", model.a, zeta.z) + np.einsum("mku,ku->m", model.b, zeta.v)
+        slope = (logarithm(setup.control + 1e-3 * way) - logarithm(setup.control - 1e-3 * way)) / 2e-3
+        assert relative_error(found, slope) < 5e-3
+        # what the gradient of the cost holds besides is the running cost's
+        running = problem.running.gradient(setup.initial)
+        rest = float(np.sum(running[0] * zeta.z) + np.sum(running[1] * zeta.v)) / point.cost
+        whole = float(model.gradient(np.zeros(6)) @ found) + rest
+        assert whole == pytest.approx(expansion.slope(zeta) / point.cost, rel=1e-6, abs=1e-9)
+
+
+def test_other_criteria_and_plain_expansions_have_no_model(tmp_path: Path) -> None:
+    setup = cart_setup(tmp_path, limits={"control": {"force": (-9.0, 9.0)}}).free()
+    point = setup.problem.point(setup.initial)
+    assert setup.problem.tapped(point, fence_of(setup).taps)[0].spectral is None  # 1 / lambda_min itself
+    smooth = replace(setup.problem, information=replace(setup.problem.information, power=40.0))
+    assert smooth.expand(smooth.judged(point)).spectral is None

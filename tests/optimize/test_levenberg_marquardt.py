@@ -1,0 +1,348 @@
+"""The bounded Levenberg-Marquardt search against scipy's on small analytic problems, and what it says when it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from support.numerics import Array
+
+from mjfim.optimize.condensed_least_squares import Condensed, Step
+from mjfim.optimize.levenberg_marquardt import Progress, Search, Solution, Unknowns, minimise
+
+Rows = Callable[[Array, Array], Array]
+FREE = np.inf
+SHARP = Search(iterations=200, tolerance=1e-9)
+
+
+@dataclass(eq=False)
+class Analytic:
+    """Residuals of each piece as a function of (theta, its start), by complex steps; every point that is looked at is kept.
+
+    prior: standard deviation of theta about 0;  spoil: of the Jacobian, (k, n + c) of a piece
+    """
+
+    pieces: tuple[Rows, ...]
+    lower: Array
+    upper: Array
+    spoil: Callable[[Array], Array] = np.asarray
+    stop: int | None = None
+    seen: list[Unknowns] = field(default_factory=list)
+
+    def residuals(self, at: Unknowns) -> list[Array]:
+        return [rows(at.theta, own) for rows, own in zip(self.pieces, at.starts, strict=True)]
+
+    def cost(self, at: Unknowns) -> float:
+        self.seen.append(at)
+        if self.stop is not None and len(self.seen) >= self.stop:
+            raise KeyboardInterrupt
+        with np.errstate(all="ignore"):
+            half = 0.5 * sum(float(r @ r) for r in self.residuals(at))
+        return half if np.isfinite(half) else np.inf
+
+    def condense(self, at: Unknowns) -> Condensed | None:
+        n, c = at.starts.shape[1], len(at.theta)
+        blocks = np.zeros((len(self.pieces), n + c + 1, n + c + 1))
+        for i, (rows, r) in enumerate(zip(self.pieces, self.residuals(at), strict=True)):
+            both = np.concatenate([at.starts[i], at.theta]).astype(complex)
+            J = np.stack([rows(*_split(both + 1e-30j * e, n)).imag / 1e-30 for e in np.eye(n + c)], axis=1)
+            R = np.linalg.qr(np.column_stack([self.spoil(J), r]), mode="r")
+            blocks[i, : len(R)] = R
+        if not np.isfinite(blocks).all():
+            return None
+        owners = np.arange(len(self.pieces))
+        return Condensed(blocks, owners, np.zeros((len(owners), 0, n + c + 1)), np.zeros((0, c + 1)))
+
+    def moved(self, at: Unknowns, step: Step, length: float) -> Unknowns:
+        theta = np.clip(at.theta + length * step.common, self.lower, self.upper)
+        return Unknowns(theta, at.starts + length * step.private)
+
+    def place(self, at: Unknowns) -> Array:
+        return at.theta
+
+
+def _split(both: Array, n: int) -> tuple[Array, Array]:
+    return both[n:], both[:n]
+
+
+def problem(*pieces: Rows, lower: list[float], upper: list[float] | None = None, **more: object) -> Analytic:
+    """Bounds of the common unknowns; none above where not stated."""
+    top = np.full(len(lower), FREE) if upper is None else np.array(upper)
+    return Analytic(pieces, np.array(lower), top, **more)  # type: ignore[arg-type]
+
+
+def reference(p: Analytic, start: Unknowns) -> tuple[Array, Array, float]:
+    """theta, starts and half of the squares by scipy, all unknowns in one vector."""
+    c, shape = len(start.theta), start.starts.shape
+
+    def f(z: Array) -> Array:
+        return np.concatenate(p.residuals(Unknowns(z[:c], z[c:].reshape(shape))))
+
+    none = np.full(start.starts.size, FREE)
+    bounds = (np.concatenate([p.lower, -none]), np.concatenate([p.upper, none]))
+    z0 = np.concatenate([start.theta, start.starts.ravel()])
+    found = least_squares(f, z0, "cs", bounds, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=5000)
+    return found.x[:c], found.x[c:].reshape(shape), float(found.cost)
+
+
+def solved(p: Analytic, start: Unknowns, search: Search = SHARP) -> Solution:
+    """What `minimise` finds."""
+    found = minimise(p, start, search)
+    assert found is not None
+    return found
+
+
+def decays(sigma: float = 0.01) -> tuple[Rows, ...]:
+    """Exponential decays with one rate and one offset, each piece with an amplitude of its own."""
+    rng = np.random.default_rng(0)
+    t = np.linspace(0.0, 2.0, 25)
+    found = []
+    for amplitude in (1.0, 0.4, -2.0):
+        y = amplitude * np.exp(-1.7 * t) + 0.3 + sigma * rng.standard_normal(len(t))
+        found.append(lambda theta, own, y=y: (own[0] * np.exp(-theta[0] * t) + theta[1] - y) / sigma)
+    return tuple(found)
+
+
+def rosenbrock(theta: Array, own: Array) -> Array:
+    """A bent valley with its minimum at (1, 1)."""
+    return np.array([100.0 * (theta[1] - theta[0] ** 2), 10.0 * (1.0 - theta[0])])
+
+
+def powell(theta: Array, own: Array) -> Array:
+    """Powell's badly scaled function: the minimum is near (1.1e-5, 9.1)."""
+    return np.array([1e4 * theta[0] * theta[1] - 1.0, np.exp(-theta[0]) + np.exp(-theta[1]) - 1.0001])
+
+
+def peak(theta: Array, own: Array) -> Array:
+    """A Gaussian peak on noise."""
+    x = np.linspace(-3.0, 3.0, 60)
+    y = 2.0 * np.exp(-((x - 0.4) ** 2) / (2 * 0.7**2)) + 0.05 * np.random.default_rng(1).standard_normal(60)
+    return (theta[0] * np.exp(-((x - theta[1]) ** 2) / (2 * theta[2] ** 2)) - y) / 0.05
+
+
+def alone(*theta: float) -> Unknowns:
+    """A start without private unknowns."""
+    return Unknowns(np.array(theta), np.zeros((1, 0)))
+
+
+CASES = {
+    "decays": (lambda: problem(*decays(), lower=[0.0, -5.0]), Unknowns(np.array([0.3, 0.0]), np.ones((3, 1)))),
+    "bounded decays": (
+        lambda: problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0]),
+        Unknowns(np.array([0.3, 1.0]), np.ones((3, 1))),
+    ),
+    "valley": (lambda: problem(rosenbrock, lower=[-5.0, -5.0], upper=[5.0, 5.0]), alone(-1.2, 1.0)),
+    "walled valley": (lambda: problem(rosenbrock, lower=[-2.0, -2.0], upper=[0.6, 5.0]), alone(-1.2, 1.0)),
+    "valley from the wall": (lambda: problem(rosenbrock, lower=[-2.0, 1.5], upper=[5.0, 3.0]), alone(-2.0, 1.5)),
+    "badly scaled": (lambda: problem(powell, lower=[0.0, 0.0], upper=[1.0, 20.0]), alone(0.0, 1.0)),
+    "peak": (lambda: problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0]), alone(1.0, -0.5, 1.5)),
+    "held at a wall": (lambda: problem(peak, lower=[0.0, -3.0, 1.0], upper=[1.5, 3.0, 5.0]), alone(1.0, 1.0, 2.0)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_minimum_is_that_of_scipy(name: str) -> None:
+    """Within bounds that no evaluated point leaves; the cost falls from iterate to iterate."""
+    build, start = CASES[name]
+    p = build()
+    told: list[Progress] = []
+    found = minimise(p, start, SHARP, told.append)
+    assert found is not None
+    theta, starts, cost = reference(build(), start)
+    assert found.success, found.status
+    assert found.cost <= cost * (1 + 1e-9) + 1e-12
+    np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(found.unknowns.starts, starts, rtol=1e-6, atol=1e-8)
+    assert len(p.seen) > 3
+    for at in p.seen:
+        assert (at.theta >= p.lower).all()
+        assert (at.theta <= p.upper).all()
+    costs = [progress.cost for progress in told]
+    assert costs == sorted(costs, reverse=True)
+    assert [progress.iteration for progress in told] == list(range(1, len(told) + 1))
+    assert found.cost == costs[-1]
+    assert found.cost == pytest.approx(p.cost(found.unknowns), rel=1e-12)
+
+
+def test_gauss_newton_goes_where_damped_steps_go_and_ignores_bounds() -> None:
+    """Undamped from nearby; steps that would raise the cost are halved."""
+    p = problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0])
+    start = Unknowns(np.array([1.0, 0.4]), np.ones((3, 1)))
+    p.lower, p.upper = np.full(2, -FREE), np.full(2, FREE)
+    found = solved(p, start, Search(iterations=50, tolerance=1e-9, damped=False))
+    theta, starts, _ = reference(p, start)
+    assert found.success
+    np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-6)
+    np.testing.assert_allclose(found.unknowns.starts, starts, rtol=1e-6)
+    assert found.unknowns.theta[0] > 1.2
+    valley = problem(rosenbrock, lower=[-FREE, -FREE])
+    through = solved(valley, alone(-1.2, 1.0), Search(iterations=100, tolerance=1e-9, damped=False))
+    np.testing.assert_allclose(through.unknowns.theta, 1.0, rtol=1e-6)
+    lengths = {np.abs(a.theta - b.theta).max() for a, b in zip(valley.seen[1:], valley.seen, strict=False)}
+    assert len(lengths) > 3
+
+
+def cliff(theta: Array, own: Array) -> Array:
+    """Nothing left of 0.2, where the minimum is close; the first steps from the right overshoot into it."""
+    bad = np.real(theta[0]) < 0.2
+    x = np.linspace(0.0, 1.0, 12)
+    y = 1.0 / (0.25 + x)
+    return np.where(bad, np.nan, 100.0 * (1.0 / (theta[0] + x) - y))
+
+
+def test_places_that_diverge_are_survived() -> None:
+    """Steps into a region without a cost are shortened; a start there gives nothing."""
+    p = problem(cliff, lower=[-10.0])
+    found = solved(p, alone(3.0))
+    assert any(at.theta[0] < 0.2 for at in p.seen), "no step led off the cliff"
+    assert found.success
+    assert found.unknowns.theta[0] == pytest.approx(0.25, rel=1e-6)
+    newton = problem(cliff, lower=[-10.0])
+    undamped = solved(newton, alone(3.0), Search(iterations=60, tolerance=1e-9, damped=False))
+    assert any(at.theta[0] < 0.2 for at in newton.seen)
+    assert undamped.unknowns.theta[0] == pytest.approx(0.25, rel=1e-6)
+    assert minimise(p, alone(0.1), SHARP) is None
+
+
+def test_a_minimum_at_a_cliff_is_not_called_converged() -> None:
+    """The cost falls all the way to where nothing can be simulated any more."""
+
+    def rows(theta: Array, own: Array) -> Array:
+        bad = np.real(theta[0]) < 1.0
+        return np.where(bad, np.nan, np.array([10.0 * theta[0], 3.0 * theta[0] + 1.0]))
+
+    found = solved(problem(rows, lower=[-10.0]), alone(3.0))
+    assert 1.0 <= found.unknowns.theta[0] < 1.1
+    assert not found.success
+    assert "converged" not in found.status.replace("not converged", "")
+
+
+def test_a_neighbourhood_that_diverges_is_said() -> None:
+    """Where the linearisation fails after a step, the best is returned, with the linearisation before."""
+
+    class Once(Analytic):
+        def condense(self, at: Unknowns) -> Condensed | None:
+            return super().condense(at) if at.theta[0] == -1.2 else None
+
+    p = Once((rosenbrock,), np.full(2, -5.0), np.full(2, 5.0))
+    found = solved(p, alone(-1.2, 1.0))
+    assert not found.success
+    assert "diverges" in found.status
+    assert found.cost < p.cost(alone(-1.2, 1.0))
+    assert minimise(p, alone(-1.0, 1.0), SHARP) is None
+
+
+@pytest.mark.parametrize("damped", [True, False])
+@pytest.mark.parametrize("fault", ["sign", "swapped", "noise"])
+def test_a_wrong_jacobian_is_noticed(damped: bool, fault: str) -> None:
+    """No step helps, though the linearisation promises much: that is no convergence, however short damping makes steps."""
+    rng = np.random.default_rng(3)
+    spoils = {
+        "sign": lambda J: -J,
+        "swapped": lambda J: J[:, ::-1],
+        "noise": lambda J: rng.standard_normal(J.shape) * np.linalg.norm(J, axis=0),
+    }
+    p = problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0], spoil=spoils[fault])
+    found = solved(p, alone(1.0, -0.5, 1.5), Search(damped=damped))
+    assert found.cost > 1.05 * reference(p, alone(1.0, -0.5, 1.5))[2], "it is at the minimum in spite of all"
+    assert not found.success
+    assert found.status.startswith(("stopped", "not converged"))
+
+
+def test_the_noise_of_a_simulation_does_not_hinder_convergence() -> None:
+    """A cost with round-off far above the machine's: the search ends with success next to the minimum."""
+    for seed in range(10):
+
+        def rough(theta: Array, own: Array, seed: int = seed) -> Array:
+            ripple = np.sin(1e9 * (seed + 1) * np.sum(np.real(theta)) + np.arange(60.0))
+            return peak(theta, own) * (1.0 + 1e-7 * ripple)
+
+        found = solved(problem(rough, lower=[0.0, -3.0, 0.1]), alone(1.0, -0.5, 1.5), Search(tolerance=1e-6))
+        theta, _, cost = reference(problem(peak, lower=[0.0, -3.0, 0.1]), alone(2.0, 0.4, 0.7))
+        assert found.success, found.status
+        assert found.cost < cost + 1e-3
+        np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-3)
+
+
+def test_a_start_at_the_minimum_ends_at_once() -> None:
+    """Also where residuals vanish there, and where they do not."""
+    exact = solved(problem(rosenbrock, lower=[-5.0, -5.0]), alone(1.0, 1.0))
+    assert exact.success
+    assert exact.iterations == 1
+    theta, _, _ = reference(problem(peak, lower=[0.0, -3.0, 0.1]), alone(1.0, -0.5, 1.5))
+    again = solved(problem(peak, lower=[0.0, -3.0, 0.1]), alone(*theta), Search())
+    assert again.success
+    assert again.iterations <= 2
+    np.testing.assert_allclose(again.unknowns.theta, theta, rtol=1e-6)
+
+
+def test_a_flat_valley_is_not_mistaken_for_its_end() -> None:
+    """On the floor of a narrow valley first steps are short; the minimum lies ten standard deviations on."""
+    for thin in (1e-2, 1e-3, 1e-4, 1e-5):
+
+        def rows(theta: Array, own: Array, thin: float = thin) -> Array:
+            total, apart = theta[0] + theta[1], theta[0] - theta[1]
+            return np.array([total - 2.0, thin * apart - 10.0])
+
+        found = solved(problem(rows, lower=[-FREE, -FREE]), alone(1.0, 1.0), Search())
+        assert found.success, found.status
+        np.testing.assert_allclose(thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("stop", [2, 3, 7])
+def test_an_interrupt_returns_the_best_so_far(stop: int) -> None:
+    """Whenever it comes after the start; before, it is passed on."""
+    p = problem(rosenbrock, lower=[-5.0, -5.0], stop=stop)
+    found = solved(p, alone(-1.2, 1.0))
+    assert found.interrupted
+    assert not found.success
+    assert "interrupted" in found.status
+    p.stop = None
+    costs = [p.cost(at) for at in p.seen[: stop - 1]]
+    assert found.cost == min(costs)
+    assert p.cost(found.unknowns) == found.cost
+
+
+def test_an_interrupt_by_the_listener_keeps_what_was_told() -> None:
+    """Ctrl-C often comes while progress is shown."""
+
+    def tell(progress: Progress) -> None:
+        if progress.iteration == 3:
+            costs.append(progress.cost)
+            raise KeyboardInterrupt
+
+    costs: list[float] = []
+    found = minimise(problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0), SHARP, tell)
+    assert found is not None
+    assert found.interrupted
+    assert found.cost == costs[0]
+    with pytest.raises(KeyboardInterrupt):
+        minimise(problem(rosenbrock, lower=[-5.0, -5.0], stop=1), alone(-1.2, 1.0), SHARP)
+
+
+def test_the_limit_of_iterations_is_kept_and_said() -> None:
+    """And the cost of what is returned is that of its unknowns."""
+    p = problem(rosenbrock, lower=[-5.0, -5.0])
+    found = solved(p, alone(-1.2, 1.0), Search(iterations=3))
+    assert found.iterations == 3
+    assert not found.success
+    assert "not converged in 3 iterations" in found.status
+    assert p.cost(found.unknowns) == found.cost < p.cost(alone(-1.2, 1.0))
+
+
+def test_the_last_linearisation_is_at_the_solution() -> None:
+    """Unless that was not wanted; then it is the one before."""
+    start = Unknowns(np.array([0.3, 0.0]), np.ones((3, 1)))
+    p = problem(*decays(), lower=[0.0, -5.0])
+    found = solved(p, start, Search())
+    fresh = p.condense(found.unknowns)
+    assert fresh is not None
+    np.testing.assert_array_equal(found.condensed.blocks, fresh.blocks)
+    saved = solved(p, start, Search(fresh=False))
+    np.testing.assert_allclose(saved.unknowns.theta, found.unknowns.theta, rtol=1e-5)
+    assert saved.cost == p.cost(saved.unknowns)
+    assert not np.array_equal(saved.condensed.blocks, fresh.blocks)
+    np.testing.assert_allclose(saved.condensed.information(), fresh.information(), rtol=1e-3)

@@ -1,0 +1,279 @@
+"""Linear recursions, regulator and descent against plain loops, SciPy's Riccati solver and a dense KKT system."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+from mjfim.optimize.lq import Recursion, Riccati, TangentCurve, Weights, descent, growth, regulator
+
+
+def random_system(rng: np.random.Generator, N: int, nx: int, nu: int) -> tuple[np.ndarray, np.ndarray]:
+    """A time-varying pair (A, B), mildly unstable."""
+    return np.eye(nx) + 0.2 * rng.normal(size=(N, nx, nx)), rng.normal(size=(N, nx, nu))
+
+
+def positive(rng: np.random.Generator, n: int) -> np.ndarray:
+    """A random symmetric positive definite weight that is not diagonal."""
+    root = rng.normal(size=(n, n))
+    return root @ root.T + 0.5 * np.eye(n)
+
+
+def dense_solution(A, B, a, b, Q, R, terminal) -> tuple[np.ndarray, np.ndarray]:
+    """(z, v) of the LQ problem by one dense KKT solve over z_1 ... z_N, v_0 ... v_{N-1} and the multipliers."""
+    N, nx, nu = B.shape
+    nz, nv = N * nx, N * nu
+    H, g, J = np.zeros((nz + nv, nz + nv)), np.zeros(nz + nv), np.zeros((nz, nz + nv))
+    for k in range(1, N + 1):
+        rows = slice((k - 1) * nx, k * nx)
+        H[rows, rows], g[rows] = terminal if k == N else Q, a[k]
+        J[rows, rows] = np.eye(nx)
+        if k > 1:
+            J[rows, (k - 2) * nx : (k - 1) * nx] = -A[k - 1]
+        J[rows, nz + (k - 1) * nu : nz + k * nu] = -B[k - 1]
+    for k in range(N):
+        cols = slice(nz + k * nu, nz + (k + 1) * nu)
+        H[cols, cols], g[cols] = R, b[k]
+    KKT = np.block([[H, J.T], [J, np.zeros((nz, nz))]])
+    solution = np.linalg.solve(KKT, np.concatenate([-g, np.zeros(nz)]))
+    z = np.concatenate([np.zeros((1, nx)), solution[:nz].reshape(N, nx)])
+    return z, solution[nz : nz + nv].reshape(N, nu)
+
+
+def random_weights(rng: np.random.Generator, N: int, nx: int, nu: int, steps: bool) -> Weights:
+    """Weights that vary over time and couple state and control, positive definite together; zero or positive on steps."""
+    both = [positive(rng, nx + nu) for _ in range(N)]
+    Q = np.array([*(form[:nx, :nx] for form in both), positive(rng, nx)])
+    S, R = np.array([form[nx:, :nx] for form in both]), np.array([form[nx:, nx:] for form in both])
+    return Weights(Q, S, R, rng.uniform(0.0, 5.0, (N + 1, nu)) * steps)
+
+
+def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
+    """The quadratic form, sample by sample."""
+    total, before = float(z[-1] @ weights.Q[-1] @ z[-1]), np.zeros(v.shape[1])
+    for k, now in enumerate(v):
+        total += z[k] @ weights.Q[k] @ z[k] + 2 * now @ weights.S[k] @ z[k] + now @ weights.R[k] @ now
+        total += weights.W[k] @ (now - before) ** 2
+        before = now
+    return total + weights.W[-1] @ before**2
+
+
+@pytest.mark.parametrize("sizes", [(1, 1), (7, 1), (1, 3), (30, 4)])
+def test_forward_recursion_is_the_plain_loop(sizes: tuple[int, int]) -> None:
+    N, n = sizes
+    rng = np.random.default_rng(N)
+    A, c, z0 = rng.normal(size=(N, n, n)), rng.normal(size=(N, n)), rng.normal(size=n)
+    z = [z0]
+    for k in range(N):
+        z.append(A[k] @ z[-1] + c[k])
+    np.testing.assert_allclose(Recursion(A).forward(z0, c), z, rtol=1e-12, atol=1e-12 * np.abs(z).max())
+
+
+@pytest.mark.parametrize("sizes", [(1, 1), (7, 1), (1, 3), (30, 4)])
+def test_adjoint_recursion_is_the_plain_loop(sizes: tuple[int, int]) -> None:
+    N, n = sizes
+    rng = np.random.default_rng(N)
+    A, a = rng.normal(size=(N, n, n)), rng.normal(size=(N + 1, n))
+    costate = [a[N]]
+    for k in range(N - 1, -1, -1):
+        costate.insert(0, A[k].T @ costate[0] + a[k])
+    np.testing.assert_allclose(Recursion(A).adjoint(a), costate, rtol=1e-12, atol=1e-12 * np.abs(costate).max())
+
+
+def test_adjoint_is_the_transpose_of_forward() -> None:
+    rng = np.random.default_rng(3)
+    A, c, a = rng.normal(size=(12, 3, 3)) * 0.7, rng.normal(size=(12, 3)), rng.normal(size=(13, 3))
+    z0, recursion = rng.normal(size=3), Recursion(A)
+    costate = recursion.adjoint(a)
+    left = np.sum(a * recursion.forward(z0, c))
+    assert left == pytest.approx(np.sum(costate[1:] * c) + costate[0] @ z0, rel=1e-12)
+
+
+def test_recursions_leave_their_inputs_alone_and_can_be_reused() -> None:
+    rng = np.random.default_rng(4)
+    A, c, a = rng.normal(size=(5, 2, 2)), rng.normal(size=(5, 2)), rng.normal(size=(6, 2))
+    kept, recursion = [v.copy() for v in (A, c, a)], Recursion(A)
+    first = recursion.forward(np.ones(2), c)
+    recursion.adjoint(a)
+    np.testing.assert_array_equal(recursion.forward(np.ones(2), c), first)
+    for now, before in zip((A, c, a), kept, strict=True):
+        np.testing.assert_array_equal(now, before)
+
+
+def test_recursion_overflows_to_infinity_without_a_warning() -> None:
+    z = Recursion(np.full((400, 1, 1), 10.0)).forward(np.ones(1), np.zeros((400, 1)))
+    assert np.isinf(z[-1, 0])
+
+
+def test_regulator_over_a_long_horizon_is_the_stationary_riccati_gain() -> None:
+    rng = np.random.default_rng(5)
+    A = np.array([[1.05, 0.1, 0.0], [0.0, 1.1, 0.1], [0.05, 0.0, 0.95]])
+    B, Q, R = rng.normal(size=(3, 2)), positive(rng, 3), positive(rng, 2)
+    assert np.abs(np.linalg.eigvals(A)).max() > 1.05  # unstable: the gain matters
+    X = solve_discrete_are(A, B, Q, R)
+    stationary = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A)
+    K = regulator(np.tile(A, (300, 1, 1)), np.tile(B, (300, 1, 1)), Q, R, np.zeros((3, 3)))
+    np.testing.assert_allclose(K[0], stationary, rtol=1e-10)
+    assert np.abs(np.linalg.eigvals(A - B @ K[0])).max() < 1.0
+    # without a terminal weight the last control is worth nothing
+    np.testing.assert_allclose(K[-1], 0.0, atol=1e-14)
+
+
+def test_regulator_starting_from_the_stationary_cost_is_stationary_throughout() -> None:
+    rng = np.random.default_rng(6)
+    A, B, Q, R = 1.1 * np.eye(2) + 0.1 * rng.normal(size=(2, 2)), np.eye(2), positive(rng, 2), positive(rng, 2)
+    X = solve_discrete_are(A, B, Q, R)
+    K = regulator(np.tile(A, (20, 1, 1)), np.tile(B, (20, 1, 1)), Q, R, X)
+    np.testing.assert_allclose(K, np.broadcast_to(K[0], K.shape), rtol=1e-10)
+
+
+def test_regulator_gain_minimises_its_cost_over_a_finite_time_varying_horizon() -> None:
+    rng = np.random.default_rng(7)
+    A, B = random_system(rng, 9, 3, 2)
+    Q, R, terminal = positive(rng, 3), positive(rng, 2), positive(rng, 3)
+    K, z0 = regulator(A, B, Q, R, terminal), rng.normal(size=3)
+
+    def cost(v: np.ndarray) -> float:
+        z = Recursion(A).forward(z0, np.einsum("kij,kj->ki", B, v))
+        running = np.einsum("ki,ij,kj->", z[:-1], Q, z[:-1]) + np.einsum("ki,ij,kj->", v, R, v)
+        return float(running + z[-1] @ terminal @ z[-1])
+
+    z = Recursion(A - B @ K).forward(z0, np.zeros((9, 3)))
+    best = -np.einsum("kui,ki->ku", K, z[:-1])
+    for _ in range(20):
+        step = 1e-3 * rng.normal(size=best.shape)
+        rise = cost(best + step) - cost(best)
+        assert rise > 0.0
+        assert cost(best - step) - cost(best) == pytest.approx(rise, rel=1e-5)  # stationary: no linear term
+
+
+@pytest.mark.parametrize("sizes", [(1, 2, 1), (2, 1, 1), (8, 3, 2), (25, 4, 1)])
+def test_descent_is_the_dense_kkt_solution(sizes: tuple[int, int, int]) -> None:
+    N, nx, nu = sizes
+    rng = np.random.default_rng(N + nx)
+    A, B = random_system(rng, N, nx, nu)
+    a, b = rng.normal(size=(N + 1, nx)), rng.normal(size=(N, nu))
+    Q, R, terminal = positive(rng, nx), positive(rng, nu), 3.0 * positive(rng, nx)
+    zeta = descent(A, B, a, b, Q, R, terminal)
+    z, v = dense_solution(A, B, a, b, Q, R, terminal)
+    np.testing.assert_allclose(zeta.z, z, rtol=0, atol=1e-9 * np.abs(z).max())
+    np.testing.assert_allclose(zeta.v, v, rtol=0, atol=1e-9 * np.abs(v).max())
+    wrong, _ = dense_solution(A, B, a, b, Q, R, Q)
+    assert np.abs(zeta.z - wrong).max() > 1e-3 * np.abs(z).max()  # the terminal weight is seen
+
+
+def test_descent_without_weight_on_the_state_is_the_dense_kkt_solution() -> None:
+    rng = np.random.default_rng(11)
+    A, B = random_system(rng, 15, 3, 2)
+    a, b, R, none = rng.normal(size=(16, 3)), rng.normal(size=(15, 2)), positive(rng, 2), np.zeros((3, 3))
+    zeta = descent(A, B, a, b, none, R, none)
+    z, v = dense_solution(A, B, a, b, none, R, none)
+    np.testing.assert_allclose(zeta.z, z, rtol=0, atol=1e-10 * np.abs(z).max())
+    np.testing.assert_allclose(zeta.v, v, rtol=0, atol=1e-10 * np.abs(v).max())
+
+
+@pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
+@pytest.mark.parametrize("sizes", [(1, 2, 1), (2, 1, 1), (8, 3, 2), (25, 4, 1)])
+def test_weighted_descent_solves_the_dense_normal_equations(sizes: tuple[int, int, int], steps: bool) -> None:
+    N, nx, nu = sizes
+    rng = np.random.default_rng(N + 10 * nx)
+    A, B = random_system(rng, N, nx, nu)
+    a, b, weights = rng.normal(size=(N + 1, nx)), rng.normal(size=(N, nu)), random_weights(rng, N, nx, nu, steps)
+
+    def response(v: np.ndarray) -> np.ndarray:
+        return Recursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
+
+    def cost(v: np.ndarray) -> tuple[float, float]:
+        z = response(v)
+        return float(np.sum(a * z) + np.sum(b * v)), form(weights, z, v)
+
+    units = np.eye(N * nu).reshape(-1, N, nu)
+    g, diagonal = np.array([cost(e) for e in units]).T
+    pairs = np.array([[cost(e + f)[1] for f in units] for e in units])
+    H = 0.5 * (pairs - diagonal[:, None] - diagonal)  # by polarisation
+    best = -np.linalg.solve(H, g).reshape(N, nu)
+    zeta = Riccati.of(A, B, weights).descent(a, b)
+    np.testing.assert_allclose(zeta.v, best, rtol=0, atol=1e-8 * np.abs(best).max())
+    np.testing.assert_allclose(zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0))
+    # every weight is seen
+    for name in ("S", "W") if steps else ("S",):
+        other = Weights(**{**weights.__dict__, name: 0.5 * getattr(weights, name)})
+        assert np.abs(Riccati.of(A, B, other).descent(a, b).v - best).max() > 1e-4 * np.abs(best).max() or (
+            name == "S" and N == 1  # z_0 = 0
+        )
+
+
+def test_force_is_half_the_derivative_of_the_form() -> None:
+    rng = np.random.default_rng(21)
+    N, nx, nu = 9, 3, 2
+    weights = random_weights(rng, N, nx, nu, steps=True)
+    z, v, dz, dv = (rng.normal(size=s) for s in ((N + 1, nx), (N, nu), (N + 1, nx), (N, nu)))
+    a, b = weights.force(TangentCurve(z, v))
+    slope = 0.5 * (form(weights, z + dz, v + dv) - form(weights, z - dz, v - dv)) / 2.0  # a quadratic: exact
+    assert np.sum(a * dz) + np.sum(b * dv) == pytest.approx(slope, rel=1e-12)
+    assert np.sum(a * z) + np.sum(b * v) == pytest.approx(form(weights, z, v), rel=1e-12)
+
+
+def test_descent_is_feasible_optimal_and_goes_down_by_its_own_metric() -> None:
+    rng = np.random.default_rng(12)
+    A, B = random_system(rng, 10, 3, 2)
+    a, b = rng.normal(size=(11, 3)), rng.normal(size=(10, 2))
+    Q, R, terminal = positive(rng, 3), positive(rng, 2), positive(rng, 3)
+
+    def model(z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+        square = np.einsum("ki,ij,kj->", z[:-1], Q, z[:-1]) + z[-1] @ terminal @ z[-1]
+        return float(np.sum(a * z) + np.sum(b * v)), float(square + np.einsum("ki,ij,kj->", v, R, v))
+
+    zeta = descent(A, B, a, b, Q, R, terminal)
+    recursion = Recursion(A)
+    np.testing.assert_allclose(
+        zeta.z, recursion.forward(np.zeros(3), np.einsum("kij,kj->ki", B, zeta.v)), rtol=0, atol=1e-12
+    )
+    slope, square = model(zeta.z, zeta.v)
+    assert slope == pytest.approx(-square, rel=1e-10)  # DJ.zeta = -<zeta, zeta> at the minimiser
+    best = slope + 0.5 * square
+    for _ in range(20):
+        v = zeta.v + 1e-2 * rng.normal(size=zeta.v.shape)
+        slope, square = model(recursion.forward(np.zeros(3), np.einsum("kij,kj->ki", B, v)), v)
+        assert slope + 0.5 * square > best
+
+
+def test_a_control_weight_that_is_not_positive_is_refused() -> None:
+    A, B, flat = np.ones((3, 1, 1)), np.ones((3, 1, 1)), np.zeros((1, 1))
+    with pytest.raises(np.linalg.LinAlgError, match="positive"):
+        regulator(A, B, flat, np.array([[-1.0]]), flat)
+    with pytest.raises(np.linalg.LinAlgError, match="positive"):
+        descent(A, B, np.zeros((4, 1)), np.zeros((3, 1)), flat, flat, flat)
+
+
+@pytest.mark.parametrize("wrong", ["A", "B", "a", "b", "Q", "R"])
+def test_arrays_that_do_not_fit_together_are_refused(wrong: str) -> None:
+    shapes = {"A": (6, 3, 3), "B": (6, 3, 2), "a": (7, 3), "b": (6, 2), "Q": (3, 3), "R": (2, 2)}
+    misfits = {"A": (6, 4, 4), "B": (6, 4, 2), "a": (6, 3), "b": (5, 2), "Q": (4, 4), "R": (3, 3)}
+    shapes[wrong] = misfits[wrong]
+    values = {k: np.eye(*s) if k in "QR" else np.ones(s) for k, s in shapes.items()}
+    with pytest.raises((ValueError, IndexError)):
+        descent(**values, terminal=np.eye(3))
+
+
+@pytest.mark.parametrize(("rows", "rhs"), [(3, "c"), (5, "c"), (4, "a"), (6, "a")])
+def test_recursion_refuses_arrays_of_the_wrong_length(rows: int, rhs: str) -> None:
+    recursion, wrong = Recursion(np.ones((4, 2, 2))), np.ones((rows, 2))
+    solve = recursion.adjoint if rhs == "a" else partial(recursion.forward, np.ones(2))
+    with pytest.raises(ValueError, match="needs"):
+        solve(wrong)
+
+
+def test_growth_is_the_largest_amplification_from_the_start_or_to_the_end() -> None:
+    rng = np.random.default_rng(11)
+    A = 1.1 * np.linalg.qr(rng.standard_normal((12, 3, 3)))[0]
+    product, largest = np.eye(3), 1.0
+    for step in A:
+        product = step @ product
+        largest = max(largest, np.linalg.norm(product, 2))
+    assert growth(A) == pytest.approx(largest)
+    late = np.concatenate([0.01 * A, 3.0 * A])  # forgets the start, then explodes
+    assert growth(late) == pytest.approx(3.3**12)

@@ -1,0 +1,472 @@
+"""Algorithm 1 on a pendulum written in NumPy, with exact derivatives: no MuJoCo, nothing but the algorithm is tested."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from support.numerics import Array, directional_check
+
+from mjfim.optimize.directions import LBFGS, MetricDescent
+from mjfim.optimize.lq import TangentCurve, growth
+from mjfim.optimize.projection_operator import Armijo, Direction, Expansion, Iterate, Regulator, optimize
+from mjfim.records.design import Status
+
+DT, N = 0.05, 60
+START, GOAL = np.array([0.4, 0.0]), np.array([np.pi, 0.0])
+Q, R, TERMINAL = np.diag([1.0, 0.1]), np.array([[0.05]]), np.diag([20.0, 5.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """x: (N+1, 2) angle and rate, u: (N, 1)."""
+
+    x: Array
+    u: Array
+
+
+def step(x: Array, u: Array) -> Array:
+    """One sample of a damped pendulum, angle from hanging."""
+    rate = x[1] + DT * (-np.sin(x[0]) - 0.1 * x[1] + u[0])
+    return np.array([x[0] + DT * rate, rate])
+
+
+def jacobians(x: Array) -> tuple[Array, Array]:
+    """Derivative of `step`."""
+    bend = -DT * np.cos(x[0])
+    drag = 1.0 - 0.1 * DT
+    return np.array([[1.0 + DT * bend, DT * drag], [bend, drag]]), np.array([[DT * DT], [DT]])
+
+
+@dataclass
+class Pendulum:
+    """Swing towards upright at quadratic cost. Remembers every value that was asked for.
+
+    shift: subtracted from the cost;  sign: of the gradient that `expand` tells;  wall: |u| beyond which a trial diverges
+    refinements: how often `refine` has something better
+    """
+
+    shift: float = 0.0
+    sign: float = 1.0
+    wall: float = np.inf
+    refinements: int = 0
+    values: list[float] = field(default_factory=list)
+
+    def rollout(self, u: Array) -> Curve:
+        """Open loop."""
+        x = [START]
+        for k in range(N):
+            x.append(step(x[-1], u[k]))
+        return Curve(np.array(x), u)
+
+    def value(self, point: Curve) -> float:
+        """J by plain loops."""
+        self.values.append(self.whole(point) - self.shift)
+        return self.values[-1]
+
+    def size(self, point: Curve) -> float:
+        """The cost before anything is subtracted."""
+        return self.whole(point)
+
+    def whole(self, point: Curve) -> float:
+        """The quadratic cost, infinite beyond the wall."""
+        if np.abs(point.u).max() > self.wall:
+            return np.inf
+        total = 0.0
+        for k in range(N):
+            d = point.x[k] - GOAL
+            total += 0.5 * DT * float(d @ Q @ d + point.u[k] @ R @ point.u[k])
+        d = point.x[N] - GOAL
+        return total + 0.5 * float(d @ TERMINAL @ d)
+
+    def expand(self, point: Curve) -> Expansion:
+        """Exact first derivatives."""
+        A, B = (np.array(m) for m in zip(*(jacobians(x) for x in point.x[:-1]), strict=True))
+        a = DT * (point.x - GOAL) @ Q
+        a[0], a[N] = 0.0, TERMINAL @ (point.x[N] - GOAL)
+        return Expansion(A, B, self.sign * a, self.sign * DT * point.u @ R)
+
+    def project(self, point: Curve, zeta: TangentCurve, gamma: float, K: Array) -> Curve:
+        """The projection operator, sample by sample."""
+        x, u = [START], []
+        for k in range(N):
+            u.append(point.u[k] + gamma * zeta.v[k] + K[k] @ (point.x[k] + gamma * zeta.z[k] - x[-1]))
+            x.append(step(x[-1], u[-1]))
+        return Curve(np.array(x), np.array(u))
+
+    def difference(self, new: Curve, old: Curve) -> TangentCurve:
+        """On a vector space."""
+        return TangentCurve(new.x - old.x, new.u - old.u)
+
+    def refine(self, point: Curve) -> Curve | None:
+        """Nothing to refine, unless asked for."""
+        if self.refinements == 0:
+            return None
+        self.refinements -= 1
+        return replace(point)
+
+
+def start(problem: Pendulum) -> Curve:
+    """A gentle push."""
+    return problem.rollout(0.5 * np.sin(np.arange(N) * DT)[:, None])
+
+
+METRIC = MetricDescent(Q * DT, R * DT, TERMINAL)
+REGULATOR = Regulator(np.eye(2) * DT, np.eye(1) * DT, np.eye(2))
+
+
+def run(problem: Any, direction: Direction, **changes: Any) -> list[Iterate[Curve]]:
+    """All iterates."""
+    settings = {"regulate": REGULATOR, "armijo": Armijo(), "tolerance": 1e-12, "max_iterations": 200, **changes}
+    return list(optimize(problem, start(problem), direction, **settings))
+
+
+@pytest.fixture(scope="module")
+def optimum() -> float:
+    """The least cost over controls, by SciPy with its own differences."""
+    problem = Pendulum()
+
+    def cost(u: Array) -> float:
+        return problem.value(problem.rollout(u[:, None]))
+
+    u = start(problem).u[:, 0]
+    for _ in range(2):
+        u = minimize(cost, u, method="BFGS", options={"gtol": 1e-7, "maxiter": 400}).x
+    return cost(u)
+
+
+DIRECTIONS: dict[str, Callable[[], Direction]] = {"metric": lambda: METRIC, "lbfgs": lambda: LBFGS(R * DT)}
+
+
+@pytest.mark.parametrize("method", DIRECTIONS)
+def test_descent_reaches_the_optimum_that_scipy_finds(method: str, optimum: float) -> None:
+    iterates = run(Pendulum(), DIRECTIONS[method]())
+    assert iterates[-1].status is Status.CONVERGED
+    assert iterates[-1].value == pytest.approx(optimum, rel=1e-7)
+    assert iterates[0].value > 2.0 * optimum
+
+
+@pytest.mark.parametrize("method", DIRECTIONS)
+@pytest.mark.parametrize("period", [1, 7, 1000])
+def test_the_optimum_does_not_depend_on_how_often_the_regulator_is_renewed(
+    method: str, period: int, optimum: float
+) -> None:
+    iterates = run(Pendulum(), DIRECTIONS[method](), regulate=replace(REGULATOR, period=period))
+    assert iterates[-1].status is Status.CONVERGED
+    assert iterates[-1].value == pytest.approx(optimum, rel=1e-7)
+
+
+@pytest.mark.parametrize("method", DIRECTIONS)
+def test_iterates_go_down_and_are_numbered_and_only_the_last_has_a_status(method: str) -> None:
+    iterates = run(Pendulum(), DIRECTIONS[method]())
+    assert all(b.value < a.value for a, b in pairwise(iterates))
+    assert [i.index for i in iterates] == list(range(len(iterates)))
+    assert [i.status for i in iterates[:-1]] == [None] * (len(iterates) - 1)
+    assert iterates[0].gamma == 0.0
+    assert all(0.0 < i.gamma <= 1.0 for i in iterates[1:])
+
+
+@pytest.mark.parametrize("method", DIRECTIONS)
+def test_the_expansion_of_this_problem_is_exact(method: str) -> None:
+    problem = Pendulum()
+    point = start(problem)
+    expansion = problem.expand(point)
+    K = REGULATOR.gain(expansion)
+    zeta = DIRECTIONS[method]()(expansion, K)
+    size = 1e-2 / np.abs(zeta.v).max()
+    short = TangentCurve(size * zeta.z, size * zeta.v)
+
+    def J(t: float) -> float:
+        return problem.value(problem.project(point, short, t, K))
+
+    assert directional_check([expansion.slope(short)], [J], 1.0) < 1e-7
+    assert directional_check([1.001 * expansion.slope(short)], [J], 1.0) > 5e-4
+
+
+def test_slope_decides_convergence_and_is_relative_to_the_cost() -> None:
+    for tolerance in (1e-2, 1e-5):
+        iterates = run(Pendulum(), METRIC, tolerance=tolerance)
+        assert iterates[-1].status is Status.CONVERGED
+        assert iterates[-1].slope <= tolerance * iterates[-1].value
+        assert all(i.slope > tolerance * i.value for i in iterates[:-1])
+
+
+def test_metric_descent_slope_is_minus_the_squared_metric_length() -> None:
+    problem = Pendulum()
+    expansion = problem.expand(start(problem))
+    zeta = METRIC(expansion, REGULATOR.gain(expansion))
+    square = np.einsum("ki,ij,kj->", zeta.z[:-1], METRIC.Q, zeta.z[:-1]) + zeta.z[-1] @ TERMINAL @ zeta.z[-1]
+    square += np.einsum("ki,ij,kj->", zeta.v, METRIC.R, zeta.v)
+    assert expansion.slope(zeta) == pytest.approx(-square, rel=1e-10)
+
+
+@pytest.mark.parametrize("limit", [0, 1, 3])
+def test_max_iterations_is_an_outcome_and_counts_accepted_steps(limit: int) -> None:
+    iterates = run(Pendulum(), METRIC, max_iterations=limit)
+    assert iterates[-1].status is Status.MAX_ITERATIONS
+    assert iterates[-1].index == limit
+    assert not iterates[-1].status.success
+
+
+@pytest.mark.parametrize("method", DIRECTIONS)
+def test_a_gradient_of_the_wrong_sign_stalls_and_never_raises_the_cost(method: str) -> None:
+    problem = Pendulum(sign=-1.0)
+    iterates = run(problem, DIRECTIONS[method]())
+    assert iterates[-1].status is Status.STALLED
+    assert not iterates[-1].status.success
+    assert iterates[-1].value == iterates[0].value
+    assert {i.index for i in iterates} == {0}
+
+
+def test_a_gradient_that_is_wrong_in_part_of_the_horizon_is_not_called_converged() -> None:
+    class Wrong(Pendulum):
+        def expand(self, point: Curve) -> Expansion:
+            e = super().expand(point)
+            a = np.array(e.a)
+            a[N] *= -0.5
+            return replace(e, a=a)
+
+    assert run(Wrong(), LBFGS(R * DT))[-1].status is Status.STALLED
+
+
+@dataclass
+class Upwards:
+    """A direction that climbs although the expansion is right."""
+
+    def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
+        zeta = METRIC(expansion, K)
+        return TangentCurve(-zeta.z, -zeta.v)
+
+    def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
+        """Nothing is learnt."""
+
+    def reset(self) -> bool:
+        """Nothing to forget."""
+        return False
+
+
+def test_a_direction_that_climbs_is_not_called_converged() -> None:
+    iterates = run(Pendulum(), Upwards(), max_iterations=5)
+    assert iterates[-1].status is not Status.CONVERGED
+    assert iterates[-1].value <= iterates[0].value
+
+
+def searched(problem: Pendulum, factor: float, armijo: Armijo, first: float = 1.0) -> tuple[Any, float, float]:
+    """(what the line search found, J at the start, slope) along the metric direction times a factor."""
+    point = start(problem)
+    expansion = problem.expand(point)
+    K = REGULATOR.gain(expansion)
+    zeta = METRIC(expansion, K)
+    zeta = TangentCurve(factor * zeta.z, factor * zeta.v)
+    slope = expansion.slope(zeta)
+    return armijo.search(problem, point, zeta, slope, K, first), problem.value(point), slope
+
+
+@pytest.mark.parametrize("factor", [1.0, 10.0, 100.0, 1e4])
+@pytest.mark.parametrize("sigma", [1e-4, 0.3])
+def test_armijo_accepts_a_step_of_sufficient_decrease_however_long_the_direction(factor: float, sigma: float) -> None:
+    problem = Pendulum()
+    (trial, gamma), value, slope = searched(problem, factor, Armijo(sigma=sigma))
+    assert problem.value(trial) <= value + sigma * gamma * slope
+    assert problem.value(trial) < value
+    assert 0.0 < gamma <= 1.0
+    rejected = problem.values[1:-3]  # between J at the start and the three asked for after the accepted one
+    assert all(v > value + sigma * gamma * slope for v in rejected[:-1])
+
+
+def test_armijo_rejects_small_decrease_that_is_not_sufficient() -> None:
+    class Flat(Pendulum):
+        """Every trial is lower than the start, by a thousandth of what the slope promises."""
+
+        def value(self, point: Curve) -> float:
+            gap = float(np.abs(point.u - origin.u).max())
+            return 10.0 - 1e-3 * gap
+
+    problem = Flat()
+    origin = start(problem)
+    zeta = TangentCurve(np.zeros((N + 1, 2)), np.ones((N, 1)))
+    K = np.zeros((N, 1, 2))
+    assert Armijo(sigma=1e-2).search(problem, origin, zeta, -1.0, K) is None
+    assert Armijo(sigma=1e-4).search(problem, origin, zeta, -1.0, K) is not None
+
+
+def test_armijo_gives_up_on_an_ascent_direction_that_claims_to_descend() -> None:
+    problem = Pendulum()
+    point = start(problem)
+    expansion = problem.expand(point)
+    K = REGULATOR.gain(expansion)
+    zeta = METRIC(expansion, K)
+    up = TangentCurve(-zeta.z, -zeta.v)
+    before = len(problem.values)
+    assert Armijo(trials=12).search(problem, point, up, expansion.slope(zeta), K) is None
+    assert len(problem.values) - before == 13  # the start and every trial
+
+
+def test_armijo_does_not_accept_a_step_too_short_to_change_the_cost() -> None:
+    problem = Pendulum()
+    point = start(problem)
+    expansion = problem.expand(point)
+    K = REGULATOR.gain(expansion)
+    zeta = METRIC(expansion, K)
+    up = TangentCurve(-zeta.z, -zeta.v)
+    found = Armijo(trials=100).search(problem, point, up, expansion.slope(zeta), K)
+    assert found is None or problem.value(found[0]) < problem.value(point)
+
+
+def test_armijo_backtracks_from_trials_that_diverge() -> None:
+    problem = Pendulum(wall=6.0)
+    (trial, gamma), value, _ = searched(problem, 100.0, Armijo())
+    assert np.abs(trial.u).max() <= 6.0
+    assert gamma < 0.1
+    assert problem.value(trial) < value
+
+
+def test_descent_goes_on_past_trials_that_diverge(optimum: float) -> None:
+    free = run(Pendulum(), LBFGS(R * DT))
+    peak = np.abs(free[-1].point.u).max()
+    problem = Pendulum(wall=1.02 * peak)
+    iterates = run(problem, LBFGS(R * DT))
+    assert iterates[-1].value == pytest.approx(optimum, rel=1e-6)
+
+
+def test_armijo_never_gets_longer_than_it_is_asked_to_begin_with() -> None:
+    (_, gamma), _, _ = searched(Pendulum(), 1.0, Armijo(), first=0.125)
+    assert gamma <= 0.125
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"sigma": 0.0}, {"sigma": 0.5}, {"sigma": -1.0}, {"beta": 0.0}, {"beta": 1.0}, {"trials": 0}],
+)
+def test_armijo_refuses_settings_that_cannot_work(settings: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="Armijo needs"):
+        Armijo(**settings)
+
+
+@pytest.mark.parametrize("method", DIRECTIONS)
+@pytest.mark.parametrize("share", [0.0, 0.9, 1.0, 1.5])
+def test_a_constant_added_to_the_cost_does_not_keep_the_descent_from_the_optimum(
+    method: str, share: float, optimum: float
+) -> None:
+    begin = Pendulum()
+    shift = share * begin.value(start(begin))  # share = 1: the cost starts at exactly zero, as a log-determinant may
+    iterates = run(Pendulum(shift=shift), DIRECTIONS[method](), max_iterations=300)
+    assert iterates[-1].value + shift == pytest.approx(optimum, rel=1e-6)
+
+
+def test_better_differences_are_used_before_convergence_is_claimed(optimum: float) -> None:
+    problem = Pendulum(refinements=1)
+    iterates = run(problem, LBFGS(R * DT))
+    assert problem.refinements == 0
+    assert iterates[-1].status is Status.CONVERGED
+    assert iterates[-1].value == pytest.approx(optimum, rel=1e-7)
+
+
+def test_better_differences_are_used_before_a_stall_is_claimed() -> None:
+    problem = Pendulum(sign=-1.0, refinements=2)
+    assert run(problem, METRIC)[-1].status is Status.STALLED
+    assert problem.refinements == 0
+
+
+def test_the_consumer_may_stop_between_iterates() -> None:
+    problem = Pendulum()
+    loop: Iterator[Iterate[Curve]] = optimize(problem, start(problem), METRIC, REGULATOR, Armijo(), 1e-12, 100)
+    first, second = next(loop), next(loop)
+    loop.close()
+    assert second.value < first.value
+
+
+def test_lbfgs_needs_fewer_iterations_than_metric_descent_for_the_same_digits() -> None:
+    metric = MetricDescent(np.zeros((2, 2)), R * DT, np.zeros((2, 2)))  # the same metric as the L-BFGS here starts from
+    counts = [len(run(Pendulum(), d, max_iterations=120)) for d in (metric, LBFGS(R * DT))]
+    assert counts[1] < 0.5 * counts[0]
+
+
+def learned(memory: int, iterations: int = 9) -> tuple[LBFGS, Expansion, Array]:
+    """An L-BFGS after some iterations, the expansion it will see next, and K."""
+    problem, direction = Pendulum(), LBFGS(R * DT, memory)
+    iterates = run(problem, direction, max_iterations=iterations, regulate=replace(REGULATOR, period=1000))
+    K = REGULATOR.gain(problem.expand(iterates[0].point))
+    return direction, problem.expand(iterates[-1].point), K
+
+
+def test_lbfgs_keeps_a_limited_number_of_pairs_all_of_positive_curvature() -> None:
+    direction, _, _ = learned(memory=4)
+    assert len(direction._pairs) == 4
+    for pair in direction._pairs:
+        assert pair.curvature == pytest.approx(np.sum(pair.s * pair.y), rel=1e-12)
+        assert pair.curvature > 0.0
+
+
+def test_lbfgs_direction_is_minus_the_inverse_bfgs_matrix_times_the_gradient() -> None:
+    direction, expansion, K = learned(memory=20)
+    pairs = [(pair.s.ravel(), pair.y.ravel()) for pair in direction._pairs]
+    s, y = pairs[-1]
+    inverse = np.kron(np.eye(N), np.linalg.inv(R * DT))
+    H = inverse * (s @ y) / (y @ inverse @ y)
+    for s, y in pairs:  # dense update, eq. 6.17 of Nocedal & Wright
+        V = np.eye(N) - np.outer(y, s) / (s @ y)
+        H = V.T @ H @ V + np.outer(s, s) / (s @ y)
+    zeta = direction(expansion, K)
+    c = zeta.v + np.einsum("kui,ki->ku", K, zeta.z[:-1])
+    expected = -H @ expansion.gradient(K).ravel()
+    np.testing.assert_allclose(c.ravel(), expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+    assert expansion.slope(zeta) < 0.0
+
+
+def test_lbfgs_without_memory_is_steepest_descent_in_the_control_metric() -> None:
+    problem, direction = Pendulum(), LBFGS(R * DT)
+    expansion = problem.expand(start(problem))
+    K = REGULATOR.gain(expansion)
+    zeta = direction(expansion, K)
+    c = zeta.v + np.einsum("kui,ki->ku", K, zeta.z[:-1])
+    np.testing.assert_allclose(c, -expansion.gradient(K) / (R * DT), rtol=1e-10)
+
+
+def test_lbfgs_refuses_pairs_of_negative_curvature_and_forgets_on_demand() -> None:
+    problem, direction = Pendulum(), LBFGS(R * DT)
+    expansion = problem.expand(start(problem))
+    K = REGULATOR.gain(expansion)
+    direction(expansion, K)
+    other = replace(expansion, b=expansion.b + 1.0)
+    gradient = other.gradient(K) - expansion.gradient(K)
+    direction.accept(other, K, other.lift(K, -gradient))
+    assert direction._pairs == ()
+    assert direction.reset() is False
+    direction(expansion, K)
+    direction.accept(other, K, other.lift(K, gradient))
+    assert len(direction._pairs) == 1
+    assert direction.reset() is True
+    assert direction._pairs == ()
+
+
+def test_lbfgs_carried_to_a_finer_grid_keeps_its_curvature_and_its_direction() -> None:
+    direction, _, _ = learned(memory=6)
+    fine = direction.refined(R * DT / 4, 4)
+    assert len(fine._pairs) == len(direction._pairs) == 6
+    for old, new in zip(direction._pairs, fine._pairs, strict=True):
+        assert new.s.shape == new.y.shape == (4 * N, 1)
+        assert np.sum(new.s * new.y) == pytest.approx(np.sum(old.s * old.y), rel=1e-12)
+        assert new.curvature == pytest.approx(old.curvature, rel=1e-12)
+    g = np.cos(np.arange(N))[:, None]
+    still = Expansion(np.zeros((N, 1, 1)), np.zeros((N, 1, 1)), np.zeros((N + 1, 1)), g)
+    dense = Expansion(
+        np.zeros((4 * N, 1, 1)), np.zeros((4 * N, 1, 1)), np.zeros((4 * N + 1, 1)), np.repeat(g, 4, axis=0) / 4
+    )
+    coarse = direction(still, np.zeros((N, 1, 1))).v
+    np.testing.assert_allclose(fine(dense, np.zeros((4 * N, 1, 1))).v, np.repeat(coarse, 4, axis=0), rtol=1e-9)
+    assert direction._pairs[0].s.shape == (N, 1)  # the coarse memory is left alone
+
+
+def test_feedback_only_where_the_plant_is_not_calm() -> None:
+    expansion = Pendulum().expand(start(Pendulum()))
+    amplification = growth(expansion.A)
+    assert not replace(REGULATOR, calm=1.01 * amplification).gain(expansion).any()
+    np.testing.assert_array_equal(
+        replace(REGULATOR, calm=0.99 * amplification).gain(expansion), REGULATOR.gain(expansion)
+    )

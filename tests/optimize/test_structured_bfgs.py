@@ -1,0 +1,298 @@
+"""Directions under hard limits: metrics against dense matrices and each other, a toy with a barrier against SciPy's optimum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pytest
+from optimize.test_lq import random_system, random_weights
+from scipy.optimize import minimize
+from support.numerics import Array, cart_setup, relative_error
+
+from mjfim.optimize.barrier import Band, Hedge
+from mjfim.optimize.lq import Chart, Recursion, TangentCurve, Weights
+from mjfim.optimize.projection_operator import Armijo, Expansion, Regulator, optimize
+from mjfim.optimize.structured_bfgs import BasisMetric, Metric, StructuredBFGS
+from mjfim.records.design import Status
+
+N, NX, NU = 12, 3, 2
+
+
+def random_expansion(rng: np.random.Generator) -> tuple[Expansion, Weights]:
+    """An expansion with every weight."""
+    A, B = random_system(rng, N, NX, NU)
+    expansion = Expansion(A, B, rng.normal(size=(N + 1, NX)), rng.normal(size=(N, NU)))
+    return expansion, random_weights(rng, N, NX, NU, steps=True)
+
+
+def dense(metric: Metric) -> Array:
+    """(N*nu, N*nu) matrix of a metric: what it makes of each unit step."""
+    units = np.eye(N * NU).reshape(-1, N, NU)
+    return np.stack([metric.apply(e).reshape(-1) for e in units], axis=1)
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: bool) -> None:
+    rng = np.random.default_rng(1)
+    expansion, weights = random_expansion(rng)
+    K = feedback * 0.3 * rng.normal(size=(N, NU, NX))
+    metric = Metric(Chart(expansion.A, expansion.B, K), weights)
+    H = dense(metric)
+    np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
+    assert np.linalg.eigvalsh(H)[0] > 0.0
+    g = rng.normal(size=(N, NU))
+    np.testing.assert_allclose(metric.solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1)), rtol=1e-7, atol=1e-9)
+    # its own form on the curve that a step makes
+    s = rng.normal(size=(N, NU))
+    zeta = expansion.lift(K, s)
+    a, b = weights.force(zeta)
+    assert np.vdot(s, metric.apply(s)) == pytest.approx(np.sum(a * zeta.z) + np.sum(b * zeta.v), rel=1e-10)
+
+
+def test_on_an_identity_basis_both_metrics_agree() -> None:
+    rng = np.random.default_rng(2)
+    expansion, weights = random_expansion(rng)
+    free = Metric(Chart(expansion.A, expansion.B, np.zeros((N, NU, NX))), weights)
+    based = BasisMetric.of(expansion, weights, np.eye(N))
+    for _ in range(3):
+        s = rng.normal(size=(N, NU))
+        assert relative_error(based.apply(s), free.apply(s)) < 1e-8
+        assert relative_error(based.solve(s), free.solve(s)) < 1e-8
+    assert relative_error(based.H, dense(free)) < 1e-10
+
+
+def test_on_fewer_curves_the_metric_is_the_projected_one() -> None:
+    """Also where some weights are zero, as far as every curve is weighed by something."""
+    rng = np.random.default_rng(3)
+    expansion, weights = random_expansion(rng)
+    weights.Q[4:9], weights.S[4:9], weights.W[::2] = 0.0, 0.0, 0.0
+    basis = rng.normal(size=(N, 5))
+    wide = np.einsum("km,uw->kumw", basis, np.eye(NU)).reshape(N * NU, -1)
+    H = wide.T @ dense(Metric(Chart(expansion.A, expansion.B, np.zeros((N, NU, NX))), weights)) @ wide
+    based = BasisMetric.of(expansion, weights, basis)
+    assert relative_error(based.H, H) < 1e-9
+    g = rng.normal(size=(5, NU))
+    assert relative_error(based.solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1))) < 1e-7
+    assert relative_error(based.apply(based.solve(g)), g) < 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class ToyPoint:
+    """A control of the toy with its curve."""
+
+    u: Array
+    x: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Toy:
+    """A linear plant, a convex quadratic cost that wants to leave, and a barrier on its first state and its control.
+
+    mu: of the barrier;  steps: also on the steps of the control
+    """
+
+    mu: float
+    steps: bool = False
+
+    @cached_property
+    def plant(self) -> tuple[Array, Array]:
+        """A oscillates, B pushes the second state; and one more state that follows."""
+        A = np.array([[1.0, 0.2, 0.0], [-0.3, 0.95, 0.0], [0.1, 0.0, 0.9]])
+        return np.tile(A, (N, 1, 1)), np.tile(np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.3]]), (N, 1, 1))
+
+    wanted = np.array([3.0, 0.0, -1.0])
+    start = np.array([0.2, 0.0, 0.1])
+    shown = Band.of(np.array([-1.0]), np.array([1.0]))
+    control = Band.of(np.full(NU, -0.6), np.array([0.6, np.inf]))
+    rate = Band.of(np.full(NU, -0.4), np.full(NU, 0.4))
+
+    @property
+    def delta(self) -> float:
+        """As on the ladder: sharper with mu."""
+        return 0.3 * self.mu
+
+    def point(self, u: Array) -> ToyPoint:
+        """The curve of a control."""
+        A, B = self.plant
+        return ToyPoint(u, Recursion(A).forward(self.start, np.einsum("kij,kj->ki", B, u)))
+
+    def value(self, point: ToyPoint) -> float:
+        """Cost and barrier."""
+        cost = 0.01 * np.sum((point.x[1:] - self.wanted) ** 2) + 1e-4 * np.sum(point.u**2)
+        cost += 2e-3 * np.sum(point.x[1:, 2] ** 2 * point.u[:, 1] ** 2)  # a little that is not quadratic
+        if not self.mu:
+            return float(cost)
+        walls = (
+            self.shown.wall(point.x[1:, :1], self.delta, 1.0).value + self.control.wall(point.u, self.delta, 1.0).value
+        )
+        if self.steps:
+            walls += self.rate.wall(np.diff(point.u, axis=0, prepend=0.0, append=0.0), self.delta, 1.0).value
+        return float(cost + self.mu * walls)
+
+    def size(self, point: ToyPoint) -> float:
+        """Of a change."""
+        return max(1.0, abs(self.value(point)))
+
+    def expand(self, point: ToyPoint) -> Expansion:
+        """Slopes by hand; the barrier with its curvature, the cost's own is to be learnt."""
+        (A, B), x, u = self.plant, point.x, point.u
+        a, b = np.zeros((N + 1, NX)), 2e-4 * u
+        a[1:] = 0.02 * (x[1:] - self.wanted)
+        a[1:, 2] += 4e-3 * x[1:, 2] * u[:, 1] ** 2
+        b[:, 1] += 4e-3 * x[1:, 2] ** 2 * u[:, 1]
+        if not self.mu:
+            return Expansion(A, B, a, b)
+        shown, held = self.shown.wall(x[1:, :1], self.delta, self.mu), self.control.wall(u, self.delta, self.mu)
+        Q, R, W = np.zeros((N + 1, NX, NX)), np.zeros((N, NU, NU)), np.zeros((N + 1, NU))
+        Q[1:, 0, 0], R[:, range(NU), range(NU)] = shown.bend[:, 0], held.bend
+        wall_a, wall_b = np.zeros_like(a), held.slope.copy()
+        wall_a[1:, 0] = shown.slope[:, 0]
+        if self.steps:
+            wall = self.rate.wall(np.diff(u, axis=0, prepend=0.0, append=0.0), self.delta, self.mu)
+            wall_b += wall.slope[:-1] - wall.slope[1:]
+            W = wall.bend
+        taps = np.zeros((N, 1, 1, NX + NU))
+        taps[:, 0, 0, :NX], taps[:, 0, 0, NX:] = A[:, 0], B[:, 0]
+        hedge = Hedge(
+            wall_a, wall_b, Weights(Q, np.zeros((N, NU, NX)), R, W), taps, self.control.scale, self.rate.scale
+        )
+        return Expansion(A, B, a + wall_a, b + wall_b, None, hedge)
+
+    def project(self, point: ToyPoint, zeta: TangentCurve, gamma: float, K: Array) -> ToyPoint:
+        """The plant is linear: with feedback or without, a tangent curve is a move of the control."""
+        return self.point(point.u + gamma * zeta.v)
+
+    def difference(self, new: ToyPoint, old: ToyPoint) -> TangentCurve:
+        """Linear."""
+        return TangentCurve(new.x - old.x, new.u - old.u)
+
+    def refine(self, point: ToyPoint) -> ToyPoint | None:
+        """It is exact."""
+        return None
+
+
+CALM = Regulator(np.eye(NX), np.eye(NU), np.eye(NX), calm=np.inf)
+FED_BACK = Regulator(np.eye(NX), np.eye(NU), np.eye(NX))
+
+
+@pytest.mark.parametrize("mu", [1e-1, 1e-3])
+@pytest.mark.parametrize("kind", ["free", "fed back", "with steps", "on a basis"])
+def test_the_toy_is_driven_to_the_optimum_that_scipy_finds(kind: str, mu: float) -> None:
+    toy, basis = Toy(mu, steps=kind == "with steps"), None
+    if kind == "on a basis":
+        t = np.linspace(-1.0, 1.0, N)
+        basis = t[:, None] ** np.arange(5)
+    curves = np.eye(N) if basis is None else basis
+
+    def cost(c: Array) -> float:
+        return toy.value(toy.point(curves @ c.reshape(-1, NU)))
+
+    def slope(c: Array) -> Array:
+        gradient = toy.expand(toy.point(curves @ c.reshape(-1, NU))).gradient(np.zeros((N, NU, NX)))
+        return (curves.T @ gradient).reshape(-1)
+
+    best = minimize(
+        cost, np.zeros(curves.shape[1] * NU), jac=slope, method="BFGS", options={"gtol": 1e-9, "maxiter": 5000}
+    )
+    direction = StructuredBFGS(np.full(NU, 1e-3), basis)
+    regulate = FED_BACK if kind == "fed back" else CALM
+    iterates = list(optimize(toy, toy.point(np.zeros((N, NU))), direction, regulate, Armijo(), 1e-9, 150))
+    values = [iterate.value for iterate in iterates]
+    assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
+    assert (np.diff(values) <= 0.0).all()
+    assert values[-1] == pytest.approx(best.fun, abs=1e-6 * abs(best.fun))
+    np.testing.assert_allclose(iterates[-1].point.u, curves @ best.x.reshape(-1, NU), rtol=0, atol=2e-3)
+    assert len(iterates) < 60
+    if mu < 1e-2:  # the bound is reached, and kept
+        assert 0.0 < toy.shown.margin(iterates[-1].point.x[:, :1]).min() < 0.05
+
+
+def test_what_was_learnt_outlives_a_sharper_barrier() -> None:
+    """Pairs hold the change of the cost's gradient alone: nothing of a barrier, blunt or sharp."""
+    direction, blunt = StructuredBFGS(np.full(NU, 1e-3)), Toy(1e-1)
+    for iterate in optimize(blunt, blunt.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-6, 40):
+        point = iterate.point
+    pairs = direction._pairs
+    assert len(pairs) > 2
+
+    def gradient(u: Array) -> Array:
+        return Toy(0.0).expand(Toy(0.0).point(u)).gradient(np.zeros((N, NU, NX)))
+
+    last = pairs[-1]
+    wanted = gradient(point.u) - gradient(point.u - last.s)
+    np.testing.assert_allclose(last.y, wanted, rtol=0, atol=1e-9 * max(np.abs(wanted).max(), 1.0))
+    assert direction.reset() is True
+    assert direction.reset() is False
+
+
+def test_no_step_moves_anything_limited_too_far() -> None:
+    toy = Toy(1e-4)
+    e = toy.expand(toy.point(np.zeros((N, NU))))
+    assert e.hedge is not None
+    K = np.zeros((N, NU, NX))
+    long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(e, K)
+    short = StructuredBFGS(np.full(NU, 1e-6), reach=0.25)(e, K)
+    assert e.hedge.motion(long) > 1.0
+    assert 0.05 < e.hedge.motion(short) <= 0.25
+    assert e.slope(short) < 0.0
+    tiny = Expansion(e.A, e.B, 1e-9 * e.a, 1e-9 * e.b, None, e.hedge)
+    assert e.hedge.motion(StructuredBFGS(np.full(NU, 1.0))(tiny, K)) < 1e-6  # a short step stays as it is
+
+
+def test_damping_shortens_what_nothing_holds_and_leaves_the_way_back_inside() -> None:
+    """From outside a bound, with a cost that pulls far elsewhere: the damped step gains more than the one scaled down."""
+    toy, outside = Toy(1e-4), np.zeros((N, NU))
+    outside[3, 0] = toy.control.upper[0] + 0.2 * toy.control.scale[0]
+    e = toy.expand(toy.point(outside))
+    assert e.hedge is not None
+    a = e.a + 50.0 * np.random.default_rng(2).normal(size=e.a.shape) * np.array([0.0, 1.0, 1.0])
+    pulled, K = replace(e, a=a), np.zeros((N, NU, NX))
+    long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(pulled, K)
+    far = e.hedge.motion(long) / 0.25
+    assert far > 10.0
+    direction = StructuredBFGS(np.full(NU, 1e-6), reach=0.25)
+    damped = direction(pulled, K)
+    assert direction.damping > 0.0
+    assert e.hedge.motion(damped) <= 0.25 + 1e-12
+    assert pulled.slope(damped) < 0.0
+    assert damped.v[3, 0] < 2.0 * long.v[3, 0] / far < 0.0
+
+
+def test_damping_fades_where_steps_are_short() -> None:
+    toy = Toy(1e-2)
+    direction = StructuredBFGS(np.full(NU, 1e-3), damping=10.0)
+    iterates = list(optimize(toy, toy.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-9, 150))
+    assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
+    assert direction.damping < 1e-3
+
+
+def test_an_expansion_without_limits_is_refused() -> None:
+    rng = np.random.default_rng(5)
+    expansion, _ = random_expansion(rng)
+    with pytest.raises(ValueError, match="needs their expansion"):
+        StructuredBFGS(np.ones(NU))(expansion, np.zeros((N, NU, NX)))
+
+
+@pytest.mark.parametrize("based", [False, True])
+def test_the_direction_goes_down_on_a_real_design(based: bool, tmp_path: Path) -> None:
+    """Its slope along the expansion is that of simulated trials."""
+    from mjfim.excitation.constraints import fence_of
+    from mjfim.excitation.interior_point import InteriorProblem
+    from mjfim.signals import spline_basis
+
+    setup = cart_setup(tmp_path, limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}}).free()
+    problem = InteriorProblem(setup.problem, fence_of(setup), 0.1, 0.03)
+    point = problem.point(setup.control)
+    expansion = problem.expand(point)
+    basis = spline_basis(setup.t, 0.5, 8.0, False, False, False) if based else None
+    zeta = StructuredBFGS(np.full(1, 1e-4), basis)(expansion, np.zeros((setup.samples, 1, 4)))
+    assert expansion.slope(zeta) < 0.0
+    h = 1e-4
+    up, down = (problem.value(problem.point(setup.control + s * h * zeta.v)) for s in (1.0, -1.0))
+    assert expansion.slope(zeta) == pytest.approx((up - down) / (2 * h), rel=1e-3)
+    if basis is not None:
+        left = zeta.v - basis @ np.linalg.lstsq(basis, zeta.v)[0]
+        assert np.abs(left).max() < 1e-10 * np.abs(zeta.v).max()

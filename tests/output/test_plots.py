@@ -1,0 +1,430 @@
+"""Figures from hand-made records: units, legends, both trajectories, odd sizes, failed trials, singular information."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.patches import StepPatch
+from matplotlib.text import Text
+
+from mjfim.arrays import Array
+from mjfim.errors import MjfimError
+from mjfim.output import plots
+from mjfim.output.labels import Labels
+from mjfim.output.plots.style import INITIAL, OPTIMIZED, number, per, squared, with_error
+from mjfim.records.design import Design, Evaluation, HistoryRow, Status
+from mjfim.records.estimate import Estimate
+from mjfim.records.monte_carlo import Study, TrialSet
+from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Trajectory
+
+SIZES = [(1, 1), (14, 30), (1, 70)]
+
+
+def make_labels(dofs: int, count: int) -> Labels:
+    """Labels of a chain of hinges."""
+    joints = [f"joint_{i}" for i in range(dofs)]
+    return Labels(
+        qpos=tuple(f"{j} [rad]" for j in joints),
+        positions=tuple(f"{j} [rad]" for j in joints),
+        velocities=tuple(f"{j} [rad/s]" for j in joints),
+        controls=("torque [N m]",),
+        parameters=tuple(f"link_{j}.damping" for j in range(count)),
+        parameter_units=tuple(("N m s/rad", "kg", "")[j % 3] for j in range(count)),
+        outputs={f"qpos:{j}": f"{j} [rad]" for j in joints},
+    )
+
+
+def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
+    """Sinusoids of the given size; a larger motion is more informative."""
+    t = np.asarray(np.linspace(0.0, 2.0, 51), dtype=np.float64)
+    waves = size * np.sin(np.outer(t, 1.0 + np.arange(dofs)))
+    control = np.asarray(size * np.cos(t[:-1, None]), dtype=np.float64)
+    curve = Trajectory(t, waves, np.gradient(waves, t, axis=0), np.zeros((51, 0)), control)
+    psi = size * np.sin(np.multiply.outer(t, 1.0 + np.arange(2 * dofs * count))).reshape(51, 2 * dofs, count)
+    eigenvalues = np.asarray(size**2 * (1.0 + np.arange(count)), dtype=np.float64)
+    std = 0.1 / size / np.sqrt(1.0 + np.arange(count))
+    smallest = np.asarray(size**2 * t / 2.0, dtype=np.float64)
+    criterion = 1.0 / size**2
+    return Evaluation(
+        curve,
+        np.zeros((50, 1, 2 * dofs)),
+        psi,
+        np.diag(std**-2),
+        eigenvalues,
+        std,
+        smallest,
+        criterion,
+        criterion + 0.01,
+    )
+
+
+def make_design(dofs: int = 2, count: int = 3) -> Design:
+    """Ten iterations from a small to a large motion."""
+    rows = tuple(HistoryRow(i, 2.0**-i, 2.0**-i, 2.0**i, -(4.0**-i), 1.0, 0.1 * i, 100 * i) for i in range(10))
+    return Design(
+        status=Status.CONVERGED,
+        parameters=tuple(f"p{j}" for j in range(count)),
+        theta=np.linspace(1.0, 2.0, count),
+        initial=make_evaluation(dofs, count, 0.1),
+        final=make_evaluation(dofs, count, 1.0),
+        history=rows,
+        slope=1e-8,
+        steps=1000,
+        seconds=1.0,
+    )
+
+
+def make_trials(theta: Array, std: float, failed: int, seed: int, trials: int = 200) -> TrialSet:
+    """Efficient estimates with the first `failed` rows NaN."""
+    count = len(theta)
+    estimates = theta + std * np.random.default_rng(seed).normal(size=(trials, count))
+    estimates[:failed] = np.nan
+    spread = np.diag(np.full(count, std**2))
+    interval = np.tile([0.8, 1.2], (count, 1))
+    return TrialSet(estimates, theta, spread, spread, np.ones(count), interval, trials, failed)
+
+
+def make_study(count: int = 3, failed: int = 5) -> Study:
+    """Two sets, the second fifty times tighter."""
+    theta = np.linspace(1.0, 2.0, count)
+    sets = {"initial": make_trials(theta, 0.2, failed, 0), "final": make_trials(theta, 0.004, failed, 1)}
+    information = {name: np.diag(1.0 / np.diagonal(trials.crlb)) for name, trials in sets.items()}
+    return Study(tuple(f"p{j}" for j in range(count)), theta, 25.0, sets, information)
+
+
+def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estimate:
+    """One recording with gaps; the first parameter sits at its bound."""
+    t = np.linspace(0.0, 2.0, 51)
+    predicted = np.sin(np.outer(t, 1.0 + np.arange(dofs)))
+    measured = predicted + 0.05 * np.random.default_rng(2).normal(size=predicted.shape)
+    measured[10:20, 0] = np.nan
+    recording = Recording(t, np.zeros((50, 1)), measured, tuple(f"qpos:joint_{i}" for i in range(dofs)), "swing")
+    theta = np.linspace(1.0, 2.0, count)
+    return Estimate(
+        parameters=tuple(f"p{j}" for j in range(count)),
+        theta=theta,
+        std=0.02 * theta,
+        covariance=np.diag((0.02 * theta) ** 2),
+        initial_theta=1.2 * theta,
+        chi2=50.0,
+        dof=48,
+        status="converged",
+        success=True,
+        misfit=misfit,
+        iterations=4,
+        residual_rms={},
+        at_bound=("p0",),
+        predicted=(predicted,),
+        recordings=(recording,),
+    )
+
+
+def all_text(figure: Figure) -> str:
+    """Every string drawn."""
+    return "\n".join(t.get_text() for t in figure.findobj(Text) if isinstance(t, Text))
+
+
+def all_colours(figure: Figure) -> set[str]:
+    """Colours of the drawn lines and patches inside the axes."""
+    colours = set()
+    for axes in figure.axes:
+        colours |= {to_hex(line.get_color()) for line in axes.get_lines()}
+        colours |= {to_hex(patch.get_facecolor()) for patch in axes.patches}
+        colours |= {to_hex(patch.get_edgecolor()) for patch in axes.patches}
+        colours |= {to_hex(text.get_color()) for text in axes.texts}
+    return colours
+
+
+def render(figure: Figure, folder: Path) -> Array:
+    """Save, reload, and return the pixels."""
+    path = plots.save(figure, folder / "figure.png", dpi=50.0)
+    pixels = np.asarray(matplotlib.image.imread(path), dtype=np.float64)
+    assert pixels.std() > 0.01
+    return pixels
+
+
+Draw = Callable[[int, int], Figure]
+
+FIGURES: dict[str, Draw] = {
+    "trajectories": lambda n, p: plots.trajectories(make_design(n, p), make_labels(n, p)),
+    "sensitivity_phase": lambda n, p: plots.sensitivity_phase(make_design(n, p), make_labels(n, p)),
+    "histogram": lambda n, p: plots.histogram(make_study(p), p - 1, make_labels(n, p)),
+    "convergence": lambda n, p: plots.convergence(make_design(n, p)),
+    "std_bars": lambda n, p: plots.std_bars(make_design(n, p), make_labels(n, p)),
+    "fit": lambda n, p: plots.fit(make_estimate(n, p), 0, make_labels(n, p), np.full(n, 0.05)),
+    "parameter_intervals": lambda n, p: plots.parameter_intervals(make_estimate(n, p), make_labels(n, p)),
+}
+TABLES: dict[str, Draw] = {
+    "design_table": lambda n, p: plots.design_table(make_design(n, p), make_labels(n, p)),
+    "study_table": lambda n, p: plots.study_table(make_study(p), make_labels(n, p)),
+}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize(("dofs", "count"), SIZES)
+def test_figure_has_units_legend_and_pixels(name: str, dofs: int, count: int, tmp_path: Path) -> None:
+    figure = FIGURES[name](dofs, count)
+    axis_labels = [label for axes in figure.axes for label in (axes.get_xlabel(), axes.get_ylabel()) if label]
+    assert axis_labels
+    assert all(re.search(r"\[.+\]", label, re.DOTALL) for label in axis_labels)
+    assert len(figure.legends) == 1 and figure.legends[0].get_texts()
+    render(figure, tmp_path)
+
+
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize(("dofs", "count"), SIZES)
+def test_table_names_every_parameter_and_unit(name: str, dofs: int, count: int, tmp_path: Path) -> None:
+    figure = TABLES[name](dofs, count)
+    text = all_text(figure)
+    labels = make_labels(dofs, count)
+    assert all(labels.parameter(j) in text for j in range(count))
+    assert "initial" in text and "optimized" in text
+    render(figure, tmp_path)
+
+
+@pytest.mark.parametrize("name", [n for n in (*FIGURES, *TABLES) if n not in ("fit", "parameter_intervals")])
+def test_both_trajectories_are_drawn_in_their_colours(name: str) -> None:
+    assert {INITIAL, OPTIMIZED} <= all_colours((FIGURES | TABLES)[name](2, 3))
+
+
+@pytest.mark.parametrize("name", [*FIGURES, *TABLES])
+def test_artists_stay_inside_the_figure(name: str) -> None:
+    figure = (FIGURES | TABLES)[name](2, 3)
+    figure.canvas.draw()
+    box = figure.get_tightbbox()
+    assert box.x0 >= -0.01 and box.y0 >= -0.01
+    assert box.x1 <= figure.get_figwidth() + 0.01 and box.y1 <= figure.get_figheight() + 0.01
+
+
+def test_trajectories_prints_the_final_information() -> None:
+    text = all_text(plots.trajectories(make_design(), make_labels(2, 3)))
+    assert number(1.0) in text and number(0.1) in text
+
+
+def test_trajectories_accepts_more_positions_than_velocities() -> None:
+    design = make_design(6, 3)
+
+    def free(e: Evaluation) -> Evaluation:
+        quaternion = np.hstack([e.trajectory.qpos, np.ones((51, 1))])
+        return dataclasses.replace(e, trajectory=dataclasses.replace(e.trajectory, qpos=quaternion))
+
+    design = dataclasses.replace(design, initial=free(design.initial), final=free(design.final))
+    labels = dataclasses.replace(make_labels(6, 3), qpos=tuple(f"q{i} [1]" for i in range(7)))
+    assert len(plots.trajectories(design, labels).axes) == 7 + 6 + 1 + 1
+    assert plots.sensitivity_phase(design, labels).axes
+
+
+def test_phase_limits_the_panels_and_says_so() -> None:
+    figure = plots.sensitivity_phase(make_design(14, 30), make_labels(14, 30))
+    assert len(figure.axes) == 4 * 6
+    assert "4 of 14" in all_text(figure) and "6 of 30" in all_text(figure)
+
+
+def test_histogram_reports_failed_trials_and_efficiency() -> None:
+    text = all_text(plots.histogram(make_study(3, failed=7), 0, make_labels(2, 3)))
+    assert "200 trials, 7 failed" in text
+    assert "efficiency 1.00, 95 % interval [0.800, 1.20]" in text
+
+
+def test_histogram_is_a_density() -> None:
+    figure = plots.histogram(make_study(), 0, make_labels(2, 3))
+    for axes in figure.axes[:2]:
+        bars = axes.patches[0]
+        assert isinstance(bars, StepPatch)
+        heights, edges, _ = bars.get_data()
+        assert np.sum(heights * np.diff(edges)) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("survivors", [0, 1])
+def test_histogram_survives_when_nearly_all_trials_fail(survivors: int, tmp_path: Path) -> None:
+    study = make_study(2, failed=200 - survivors)
+    render(plots.histogram(study, 1, make_labels(2, 2)), tmp_path)
+
+
+def test_histogram_ignores_outliers_in_its_range() -> None:
+    study = make_study()
+    estimates = study.sets["initial"].estimates.copy()
+    estimates[10, 0] = 1e6
+    sets = {**study.sets, "initial": dataclasses.replace(study.sets["initial"], estimates=estimates)}
+    figure = plots.histogram(dataclasses.replace(study, sets=sets), 0, make_labels(2, 3))
+    assert figure.axes[0].get_xlim()[1] < 10.0
+    assert "1 outside this range" in all_text(figure)
+
+
+def test_histogram_without_a_finite_bound(tmp_path: Path) -> None:
+    study = make_study()
+    endless = dataclasses.replace(study.sets["initial"], crlb=np.full((3, 3), np.inf), efficiency=np.full(3, np.nan))
+    figure = plots.histogram(dataclasses.replace(study, sets={**study.sets, "initial": endless}), 0, make_labels(2, 3))
+    assert "bound ∞" in all_text(figure)
+    render(figure, tmp_path)
+
+
+def test_one_set_is_enough(tmp_path: Path) -> None:
+    study = make_study()
+    alone = dataclasses.replace(study, sets={"final": study.sets["final"]})
+    render(plots.histogram(alone, 0, make_labels(2, 3)), tmp_path)
+    render(plots.study_table(alone, make_labels(2, 3)), tmp_path)
+
+
+@pytest.mark.parametrize("everything", [False, True])
+def test_singular_information_breaks_neither_bars_nor_tables(everything: bool, tmp_path: Path) -> None:
+    design = make_design()
+    std = np.full(3, np.inf) if everything else np.array([np.inf, 0.1, 0.1])
+    design = dataclasses.replace(design, initial=dataclasses.replace(design.initial, std=std))
+    if everything:
+        design = dataclasses.replace(design, final=dataclasses.replace(design.final, std=std))
+    bars, table = plots.std_bars(design, make_labels(2, 3)), plots.design_table(design, make_labels(2, 3))
+    assert "∞" in all_text(bars) and "∞" in all_text(table)
+    render(bars, tmp_path)
+    render(table, tmp_path)
+
+
+def test_zero_parameter_has_no_relative_accuracy(tmp_path: Path) -> None:
+    design = dataclasses.replace(make_design(), theta=np.array([0.0, 1.0, 2.0]))
+    render(plots.std_bars(design, make_labels(2, 3)), tmp_path)
+    render(plots.design_table(design, make_labels(2, 3)), tmp_path)
+    estimate = dataclasses.replace(make_estimate(), initial_theta=np.array([0.0, 1.0, 2.0]))
+    figure = plots.parameter_intervals(estimate, make_labels(2, 3))
+    assert "guess of 0" in all_text(figure)
+    render(figure, tmp_path)
+
+
+def test_convergence_of_odd_histories(tmp_path: Path) -> None:
+    design = make_design()
+    negative = tuple(dataclasses.replace(row, cost=-1.0, slope=0.0) for row in design.history)
+    for history in ((), design.history[:1], negative):
+        render(plots.convergence(dataclasses.replace(design, history=history)), tmp_path)
+
+
+def test_convergence_is_logarithmic() -> None:
+    assert [axes.get_yscale() for axes in plots.convergence(make_design()).axes] == ["log"] * 3
+
+
+def test_fit_draws_data_residuals_and_band() -> None:
+    estimate = make_estimate()
+    figure = plots.fit(estimate, 0, make_labels(2, 3), [0.05, 0.05])
+    left, right = figure.axes[:2]
+    np.testing.assert_array_equal(left.get_lines()[0].get_ydata(), estimate.recordings[0].y[:, 0])
+    np.testing.assert_array_equal(left.get_lines()[1].get_ydata(), estimate.predicted[0][:, 0])
+    assert right.patches[0].get_extents().height > 0.0
+    assert "±2σ" in all_text(figure)
+
+
+def test_fit_without_measurements_of_an_output(tmp_path: Path) -> None:
+    estimate = make_estimate()
+    y = estimate.recordings[0].y.copy()
+    y[:, 1] = np.nan
+    estimate = dataclasses.replace(estimate, recordings=(dataclasses.replace(estimate.recordings[0], y=y),))
+    figure = plots.fit(estimate, 0, make_labels(2, 3), [0.05, 0.05])
+    assert "not measured" in all_text(figure)
+    render(figure, tmp_path)
+
+
+def test_unnamed_output_shows_its_column() -> None:
+    labels = dataclasses.replace(make_labels(2, 3), outputs={})
+    assert "qpos:joint_0\n[model unit]" in all_text(plots.fit(make_estimate(), 0, labels, [0.05, 0.05]))
+
+
+def test_intervals_flag_bounds_and_misfit() -> None:
+    text = all_text(plots.parameter_intervals(make_estimate(misfit=True), make_labels(2, 3))).replace("\n", " ")
+    assert text.count("N m s/rad   at its bound") == 1
+    assert "kg   at its bound" not in text
+    assert "no interval covers what a wrong model does" in text
+
+
+def test_intervals_with_infinite_std(tmp_path: Path) -> None:
+    for std in ([np.inf, 0.1, 0.1], [np.inf] * 3):
+        figure = plots.parameter_intervals(dataclasses.replace(make_estimate(), std=np.array(std)), make_labels(2, 3))
+        assert "± ∞" in all_text(figure)
+        render(figure, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "misuse",
+    [
+        lambda: plots.trajectories(make_design(3, 3), make_labels(2, 3)),
+        lambda: plots.std_bars(make_design(2, 3), make_labels(2, 4)),
+        lambda: plots.histogram(make_study(), 3, make_labels(2, 3)),
+        lambda: plots.fit(make_estimate(), 1, make_labels(2, 3), [0.05, 0.05]),
+        lambda: plots.fit(make_estimate(), 0, make_labels(2, 3), [0.05]),
+        lambda: plots.save(Figure(), "figure.jpg"),
+        lambda: Labels((), (), (), (), ("m",), ()),
+    ],
+)
+def test_misuse_is_refused(misuse: Callable[[], object]) -> None:
+    with pytest.raises(MjfimError):
+        misuse()
+
+
+def test_save_writes_a_png_and_leaves_nothing_else(tmp_path: Path) -> None:
+    path = plots.save(plots.convergence(make_design()), tmp_path / "convergence.png")
+    assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
+    assert [p.name for p in tmp_path.iterdir()] == ["convergence.png"]
+
+
+def test_failed_save_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "figure.png"
+    path.write_bytes(b"old")
+
+    def break_off(self: Figure, name: Path, **_: object) -> None:
+        Path(name).write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Figure, "savefig", break_off)
+    with pytest.raises(OSError, match="disk full"):
+        plots.save(plots.convergence(make_design()), path)
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
+
+
+def test_pyplot_is_never_imported() -> None:
+    code = "import sys, mjfim.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
+    root = Path(plots.__file__).parents[1]
+    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
+
+
+def test_only_the_plot_modules_import_matplotlib() -> None:
+    own = Path(plots.__file__).parent
+    others = [p for p in own.parent.rglob("*.py") if own not in p.parents]
+    assert others
+    assert [p.name for p in others if re.search(r"^\s*(import|from) matplotlib", p.read_text(), re.MULTILINE)] == []
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.87398, "0.874"),
+        (16482.0, "1.65×10⁴"),
+        (-4.1e-5, "−4.10×10⁻⁵"),
+        (0.0, "0.00"),
+        (999.9, "1000"),
+        (np.inf, "∞"),
+        (-np.inf, "−∞"),
+        (np.nan, "–"),
+    ],
+)
+def test_number(value: float, text: str) -> None:
+    assert number(value) == text
+
+
+def test_units_of_quotients_and_variances() -> None:
+    assert per("m", "kg") == "m/kg"
+    assert per("rad/s", "N m s/rad") == "(rad/s)/(N m s/rad)"
+    assert per("m", "") == "m"
+    assert squared("kg") == "kg²" and squared("N m") == "(N m)²" and squared("") == ""
+
+
+def test_value_is_rounded_to_its_uncertainty() -> None:
+    assert with_error(0.99412, 0.0121) == "0.994 ± 0.012"
+    assert with_error(1.0, np.inf) == "1.000 ± ∞"

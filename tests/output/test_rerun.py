@@ -1,0 +1,490 @@
+"""Rerun files are read back and compared with the records and with MuJoCo."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+pytest.importorskip("rerun")
+from rerun.chunk import RrdReader
+
+from mjfim.arrays import Array
+from mjfim.errors import MjfimError, RecordingError
+from mjfim.model.coordinates import output_label
+from mjfim.output.labels import Labels
+from mjfim.output.rerun import documents
+from mjfim.output.rerun.documents import log_design, log_estimate, log_trajectories, show
+from mjfim.output.rerun.panels import dof_positions, history_series
+from mjfim.output.rerun.scene import camera, entity, motion
+from mjfim.records.design import Design, Evaluation, HistoryRow, StartResult, Status
+from mjfim.records.estimate import Estimate
+from mjfim.records.recording import Recording
+from mjfim.records.trajectory import Trajectory
+
+ROOT = Path(__file__).parents[2]
+SHARED = ROOT.parent / "shared" / "models"
+MODELS = {
+    "cart": ROOT / "models" / "cart_pendulum.xml",
+    "acrobot": SHARED / "dmc_acrobot" / "acrobot.xml",
+    "panda": SHARED / "menagerie_panda" / "panda_nomesh.xml",
+    "panda without geoms": SHARED / "menagerie_panda" / "panda_nohand_nomesh.xml",
+}
+
+ZOO = """
+<mujoco model="zoo">
+  <asset>
+    <mesh name="tetrahedron" vertex="0 0 0  .4 0 0  0 .4 0  0 0 .4"/>
+    <hfield name="hills" nrow="3" ncol="4" size=".6 .4 .3 .05" elevation="0 0 0 0  0 1 0 0  0 0 0 .5"/>
+  </asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 .1" pos="0 0 -1"/>
+    <geom name="hills" type="hfield" hfield="hills" pos="0 1 0"/>
+    <body name="floating"><freejoint name="float"/><geom type="box" size=".1 .2 .3"/></body>
+    <body name="a/b c" pos="1 0 0">
+      <joint name="ball" type="ball"/>
+      <geom name="limb" type="capsule" fromto="0 0 0 .3 0 .4" size=".05"/>
+      <geom name="egg" type="ellipsoid" size=".1 .2 .05"/>
+      <body pos=".3 0 .4"><joint axis="0 1 0"/><geom type="cylinder" size=".1 .2"/></body>
+    </body>
+    <body name="rock" pos="2 0 0"><joint type="slide"/><geom name="rock" type="mesh" mesh="tetrahedron"/></body>
+    <body name="bare" pos="3 0 0">
+      <joint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+      <body name="tip" pos="0 .3 .5"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>
+    </body>
+    <body name="fixed" pos="0 -1 0"><geom type="sphere" size=".1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def load(name: str) -> mujoco.MjModel:
+    """Model by its short name; skips where the shared models are absent."""
+    if name == "zoo":
+        return mujoco.MjModel.from_xml_string(ZOO)
+    if not MODELS[name].is_file():
+        pytest.skip(f"{MODELS[name].name} is not in this checkout's neighbourhood")
+    return mujoco.MjModel.from_xml_path(str(MODELS[name]))
+
+
+def simulated(model: mujoco.MjModel, amplitude: float, samples: int = 40) -> Trajectory:
+    """Sine controls from the first keyframe, one engine step per sample."""
+    data = mujoco.MjData(model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    t = np.arange(samples + 1) * model.opt.timestep
+    ctrl = data.ctrl + amplitude * np.sin(2.0 * t[:-1, None] * np.ones(model.nu))
+    rows = [(data.qpos.copy(), data.qvel.copy(), data.act.copy())]
+    for u in ctrl:
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data)
+        rows.append((data.qpos.copy(), data.qvel.copy(), data.act.copy()))
+    qpos, qvel, act = (np.array(column) for column in zip(*rows, strict=True))
+    return Trajectory(t, qpos, qvel, act, ctrl)
+
+
+def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Evaluation:
+    """A made-up evaluation of two parameters: smooth sensitivities, information growing with time."""
+    nx, t = 2 * model.nv + model.na, trajectory.t
+    psi = gain * np.sin(t)[:, None, None] * np.arange(1.0, 2 * nx + 1).reshape(1, nx, 2)
+    return Evaluation(
+        trajectory=trajectory,
+        gain=np.zeros((trajectory.samples, model.nu, nx)),
+        sensitivity=psi,
+        information=gain * np.eye(2),
+        eigenvalues=gain * np.ones(2),
+        std=np.array([0.5, 0.25]) / gain,
+        min_eigenvalue=gain * t**2,
+        criterion=1.0 / gain,
+        cost=2.0 / gain,
+    )
+
+
+def designed(model: mujoco.MjModel) -> Design:
+    """A hand-made design: a gentle and a vigorous control, three iterations."""
+    history = tuple(HistoryRow(k, 2.0 / 4**k, 1.0, 4.0**k, 0.1**k, 0.5, 0.1 * k, 100 * k) for k in range(3))
+    return Design(
+        status=Status.MAX_ITERATIONS,
+        parameters=("mass", "gear/ratio"),
+        theta=np.array([2.0, 1.0]),
+        initial=evaluated(model, simulated(model, 0.5), 1.0),
+        final=evaluated(model, simulated(model, 2.0), 16.0),
+        history=history,
+        slope=0.01,
+        steps=200,
+        seconds=0.2,
+        limits={"position": -0.1, "control": 2.0},
+        warnings=("the two parameters are nearly confounded",),
+        found_by="multisine 2",
+        starts=(StartResult("initial", 9.0, Status.STALLED, 5), StartResult("multisine 2", 0.125, Status.CONVERGED, 3)),
+    )
+
+
+def estimated(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
+    """A hand-made estimate from two recordings, one sample of one output missing."""
+    outputs = ("qpos:slide", "hinge_angle")
+    predicted = trajectory.qpos[:, :2]
+    y = predicted + 0.01
+    y[3, 0] = np.nan
+    recordings = tuple(Recording(trajectory.t, trajectory.ctrl, y, outputs, f"run {k}") for k in range(2))
+    return Estimate(
+        parameters=("mass", "gear/ratio"),
+        theta=np.array([2.0, 1.0]),
+        std=np.array([0.1, 0.2]),
+        covariance=np.diag([0.01, 0.04]),
+        initial_theta=np.array([2.5, 1.4]),
+        chi2=500.0,
+        dof=80,
+        status="the residuals no longer fall",
+        success=True,
+        misfit=True,
+        iterations=4,
+        residual_rms={"qpos:slide": 0.01, "hinge_angle": 0.01},
+        at_bound=("mass",),
+        predicted=(predicted, predicted),
+        recordings=recordings,
+    )
+
+
+def entities(path: Path) -> set[str]:
+    """Every entity path in a recording."""
+    return {str(chunk.entity_path) for chunk in RrdReader(path).stream().to_chunks()}
+
+
+def column(path: Path, at: tuple[str, ...], timeline: str | None, component: str) -> tuple[Any, Array]:
+    """(times, values) of one component of one entity; timeline None: static."""
+    times: list[int] = []
+    values: list[Any] = []
+    for chunk in RrdReader(path).stream().filter(content=entity(at)).to_chunks():
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names and (
+            timeline in batch.schema.names or (timeline is None and chunk.is_static)
+        ):
+            values += batch.column(component).to_pylist()
+            times += batch.column(timeline).cast("int64").to_pylist() if timeline else []
+    order = np.argsort(times, kind="stable") if timeline else slice(None)
+    return np.array(times)[order], np.array(values)[order]
+
+
+@pytest.fixture(scope="module")
+def cart() -> mujoco.MjModel:
+    """The paper's model."""
+    return load("cart")
+
+
+@pytest.fixture(scope="module")
+def design(cart: mujoco.MjModel) -> Design:
+    """A hand-made design on the paper's model."""
+    return designed(cart)
+
+
+@pytest.fixture(scope="module")
+def file(cart: mujoco.MjModel, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its recording, in a folder that does not exist yet."""
+    path = tmp_path_factory.mktemp("rerun") / "new" / "design.rrd"
+    log_design(path, cart, design, Labels.of_model(cart), "| a caller's | table |")
+    return path
+
+
+class TestDesign:
+    """design.rrd"""
+
+    def test_holds_both_robots_and_every_panel(self, file: Path) -> None:
+        expected = [("summary",), ("phase", "gear/ratio", "axes"), ("bars", "log10 cost"), ("history", "step length")]
+        for key in ("initial", "optimized"):
+            expected += [
+                ("robots", key, "bodies", "bob"),
+                ("robots", key, "bodies", "bob", "bob"),
+                ("robots", key, "path"),
+            ]
+            expected += [("positions", "slide [m]", key), ("velocities", "hinge velocity [rad/s]", key)]
+            expected += [("controls", "force [N]", key), ("information", key), ("phase", "mass", key, "now")]
+        assert {entity(path) for path in expected} <= entities(file)
+
+    def test_has_no_warnings_and_one_blueprint(self, file: Path) -> None:
+        assert not [path for path in entities(file) if "__warnings" in path]
+        assert len(RrdReader(file).recordings()) == 1
+        assert len(RrdReader(file).blueprints()) == 1
+
+    def test_views_look_where_data_is(self, file: Path) -> None:
+        reader = RrdReader(file)
+        chunks = reader.stream(store=reader.blueprints()[0]).to_chunks()
+        batches = [chunk.to_record_batch() for chunk in chunks]
+        name = "ViewBlueprint:space_origin"
+        origins = {v[0] for b in batches if name in b.schema.names for v in b.column(name).to_pylist() if v}
+        logged = entities(file)
+        assert len(origins) >= 16
+        for origin in origins:
+            assert any(path == origin or path.startswith(f"{origin}/") for path in logged), origin
+
+    @pytest.mark.parametrize("key", ["initial", "optimized"])
+    def test_series_are_exact(self, file: Path, design: Design, key: str) -> None:
+        side = design.initial if key == "initial" else design.final
+        nanoseconds = np.rint(side.trajectory.t * 1e9).astype(np.int64)
+        columns = {
+            ("positions", "hinge [rad]"): side.trajectory.qpos[:, 1],
+            ("velocities", "slide velocity [m/s]"): side.trajectory.qvel[:, 0],
+            ("controls", "force [N]"): side.trajectory.ctrl[:, 0],
+            ("information",): np.sqrt(side.min_eigenvalue),
+        }
+        for path, expected in columns.items():
+            times, values = column(file, (*path, key), "sim_time", "Scalars:scalars")
+            np.testing.assert_array_equal(times, nanoseconds[: len(expected)])
+            np.testing.assert_array_equal(values[:, 0], expected)
+
+    def test_poses_are_those_of_mujoco(self, file: Path, cart: mujoco.MjModel, design: Design) -> None:
+        data = mujoco.MjData(cart)
+        path = ("robots", "optimized", "bodies", "bob")
+        times, translation = column(file, path, "sim_time", "Transform3D:translation")
+        _, quaternion = column(file, path, "sim_time", "Transform3D:quaternion")
+        assert len(times) == len(design.trajectory.t)
+        for k, q in enumerate(design.trajectory.qpos):
+            data.qpos[:] = q
+            mujoco.mj_forward(cart, data)
+            np.testing.assert_allclose(translation[k, 0], data.body("bob").xpos, atol=1e-6)
+            np.testing.assert_allclose(np.roll(quaternion[k, 0], 1), data.body("bob").xquat, atol=1e-6)
+
+    def test_the_line_is_the_path_of_the_bob(self, file: Path) -> None:
+        _, translation = column(file, ("robots", "initial", "bodies", "bob"), "sim_time", "Transform3D:translation")
+        strip = column(file, ("robots", "initial", "path"), None, "LineStrips3D:strips")[1][0, 0]
+        np.testing.assert_allclose(strip, translation[:, 0], atol=1e-6)
+
+    def test_moving_bodies_have_no_static_pose_and_show_on_both_timelines(self, file: Path) -> None:
+        path = ("robots", "initial", "bodies", "cart")
+        assert len(column(file, path, None, "Transform3D:translation")[1]) == 0
+        assert list(column(file, path, "iteration", "Transform3D:translation")[0]) == [0]
+
+    def test_history_is_on_its_own_timeline_and_as_bars(self, file: Path, design: Design) -> None:
+        iterations, cost = column(file, ("history", "log10 cost"), "iteration", "Scalars:scalars")
+        assert list(iterations) == [0, 1, 2]
+        np.testing.assert_allclose(cost[:, 0], np.log10([row.cost for row in design.history]), rtol=0, atol=0)
+        assert len(column(file, ("bars", "log10 λ_min"), None, "BarChart:values")[1]) == 1
+
+    def test_text_says_what_a_reader_needs(self, file: Path) -> None:
+        text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
+        assert "Stopped at max_iterations" in text
+        assert "| mass | 2 | 0.5 | 0.0312 | 16× |" in text
+        assert "Limits are violated: position" in text
+        assert "nearly confounded" in text
+        assert "Best of 2 starts: multisine 2" in text
+        assert "a caller's" in text
+
+    def test_phase_plots_share_one_scale(self, file: Path) -> None:
+        peak = {}
+        for key in ("initial", "optimized"):
+            values = column(file, ("phase", "mass", key, "now"), "sim_time", "Points2D:positions")[1]
+            peak[key] = np.abs(values[:, 0]).max(axis=0)
+        np.testing.assert_allclose(peak["optimized"], [1.5, 1.0], rtol=1e-6)
+        np.testing.assert_allclose(peak["initial"], [1.5 / 16, 1.0 / 16], rtol=1e-6)
+
+    def test_replaces_the_file_only_when_complete(
+        self, cart: mujoco.MjModel, design: Design, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path = tmp_path / "design.rrd"
+        path.write_text("old")
+
+        def fail(*_: object) -> None:
+            raise RuntimeError("disk full")
+
+        monkeypatch.setattr(documents, "log_history", fail)
+        with pytest.raises(RuntimeError, match="disk full"):
+            log_design(path, cart, design, Labels.of_model(cart))
+        assert path.read_text() == "old"
+        assert list(tmp_path.iterdir()) == [path]
+
+    def test_manages_without_history_and_with_infinite_sigma(
+        self, cart: mujoco.MjModel, design: Design, tmp_path: Path
+    ) -> None:
+        blind = replace(design.initial, std=np.array([np.inf, 0.1]), min_eigenvalue=np.zeros(41))
+        path = tmp_path / "design.rrd"
+        log_design(path, cart, replace(design, initial=blind, history=()), Labels.of_model(cart))
+        assert entity(("information", "initial")) in entities(path)
+
+
+@pytest.mark.parametrize("name", ["acrobot", "panda", "panda without geoms", "zoo"])
+class TestAnyModel:
+    """Other models than the paper's."""
+
+    def test_design_of(self, name: str, tmp_path: Path) -> None:
+        model = load(name)
+        path = tmp_path / "design.rrd"
+        log_design(path, model, designed(model), Labels.of_model(model))
+        logged = entities(path)
+        assert not [entry for entry in logged if "__warnings" in entry]
+        for key in ("initial", "optimized"):
+            bodies = [model.body(b).name or f"body{b}" for b in range(1, model.nbody)]
+            assert {entity(("robots", key, "bodies", body)) for body in bodies} <= logged
+
+    def test_names_count_degrees_of_freedom(self, name: str, tmp_path: Path) -> None:
+        model = load(name)
+        names = Labels.of_model(model)
+        assert (len(names.positions), len(names.velocities), len(names.controls)) == (model.nv, model.nv, model.nu)
+        assert len(set(names.positions)) == model.nv
+
+    def test_camera_sees_every_moving_body(self, name: str, tmp_path: Path) -> None:
+        model = load(name)
+        trajectory = simulated(model, 1.0)
+        poses = motion(model, trajectory.t, trajectory.qpos)
+        eye = camera(model, [poses], views=1, aspect=1.3)
+        towards = np.subtract(eye.target, eye.position)
+        moving = np.flatnonzero(model.body_weldid)
+        ray = poses.pos[:, moving] - np.array(eye.position)
+        cosine = ray @ towards / np.linalg.norm(towards) / np.linalg.norm(ray, axis=2)
+        assert np.degrees(np.arccos(cosine.min())) < 40.0
+
+
+@pytest.fixture(scope="module")
+def zoo_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Replay of the model with every type of geom."""
+    model = load("zoo")
+    path = tmp_path_factory.mktemp("zoo") / "zoo.rrd"
+    log_trajectories(path, model, {"initial": simulated(model, 0.0)}, Labels.of_model(model))
+    return path
+
+
+class TestShapes:
+    """Geoms of every type."""
+
+    def geom(self, path: Path, body: str, geom: str, component: str) -> Array:
+        """First row of a static component of a geom."""
+        return np.array(column(path, ("robots", "initial", "bodies", body, geom), None, component)[1][0])
+
+    def test_mesh_keeps_the_compiled_vertices_and_flat_normals(self, zoo_file: Path) -> None:
+        model = load("zoo")
+        vertices = self.geom(zoo_file, "rock", "rock", "Mesh3D:vertex_positions")
+        triangles = self.geom(zoo_file, "rock", "rock", "Mesh3D:triangle_indices").reshape(-1, 3)
+        assert triangles.shape == (4, 3)
+        assert len(vertices) == len(np.unique(triangles))
+        corners = {tuple(np.round(v, 6)) for v in vertices}
+        assert corners == {tuple(np.round(v, 6)) for v in model.mesh_vert.astype(float)}
+
+    def test_height_field_has_heights_where_mujoco_has_them(self, zoo_file: Path) -> None:
+        vertices = self.geom(zoo_file, "world", "hills", "Mesh3D:vertex_positions")
+        model, data = load("zoo"), mujoco.MjData(load("zoo"))
+        mujoco.mj_kinematics(model, data)
+        for x, y, z in vertices:
+            start = np.array([0.99 * x, 1.0 + 0.99 * y, 2.0])
+            hit = mujoco.mj_ray(model, data, start, np.array([0.0, 0.0, -1.0]), None, 1, -1, np.zeros(1, np.int32))
+            assert 2.0 - hit == pytest.approx(z, abs=0.02)
+
+    def test_capsule_is_centred_on_its_frame(self, zoo_file: Path) -> None:
+        assert self.geom(zoo_file, "a/b c", "limb", "Capsules3D:lengths")[0] == pytest.approx(0.5)
+        np.testing.assert_allclose(self.geom(zoo_file, "a/b c", "limb", "Capsules3D:translations")[0], [0, 0, -0.25])
+
+    def test_bodies_without_geoms_become_sticks(self, zoo_file: Path) -> None:
+        assert self.geom(zoo_file, "bare", "sticks", "Capsules3D:lengths")[0] == pytest.approx(np.hypot(0.3, 0.5))
+
+    def test_fixed_bodies_have_one_static_pose(self, zoo_file: Path) -> None:
+        path = ("robots", "initial", "bodies", "fixed")
+        np.testing.assert_allclose(column(zoo_file, path, None, "Transform3D:translation")[1][0, 0], [0, -1, 0])
+
+    def test_infinite_planes_get_a_finite_board(self, zoo_file: Path) -> None:
+        vertices = self.geom(zoo_file, "world", "floor", "Mesh3D:vertex_positions")
+        assert np.abs(vertices).max() == pytest.approx(2.0 * load("zoo").stat.extent, rel=1e-6)
+
+
+class TestEstimate:
+    """estimate.rrd"""
+
+    def test_measured_and_predicted_outputs_and_their_difference(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
+        path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
+        estimate = estimated(cart, trajectory)
+        log_estimate(path, cart, estimate, trajectory, trajectory, Labels.of_model(cart))
+        at = ("recording 1", "qpos:slide [m]")
+        times, values = column(path, ("outputs", *at, "measured"), "sim_time", "Scalars:scalars")
+        kept = np.isfinite(estimate.recordings[0].y[:, 0])
+        assert len(times) == 40
+        np.testing.assert_array_equal(values[:, 0], estimate.recordings[0].y[kept, 0])
+        residual = column(path, ("residuals", *at), "sim_time", "Scalars:scalars")[1][:, 0]
+        np.testing.assert_allclose(residual, 0.01, atol=1e-12)
+        assert entity(("outputs", "recording 2", "hinge_angle [rad]", "predicted")) in entities(path)
+
+    def test_ghost_is_see_through(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
+        path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
+        log_estimate(path, cart, estimated(cart, trajectory), trajectory, trajectory, Labels.of_model(cart))
+        alpha = {}
+        for key in ("measured", "predicted"):
+            at = ("robots", key, "bodies", "bob", "bob")
+            alpha[key] = int(column(path, at, None, "Ellipsoids3D:colors")[1][0, 0]) & 0xFF
+        assert alpha["measured"] < 128
+        assert alpha["predicted"] == 255
+
+    def test_no_ghost_where_positions_were_not_measured(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
+        path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
+        log_estimate(path, cart, estimated(cart, trajectory), None, trajectory, Labels.of_model(cart), "see the report")
+        assert not [entry for entry in entities(path) if entry.startswith("/robots/measured")]
+        text = str(column(path, ("summary",), None, "TextDocument:text")[1][0, 0])
+        assert "no noise: σ is then not accuracy" in text
+        assert "see the report" in text
+
+
+class TestLabels:
+    """Names and units."""
+
+    def test_units_follow_joints_and_plain_actuators(self, cart: mujoco.MjModel) -> None:
+        names = Labels.of_model(cart)
+        assert names.positions == ("slide [m]", "hinge [rad]")
+        assert names.velocities == ("slide velocity [m/s]", "hinge velocity [rad/s]")
+        assert names.controls == ("force [N]",)
+
+    def test_outputs(self, cart: mujoco.MjModel) -> None:
+        assert output_label(cart, "qvel:hinge") == "qvel:hinge [rad/s]"
+        assert output_label(cart, "slide_velocity") == "slide_velocity [m/s]"
+        assert output_label(cart, "something else") == "something else"
+
+    def test_rotations_become_rotation_vectors(self) -> None:
+        model = load("zoo")
+        qpos = np.array([model.qpos0])
+        turn = np.array([0.3, -0.2, 0.1])
+        mujoco.mju_axisAngle2Quat(qpos[0, 7:11], turn / np.linalg.norm(turn), float(np.linalg.norm(turn)))
+        out = dof_positions(model, qpos)
+        np.testing.assert_allclose(out[0, 6:9], turn, atol=1e-12)
+        np.testing.assert_array_equal(out[0, :3], qpos[0, :3])
+
+    def test_costs_that_change_sign_are_not_put_on_a_logarithm(self) -> None:
+        rows = [HistoryRow(k, 1.0 - k, 0.0, 1.0, 0.0, float("nan"), 0.0, 0) for k in range(3)]
+        series = history_series(rows)
+        assert list(series["cost"][1]) == [1.0, 0.0, -1.0]
+        assert len(series["slope"][0]) == 0
+        assert len(series["step length"][0]) == 0
+
+
+class FakeViewer:
+    """Stands in for the viewer's process."""
+
+    code: int | None = None
+    command: tuple[str, ...] = ()
+
+    def __init__(self, command: list[str], **_: object) -> None:
+        FakeViewer.command = tuple(command)
+
+    def wait(self, timeout: float) -> int:
+        """Ends with `code`, or keeps running where there is none."""
+        if FakeViewer.code is None:
+            raise subprocess.TimeoutExpired(FakeViewer.command, timeout)
+        return FakeViewer.code
+
+
+class TestShow:
+    """Opening the viewer."""
+
+    def test_says_that_the_file_is_missing(self, tmp_path: Path) -> None:
+        with pytest.raises(RecordingError, match=r"nothing\.rrd"):
+            show(tmp_path / "nothing.rrd")
+
+    def test_leaves_the_viewer_open(self, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(subprocess, "Popen", FakeViewer)
+        monkeypatch.setattr(FakeViewer, "code", None)
+        show(file)
+        assert FakeViewer.command[-1] == str(file)
+
+    def test_reports_a_viewer_that_cannot_start(self, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(subprocess, "Popen", FakeViewer)
+        monkeypatch.setattr(FakeViewer, "code", 1)
+        with pytest.raises(MjfimError, match="display"):
+            show(file)

@@ -1,0 +1,255 @@
+"""scripts/export_sysid.py: sysid and mjfim simulate, compare and weigh alike, so they find the same values."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from mujoco import sysid
+from support.numerics import Array, body_setup, filtered_setup
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.identification.residuals import Fit
+from mjfim.output.archive import write_recording
+from mjfim.output.mjcf.write import same_dynamics
+from mjfim.records.recording import Recording
+
+ROOT = Path(__file__).parents[2]
+CART = ROOT / "models" / "cart_pendulum.toml"
+UNEQUAL = {"qpos:slide": 0.05, "qpos:hinge": 0.05, "qvel:slide": 0.005, "qvel:hinge": 0.005}
+installed = pytest.mark.skipif(
+    not hasattr(sysid, "ModelSequences"), reason="needs mujoco.sysid: pip install 'mjfim[sysid]'"
+)
+
+
+@pytest.fixture(scope="module")
+def script() -> Iterator[ModuleType]:
+    """scripts/export_sysid.py"""
+    sys.path.insert(0, str(ROOT / "scripts"))
+    yield import_module("export_sysid")
+    sys.path.remove(str(ROOT / "scripts"))
+
+
+def cart(**tables: Any) -> Setup:
+    """The cart-pendulum of the models. tables: replaced as a whole"""
+    return Setup(Experiment.from_file(CART).model_copy(update=tables))
+
+
+def noiseless(setup: Setup, theta: Array | None = None) -> Recording:
+    """Of the initial control, at the true values."""
+    values = setup.parameters.true if theta is None else theta
+    y, _ = setup.plant.measure(values[None], setup.control)
+    return Recording(np.arange(len(y[0])) * setup.dt, setup.control, y[0], setup.outputs.names)
+
+
+def residual(exported: Any, theta: Array, weighted: bool) -> Array:
+    """All in one row."""
+    found, _, _ = exported.residual(weighted)(theta, exported.parameters.copy())
+    return np.concatenate(found)
+
+
+@installed
+@pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.parametrize(
+    "noise",
+    [{"state": 0.05}, UNEQUAL, {"slide_position": 0.05, "hinge_velocity": 0.005}],
+    ids=["state", "unequal", "sensors"],
+)
+def test_sysid_recovers_the_truth_without_lag(script: ModuleType, noise: dict[str, float], weighted: bool) -> None:
+    setup = cart(noise=noise)
+    exported = script.export(setup, [noiseless(setup)])
+    fit = script.fitted(exported, weighted)
+    np.testing.assert_allclose(fit.theta, setup.parameters.true, rtol=1e-6)
+    assert fit.ended.startswith("Terminated after") and fit.seconds > 0.0
+
+
+@installed
+def test_states_are_compared_as_sysid_does_and_sensors_without_its_lag(script: ModuleType) -> None:
+    setup = cart()
+    exported = script.export(setup, [mjfim.simulate(setup, setup.initial, 0)])
+    own = sysid.build_residual_fn(models_sequences=[exported.sequences])
+    theirs = np.concatenate(own(setup.parameters.guess, exported.parameters.copy())[0])
+    np.testing.assert_allclose(residual(exported, setup.parameters.guess, weighted=False), theirs, rtol=0, atol=1e-12)
+    names = ["slide_position", "hinge_angle", "slide_velocity", "hinge_velocity"]
+    setup = cart(noise=dict.fromkeys(names, 0.05))
+    exported = script.export(setup, [noiseless(setup)])
+    own = sysid.build_residual_fn(models_sequences=[exported.sequences])
+    theirs = np.concatenate(own(setup.parameters.true, exported.parameters.copy())[0])
+    assert np.abs(residual(exported, setup.parameters.true, weighted=False)).max() < 1e-10
+    assert np.abs(theirs).max() > 1e-3  # the lag: without noise, at the true values
+
+
+def coarse(folder: Path) -> tuple[Setup, Recording]:
+    """Two engine steps a sample, velocities measured every other one."""
+    noise = {**UNEQUAL, "qvel:slide": {"sigma": 0.005, "rate": 25.0}}
+    values = Experiment.from_file(CART).model_dump(exclude_unset=True) | {
+        "rate": 50.0,
+        "measure_rate": 50.0,
+        "noise": noise,
+    }
+    values["initial"]["control"] = {"kind": "chirp", "amplitude": 2.0, "frequency": 0.3, "frequency_end": 1.0}
+    setup = Setup(Experiment(**values, directory=CART.parent))
+    return setup, mjfim.simulate(setup, setup.initial, 1)
+
+
+def whole(folder: Path) -> tuple[Setup, Recording]:
+    """Free and ball joints by their states, some components of them only, and sensors."""
+    noise = {"qpos:float": 0.01, "qvel:ball.rx": 0.02, "gyro": 0.02, "tip": 0.01}
+    setup = body_setup(folder, noise=noise)
+    return setup, mjfim.simulate(setup, setup.initial, 1)
+
+
+def activated(folder: Path) -> tuple[Setup, Recording]:
+    """An actuator with a state."""
+    setup = filtered_setup(folder)
+    return setup, mjfim.simulate(setup, setup.initial, 1)
+
+
+def model(name: str) -> Callable[[Path], tuple[Setup, Recording]]:
+    """One of the models: inertias in charts, servo gains, a tendon, a loop."""
+
+    def build(folder: Path) -> tuple[Setup, Recording]:
+        setup = Setup(Experiment.from_file(ROOT / "models" / f"{name}.toml"))
+        return setup, mjfim.simulate(setup, setup.initial, 1)
+
+    return build
+
+
+MODELS = ("ball_pendulum", "servo_arm", "four_bar", "muscle_arm")
+CASES = {"coarse": coarse, "whole": whole, "activated": activated, **{name: model(name) for name in MODELS}}
+
+
+@installed
+@pytest.mark.parametrize("case", CASES)
+def test_sysid_gets_the_same_model_data_and_weights(script: ModuleType, case: str, tmp_path: Path) -> None:
+    """Whitened residuals away from the guess, and what the MjSpec compiles to there."""
+    setup, recording = CASES[case](tmp_path)
+    exported, p = script.export(setup, [recording]), setup.parameters
+    theta = np.clip(p.guess + 0.02 * p.step * np.cos(np.arange(len(p))), p.lower, p.upper)
+    moved = exported.parameters.copy()
+    moved.update_from_vector(theta)
+    before = exported.sequences.spec.to_xml()
+    built = import_module("sysid_sequences").build(moved, exported.sequences.spec)
+    assert same_dynamics(built, setup.model_at(theta))
+    assert exported.sequences.spec.to_xml() == before
+    fit = Fit(setup, [recording])
+    wanted = fit.dense(fit.begin(theta))
+    assert wanted is not None
+    mine = residual(exported, theta, weighted=True)
+    np.testing.assert_allclose(np.sum(mine**2), np.sum(wanted.r**2), rtol=1e-6)
+    data = fit.count  # priors follow the data
+    np.testing.assert_allclose(np.sum(mine[:data] ** 2), script.chi2(exported, theta), rtol=1e-12)
+    np.testing.assert_allclose(np.sort(np.abs(mine[:data])), np.sort(np.abs(wanted.r[:data])), rtol=1e-6, atol=1e-6)
+
+
+@installed
+def test_times_off_the_grid_are_read_between_the_steps(script: ModuleType) -> None:
+    setup = cart()
+    fine, rng = noiseless(setup), np.random.default_rng(4)
+    rows = np.sort(rng.choice(np.arange(1, 400), 300, replace=False))
+    t = fine.t[rows] + rng.uniform(-2e-3, 2e-3, 300)
+    t[0] = 0.0
+    y = np.column_stack([np.interp(t, fine.t, column) for column in fine.y.T])
+    recording = Recording(t, fine.ctrl[rows[:-1]], y, fine.outputs)
+    exported, fit = script.export(setup, [recording]), Fit(setup, [recording])
+    wanted = fit.dense(fit.begin(setup.parameters.true))
+    assert wanted is not None
+    mine = residual(exported, setup.parameters.true, weighted=True)
+    np.testing.assert_allclose(mine, -wanted.r, atol=1e-3)
+
+
+@installed
+def test_the_report_draws_components_and_what_is_measured_now_and_then(script: ModuleType, tmp_path: Path) -> None:
+    """sysid's own report counts signals where it draws their components."""
+    setup, recording = whole(tmp_path)
+    exported = script.export(setup, [recording])
+    assert "tip[2]" in script.report(exported, script.fitted(exported, weighted=True))
+    assert set(exported.layout.mapping) == {"hull_qpos", "ball_qvel", "gyro", "tip"}
+    setup, recording = coarse(tmp_path)
+    exported = script.export(setup, [recording])
+    _, _, records = exported.residual(weighted=True)(setup.parameters.guess, exported.parameters, return_pred_all=True)
+    assert list(records[0][0].signal_mapping) == ["slide_qpos", "hinge_qpos", "slide_qvel", "hinge_qvel"]
+    known, drawn = recording.y[1:, 2], records[0][0].data[:, 2]
+    assert np.isnan(known).any() and np.isfinite(drawn).all()
+    np.testing.assert_array_equal(drawn[np.isfinite(known)], known[np.isfinite(known)])
+
+
+@installed
+def test_the_command_compares_both_and_leaves_the_report(
+    script: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Unequal sensors: weighted, sysid finds what mjfim finds; as is, it is several sigmas off."""
+    setup = cart(noise=UNEQUAL)
+    text = CART.read_text(encoding="utf-8").replace(
+        "state = 0.05", "\n".join(f'"{k}" = {v}' for k, v in UNEQUAL.items())
+    )
+    text = re.sub(r'"(cart_pendulum\.\w+)"', lambda match: f'"{(CART.parent / match[1]).as_posix()}"', text)
+    experiment = tmp_path / "experiment.toml"
+    experiment.write_text(text, encoding="utf-8")
+    files = [tmp_path / f"recording_{seed}.csv" for seed in (0, 1)]
+    for seed, path in enumerate(files):
+        write_recording(path, mjfim.simulate(setup, setup.initial, seed), setup)
+    assert script.main([str(experiment), *map(str, files), "-o", str(tmp_path / "out")]) == 0
+    shown = capfd.readouterr()
+    assert not shown.err, "sysid is heard"
+    assert "The same data, two estimators" in shown.out and "iter:" not in shown.out
+    found = json.loads((tmp_path / "out" / "comparison.json").read_text(encoding="utf-8"))
+    assert (
+        found["parameters"] == ["m", "l", "c"]
+        and found["true"] == [2.0, 1.0, 1.0]
+        and found["start"] == [2.5, 1.4, 1.4]
+    )
+    assert found["recordings"] == [str(path) for path in files]
+    std = np.array(found["mjfim"]["std"])
+    off = {
+        key: (np.array(found[key]["theta"]) - found["mjfim"]["theta"]) / std
+        for key in ("sysid_weighted", "sysid_default")
+    }
+    assert np.abs(off["sysid_weighted"]).max() < 1e-3
+    assert np.abs(off["sysid_default"]).max() > 0.5
+    assert found["sysid_weighted"]["chi2"] == pytest.approx(found["mjfim"]["chi2"], rel=1e-6)
+    assert found["sysid_default"]["chi2"] > found["mjfim"]["chi2"]
+    html = (tmp_path / "out" / "sysid_report.html").read_text(encoding="utf-8")
+    assert "Parameter Distribution" in html and "recording_1.csv" in html and "hinge_qvel" in html
+
+
+@installed
+@pytest.mark.parametrize(
+    ("tables", "said"),
+    [
+        ({"nuisance": {"initial": 0.1}}, "numbers of the model only"),
+        ({"nuisance": {"delay": 0.01}}, "delay: sysid fits"),
+        ({"fit": {"segments": 1.0}}, "every start as stated"),
+    ],
+)
+def test_what_sysid_cannot_fit_is_refused(script: ModuleType, tables: dict[str, Any], said: str) -> None:
+    setup = Setup(Experiment.from_file(CART).replace(**tables))
+    with pytest.raises(ExperimentError, match=said):
+        script.export(setup, [noiseless(setup)])
+
+
+@installed
+def test_misuse_ends_with_a_sentence(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert script.main([str(CART), str(tmp_path / "none.csv"), "-o", str(tmp_path / "out")]) == 2
+    assert "none.csv" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_the_extra_it_says_how_to_get_it(
+    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(sysid, "ModelSequences", raising=False)
+    assert script.main([str(CART), str(tmp_path / "recording.csv"), "-o", str(tmp_path / "out")]) == 2
+    assert "pip install 'mjfim[sysid]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,140 @@
+"""Noise: whitening against SciPy's normal density, missing values marginalised, and information per second kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import multivariate_normal
+
+from mjfim.plant.noise import Noise
+
+Array = NDArray[np.float64]
+
+ROOT = np.array([[1.0, 0.0, 0.0, 0.0], [0.8, 0.5, 0.0, 0.0], [-0.3, 0.4, 2.0, 0.0], [0.0, 0.0, 0.0, 0.1]])
+FULL = ROOT @ ROOT.T  # the last output is uncorrelated with the others
+
+
+def correlated(strides: tuple[int, ...] = (1, 1, 1, 1)) -> Noise:
+    """Four outputs, three of them correlated."""
+    return Noise(FULL, np.array(strides))
+
+
+def half_square(rows: Array) -> float:
+    """What whitened residuals contribute to minus the log-density."""
+    return 0.5 * float(rows @ rows)
+
+
+def test_whitened_residuals_are_the_normal_density() -> None:
+    """Differences of log-densities are differences of half squares, sample by sample."""
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((6, 4)) * [1.0, 2.0, 3.0, 0.2]
+    density = multivariate_normal(np.zeros(4), FULL)
+    for row, white in zip(values, correlated().whiten(values), strict=True):
+        assert density.logpdf(np.zeros(4)) - density.logpdf(row) == pytest.approx(half_square(white), rel=1e-10)
+    wrong = Noise.independent(np.sqrt(np.diag(FULL))).whiten(values)
+    assert half_square(wrong[0]) != pytest.approx(half_square(correlated().whiten(values)[0]), rel=1e-2)
+
+
+def test_independent_outputs_are_the_special_case() -> None:
+    """Division by sigma and the triangular solve agree on a diagonal covariance."""
+    sigma, values = np.array([0.5, 2.0, 0.1]), np.random.default_rng(1).standard_normal((7, 3, 2))
+    plain = Noise.independent(sigma, stride=2)
+    assert not plain.correlated
+    np.testing.assert_allclose(plain.whiten(values), values / sigma[:, None], rtol=1e-15)
+    np.testing.assert_allclose(plain.factor, np.diag(sigma), rtol=1e-15)
+    faint = Noise(plain.covariance + 1e-300 * (1 - np.eye(3)), plain.strides)
+    assert faint.correlated
+    np.testing.assert_allclose(faint.whiten(values), plain.whiten(values), rtol=1e-14)
+    assert plain.strides.tolist() == [2, 2, 2]
+
+
+def test_jacobians_are_whitened_like_residuals() -> None:
+    """Any trailing axes; the product of whitened rows is the Fisher information by the precision."""
+    G = np.random.default_rng(2).standard_normal((5, 4, 3))
+    noise = correlated()
+    white = noise.whiten(G)
+    for j in range(3):
+        np.testing.assert_allclose(white[..., j], noise.whiten(G[..., j]), rtol=1e-13, atol=1e-13)
+    wanted = sum(G[k].T @ np.linalg.inv(FULL) @ G[k] for k in range(1, 5))
+    rows = noise.rows(G)
+    assert rows.shape == (16, 3)
+    np.testing.assert_allclose(rows.T @ rows, wanted, rtol=1e-11)
+    np.testing.assert_allclose(noise.precision, np.linalg.inv(FULL), rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(noise.sigma, np.sqrt(np.diag(FULL)), rtol=1e-15)
+
+
+def test_strides_say_which_samples_hold_which_output() -> None:
+    """The start is never measured; an output's slower rate is its own."""
+    measured = correlated((2, 2, 2, 3)).measured(7)
+    assert measured[:, 0].tolist() == [0, 0, 1, 0, 1, 0, 1, 0]
+    assert measured[:, 3].tolist() == [0, 0, 0, 1, 0, 0, 1, 0]
+    assert np.array_equal(measured[:, 0], measured[:, 2])
+    G = np.random.default_rng(3).standard_normal((8, 4, 2))
+    rows = correlated((2, 2, 2, 3)).rows(G)
+    joint, alone = np.linalg.inv(FULL[:3, :3]), 1.0 / FULL[3, 3]
+    wanted = sum(G[k, :3].T @ joint @ G[k, :3] for k in (2, 4, 6)) + sum(
+        alone * np.outer(G[k, 3], G[k, 3]) for k in (3, 6)
+    )
+    np.testing.assert_allclose(rows.T @ rows, wanted, rtol=1e-11)
+
+
+def test_missing_values_are_marginalised() -> None:
+    """The density of what is there, by SciPy, whatever stands where nothing was measured."""
+    rng = np.random.default_rng(4)
+    values = rng.standard_normal((12, 4))
+    present = rng.random((12, 4)) < 0.6
+    present[3], present[5] = False, True
+    noise = correlated()
+    kept = np.where(present, values, np.nan)
+    white = noise.whiten_present(kept, present)
+    assert white.shape == (present.sum(),)
+    ends = np.cumsum(present.sum(axis=1))[:-1]
+    for row, seen, own in zip(values, present, np.split(white, ends), strict=True):
+        if seen.any():
+            density = multivariate_normal(np.zeros(seen.sum()), FULL[np.ix_(seen, seen)])
+            drop = density.logpdf(np.zeros(seen.sum())) - density.logpdf(row[seen])
+            assert drop == pytest.approx(half_square(own), rel=1e-10)
+        else:
+            assert own.size == 0
+    np.testing.assert_array_equal(noise.whiten_present(np.where(present, values, 7.0), present), white)
+    # taking rows of the joint whitening instead would condition on zeros
+    conditioned = noise.whiten(np.where(present, values, 0.0))[present]
+    assert np.abs(conditioned - white).max() > 0.1
+
+
+def test_missing_values_of_jacobians_go_with_those_of_residuals() -> None:
+    """In the same order, for correlated and for independent outputs."""
+    rng = np.random.default_rng(5)
+    y, G, present = rng.standard_normal((9, 4)), rng.standard_normal((9, 4, 3)), rng.random((9, 4)) < 0.5
+    for noise in (correlated(), Noise.independent([1.0, 2.0, 3.0, 4.0])):
+        theta = np.array([0.3, -1.0, 2.0])
+        together = noise.whiten_present(y + G @ theta, present)
+        apart = noise.whiten_present(y, present) + noise.whiten_present(G, present) @ theta
+        np.testing.assert_allclose(together, apart, rtol=1e-12, atol=1e-12)
+
+
+def test_samples_have_the_stated_covariance() -> None:
+    """Against the standard error of a sample covariance."""
+    drawn = correlated().sample(40_000, np.random.default_rng(6))
+    spread = np.sqrt((FULL**2 + np.outer(np.diag(FULL), np.diag(FULL))) / len(drawn))
+    assert np.abs((drawn.T @ drawn / len(drawn) - FULL) / spread).max() < 4.0
+    again = correlated().sample(40_000, np.random.default_rng(6))
+    np.testing.assert_array_equal(drawn, again)
+    white = correlated().whiten(drawn)
+    np.testing.assert_allclose(np.cov(white.T), np.eye(4), atol=0.03)
+
+
+@pytest.mark.parametrize("coarsen", [1, 3])
+def test_every_sample_keeps_the_information_per_second(coarsen: int) -> None:
+    """Of each output at its own rate, on a grid `coarsen` times longer, related to the measurement rate of that grid."""
+    strides, stride, N, rate = np.array([4, 4, 4, 6]), 2, 72, 100.0
+    G = np.array([[1.0, 0.2], [-0.5, 1.0], [0.3, 0.3], [2.0, -1.0]])  # the same at all samples
+    fine = Noise(FULL, strides)
+    before = fine.rows(np.broadcast_to(G, (N + 1, *G.shape)))
+    coarse = fine.every_sample(stride)
+    after = coarse.rows(np.broadcast_to(G, (N // coarsen + 1, *G.shape)))
+    assert coarse.strides.tolist() == [1] * 4
+    np.testing.assert_allclose(after.T @ after / (rate / coarsen), before.T @ before / (rate / stride), rtol=1e-11)
+    ratio = coarse.covariance[:3, :3] / FULL[:3, :3]
+    np.testing.assert_allclose(ratio, ratio[0, 0])  # correlations stay

@@ -1,0 +1,768 @@
+"""The plant in discrete time: derivatives against MuJoCo's and plain loops, sensors, projection, divergence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from support.numerics import (
+    CART_PARAMETERS,
+    CART_PENDULUM,
+    Array,
+    Loop,
+    body_setup,
+    cart_setup,
+    filtered_setup,
+    make_setup,
+    relative_error,
+    shared_model,
+)
+
+from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.experiment.system import Setup
+from mjfim.model.loading import compile_spec, load_spec, unconstrained
+from mjfim.model.mujoco_log import quiet
+from mjfim.model.variants import Source
+from mjfim.optimize.lq import Recursion, TangentCurve, regulator
+from mjfim.output.mjcf.write import write_spec
+from mjfim.plant.plant import CENTRAL, FAST
+from mjfim.records.trajectory import Linearization
+
+SENSED = {"angle": 0.01, "rate": 0.05, "acc": 0.3, "drive": 0.1}
+SAMPLES = (0, 7, 23, 49)
+
+
+def linear(setup: Setup) -> Linearization:
+    """Derivatives along the initial trajectory."""
+    return setup.plant.linearize(setup.theta, setup.initial)
+
+
+def furuta(folder: Path) -> Setup:
+    """The Qube, RK4 with 20 steps per sample; a torque that swings the pole without limits or contacts (it has none)."""
+    parameters = {"stiff": {"target": "joint/theta:damping"}, "weak": {"target": "joint/alpha:damping"}}
+    control = {"kind": "sine", "amplitude": 2e-3, "frequency": 1.5}
+    model = shared_model("qube_furuta/furuta_pendulum.xml")
+    initial = {"qpos": (0.1, 0.3), "control": control}
+    return make_setup(model, folder, initial=initial, parameters=parameters, noise={"state": 0.01})
+
+
+def acrobot_without_rk4(folder: Path, integrator: str) -> Setup:
+    """dm_control's acrobot under another integrator; its constraints are off and |u| stays below its range of 1."""
+    source = shared_model("dmc_acrobot/acrobot.xml")
+    spec = mujoco.MjSpec.from_file(str(source))
+    for kind in ("textures", "materials"):  # pictures are not needed and not copied
+        for element in getattr(spec, kind):
+            spec.delete(element)
+    for geom in spec.geoms:
+        geom.material = ""
+    for site in spec.sites:
+        site.material = ""
+    spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    spec.compile()
+    parameters = {"m": {"target": "body/lower_arm:mass"}, "c": {"target": "joint/elbow:damping"}}
+    control = {"kind": "sine", "amplitude": 0.8, "frequency": 1.0}
+    initial = {"qpos": (2.5, 0.4), "control": control}
+    return make_setup(spec.to_xml(), folder, initial=initial, parameters=parameters, noise={"state": 0.05})
+
+
+def transition(setup: Setup, k: int) -> tuple[Array, Array, Array, Array]:
+    """A, B, C, D of sample k by `mjd_transitionFD`."""
+    model, curve = setup.plant.model(setup.theta), setup.initial
+    loop = Loop(model, 1)
+    loop.load(curve.state[k], curve.ctrl[k])
+    nx, nu = setup.space.nx, model.nu
+    A, B = np.zeros((nx, nx)), np.zeros((nx, nu))
+    C, D = np.zeros((model.nsensordata, nx)), np.zeros((model.nsensordata, nu))
+    mujoco.mjd_transitionFD(model, loop.data, 1e-6, True, A, B, C, D)
+    return A, B, C, D
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("make", [cart_setup, body_setup, acrobot_without_rk4], ids=["cart", "body", "acrobot"])
+def test_A_and_B_are_those_of_mjd_transitionFD(make, integrator: str, tmp_path) -> None:
+    setup = make(tmp_path, integrator)
+    assert setup.substeps == 1
+    found = linear(setup)
+    for k in SAMPLES:
+        A, B, _, _ = transition(setup, k)
+        assert relative_error(found.A[k], A) < 1e-8
+        assert relative_error(found.B[k], B) < 1e-7
+
+
+@pytest.mark.parametrize("make", [body_setup, lambda f, i: cart_setup(f, i, noise=SENSED)], ids=["body", "cart"])
+def test_C_and_D_of_sensors_are_those_of_mjd_transitionFD(make, tmp_path) -> None:
+    setup = make(tmp_path, "implicitfast")
+    found = linear(setup)
+    for k in SAMPLES:
+        _, _, C, D = transition(setup, k)
+        assert relative_error(found.C[k], C) < 1e-7
+        assert relative_error(found.D[k], D) < 1e-7
+    assert np.abs(found.D).max() > 0.1  # accelerations and forces depend on the control at once
+
+
+@pytest.mark.parametrize(
+    "make",
+    [cart_setup, body_setup, lambda f: filtered_setup(f, "RK4"), filtered_setup, furuta],
+    ids=["cart", "body", "activation", "activation-implicitfast", "furuta"],
+)
+def test_A_and_B_are_those_of_a_plain_loop_for_any_integrator_and_substeps(make, tmp_path) -> None:
+    setup = make(tmp_path)
+    found, curve = linear(setup), setup.initial
+    loop = Loop(setup.plant.model(setup.theta), setup.substeps)
+    for k in SAMPLES:
+        A, B, _, _ = loop.jacobians(curve.state[k], curve.ctrl[k])
+        assert relative_error(found.A[k], A) < 1e-7
+        assert relative_error(found.B[k], B) < 1e-6
+
+
+def test_these_setups_hold_one_and_several_steps_per_sample(tmp_path) -> None:
+    (tmp_path / "b").mkdir()
+    assert cart_setup(tmp_path).substeps == 1
+    assert filtered_setup(tmp_path / "b").substeps == 2
+    assert furuta(tmp_path).substeps == 20
+
+
+def test_a_wrong_jacobian_would_be_noticed(tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    A, _, _, _ = Loop(setup.plant.model(setup.theta), 2).jacobians(setup.initial.state[7], setup.initial.ctrl[7])
+    assert relative_error(linear(setup).A[7], A) > 1e-3  # two steps instead of one
+    assert relative_error(1.001 * linear(setup).A[7], linear(setup).A[7]) > 1e-7
+
+
+def rebuilt(setup: Setup, theta: Array) -> Any:
+    """The model compiled anew at theta, sensors and solver as in the plant."""
+    spec = setup.spec.copy()
+    write_spec(spec, setup.model, setup.model_at(theta), setup.parameters, theta)
+    for body in spec.bodies:
+        body.simple = 0
+    return spec.compile()
+
+
+def sensed(setup: Setup) -> tuple[list[int], list[int]]:
+    """Rows of the outputs that are sensors, and where those stand in sensordata."""
+    found = [(i, o.sensor) for i, o in enumerate(setup.outputs.outputs) if o.sensor is not None]
+    return [i for i, _ in found], [s for _, s in found]
+
+
+@pytest.mark.parametrize(
+    ("make", "tolerance"), [(cart_setup, 1e-6), (body_setup, 1e-6), (filtered_setup, 1e-6)], ids=["cart", "body", "act"]
+)
+def test_E_and_H_are_differences_of_rebuilt_models(make, tolerance: float, tmp_path) -> None:
+    setup = make(tmp_path)
+    found, curve, theta = linear(setup), setup.initial, setup.theta
+    rows, address = sensed(setup)
+    for j, h in enumerate(1e-5 * np.abs(theta)):
+        step = h * np.eye(len(theta))[j]
+        up, down = (Loop(rebuilt(setup, theta + s), setup.substeps) for s in (step, -step))
+        F, H = np.zeros((len(SAMPLES), setup.space.nx)), np.zeros((len(SAMPLES), len(rows)))
+        for i, k in enumerate(SAMPLES):
+            x, u = curve.state[k], curve.ctrl[k]
+            F[i] = up.minus(up.F(x, u), down.F(x, u)) / (2 * h)
+            H[i] = ((up.h(x, u) - down.h(x, u)) / (2 * h))[address]
+        assert relative_error(found.E[list(SAMPLES), :, j], F) < tolerance
+        if len(rows) and np.abs(H).max() > 1e-9:
+            assert relative_error(found.H[list(SAMPLES)][:, rows, j], H) < tolerance
+
+
+def test_H_of_sensors_is_not_zero_here(tmp_path) -> None:
+    assert np.abs(linear(body_setup(tmp_path)).H).max() > 0.1
+    assert np.abs(linear(cart_setup(tmp_path)).H).max() == 0.0  # states are measured as they are
+
+
+@pytest.mark.parametrize(
+    "make",
+    [cart_setup, body_setup, filtered_setup, lambda f: cart_setup(f, noise={**SENSED, "state": 0.1}), furuta],
+    ids=["cart", "body", "activation", "cart-sensors", "furuta"],
+)
+def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
+    setup = make(tmp_path)
+    tolerance = 1e-5 if make is furuta else 1e-6  # its dampings are 1e-6, hardly above the round-off of a step
+    L, S = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial)
+    psi = np.zeros((setup.space.nx, len(setup.theta)))
+    for k in range(setup.samples):
+        psi = L.A[k] @ psi + L.E[k]
+    np.testing.assert_array_equal(S.psi[0], 0.0)
+    scale = np.abs(S.psi).max(axis=(0, 1))
+    assert (scale > 0).all()
+    assert np.abs((S.psi[-1] - psi) / scale).max() < tolerance
+    every = np.stack(
+        [Recursion(L.A).forward(np.zeros(setup.space.nx), L.E[:, :, j]) for j in range(len(scale))], axis=2
+    )
+    assert np.abs((S.psi - every) / scale).max() < tolerance
+    G = np.einsum("kyx,kxp->kyp", L.C, S.psi) + L.H
+    assert np.abs((S.G - G) / np.abs(G).max(axis=(0, 1))).max() < tolerance
+    assert S.G.shape == (setup.samples + 1, len(setup.outputs.outputs), len(setup.theta))
+
+
+def test_prediction_gives_the_same_outputs_and_derivative_as_the_sensitivity(tmp_path) -> None:
+    setup = body_setup(tmp_path)
+    y, G = setup.plant.predict(setup.theta, setup.initial.ctrl)
+    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    assert relative_error(G, S.G) < 1e-6
+    measured, finite = setup.plant.measure(setup.theta[None], setup.initial.ctrl)
+    assert finite.all()
+    np.testing.assert_array_equal(measured[0], y)
+
+
+@pytest.mark.parametrize("make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"])
+@pytest.mark.parametrize("accuracy", [CENTRAL, FAST], ids=["central", "fast"])
+def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> None:
+    setup = make(tmp_path)
+    L, psi = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial).psi
+    w = np.abs(setup.theta)[None] * np.linspace(0.5, 1.0, len(setup.theta))
+    found = setup.plant.bilinear(setup.theta, setup.initial, psi, w, accuracy)
+    tolerance = 1e-5 if accuracy.central else 1e-3
+    for name in ("A", "B", "C", "D"):
+        if np.abs(getattr(L, name)).max() > 0:
+            assert relative_error(getattr(found, name), getattr(L, name)) < tolerance
+
+
+@pytest.mark.parametrize("make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"])
+def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, tmp_path) -> None:
+    setup = make(tmp_path)
+    theta, curve, nx = setup.theta, setup.initial, setup.space.nx
+    psi = setup.plant.sensitivity(theta, curve).psi
+    w = np.abs(theta) * np.linspace(1.0, 0.5, len(theta))
+    found = setup.plant.bilinear(theta, curve, psi, w[None], CENTRAL)
+    e, d = 3e-4, 3e-4
+    rows, address = sensed(setup)
+    plus, minus = (Loop(rebuilt(setup, theta + s * e * w), setup.substeps) for s in (1, -1))
+    for k in (7, 23):
+        x, u, push = curve.state[k], curve.ctrl[k], psi[k] @ w
+
+        def DF(x: Array, u: Array, push: Array = push) -> tuple[Array, Array]:
+            up, down = plus.plus(x, e * push), plus.plus(x, -e * push)
+            dh = (plus.h(up, u) - minus.h(down, u)) / (2 * e)
+            return plus.minus(plus.F(up, u), minus.F(down, u)) / (2 * e), dh
+
+        F, H = [], []
+        for i in range(nx + setup.plant.nu):
+            step = d * np.eye(nx + setup.plant.nu)[i]
+            ahead, back = DF(plus.plus(x, step[:nx]), u + step[nx:]), DF(plus.plus(x, -step[:nx]), u - step[nx:])
+            F.append((ahead[0] - back[0]) / (2 * d))
+            H.append((ahead[1] - back[1])[address] / (2 * d))
+        assert relative_error(found.F_mixed[0, k], np.array(F)) < 1e-4
+        if setup.outputs.needs_sensors:
+            assert relative_error(found.h_mixed[0, k][:, rows], np.array(H)) < 1e-4
+
+
+def test_outputs_belong_to_the_state_and_control_of_their_own_sample(tmp_path) -> None:
+    noise = {"state": 0.1, **SENSED}
+    setup = cart_setup(tmp_path, noise=noise)
+    y, _ = setup.plant.measure(setup.theta[None], setup.initial.ctrl)
+    columns = {name: y[0][:, i] for i, name in enumerate(setup.outputs.names)}
+    np.testing.assert_array_equal(columns["angle"], columns["qpos:hinge"])  # no lag between sensor and state
+    np.testing.assert_array_equal(columns["rate"], columns["qvel:hinge"])
+    assert np.abs(np.diff(columns["angle"])).max() > 1e-3
+    np.testing.assert_array_equal(columns["drive"][:-1], setup.initial.ctrl[:, 0])
+    assert columns["drive"][-1] == setup.initial.ctrl[-1, 0]  # the last control is held
+
+
+@pytest.mark.parametrize("make", [filtered_setup, body_setup], ids=["two steps a sample", "one"])
+def test_rollout_and_sensors_are_those_of_a_plain_loop(make, tmp_path) -> None:
+    noise = {"noise": {"angle": 0.1, "torque": 0.1}} if make is filtered_setup else {}
+    setup = make(tmp_path, "RK4", **noise)
+    curve, loop = setup.initial, Loop(setup.plant.model(setup.theta), setup.substeps)
+    y, _ = setup.plant.measure(setup.theta[None], curve.ctrl)
+    for k in range(setup.samples):
+        expected = loop.F(curve.state[k], curve.ctrl[k])
+        np.testing.assert_allclose(curve.state[k + 1], expected, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(y[0, k], loop.h(curve.state[k], curve.ctrl[k]), rtol=0, atol=1e-11)
+    last = loop.h(curve.state[-1], curve.ctrl[-1])
+    np.testing.assert_allclose(y[0, -1], last, rtol=0, atol=1e-11)
+    assert curve.t[-1] == pytest.approx(setup.samples * setup.substeps * setup.model.opt.timestep)
+
+
+def gain(setup: Setup) -> Array:
+    """Regulator with unit weights along the initial trajectory."""
+    L, dt = linear(setup), setup.dt
+    nx, nu = setup.space.nx, setup.plant.nu
+    return regulator(L.A, L.B, np.eye(nx) * dt, np.eye(nu) * dt, np.eye(nx))
+
+
+def tangent(setup: Setup, K: Array, size: float = 1.0) -> TangentCurve:
+    """A smooth tangent vector along the initial trajectory."""
+    L, t = linear(setup), setup.t[:, None]
+    c = size * np.sin(7.0 * t + 1.0 + np.arange(setup.plant.nu))
+    z = Recursion(L.A - L.B @ K).forward(np.zeros(setup.space.nx), np.einsum("kiu,ku->ki", L.B, c))
+    return TangentCurve(z, c - np.einsum("kui,ki->ku", K, z[:-1]))
+
+
+STILL = pytest.mark.parametrize("make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"])
+
+
+@STILL
+@pytest.mark.parametrize("open_loop", [True, False])
+def test_projecting_a_trajectory_onto_itself_changes_nothing(make, open_loop: bool, tmp_path) -> None:
+    setup = make(tmp_path)
+    K = gain(setup) * (not open_loop)
+    still = TangentCurve(np.zeros((setup.samples + 1, setup.space.nx)), np.zeros((setup.samples, setup.plant.nu)))
+    same = setup.plant.project(setup.theta, setup.initial, still, 1.0, K)
+    np.testing.assert_allclose(same.state, setup.initial.state, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(same.ctrl, setup.initial.ctrl, rtol=0, atol=1e-12)
+
+
+@STILL
+def test_projection_is_idempotent_and_feasible(make, tmp_path) -> None:
+    setup = make(tmp_path)
+    K, plant, theta = gain(setup), setup.plant, setup.theta
+    zeta = tangent(setup, K)
+    once = plant.project(theta, setup.initial, zeta, 0.5, K)
+    moved = plant.difference(once, setup.initial)
+    assert np.abs(moved.z).max() > 1e-3
+    # P(xi) is a trajectory: its own control in open loop gives it back
+    np.testing.assert_allclose(plant.simulate(theta, once.ctrl).state, once.state, rtol=0, atol=1e-9)
+    # P(P(xi)) = P(xi), by asking again for where it has arrived
+    twice = plant.project(theta, setup.initial, moved, 1.0, K)
+    np.testing.assert_allclose(twice.state, once.state, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(twice.ctrl, once.ctrl, rtol=0, atol=1e-9)
+
+
+@STILL
+@pytest.mark.parametrize("open_loop", [True, False])
+def test_projection_moves_along_its_tangent_vector_to_first_order(make, open_loop: bool, tmp_path) -> None:
+    setup = make(tmp_path)
+    K = gain(setup) * (not open_loop)
+    zeta, errors = tangent(setup, K), []
+    for gamma in (1e-2, 5e-3):
+        moved = setup.plant.difference(setup.plant.project(setup.theta, setup.initial, zeta, gamma, K), setup.initial)
+        errors.append(np.abs(moved.z / gamma - zeta.z).max() + np.abs(moved.v / gamma - zeta.v).max())
+    assert errors[0] < 0.05 * np.abs(zeta.z).max()
+    assert errors[1] < 0.6 * errors[0] or errors[1] < 1e-9  # the remainder is of second order
+
+
+def test_feedback_is_that_of_the_projection_operator(tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    K, curve, zeta = gain(setup), setup.initial, tangent(setup, gain(setup), 3.0)
+    new = setup.plant.project(setup.theta, curve, zeta, 1.0, K)
+    alpha, mu = curve.state + zeta.z, curve.ctrl + zeta.v
+    expected = mu + np.einsum("kui,ki->ku", K, alpha[:-1] - new.state[:-1])
+    np.testing.assert_allclose(new.ctrl, expected, rtol=0, atol=1e-12)
+
+
+def test_feedback_holds_an_upright_pendulum_that_open_loop_loses(tmp_path) -> None:
+    start = {"qpos": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
+    light = CART_PENDULUM.format(integrator="RK4").replace('damping="0.4"', 'damping="0.01"')
+    setup = make_setup(light, tmp_path, initial=start, horizon=4.0, parameters=CART_PARAMETERS, noise={"state": 0.1})
+    K, kick = gain(setup), np.zeros((setup.samples, 1))
+    kick[:20] = 0.5
+    zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), kick)
+    lost = setup.plant.project(setup.theta, setup.initial, zeta, 1.0, 0.0 * K)
+    held = setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K)
+    assert np.abs(lost.qpos[:, 1]).max() > 2.0
+    assert np.abs(held.qpos[:, 1]).max() < 0.1
+    assert np.abs(held.state[-1]).max() < 0.05
+
+
+def test_a_control_that_diverges_is_an_outcome_without_noise(tmp_path, monkeypatch, capfd) -> None:
+    monkeypatch.chdir(tmp_path)
+    setup = cart_setup(tmp_path)
+    before, K = sorted(p.name for p in tmp_path.iterdir()), gain(setup)
+    wild = TangentCurve(np.zeros((setup.samples + 1, 4)), np.full((setup.samples, 1), 9e9))
+    assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, 0.0 * K) is None
+    assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, K) is None
+    with pytest.raises(SimulationDiverged, match="diverges"):
+        setup.plant.simulate(setup.theta, wild.v)
+    ctrl = setup.plant.trajectory(setup.initial.state, wild.v)
+    assert setup.plant.sensitivity(setup.theta, ctrl) is None
+    assert setup.plant.predict(setup.theta, wild.v) is None
+    assert capfd.readouterr() == ("", "")
+    assert sorted(p.name for p in tmp_path.iterdir()) == before  # no MUJOCO_LOG.TXT
+
+
+@pytest.mark.parametrize("open_loop", [True, False])
+@pytest.mark.parametrize("bad", [np.nan, 1e12])
+def test_a_control_that_mujoco_would_silently_replace_by_zero_is_not_simulated(
+    bad: float, open_loop: bool, tmp_path
+) -> None:
+    setup = cart_setup(tmp_path)
+    K, wild = gain(setup) * (not open_loop), np.zeros((setup.samples, 1))
+    wild[20] = bad
+    zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), wild)
+    assert setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K) is None
+
+
+@pytest.mark.parametrize("open_loop", [True, False])
+@pytest.mark.parametrize("sample", [0, 1, 30])
+def test_an_acceleration_that_makes_mujoco_reset_is_noticed_at_any_sample(
+    sample: int, open_loop: bool, tmp_path
+) -> None:
+    light = CART_PENDULUM.format(integrator="RK4").replace('mass="1"', 'mass="0.01"').replace("1.5", "0.01")
+    setup = make_setup(light, tmp_path, parameters=CART_PARAMETERS, noise={"state": 0.1})
+    K, wild = gain(setup) * (not open_loop), np.zeros((setup.samples, 1))
+    wild[sample] = 9e9
+    zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), wild)
+    assert setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K) is None
+
+
+@pytest.mark.parametrize("bad", [np.nan, 1e12])
+def test_linearising_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    states = np.array(setup.initial.state)
+    states[20, 2] = bad
+    with pytest.raises(SimulationDiverged, match="linearising"):
+        setup.plant.linearize(setup.theta, setup.plant.trajectory(states, setup.initial.ctrl))
+
+
+def test_quiet_blocks_may_overlap_in_threads() -> None:
+    """Quiet until the last one is left, and as it was after that."""
+    before = mujoco.MjLogConfig.get()
+    first, second = quiet(), quiet()
+    for block in (first, second):
+        block.__enter__()
+    for block in (first, second):
+        config = mujoco.MjLogConfig.get()
+        assert (config.logto_console, config.logto_file) == (False, False)
+        block.__exit__(None, None, None)
+    after = mujoco.MjLogConfig.get()
+    assert (after.logto_console, after.logto_file) == (before.logto_console, before.logto_file)
+    assert after.logto_console or after.logto_file
+
+
+def test_mujoco_itself_would_have_made_that_noise(tmp_path, monkeypatch, capfd) -> None:
+    monkeypatch.chdir(tmp_path)
+    setup = cart_setup(tmp_path)
+    setup.initial  # noqa: B018  (quiet work first: afterwards MuJoCo's own settings must be back)
+    loop = Loop(setup.plant.model(setup.theta), 5)
+    loop.F(setup.plant.nominal_start, np.array([9e9]))
+    out = "".join(capfd.readouterr())
+    assert "WARNING" in out or (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_after_a_diverged_trial_the_plant_works_as_before(tmp_path) -> None:
+    setup = cart_setup(tmp_path, noise=SENSED)
+    first = setup.plant.sensitivity(setup.theta, setup.initial)
+    L = linear(setup)
+    wild = setup.plant.trajectory(setup.initial.state, np.full((setup.samples, 1), 9e9))
+    assert setup.plant.sensitivity(setup.theta, wild) is None
+    with pytest.raises(SimulationDiverged):
+        setup.plant.simulate(setup.theta, wild.ctrl)
+    np.testing.assert_array_equal(setup.plant.sensitivity(setup.theta, setup.initial).G, first.G)
+    np.testing.assert_array_equal(linear(setup).A, L.A)
+
+
+def test_results_do_not_depend_on_what_was_simulated_before_or_on_threads(tmp_path) -> None:
+    (tmp_path / "b").mkdir()
+    setup, other = body_setup(tmp_path), body_setup(tmp_path / "b")
+    other.plant.engine.threads = 2
+    other.plant.measure(1.3 * other.theta[None], -other.control)
+    other.plant.linearize(0.8 * other.theta, other.initial)
+    np.testing.assert_array_equal(
+        setup.plant.sensitivity(setup.theta, setup.initial).G, other.plant.sensitivity(other.theta, other.initial).G
+    )
+
+
+def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None:
+    (tmp_path / "b").mkdir()
+    setup, rng = filtered_setup(tmp_path), np.random.default_rng(5)
+    thetas = setup.theta * rng.uniform(0.8, 1.2, (70, 2))
+    alone = np.stack([filtered_setup(tmp_path / "b").plant.measure(t[None], setup.control)[0][0] for t in thetas[:6]])
+    for count in (2, 6, 1, 70, 3, 5):
+        y, finite = setup.plant.measure(thetas[:count], setup.control)
+        assert finite.shape == (count,)
+        assert finite.all()
+        np.testing.assert_array_equal(y[:6], alone[:count])
+    wild = thetas.copy()
+    wild[1] *= -1.0  # a negative mass: this one may do as it likes, its neighbours may not
+    y, _ = setup.plant.measure(wild[:4], setup.control)
+    np.testing.assert_array_equal(y[[0, 2, 3]], alone[[0, 2, 3]])
+    states, ctrl = setup.initial.state, np.repeat(setup.control, 1, axis=0)
+    for count in (5, 50, 1, 12):
+        out = setup.plant.engine.step([setup.plant.model(setup.theta)], states[:count], ctrl[:count]).states
+        np.testing.assert_array_equal(out, states[1 : count + 1])
+
+
+def test_every_mj_step_is_counted(tmp_path) -> None:
+    setup = filtered_setup(tmp_path)
+    engine, N, n = setup.plant.engine, setup.samples, setup.substeps
+    curve, count = setup.initial, engine.steps
+    setup.plant.linearize(setup.theta, curve)
+    assert engine.steps - count == (N + 1) * n * (2 * (3 + 1) + 2 * 2)
+    count = engine.steps
+    setup.plant.sensitivity(setup.theta, curve)
+    assert engine.steps - count == 2 * 2 * (N * n + 1)  # one more for the sensors of the last sample
+    count = engine.steps
+    zero = TangentCurve(np.zeros((N + 1, 3)), np.zeros((N, 1)))
+    setup.plant.project(setup.theta, curve, zero, 1.0, np.ones((N, 1, 3)))
+    assert engine.steps - count == N * n
+
+
+def bits(model: Any) -> tuple[bool, bool]:
+    """(solver is off, sensors are off)."""
+    flags = model.opt.disableflags
+    return (
+        bool(flags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)),
+        bool(flags & int(mujoco.mjtDisableBit.mjDSBL_SENSOR)),
+    )
+
+
+def written(folder: Path, xml: str) -> tuple[Any, Path]:
+    """(spec, path) of an MJCF string."""
+    path = folder / "model.xml"
+    path.write_text(xml, encoding="utf-8")
+    return load_spec(path), path
+
+
+@pytest.mark.parametrize("integrator", ["RK4", "Euler", "implicitfast"])
+def test_switching_off_solver_and_sensors_of_an_unconstrained_model_changes_no_bit(integrator: str, tmp_path) -> None:
+    spec, path = written(tmp_path, CART_PENDULUM.format(integrator=integrator))
+    plain, lean = compile_spec(spec, path), Source(spec, path, ["bob"], sensors=False, friction=False).model
+    assert (bits(plain), bits(lean)) == ((False, False), (True, True))
+    states = []
+    for model in (plain, lean):
+        data, rows = mujoco.MjData(model), []
+        data.qpos[:] = 0.1, 2.0
+        for k in range(200):
+            data.ctrl[:] = 5.0 * np.sin(0.1 * k)
+            mujoco.mj_step(model, data)
+            rows.append(np.concatenate([data.qpos, data.qvel]))
+        states.append(rows)
+    np.testing.assert_array_equal(states[0], states[1])
+
+
+FREE_OF_CONSTRAINTS = CART_PENDULUM.format(integrator="Euler")
+CONSTRAINED = {
+    "joint limit": ('<joint name="slide"', '<joint name="slide" limited="true" range="-1 1"'),
+    "dry friction": ('damping="0.4"', 'damping="0.4" frictionloss="0.1"'),
+    "equality": ("<actuator>", '<equality><joint joint1="slide" joint2="hinge"/></equality><actuator>'),
+    "tendon limit": (
+        "<actuator>",
+        '<tendon><fixed limited="true" range="-1 1"><joint joint="slide" coef="1"/></fixed></tendon><actuator>',
+    ),
+    "tendon friction": (
+        "<actuator>",
+        '<tendon><fixed frictionloss="1"><joint joint="slide" coef="1"/></fixed></tendon><actuator>',
+    ),
+    "contact": (
+        '<flag contact="disable"/></option>\n  <default><geom mass="0" contype="0" conaffinity="0"/></default>\n  <worldbody>',
+        '</option><worldbody><geom size="1 1 1" type="plane" pos="0 0 -2"/><geom size="0.1"/>',
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CONSTRAINED)
+def test_the_solver_stays_on_where_a_constraint_can_act(case: str, tmp_path) -> None:
+    old, new = CONSTRAINED[case]
+    assert old in FREE_OF_CONSTRAINTS
+    spec, path = written(tmp_path, FREE_OF_CONSTRAINTS.replace(old, new))
+    assert not unconstrained(compile_spec(spec, path))
+    assert bits(Source(spec, path, [], sensors=True, friction=False).model) == (False, False)
+
+
+def test_the_solver_stays_on_where_friction_is_to_be_identified(tmp_path) -> None:
+    spec, path = written(tmp_path, FREE_OF_CONSTRAINTS)
+    assert bits(Source(spec, path, [], sensors=True, friction=True).model) == (False, False)
+    loss = {"loss": {"target": "joint/slide:frictionloss", "guess": 0.2}}
+    setup = cart_setup(tmp_path, parameters=loss)
+    assert bits(setup.plant.source.model)[0] is False
+    assert np.abs(setup.plant.sensitivity(setup.theta, setup.initial).psi).max() > 1e-3
+
+
+def test_private_copies_leave_the_users_spec_and_model_alone(tmp_path) -> None:
+    setup = body_setup(tmp_path)
+    before = setup.spec.to_xml()
+    setup.plant.linearize(1.5 * setup.theta, setup.initial)
+    assert setup.spec.to_xml() == before
+    assert setup.model.body("arm").mass[0] == pytest.approx(0.4)
+    assert bits(setup.model) == (False, False)
+
+
+OUTSIDE = {"noise": {"state": 0.05, **SENSED}}
+START = {"initial": {"qpos:hinge": True, "qvel:slide": True}}
+
+
+def test_the_start_enters_the_sensitivity_as_its_own_initial_value(tmp_path) -> None:
+    setup = cart_setup(tmp_path, **OUTSIDE, nuisance=START)
+    L, S = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial)
+    start = np.eye(4)[:, [1, 2]]  # (dq, dv): the hinge's angle, the slide's speed
+    np.testing.assert_allclose(S.psi[0][:, 3:], start, rtol=0, atol=1e-9)
+    for j in (0, 1):
+        alone = Recursion(L.A).forward(start[:, j], np.zeros((setup.samples, 4)))
+        assert relative_error(S.psi[..., 3 + j], alone) < 1e-6
+        assert relative_error(S.G[..., 3 + j], np.einsum("kyx,kx->ky", L.C, alone)) < 1e-6
+
+
+def test_the_start_of_a_quaternion_moves_in_its_tangent_space(tmp_path) -> None:
+    setup = body_setup(tmp_path, nuisance={"initial": {"qpos:ball[2]": True, "qvel:float[4]": True}})
+    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    np.testing.assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)
+    loop, h = Loop(setup.plant.model(setup.theta), 1), 1e-4
+    ends = []
+    for sign in (1, -1):
+        state = loop.plus(setup.initial.state[0], sign * h * np.eye(18)[8])
+        for u in setup.initial.ctrl[:20]:
+            state = loop.F(state, u)
+        ends.append(state)
+    assert relative_error(S.psi[20][:, 4], loop.minus(*ends) / (2 * h)) < 1e-6
+
+
+def test_biases_add_to_their_own_output_and_to_nothing_else(tmp_path) -> None:
+    setup = cart_setup(tmp_path, **OUTSIDE, nuisance={"bias": {"angle": True, "acc[2]": 0.1}})
+    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    names = list(setup.outputs.names)
+    for j, name in ((3, "angle"), (4, "acc[2]")):
+        expected = np.zeros(len(names))
+        expected[names.index(name)] = 1.0
+        np.testing.assert_array_equal(S.G[..., j], np.broadcast_to(expected, S.G.shape[:2]))
+        np.testing.assert_array_equal(S.psi[..., j], 0.0)
+    theta = setup.theta + np.array([0.0, 0.0, 0.0, 0.7, -0.2])
+    y, _ = setup.plant.measure(np.stack([setup.theta, theta]), setup.control)
+    shift = np.zeros(len(names))
+    shift[[names.index("angle"), names.index("acc[2]")]] = 0.7, -0.2
+    np.testing.assert_allclose(y[1] - y[0], np.broadcast_to(shift, y[0].shape), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.0237])
+def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
+    parameters = {**CART_PARAMETERS, "late": {"target": "output:delay", "guess": delay, "scale": 0.01}}
+    late, plain = cart_setup(tmp_path, **OUTSIDE, parameters=parameters), cart_setup(tmp_path, **OUTSIDE)
+    (y, G), (exact, exact_G) = (s.plant.predict(s.theta, s.control) for s in (late, plain))
+    t, states = np.arange(51) * 0.01, slice(0, 4)  # smooth states; accelerations follow the steps of the control
+    for i in range(4):
+        moved = CubicSpline(t, exact[:, i])
+        np.testing.assert_allclose(y[5:, i], moved(t[5:] - delay), rtol=0, atol=1e-4 * np.ptp(exact[:, i]))
+        slope = -moved(t[5:-3] - delay, 1)
+        np.testing.assert_allclose(G[5:-3, i, 3], slope, rtol=0, atol=1e-2 * np.abs(slope).max())
+    if not delay:
+        np.testing.assert_allclose(y, exact, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(G[:, states, :3], exact_G[:, states], rtol=0, atol=1e-12)
+    h = 1e-6
+    moved, _ = late.plant.measure(late.theta + np.outer([h, -h], np.eye(4)[3]), late.control)
+    if delay:  # at a knot of the interpolation the two sides differ
+        assert relative_error(G[..., 3], (moved[0] - moved[1]) / (2 * h)) < 1e-5
+    assert relative_error(late.plant.sensitivity(late.theta, late.initial).G, G) < 1e-6
+
+
+def test_faint_parameters_get_longer_differences_and_others_keep_theirs(tmp_path) -> None:
+    faint = {"tiny": {"target": "body/bob:inertia[1]"}, **CART_PARAMETERS}
+    setup = cart_setup(tmp_path, parameters=faint)
+    relative = setup.plant.span / setup.parameters.step
+    assert relative[0] > 5.0
+    assert (relative >= 1.0).all() and (relative <= 100.0).all()
+    np.testing.assert_array_equal(relative[1:3], 1.0)
+    # what the longer step is for: less round-off, without a change of the derivative
+    S = setup.plant.sensitivity(setup.theta, setup.initial).psi[..., 0]
+    far = setup.plant.sensitivity(setup.theta, setup.initial, 1e-4).psi[..., 0]
+    assert relative_error(S, far) < 1e-6
+
+
+def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> None:
+    setup = body_setup(tmp_path)
+    picked, L = np.array([3, 20, 41]), linear(setup)
+    found = setup.plant.one_step(setup.theta, setup.initial, picked, 1e-5)
+    nx, ny, p = setup.space.nx, len(setup.outputs), len(setup.theta)
+    states = found[: 3 * nx].reshape(3, nx, p) * (setup.dt * setup.plant.steps_of(setup.initial)[:nx])[:, None]
+    assert relative_error(states, L.E[picked]) < 1e-6
+    sensors = found[3 * nx :].reshape(3, ny, p)
+    H = L.H[picked] * setup.parameters.step
+    size = np.abs(H).max(axis=(0, 2))
+    moving = size > 1e-6
+    assert moving.sum() >= 3
+    assert (
+        relative_error(
+            sensors[:, moving] * setup.parameters.step, (H / np.where(moving, size, 1.0)[:, None])[:, moving]
+        )
+        < 1e-5
+    )
+
+
+# A cart that hangs on two mocap bodies: on one by a spring, on the other by an equality, whose constants MuJoCo derives
+# from where they compile.
+CARRIED = """
+<mujoco>
+  <option timestep="0.01" gravity="0 0 0"/>
+  <worldbody>
+    <body name="near" mocap="true" pos="0.1 0 0"><site name="near"/></body>
+    <body name="cart">
+      <joint name="x" type="slide" axis="1 0 0" damping="1"/><joint name="turn" axis="0 0 1" damping="0.1"/>
+      <geom size=".1" mass="1" contype="0" conaffinity="0"/><site name="cart"/>
+    </body>
+    <body name="far" mocap="true" pos="0 1 0"><site name="far" pos="0 0.1 0"/></body>
+  </worldbody>
+  <tendon><spatial name="t" stiffness="20"><site site="cart"/><site site="near"/></spatial></tendon>
+  <equality><weld body1="cart" body2="far" solref="0.3 1"/></equality>
+  <actuator><motor name="m" joint="x"/></actuator>
+  <sensor><framepos name="far" objtype="site" objname="far" noise="0.1"/></sensor>
+  <keyframe><key name="moved" mpos="0.6 0 0  0.2 1.1 0" mquat="1 0 0 0  0.9 0 0 0.4" qpos="0.1 0.05"/></keyframe>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("function", [False, True])
+def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> None:
+    """Against plain MuJoCo from `mj_resetDataKeyframe`, by every way of stepping."""
+    damped: dict[str, Any] = {"target": "joint/x:damping"}
+    if function:
+        damped = {"function": lambda spec, v: setattr(spec.joint("x"), "damping", [v, 0.0, 0.0]), "guess": 1.0}
+    initial = {"keyframe": "moved", "control": {"kind": "sine", "amplitude": 2.0}}
+    setup = make_setup(CARRIED, tmp_path, initial=initial, parameters={"d": damped})
+    data = mujoco.MjData(setup.model)
+    mujoco.mj_resetDataKeyframe(setup.model, data, 0)
+    states, sensed = [], []
+    for u in [*setup.control, setup.control[-1]]:
+        states.append(np.concatenate([data.qpos, data.qvel]))
+        data.ctrl[:] = u
+        mujoco.mj_step(setup.model, data)
+        sensed.append(np.array(data.sensordata))
+    wanted = np.array(states)
+    assert np.abs(wanted[-1] - wanted[0]).max() > 0.05
+    tolerance = {"rtol": 0.0, "atol": 1e-6}  # the model is stepped to a tighter solver tolerance
+    for theta in (setup.theta, setup.theta + 0.5, setup.theta):  # models are written anew
+        y, _ = setup.plant.measure(theta[None], setup.control)
+    np.testing.assert_allclose(setup.initial.state, wanted, **tolerance)
+    np.testing.assert_allclose(y[0], sensed, **tolerance)
+    model, K = setup.plant.model(setup.theta), np.zeros((setup.samples, 1, 4))
+    closed, _, _ = setup.plant.engine.closed_loop(model, setup.initial.state, setup.control, K)
+    np.testing.assert_allclose(closed, wanted, **tolerance)
+    stepped = setup.plant.engine.step([model], wanted[:-1], setup.control)
+    np.testing.assert_allclose(stepped.states, wanted[1:], **tolerance)
+    whole = setup.model_at(setup.theta)
+    np.testing.assert_allclose(whole.eq_data, setup.model.eq_data, atol=1e-12)
+    np.testing.assert_array_equal(mujoco.MjData(whole).mocap_pos, [[0.6, 0, 0], [0.2, 1.1, 0]])
+    np.testing.assert_array_equal(setup.model_at(setup.theta, placed=False).body_pos, setup.model.body_pos)
+
+
+def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tmp_path) -> None:
+    place = {"x": {"target": "body/near:pos[0]", "scale": 1.0}}
+    setup = make_setup(CARRIED, tmp_path, parameters=place)
+    found = setup.plant.sensitivity(setup.theta, setup.initial)
+    assert found is not None
+    ends = [setup.plant.simulate(setup.theta + h, setup.control).state[-1] for h in (1e-4, -1e-4)]
+    slope = (ends[0] - ends[1]) / 2e-4
+    assert np.abs(slope).max() > 0.1
+    np.testing.assert_allclose(found.psi[-1, :, 0], slope, rtol=1e-4, atol=1e-6)
+    initial = {"keyframe": "moved", "control": {"kind": "sine"}}
+    with pytest.raises(ExperimentError, match=r"parameters\.x: the keyframe says where mocap body 'near' is"):
+        make_setup(CARRIED, tmp_path, parameters=place, initial=initial)
+
+
+def test_clocks_begin_at_zero(tmp_path) -> None:
+    xml = CART_PENDULUM.format(integrator="RK4").replace("<sensor>", '<sensor><clock name="clock" noise="0.1"/>')
+    parameters = {"c": {"target": "joint/hinge:damping"}}
+    setup = make_setup(xml, tmp_path, rate=50.0, parameters=parameters, noise={"clock": 0.1, "rate": 0.1})
+    y, _ = setup.plant.measure(setup.theta[None], setup.control)
+    t = np.arange(setup.samples + 1) * setup.dt
+    np.testing.assert_allclose(y[0, :, setup.outputs.names.index("clock")], t, atol=1e-12)
+    model = setup.plant.model(setup.theta)
+    sensed = setup.plant.engine.step([model], setup.initial.state[:1], setup.control[:1]).sensors
+    assert sensed is not None
+    assert sensed[0, setup.model.sensor("clock").adr[0]] == 0.0
+
+
+def test_quaternions_of_the_start_have_unit_length_or_are_refused(tmp_path) -> None:
+    def start(*qpos: float) -> Array:
+        return body_setup(tmp_path, initial={"qpos": qpos, "control": {"kind": "sine"}}).plant.nominal_start
+
+    unit = start(1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0)
+    np.testing.assert_array_equal(unit[:11], [1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0])
+    np.testing.assert_allclose(start(1, 2, 3, 1.2, 0, 1.6, 0, 0, 0, 5, 0), unit, atol=1e-15)
+    with pytest.raises(
+        ExperimentError, match=r"initial\.qpos: the quaternion of joint 'ball' \(numbers 7 to 10\) is zero"
+    ):
+        start(1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 0, 1e-9)
+    with pytest.raises(ExperimentError, match=r"joint 'float' \(numbers 3 to 6\)"):
+        start(*[0.0] * 11)

@@ -1,0 +1,156 @@
+"""Steps and differences of states against MuJoCo's own, on a model with every type of joint."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from support.numerics import Loop
+
+from mjfim.plant.batch import state_space
+
+EVERY_JOINT = """
+<mujoco>
+  <worldbody>
+    <body><joint type="slide"/><geom size="0.1"/>
+      <body><joint type="ball"/><geom size="0.1"/>
+        <body><joint type="hinge"/><joint type="slide" axis="1 0 0"/><geom size="0.1"/></body>
+      </body>
+    </body>
+    <body><freejoint/><geom size="0.1"/>
+      <body><joint type="hinge"/><geom size="0.1"/><body><joint type="ball"/><geom size="0.1"/></body></body>
+    </body>
+  </worldbody>
+  <actuator><general joint="" dyntype="integrator"/></actuator>
+</mujoco>
+""".replace('joint=""', 'joint="first"').replace('type="slide"/>', 'name="first" type="slide"/>', 1)
+
+COUNT = 200
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Slide, ball, hinge, slide; free, hinge, ball; one activation."""
+    return mujoco.MjModel.from_xml_string(EVERY_JOINT)
+
+
+def random_states(space, rng: np.random.Generator, count: int = COUNT) -> np.ndarray:
+    """States with unit quaternions anywhere on the sphere."""
+    states = rng.normal(size=(count, space.nq + space.nv + space.na))
+    for q, _ in space.quaternions:
+        states[:, q : q + 4] /= np.linalg.norm(states[:, q : q + 4], axis=1, keepdims=True)
+    return states
+
+
+def random_rotations(count: int, longest: float, rng: np.random.Generator) -> np.ndarray:
+    """Rotation vectors of every direction, up to a length [rad]."""
+    axis = rng.normal(size=(count, 3))
+    return axis / np.linalg.norm(axis, axis=1, keepdims=True) * rng.uniform(0.0, longest, (count, 1))
+
+
+def random_steps(space, longest: float, rng: np.random.Generator, count: int = COUNT) -> np.ndarray:
+    """Tangent vectors whose rotations are at most so long [rad]."""
+    dx = rng.normal(size=(count, space.nx))
+    for _, v in space.quaternions:
+        dx[:, v : v + 3] = random_rotations(count, longest, rng)
+    return dx
+
+
+def test_layout_covers_every_coordinate_once(model) -> None:
+    space = state_space(model)
+    covered = [*space.scalar_q, *(q + i for q, _ in space.quaternions for i in range(4))]
+    tangent = [*space.scalar_v, *(v + i for _, v in space.quaternions for i in range(3))]
+    assert sorted(covered) == list(range(model.nq))
+    assert sorted(tangent) == list(range(model.nv))
+    assert (space.nx, space.na, len(space.quaternions)) == (2 * model.nv + 1, 1, 3)
+
+
+@pytest.mark.parametrize("longest", [1e-9, 1e-3, 1.0, 3.1, 10.0])
+def test_plus_is_mj_integratePos(model, longest: float) -> None:
+    space, loop, rng = state_space(model), Loop(model, 1), np.random.default_rng(1)
+    states, dx = random_states(space, rng), random_steps(space, longest, rng)
+    expected = np.array([loop.plus(x, d) for x, d in zip(states, dx, strict=True)])
+    np.testing.assert_allclose(space.plus(states, dx), expected, rtol=0, atol=1e-14)
+
+
+def test_minus_is_mj_differentiatePos(model) -> None:
+    space, loop, rng = state_space(model), Loop(model, 1), np.random.default_rng(2)
+    new, old = random_states(space, rng), random_states(space, rng)
+    expected = np.array([loop.minus(a, b) for a, b in zip(new, old, strict=True)])
+    np.testing.assert_allclose(space.minus(new, old), expected, rtol=0, atol=1e-12)
+    rotations = np.linalg.norm(expected[:, 1:4], axis=1)
+    assert rotations.max() > 3.0  # the sample reaches close to half a turn
+
+
+@pytest.mark.parametrize("longest", [1e-9, 1e-5, 1.0, 3.14])
+def test_minus_undoes_plus(model, longest: float) -> None:
+    space, rng = state_space(model), np.random.default_rng(3)
+    states, dx = random_states(space, rng), random_steps(space, longest, rng)
+    np.testing.assert_allclose(space.minus(space.plus(states, dx), states), dx, rtol=0, atol=1e-13 * 1e2)
+
+
+def test_plus_undoes_minus_up_to_the_sign_of_the_quaternion(model) -> None:
+    space, rng = state_space(model), np.random.default_rng(4)
+    new, old = random_states(space, rng), random_states(space, rng)
+    back = space.plus(old, space.minus(new, old))
+    for q, _ in space.quaternions:
+        sign = np.sign(np.sum(back[:, q : q + 4] * new[:, q : q + 4], axis=1, keepdims=True))
+        back[:, q : q + 4] *= sign
+    np.testing.assert_allclose(back, new, rtol=0, atol=1e-12)
+
+
+def test_negated_quaternions_are_the_same_state(model) -> None:
+    space, rng = state_space(model), np.random.default_rng(5)
+    new, old = random_states(space, rng), random_states(space, rng)
+    flipped = new.copy()
+    for q, _ in space.quaternions:
+        flipped[:, q : q + 4] *= -1.0
+    np.testing.assert_allclose(space.minus(flipped, old), space.minus(new, old), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(space.minus(new, new)[:, space.scalar_v], 0.0)
+    np.testing.assert_allclose(space.minus(flipped, new), 0.0, atol=1e-12)
+
+
+def test_rotations_are_taken_in_the_body_frame_not_the_world_frame(model) -> None:
+    space, rng = state_space(model), np.random.default_rng(6)
+    state, dx = random_states(space, rng, 1), np.zeros((1, space.nx))
+    q, v = space.quaternions[0]
+    dx[0, v : v + 3] = [0.3, -0.4, 0.5]
+    moved = space.plus(state, dx)[0, q : q + 4]
+    turn, world = np.zeros(4), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(turn, dx[0, v : v + 3] / np.linalg.norm(dx[0, v : v + 3]), np.linalg.norm(dx))
+    mujoco.mju_mulQuat(world, turn, state[0, q : q + 4])
+    assert np.abs(moved - world).max() > 0.1
+    body = np.zeros(4)
+    mujoco.mju_mulQuat(body, state[0, q : q + 4], turn)
+    np.testing.assert_allclose(moved, body, atol=1e-14)
+
+
+def test_states_and_steps_broadcast(model) -> None:
+    space, rng = state_space(model), np.random.default_rng(7)
+    states, dx = random_states(space, rng, 5), random_steps(space, 1.0, rng, 3)
+    grid = space.plus(states[None], dx[:, None])
+    assert grid.shape == (3, 5, states.shape[1])
+    np.testing.assert_array_equal(grid[2, 4], space.plus(states[4], dx[2]))
+    np.testing.assert_array_equal(space.minus(grid, states)[1, 3], space.minus(grid[1, 3], states[3]))
+
+
+def test_inputs_are_left_alone(model) -> None:
+    space, rng = state_space(model), np.random.default_rng(8)
+    states, dx = random_states(space, rng, 4), random_steps(space, 1.0, rng, 4)
+    kept, step = states.copy(), dx.copy()
+    space.minus(space.plus(states, dx), states)
+    np.testing.assert_array_equal(states, kept)
+    np.testing.assert_array_equal(dx, step)
+
+
+def test_the_slope_of_a_difference_is_that_of_nearby_differences(model) -> None:
+    """Also where rotations are small, and where they are nearly half a turn."""
+    space, rng, h = state_space(model), np.random.default_rng(9), 1e-6
+    origin = random_states(space, rng, 1)[0]
+    for longest in (1e-9, 1e-2, 3.0):
+        dx = random_steps(space, longest, rng, 1)[0]
+        state = space.plus(origin, dx)
+        moved = space.plus(state, h * np.eye(space.nx)), space.plus(state, -h * np.eye(space.nx))
+        slope = (space.minus(moved[0], origin) - space.minus(moved[1], origin)).T / (2 * h)
+        np.testing.assert_allclose(space.minus_slope(space.minus(state, origin)), slope, rtol=0, atol=1e-7)
+    assert np.abs(slope - np.eye(space.nx)).max() > 0.1

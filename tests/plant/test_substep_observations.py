@@ -1,0 +1,255 @@
+"""What the limits look at between the samples: against plain loops around mj_step, and their derivatives against differences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from support.numerics import Array, Loop, make_setup, relative_error
+
+from mjfim.excitation.constraints import fence_of, looked_at
+from mjfim.experiment.system import Setup
+from mjfim.plant.batch import Taps
+from mjfim.plant.plant import CENTRAL, DRAFT, FAST
+
+# An arm of two servos on a hull that floats: addresses of positions, velocities, joints and actuators all differ. One
+# servo has an activation state, one a clamp that acts, one joint a clamp on what actuators may do to it.
+FLOATING = """
+<mujoco model="floating">
+  <option timestep="0.002" integrator="{integrator}" gravity="0 0 -1"><flag contact="disable"/></option>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="hull" pos="0 0 1">
+      <freejoint name="float"/>
+      <geom type="box" size="0.2 0.1 0.1" mass="3"/>
+      <body name="upper" pos="0.2 0 0">
+        <joint name="shoulder" axis="0 1 0" damping="0.1" armature="0.01" actuatorfrcrange="-0.9 0.9"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.5"/>
+        <body name="fore" pos="0.3 0 0">
+          <joint name="elbow" axis="0 0 1" damping="0.1" armature="0.005" range="-3 3" limited="false"/>
+          <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.3"/>
+          <site name="tip" pos="0.25 0 0"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="thrust" joint="float" gear="0 0 1 0 0 0"/>
+    <general name="shoulder" joint="shoulder" dyntype="filter" dynprm="0.03" gainprm="20" biastype="affine" biasprm="0 -20 -0.5"/>
+    <position name="elbow" joint="elbow" kp="12" kv="0.3" forcerange="-0.7 0.7"/>
+  </actuator>
+  <sensor><gyro name="gyro" site="tip"/></sensor>
+</mujoco>
+"""
+LIMITS = {
+    "position": {"elbow": (-2.0, 2.0), "shoulder": (-1.5, 2.5)},
+    "velocity": {"shoulder": 9.0},
+    "acceleration": 300.0,
+    "force": {"shoulder": 8.0, "thrust": 50.0},
+}
+# kinds, names in the order of the taps
+SHOWN = [
+    ("position", "shoulder"),
+    ("position", "elbow"),
+    ("velocity", "shoulder"),
+    ("acceleration", "shoulder"),
+    ("acceleration", "elbow"),
+    ("force", "thrust"),
+    ("force", "shoulder"),
+    ("force", "elbow"),
+    ("joint_force", "shoulder"),
+]
+
+
+def floating_setup(folder: Path, integrator: str = "implicitfast", **tables: Any) -> Setup:
+    """The floating arm, swinging: 0.3 s of five engine steps per sample; every state is measured."""
+    tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
+    control = {
+        "kind": "sine",
+        "amplitude": {"thrust": 4.0, "shoulder": 0.6, "elbow": 0.5},
+        "offset": {"thrust": 3.0, "shoulder": 0.2, "elbow": 0.1},
+        "frequency": 2.0,
+    }
+    defaults: dict[str, Any] = {
+        "horizon": 0.3,
+        "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/shoulder:damping"}},
+        "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01, "qvel:elbow": 0.05},
+        "limits": LIMITS,
+        "initial": {
+            "qpos": (0.0, 0.0, 1.0, *tilt.tolist(), 0.4, -0.3),
+            "qvel": (0.1, 0.0, 0.2, 0.5, -0.4, 0.3, 1.0, -2.0),
+            "act": (0.1,),
+            "control": control,
+        },
+    }
+    return make_setup(FLOATING.format(integrator=integrator), folder, **{**defaults, **tables})
+
+
+def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
+    """(N, substeps, 9) what SHOWN names at every engine step under ctrl: (N, nu), by a plain loop around mj_step."""
+    data, rows = mujoco.MjData(model), np.empty((len(ctrl), substeps, len(SHOWN)))
+    data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + model.nv])
+    for k, held in enumerate(ctrl):
+        data.ctrl[:] = held
+        for s in range(substeps):
+            before = data.qvel.copy()
+            mujoco.mj_step(model, data)
+            change = (data.qvel - before) / model.opt.timestep
+            rows[k, s] = [
+                {
+                    "position": lambda n: data.joint(n).qpos[0],
+                    "velocity": lambda n: data.joint(n).qvel[0],
+                    "acceleration": lambda n, change=change: change[model.joint(n).dofadr[0]],
+                    "force": lambda n: data.actuator(n).force[0],
+                    "joint_force": lambda n: data.joint(n).qfrc_actuator[0],
+                }[kind](name)
+                for kind, name in SHOWN
+            ]
+    return rows
+
+
+def taps_of(setup: Setup) -> Taps:
+    """What the limits of the experiment look at."""
+    fence = fence_of(setup)
+    assert fence.kinds == tuple(kind for kind, _ in SHOWN)
+    return fence.taps
+
+
+@pytest.mark.parametrize(
+    ("substeps", "expected"),
+    [(1, (1,)), (2, (1, 2)), (5, (1, 2, 3, 5)), (20, (1, 2, 4, 9, 20)), (100, (1, 3, 10, 32, 100))],
+)
+def test_derivatives_look_at_the_first_and_the_last_engine_step_and_some_between(
+    substeps: int, expected: tuple[int, ...]
+) -> None:
+    assert looked_at(substeps) == expected
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "Euler", "RK4"])
+@pytest.mark.parametrize("lifted", [False, True], ids=["as it is", "without clamps"])
+def test_what_is_watched_is_what_plain_steps_show_at_every_engine_step(
+    lifted: bool, integrator: str, tmp_path: Path
+) -> None:
+    setup = floating_setup(tmp_path, integrator)
+    model, plant = setup.model, setup.free().plant if lifted else setup.plant
+    if lifted:
+        model = mujoco.MjModel.from_xml_string(
+            FLOATING.format(integrator=integrator)
+            .replace('actuatorfrcrange="-0.9 0.9"', "")
+            .replace('forcerange="-0.7 0.7"', "")
+        )
+    watched = plant.watch(setup.theta, setup.control, taps_of(setup))
+    assert watched is not None
+    trajectory, tapped = watched
+    np.testing.assert_array_equal(trajectory.state, plant.simulate(setup.theta, setup.control).state)
+    wanted = played(model, setup.plant.start(setup.theta), setup.control, setup.substeps)
+    assert tapped.shape == wanted.shape == (30, 5, len(SHOWN))
+    for i, (kind, name) in enumerate(SHOWN):
+        assert relative_error(tapped[..., i], wanted[..., i]) < 1e-9, (kind, name)
+    # the clamps act, where they are
+    forces, torques = wanted[..., SHOWN.index(("force", "elbow"))], wanted[..., -1]
+    assert (np.abs(forces).max() == 0.7) is not lifted
+    assert (np.abs(torques).max() == 0.9) is not lifted
+
+
+def test_a_batch_of_samples_shows_the_same_as_the_whole_curve(tmp_path: Path) -> None:
+    setup = floating_setup(tmp_path)
+    taps, plant = taps_of(setup), setup.plant
+    watched = plant.watch(setup.theta, setup.control, taps)
+    assert watched is not None
+    trajectory, tapped = watched
+    for order in (slice(None), slice(None, None, -1), slice(4, 9)):
+        stepped = plant.engine.step(
+            [plant.model(setup.theta)], trajectory.state[:-1][order], setup.control[order], taps
+        )
+        np.testing.assert_allclose(stepped.tapped, tapped[order][:, np.array(taps.substeps) - 1], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(stepped.states, trajectory.state[1:][order], rtol=0, atol=1e-12)
+    assert plant.engine.step([plant.model(setup.theta)], trajectory.state[:1], setup.control[:1]).tapped is None
+
+
+def test_a_control_that_diverges_shows_nothing(tmp_path: Path) -> None:
+    setup = floating_setup(tmp_path)
+    assert setup.plant.watch(setup.theta, 1e12 * setup.control, taps_of(setup)) is None
+
+
+def test_taps_cost_no_further_steps(tmp_path: Path) -> None:
+    setup = floating_setup(tmp_path)
+    taps, plant = taps_of(setup), setup.plant
+    counts = []
+    for own in (None, taps):
+        begun = plant.engine.steps
+        plant.engine.step([plant.model(setup.theta)], setup.initial.state[:7], setup.control[:7], own)
+        counts.append(plant.engine.steps - begun)
+    assert counts == [35, 35]
+
+
+def differences(setup: Setup, sample: int, substeps: tuple[int, ...], step: float = 1e-6) -> Array:
+    """(looked-at substeps, 9, nx+nu) central differences of plain loops over one sample of the lifted plant."""
+    plant, u = setup.plant, setup.control[sample]
+    model, x = plant.model(setup.theta), setup.initial.state[sample]
+    loop, nx, columns = Loop(model, setup.substeps), setup.space.nx, []
+    for e in step * np.eye(nx + len(u)):
+        up, down = (
+            played(model, loop.plus(x, sign * e[:nx]), (u + sign * e[nx:])[None], setup.substeps)[0]
+            for sign in (1.0, -1.0)
+        )
+        columns.append((up - down)[np.array(substeps) - 1] / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+def assert_slopes(found: Array, setup: Setup, taps: Taps, tolerance: float) -> None:
+    """Derivatives (N, looked-at substeps, 9, nx+nu) of every kind at some samples."""
+    for sample in (0, 11, 29):
+        wanted = differences(setup, sample, taps.substeps)
+        for i, shown in enumerate(SHOWN):
+            assert relative_error(found[sample, :, i], wanted[:, i]) < tolerance, (sample, shown)
+
+
+@pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
+def test_derivatives_of_taps_are_differences_of_independent_simulations(integrator: str, tmp_path: Path) -> None:
+    setup = floating_setup(tmp_path, integrator).free()
+    taps = taps_of(setup)
+    A, B, slopes = setup.plant.tapped(setup.theta, setup.initial, taps)
+    assert slopes.shape == (30, len(taps.substeps), len(SHOWN), 20)
+    assert_slopes(slopes, setup, taps, 1e-3)
+    exact = setup.plant.jacobians(setup.theta, setup.initial)
+    assert relative_error(A, exact[0]) < 1e-5
+    assert relative_error(B, exact[1]) < 1e-3
+
+
+@pytest.mark.parametrize("accuracy", [DRAFT, FAST, CENTRAL], ids=["draft", "fast", "central"])
+@pytest.mark.parametrize("sensors", [False, True], ids=["states", "sensors"])
+def test_derivatives_beside_those_of_the_information_are_the_same(sensors: bool, accuracy, tmp_path: Path) -> None:
+    """Whichever differences the information takes; with sensors all of them are made one direction at a time."""
+    noise = {"gyro": 0.1, "qpos:elbow": 0.01} if sensors else {"qpos:elbow": 0.01, "qpos:shoulder": 0.01}
+    setup = floating_setup(tmp_path, noise=noise).free()
+    assert setup.plant.engine.sensors is sensors
+    taps, psi = taps_of(setup), setup.plant.sensitivity(setup.theta, setup.initial).psi
+    directions = np.array([[1.0, 0.3], [-0.2, 0.9]])
+    found = setup.plant.bilinear(setup.theta, setup.initial, psi, directions, accuracy, taps)
+    assert found.taps is not None
+    assert_slopes(found.taps, setup, taps, 2e-3)
+    assert setup.plant.bilinear(setup.theta, setup.initial, psi, directions, accuracy).taps is None
+
+
+def test_drafted_derivatives_are_the_careful_ones_to_a_hundredth(tmp_path: Path) -> None:
+    """One-sided from one origin against central differences of every direction."""
+    setup = floating_setup(tmp_path).free()
+    taps, psi = taps_of(setup), setup.plant.sensitivity(setup.theta, setup.initial).psi
+    directions = np.array([[1.0, 0.3], [-0.2, 0.9], [0.0, -1.0]])
+    begun = setup.plant.engine.steps
+    draft = setup.plant.bilinear(setup.theta, setup.initial, psi, directions, DRAFT, taps)
+    spent, begun = setup.plant.engine.steps - begun, setup.plant.engine.steps
+    careful = setup.plant.bilinear(setup.theta, setup.initial, psi, directions, CENTRAL, taps)
+    assert spent < 0.4 * (setup.plant.engine.steps - begun)
+    for name in ("A", "B", "C", "D", "taps"):
+        if getattr(careful, name).any():
+            assert relative_error(getattr(draft, name), getattr(careful, name)) < 1e-2, name
+        else:
+            assert not getattr(draft, name).any()
+    for r in range(3):
+        assert relative_error(draft.F_mixed[r], careful.F_mixed[r]) < 1e-2, r
+    assert (draft.h_mixed is None) == (careful.h_mixed is None)

@@ -1,0 +1,395 @@
+"""Every format gives the same columns; what is damaged, unpacks to too much or holds pickles is refused with one sentence."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import os
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from numpy.typing import NDArray
+
+from mjfim.errors import RecordingError
+from mjfim.recordings.formats import table as limits
+from mjfim.recordings.formats.read import read_columns
+from mjfim.recordings.formats.table import Table
+from mjfim.recordings.spec import RecordingSpec
+
+Array = NDArray[np.float64]
+Columns = dict[str, Array]
+
+ALL = RecordingSpec()
+ROWS = 50
+
+
+@pytest.fixture
+def columns() -> Columns:
+    """Three columns of doubles, one with holes."""
+    rng = np.random.default_rng(2)
+    q = rng.standard_normal(ROWS)
+    q[7:12] = np.nan
+    return {"t": np.arange(ROWS) * 0.01, "q": q, "u": rng.standard_normal(ROWS) * 1e-9}
+
+
+def as_csv(path: Path, columns: Columns) -> None:
+    """Empty fields for NaN."""
+    pyarrow.csv.write_csv(pyarrow.table({n: pyarrow.array(c, from_pandas=True) for n, c in columns.items()}), path)
+
+
+def as_gzip(path: Path, columns: Columns) -> None:
+    """The same, packed."""
+    as_csv(path.with_suffix(""), columns)
+    path.write_bytes(gzip.compress(path.with_suffix("").read_bytes()))
+
+
+def as_parquet(path: Path, columns: Columns) -> None:
+    """Nulls for NaN."""
+    table = pyarrow.table({n: pyarrow.array(c, from_pandas=True) for n, c in columns.items()})
+    pyarrow.parquet.write_table(table, path)
+
+
+def as_npz(path: Path, columns: Columns) -> None:
+    """One array per column."""
+    np.savez_compressed(path, **columns)
+
+
+def as_json(path: Path, columns: Columns) -> None:
+    """A list of records, null for NaN."""
+    rows = zip(*(c.tolist() for c in columns.values()), strict=True)
+    path.write_text(
+        json.dumps([dict(zip(columns, (None if v != v else v for v in row), strict=True)) for row in rows]),
+        encoding="utf-8",
+    )
+
+
+WRITERS = {".csv": as_csv, ".csv.gz": as_gzip, ".parquet": as_parquet, ".npz": as_npz, ".json": as_json}
+formats = pytest.mark.parametrize("ending", WRITERS)
+
+
+def same(table: Table, columns: Columns) -> bool:
+    """To the last bit, in float64."""
+    return set(table.columns) == set(columns) and all(
+        table.column(name).dtype == np.float64 and np.array_equal(table.column(name), column, equal_nan=True)
+        for name, column in columns.items()
+    )
+
+
+@formats
+def test_formats_agree(ending: str, columns: Columns, tmp_path: Path) -> None:
+    path = tmp_path / f"log{ending}"
+    WRITERS[ending](path, columns)
+    assert same(read_columns(path, ALL), columns)
+
+
+@formats
+def test_truncated_files(ending: str, columns: Columns, tmp_path: Path) -> None:
+    """However much is missing; a CSV that ends in the middle of a row is told by its number of fields."""
+    path = tmp_path / f"log{ending}"
+    WRITERS[ending](path, columns)
+    whole = path.read_bytes()
+    cuts = [len(whole) // 2, len(whole) - 8] if ending != ".csv" else [whole.index(b",", len(whole) // 2)]
+    for cut in cuts:
+        path.write_bytes(whole[:cut])
+        with pytest.raises(RecordingError, match=rf"log\{ending}: not (a )?readable") as refused:
+            read_columns(path, ALL)
+        assert "\n" not in str(refused.value)
+
+
+@formats
+def test_damaged_files(ending: str, columns: Columns, tmp_path: Path) -> None:
+    """Overwritten bytes: never another error than ours, and that in one line."""
+    path = tmp_path / f"log{ending}"
+    WRITERS[ending](path, columns)
+    whole, rng, said = path.read_bytes(), np.random.default_rng(3), list[str]()
+    for _ in range(100):
+        damaged = bytearray(whole)
+        for at in rng.integers(0, len(whole), 4).tolist():
+            damaged[at] = int(rng.integers(256))
+        path.write_bytes(bytes(damaged))
+        try:
+            read_columns(path, ALL)
+        except RecordingError as error:
+            said.append(str(error))
+    assert len(said) > 20
+    assert "\n" not in "".join(said)
+
+
+@formats
+def test_empty_files(ending: str, tmp_path: Path) -> None:
+    path = tmp_path / f"log{ending}"
+    path.touch()
+    with pytest.raises(RecordingError, match="the file is empty"):
+        read_columns(path, ALL)
+
+
+@formats
+def test_only_what_is_wanted_is_read(ending: str, columns: Columns, tmp_path: Path) -> None:
+    """Others may hold anything; their names stay known."""
+    path = tmp_path / f"log{ending}"
+    WRITERS[ending](path, columns)
+    table = read_columns(path, RecordingSpec(columns={"qpos:j": "q", "ctrl:m": "q"}))
+    assert {"t", "q"} <= set(table.columns)
+    assert ("u" in table.columns) == (ending == ".json")
+    with pytest.raises(RecordingError, match=r"column 'v' is missing; found: .*u"):
+        table.column("v")
+
+
+def test_unknown_endings(tmp_path: Path) -> None:
+    """The message lists the known ones."""
+    (tmp_path / "log.xlsx").write_text("x", encoding="utf-8")
+    with pytest.raises(
+        RecordingError, match=r"log\.xlsx: not a known kind.*\.csv, \.csv\.gz, \.parquet, \.npz, \.json"
+    ):
+        read_columns(tmp_path / "log.xlsx", ALL)
+    with pytest.raises(RecordingError, match=r"gone\.csv: no such file"):
+        read_columns(tmp_path / "gone.csv", ALL)
+    with pytest.raises(RecordingError, match=r"no ROS 2 bag"):
+        read_columns(tmp_path, ALL)
+
+
+# ---- CSV and Parquet
+
+
+def test_text_is_no_fault_until_it_is_used(tmp_path: Path) -> None:
+    """Numbers beside it are read in full."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,mode,q,big\n0,idle,1.5,1700000000000000123\n0.1,run,,1700000000000000124\n", encoding="utf-8")
+    table = read_columns(path, ALL)
+    assert np.array_equal(table.column("q"), [1.5, np.nan], equal_nan=True)
+    assert table.column("big")[0] == 1.7e18
+    with pytest.raises(RecordingError, match=r"log\.csv: column 'mode' is not numeric"):
+        table.column("mode")
+    pyarrow.parquet.write_table(
+        pyarrow.table({"t": [0.0, 1.0], "mode": ["1", "2"], "on": [True, False]}), tmp_path / "a.parquet"
+    )
+    table = read_columns(tmp_path / "a.parquet", ALL)
+    assert table.column("on").tolist() == [1.0, 0.0]
+    with pytest.raises(RecordingError, match="'mode' is not numeric"):
+        table.column("mode")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,q,q\n0,1,2\n", "'q' stands there more than once"),
+        ("t,q\n0,1\n1\n", "not a readable CSV table: .*Expected 2 columns, got 1"),
+        ("t,q\xff\n0,1\n", "not a readable CSV table"),
+    ],
+)
+def test_ill_formed_csv(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(RecordingError, match=message):
+        read_columns(path, ALL)
+
+
+def bomb_csv(path: Path) -> None:
+    """Many rows that are alike, in few bytes."""
+    path.write_bytes(gzip.compress(b"t,q\n" + b"0,0\n" * 1_000_000))
+
+
+def bomb_npz(path: Path) -> None:
+    """A million zeros."""
+    np.savez_compressed(path, t=np.zeros(1_000_000))
+
+
+def bomb_parquet(path: Path) -> None:
+    """A million times the same number, written once."""
+    pyarrow.parquet.write_table(pyarrow.table({"t": np.zeros(1_000_000)}), path)
+
+
+@pytest.mark.parametrize(
+    ("name", "write"), [("log.csv.gz", bomb_csv), ("log.npz", bomb_npz), ("log.parquet", bomb_parquet)]
+)
+def test_bombs(name: str, write: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few kB that unpack to MB: fine within the limits, refused beyond either of them."""
+    path = tmp_path / name
+    write(path)
+    assert path.stat().st_size < 16_000
+    assert len(read_columns(path, ALL).column("t")) == 1_000_000
+    with monkeypatch.context() as patch:
+        patch.setattr(limits, "LARGEST", 2_000_000)
+        with pytest.raises(RecordingError, match=rf"{name}: .* more than 0\.00186 GiB"):
+            read_columns(path, ALL)
+    if name != "log.parquet":
+        monkeypatch.setattr(limits, "SUSPECT", 1_000_000)
+        with pytest.raises(RecordingError, match=rf"{name}: unpacks to more than 200 times its size"):
+            read_columns(path, ALL)
+
+
+def test_packed_logs_are_no_bombs(columns: Columns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ratio alone tells."""
+    monkeypatch.setattr(limits, "SUSPECT", 100)
+    as_gzip(tmp_path / "log.csv.gz", columns)
+    assert same(read_columns(tmp_path / "log.csv.gz", ALL), columns)
+
+
+# ---- npz
+
+
+class Trap:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.mkdir, (str(self.path),)
+
+
+def test_pickles_are_not_loaded(tmp_path: Path) -> None:
+    """Neither where the array is wanted nor where it is not; the trap itself works."""
+    np.savez(tmp_path / "log.npz", t=np.arange(3.0), q=np.array([Trap(tmp_path / "sprung")], dtype=object))
+    for spec in (ALL, RecordingSpec(columns={"qpos:j": "t", "ctrl:m": "t"})):
+        with pytest.raises(RecordingError, match=r"log\.npz: array 'q' holds pickled objects, which are never read"):
+            read_columns(tmp_path / "log.npz", spec)
+    assert not (tmp_path / "sprung").exists()
+    pickle.loads(pickle.dumps(Trap(tmp_path / "sprung")))
+    assert (tmp_path / "sprung").exists()
+
+
+def test_matrices_become_columns(tmp_path: Path) -> None:
+    """`name[i]`; a control lacks its last row; a number alone holds for all rows; cubes are left out."""
+    q = np.arange(8.0).reshape(4, 2)
+    np.savez(tmp_path / "log.npz", t=np.arange(4.0), qpos=q, ctrl=q[:3], kp=2.5, gain=np.zeros((3, 2, 2)))
+    table = read_columns(tmp_path / "log.npz", ALL)
+    assert table.names == ("t", "qpos[0]", "qpos[1]", "ctrl[0]", "ctrl[1]", "kp")
+    assert table.column("qpos[1]").tolist() == [1.0, 3.0, 5.0, 7.0]
+    assert np.array_equal(table.column("ctrl[0]"), [0.0, 2.0, 4.0, np.nan], equal_nan=True)
+    assert table.column("kp").tolist() == [2.5] * 4
+
+
+def test_arrays_of_other_lengths(tmp_path: Path) -> None:
+    """Only a control may lack a row, under whatever name."""
+    np.savez(tmp_path / "log.npz", t=np.arange(4.0), q=np.zeros(3), u=np.zeros(3), name=np.array(["a"]))
+    table = read_columns(tmp_path / "log.npz", RecordingSpec(columns={"qpos:j": "q", "ctrl:m": "u"}))
+    assert np.isnan(table.column("u")[-1])
+    with pytest.raises(RecordingError, match=r"column 'q' has 3 rows where 't' has 4"):
+        table.column("q")
+    with pytest.raises(RecordingError, match=r"column 'name' is not numeric"):
+        table.column("name")
+
+
+def header(shape: tuple[int, ...]) -> bytes:
+    """Of an npy file without content."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def test_headers_that_promise_too_much(tmp_path: Path) -> None:
+    """Nothing is allocated for numbers that are not there."""
+    with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
+        archive.writestr("t.npy", header((10**13,)))
+    with pytest.raises(RecordingError, match=r"promises more numbers than it holds"):
+        read_columns(tmp_path / "log.npz", ALL)
+
+
+def test_rows_that_are_columns(tmp_path: Path) -> None:
+    """A matrix whose time runs to the right; a time that is one."""
+    np.savez(tmp_path / "log.npz", t=np.arange(5000.0), qpos=np.zeros((2, 5000)))
+    with pytest.raises(RecordingError, match=r"'qpos' of shape \(2, 5000\) has too many columns; time runs down"):
+        read_columns(tmp_path / "log.npz", ALL)
+    np.savez(tmp_path / "log.npz", t=np.zeros((5, 1)))
+    with pytest.raises(RecordingError, match=r"array 't' has shape \(5, 1\)"):
+        read_columns(tmp_path / "log.npz", ALL)
+    np.savez(tmp_path / "log.npz", time=np.zeros(5))
+    with pytest.raises(RecordingError, match=r"array 't' is missing; found: time"):
+        read_columns(tmp_path / "log.npz", ALL)
+
+
+# ---- JSON
+
+
+def read_json(content: object, tmp_path: Path, spec: RecordingSpec = ALL) -> Table:
+    """Columns of this content."""
+    (tmp_path / "log.json").write_text(json.dumps(content), encoding="utf-8")
+    return read_columns(tmp_path / "log.json", spec)
+
+
+def test_json_records(tmp_path: Path) -> None:
+    """Header numbers, booleans, nested objects and lists; what a record lacks is empty."""
+    content = {
+        "kp": 100,
+        "motor": {"kt": 0.3, "name": "xl"},
+        "t": 7,
+        "entries": [
+            {"t": 0.0, "on": True, "joint": {"q": 1.5}, "imu": [1, 2]},
+            {"t": 0.1, "on": False, "joint": {"q": None}, "imu": [3, 4], "late": 5, "note": "x"},
+        ],
+    }
+    table = read_json(content, tmp_path)
+    expected = {
+        "kp": [100, 100],
+        "motor.kt": [0.3, 0.3],
+        "t": [0, 0.1],
+        "on": [1, 0],
+        "joint.q": [1.5, np.nan],
+        "imu[0]": [1, 3],
+        "imu[1]": [2, 4],
+        "late": [np.nan, 5],
+    }
+    assert same(table, {name: np.array(v, dtype=np.float64) for name, v in expected.items()})
+    assert set(table.faults) == {"motor.name", "note"}
+
+
+def test_json_place(tmp_path: Path) -> None:
+    """Several lists of records need a word; that word must be right."""
+    content = {"k": 1, "a": {"gain": 2, "left": [{"t": 0}], "right": [{"t": 1}, {"t": 2}]}}
+    with pytest.raises(RecordingError, match=r"several lists of records: a\.left, a\.right; .*recording\.records"):
+        read_json(content, tmp_path)
+    table = read_json(content, tmp_path, RecordingSpec(records="a.right"))
+    assert {name: c.tolist() for name, c in table.columns.items()} == {"t": [1, 2], "k": [1, 1], "a.gain": [2, 2]}
+    for wrong in ("a.rigth", "k.right"):
+        with pytest.raises(RecordingError, match=rf"recording\.records: .*'{wrong}'.*a\.left, a\.right"):
+            read_json(content, tmp_path, RecordingSpec(records=wrong))
+    with pytest.raises(RecordingError, match=r"'k' is not a list of records"):
+        read_json(content, tmp_path, RecordingSpec(records="k"))
+
+
+def test_json_lists(tmp_path: Path) -> None:
+    """One list per column; ragged ones are named when they are used."""
+    table = read_json({"t": [0, 1, 2], "q": [1, None, 3], "short": [1, 2], "k": 4, "s": ["a", 1, 2]}, tmp_path)
+    assert np.array_equal(table.column("q"), [1, np.nan, 3], equal_nan=True)
+    assert table.column("k").tolist() == [4, 4, 4]
+    with pytest.raises(RecordingError, match=r"column 'short' has 2 rows where 't' has 3"):
+        table.column("short")
+    with pytest.raises(RecordingError, match=r"column 's' is not numeric"):
+        table.column("s")
+    ragged = read_json([{"t": 0, "q": [1, 2]}, {"t": 1, "q": [1]}], tmp_path)
+    with pytest.raises(RecordingError, match=r"column 'q\[0\]' is ragged: 1 numbers in record 2, 2 before"):
+        ragged.column("q[0]")
+
+
+@pytest.mark.parametrize("content", [3, [], [1, 2], {"a": 1}, {}, "text", None])
+def test_json_without_records(content: object, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"log\.json: holds no list of records"):
+        read_json(content, tmp_path)
+
+
+def test_json_of_odd_numbers(tmp_path: Path) -> None:
+    """Beyond float64 is infinite, which a recording refuses; too deep or too long is no JSON."""
+    assert read_json([{"t": 10**400}], tmp_path).column("t").tolist() == [np.inf]
+    for text in ("[" * 100_000, "1" * 5000):
+        (tmp_path / "log.json").write_text(text, encoding="utf-8")
+        with pytest.raises(RecordingError, match=r"not readable JSON"):
+            read_columns(tmp_path / "log.json", ALL)
+
+
+def test_a_message_never_quotes_what_a_terminal_would_obey(tmp_path: Path) -> None:
+    """A damaged file may hold anything, escape sequences too."""
+    path = tmp_path / "log.csv"
+    path.write_bytes(b"t\n0\n\x1b[2J\x07\xff,1,2\n")
+    with pytest.raises(RecordingError) as refused:
+        read_columns(path, RecordingSpec())
+    assert str(refused.value).isprintable()
+    assert "Expected 1 columns" in str(refused.value)

@@ -1,0 +1,586 @@
+"""Logs as recordings: formula, units, counters, windows, holes; every refusal with its sentence; logs of real robots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mjfim.errors import ExperimentError, RecordingError
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.output.archive import write_table
+from mjfim.recordings.read import Logged, read_log, read_recording
+
+Array = NDArray[np.float64]
+Read = Callable[..., Logged]
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+ARM = """
+<mujoco>
+  <option timestep="0.001"/>
+  <worldbody>
+    <body name="cart">
+      <joint name="rail" type="slide" axis="1 0 0"/>
+      <geom size="0.05" mass="1"/>
+      <body name="arm">
+        <joint name="pin" axis="0 1 0"/>
+        <joint name="stop" axis="1 0 0" range="-60 90"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/>
+        <site name="tip" pos="0 0 -0.3"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push" joint="rail"/>
+    <motor name="turn" joint="pin"/>
+  </actuator>
+  <sensor>
+    <jointpos name="encoder" joint="pin"/>
+    <jointvel name="ruler" joint="rail"/>
+    <gyro name="gyro" site="tip"/>
+    <force name="cell" site="tip"/>
+    <actuatorpos name="motor" actuator="turn"/>
+  </sensor>
+</mujoco>
+"""
+NOISE = {"state": 0.01, "encoder": 0.01, "ruler": 0.01, "gyro": 0.01, "cell": 0.1, "motor": 0.1}
+M = 400
+T = np.arange(M) * 0.005
+CTRL = {"ctrl:push": np.cos(T), "ctrl:turn": np.sin(3.0 * T)}
+
+
+def setup_of(folder: Path, recording: Mapping[str, Any], model: str = ARM) -> Setup:
+    """The arm on its cart, with this [recording] table."""
+    (folder / "arm.xml").write_text(model, encoding="utf-8")
+    mass = {"mass": {"target": "body/arm:mass"}}
+    start = {"control": {"kind": "sine"}}
+    noise = NOISE if model == ARM else {"state": 0.01}
+    e = Experiment(
+        model="arm.xml", rate=100.0, horizon=1.0, initial=start, parameters=mass, noise=noise, recording=recording,
+        directory=folder, source="study.toml",
+    )  # fmt: skip
+    return Setup(e)
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Read:
+    """Columns, written as CSV and read by a [recording] table; t and the controls are there unless stated otherwise."""
+
+    def run(columns: Mapping[str, Any], /, bare: bool = False, **recording: Any) -> Logged:
+        path = tmp_path / "lab.csv"
+        write_table(path, dict(columns) if bare else {"t": T, **CTRL, **columns})
+        return read_log(path, setup_of(tmp_path, recording))
+
+    return run
+
+
+def column(logged: Logged, name: str) -> Array:
+    """Measured column by name."""
+    return logged.recording.y[:, logged.recording.outputs.index(name)]
+
+
+def wave(amplitude: float = 1.0, frequency: float = 2.0) -> Array:
+    """A motion (M,) of that amplitude [rad/s]."""
+    return amplitude * np.sin(frequency * T)
+
+
+# ---- the formula
+
+
+def test_own_columns(read: Read) -> None:
+    """Without a [recording] table: mjfim's names; other columns are no fault, not even text."""
+    logged = read({"qpos:pin": wave(), "encoder": wave(0.9), "note": np.array(["x"] * M)})
+    recording = logged.recording
+    assert recording.outputs == ("qpos:pin", "encoder")
+    assert np.array_equal(recording.ctrl, np.column_stack(list(CTRL.values()))[:-1])
+    assert np.array_equal(recording.t, T)
+    assert np.array_equal(column(logged, "encoder"), wave(0.9))
+
+
+def test_formula(read: Read) -> None:
+    """(scale unit raw + offset) times: by hand for every piece."""
+    on, kp = (T < 1.0).astype(float), np.full(M, 100.0)
+    columns = {"a": wave(90.0), "on": on, "kp": kp}
+    spec = {"column": "a", "unit": "deg", "scale": -2.0, "offset": 0.5, "times": ["on", "kp"]}
+    logged = read(columns, columns={"qpos:pin": spec})
+    expected = (-2.0 * np.pi / 180.0 * wave(90.0) + 0.5) * on * 100.0
+    assert np.allclose(column(logged, "qpos:pin"), expected, rtol=1e-14, atol=1e-12)
+    assert logged.recording.outputs == ("qpos:pin",)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "factor"),
+    [
+        ("qpos:pin", "deg", np.pi / 180),
+        ("qpos:pin", "rev", 2 * np.pi),
+        ("qpos:pin", "rad", 1),
+        ("qvel:pin", "deg/s", np.pi / 180),
+        ("qvel:pin", "rpm", 2 * np.pi / 60),
+        ("qvel:pin", "rev/s", 2 * np.pi),
+        ("qvel:pin", "rad/s", 1),
+        ("qpos:rail", "mm", 1e-3),
+        ("qpos:rail", "cm", 1e-2),
+        ("qpos:rail", "m", 1),
+        ("qvel:rail", "mm/s", 1e-3),
+        ("qvel:rail", "m/s", 1),
+        ("encoder", "deg", np.pi / 180),
+        ("ruler", "mm/s", 1e-3),
+        ("gyro[1]", "rpm", 2 * np.pi / 60),
+        ("motor", "deg", np.pi / 180),
+    ],
+)
+def test_units(name: str, unit: str, factor: float, read: Read) -> None:
+    """Each converts to the model's unit."""
+    logged = read({"raw": wave(7.0)}, columns={name: {"column": "raw", "unit": unit}})
+    assert np.allclose(column(logged, name), factor * wave(7.0), rtol=1e-14, atol=0)
+
+
+def test_unit_of_a_control(read: Read) -> None:
+    """A servo's target may be in degrees."""
+    source = {"column": "goal", "unit": "deg"}
+    logged = read({"goal": wave(90.0), "qpos:pin": wave()}, columns={"ctrl:turn": source})
+    assert np.allclose(logged.recording.ctrl[:, 1], np.pi / 180 * wave(90.0)[:-1], rtol=1e-14, atol=0)
+    assert np.array_equal(logged.recording.ctrl[:, 0], CTRL["ctrl:push"][:-1])
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "said"),
+    [
+        ("qpos:rail", {"unit": "deg"}, r"qpos:rail\.unit: unknown unit 'deg'.*valid: cm, m, mm"),
+        ("qpos:pin", {"unit": "deg/s"}, r"qpos:pin\.unit: unknown unit 'deg/s'.*valid: deg, rad, rev;"),
+        ("qvel:pin", {"unit": "m/s"}, r"valid: deg/s, rad/s, rev/s, rpm"),
+        ("ruler", {"unit": "rpm"}, r"ruler\.unit: .*valid: m/s, mm/s"),
+        ("cell[0]", {"unit": "m"}, r"cell\[0\]\.unit: .*valid: none; for others there is scale"),
+        ("qpos:rail", {"unwrap": True}, r"qpos:rail\.unwrap: only angles"),
+        ("qpos:pinn", {}, r": unknown column 'qpos:pinn' \(did you mean 'qpos:pin'\?\)"),
+        ("ctrl:twist", {}, r"unknown column 'ctrl:twist'.*ctrl:turn"),
+    ],
+)
+def test_columns_that_do_not_fit_the_model(name: str, source: dict[str, Any], said: str, read: Read) -> None:
+    """Said before the file is read, naming the experiment's key."""
+    with pytest.raises(ExperimentError, match=rf"study\.toml: recording\.columns.*{said}"):
+        read({"raw": wave()}, columns={name: {"column": "raw", **source}})
+
+
+def test_signed(read: Read) -> None:
+    """Two's complement; numbers that are negative already stay."""
+    truth = np.rint(300.0 * np.sin(5.0 * T))
+    raw = np.where(truth < 0, truth + 65536, truth)
+    raw[3] = truth[3] = -7.0
+    raw[4], truth[4] = 32768.0, -32768.0
+    logged = read({"raw": raw}, columns={"motor": {"column": "raw", "signed": 16, "scale": 0.1}})
+    assert np.allclose(column(logged, "motor"), 0.1 * truth, rtol=1e-14, atol=0)
+    for wrong in (65536.0, -32769.0, 1.5):
+        raw[9] = wrong
+        with pytest.raises(RecordingError, match=rf"column 'raw' holds {wrong:g} in data row 10, which is no integer"):
+            read({"raw": raw}, columns={"motor": {"column": "raw", "signed": 16}})
+
+
+def test_counters_begin_anew(read: Read) -> None:
+    """Raw numbers of a 12-bit encoder, through holes, in the scale of the encoder."""
+    truth = np.rint(9000.0 * np.sin(2.0 * T))
+    raw = np.mod(truth, 4096)
+    raw[50:53] = np.nan
+    scale = 2 * np.pi / 4096
+    logged = read({"raw": raw}, columns={"encoder": {"column": "raw", "period": 4096.0, "scale": scale}})
+    found = column(logged, "encoder")
+    assert np.isnan(found[50:53]).all()
+    there = np.isfinite(raw)
+    assert np.allclose(found[there], scale * truth[there], rtol=0, atol=1e-9)
+
+
+def test_angles_jump_by_turns(read: Read) -> None:
+    """In whatever unit they are; after a hole too."""
+    truth = 4.0 * np.sin(2.0 * T)
+    raw = np.degrees(np.angle(np.exp(1j * truth)))
+    raw[::7] = np.nan
+    logged = read({"raw": raw}, columns={"qpos:pin": {"column": "raw", "unit": "deg", "unwrap": True}})
+    there = np.isfinite(raw)
+    assert np.abs(np.diff(raw[there])).max() > 300
+    assert np.allclose(column(logged, "qpos:pin")[there], truth[there], rtol=0, atol=1e-12)
+
+
+# ---- time
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_time_units(unit: str, factor: float, read: Read) -> None:
+    """Irregular times stay as they are, from zero; seconds since 1970 too."""
+    rng = np.random.default_rng(1)
+    t = T + rng.uniform(-1e-3, 1e-3, M)
+    logged = read({"stamp": (t + 1000.0) * factor, "qpos:pin": wave()}, time="stamp", time_unit=unit)
+    assert np.allclose(logged.recording.t, t - t[0], rtol=0, atol=1e-9)
+    assert logged.recording.t[0] == 0.0
+
+
+def test_window(read: Read) -> None:
+    """Rows from begin to end; time restarts; a control is known from before."""
+    ctrl = np.where(np.arange(M) % 3 == 0, np.arange(M, dtype=float), np.nan)
+    columns = {"qpos:pin": wave(), "ctrl:push": ctrl}
+    logged = read({**columns, "t": T + 5.0}, window=(0.52, 1.0))
+    r = logged.recording
+    assert (len(r.t), r.t[0], logged.look.dropped) == (97, 0.0, M - 97)
+    assert np.allclose(r.t, T[:97], rtol=0, atol=1e-12)
+    assert np.array_equal(column(logged, "qpos:pin"), wave()[104:201])
+    assert r.ctrl[:4, 0].tolist() == [102.0, 105.0, 105.0, 105.0]
+    with pytest.raises(RecordingError, match=r"recording\.window: no row between 7 and 8 s; the log lasts 1\.995 s"):
+        read(columns, window=(7.0, 8.0))
+
+
+def test_window_cuts_what_is_wrong(read: Read) -> None:
+    """A clock that begins anew, a hole, an infinite value behind the window are no fault."""
+    t, q = np.array(T), wave()
+    t[300:] -= t[300]
+    q[350] = np.inf
+    with pytest.raises(RecordingError, match="data row 301"):
+        read({"t": t, "qpos:pin": q})
+    assert len(read({"t": t, "qpos:pin": q}, window=(0.0, 1.4)).recording.t) == 281
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: t[:2], r"too few rows \(2\)"),
+        (lambda t: t[:0], r"too few rows \(0\)"),
+        (lambda t: np.where(t == t[7], np.nan, t), "holds NaN in data row 8"),
+        (lambda t: np.where(t == t[7], np.inf, t), "holds an infinite time in data row 8"),
+        (
+            lambda t: np.where(t == t[7], t[6], t),
+            r"does not increase in data row 8: 0\.03 s, then 0\.03 s \(a duplicate\)",
+        ),
+        (lambda t: np.floor(t * 50) / 50, r"in data row 2: .*\(a duplicate, one of 3\d\d\)"),
+        (lambda t: np.mod(t, 1.2), r"in data row 241: 1\.195 s, then 0 s \(the clock began anew, or wrapped around\)"),
+        (lambda t: np.where(t == t[7], t[5] + 1e-4, t), r"in data row 8: .*\(rows out of order\)"),
+        (lambda t: 1e3 * t, r'median step is 5 s, .* is it recording\.time_unit = "ms"\?'),
+        (lambda t: 1e6 * t, r'recording\.time_unit = "us"\?'),
+        (lambda t: 1e9 * t, r'recording\.time_unit = "ns"\?'),
+        (lambda t: t + 0.2 * (t > t[99]), r"a hole of 0\.205 s after data row 100 \(0\.495 s .*longer than 0\.1 s"),
+    ],
+)
+def test_clocks_that_are_wrong(change: Callable[[Array], Array], said: str, read: Read) -> None:
+    """Row, and what it looks like."""
+    t = change(T)
+    columns = {"t": t, **{n: c[: len(t)] for n, c in CTRL.items()}, "qpos:pin": wave()[: len(t)]}
+    with pytest.raises(RecordingError, match=rf"lab\.csv: column 't'.*{said}"):
+        read(columns, bare=True)
+
+
+def test_unit_of_time_is_guessed_from_what_was_stated(read: Read) -> None:
+    with pytest.raises(RecordingError, match=r'median step is 5e-12 s.*time_unit = "s"'):
+        read({"qpos:pin": wave()}, time_unit="ns")
+
+
+def test_holes_in_time_may_be_allowed(read: Read) -> None:
+    """By a larger gap; and five steps of a slow log are no hole."""
+    hole = T + 0.2 * (np.arange(M) > 99)
+    assert len(read({"t": hole, "qpos:pin": wave()}, gap=0.3).recording.t) == M
+    slow = np.arange(M) * 0.05
+    slow[200:] += 0.15
+    assert len(read({"t": slow, "qpos:rail": wave()}).recording.t) == M
+
+
+# ---- columns
+
+
+def test_measured_at_several_rates(read: Read) -> None:
+    """Regularly empty fields are no holes, however slow the column is."""
+    slow = np.where(np.arange(M) % 50 == 3, wave(), np.nan)
+    logged = read({"qpos:pin": wave(), "encoder": slow}, gap=0.02)
+    assert np.isfinite(column(logged, "encoder")).sum() == 8
+
+
+def test_holes_in_columns(read: Read) -> None:
+    """A run that is longer than the gap, in the middle and at the ends; shorter ones stay empty."""
+    for begin, end, said in ((100, 160, r"from 0\.495 to 0\.8 s"), (0, 30, "from 0 to 0.15 s"), (360, M, "to 1.995 s")):
+        q = wave()
+        q[begin:end] = np.nan
+        with pytest.raises(RecordingError, match=rf"column 'qpos:pin' is empty .*{said}; longer than 0\.1 s"):
+            read({"qpos:pin": q})
+        assert np.isnan(column(read({"qpos:pin": q}, gap=0.5), "qpos:pin")).sum() == end - begin
+    q = wave()
+    q[100:115] = np.nan
+    assert np.isnan(column(read({"qpos:pin": q}), "qpos:pin")).sum() == 15
+
+
+def test_controls_are_held(read: Read) -> None:
+    """Over less than the gap, never before they begin; the last row needs none."""
+    u = np.arange(M, dtype=float)
+    u[10:20] = u[-5:] = np.nan
+    logged = read({"qpos:pin": wave(), "ctrl:push": u})
+    assert logged.recording.ctrl[9:21, 0].tolist() == [9.0] * 11 + [20.0]
+    assert logged.recording.ctrl[-3:, 0].tolist() == [394.0] * 3
+    late = np.where(np.arange(M) < M - 21, u, np.nan)
+    assert read({"qpos:pin": wave(), "ctrl:push": late}, gap=0.1025).recording.ctrl[-1, 0] == M - 22
+    u[10:40] = np.nan
+    with pytest.raises(RecordingError, match=r"'ctrl:push'.* is empty for 0\.15 s until 0\.195 s; longer than 0\.1 s"):
+        read({"qpos:pin": wave(), "ctrl:push": u})
+    assert read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2).recording.ctrl[39, 0] == 9.0
+    u[:4] = np.nan
+    with pytest.raises(RecordingError, match=r"'ctrl:push'.*no value in the first row; it begins 0\.02 s later"):
+        read({"qpos:pin": wave(), "ctrl:push": u})
+    assert read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2, window=(0.02, 1.0)).recording.ctrl[0, 0] == 4.0
+    with pytest.raises(RecordingError, match="it holds no number"):
+        read({"qpos:pin": wave(), "ctrl:push": np.full(M, np.nan)})
+
+
+def test_dead_channels(read: Read) -> None:
+    """A measured column that never moves is refused, a constant control is not."""
+    with pytest.raises(
+        RecordingError, match=r"column 'enc' is 1\.5 in all of its 400 rows, a dead channel; leave it out"
+    ):
+        read({"enc": np.full(M, 1.5), "q": wave()}, columns={"encoder": "enc", "qpos:pin": "q"})
+    with pytest.raises(RecordingError, match=r"column 'encoder' holds no number; leave it out"):
+        read({"encoder": np.full(M, np.nan), "qpos:pin": wave()})
+    few = np.where(np.arange(M) % 50 == 0, 1.5, np.nan)
+    assert len(read({"encoder": few, "qpos:pin": wave(), "ctrl:push": np.zeros(M)}).recording.t) == M
+
+
+@pytest.mark.parametrize("name", ["qpos:pin", "ctrl:push", "kp"])
+def test_infinite_values(name: str, read: Read) -> None:
+    """In the columns that are used, also as a factor."""
+    columns = {"qpos:pin": wave(), **CTRL, "kp": np.full(M, 2.0)}
+    columns[name] = np.where(np.arange(M) == 11, np.inf, columns[name])
+    source = {"column": "ctrl:turn", "times": ["kp"]}
+    with pytest.raises(RecordingError, match=rf"column '{name}' is infinite in data row 12"):
+        read(columns, columns={"ctrl:turn": source})
+
+
+def test_columns_that_are_missing(read: Read) -> None:
+    """Or text, where they are used."""
+    for name, said in (("lost", "column 'lost' is missing; found: .*note"), ("note", "column 'note' is not numeric")):
+        for source in (name, {"column": "q", "times": [name]}):
+            with pytest.raises(RecordingError, match=said):
+                read({"q": wave(), "note": np.array(["x"] * M)}, columns={"qpos:pin": source})
+    with pytest.raises(RecordingError, match=r"column 'ctrl:push' is missing"):
+        read({"t": T, "q": wave(), "ctrl:turn": T}, bare=True, columns={"qpos:pin": "q"})
+
+
+# ---- degrees
+
+
+def test_slope_tells_degrees(read: Read) -> None:
+    """Whichever of the two it is, with noise and a coarse resolution."""
+    rng = np.random.default_rng(4)
+    q = np.round((1 - np.cos(2 * T)) / 1e-3) * 1e-3
+    v = 2.0 * np.sin(2 * T) + 0.1 * rng.standard_normal(M)
+    assert len(read({"qpos:pin": q, "qvel:pin": v}).recording.t) == M
+    with pytest.raises(RecordingError, match=r"5\d\.\d times .* 'qpos:pin' is probably in deg: state unit = \"deg\""):
+        read({"qpos:pin": np.degrees(q), "qvel:pin": v})
+    with pytest.raises(RecordingError, match=r"0\.017.* 'qvel:pin' is probably in deg/s: state unit = \"deg/s\""):
+        read({"qpos:pin": q, "qvel:pin": np.degrees(v)})
+    both = {"q": np.degrees(q), "v": np.degrees(v)}
+    fine = {"qpos:pin": {"column": "q", "unit": "deg"}, "qvel:pin": {"column": "v", "unit": "deg/s"}}
+    assert np.allclose(column(read(both, columns=fine), "qpos:pin"), q, rtol=0, atol=1e-12)
+    silent = {"qpos:pin": {"column": "q", "unit": "rad"}, "qvel:pin": "v"}
+    assert column(read({"q": np.degrees(q), "v": v}, columns=silent), "qpos:pin").max() > 100
+
+
+def test_slopes_of_noise_say_nothing(read: Read) -> None:
+    """At rest the ratio is anything."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        q, v = 2e-3 * rng.standard_normal(M), 0.5 * rng.standard_normal(M)
+        assert len(read({"qpos:pin": q, "qvel:pin": v}).recording.t) == M
+    rail = {"qpos:rail": 57.3 * (1 - np.cos(2 * T)), "qvel:rail": 2.0 * np.sin(2 * T)}
+    assert len(read(rail).recording.t) == M
+
+
+def test_range_tells_degrees(read: Read) -> None:
+    """Far beyond the joint's range, and inside as degrees."""
+    with pytest.raises(RecordingError, match=r"'qpos:stop' goes from -\d+.* from -1\.047\d* to 1\.57\d* rad; .*in deg"):
+        read({"qpos:stop": wave(50.0, 6.0)})
+    for fine in (wave(1.5, 6.0), wave(4.0, 6.0), wave(700.0, 0.25)):
+        assert len(read({"qpos:stop": fine, "qvel:stop": wave()}).recording.t) == M
+    stated = {"qpos:stop": {"column": "s", "unit": "rad"}}
+    assert len(read({"s": wave(50.0, 6.0)}, columns=stated).recording.t) == M
+
+
+def test_speed_tells_degrees(read: Read) -> None:
+    """Many turns, faster than a robot turns; also where the velocity is in degrees as well, and so no contradiction."""
+    with pytest.raises(RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"):
+        read({"qpos:pin": wave(90.0, 6.0)})
+    assert len(read({"qpos:pin": 60.0 * T}).recording.t) == M  # a motor that runs
+    both = {"qpos:pin": wave(90.0, 6.0), "qvel:pin": 540.0 * np.cos(6.0 * T)}
+    with pytest.raises(RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"):
+        read(both)
+    stated = {"qpos:pin": {"column": "q", "unit": "rad"}, "qvel:pin": "v"}
+    fast = dict(zip("qv", both.values(), strict=True))
+    assert len(read(fast, columns=stated).recording.t) == M
+
+
+# ---- the summary
+
+
+def test_look(read: Read) -> None:
+    """Numbers that can be counted by hand."""
+    t = np.array(T)
+    t[100:] += 0.02
+    q = np.round(wave(1.0, 3.0) / 0.01) * 0.01
+    q[:40:4] = np.nan
+    look = read({"t": t, "q": q}, columns={"qpos:pin": "q"}, window=(0.0, 1.5)).look
+    assert (look.rows, look.dropped) == (297, M - 297)
+    assert look.rate == pytest.approx(200.0)
+    assert look.duration == pytest.approx(1.5)
+    assert (look.longest, look.jitter_max) == (pytest.approx(0.025), pytest.approx(0.02))
+    assert look.jitter_std == pytest.approx(0.02 * np.sqrt(1 / 296 - 1 / 296**2))
+    assert [c.name for c in look.columns] == ["ctrl:push", "ctrl:turn", "qpos:pin"]
+    pin = look.columns[2]
+    assert (pin.source, pin.resolution) == ("q", pytest.approx(0.01))
+    assert (pin.minimum, pin.maximum) == (np.nanmin(q[:297]), np.nanmax(q[:297]))
+    assert pin.empty == pytest.approx(10 / 297)
+
+
+def test_resolution_ignores_rounding(read: Read) -> None:
+    """Equal angles stay equal after turns were undone, but for the last digits."""
+    truth = np.rint(300 * np.sin(2 * T)) * (2 * np.pi / 100)
+    wrapped = np.mod(truth, 2 * np.pi)
+    look = read({"q": wrapped}, columns={"qpos:pin": {"column": "q", "unwrap": True}}).look
+    assert look.columns[-1].resolution == pytest.approx(2 * np.pi / 100)
+
+
+# ---- archives of arrays
+
+
+def test_design_archives_are_recordings(tmp_path: Path) -> None:
+    """Matrices in the order of the model's joints and actuators, one control less than states."""
+    setup = setup_of(tmp_path, {})
+    rng = np.random.default_rng(0)
+    qpos, qvel, ctrl = (rng.standard_normal((n, k)) for n, k in ((M, 3), (M, 3), (M - 1, 2)))
+    np.savez(tmp_path / "d.npz", t=T, qpos=qpos, qvel=qvel, ctrl=ctrl, gain=np.zeros((M - 1, 2, 6)))
+    r = read_recording(tmp_path / "d.npz", setup)
+    assert np.array_equal(r.ctrl, ctrl)
+    order = [f"{kind}:{joint}" for kind in ("qpos", "qvel") for joint in ("rail", "pin", "stop")]
+    assert np.array_equal(r.y[:, [r.outputs.index(name) for name in order]], np.hstack([qpos, qvel]))
+    np.savez(tmp_path / "d.npz", t=T, qpos=qpos[:, :2], ctrl=ctrl)
+    with pytest.raises(RecordingError, match=r"'qpos' has 2 columns, the model 3: qpos:rail, qpos:pin, qpos:stop"):
+        read_recording(tmp_path / "d.npz", setup)
+    stated = setup_of(tmp_path, {"columns": {"qpos:pin": "qpos[1]"}})
+    assert np.array_equal(read_recording(tmp_path / "d.npz", stated).y[:, 0], qpos[:, 1])
+
+
+def test_names_beside_matrices(tmp_path: Path) -> None:
+    """One array per column is fine too; a control of full length is cut."""
+    setup = setup_of(tmp_path, {})
+    arrays = {"t": T, **CTRL, "qpos:pin": wave(), "gyro": np.column_stack([wave(), wave(2.0), wave(3.0)])}
+    np.savez(tmp_path / "r.npz", **arrays)
+    r = read_recording(tmp_path / "r.npz", setup)
+    assert r.outputs == ("qpos:pin", "gyro[0]", "gyro[1]", "gyro[2]")
+    assert np.array_equal(r.y[:, 3], wave(3.0))
+    assert r.ctrl.shape == (M - 1, 2)
+
+
+def test_bags_are_recordings(tmp_path: Path) -> None:
+    """Positions and velocities by the joints' names; the control has to be named."""
+    pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
+    from recordings.test_ros2_bag import EPOCH, State, write
+    from rosbags.rosbag2 import StoragePlugin
+
+    states = [
+        State(EPOCH + 5_000_000 * i, ["pin", "grip"], [wave()[i], 0.0], [2 * np.cos(2 * T[i]), 0.0], [T[i], 1.0])
+        for i in range(M)
+    ]
+    path = write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": states})
+    with pytest.raises(RecordingError, match="column 'ctrl:push' is missing; found: t, position:pin"):
+        read_recording(path, setup_of(tmp_path, {}))
+    spec = {"columns": {"ctrl:turn": "effort:pin", "ctrl:push": {"column": "effort:grip", "scale": 0.0}}}
+    r = read_recording(path, setup_of(tmp_path, spec))
+    assert r.outputs == ("qpos:pin", "qvel:pin")
+    assert np.array_equal(r.y[:, 0], wave())
+    assert np.allclose(r.t, T, rtol=0, atol=1e-12)
+    assert np.array_equal(r.ctrl, np.column_stack([np.zeros(M), T])[:-1])
+
+
+# ---- robots
+
+ONE = """
+<mujoco>
+  <worldbody>
+    <body name="arm">
+      <joint name="one" axis="0 1 0"/>
+      <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/>
+      {inner}
+    </body>
+  </worldbody>
+  <actuator><motor name="one" joint="one"/>{motor}</actuator>
+</mujoco>
+"""
+INNER = '<body pos="0 0 -0.3"><joint name="two" axis="0 1 0"/><geom size="0.05" mass="0.5"/></body>'
+ROBOTS: dict[str, dict[str, Any]] = {
+    "bam_xl330/raw/*.json": {
+        "time": "timestamp",
+        "records": "entries",
+        "columns": {
+            "qpos:one": "position",
+            "qvel:one": "speed",
+            "ctrl:one": {"column": "load", "signed": 16, "scale": 1e-3, "times": ["torque_enable", "kp"]},
+        },
+    },
+    "dfki_simple_pendulum/*_measured.csv": {
+        "time": "time",
+        "columns": {"qpos:one": "position", "qvel:one": "velocity", "ctrl:one": "torque"},
+    },
+    "dfki_double_pendulum/*.csv.gz": {
+        "time": "time",
+        "columns": {
+            f"{kind}:{joint}": f"{name}_meas{i + 1}"
+            for i, joint in enumerate(("one", "two"))
+            for kind, name in (("qpos", "pos"), ("qvel", "vel"), ("ctrl", "tau"))
+        },
+    },
+}
+
+
+def robot(pattern: str, folder: Path, **changes: Any) -> tuple[list[Path], Setup]:
+    """Logs of one of them and how they are read; skips where they are absent."""
+    files = sorted(DATA.glob(pattern))
+    if not files:
+        pytest.skip(f"no logs of robots at {DATA}")
+    double = "double" in pattern
+    model = ONE.format(inner=INNER if double else "", motor='<motor name="two" joint="two"/>' if double else "")
+    return files, setup_of(folder, {**ROBOTS[pattern], **changes}, model)
+
+
+@pytest.mark.parametrize("pattern", ROBOTS)
+def test_logs_of_robots(pattern: str, tmp_path: Path) -> None:
+    """They are read whole, and their velocities are the slopes of their positions."""
+    files, setup = robot(pattern, tmp_path)
+    for file in files:
+        logged = read_log(file, setup)
+        r, look = logged.recording, logged.look
+        assert look.rows == len(r.t) > 1000 and look.dropped == 0
+        assert 150.0 < look.rate < 600.0 and 3.0 < look.duration < 21.0
+        assert np.isfinite(r.y).all() and np.isfinite(r.ctrl).all()
+        q, v = (r.y[:, r.outputs.index(f"{kind}:one")] for kind in ("qpos", "qvel"))
+        way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(r.t))])
+        assert np.corrcoef(q, way)[0, 1] > 0.9
+
+
+@pytest.mark.parametrize("pattern", ROBOTS)
+@pytest.mark.parametrize("kind", ["qpos", "qvel"])
+def test_robots_in_degrees(pattern: str, kind: str, tmp_path: Path) -> None:
+    """Had they been logged so, it would have been noticed in every one."""
+    sources = dict(ROBOTS[pattern]["columns"])
+    sources[f"{kind}:one"] = {"column": sources[f"{kind}:one"], "scale": 180.0 / np.pi}
+    files, setup = robot(pattern, tmp_path, columns=sources)
+    for file in files:
+        with pytest.raises(RecordingError, match=f"'{kind}:one' is probably in deg"):
+            read_log(file, setup)
+
+
+def test_loads_of_a_servo(tmp_path: Path) -> None:
+    """What the log holds as 65 thousand is a small negative load."""
+    files, setup = robot("bam_xl330/raw/*.json", tmp_path)
+    loads = np.concatenate([read_recording(file, setup).ctrl[:, 0] for file in files])
+    assert loads.min() < -10.0 and loads.max() > 10.0
+    assert np.abs(loads).max() < 500.0
+    _, naive = robot(
+        "bam_xl330/raw/*.json",
+        tmp_path,
+        columns={**ROBOTS["bam_xl330/raw/*.json"]["columns"], "ctrl:one": "load"},
+    )
+    assert read_recording(files[0], naive).ctrl.max() > 65_000

@@ -1,0 +1,214 @@
+"""ROS 2 bags, written by the library's own writer: both storages, joints in any order, topics merged by time."""
+
+from __future__ import annotations
+
+import builtins
+import importlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjfim.errors import RecordingError
+from mjfim.recordings.formats.read import read_columns
+from mjfim.recordings.spec import RecordingSpec
+
+pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
+
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+EPOCH = 1_700_000_000_123_456_789  # [ns]
+PERIOD = 2_000_000  # [ns]
+ALL = RecordingSpec()
+both = pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+
+
+@dataclass(frozen=True)
+class State:
+    """A message. stamp, received: [ns]"""
+
+    stamp: int
+    names: Sequence[str]
+    position: Sequence[float] = ()
+    velocity: Sequence[float] = ()
+    effort: Sequence[float] = ()
+    received: int | None = None
+
+
+def message(state: State) -> Any:
+    """As ROS has it."""
+    types = STORE.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=state.stamp // 10**9, nanosec=state.stamp % 10**9)
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="base")
+    arrays = (np.array(v, dtype=np.float64) for v in (state.position, state.velocity, state.effort))
+    return types["sensor_msgs/msg/JointState"](header, list(state.names), *arrays)
+
+
+def write(path: Path, storage: Any, topics: dict[str, list[State]], text: bool = False) -> Path:
+    """A bag's folder; text: with a topic of another type."""
+    with Writer(path, version=9, storage_plugin=storage) as writer:
+        if text:
+            other = writer.add_connection("/log", "std_msgs/msg/String", typestore=STORE)
+            raw = STORE.serialize_cdr(STORE.types["std_msgs/msg/String"](data="hello"), "std_msgs/msg/String")
+            writer.write(other, EPOCH, raw)
+        for topic, states in topics.items():
+            kind = "sensor_msgs/msg/JointState"
+            connection = writer.add_connection(topic, kind, typestore=STORE)
+            for state in states:
+                received = state.stamp + 500_000 if state.received is None else state.received
+                writer.write(connection, received, STORE.serialize_cdr(message(state), kind))
+    return path
+
+
+def swing(count: int = 20) -> list[State]:
+    """Two joints whose order changes from message to message."""
+    states = []
+    for i in range(count):
+        names = ["a", "b"] if i % 2 == 0 else ["b", "a"]
+        sign = 1.0 if i % 2 == 0 else -1.0
+        states.append(State(EPOCH + i * PERIOD, names, [sign * i, -sign * i], [sign * 0.5, -sign * 0.5]))
+    return states
+
+
+@both
+def test_joints_are_found_by_name(storage: Any, tmp_path: Path) -> None:
+    """The bag's folder or the file in it; time to the nanosecond; effort may be empty."""
+    path = write(tmp_path / "bag", storage, {"/joint_states": swing()}, text=True)
+    file = next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
+    for place in (path, file):
+        table = read_columns(place, ALL)
+        assert set(table.names) == {"t", "position:a", "position:b", "velocity:a", "velocity:b"}
+        assert table.column("position:a").tolist() == [float(i) for i in range(20)]
+        assert table.column("position:b").tolist() == [-float(i) for i in range(20)]
+        assert table.column("velocity:a").tolist() == [0.5] * 20
+        assert table.column("t").tolist() == [i * PERIOD / 1e9 for i in range(20)]
+
+
+@both
+def test_topics_are_merged_by_time(storage: Any, tmp_path: Path) -> None:
+    """A row per stamp, empty where a topic has none."""
+    arm = [State(EPOCH + i * PERIOD, ["a"], [float(i)]) for i in range(4)]
+    hand = [State(EPOCH + i * PERIOD + (PERIOD // 2 if i else 0), ["a"], (), (), [10.0 * i]) for i in range(3)]
+    path = write(tmp_path / "bag", storage, {"/arm": arm, "/hand": hand})
+    with pytest.raises(RecordingError, match=r"several topics of joint states: /arm, /hand; .*recording\.topics"):
+        read_columns(path, ALL)
+    assert read_columns(path, RecordingSpec(topics=("/hand",))).names == ("t", "effort:a")
+    table = read_columns(path, RecordingSpec(topics=("/arm", "/hand")))
+    nan = np.nan
+    assert np.allclose(table.column("t"), [0.0, 0.002, 0.003, 0.004, 0.005, 0.006], rtol=0, atol=1e-15)
+    assert np.array_equal(table.column("/arm:position:a"), [0, 1, nan, 2, nan, 3], equal_nan=True)
+    assert np.array_equal(table.column("/hand:effort:a"), [0, nan, 10, nan, 20, nan], equal_nan=True)
+    with pytest.raises(RecordingError, match=r"recording\.topics: unknown topic '/amr' \(did you mean '/arm'\?\)"):
+        read_columns(path, RecordingSpec(topics=("/amr",)))
+
+
+def test_two_publishers_of_one_topic(tmp_path: Path) -> None:
+    """Each names its own joints, and their stamps interleave."""
+    left = [State(EPOCH + i * PERIOD, ["a"], [float(i)], received=EPOCH + i * PERIOD + 100) for i in range(3)]
+    right = [State(s.stamp - 1000 * (i > 0), ["b"], [5.0], received=s.stamp + 200) for i, s in enumerate(left)]
+    states = sorted([*left, *right], key=lambda s: s.received or 0)
+    table = read_columns(write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": states}), ALL)
+    nan = np.nan
+    assert np.array_equal(table.column("position:a"), [0, nan, 1, nan, 2], equal_nan=True)
+    assert np.array_equal(table.column("position:b"), [5, 5, nan, 5, nan], equal_nan=True)
+
+
+def test_received_where_there_is_no_stamp(tmp_path: Path) -> None:
+    states = [State(0, ["a"], [float(i)], received=EPOCH + i * PERIOD) for i in range(3)]
+    table = read_columns(write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": states}), ALL)
+    assert table.column("t").tolist() == [0.0, 0.002, 0.004]
+
+
+@pytest.mark.parametrize(
+    ("states", "said"),
+    [
+        (
+            [State(EPOCH, ["a"], [0.0]), State(EPOCH, ["a"], [1.0], received=EPOCH + 10**6)],
+            "message 2: has the stamp of",
+        ),
+        (
+            [State(EPOCH, ["a"], [0.0], received=EPOCH), State(EPOCH - 10**9, ["a"], [1.0], received=EPOCH + 1)],
+            r"message 2: has a stamp before the last one's \(-1 s\)",
+        ),
+        ([State(EPOCH, ["a", "b"], [0.0])], r"message 1: as many names as numbers are wanted \(2 names\)"),
+        ([State(EPOCH, ["a", "a"], [0.0, 1.0])], "message 1: a joint is named twice: a, a"),
+        ([], "topic /j has no message"),
+    ],
+)
+def test_messages_that_do_not_fit(states: list[State], said: str, tmp_path: Path) -> None:
+    path = write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": states}, text=True)
+    with pytest.raises(RecordingError, match=said):
+        read_columns(path, ALL)
+
+
+def test_no_joint_states(tmp_path: Path) -> None:
+    """The message lists what there is."""
+    path = write(tmp_path / "bag", StoragePlugin.MCAP, {}, text=True)
+    with pytest.raises(
+        RecordingError, match=r"no topic of sensor_msgs/msg/JointState.*found: /log \(std_msgs/msg/String\)"
+    ):
+        read_columns(path, ALL)
+
+
+def test_stamps_have_their_unit(tmp_path: Path) -> None:
+    path = write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": swing()})
+    with pytest.raises(RecordingError, match=r"recording\.time_unit: the stamps of a bag are in seconds"):
+        read_columns(path, RecordingSpec(time_unit="ns"))
+
+
+@both
+def test_truncated_bags(storage: Any, tmp_path: Path) -> None:
+    """Cut anywhere, or a file of the bag missing."""
+    path = write(tmp_path / "bag", storage, {"/j": swing(400)})
+    file = next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
+    whole = file.read_bytes()
+    for share in (0.001, 0.1, 0.5, 0.9):
+        file.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(RecordingError, match=r"not a readable ROS 2 bag|the file is empty"):
+            read_columns(file, ALL)
+    file.unlink()
+    with pytest.raises(RecordingError, match=r"bag: not a readable ROS 2 bag .*missing"):
+        read_columns(path, ALL)
+
+
+@both
+def test_damaged_bags(storage: Any, tmp_path: Path) -> None:
+    """Overwritten bytes: never another error than ours."""
+    path = write(tmp_path / "bag", storage, {"/j": swing(100)})
+    file = next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
+    whole, rng, refused = file.read_bytes(), np.random.default_rng(5), 0
+    for _ in range(60):
+        damaged = bytearray(whole)
+        for at in rng.integers(0, len(whole), 20).tolist():
+            damaged[at] = int(rng.integers(256))
+        file.write_bytes(bytes(damaged))
+        try:
+            read_columns(file, ALL)
+        except RecordingError:
+            refused += 1
+    assert refused > 10
+
+
+def test_without_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """How to get it."""
+    path = write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": swing()})
+    real = builtins.__import__
+
+    def absent(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.startswith("rosbags"):
+            raise ModuleNotFoundError(name)
+        return real(name, *args, **kwargs)
+
+    for name in [n for n in sys.modules if n.split(".")[0] == "rosbags"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(builtins, "__import__", absent)
+    monkeypatch.setattr(importlib, "import_module", absent)
+    monkeypatch.setattr("mjfim.recordings.formats.ros2_bag.import_module", absent)
+    with pytest.raises(RecordingError, match=r"pip install 'mjfim\[ros\]'"):
+        read_columns(path, ALL)

@@ -1,0 +1,372 @@
+"""Campaigns: they end at what is wanted and at the truth, gain by the redesign, say what is wrong, go on where they stopped."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from support.numerics import MODELS, cart_setup
+
+import mjfim
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, SimulationDiverged, UnidentifiableError
+from mjfim.experiment.system import Setup
+from mjfim.identification.residual_tests import larger
+from mjfim.records.campaign import Campaign, Outcome, Played
+from mjfim.records.design import Design, Status
+from mjfim.records.recording import Recording
+from mjfim.studies.redesign import restated
+
+SCRIPTS = MODELS.parent / "scripts"
+loop = importlib.import_module("mjfim.studies.campaign")  # `mjfim.sequential` is the function
+STUDY = mjfim.Experiment.from_file(MODELS / "cart_pendulum_guess.toml").replace(  # its guesses are 25 to 40 % off
+    horizon=1.0,
+    initial={"control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.8}},
+    descent={"starts": 1, "tolerance": 1e-3, "max_iterations": 30},
+    parameters={name: {"wanted": 0.008} for name in "mlc"},
+)
+
+
+def robot(design: Design, number: int) -> Recording:
+    """The model at its true values."""
+    return mjfim.simulate(STUDY, design.trajectory, seed=number)
+
+
+def never(design: Design, number: int) -> Recording:
+    """For what must fail before anything moves."""
+    raise AssertionError("the robot was asked to move")
+
+
+def with_model(folder: Path, old: str, new: str) -> mjfim.Experiment:
+    """The study on a changed cart-pendulum."""
+    text = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
+    assert old in text
+    (folder / "robot.xml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    return STUDY.replace(model=str(folder / "robot.xml"))
+
+
+@pytest.fixture(scope="module")
+def campaign() -> Campaign:
+    """From the wrong guess to what is wanted."""
+    return mjfim.sequential(STUDY, robot)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Setup:
+    """The study at its true values."""
+    return Setup(STUDY.replace(cost={"linearize_at": "true"}))
+
+
+def test_it_ends_at_what_is_wanted_and_at_the_truth(campaign: Campaign, truth: Setup) -> None:
+    assert campaign.reached and campaign.status is Outcome.REACHED
+    assert 2 <= len(campaign.rounds) <= 5, "one round would not test a redesign"
+    last = campaign.estimate
+    assert last is not None and (last.std <= 0.008).all()
+    error = last.theta - truth.parameters.true
+    assert (np.abs(error) < 3.0 * last.std).all()
+    assert error @ np.linalg.solve(last.covariance, error) < chi2.ppf(0.999, 3)
+    assert not campaign.warnings and not campaign.short
+
+
+def test_a_round_is_what_its_parts_say(campaign: Campaign) -> None:
+    """All recordings so far count, once; the first design is at the guess, the next at the estimate; promises are kept."""
+    setup = Setup(STUDY)
+    recordings = [r for each in campaign.rounds for r in each.recordings]
+    alone = mjfim.identify(setup, recordings)
+    last = campaign.rounds[-1]
+    np.testing.assert_allclose(last.estimate.theta, alone.theta, atol=1e-4 * alone.std.min())
+    np.testing.assert_allclose(last.attained, alone.std, rtol=1e-4)
+    np.testing.assert_array_equal(campaign.rounds[0].theta, setup.parameters.guess)
+    np.testing.assert_array_equal(last.theta, campaign.rounds[-2].estimate.theta)
+    np.testing.assert_allclose(last.predicted, last.attained, rtol=0.05)
+    assert (np.abs(campaign.rounds[0].predicted / campaign.rounds[0].attained - 1.0) > 0.1).any(), "the guess was right"
+    assert len(campaign.designs) == len(campaign.estimates) == len(recordings)
+
+
+def gained(controls: Sequence[Array], truth: Setup) -> float:
+    """Smallest eigenvalue of what the controls tell at the truth, over that of as many repetitions of the first."""
+    told = [mjfim.evaluate_trajectory(truth, truth.plant.simulate(truth.theta, c)).information for c in controls]
+    return float(np.linalg.eigvalsh(np.sum(told, axis=0))[0] / np.linalg.eigvalsh(len(told) * told[0])[0])
+
+
+def test_a_redesign_tells_more_than_the_first_design_again(campaign: Campaign, truth: Setup) -> None:
+    """For about the same effort: information that is there already makes later rounds neither gentler nor wilder."""
+    assert gained([r.control for r in campaign.rounds], truth) > 1.03
+    efforts = [float((r.control**2).sum()) for r in campaign.rounds]
+    assert 0.8 * efforts[0] < min(efforts) and max(efforts) < 1.25 * efforts[0]
+
+
+def test_a_redesign_is_at_the_estimate_on_the_same_scales(tmp_path: Path) -> None:
+    """Relative scales stay those of the stated guess; guesses keep inside bounds; true values are not told."""
+    tables = {
+        "m": {"target": "body/bob:mass", "true": 1.4, "bounds": (0.5, 2.0)},
+        "c": {"target": "joint/hinge:damping"},
+    }
+    base = cart_setup(tmp_path, parameters=tables, cost={"linearize_at": "true"})
+    moved = Setup(restated(base, np.array([2.0, 0.1])))
+    np.testing.assert_array_equal(moved.parameters.scale, base.parameters.scale)
+    assert moved.theta[0] == pytest.approx(2.0 - 1e-3 * 1.5) and moved.theta[1] == 0.1
+    assert moved.experiment.parameters["m"].true is None
+    np.testing.assert_array_equal(Setup(restated(base)).theta, base.parameters.guess)
+
+
+def test_a_whole_inertia_moves_where_the_recordings_show_it(tmp_path: Path) -> None:
+    """Coordinate by coordinate, by the same names in the same order; what does not show stays where it was stated."""
+    tables = {
+        "c": {"target": "joint/hinge:damping"},
+        "bob": {"inertial": "bob", "coordinates": "barycentric"},
+        "d": {"target": "joint/slide:damping"},
+    }
+    base = cart_setup(tmp_path, parameters=tables)
+    p = base.parameters
+    theta = p.guess + 0.01 * p.step
+    estimate = mjfim.identify(
+        cart_setup(tmp_path), [mjfim.simulate(cart_setup(tmp_path), cart_setup(tmp_path).initial)]
+    )
+    shown = replace(estimate, data=np.diag(1e4 / p.step**2), std=0.01 * p.step)
+    moved = Setup(restated(base, theta, shown))
+    assert moved.parameters.names == p.names
+    np.testing.assert_allclose(moved.theta, theta)
+    np.testing.assert_allclose(moved.parameters.scale, p.scale)
+    hidden = np.array(shown.data)
+    hidden[3, 3] = 0.0
+    kept = Setup(restated(base, theta, replace(shown, data=hidden)))
+    np.testing.assert_allclose(kept.theta[1:11], p.guess[1:11])
+    np.testing.assert_allclose(kept.theta[[0, 11]], theta[[0, 11]])
+
+
+def test_robust_redesigns_sample_what_is_known_by_now(campaign: Campaign) -> None:
+    wide = STUDY.replace(robust={"samples": 6})
+    last = campaign.rounds[0].estimate
+    pool = Setup(restated(Setup(wide), last.theta, last)).pool
+    before = Setup(wide).pool
+    assert pool is not None and before is not None
+    assert (np.abs(pool.thetas - last.theta) <= 2.51 * last.std).all()
+    assert np.ptp(before.thetas, axis=0).min() > 10 * np.ptp(pool.thetas, axis=0).max()
+
+
+def test_friction_that_the_model_has_not_is_not_silent(tmp_path: Path) -> None:
+    """Formally as good as wanted, and wrong by many sigma: not reached."""
+    rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1.0"/>')
+    easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
+    found = mjfim.sequential(easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=2)
+    assert found.estimate is not None and found.estimate.misfit
+    assert found.status is Outcome.DOUBTFUL and not found.reached
+    assert any("misfit" in sentence for sentence in found.warnings)
+
+
+def test_friction_too_weak_for_chi_squared_shows_in_successive_residuals(tmp_path: Path) -> None:
+    rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" damping="0.5"/>')
+    easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
+    found = mjfim.sequential(easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=1)
+    assert found.estimate is not None and found.estimate.misfit
+    assert not larger(found.estimate.chi2, found.estimate.dof)
+    assert found.status is Outcome.DOUBTFUL
+    assert any("follow one another" in sentence for sentence in found.warnings)
+
+
+def test_a_round_that_tells_nothing_is_named(campaign: Campaign) -> None:
+    """Three rows of a recording are no progress; the rounds are used up, and it says what is missing."""
+    first = campaign.rounds[0]
+    start = replace(
+        first.recordings[0], t=first.recordings[0].t[:3], ctrl=first.control[:2], y=first.recordings[0].y[:3]
+    )
+    done = [Played(first.recordings, first.theta, first.predicted, first.control), Played((start,))]
+    found = mjfim.sequential(STUDY, never, rounds=2, done=done)
+    assert found.status is Outcome.EXHAUSTED and not found.reached
+    assert any("round 2: no progress" in sentence for sentence in found.warnings)
+    assert "wanted 0.008" in found.short and "wanted 0.008" in str(found)
+
+
+def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
+    """The bob loses a tenth of its mass between two rounds."""
+    first = campaign.rounds[0]
+    light = STUDY.replace(parameters={"m": {"true": 1.8}})
+    second = mjfim.simulate(light, campaign.designs[1].trajectory, seed=1)
+    done = [Played(first.recordings, first.theta, first.predicted, first.control), Played((second,))]
+    found = mjfim.sequential(STUDY, never, rounds=2, done=done)
+    assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
+
+
+def test_what_is_recorded_already_is_not_done_again(campaign: Campaign) -> None:
+    """The next design of a campaign that is taken up again is the one that it would have had."""
+    first = campaign.rounds[0]
+    done = [Played(first.recordings, first.theta, first.predicted, first.control)]
+    found = mjfim.sequential(STUDY, lambda design, number: None, done=done)
+    assert found.status is Outcome.WAITING and found.pending is not None
+    np.testing.assert_allclose(found.pending.trajectory.ctrl, campaign.rounds[1].control, atol=1e-6)
+    np.testing.assert_allclose(found.pending.theta, campaign.rounds[1].theta, rtol=1e-9)
+
+
+def test_interrupted_while_recording(campaign: Campaign) -> None:
+    def stop(design: Design, number: int) -> Recording:
+        if number == 2:
+            raise KeyboardInterrupt
+        return robot(design, number)
+
+    found = mjfim.sequential(STUDY, stop)
+    assert found.status is Outcome.INTERRUPTED and len(found.rounds) == 1 and found.pending is not None
+    np.testing.assert_allclose(found.rounds[0].estimate.theta, campaign.rounds[0].estimate.theta, rtol=1e-9)
+
+
+def test_nothing_is_played_that_leaves_the_limits(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
+    outside = replace(campaign.designs[0], status=Status.INFEASIBLE)
+    monkeypatch.setattr(loop, "design", lambda *args, **kwargs: outside)
+    found = mjfim.sequential(STUDY, never)
+    assert found.status is Outcome.INFEASIBLE and found.pending is outside and not found.rounds
+
+
+def test_without_a_design_at_the_estimate_the_last_place_serves(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, asked = campaign.rounds[0], []
+
+    def fails_once(base: Setup, past: object, theta: Array, *rest: object) -> Design:
+        asked.append(theta)
+        if len(asked) == 1:
+            raise SimulationDiverged("too fast")
+        return campaign.designs[1]
+
+    monkeypatch.setattr(loop, "redesigned", fails_once)
+    done = [Played(first.recordings, first.theta, first.predicted, first.control)]
+    found = mjfim.sequential(STUDY, robot, rounds=2, done=done)
+    np.testing.assert_array_equal(asked, [first.estimate.theta, first.theta])
+    assert any("no design at the estimate" in w and "too fast" in w for w in found.warnings)
+
+
+def test_each_recording_has_its_own_start() -> None:
+    """Deviations of the start are private: what one round learned about its own says nothing about the next's."""
+    loose = STUDY.replace(
+        nuisance={"initial": 0.05},
+        parameters={name: {"wanted": 1e-4} for name in "mlc"},
+        descent={"max_iterations": 10},
+    )
+    rng = np.random.default_rng(3)
+
+    def displaced(design: Design, number: int) -> Recording:
+        shift = rng.normal(0.0, 0.05, 2)
+        there = loose.replace(
+            initial={"keyframe": None, "qpos": (float(shift[0]), float(np.pi + shift[1]))}, nuisance={"initial": None}
+        )
+        return mjfim.simulate(there, design.trajectory, seed=number)
+
+    found = mjfim.sequential(loose, displaced, rounds=2)
+    last = found.rounds[-1]
+    j = last.estimate.parameters.index("initial qpos:slide")
+    assert not last.estimate.data[j].any()
+    assert found.designs[1].prior[j, j] == pytest.approx(0.05**-2)
+    error = (last.estimate.theta - Setup(loose).parameters.true)[:3]
+    assert (np.abs(error) < 3.5 * last.attained[:3]).all()
+
+
+def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: Setup) -> None:
+    limited = STUDY.replace(
+        limits={"control": {"force": (-12.0, 12.0)}, "position": {"slide": (-1.0, 1.0)}},
+        cost={"control": 0.0, "tracking": {}},
+        descent={"max_iterations": 15},
+        parameters={name: {"wanted": 1e-4} for name in "mlc"},
+    )
+    found = mjfim.sequential(limited, robot, rounds=2)
+    assert len(found.rounds) == 2 and found.status is Outcome.EXHAUSTED
+    for design in found.designs:
+        assert min(design.limits.values()) >= 0.0
+    assert gained([r.control for r in found.rounds], truth) > 1.2
+
+
+def test_faulty_requests_say_what_is_right(tmp_path: Path) -> None:
+    plain = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    with pytest.raises(ExperimentError, match=r"parameters\.m\.wanted"):
+        mjfim.sequential(plain, never)
+    with pytest.raises(ExperimentError, match="recordings alone"):
+        mjfim.sequential(STUDY.replace(earlier=("design.json",)), never)
+    with pytest.raises(ExperimentError, match="0 rounds"):
+        mjfim.sequential(STUDY, never, rounds=0)
+
+
+def test_what_no_round_can_tell_is_said_before_anything_moves() -> None:
+    """The cart's mass and what the drive adds to it: only their sum shows."""
+    tables = {"cart": {"target": "body/cart:mass"}, "rotor": {"target": "joint/slide:armature", "guess": 0.1}}
+    both = STUDY.replace(
+        parameters={name: {**table, "wanted": 0.01} for name, table in tables.items()}, descent={"max_iterations": 2}
+    )
+    with pytest.raises(UnidentifiableError, match=r"cart, rotor can be reached.*cart \+ rotor"):
+        mjfim.sequential(both, never)
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """scripts/sequential.py."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    spec = importlib.util.spec_from_file_location("sequential_script", SCRIPTS / "sequential.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    for name in ("sequential_folder", "sequential_picture"):
+        sys.modules.pop(name, None)
+
+
+def write_study(folder: Path) -> Path:
+    """The study as a file."""
+    for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
+        shutil.copy(MODELS / name, folder)
+    text = (MODELS / "cart_pendulum_guess.toml").read_text(encoding="utf-8")
+    for old, new in (
+        ("horizon = 4.0", "horizon = 1.0"),
+        ('"cart_pendulum.csv"', '{ kind = "sine", amplitude = 2.0, frequency = 0.8 }'),
+        ("starts = 4", "starts = 1"),
+        ("tolerance = 1e-7", "tolerance = 1e-3"),
+        ("max_iterations = 200", "max_iterations = 30"),
+    ):
+        assert old in text
+        text = text.replace(old, new, 1)
+    (folder / "study.toml").write_text(text, encoding="utf-8")
+    return folder / "study.toml"
+
+
+def test_round_by_round_is_the_simulated_campaign(
+    tmp_path: Path, script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Calls that know of each other by the folder alone design and estimate the same; then the misuses."""
+    study = write_study(tmp_path)
+    together, apart = tmp_path / "together", tmp_path / "apart"
+
+    def call(*words: object) -> int:
+        monkeypatch.setattr(sys, "argv", ["sequential.py", str(study), *(str(word) for word in words)])
+        return int(script.main())
+
+    wanted = ("--wanted", 0.0055)
+    assert call("-o", together, *wanted, "--seed", 5) == 0
+    first = json.loads((together / "campaign.json").read_text(encoding="utf-8"))
+    assert first["reached"] and len(first["rounds"]) >= 2
+    assert (together / "campaign.png").stat().st_size > 10_000 and (together / "identified.xml").is_file()
+    assert call("-o", apart, *wanted, "--real") == 1
+    files: list[Path] = []
+    for k in range(1, len(first["rounds"]) + 1):
+        assert f"round_{k}/design.csv" in capsys.readouterr().out.replace("\n", "")
+        if k == 1:
+            assert call("-o", apart, *wanted, "--real") == 1, "asked again, it still waits"
+        files.append(together / f"round_{k}" / "recording.csv")
+        capsys.readouterr()
+        code = call("-o", apart, *wanted, "--recordings", *files)  # what is known already does no harm
+        assert code == (0 if k == len(first["rounds"]) else 1)
+    second = json.loads((apart / "campaign.json").read_text(encoding="utf-8"))
+    assert second["reached"] and not second["simulated"] and len(second["rounds"]) == len(first["rounds"])
+    for one, other in zip(first["rounds"], second["rounds"], strict=True):
+        for key in ("theta", "std", "predicted", "designed_at"):
+            np.testing.assert_allclose(one[key], other[key], rtol=1e-6)
+    capsys.readouterr()
+    assert call("-o", together, *wanted) == 2
+    assert "--real" in capsys.readouterr().err
+    assert call("-o", tmp_path / "none", "--real") == 2
+    assert "wanted" in capsys.readouterr().err

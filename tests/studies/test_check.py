@@ -1,0 +1,208 @@
+"""`mjfim.check` against independent numbers, null directions in the user's words, and what its self-test must catch."""
+
+from __future__ import annotations
+
+import gzip
+
+import numpy as np
+import pytest
+from support.numerics import CART_PARAMETERS, MODELS, SHARED, Array, cart_setup, make_setup, relative_error
+
+import mjfim
+from mjfim.experiment.system import Setup
+from mjfim.identification.residuals import Fit
+from mjfim.information.fisher import Information
+from mjfim.output import archive
+from mjfim.plant.plant import Plant
+from mjfim.records.recording import Recording
+from mjfim.studies.check import check
+
+RECORDED = SHARED.parent / "data" / "dfki_double_pendulum"
+PRODUCT = {"gear": {"target": "actuator/force:gear[0]"}, "gain": {"target": "actuator/force:gainprm[0]"}}
+BLOCK = """
+<mujoco>
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body name="block">
+      <joint name="x" type="slide" axis="1 0 0" frictionloss="2"/>
+      <geom name="block" type="box" size="0.1 0.1 0.1" mass="1" contype="0" conaffinity="0"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="x"/></actuator>
+</mujoco>
+"""
+
+
+def test_sigmas_are_the_square_roots_of_the_inverse_information(tmp_path) -> None:
+    found = check(cart_setup(tmp_path))
+    expected = np.sqrt(np.diag(np.linalg.inv(found.information)))
+    np.testing.assert_allclose([row.std for row in found.rows], expected, rtol=1e-8)
+    np.testing.assert_allclose([row.relative for row in found.rows], expected / [1.5, 0.8, 0.4], rtol=1e-8)
+    covariance = np.linalg.inv(found.information)
+    assert relative_error(found.correlation, covariance / np.outer(expected, expected)) < 1e-8
+    assert found.self_test.passed
+
+
+def test_sigmas_are_those_of_evaluate_trajectory_also_with_priors_and_nuisance(tmp_path) -> None:
+    parameters = {**CART_PARAMETERS, "gain": {"target": "actuator/force:gainprm[0]", "nuisance": True, "prior": 0.1}}
+    setup = cart_setup(tmp_path, parameters=parameters, nuisance={"initial": 0.02, "bias": {"qpos:hinge": True}})
+    found, told = check(setup), mjfim.evaluate_trajectory(setup, setup.initial)
+    wanted = [row.std for row in found.rows if not row.nuisance]
+    np.testing.assert_allclose(wanted, told.std[:3], rtol=1e-6)
+    assert found.wanted == ("m", "l", "c")
+    assert [row.name for row in found.rows if row.nuisance][:2] == ["gain", "initial qpos:slide"]
+
+
+def test_a_product_is_told_with_its_combination(tmp_path) -> None:
+    parameters = {**CART_PARAMETERS, **PRODUCT, "gear": {"target": "actuator/force:gear[0]", "guess": 4.0}}
+    found = check(cart_setup(tmp_path, parameters=parameters))
+    assert not found.ok
+    assert len(found.never) == 1
+    group = found.never[0]
+    assert set(group.members) == {"gear", "gain"}
+    assert len(group.combinations) == 1
+    first, second = group.combinations[0].members
+    ratio = dict(zip(group.combinations[0].members, group.combinations[0].coefficients, strict=True))
+    # d(gear gain) = gain dgear + gear dgain, gear = 4 and gain = 1
+    assert ratio["gain"] / ratio["gear"] == pytest.approx(4.0, rel=1e-6)
+    assert {first, second} == {"gear", "gain"}
+    alone = {row.name: row.std for row in found.rows}
+    assert np.isinf(alone["gear"]) and np.isinf(alone["gain"])
+    assert np.isfinite([alone["m"], alone["l"], alone["c"]]).all()
+    assert any("gear" in sentence and "gain" in sentence for sentence in found.verdict)
+
+
+def test_what_another_control_would_show_is_told_apart_from_what_none_would(tmp_path) -> None:
+    rest = {"qpos": (0.0, 0.0), "qvel": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
+    found = check(cart_setup(tmp_path, initial=rest, parameters=CART_PARAMETERS))
+    assert not found.never
+    assert {name for group in found.not_here for name in group.members} == {"m", "l", "c"}
+    assert not found.ok
+    assert any("another control would show" in sentence for sentence in found.verdict)
+
+
+def test_repetitions_are_the_least_that_reach_the_wanted_sigma(tmp_path) -> None:
+    single = {row.name: row.std for row in check(cart_setup(tmp_path)).rows}
+    wanted = {"m": single["m"] / 3.001, "l": 10.0 * single["l"], "c": single["c"] / 1.5}
+    parameters = {name: {**table, "wanted": wanted[name]} for name, table in CART_PARAMETERS.items()}
+    rows = {row.name: row for row in check(cart_setup(tmp_path, parameters=parameters)).rows}
+    assert {name: row.repetitions for name, row in rows.items()} == {"m": 10, "l": 1, "c": 3}
+    assert rows["m"].seconds == pytest.approx(10 * 0.5)
+
+
+def test_a_wanted_sigma_below_what_nuisance_allows_is_never_reached(tmp_path) -> None:
+    parameters = {
+        "m": {**CART_PARAMETERS["m"], "wanted": 1e-4},
+        "gravity": {"target": "option:gravity[2]", "nuisance": True, "prior": 0.1},
+        **PRODUCT,
+    }
+    rows = {row.name: row for row in check(cart_setup(tmp_path, parameters=parameters)).rows}
+    assert rows["gear"].repetitions == 0  # only the product shows, however often
+    assert rows["m"].repetitions > 1
+
+
+def test_recordings_add_up_and_missing_values_do_not_count(tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    whole = mjfim.simulate(setup, setup.initial, seed=1)
+    thinned = np.array(whole.y)
+    thinned[::2] = np.nan
+    part = Recording(whole.t, whole.ctrl, thinned, whole.outputs, "half")
+    two = check(setup, [whole, part])
+    fit = Fit(setup, [whole, part], data_only=True)
+    J = fit.dense(fit.begin(setup.theta)).J
+    assert relative_error(two.information, J.T @ J) < 1e-6
+    alone = check(setup, [whole])
+    assert relative_error(alone.information, check(setup).information) < 1e-6
+    ratio = np.diag(two.information) / np.diag(alone.information)
+    assert (ratio > 1.3).all() and (ratio < 1.7).all()
+    assert two.source == "2 recordings"
+    assert two.horizon == pytest.approx(2 * alone.horizon)
+
+
+def test_a_given_trajectory_is_looked_at_instead(tmp_path) -> None:
+    setup = cart_setup(tmp_path)
+    other = setup.plant.simulate(setup.theta, 2.0 * setup.control)
+    found = check(setup, trajectory=other)
+    told = mjfim.evaluate_trajectory(setup, other)
+    np.testing.assert_allclose([row.std for row in found.rows], told.std, rtol=1e-6)
+
+
+def test_dry_friction_is_flagged_with_its_sample_and_cause(tmp_path) -> None:
+    parameters = {"mass": {"target": "body/block:mass"}, "friction": {"target": "joint/x:frictionloss"}}
+    sine = {"kind": "sine", "amplitude": 4.0, "frequency": 1.0}
+    setup = make_setup(BLOCK, tmp_path, parameters=parameters, control=sine, noise={"state": 0.01}, horizon=2.0)
+    found = check(setup)
+    assert not found.self_test.passed
+    rough = found.self_test.rough
+    assert rough is not None
+    assert 0 < rough.sample <= setup.samples
+    assert "dry friction of x" in rough.causes
+    assert "not smooth" in found.verdict[0]
+
+
+def test_a_wrong_sensitivity_is_caught_by_the_recursion(tmp_path, monkeypatch) -> None:
+    right = Plant.sensitivity
+
+    def wrong(plant: Plant, *arguments, **options):
+        found = right(plant, *arguments, **options)
+        return type(found)(found.psi * 1.01, found.G)
+
+    monkeypatch.setattr(Plant, "sensitivity", wrong)
+    tested = check(cart_setup(tmp_path)).self_test
+    assert tested.recursion == pytest.approx(0.01, rel=0.05)
+    assert not tested.passed
+
+
+def test_a_wrong_gradient_is_caught_by_the_slope(tmp_path, monkeypatch) -> None:
+    right = Information.gradient
+
+    def wrong(information: Information, *arguments) -> tuple[Array, Array]:
+        a, b = right(information, *arguments)
+        return 1.05 * a, 1.05 * b
+
+    monkeypatch.setattr(Information, "gradient", wrong)
+    tested = check(cart_setup(tmp_path)).self_test
+    assert 0.02 < tested.slope < 0.1
+    assert not tested.passed
+
+
+def double_pendulum_groups(found: mjfim.Check) -> dict[str, dict[str, float]]:
+    """Combinations of the one group that is expected, by their first member."""
+    assert [set(group.members) for group in found.never] == [{"m1r1", "I1", "m2"}]
+    return {c.members[0]: dict(zip(c.members, c.coefficients, strict=True)) for c in found.never[0].combinations}
+
+
+def test_the_double_pendulum_names_its_base_parameters() -> None:
+    found = check(mjfim.Experiment.from_file(MODELS / "double_pendulum.toml"))
+    combinations = double_pendulum_groups(found)
+    assert combinations["m1r1"]["m2"] == pytest.approx(0.3, rel=1e-4)  # l1
+    assert combinations["I1"]["m2"] == pytest.approx(0.09, rel=1e-4)  # l1²
+    assert all(np.isfinite(row.std) for row in found.rows if row.name in ("m2r2", "I2", "d1", "d2"))
+
+
+def test_recordings_of_the_real_double_pendulum_tell_the_same() -> None:
+    file = RECORDED / "A0_00.csv.gz"
+    if not file.is_file():
+        pytest.skip("the recordings of the double pendulum are not here")
+    with gzip.open(file, "rt", encoding="utf-8") as stream:
+        columns = dict(zip(stream.readline().strip().split(","), np.loadtxt(stream, delimiter=",").T, strict=True))
+    experiment = mjfim.Experiment.from_file(MODELS / "double_pendulum.toml")
+    setup = Setup(experiment)
+    every = round(500 / experiment.rate)
+    count = 1 + round(2.0 * experiment.rate)  # two seconds; later the motion is chaotic
+    picked = {name: column[::every][:count] for name, column in columns.items()}
+    names = ("shoulder_angle", "elbow_angle", "shoulder_velocity", "elbow_velocity")
+    y = np.column_stack([picked[n] for n in ("pos_meas1", "pos_meas2", "vel_meas1", "vel_meas2")])
+    ctrl = np.column_stack([picked["tau_meas1"], picked["tau_meas2"]])[:-1]
+    recording = Recording(np.arange(count) / experiment.rate, ctrl, y, names, file.name)
+    combinations = double_pendulum_groups(check(setup, [recording]))
+    assert combinations["m1r1"]["m2"] == pytest.approx(0.3, rel=1e-3)
+    assert combinations["I1"]["m2"] == pytest.approx(0.09, rel=1e-3)
+
+
+def test_the_summary_is_strict_json(tmp_path) -> None:
+    parameters = {**CART_PARAMETERS, **PRODUCT}
+    text = archive.as_json(archive.check_summary(check(cart_setup(tmp_path, parameters=parameters))))
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    assert '"identifiable"' in text

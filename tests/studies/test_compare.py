@@ -1,0 +1,306 @@
+"""`mjfim compare`: equal budgets, one way of judging, honest about who wins; records, files, exit codes, misuse."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cli.test_cli import loads, names, read, run, write_experiment
+from matplotlib.image import imread
+from studies.test_baselines import pendulum, played
+
+import mjfim
+from mjfim.errors import ExperimentError
+from mjfim.excitation.verification import audit
+from mjfim.experiment.system import Setup
+from mjfim.output.plots.compare import compare_figure
+from mjfim.records.comparison import DESIGN, Comparison, Outcome, Row
+from mjfim.records.design import Design, HistoryRow
+from mjfim.studies.baselines.budget import Attempt
+from mjfim.studies.compare import Glance, Judge, Meter, chosen_methods
+
+compare = importlib.import_module("mjfim.studies.compare")  # the name in the package is the function's
+LIMITS = "\n[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] }\n"
+
+
+@cache
+def small() -> Comparison:
+    """A chirp and a Fourier series against the design of the cart-pendulum."""
+    return mjfim.compare(pendulum(), 60.0, 100_000, 1, ["chirp", "fourier5"])
+
+
+def row(method: str, cost: float, outcome: Outcome = Outcome.INSIDE) -> Row:
+    """A made-up result."""
+    std = np.full(2, np.sqrt(abs(cost)))
+    return Row(method, method, outcome, np.zeros((4, 1)), cost, cost, std, 1.0 / cost, std[0], 1.0, 10, {}, {})
+
+
+def made(*rows: Row, nats: float = 0.0) -> Comparison:
+    """A made-up comparison."""
+    return Comparison(
+        "e", "D" if nats else "E", nats, ("a", "b"), ("", ""), np.ones(2), (), rows, 1.0, np.inf, 0, False
+    )
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short experiment under hard limits."""
+    path = write_experiment(tmp_path_factory.mktemp("compare"))
+    text = path.read_text(encoding="utf-8").replace("control = 1e-3", "control = 0.0").replace("slide = 0.05", "")
+    path.write_text(text + LIMITS, encoding="utf-8")
+    return path
+
+
+# ---- records
+
+
+def test_each_method_has_its_budget_and_the_design_comes_last() -> None:
+    c = small()
+    assert [r.method for r in c.rows] == ["chirp", "fourier5", DESIGN]
+    assert all(r.sound for r in c.rows)
+    for r in c.rows[:2]:
+        assert r.steps < 1.2 * 100_000
+    assert c.rows[2].steps < 2.0 * 100_000  # its survey, and looking at the result, come on top
+    assert c.steps == 100_000
+    assert not c.interrupted
+
+
+def test_rows_say_what_their_controls_do() -> None:
+    setup = Setup(pendulum())
+    for r in small().rows:
+        assert r.control is not None
+        trajectory = setup.plant.simulate(setup.theta, r.control)
+        told = mjfim.evaluate_trajectory(setup, trajectory)
+        np.testing.assert_allclose(r.std, told.std, rtol=1e-5)
+        assert r.cost == pytest.approx(told.cost, rel=1e-5)
+        assert r.criterion == pytest.approx(told.criterion, rel=1e-5)
+        scale = setup.parameters.scale
+        worst = np.linalg.eigvalsh(told.information * np.outer(scale, scale))[0] ** -0.5
+        assert r.worst == pytest.approx(worst, rel=1e-5)
+        assert r.margins == audit(setup, trajectory).margins
+        qpos, _, ctrl = played(pendulum(), r.control)
+        assert np.abs(qpos[:, 0]).max() <= 0.5
+        assert np.abs(ctrl).max() <= 5.0
+
+
+def test_a_control_that_leaks_is_shrunk_until_it_does_not() -> None:
+    setup, found = Setup(pendulum()), small().rows[0]
+    assert found.control is not None
+    leaking = setup.centre + 1.15 * (found.control - setup.centre)
+    r = Judge(setup, None).row("chirp", "chirp", Attempt(leaking, 1.0))
+    assert r.outcome is Outcome.INSIDE
+    assert "shrunk to" in r.note
+    assert min(r.margins.values()) >= 0.0
+    far = Judge(setup, None).row("chirp", "chirp", Attempt(leaking, np.inf))
+    assert far.outcome is Outcome.NOTHING
+    assert min(far.margins.values()) < 0.0
+    assert not far.sound
+    nothing = Judge(setup, None).row("chirp", "chirp", Attempt())
+    assert (nothing.outcome, nothing.control) == (Outcome.NONE, None)
+
+
+def test_the_designs_control_is_never_shrunk() -> None:
+    setup, found = Setup(pendulum()), small().rows[2]
+    assert found.control is not None
+    r = Judge(setup, None).row(DESIGN, "design", Attempt(1.05 * found.control, 1.0))
+    assert r.outcome is Outcome.OUTSIDE
+
+
+def test_who_beats_whom() -> None:
+    c = made(row("a", 2.0), row("b", 0.5), row("c", 0.4, Outcome.OUTSIDE), row("d", 0.9995), row(DESIGN, 1.0))
+    assert [r.method for r in c.beating] == ["b"]  # not what leaves the limits, nor what is no better
+    assert not c.ok
+    assert "beaten by b (J 50 % lower)" in c.verdict[0]
+    assert c.best is not None
+    assert c.best.method == "b"
+    won = made(row("a", 2.0), row(DESIGN, 1.0))
+    assert won.ok
+    assert "J 50 % lower than that of the best baseline, a" in won.verdict[0]
+    assert "as good as" in made(row("a", 1.0), row(DESIGN, 1.0)).verdict[0]
+    assert made(row("a", 1.0), row(DESIGN, 1.0)).ok
+
+
+def test_a_design_that_may_not_be_played_has_lost() -> None:
+    c = made(row("a", 2.0), row(DESIGN, 1.0, Outcome.OUTSIDE))
+    assert not c.ok
+    assert [r.method for r in c.beating] == ["a"]
+    assert "leaves a limit" in c.verdict[0]
+    assert not made(row("a", 2.0, Outcome.NOTHING), row(DESIGN, 1.0, Outcome.OUTSIDE)).ok
+    assert not made(row("a", 2.0)).ok  # no design, no win
+
+
+def test_logarithms_are_compared_by_their_difference() -> None:
+    c = made(row("a", -1.0), row(DESIGN, -3.0), nats=2.0)
+    assert c.ok
+    assert c.gain(c.rows[1], c.rows[0]) == pytest.approx(1.0 - np.exp(-1.0))
+
+
+def test_only_methods_that_make_sense() -> None:
+    hard, soft = Setup(pendulum()), Setup(pendulum(limits={}, cost={"control": 1e-3}))
+    assert "fourier5-mjfim" in chosen_methods(hard, None)
+    assert soft.enforced or "fourier5-mjfim" not in chosen_methods(soft, None)
+    assert chosen_methods(hard, ["steps", "design", "steps"]) == ("steps",)
+    with pytest.raises(ExperimentError, match="did you mean 'chirp'"):
+        chosen_methods(hard, ["chrip"])
+
+
+def test_a_design_is_stopped_at_its_steps() -> None:
+    told: list[float] = []
+    job = compare.Job(pendulum(), DESIGN, 60.0, 1000.0)
+    meter = Meter(job, lambda used, cost: told.append(used))
+
+    def iterate(steps: int) -> HistoryRow:
+        return HistoryRow(0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, steps)
+
+    meter(iterate(400))
+    meter(iterate(300))  # another task
+    meter(iterate(550))
+    with pytest.raises(KeyboardInterrupt):
+        meter(iterate(700))
+    assert meter.spent
+    np.testing.assert_allclose(told, [0.4, 0.7, 0.95, 1.1], atol=0.05)
+
+
+def test_ctrl_c_keeps_the_methods_that_are_finished() -> None:
+    def monitor(glance: Glance) -> None:
+        if glance.place == 1:
+            raise KeyboardInterrupt
+
+    c = mjfim.compare(pendulum(), 60.0, 10_000, methods=["chirp", "steps"], monitor=monitor)
+    assert [r.method for r in c.rows] == ["chirp"]
+    assert c.interrupted
+    assert not c.ok
+    assert "not reached" in c.verdict[0]
+    assert "nterrupted" in c.verdict[1]
+
+
+@pytest.mark.parametrize("budget", [{"seconds": 0.0}, {"seconds": np.inf}, {"steps": -1.0}])
+def test_budgets_must_be_positive(budget: dict[str, float]) -> None:
+    with pytest.raises(ExperimentError, match="positive"):
+        mjfim.compare(pendulum(), **budget)
+
+
+# ---- the picture
+
+
+def test_the_picture_has_a_row_per_method() -> None:
+    figure = compare_figure(small())
+    cells, bars = figure.axes[:2]
+    assert [label.get_text() for label in cells.get_yticklabels()] == [r.title for r in small().rows]
+    assert [label.get_text() for label in cells.get_xticklabels()] == ["m", "l", "c"]
+    shown = np.exp(np.asarray(cells.images[0].get_array()))
+    np.testing.assert_allclose(shown[2], 1.0)
+    np.testing.assert_allclose(shown[0], small().rows[0].std / small().rows[2].std)
+    assert [bar.get_width() for bar in bars.patches] == pytest.approx([r.worst for r in small().rows])
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        (row("a", 1.0),),
+        (row("a", 1e-4), row("b", 1.0, Outcome.OUTSIDE), row(DESIGN, 0.5)),
+        (replace(row("a", 1.0, Outcome.NONE), control=None, worst=np.nan, std=np.full(2, np.nan)),),
+        (replace(row(DESIGN, 1.0), std=np.full(2, np.inf)),),
+    ],
+)
+def test_the_picture_of_any_result_is_drawn(rows: tuple[Row, ...], tmp_path: Path) -> None:
+    compare_figure(made(*rows)).savefig(tmp_path / "x.png")
+    assert imread(tmp_path / "x.png").std() > 0.0
+
+
+# ---- the command line
+
+
+def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = (study, "-o", out, "--seconds", 60, "--steps", 60_000, "--methods", "chirp,steps", "--json")
+    result = run("compare", *words)
+    assert result.exit_code == 0, result.stderr
+    assert "1/3 chirp" in result.stderr
+    told = loads(result.stdout)
+    assert told == read(out / "compare.json")
+    assert [m["method"] for m in told["methods"]] == ["chirp", "steps", DESIGN]
+    assert told["ok"] is True
+    assert told["budget"] == {"seconds": 60.0, "steps": 60000.0}
+    assert all(len(m["std"]) == 3 and m["limits"]["margins"] for m in told["methods"])
+    controls = {f"control_{m}.csv" for m in ("chirp", "steps", DESIGN)}
+    assert names(out) == {"compare.json", "compare.png", *controls}
+    assert imread(out / "compare.png").shape[0] > 300
+    again = run("compare", study, "-o", out, "--seconds", 60, "--steps", 20_000, "--methods", "chirp")
+    assert again.exit_code == 0, again.stderr
+    assert names(out) == {"compare.json", "compare.png", "control_chirp.csv", f"control_{DESIGN}.csv"}
+    for word in (
+        "chirp",
+        "mjfim's design",
+        "worst σ",
+        "σ of each parameter",
+        "m (kg)",
+        "million MuJoCo steps",
+        "The design is the best",
+    ):
+        assert word in " ".join(again.stdout.split())
+    assert "…" not in again.stdout  # every number whole
+    # a control of it is the initial control of another experiment
+    text = study.read_text(encoding="utf-8").replace('"cart_pendulum.csv"', f'"{out / "control_chirp.csv"}"')
+    (study.parent / "next.toml").write_text(text, encoding="utf-8")
+    setup = Setup(mjfim.Experiment.from_file(study.parent / "next.toml"))
+    reached = next(m for m in read(out / "compare.json")["methods"] if m["method"] == "chirp")
+    assert setup.problem.point(setup.initial).cost == pytest.approx(reached["cost"], rel=1e-6)
+
+
+def worse(design: Callable[..., Design]) -> Callable[..., Design]:
+    """A design that keeps where it started."""
+
+    def rigged(setup: Setup, *args: Any, **kwargs: Any) -> Design:
+        found = design(setup, *args, **kwargs)
+        gentle = setup.plant.simulate(setup.theta, 0.05 * setup.control)
+        return replace(found, final=mjfim.evaluate_trajectory(setup, gentle))
+
+    return rigged
+
+
+def test_a_design_that_is_worse_is_said_to_be_beaten(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compare, "design", worse(compare.design))
+    result = run("compare", study, "-o", tmp_path, "--seconds", 60, "--steps", 20_000, "--methods", "chirp")
+    assert result.exit_code == 1
+    assert "beaten by chirp" in " ".join(result.stdout.split())
+    assert "beaten by chirp" in result.stderr
+    told = read(tmp_path / "compare.json")
+    assert (told["ok"], told["best"], told["beating"]) == (False, "chirp", ["chirp"])
+
+
+def test_an_interrupted_comparison_is_written(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*args: Any, **kwargs: Any) -> Design:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(compare, "design", interrupted)
+    result = run("compare", study, "-o", tmp_path, "--steps", 10_000, "--methods", "chirp")
+    assert result.exit_code == 1
+    assert read(tmp_path / "compare.json")["interrupted"] is True
+    monkeypatch.setattr(compare, "perform", interrupted)
+    nothing = run("compare", study, "-o", tmp_path / "none", "--steps", 10_000)
+    assert nothing.exit_code == 1
+    assert "interrupted before there was a result" in nothing.stderr
+
+
+def test_misuse(study: Path, tmp_path: Path) -> None:
+    for words, said in (
+        ((tmp_path / "no.toml", "-o", tmp_path / "o"), "no.toml"),
+        ((study, "-o", tmp_path / "o", "--methods", "chirp,sweep"), "unknown method 'sweep'"),
+        ((study, "-o", tmp_path / "o", "--seconds", 0), "positive"),
+        ((study, "-o", study), study.name),
+        ((study,), "--output"),
+    ):
+        result = run("compare", *words)
+        assert result.exit_code == 2, words
+        assert said in result.stderr
+        assert "Traceback" not in result.stderr
+    assert not (tmp_path / "o").exists()

@@ -1,0 +1,507 @@
+"""design.csv and reference.csv as a controller plays them, and the script that plays them on robots that are not the model."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.stats import binom
+from support.numerics import Array, body_setup, cart_setup, filtered_setup
+
+import mjfim
+from mjfim.errors import ExperimentError, RecordingError
+from mjfim.excitation.initial_controls import previous
+from mjfim.experiment.system import Setup
+from mjfim.model.coordinates import tangent_names
+from mjfim.optimize.lq import regulator
+from mjfim.output import archive
+from mjfim.output.playback import design_columns, playback_of, reference_columns
+from mjfim.recordings.design_table import read_playback
+from mjfim.records.playback import Playback
+
+ROOT = Path(__file__).parents[2]
+FILTERED_FINE = {"rate": 50.0, "playback_rate": 100.0}  # of an engine at 200 Hz
+COARSE = {"rate": 25.0, "horizon": 0.8}  # of engines at 100 Hz
+BUILD: dict[str, Any] = {
+    "cart": lambda folder, **tables: cart_setup(folder, **{**COARSE, **tables}),
+    "body": lambda folder, **tables: body_setup(folder, **{**COARSE, **tables}),
+    "filtered": lambda folder, **tables: filtered_setup(folder, **{"rate": 50.0, **tables}),
+}
+FINE = {"cart": 100.0, "body": 50.0, "filtered": 100.0}
+
+
+def gains(setup: Setup) -> Array:
+    """(N, nu, nx) of a regulator about the initial trajectory."""
+    A, B, _, _ = setup.plant.jacobians(setup.theta, setup.initial)
+    return regulator(A, B, np.eye(setup.space.nx), np.eye(B.shape[2]), np.eye(setup.space.nx))
+
+
+def table(path: Path) -> dict[str, Array]:
+    """Columns of a CSV by Python's own reader; empty fields are NaN."""
+    with path.open(newline="", encoding="utf-8") as stream:
+        header, *rows = csv.reader(stream)
+    values = np.array([[float(field or "nan") for field in row] for row in rows])
+    return dict(zip(header, values.T, strict=True))
+
+
+def written(setup: Setup, folder: Path) -> tuple[Path, Playback]:
+    """design.csv of the initial trajectory, with gains."""
+    played = playback_of(setup, setup.initial, gains(setup))
+    archive.write_table(folder / "design.csv", design_columns(played, setup))
+    return folder / "design.csv", played
+
+
+def starting(rows: dict[str, Array], prefix: str) -> Array:
+    """All columns of a kind, side by side."""
+    return np.column_stack([values for name, values in rows.items() if name.startswith(prefix)])
+
+
+@pytest.mark.parametrize("kind", BUILD)
+def test_the_table_alone_replays_exactly(kind: str, tmp_path: Path) -> None:
+    """A bare mj_step loop on the model file, fed from the CSV, walks through its positions, velocities and activations."""
+    setup = BUILD[kind](tmp_path, playback_rate=FINE[kind])
+    path, _ = written(setup, tmp_path)
+    rows = table(path)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    data = mujoco.MjData(model)
+    steps = round(1.0 / FINE[kind] / model.opt.timestep)
+    qpos, qvel, ctrl = (starting(rows, prefix) for prefix in ("qpos:", "qvel:", "ctrl:"))
+    data.qpos[:], data.qvel[:] = qpos[0], qvel[0]
+    if model.na:
+        data.act[:] = starting(rows, "act:")[0]
+    assert len(qpos) == round(setup.experiment.horizon * FINE[kind]) + 1
+    for k in range(len(ctrl) - 1):
+        np.testing.assert_allclose(data.qpos, qpos[k], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(data.qvel, qvel[k], rtol=0, atol=1e-9)
+        data.ctrl[:] = ctrl[k]
+        mujoco.mj_step(model, data, steps)
+    np.testing.assert_allclose(data.qpos, qpos[-1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(rows["t"], np.arange(len(qpos)) / FINE[kind], rtol=0, atol=1e-12)
+    assert np.isnan(ctrl[-1]).all() and np.isnan(starting(rows, "gain:")[-1]).all()
+
+
+@pytest.mark.parametrize("kind", BUILD)
+def test_rows_at_samples_are_the_design(kind: str, tmp_path: Path) -> None:
+    """However fast the controller, every sample of the design stands there to the last bit."""
+    setup = BUILD[kind](tmp_path, playback_rate=FINE[kind])
+    stride = round(FINE[kind] / setup.experiment.rate)
+    played = playback_of(setup, setup.initial, gains(setup))
+    assert stride > 1
+    np.testing.assert_array_equal(played.state[::stride], setup.initial.state)
+    for first in range(stride):
+        np.testing.assert_array_equal(played.ctrl[first::stride], setup.initial.ctrl)
+        np.testing.assert_array_equal(played.gain[first::stride], gains(setup))
+
+
+def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Array]:
+    """States and controls of a loop that knows only the CSV and the model file, and the planned ones. push: (nx,) of the start"""
+    rows = table(path)
+    model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
+    data, nv, na = mujoco.MjData(model), model.nv, model.na
+    qpos, qvel, ctrl = (starting(rows, prefix) for prefix in ("qpos:", "qvel:", "ctrl:"))
+    act = starting(rows, "act:") if na else np.zeros((len(qpos), 0))
+    controls = [name.removeprefix("ctrl:") for name in rows if name.startswith("ctrl:")]
+    K = np.stack([starting(rows, f"gain:{name}:") for name in controls], axis=1)
+    steps = round(float(rows["t"][1]) / model.opt.timestep)
+    data.qpos[:], data.qvel[:], data.act[:] = qpos[0], qvel[0] + push[nv : 2 * nv], act[0] + push[2 * nv :]
+    mujoco.mj_integratePos(model, data.qpos, push[:nv], 1.0)
+    states, used = [], []
+    for k in range(len(qpos)):
+        states.append(np.concatenate([data.qpos, data.qvel, data.act]))
+        if k < len(qpos) - 1:
+            error = np.zeros(nv)
+            mujoco.mj_differentiatePos(model, error, 1.0, data.qpos, qpos[k])
+            data.ctrl[:] = ctrl[k] + K[k] @ np.concatenate([error, qvel[k] - data.qvel, act[k] - data.act])
+            used.append(np.array(data.ctrl))
+            mujoco.mj_step(model, data, steps)
+    return np.array(states), np.array(used), np.concatenate([qpos, qvel, act], axis=1)
+
+
+@pytest.mark.parametrize("kind", BUILD)
+def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: Path) -> None:
+    """On the plan it changes nothing; pushed off it, it is the engine's own loop with the arrays of design.npz."""
+    setup = BUILD[kind](tmp_path)
+    path, played = written(setup, tmp_path)
+    nx = setup.space.nx
+    states, used, plan = closed_loop(path, tmp_path, np.zeros(nx))
+    np.testing.assert_allclose(states, plan, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(used, setup.initial.ctrl, rtol=0, atol=1e-9)
+    push = 0.02 * np.random.default_rng(1).standard_normal(nx)
+    states, used, _ = closed_loop(path, tmp_path, push)
+    model = setup.plant.model(setup.theta)
+    reference = np.array(setup.initial.state)
+    expected = engine_loop(setup, model, setup.space.plus(reference[0], push), reference, played.gain)
+    np.testing.assert_allclose(states, expected, rtol=0, atol=1e-9)
+    assert np.abs(used - setup.initial.ctrl).max() > 1e-3
+
+
+def engine_loop(setup: Setup, model: Any, start: Array, reference: Array, K: Array) -> Array:
+    """The same loop by single steps of the batch engine, deviations by `StateSpace.minus`."""
+    states = [start]
+    for k in range(len(K)):
+        u = setup.initial.ctrl[k] + K[k] @ setup.space.minus(reference[k], states[-1])
+        states.append(setup.plant.engine.step([model], states[-1][None], u[None]).states[0])
+    return np.array(states)
+
+
+def test_gains_of_the_samples_serve_a_faster_controller(tmp_path: Path) -> None:
+    """A cart that is put elsewhere comes back to the plan; open loop it stays away."""
+    setup = BUILD["cart"](tmp_path, playback_rate=100.0, horizon=4.0)
+    path, _ = written(setup, tmp_path)
+    push = np.array([0.3, 0.0, 0.0, 0.0])
+    states, _, plan = closed_loop(path, tmp_path, push)
+    model, start = setup.plant.model(setup.theta), setup.space.plus(setup.initial.state[:1], push)
+    alone = setup.plant.engine.rollout([model], start, setup.initial.ctrl[None]).states[0]
+    assert abs(alone[-1, 0] - plan[-1, 0]) == pytest.approx(0.3, rel=1e-6)
+    assert abs(states[-1, 0] - plan[-1, 0]) < 0.1
+
+
+def test_gain_columns_name_what_they_act_on(tmp_path: Path) -> None:
+    """Free and ball joints by tangent components, rotations as vectors; activations too."""
+    body = BUILD["body"](tmp_path)
+    parts = ["x", "y", "z", "rx", "ry", "rz"]
+    wanted = [f"float.{p}" for p in parts] + [f"ball.{p}" for p in parts[3:]]
+    assert list(tangent_names(body.model)) == [f"{kind}:{name}" for kind in ("qpos", "qvel") for name in wanted]
+    rows = table(written(body, tmp_path)[0])
+    names = [name for name in rows if name.startswith("gain:")]
+    assert names[0] == "gain:push:qpos:float.x"
+    assert names[-1] == "gain:twist:qvel:ball.rz"
+    filtered = BUILD["filtered"](tmp_path)
+    header = list(table(written(filtered, tmp_path)[0]))
+    state = ["qpos:hinge", "qvel:hinge", "act:servo"]
+    assert header == ["t", *state, "ctrl:servo", *(f"gain:servo:{name}" for name in state)]
+
+
+@pytest.mark.parametrize("kind", BUILD)
+def test_reference_is_what_mujoco_says(kind: str, tmp_path: Path) -> None:
+    """Accelerations and joint forces are those of mj_forward at each row, not differences; no field is empty."""
+    setup = BUILD[kind](tmp_path, playback_rate=FINE[kind])
+    played = playback_of(setup, setup.initial, gains(setup))
+    archive.write_table(tmp_path / "reference.csv", reference_columns(played, setup))
+    rows = table(tmp_path / "reference.csv")
+    assert all(np.isfinite(values).all() for values in rows.values())
+    kinds = [name.partition(":")[0] for name in rows]
+    assert list(dict.fromkeys(kinds)) == ["t", "qpos", "qvel", "qacc", "force"]
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    data = mujoco.MjData(model)
+    qacc, force = starting(rows, "qacc:"), starting(rows, "force:")
+    for k in (0, 3, len(qacc) - 1):
+        data.qpos[:], data.qvel[:], data.act[:] = setup.space.split(played.state[k])
+        data.ctrl[:] = played.ctrl[min(k, len(played.ctrl) - 1)]
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(qacc[k], data.qacc, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(force[k], data.qfrc_actuator, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(starting(rows, "qpos:"), played.state[:, : setup.space.nq])
+
+
+def test_a_design_leaves_both_tables(tmp_path: Path) -> None:
+    """At the controller's rate; design.csv is a control to start from and an earlier design, gains and all."""
+    setup = BUILD["filtered"](tmp_path, **FILTERED_FINE, descent={"max_iterations": 1}, cost={"control": 0.1})
+    design = mjfim.design(setup)
+    archive.write_design(tmp_path / "out", design, setup)
+    rows, motion = table(tmp_path / "out" / "design.csv"), table(tmp_path / "out" / "reference.csv")
+    assert len(rows["t"]) == len(motion["t"]) == 2 * setup.samples + 1
+    np.testing.assert_array_equal(rows["qpos:hinge"], motion["qpos:hinge"])
+    np.testing.assert_array_equal(rows["qpos:hinge"][::2], design.trajectory.qpos[:, 0])
+    np.testing.assert_array_equal(starting(rows, "gain:")[:-1:2], design.final.gain.reshape(setup.samples, -1))
+    again = Setup(setup.experiment.replace(initial={"control": str(tmp_path / "out" / "design.csv")}))
+    np.testing.assert_array_equal(again.control, design.trajectory.ctrl)
+    np.testing.assert_array_equal(previous(setup, str(tmp_path / "out" / "design.csv")), design.trajectory.ctrl)
+
+
+@pytest.mark.parametrize("rate", [37.0, 75.0, 12.5, 400.0, 150.0])
+def test_playback_rate_must_fit(rate: float, tmp_path: Path) -> None:
+    """A multiple of rate that divides the engine's; the message lists all of them."""
+    with pytest.raises(
+        ExperimentError, match=r"playback_rate: .* multiple of rate \(50 Hz\).*200 Hz.*valid: 50, 100, 200"
+    ):
+        filtered_setup(tmp_path, rate=50.0, playback_rate=rate)
+
+
+@pytest.mark.parametrize("rate", [0.0, -50.0, "fast", float("nan")])
+def test_playback_rate_is_a_rate(rate: Any, tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError, match="playback_rate"):
+        filtered_setup(tmp_path, rate=50.0, playback_rate=rate)
+
+
+def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
+    """All digits of states, controls and gains, whatever the rate."""
+    setup = BUILD["body"](tmp_path, playback_rate=50.0)
+    path, played = written(setup, tmp_path)
+    found = read_playback(path, BUILD["body"](tmp_path))
+    for name in ("t", "state", "ctrl", "gain"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(played, name))
+    assert found.period == pytest.approx(0.02, rel=1e-12)
+
+
+def change(path: Path, **fields: Any) -> None:
+    """Replace columns of a CSV; None takes one away."""
+    rows = table(path)
+    for name, values in fields.items():
+        rows.pop(name)
+        if values is not None:
+            rows[name] = values
+    archive.write_table(path, rows)
+
+
+@pytest.mark.parametrize(
+    ("column", "wrong", "words"),
+    [
+        ("gain:servo:qvel:hinge", None, "column 'gain:servo:qvel:hinge' is missing"),
+        ("act:servo", None, "column 'act:servo' is missing"),
+        ("ctrl:servo", lambda v: np.full_like(v, np.nan), "column 'ctrl:servo' has no number in data row 1"),
+        (
+            "qpos:hinge",
+            lambda v: np.where(np.arange(len(v)) == 2, np.nan, v),
+            "'qpos:hinge' has no number in data row 3",
+        ),
+        ("t", lambda v: v * 1.01, "column 't' does not go from 0 in equal periods of whole timesteps"),
+        ("t", lambda v: v + 0.02, "column 't' does not go from 0"),
+    ],
+)
+def test_a_damaged_table_is_refused(column: str, wrong: Any, words: str, tmp_path: Path) -> None:
+    setup = BUILD["filtered"](tmp_path)
+    path, _ = written(setup, tmp_path)
+    change(path, **{column: None if wrong is None else wrong(table(path)[column])})
+    with pytest.raises(RecordingError, match=words):
+        read_playback(path, setup)
+
+
+@pytest.fixture(scope="module")
+def robots() -> Iterator[ModuleType]:
+    """scripts/playback_robots.py"""
+    sys.path.insert(0, str(ROOT / "scripts"))
+    yield import_module("playback_robots")
+    sys.path.remove(str(ROOT / "scripts"))
+
+
+@pytest.fixture(scope="module")
+def verdict(robots: ModuleType) -> ModuleType:
+    """scripts/playback_verdict.py"""
+    return import_module("playback_verdict")
+
+
+CART = """
+<mujoco model="cart_pendulum">
+  <option timestep="0.005"><flag contact="disable"/></option>
+  <default><geom mass="0" contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="cart">
+      <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+      <joint name="slide" type="slide" axis="1 0 0" damping="0.5" stiffness="4"/>
+      <body name="bob">
+        <joint name="hinge" type="hinge" axis="0 -1 0" damping="0.1" stiffness="1" springref="0.5"/>
+        <inertial pos="0 0 -0.5" mass="0.8" diaginertia="0.02 0.02 0.02"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="force" joint="slide" ctrlrange="-10 10"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def cart(tmp_path_factory: pytest.TempPathFactory) -> tuple[mjfim.Experiment, Path]:
+    """A cart on a spring with a bob that rests where its mass says, and the table of its initial control."""
+    home = tmp_path_factory.mktemp("cart")
+    (home / "cart.xml").write_text(CART, encoding="utf-8")
+    model = mujoco.MjModel.from_xml_string(CART)
+    data = mujoco.MjData(model)
+    for _ in range(20000):
+        mujoco.mj_step(model, data)
+    text = f"""
+model = "cart.xml"
+rate = 50.0
+playback_rate = 100.0
+horizon = 2.0
+initial = {{ qpos = {data.qpos.tolist()}, control = {{ kind = "chirp", amplitude = 5.0, frequency = 0.7, frequency_end = 3.0 }} }}
+parameters.mass = {{ target = "body/bob:mass" }}
+parameters.damping = {{ target = "joint/hinge:damping" }}
+parameters.spring = {{ target = "joint/slide:stiffness" }}
+noise.state = 0.004
+limits.velocity = {{ slide = 4.0, hinge = 9.0 }}
+"""
+    (home / "cart.toml").write_text(text, encoding="utf-8")
+    experiment = mjfim.Experiment.from_file(home / "cart.toml")
+    setup = Setup(experiment, threads=1)
+    return experiment, written(setup, home)[0]
+
+
+def bench_of(robots: ModuleType, cart: tuple[mjfim.Experiment, Path], **conditions: Any) -> Any:
+    return robots.Bench(*cart, robots.Conditions(**{"latency": 0.015, **conditions}))
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+def test_a_robot_is_what_a_bare_loop_says(
+    robots: ModuleType, cart: tuple[mjfim.Experiment, Path], feedback: bool
+) -> None:
+    """Wrong parameters written by hand, commands three steps late, limits at every engine step, noisy feedback."""
+    bench = bench_of(robots, cart, feedback=feedback)
+    rng = np.random.default_rng(3)
+    noise = bench.setup.noise.sample(len(bench.plan.t), rng)
+    stands = ("initial qpos:slide", "initial qpos:hinge") if feedback else ("initial qpos:hinge",)
+    assert bench.setup.parameters.names == ("mass", "damping", "spring", *stands, "delay")
+    theta = np.array([0.8 * 1.2, 0.1 * 0.8, 4.0 * 1.2, *np.zeros(len(stands)), 0.015])
+    recording, margins, start = bench.play(theta, noise, feedback)
+    model = mujoco.MjModel.from_xml_string(CART)
+    model.body_mass[model.body("bob").id] = theta[0]
+    model.dof_damping[1], model.jnt_stiffness[0] = theta[1], theta[2]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = start[:2], start[2:]
+    mujoco.mj_forward(model, data)
+    if not feedback:
+        np.testing.assert_allclose(data.qacc, 0.0, atol=1e-7)  # it stands still
+    rows = table(cart[1])
+    plan, K = starting(rows, "qpos:"), starting(rows, "gain:")
+    plan = np.concatenate([plan, starting(rows, "qvel:")], axis=1)
+    before = K[0] @ (plan[0] - start) if feedback else 0.0
+    sent, fastest = [], np.zeros(2)
+    for step in range(400 + 3):
+        if step % 2 == 0 and step < 400:
+            seen = np.concatenate([data.qpos, data.qvel]) + noise[step // 2]
+            if (step // 2) % 2 == 0 and step:
+                np.testing.assert_allclose(recording.y[step], seen, rtol=0, atol=1e-9)
+            sent.append(rows["ctrl:force"][step // 2] + (K[step // 2] @ (plan[step // 2] - seen) if feedback else 0.0))
+        data.ctrl[0] = before if step < 3 else sent[(step - 3) // 2]
+        mujoco.mj_step(model, data)
+        fastest = np.maximum(fastest, np.abs(data.qvel))
+    np.testing.assert_allclose(recording.ctrl[::2, 0], sent, rtol=0, atol=1e-9)
+    assert np.isnan(recording.y[1::2]).all() and np.isnan(recording.y[2::4]).all()
+    by_name = {(limit.kind, limit.name): margin for limit, margin in zip(bench.limits, margins, strict=True)}
+    assert by_name["velocity", "slide"] == pytest.approx(1.0 - fastest[0] / 4.0, abs=1e-9)
+    assert by_name["velocity", "hinge"] == pytest.approx(1.0 - fastest[1] / 9.0, abs=1e-9)
+    assert by_name["control", "force"] == pytest.approx(1.0 - np.abs(sent).max() / 10.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+@pytest.mark.parametrize("latency", [0.0, 0.005, 0.02])
+def test_without_noise_the_truth_is_found(
+    robots: ModuleType, cart: tuple[mjfim.Experiment, Path], feedback: bool, latency: float
+) -> None:
+    """A late control is a late measurement, exactly; with feedback as well."""
+    bench = bench_of(robots, cart, feedback=feedback, latency=latency, loudness=0.0)
+    for number in range(3):
+        run = bench.run(number)
+        off = run.theta[:3] / bench.setup.parameters.guess[:3]
+        np.testing.assert_allclose(np.abs(off - 1.0), 0.2, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(run.estimate, run.theta, rtol=0, atol=float((1e-4 * run.std).max()))
+
+
+RUNS, FEW = 30, 12
+
+
+def judged(
+    robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path], runs: int = RUNS, **conditions: Any
+) -> Any:
+    bench = bench_of(robots, cart, **conditions)
+    return verdict.judge(bench, [bench.run(number) for number in range(runs)])
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+def test_intervals_hold_the_truth(
+    robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path], feedback: bool
+) -> None:
+    """As often as 95 % intervals should, alone and jointly; errors are as large as was predicted."""
+    found = judged(robots, verdict, cart, feedback=feedback)
+    least = binom.ppf(1e-3, RUNS, 0.95)
+    assert found.inside.min() >= least
+    assert min(found.joint) >= least
+    assert found.misfits == 0 and not found.troubles
+    ratio = found.observed / found.formal
+    assert (ratio > 0.6).all() and (ratio < 1.45).all()
+    np.testing.assert_allclose(found.formal[:3], found.predicted[:3], rtol=0.35)
+    assert found.fit == pytest.approx(1.0, abs=0.03)
+
+
+@pytest.mark.parametrize("fault", ["noise", "delay"])
+def test_the_check_can_fail(
+    robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path], fault: str
+) -> None:
+    """Noise three times as loud as stated, or a latency that is believed to be known: intervals no longer hold the truth."""
+    experiment, path = cart
+    if fault == "delay":
+        found = judged(robots, verdict, (experiment.replace(nuisance={"delay": 1e-5}), path), FEW)
+    else:
+        found = judged(robots, verdict, cart, FEW, loudness=3.0)
+    assert not found.covered and not found.ok
+    assert found.inside.min() < binom.ppf(1e-3, FEW, 0.95)
+    assert found.misfits > 0.9 * FEW
+
+
+def test_limits_that_the_plan_uses_up_are_missed(
+    robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path]
+) -> None:
+    """The script says by how much, and what reserve would have held."""
+    experiment, path = cart
+    plenty = bench_of(robots, cart)
+    planned = dict(zip([(i.kind, i.name) for i in plenty.limits], plenty.planned(), strict=True))
+    fastest = 9.0 * (1.0 - planned["velocity", "hinge"])
+    tight = (experiment.replace(limits={"velocity": {"slide": 4.0, "hinge": 1.0001 * fastest}}), path)
+    found = judged(robots, verdict, tight)
+    assert found.inside.min() >= binom.ppf(1e-3, RUNS, 0.95) and not found.ok
+    assert 0 < found.all_kept < RUNS
+    words = " ".join(verdict.conclusions(found))
+    assert "velocity of hinge is exceeded by up to" in words
+    share = found.reserve()["velocity"]
+    roomy = (experiment.replace(limits={"velocity": {"slide": 4.0, "hinge": fastest / (1.0 - share)}}), path)
+    assert judged(robots, verdict, roomy).all_kept == RUNS
+
+
+def test_a_start_on_the_move_takes_no_latency(robots: ModuleType, tmp_path: Path) -> None:
+    """What was before the start would matter; without a latency it can be played."""
+    setup = BUILD["cart"](tmp_path, playback_rate=50.0)
+    path, _ = written(setup, tmp_path)
+    with pytest.raises(ExperimentError, match=r"no control holds the start.*--latency 0"):
+        robots.Bench(setup.experiment, path, robots.Conditions(latency=0.01))
+    bench = robots.Bench(setup.experiment, path, robots.Conditions(latency=0.0, loudness=0.0))
+    run = bench.run(0)
+    np.testing.assert_allclose(run.estimate, run.theta, rtol=0, atol=float((1e-3 * run.std).max()))
+    with pytest.raises(ExperimentError, match="whole number of timesteps"):
+        robots.Bench(setup.experiment, path, robots.Conditions(latency=0.005))
+
+
+def script(*words: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "scripts" / "playback.py"), *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+
+
+def test_the_script_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: Path) -> None:
+    """Tables, sentences, JSON, a picture; in processes of its own."""
+    experiment, path = cart
+    done = script(experiment.source, path.parent, "--runs", 6, "--jobs", 2, "-o", tmp_path / "out")
+    found = json.loads((tmp_path / "out" / "playback.json").read_text(encoding="utf-8"))
+    assert done.returncode == (0 if found["ok"] else 1), done.stderr
+    assert (tmp_path / "out" / "playback.png").read_bytes()[:4] == b"\x89PNG"
+    assert found["runs"] == 6 and len(found["parameters"]) == 5
+    assert found["conditions"]["latency"] == 0.005
+    assert {row["kind"] for row in found["limits"]} == {"velocity", "control"}
+    assert "Does information arrive? 6 robots" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--latency", 0.0031], "whole number of timesteps"),
+        (["--reserve", "speed=0.1"], "unknown kind of limit 'speed'"),
+    ],
+)
+def test_misuse_is_one_sentence(
+    words: list[object], said: str, cart: tuple[mjfim.Experiment, Path], tmp_path: Path
+) -> None:
+    experiment, path = cart
+    folder = [path.parent] if "--latency" in words else []
+    done = script(experiment.source, *folder, *words, "-o", tmp_path)
+    assert done.returncode == 2
+    assert said in done.stdout.replace("\n", " ")
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,152 @@
+"""Searches side by side: stopped in the middle they return what they have, and one that breaks does not end the others."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli.test_cli import names, read, write_experiment
+from excitation.test_constrained import HARD, cart_inside
+
+import mjfim
+from mjfim import parallel as workers
+from mjfim.excitation import constrained as enclosed
+from mjfim.excitation.interior_point import Ladder, Rung
+from mjfim.records.design import HistoryRow, Status
+
+
+def identity() -> int:
+    return os.getpid()
+
+
+def until_told(longest: float) -> tuple[bool, int]:
+    """Wait for the pool's word."""
+    end = time.monotonic() + longest
+    while time.monotonic() < end and not workers.stopped():
+        time.sleep(0.02)
+    return workers.stopped(), os.getpid()
+
+
+def test_a_pool_s_processes_are_others_and_end_when_told() -> None:
+    with mjfim.Pool(2) as pool:
+        assert pool.submit(identity).result() != os.getpid()
+        running = pool.submit(until_told, 60.0)
+        pool.stop()
+        told, _ = running.result(timeout=30.0)
+        assert told
+    assert not workers.stopped()
+
+
+def test_a_pool_that_was_stopped_serves_again_once_nothing_runs() -> None:
+    with mjfim.Pool(1) as pool:
+        waiting = [pool.submit(until_told, 60.0) for _ in range(3)]
+        time.sleep(0.5)
+        first = workers.salvaged(pool, waiting)[0]
+        assert first[0]
+        assert pool.submit(until_told, 0.1).result(timeout=30.0) == (False, first[1])
+
+
+def test_what_has_ended_is_salvaged_in_order_and_the_rest_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[Future[int]] = [Future() for _ in range(4)]
+    for i, future in enumerate(done[:3]):
+        future.set_running_or_notify_cancel()
+        if i == 1:
+            future.set_exception(ValueError())
+        else:
+            future.set_result(i)
+    done[3].set_running_or_notify_cancel()  # and never ends
+    monkeypatch.setattr(workers, "GRACE", 0.2)
+    with ThreadPoolExecutor(1) as executor:
+        assert workers.salvaged(executor, [done[2], done[3], done[1], done[0]]) == [2, 0]
+    assert workers.workers_of(None) == 1
+    assert workers.workers_of(ThreadPoolExecutor(3)) == 3
+
+
+def test_interrupted_among_workers_a_design_keeps_what_they_found(tmp_path: Path) -> None:
+    """SIGINT while two of hundreds of starts are under way."""
+    setup = cart_inside(tmp_path, horizon=2.0, descent={"starts": 400, "max_iterations": 100_000})
+    with mjfim.Pool(2) as pool:
+        assert pool.submit(identity).result()
+        timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        try:
+            design = mjfim.design(setup, executor=pool)
+        finally:
+            timer.cancel()
+    assert design.status is Status.INTERRUPTED
+    assert design.starts
+    assert design.final.cost < design.initial.cost
+
+
+def test_interrupted_by_what_watches_it_keeps_the_others_too(tmp_path: Path) -> None:
+    setup = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 30})
+
+    def stop(row: HistoryRow) -> None:
+        raise KeyboardInterrupt
+
+    with mjfim.Pool(2) as pool:
+        design = mjfim.design(setup, stop, executor=pool)
+    assert design.status is Status.INTERRUPTED
+    assert len(design.starts) >= 2
+    assert design.final.cost < design.initial.cost
+
+
+def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(tmp_path: Path) -> None:
+    """A terminal sends SIGINT to the whole process group."""
+    hard = "[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] }\ncontrol_rate = 100.0"
+    path = write_experiment(tmp_path, tolerance="1e-12", max_iterations=f"100000\nstarts = 2000\n{hard}")
+    words = [sys.executable, "-W", "error", "-m", "mjfim", "design", path, "-o", tmp_path / "out"]
+    with subprocess.Popen(
+        words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as p:
+        try:
+            time.sleep(15.0)
+            os.killpg(p.pid, signal.SIGINT)
+            _, told = p.communicate(timeout=60)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(p.pid, signal.SIGKILL)
+    assert p.returncode == 1, told
+    assert "Traceback" not in told
+    data = read(tmp_path / "out" / "design.json")
+    assert data["status"] == "interrupted"
+    assert data["final"]["cost"] < data["initial"]["cost"]
+    assert "out" in names(tmp_path)
+
+
+def test_a_start_that_breaks_does_not_end_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    climb = Ladder.climb
+
+    def broken(self: Ladder, control: np.ndarray, *rest: float) -> Iterator[Rung]:
+        if np.abs(control - setup.control).max() > 1e-9:
+            raise np.linalg.LinAlgError("singular")
+        yield from climb(self, control, *rest)
+
+    setup = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 20, "coarse": 1})
+    monkeypatch.setattr(enclosed.Ladder, "climb", broken)
+    design = mjfim.design(setup)
+    assert [start.status is Status.INFEASIBLE for start in design.starts] == [False, True, True]
+    assert design.final.cost < design.initial.cost
+
+
+@pytest.mark.parametrize("limits", [{}, HARD], ids=["weights", "limits"])
+def test_seconds_end_a_design(tmp_path: Path, limits: dict[str, object]) -> None:
+    descent = {"seconds": 1.5, "starts": 500, "max_iterations": 100_000, "tolerance": 1e-14}
+    cost = {"control": 0.0 if limits else 1e-3}
+    setup = cart_inside(tmp_path, limits=limits, cost=cost, descent=descent)
+    clock = time.perf_counter()
+    design = mjfim.design(setup)
+    assert time.perf_counter() - clock < 12.0
+    assert len(design.starts) < 500
+    assert design.status is not Status.INTERRUPTED
+    assert design.final.cost <= design.initial.cost

@@ -1,0 +1,127 @@
+"""The paper's study: reference numbers, its optima from an independent solver, mesh independence."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.optimize.projection_operator import Expansion
+from mjfim.plant.plant import CENTRAL
+from mjfim.records.design import Status
+
+ROOT = Path(__file__).resolve().parents[2]
+EIGENVALUES = {"true": (0.87398028, 19.3587854, 38.1413276), "guess": (0.54702697, 18.1770570, 25.1244795)}
+# name: weights, place of the linearisation, best known J (two solvers, finer integration)
+CASES: dict[str, tuple[float, float, str, float]] = {
+    "a": (6e-3, 0.0, "true", 0.0193931429),
+    "b": (1e-3, 0.05, "true", 0.0174132438),
+    "c": (1e-4, 0.0, "true", 0.00270219419),
+    "d": (6e-3, 0.0, "guess", 0.0303767520),
+    "e": (1e-3, 0.05, "guess", 0.0248591908),
+    "f": (1e-6, 0.0, "true", 3.0087104e-4),
+}
+
+
+def experiment(case: str = "b", **descent: Any) -> Experiment:
+    """The cart-pendulum at the weights of one case."""
+    control, slide, place, _ = CASES[case]
+    cost = {"control": control, "tracking": {"slide": slide}, "linearize_at": place}
+    return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(cost=cost, descent=descent)
+
+
+@pytest.mark.parametrize(("case", "place"), [("a", "true"), ("d", "guess")])
+def test_eigenvalues_of_the_initial_trajectory(case: str, place: str) -> None:
+    setup = Setup(experiment(case))
+    criterion = setup.problem.point(setup.initial).criterion
+    assert criterion is not None
+    np.testing.assert_allclose(criterion.eigenvalues, EIGENVALUES[place], rtol=1e-5)
+
+
+def test_gradient_of_the_information_term() -> None:
+    setup = Setup(experiment("a"))
+    point = setup.problem.point(setup.initial, CENTRAL)
+    assert point.sensitivity is not None
+    assert point.criterion is not None
+    bilinear = setup.plant.bilinear(
+        setup.theta, setup.initial, point.sensitivity.psi, point.criterion.directions, CENTRAL
+    )
+    a, b = setup.information.gradient(point.criterion, point.sensitivity, bilinear)
+    gradient = Expansion(bilinear.A, bilinear.B, a, b).gradient(np.zeros((400, 1, 4)))[:, 0]
+    assert np.linalg.norm(gradient) == pytest.approx(1.4318943623, rel=1e-4)
+    np.testing.assert_allclose(gradient[[0, 100, 250]], [0.1734982191, 0.0586059128, 0.0474071683], rtol=1e-4)
+
+
+@pytest.mark.parametrize(("case", "starts"), [("a", 1), ("b", 1), ("c", 1), ("d", 1), ("e", 4), ("f", 1)])
+def test_reaches_the_best_known_cost(case: str, starts: int) -> None:
+    design = mjfim.design(experiment(case, starts=starts))
+    assert design.status is Status.CONVERGED
+    assert design.final.cost <= 1.000001 * CASES[case][3]
+    assert len(design.starts) == starts
+    assert design.found_by in {start.name for start in design.starts}
+
+
+def test_the_shipped_guess_experiment_reports_every_start() -> None:
+    design = mjfim.design(Experiment.from_file(ROOT / "models" / "cart_pendulum_guess.toml"))
+    assert design.final.cost <= 1.000001 * CASES["e"][3]
+    assert min(start.cost for start in design.starts) == pytest.approx(design.final.cost)
+    assert max(start.cost for start in design.starts) > 1.005 * design.final.cost  # the second optimum is seen too
+
+
+def test_metric_descent_of_the_paper_reaches_the_same_optimum() -> None:
+    design = mjfim.design(experiment("c", method="metric"))
+    assert design.final.cost <= 1.000001 * CASES["c"][3]
+
+
+def test_weight_on_psi_in_the_metric_reaches_the_same_optimum() -> None:
+    design = mjfim.design(experiment("a", method="metric", psi_weight=1e-6, tolerance=1e-3))
+    assert design.status is Status.CONVERGED
+    assert design.final.cost <= 1.02 * CASES["a"][3]
+
+
+@pytest.mark.parametrize("coarse", [1, 4])
+def test_half_the_sample_period_changes_neither_cost_nor_iteration_count(coarse: int, tmp_path: Path) -> None:
+    text = (ROOT / "models" / "cart_pendulum.xml").read_text().replace('timestep="0.01"', 'timestep="0.005"')
+    (tmp_path / "half.xml").write_text(text)
+    # the same piecewise-constant reference on both grids
+    table = np.loadtxt(ROOT / "models" / "cart_pendulum.csv", delimiter=",", skiprows=1)
+    np.savetxt(tmp_path / "reference.csv", table, delimiter=",", header="t,force", comments="")
+    coarse_run = mjfim.design(experiment("a", coarse=coarse))
+    fine = experiment("a", coarse=coarse).model_dump(exclude_unset=True)
+    fine |= {"model": "half.xml", "rate": 200.0, "measure_rate": 200.0}
+    fine["initial"] = {"keyframe": "hanging", "control": "reference.csv"}
+    fine_run = mjfim.design(Experiment(**fine, directory=tmp_path))
+    assert fine_run.status is Status.CONVERGED
+    assert fine_run.final.cost == pytest.approx(coarse_run.final.cost, rel=0.01)
+    counts = [run.history[-1].iteration for run in (coarse_run, fine_run)]
+    assert abs(counts[1] - counts[0]) < 0.2 * counts[0]
+
+
+@pytest.fixture(scope="module")
+def peer() -> ModuleType:
+    """The benchmark's CasADi solvers on the hand-derived model."""
+    pytest.importorskip("casadi", reason="casadi is a development dependency")
+    spec = importlib.util.spec_from_file_location("casadi_peer", ROOT / "scripts" / "casadi_peer.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["casadi_peer"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("case", ["b", "c"])
+def test_agrees_with_exact_derivatives_of_the_hand_derived_model(peer: ModuleType, case: str) -> None:
+    design = mjfim.design(experiment(case))
+    J, eigenvalues = peer.objective(peer.CASES[case], design.trajectory.ctrl[:, 0], False)
+    assert pytest.approx(design.final.cost, rel=1e-6) == J
+    np.testing.assert_allclose(eigenvalues, design.final.eigenvalues, rtol=1e-5)
+    assert design.final.cost <= (1 + 1e-6) * peer.lbfgs(peer.CASES[case], False).J

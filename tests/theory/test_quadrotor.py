@@ -1,0 +1,90 @@
+"""A free-floating body with thrusters: psi against plain re-simulation of recompiled models along a tumbling flight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from support.numerics import MODELS, Loop
+
+import mjfim
+from mjfim.arrays import Array
+from mjfim.experiment.system import Setup
+
+TUMBLE = {
+    "qpos": (0.0, 0.0, 2.0, 0.8, 0.4, -0.4, 0.2),
+    "qvel": (0.5, -0.3, 1.0, 4.0, -3.0, 2.0),
+    "control": {"kind": "sine", "amplitude": 0.3, "frequency": 1.5, "offset": 0.5},
+}
+ROTORS = ("fl", "fr", "rl", "rr")
+PARAMETERS = {
+    "mass": {"target": "body/quadrotor:mass"},
+    "inertia": {"target": "body/quadrotor:inertia[1]"},
+    "thrust": {"targets": [{"path": f"actuator/{rotor}:gear[2]"} for rotor in ROTORS]},
+    "com": {"target": "body/quadrotor:ipos[2]"},
+}
+
+
+def tumbling() -> Setup:
+    """One second of tumbling, driven by all four rotors."""
+    return Setup(
+        mjfim.Experiment(
+            model="quadrotor.xml",
+            directory=MODELS,
+            rate=100.0,
+            horizon=1.0,
+            initial=TUMBLE,
+            parameters=PARAMETERS,
+            noise={"state": 0.01, "imu_gyro": 0.01, "imu_accelerometer": 0.1},
+        )
+    )
+
+
+def flown(path: Path, change: dict[str, float], ctrl: Array, start: Array, substeps: int) -> tuple[Loop, Array]:
+    """States (N+1, ns) of a model compiled anew from the MJCF with relative changes of its parameters."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    body = spec.body("quadrotor")
+    body.mass *= 1.0 + change.get("mass", 0.0)
+    body.inertia = np.array(body.inertia) * [1.0, 1.0 + change.get("inertia", 0.0), 1.0]
+    body.ipos = np.array(body.ipos) * [1.0, 1.0, 1.0 + change.get("com", 0.0)]
+    for rotor in ROTORS:
+        gear = np.array(spec.actuator(rotor).gear)
+        gear[2] *= 1.0 + change.get("thrust", 0.0)
+        spec.actuator(rotor).gear = gear
+    loop, states = Loop(spec.compile(), substeps), [start]
+    for u in ctrl:
+        states.append(loop.F(states[-1], u))
+    return loop, np.array(states)
+
+
+@pytest.mark.parametrize("name", PARAMETERS)
+def test_psi_of_a_tumbling_flight_is_that_of_re_simulation(name: str) -> None:
+    setup = tumbling()
+    curve, j = setup.initial, list(PARAMETERS).index(name)
+    turned = np.abs(curve.qvel[:, 3:]).max()
+    assert turned > 3.0  # [rad/s] it does tumble
+    found = setup.plant.sensitivity(setup.theta, curve)
+    assert found is not None
+    start, value = curve.state[0], setup.theta[j]
+
+    def difference(h: float) -> Array:
+        loop, up = flown(setup.model_path, {name: h}, curve.ctrl, start, setup.substeps)
+        _, down = flown(setup.model_path, {name: -h}, curve.ctrl, start, setup.substeps)
+        return np.array([loop.minus(a, b) for a, b in zip(up, down, strict=True)]) / (2.0 * h * value)
+
+    reference = (4.0 * difference(5e-4) - difference(1e-3)) / 3.0
+    size = np.abs(reference).max(axis=0)
+    size = np.maximum(size, 1e-3 * size.max())  # mass, say, turns nothing
+    assert (np.abs(found.psi[..., j] - reference) / size).max() < 1e-6
+    assert (np.abs(1.00001 * found.psi[..., j] - reference) / size).max() > 1e-6  # an error of 1e-5 would be seen
+
+
+def test_the_shipped_experiment_is_identifiable_and_designs() -> None:
+    experiment = mjfim.Experiment.from_file(MODELS / "quadrotor.toml")
+    looked = mjfim.check(experiment)
+    assert looked.self_test.passed
+    assert not looked.never
+    design = mjfim.design(experiment.replace(descent={"max_iterations": 12}))
+    assert design.final.eigenvalues[0] > 2.0 * design.initial.eigenvalues[0]

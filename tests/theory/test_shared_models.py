@@ -1,0 +1,83 @@
+"""Models of others (`shared_models`): every file loads, and a design beats the chirp tenfold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from support.numerics import SHARED, shared_model
+from support.shared_models import EXPERIMENTS
+
+import mjfim
+from mjfim.errors import ModelError
+from mjfim.model.loading import compile_spec, load_spec
+from mjfim.records.design import Status
+
+GAIN = 10.0
+
+
+def experiment(name: str) -> mjfim.Experiment:
+    """The experiment of this name, beside its model; skips where that is absent."""
+    shared_model(EXPERIMENTS[name]["model"])
+    return mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED, source=name)
+
+
+def whole() -> list[Path]:
+    """Every MJCF that stands alone: no parts that others include, none whose meshes were not copied."""
+    files = sorted(SHARED.glob("*/*.xml"))
+    texts = [path.read_text(encoding="utf-8") for path in files]
+    return [path for path, text in zip(files, texts, strict=True) if "<worldbody" in text and "<mesh " not in text]
+
+
+def test_every_shared_model_loads() -> None:
+    if not SHARED.is_dir():
+        pytest.skip(f"no shared models at {SHARED}")
+    loaded = set()
+    for path in whole():
+        if path.name == "arm26.xml":  # MuJoCo finds no length range for it; the variant beside it states one
+            with pytest.raises(ModelError, match="Lengthrange"):
+                compile_spec(load_spec(path), path)
+            continue
+        model = compile_spec(load_spec(path), path)
+        data = mujoco.MjData(model)
+        mujoco.mj_step(model, data)
+        assert np.isfinite(data.qpos).all()
+        loaded.add(path.parent.name)
+    assert loaded == {folder.name for folder in SHARED.iterdir() if folder.is_dir()}
+
+
+@pytest.mark.parametrize("name", list(EXPERIMENTS))
+def test_every_experiment_starts(name: str) -> None:
+    start = mjfim.design(experiment(name).replace(descent={"max_iterations": 0}))
+    assert start.final.eigenvalues[0] > 0.0
+    assert not start.combinations
+
+
+@pytest.mark.parametrize("name", ["cartpole", "acrobot", "furuta", "so_arm100", "panda"])
+def test_design_knows_ten_times_more_than_the_chirp(name: str) -> None:
+    design = mjfim.design(experiment(name))
+    gain = design.final.eigenvalues[0] / design.initial.eigenvalues[0]
+    assert gain >= GAIN, f"{gain:.3g}, {design.status.value}"
+    assert all(margin >= 0.0 for margin in design.limits.values()), design.limits
+    assert not any("clamps" in sentence for sentence in design.warnings), design.warnings
+    if design.status is Status.ROUGH:  # joints with dry friction: said, with its sample
+        assert name == "so_arm100"
+        assert any("not smooth" in sentence and "dry friction" in sentence for sentence in design.warnings)
+    else:
+        assert design.status.success
+
+
+@pytest.mark.parametrize("name", list(EXPERIMENTS))
+def test_check_passes_or_names_the_sample(name: str) -> None:
+    found = mjfim.check(experiment(name))
+    assert not found.never
+    assert not found.not_here
+    assert all(np.isfinite(row.std) for row in found.rows)
+    assert found.verdict
+    if not found.self_test.passed:
+        rough = found.self_test.rough
+        assert rough is not None, found.self_test
+        assert rough.sample > 0
+        assert any("friction" in cause or "contact" in cause or "limit" in cause for cause in rough.causes)
