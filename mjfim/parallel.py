@@ -68,7 +68,9 @@ def salvaged(executor: Executor, futures: Iterable[Future[T]]) -> list[T]:
     done, left = wait(waiting, timeout=GRACE)
     if isinstance(executor, Pool) and not left:
         executor.resume()
-    return [f.result() for f in waiting if f in done and not f.cancelled() and f.exception() is None]
+    return [
+        f.result() for f in waiting if f in done and not f.cancelled() and f.exception() is None
+    ]
 
 
 @contextmanager

@@ -16,7 +16,9 @@ DEGREE = 3
 FAINT = 1e-5  # size of a combination of curves, over the largest
 
 
-def spline_basis(t: Array, horizon: float, bandwidth: float, begins: bool, ends: bool, periodic: bool) -> Array:
+def spline_basis(
+    t: Array, horizon: float, bandwidth: float, begins: bool, ends: bool, periodic: bool
+) -> Array:
     """(N, M) cubic B-splines at times t: (N,) [s] with a knot every 1/(2 bandwidth) s.
 
     begins, ends: value and slope are zero there;  periodic: the curve and two derivatives meet at the ends
@@ -32,7 +34,9 @@ def spline_basis(t: Array, horizon: float, bandwidth: float, begins: bool, ends:
     return np.asarray(values[:, 2 * begins : values.shape[1] - 2 * ends])
 
 
-def fourier_basis(t: Array, horizon: float, frequency: float, harmonics: int, begins: bool, ends: bool) -> Array:
+def fourier_basis(
+    t: Array, horizon: float, frequency: float, harmonics: int, begins: bool, ends: bool
+) -> Array:
     """(N, 2 harmonics) sines and cosines of multiples of a base frequency [Hz], each of size 1.
 
     Where the curve has to begin or end at rest, the polynomial of least degree that has the same value and first two
@@ -42,7 +46,9 @@ def fourier_basis(t: Array, horizon: float, frequency: float, harmonics: int, be
 
     def waves(times: Array, order: int) -> Array:
         angle = np.outer(times, omega) + 0.5 * np.pi * order
-        return np.asarray(np.concatenate([np.sin(angle), np.cos(angle)], axis=1) * np.tile(omega**order, 2))
+        return np.asarray(
+            np.concatenate([np.sin(angle), np.cos(angle)], axis=1) * np.tile(omega**order, 2)
+        )
 
     places = [*([0.0] if begins else []), *([horizon] if ends else [])]
     conditions = [(place, order) for place in places for order in range(3)]
@@ -51,8 +57,12 @@ def fourier_basis(t: Array, horizon: float, frequency: float, harmonics: int, be
     powers = np.arange(len(conditions))
 
     def polynomials(times: Array, order: int) -> Array:
-        factor = np.array([np.prod(np.arange(k - order + 1, k + 1)) if k >= order else 0.0 for k in powers])
-        return np.asarray(factor * (times[:, None] / horizon) ** np.maximum(powers - order, 0) / horizon**order)
+        factor = np.array(
+            [np.prod(np.arange(k - order + 1, k + 1)) if k >= order else 0.0 for k in powers]
+        )
+        return np.asarray(
+            factor * (times[:, None] / horizon) ** np.maximum(powers - order, 0) / horizon**order
+        )
 
     system = np.concatenate([polynomials(np.array([place]), order) for place, order in conditions])
     wanted = np.concatenate([waves(np.array([place]), order) for place, order in conditions])
@@ -128,7 +138,9 @@ class Chirp:
         """(N, nu)."""
         f = self.frame
         size, first, last, phase, offset = z.reshape(5, f.nu)
-        ends = zip(f.pitch(first).tolist(), f.pitch(last).tolist(), (360.0 * phase).tolist(), strict=True)
+        ends = zip(
+            f.pitch(first).tolist(), f.pitch(last).tolist(), (360.0 * phase).tolist(), strict=True
+        )
         sweeps = np.stack([chirp(f.t, a, f.horizon, b, phi=p) for a, b, p in ends], axis=1)
         return np.asarray(amplitudes(size) * (sweeps + (offset - 0.5)))
 
@@ -153,7 +165,11 @@ class Multisine:
     def wave(self, z: Array) -> Array:
         """(N, nu)."""
         f = self.frame
-        base = f.slowest * (0.5 * f.fastest / f.slowest) ** z[0] if f.fastest > 2.0 * f.slowest else f.slowest
+        base = (
+            f.slowest * (0.5 * f.fastest / f.slowest) ** z[0]
+            if f.fastest > 2.0 * f.slowest
+            else f.slowest
+        )
         most = min(HARMONICS, max(int(f.fastest / base), 1))
         order = np.arange(1, 1 + max(round(most * float(z[1])), min(2, most)))
         power = order ** (-2.0 * STEEPEST * z[2])
@@ -181,7 +197,9 @@ class Steps:
         place = np.minimum((f.t / held).astype(int), LEVELS - 1)
         levels = np.concatenate([np.zeros((1, f.nu)), 2.0 * z[2:].reshape(LEVELS, f.nu) - 1.0])
         share = (f.t / held - place) / max(float(z[1]), 1e-9)
-        passed = np.where(f.jumps, 1.0, 0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0)))[:, None]
+        passed = np.where(f.jumps, 1.0, 0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0)))[
+            :, None
+        ]
         return np.asarray((1.0 - passed) * levels[place] + passed * levels[place + 1])
 
 
@@ -206,13 +224,17 @@ def generate(signal: Signal, t: Array, names: tuple[str, ...], rest: Array) -> A
         sweeps = [chirp(t, signal.frequency * s, t[-1], end * s, phi=-90.0) for s in spread]
         shape = np.stack(sweeps, axis=1)
     elif signal.kind == "multisine":
-        shape = multisine(t, len(names), signal.frequency, signal.harmonics, np.random.default_rng(signal.seed))
+        shape = multisine(
+            t, len(names), signal.frequency, signal.harmonics, np.random.default_rng(signal.seed)
+        )
     elif signal.kind == "constant":
         shape = np.ones_like(shape)
     return np.asarray(offset + amplitude * shape)
 
 
-def multisine(t: Array, nu: int, frequency: float, harmonics: int, rng: np.random.Generator) -> Array:
+def multisine(
+    t: Array, nu: int, frequency: float, harmonics: int, rng: np.random.Generator
+) -> Array:
     """(N, nu) sums of harmonics of a base frequency [Hz] with random phases and weights, peak 1."""
     order = np.arange(1, harmonics + 1)
     phases = rng.uniform(0.0, 2 * np.pi, (nu, harmonics))

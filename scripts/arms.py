@@ -171,7 +171,9 @@ ARMS = {
 }
 
 
-def model_file(arm: Arm, name: str, friction: bool, folder: Path, timestep: float | None = None) -> Path:
+def model_file(
+    arm: Arm, name: str, friction: bool, folder: Path, timestep: float | None = None
+) -> Path:
     """Write the arm's MJCF into the folder and return its path. timestep: [s], default: the arm's."""
     source = MODELS / arm.file
     if not source.is_file():
@@ -205,7 +207,12 @@ def _embody(spec: Any, arm: Arm) -> None:
         spec.delete(geom)
     load = arm.payload
     body = spec.body(load.parent).add_body(name="payload")
-    body.explicitinertial, body.mass, body.ipos, body.inertia = True, load.mass, load.com, load.inertia
+    body.explicitinertial, body.mass, body.ipos, body.inertia = (
+        True,
+        load.mass,
+        load.com,
+        load.inertia,
+    )
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05])
     sphere = Capsule("payload", load.com, load.com, load.radius)
     for i, c in enumerate((*arm.capsules, sphere)):
@@ -247,7 +254,9 @@ def parameters(arm: Arm, friction: bool) -> dict[str, dict[str, Any]]:
     """Unknowns, relative to their guesses: 2 or 3 per joint, 4 of the payload."""
     fields = ("damping", "armature", *(("frictionloss",) if friction else ()))
     found: dict[str, dict[str, Any]] = {
-        f"{joint}_{field}": {"target": f"joint/{joint}:{field}"} for field in fields for joint in arm.joints
+        f"{joint}_{field}": {"target": f"joint/{joint}:{field}"}
+        for field in fields
+        for joint in arm.joints
     }
     found["payload_mass"] = {"target": "body/payload:mass"}
     for i, axis in enumerate("xyz"):
@@ -256,7 +265,11 @@ def parameters(arm: Arm, friction: bool) -> dict[str, dict[str, Any]]:
 
 
 def experiment(
-    name: str, horizon: float, friction: bool, model_folder: str | Path, timestep: float | None = None
+    name: str,
+    horizon: float,
+    friction: bool,
+    model_folder: str | Path,
+    timestep: float | None = None,
 ) -> Experiment:
     """An arm's experiment, rest to rest from home, designed under hard limits; its model and start are written beside.
 
@@ -267,7 +280,11 @@ def experiment(
     hold = np.array(mujoco.MjModel.from_xml_path(str(path)).key("home").ctrl)
     control = folder / f"{path.stem}_{horizon:g}s.csv"
     write_control(control, arm.joints, start_control(hold, horizon, arm.amplitude))
-    limits: dict[str, Any] = {"velocity": arm.velocity, "control_rate": arm.rate, "clearance": CLEARANCE}
+    limits: dict[str, Any] = {
+        "velocity": arm.velocity,
+        "control_rate": arm.rate,
+        "clearance": CLEARANCE,
+    }
     if arm.force is not None:
         limits["force"] = arm.force
     return Experiment(
@@ -291,7 +308,9 @@ def write_control(path: Path, names: tuple[str, ...], control: Array) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["t", *names])
-        rows.writerows([f"{k / RATE:.4f}", *(f"{u:.12g}" for u in row)] for k, row in enumerate(control))
+        rows.writerows(
+            [f"{k / RATE:.4f}", *(f"{u:.12g}" for u in row)] for k, row in enumerate(control)
+        )
 
 
 def worst_relative_sigma(information: Array, scale: Array) -> float:
@@ -368,9 +387,14 @@ def margins(e: Experiment, model: Any, control: Array, motion: Motion) -> dict[s
     worst = {
         "position": _inside(motion.qpos, *position),
         "control": _inside(control, model.actuator_ctrlrange[:, 0], model.actuator_ctrlrange[:, 1]),
-        "force": _inside(motion.force, *(s * np.minimum(model.actuator_forcerange[:, 1], stated) for s in (-1.0, 1.0))),
+        "force": _inside(
+            motion.force,
+            *(s * np.minimum(model.actuator_forcerange[:, 1], stated) for s in (-1.0, 1.0)),
+        ),
         "velocity": _inside(motion.qvel, -limits["velocity"], limits["velocity"]),
-        "control rate": _inside(np.diff(control, axis=0) * RATE, -limits["control rate"], limits["control rate"]),
+        "control rate": _inside(
+            np.diff(control, axis=0) * RATE, -limits["control rate"], limits["control rate"]
+        ),
     }
     return {**worst, "clearance": float(motion.distance.min() / CLEARANCE - 1.0)}
 
@@ -396,12 +420,17 @@ def lifted(model: Any) -> Any:
     return model
 
 
-def step_seconds(model: Any, start: Array, control: Array, simulations: int = 128, repeats: int = 3) -> float:
+def step_seconds(
+    model: Any, start: Array, control: Array, simulations: int = 128, repeats: int = 3
+) -> float:
     """Wall seconds per `mj_step` in a batch on all cores, at the best of some repeats."""
     batch = Batch(model, simulations, cores())
     substeps = round(1.0 / (RATE * model.opt.timestep))
     held = np.ascontiguousarray(
-        np.broadcast_to(np.repeat(control[:100], substeps, axis=0), (simulations, 100 * substeps, control.shape[1]))
+        np.broadcast_to(
+            np.repeat(control[:100], substeps, axis=0),
+            (simulations, 100 * substeps, control.shape[1]),
+        )
     )
     best = np.inf
     for _ in range(repeats):
@@ -412,7 +441,9 @@ def step_seconds(model: Any, start: Array, control: Array, simulations: int = 12
     return float(best / (simulations * held.shape[1]))
 
 
-def settling(model: Any, start: Array, hold: Array, speed: Array, e: Experiment) -> tuple[float, float]:
+def settling(
+    model: Any, start: Array, hold: Array, speed: Array, e: Experiment
+) -> tuple[float, float]:
     """Seconds until the boundary's tolerances hold for good when the hold meets all joints at full speed, and the error left.
 
     speed: (nv,) [rad/s];  the error: largest of the positions [rad], 2 s later
@@ -444,13 +475,20 @@ def described(e: Experiment) -> Iterator[tuple[str, str]]:
     inside = margins(e, model, control, motion)
     light = lifted(mujoco.MjModel.from_xml_path(str(e.directory / e.model)))
     seconds = step_seconds(light, start, control)
-    solver = "off" if light.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) else "on (dry friction)"
+    solver = (
+        "off"
+        if light.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        else "on (dry friction)"
+    )
     steps = round(e.horizon / model.opt.timestep)
     yield "parameters, samples", f"{len(e.parameters)}, {round(e.horizon * RATE)}"
     yield "pairs of geoms looked at", f"{len(pairs(model))}"
     yield "clearance at home", f"{100 * near:.1f} cm ({whose[0]}, {whose[1]})"
     yield "hold minus home, largest", f"{np.abs(hold - start).max():.4f} rad"
-    yield "engine step, timestep", f"{1e6 * seconds:.2f} µs on {cores()} cores, {1e3 * model.opt.timestep:g} ms"
+    yield (
+        "engine step, timestep",
+        f"{1e6 * seconds:.2f} µs on {cores()} cores, {1e3 * model.opt.timestep:g} ms",
+    )
     yield "one rollout; constraints", f"{1e3 * seconds * steps:.1f} ms; {solver}"
     yield "from full speed to rest within", f"{settled:.2f} s; after 2 s {1e3 * left:.2g} mrad off"
     last = np.abs(motion.qpos[-1] - start).max(), np.abs(motion.qvel[-1]).max()
@@ -463,17 +501,32 @@ def identifiable(e: Experiment) -> Iterator[tuple[str, str]]:
     setup = Setup(e)
     told = setup.plant.sensitivity(setup.theta, setup.initial)
     if told is None:
-        raise SystemExit(f"{e.source}: the starting motion diverges when the parameters move a little")
-    names, scale, information = setup.parameters.names, setup.parameters.scale, setup.information.matrix(told)
+        raise SystemExit(
+            f"{e.source}: the starting motion diverges when the parameters move a little"
+        )
+    names, scale, information = (
+        setup.parameters.names,
+        setup.parameters.scale,
+        setup.information.matrix(told),
+    )
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     yield "worst relative sigma", f"{worst_relative_sigma(information, scale):.3g}"
-    yield "smallest eigenvalues", ", ".join(f"{v:.3g}" for v in values[:4]) + f"; largest {values[-1]:.2g}"
+    yield (
+        "smallest eigenvalues",
+        ", ".join(f"{v:.3g}" for v in values[:4]) + f"; largest {values[-1]:.2g}",
+    )
     for j in range(2):
         largest = np.argsort(-np.abs(vectors[:, j]))[:3]
-        yield f"weakest combination {j + 1}", " ".join(f"{vectors[i, j]:+.2f} {names[i]}" for i in largest)
+        yield (
+            f"weakest combination {j + 1}",
+            " ".join(f"{vectors[i, j]:+.2f} {names[i]}" for i in largest),
+        )
     relative = setup.information.std(information) / scale
     order = np.argsort(-relative)
-    yield "worst parameters, sigma / scale", ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[:3])
+    yield (
+        "worst parameters, sigma / scale",
+        ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[:3]),
+    )
     yield "best", ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[-2:])
     seen = survey(setup, setup.initial, told)
     yield "never identifiable", "; ".join(str(group) for group in seen.groups_always) or "none"
@@ -482,9 +535,17 @@ def identifiable(e: Experiment) -> Iterator[tuple[str, str]]:
 
 def timesteps(name: str, friction: bool, horizon: float, folder: Path) -> Table:
     """How far motions and information at other timesteps are from those at a fine one."""
-    title = f"{name}{', dry' if friction else ''}: timesteps against {1e3 * FINE:g} ms, {horizon:g} s"
+    title = (
+        f"{name}{', dry' if friction else ''}: timesteps against {1e3 * FINE:g} ms, {horizon:g} s"
+    )
     table = Table(title=title, title_justify="left")
-    for heading in ("timestep", "largest error of qpos", "of qvel", "worst relative sigma", "µs per second of motion"):
+    for heading in (
+        "timestep",
+        "largest error of qpos",
+        "of qvel",
+        "worst relative sigma",
+        "µs per second of motion",
+    ):
         table.add_column(heading, justify="right")
     reference: tuple[Array, Array] | None = None
     for step in (FINE, 0.001, 0.002, 0.004, 0.005):
@@ -498,7 +559,13 @@ def timesteps(name: str, friction: bool, horizon: float, folder: Path) -> Table:
         light = lifted(mujoco.MjModel.from_xml_path(str(e.directory / e.model)))
         cost = 1e6 * step_seconds(light, start, control, 32, 2) / step
         off = (np.abs(q - reference[0]).max(), np.abs(v - reference[1]).max())
-        table.add_row(f"{1e3 * step:g} ms", f"{off[0]:.1e} rad", f"{off[1]:.1e} rad/s", f"{sigma:.4g}", f"{cost:.0f}")
+        table.add_row(
+            f"{1e3 * step:g} ms",
+            f"{off[0]:.1e} rad",
+            f"{off[1]:.1e} rad/s",
+            f"{sigma:.4g}",
+            f"{cost:.0f}",
+        )
     return table
 
 
@@ -508,11 +575,15 @@ def _sigma(setup: Setup, sensitivity: Sensitivity) -> float:
 
 def main() -> None:
     """Describe the arms and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, help="where models and starting controls are written")
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
     parser.add_argument("--horizons", nargs="+", type=float, default=[5.0, 10.0])
-    parser.add_argument("--skip-check", action="store_true", help="leave out what can be identified")
+    parser.add_argument(
+        "--skip-check", action="store_true", help="leave out what can be identified"
+    )
     parser.add_argument("--timesteps", action="store_true", help="compare timesteps as well")
     args = parser.parse_args()
     console = Console(highlight=False, width=150)

@@ -69,7 +69,9 @@ def run(arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: 
     with mjfim.Pool() as executor:
         found = mjfim.compare(experiment, args.seconds, methods=args.methods, executor=executor)
     for row in found.rows:
-        console.print(f"  {row.title}: {row.worst:.4g}, {row.outcome.value}, {row.seconds:.0f} s, {row.found_by}")
+        console.print(
+            f"  {row.title}: {row.worst:.4g}, {row.outcome.value}, {row.seconds:.0f} s, {row.found_by}"
+        )
     ours = found.design
     if ours is None:
         raise KeyboardInterrupt
@@ -114,7 +116,9 @@ def markdown(cases: list[Case]) -> str:
         ]
         for c in cases:
             if c.arm == arm:
-                inside = f"{100 * c.share:.2g} % ({c.tightest.replace('_', ' ')})" if c.kept else "no"
+                inside = (
+                    f"{100 * c.share:.2g} % ({c.tightest.replace('_', ' ')})" if c.kept else "no"
+                )
                 lines.append(
                     f"| {'dry' if c.dry else 'smooth'} | {c.horizon:g} s | {c.parameters} | {c.few:.3g} | {c.many:.3g} "
                     f"| **{c.design:.3g}** | {100 * c.gain:.0f} % | {inside} |"
@@ -124,7 +128,9 @@ def markdown(cases: list[Case]) -> str:
 
 def main() -> None:
     """Run what is missing and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seconds", type=float, default=600.0, help="of every method")
     parser.add_argument("--arms", nargs="+", choices=list(arms.ARMS), default=list(arms.ARMS))

@@ -92,7 +92,11 @@ def step_seconds(setup: Setup, trajectory: mjfim.Trajectory) -> float:
     model, data = setup.model_at(setup.theta), mujoco.MjData(setup.model)
     best = np.inf
     for k in range(0, trajectory.samples, 20):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = trajectory.qpos[k], trajectory.qvel[k], trajectory.ctrl[k]
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (
+            trajectory.qpos[k],
+            trajectory.qvel[k],
+            trajectory.ctrl[k],
+        )
         clock = time.perf_counter()
         mujoco.mj_step(model, data, 500)
         best = min(best, (time.perf_counter() - clock) / 500)
@@ -101,7 +105,9 @@ def step_seconds(setup: Setup, trajectory: mjfim.Trajectory) -> float:
 
 def fastest(repeats: int, case: str, name: str, **descent: Any) -> tuple[Run, Design]:
     """The quickest of several identical designs."""
-    return min((mjfim_run(case, name, **descent) for _ in range(repeats)), key=lambda pair: pair[0].seconds)
+    return min(
+        (mjfim_run(case, name, **descent) for _ in range(repeats)), key=lambda pair: pair[0].seconds
+    )
 
 
 def mjfim_run(case: str, name: str, **descent: Any) -> tuple[Run, Design]:
@@ -111,15 +117,27 @@ def mjfim_run(case: str, name: str, **descent: Any) -> tuple[Run, Design]:
     prepared = time.perf_counter() - clock
     design = mjfim.design(setup)
     fine = design.history[-1].rate
-    history = tuple((row.seconds, row.cost if row.rate == fine else np.inf) for row in design.history)
-    run = Run(case, name, design.final.cost, design.history[-1].iteration, design.seconds, prepared, history)
+    history = tuple(
+        (row.seconds, row.cost if row.rate == fine else np.inf) for row in design.history
+    )
+    run = Run(
+        case,
+        name,
+        design.final.cost,
+        design.history[-1].iteration,
+        design.seconds,
+        prepared,
+        history,
+    )
     return run, design
 
 
 def peer_runs(cases: Iterable[str], repeats: int) -> list[Run]:
     """CasADi's; none where it is missing."""
     rows = aside(PEERS, repeats, "".join(cases))
-    return [Run(**{**row, "history": tuple((t, J) for t, J in row["history"])}) for row in rows or ()]
+    return [
+        Run(**{**row, "history": tuple((t, J) for t, J in row["history"])}) for row in rows or ()
+    ]
 
 
 def table(title: str, *headings: str) -> Table:
@@ -177,7 +195,15 @@ def peer_table(runs: list[Run]) -> Table:
             taken = run.time_to(goal)
             ratio = "" if run.solver == "mjfim" else comparison(mine, taken)
             seconds = f"{taken:.3f} s" if np.isfinite(taken) else "never"
-            rows.add_row(case, run.solver, f"{run.cost:.9g}", str(run.iterations), seconds, ratio, f"{run.setup:.2f} s")
+            rows.add_row(
+                case,
+                run.solver,
+                f"{run.cost:.9g}",
+                str(run.iterations),
+                seconds,
+                ratio,
+                f"{run.setup:.2f} s",
+            )
     return rows
 
 
@@ -191,20 +217,34 @@ def comparison(mine: float, theirs: float) -> str:
 def metric_table(pairs: list[tuple[Run, Run]]) -> Table:
     """(c)"""
     rows = table(
-        "(c) beside the paper's metric descent, to the same J", "case", "descent", "iterations", "seconds", "J"
+        "(c) beside the paper's metric descent, to the same J",
+        "case",
+        "descent",
+        "iterations",
+        "seconds",
+        "J",
     )
     for mine, metric in pairs:
         goal = min(mine.cost, metric.cost) * (1 + CLOSE)
         for run in (mine, metric):
             count, seconds = run.iterations_to(goal), run.time_to(goal)
-            text = (f"{count:.0f}", f"{seconds:.2f} s") if np.isfinite(count) else ("never", f"> {run.seconds:.1f} s")
+            text = (
+                (f"{count:.0f}", f"{seconds:.2f} s")
+                if np.isfinite(count)
+                else ("never", f"> {run.seconds:.1f} s")
+            )
             rows.add_row(run.case, run.solver, *text, f"{run.cost:.9g}")
     return rows
 
 
 def monte_carlo_table(design: Design, trials: int) -> Table:
     """(d)"""
-    rows = table(f"(d) {trials} Monte-Carlo trials at 100 Hz (target 15 s)", "trajectory", "failed", "seconds")
+    rows = table(
+        f"(d) {trials} Monte-Carlo trials at 100 Hz (target 15 s)",
+        "trajectory",
+        "failed",
+        "seconds",
+    )
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     study = mjfim.monte_carlo(experiment("b"), curves, trials, seed=0)
     for name, s in study.sets.items():
@@ -218,7 +258,9 @@ def engine_verdict(designs: list[tuple[Run, Design]], threads: int) -> str:
     for run, design in designs:
         step = step_seconds(Setup(experiment(run.case)), design.trajectory)
         ratios.setdefault(run.solver, []).append(run.seconds * threads / (design.steps * step))
-    told = [f"{name} {min(r):.2f} to {max(r):.2f}, {judged(max(r), 1.3)}" for name, r in ratios.items()]
+    told = [
+        f"{name} {min(r):.2f} to {max(r):.2f}, {judged(max(r), 1.3)}" for name, r in ratios.items()
+    ]
     return (
         f"Ratios: {'; '.join(told)}. What is over 1: the projection runs on one thread; Riccati and L-BFGS "
         "run in Python; a coarse level has few steps to spread that over."
@@ -227,7 +269,11 @@ def engine_verdict(designs: list[tuple[Run, Design]], threads: int) -> str:
 
 def judged(worst: float, target: float) -> str:
     """Whether the worst case meets a target, and by how much it misses."""
-    return f"target {target:g} met" if worst <= target else f"target {target:g} missed by a factor {worst / target:.2g}"
+    return (
+        f"target {target:g} met"
+        if worst <= target
+        else f"target {target:g} missed by a factor {worst / target:.2g}"
+    )
 
 
 def peer_verdict(runs: list[Run]) -> str:
@@ -265,7 +311,9 @@ def markdown(tables: list[Table], verdicts: dict[int, str], threads: int) -> str
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="case a only, 100 trials, one repeat")
     parser.add_argument("--markdown", type=Path, help="also write the tables as Markdown")
     args = parser.parse_args()
@@ -281,7 +329,10 @@ def main() -> None:
     tables.append(peer_table(runs))
     verdicts[1] = peer_verdict(runs)
     console.print(tables[-1], verdicts[1])
-    metric = [mjfim_run(case, "metric (the paper's)", method="metric", max_iterations=400)[0] for case in cases]
+    metric = [
+        mjfim_run(case, "metric (the paper's)", method="metric", max_iterations=400)[0]
+        for case in cases
+    ]
     named = [dataclasses.replace(run, solver="L-BFGS on the manifold") for run, _ in flat]
     tables.append(metric_table(list(zip(named, metric, strict=True))))
     console.print(tables[-1])
@@ -289,13 +340,17 @@ def main() -> None:
     console.print(tables[-1])
     if benchmark_arm.ARM.is_file() and not args.quick:
         tables.append(
-            benchmark_arm.cost_table([benchmark_arm.measured(benchmark_arm.ARM, p, 8) for p in (3, 10, 30, 70)])
+            benchmark_arm.cost_table(
+                [benchmark_arm.measured(benchmark_arm.ARM, p, 8) for p in (3, 10, 30, 70)]
+            )
         )
         console.print(tables[-1])
     seconds = 10.0 if args.quick else 60.0
     tables.append(benchmark_limits.table(benchmark_limits.races(seconds, 0), seconds))
     console.print(tables[-1])
-    tables.append(benchmark_hour.hour_table(benchmark_hour.measured(0.01 if args.quick else 1.0, 0)))
+    tables.append(
+        benchmark_hour.hour_table(benchmark_hour.measured(0.01 if args.quick else 1.0, 0))
+    )
     console.print(tables[-1])
     if args.markdown:
         args.markdown.write_text(markdown(tables, verdicts, threads), encoding="utf-8")

@@ -25,7 +25,13 @@ from mjfim.information.identifiability import survey
 from mjfim.parallel import cores
 from mjfim.plant.plant import FAST
 
-ARM = Path(__file__).resolve().parents[2] / "shared" / "models" / "menagerie_panda" / "panda_nohand_nomesh.xml"
+ARM = (
+    Path(__file__).resolve().parents[2]
+    / "shared"
+    / "models"
+    / "menagerie_panda"
+    / "panda_nohand_nomesh.xml"
+)
 COUNTS = (3, 10, 30, 70)
 
 
@@ -46,7 +52,9 @@ class Cost:
 def experiment(model: Path, p: int, iterations: int) -> Experiment:
     """The arm with p unknown inertial parameters, counted from its tip."""
     if p == 3:
-        unknown: dict[str, Any] = {f"c{i}": {"target": f"body/link7:firstmoment[{i}]"} for i in range(3)}
+        unknown: dict[str, Any] = {
+            f"c{i}": {"target": f"body/link7:firstmoment[{i}]"} for i in range(3)
+        }
     else:
         links = range(8 - p // 10, 8)
         unknown = {f"L{i}": {"inertial": f"link{i}", "coordinates": "barycentric"} for i in links}
@@ -87,8 +95,19 @@ def measured(model: Path, p: int, iterations: int) -> Cost:
 
 def cost_table(costs: list[Cost]) -> Table:
     """One row per p, the growth beside p = 3, and a bar."""
-    rows = Table(title="(e) seconds per E-optimal iteration, seven-joint arm, 5 s at 100 Hz", title_justify="left")
-    for heading in ("p", "identifiable", "J (psi)", "gradient", "gradient / p = 3", "iteration", "curve"):
+    rows = Table(
+        title="(e) seconds per E-optimal iteration, seven-joint arm, 5 s at 100 Hz",
+        title_justify="left",
+    )
+    for heading in (
+        "p",
+        "identifiable",
+        "J (psi)",
+        "gradient",
+        "gradient / p = 3",
+        "iteration",
+        "curve",
+    ):
         rows.add_column(heading, justify="left" if heading == "curve" else "right")
     longest = max(cost.iteration for cost in costs)
     for cost in costs:
@@ -106,9 +125,14 @@ def cost_table(costs: list[Cost]) -> Table:
 
 def main() -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
-        "--model", type=Path, default=ARM, help="MJCF of the arm: bodies link1 to link7, joints joint1 to 7"
+        "--model",
+        type=Path,
+        default=ARM,
+        help="MJCF of the arm: bodies link1 to link7, joints joint1 to 7",
     )
     parser.add_argument("--iterations", type=int, default=8)
     args = parser.parse_args()

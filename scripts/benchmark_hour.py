@@ -70,12 +70,16 @@ def played(setup: Setup, seconds: float, seed: int) -> Recording:
     rate = setup.experiment.rate
     minute = np.arange(round(60.0 * rate)) / rate
     amplitude = np.array([8.0, 3.0])
-    parts = [amplitude * multisine(minute, 2, 0.1, 30, rng) for _ in range(int(np.ceil(seconds / 60.0)))]
+    parts = [
+        amplitude * multisine(minute, 2, 0.1, 30, rng) for _ in range(int(np.ceil(seconds / 60.0)))
+    ]
     ctrl = np.concatenate(parts)[: round(seconds * rate)]
     theta, states = setup.parameters.true, [setup.plant.start(setup.parameters.true)[None]]
     for first in range(0, len(ctrl), 100_000):
         model = [setup.plant.model(theta)]
-        out = setup.plant.engine.rollout(model, states[-1][-1:], ctrl[None, first : first + 100_000])
+        out = setup.plant.engine.rollout(
+            model, states[-1][-1:], ctrl[None, first : first + 100_000]
+        )
         states.append(out.states[0, 1:])
     y = setup.plant.outputs(np.concatenate(states), None)
     y += setup.noise.sample(len(y), rng)
@@ -105,10 +109,23 @@ def measured(hours: float, seed: int) -> Hour:
         write_recording(log, recording, setup)
         size, samples = log.stat().st_size / 1e6, len(recording.ctrl)
         del recording
-        read = float(subprocess.check_output([sys.executable, "-c", READ, str(EXPERIMENT), str(log)], text=True))
+        read = float(
+            subprocess.check_output(
+                [sys.executable, "-c", READ, str(EXPERIMENT), str(log)], text=True
+            )
+        )
         before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
         clock = time.perf_counter()
-        command = [sys.executable, "-m", "mjfim", "identify", str(EXPERIMENT), str(log), "-o", str(folder / "out")]
+        command = [
+            sys.executable,
+            "-m",
+            "mjfim",
+            "identify",
+            str(EXPERIMENT),
+            str(log),
+            "-o",
+            str(folder / "out"),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         fitted = time.perf_counter() - clock
         peak = max(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss, before) / 2**20
@@ -116,16 +133,30 @@ def measured(hours: float, seed: int) -> Hour:
             raise SystemExit(done.stderr)
         found = json.loads((folder / "out" / "estimate.json").read_text(encoding="utf-8"))
     theta, true = np.array(found["theta"]), setup.parameters.true
-    inside = np.array([low <= value <= high for (low, high), value in zip(found["interval"], true, strict=True)])
+    inside = np.array(
+        [low <= value <= high for (low, high), value in zip(found["interval"], true, strict=True)]
+    )
     wrong = float(np.abs((theta - true) / np.array(found["std"])).max())
     engine = bare(setup, samples)
-    return Hour(samples, size, read, fitted, engine, found["steps"], peak, wrong, int(inside.sum()), len(true))
+    return Hour(
+        samples,
+        size,
+        read,
+        fitted,
+        engine,
+        found["steps"],
+        peak,
+        wrong,
+        int(inside.sum()),
+        len(true),
+    )
 
 
 def hour_table(hour: Hour) -> Table:
     """One row."""
     table = Table(
-        title="(g) an hour of two joints at 1 kHz, five parameters, CSV (limits: 360 s, 3 GiB)", title_justify="left"
+        title="(g) an hour of two joints at 1 kHz, five parameters, CSV (limits: 360 s, 3 GiB)",
+        title_justify="left",
     )
     for heading in (
         "samples",
@@ -155,7 +186,9 @@ def hour_table(hour: Hour) -> Table:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--hours", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()

@@ -60,12 +60,16 @@ def own(seconds: float, seed: int) -> Race:
     with mjfim.Pool() as executor:
         while (left := seconds - (time.perf_counter() - clock)) > 1.0:
             descent = {"seed": seed, "seconds": left}
-            design = mjfim.design(Experiment.from_file(EXPERIMENT).replace(descent=descent), executor=executor)
+            design = mjfim.design(
+                Experiment.from_file(EXPERIMENT).replace(descent=descent), executor=executor
+            )
             value, seed = float(design.final.eigenvalues[0]), seed + 1
             if design.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             starts += len(design.starts)
-            if min(design.limits.values()) >= 0.0 and value > max((v for _, v in history), default=0.0):
+            if min(design.limits.values()) >= 0.0 and value > max(
+                (v for _, v in history), default=0.0
+            ):
                 history.append((time.perf_counter() - clock, value))
                 margin = min(design.limits.values())
     return Race("mjfim", tuple(history), starts, 0.0, margin)
@@ -82,7 +86,10 @@ def peer(seconds: float, seed: int) -> Race | None:
 
 def table(races: list[Race], seconds: float) -> Table:
     """(f)"""
-    rows = Table(title=f"(f) hard limits: λ_min within the same seconds (best known {BEST})", title_justify="left")
+    rows = Table(
+        title=f"(f) hard limits: λ_min within the same seconds (best known {BEST})",
+        title_justify="left",
+    )
     marks = [*(t for t in MARKS if t < seconds), seconds]
     for i, heading in enumerate(
         ("solver", *(f"{t:g} s" for t in marks), "starts", "before", "worst margin, every step")
@@ -103,7 +110,9 @@ def races(seconds: float, seed: int) -> list[Race]:
 
 def main() -> None:
     """Race and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()

@@ -57,7 +57,12 @@ COMMON: dict[str, Any] = {
     "ipopt.bound_relax_factor": 0.0,
 }
 COLD: dict[str, Any] = {"ipopt.tol": 1e-5}  # from a random start: the default barrier leads
-WARM: dict[str, Any] = {"ipopt.tol": 1e-6, "ipopt.mu_init": 1e-3, "ipopt.bound_push": 1e-4, "ipopt.bound_frac": 1e-4}
+WARM: dict[str, Any] = {
+    "ipopt.tol": 1e-6,
+    "ipopt.mu_init": 1e-3,
+    "ipopt.bound_push": 1e-4,
+    "ipopt.bound_frac": 1e-4,
+}
 
 
 # -- random controls -----------------------------------------------------------------------------------------------
@@ -110,7 +115,9 @@ class Draw:
     def __post_init__(self) -> None:
         """Check the kind and the range."""
         if self.kind not in STARTS or not 0 < self.peak[0] <= self.peak[1]:
-            raise ValueError(f"{self}: needs a kind of {sorted(STARTS)} and a peak of 0 < low <= high [N]")
+            raise ValueError(
+                f"{self}: needs a kind of {sorted(STARTS)} and a peak of 0 < low <= high [N]"
+            )
 
 
 # -- one sampling of the horizon -----------------------------------------------------------------------------------
@@ -154,13 +161,26 @@ class Grid:
 
 def slide_rows(x: ca.MX, u: ca.MX, theta: ca.MX, dt: float) -> ca.MX:
     """Return ds/du (samples, samples) along the states x (4, samples) before each sample, by one forward sweep."""
-    samples, now, held, p = u.shape[0], ca.SX.sym("x", peer.NX), ca.SX.sym("u"), ca.SX.sym("theta", peer.NP)
+    samples, now, held, p = (
+        u.shape[0],
+        ca.SX.sym("x", peer.NX),
+        ca.SX.sym("u"),
+        ca.SX.sym("theta", peer.NP),
+    )
     after = peer.rk4(now, held, p, dt)
-    linear = ca.Function("plain_linear", [now, held, p], [ca.jacobian(after, now), ca.jacobian(after, held)])
-    a, b, pick = ca.MX.sym("a", peer.NX, peer.NX), ca.MX.sym("b", peer.NX), ca.MX.sym("pick", 1, samples)
+    linear = ca.Function(
+        "plain_linear", [now, held, p], [ca.jacobian(after, now), ca.jacobian(after, held)]
+    )
+    a, b, pick = (
+        ca.MX.sym("a", peer.NX, peer.NX),
+        ca.MX.sym("b", peer.NX),
+        ca.MX.sym("pick", 1, samples),
+    )
     columns = ca.MX.sym("columns", peer.NX, samples)
     moved = a @ columns + b @ pick
-    sweep = ca.Function("slide_step", [columns, a, b, pick], [moved, moved[0, :]]).mapaccum("slide_sweep", samples)
+    sweep = ca.Function("slide_step", [columns, a, b, pick], [moved, moved[0, :]]).mapaccum(
+        "slide_sweep", samples
+    )
     along = linear.map(samples)(x, u.T, ca.repmat(theta, 1, samples))
     each = ca.DM.eye(samples).full().reshape(1, -1)
     rows = sweep(ca.DM.zeros(peer.NX, samples), along[0], along[1], each)[1]
@@ -170,7 +190,12 @@ def slide_rows(x: ca.MX, u: ca.MX, theta: ca.MX, dt: float) -> ca.MX:
 @functools.cache
 def grid(samples: int) -> Grid:
     """Build the functions once per process; needs a C compiler."""
-    begin, dt, u, theta = time.perf_counter(), HORIZON / samples, ca.MX.sym("u", samples), ca.MX.sym("theta", peer.NP)
+    begin, dt, u, theta = (
+        time.perf_counter(),
+        HORIZON / samples,
+        ca.MX.sym("u", samples),
+        ca.MX.sym("theta", peer.NP),
+    )
     parts, start = peer.stage(dt), ca.DM([*peer.X0, *([0.0] * (peer.NZ - peer.NX))])
     z = parts.step.mapaccum(samples)(start, u.T, ca.repmat(theta, 1, samples))
     info, slide = ca.sum2(parts.rate.map(samples)(z)), z[0, :].T
@@ -182,7 +207,9 @@ def grid(samples: int) -> Grid:
         ca.Function("slide_by_u", [u, theta], [slide, slide_rows(before, u, theta, dt)]),
     ]
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        value, gradient, by_u, linear, curvature = peer.compile_c([*blocks, parts.linear, parts.curvature], folder)
+        value, gradient, by_u, linear, curvature = peer.compile_c(
+            [*blocks, parts.linear, parts.curvature], folder
+        )
     compiled = replace(parts, linear=linear, curvature=curvature)
     factor, multipliers = ca.MX.sym("factor"), ca.MX.sym("multipliers", samples)
     slopes = peer.Slopes(factor * slope, factor * bend, multipliers, ca.MX(1, 1), ca.MX(1, 1))
@@ -222,7 +249,9 @@ class FeasibleWatch(peer.IterateWatch):
         """Register with CasADi."""
         super().__init__(problem.samples, problem.samples, peer.NP)
         self.problem, self.deadline = problem, np.inf
-        self.found: list[tuple[float, float, Array]] = []  # time [s], lambda_min, u [N], each better than before
+        self.found: list[
+            tuple[float, float, Array]
+        ] = []  # time [s], lambda_min, u [N], each better than before
 
     def eval(self, arg: Sequence[ca.DM]) -> list[int]:
         """Note the iterate and let the solver go on until the deadline."""
@@ -244,7 +273,9 @@ def solver(samples: int, warm: bool) -> tuple[ca.Function, FeasibleWatch]:
     derivatives = {"grad_f": problem.gradient, "jac_g": problem.slide, "hess_lag": problem.hessian}
     options = {**COMMON, **(WARM if warm else COLD), **derivatives, "iteration_callback": watch}
     cost, slide, _ = problem.value(u, theta)
-    return ca.nlpsol("limited", "ipopt", {"x": u, "p": theta, "f": cost, "g": slide}, options), watch
+    return ca.nlpsol(
+        "limited", "ipopt", {"x": u, "p": theta, "f": cost, "g": slide}, options
+    ), watch
 
 
 # -- the race ------------------------------------------------------------------------------------------------------
@@ -268,14 +299,21 @@ class LimitedRun:
 class Race:
     """Random starts on the search grid, the promising ones refined on the full grid, until the time is used."""
 
-    def __init__(self, seconds: float, search: int, draw: Draw, process: int, seed: np.random.SeedSequence) -> None:
+    def __init__(
+        self, seconds: float, search: int, draw: Draw, process: int, seed: np.random.SeedSequence
+    ) -> None:
         """Build the grids, then start the clock."""
         begin = time.perf_counter()
         for samples, warm in ((search, False), (peer.N, True)):
             solver(samples, warm)
         self.begin = time.perf_counter()
         self.build_seconds, self.deadline = self.begin - begin, self.begin + seconds
-        self.search, self.draw, self.process, self.rng = search, draw, process, np.random.default_rng(seed)
+        self.search, self.draw, self.process, self.rng = (
+            search,
+            draw,
+            process,
+            np.random.default_rng(seed),
+        )
         self.searched: list[Solve] = []
         self.refined: list[Solve] = []
         self.history: list[tuple[float, float]] = []
@@ -294,16 +332,28 @@ class Race:
         stats, (information, violation) = run.stats(), grid(samples).measure(u)
         iterations, converged = int(stats["iter_count"]), bool(stats["success"])
         times = end - begin, end - self.begin
-        return Solve(samples, start, self.process, information, violation, iterations, *times, converged, u)
+        return Solve(
+            samples, start, self.process, information, violation, iterations, *times, converged, u
+        )
 
     def promising(self) -> Solve | None:
         """Return the best searched optimum that is near the best of all and was not refined, nor one like it."""
         taken = {solve.start for solve in self.refined}
         known = [solve.u for solve in self.searched if solve.start in taken]
-        least = CLOSE * max((solve.information for solve in self.searched if solve.feasible), default=0.0)
+        least = CLOSE * max(
+            (solve.information for solve in self.searched if solve.feasible), default=0.0
+        )
         for candidate in sorted(self.searched, key=lambda solve: -solve.information):
-            near = any(min(np.abs(candidate.u - u).mean(), np.abs(candidate.u + u).mean()) < APART for u in known)
-            if candidate.feasible and candidate.information >= least and candidate.start not in taken and not near:
+            near = any(
+                min(np.abs(candidate.u - u).mean(), np.abs(candidate.u + u).mean()) < APART
+                for u in known
+            )
+            if (
+                candidate.feasible
+                and candidate.information >= least
+                and candidate.start not in taken
+                and not near
+            ):
                 return candidate
         return None
 
@@ -348,10 +398,14 @@ def merged(runs: Sequence[LimitedRun]) -> LimitedRun:
     for seconds, value in sorted(pair for run in runs for pair in run.history):
         if not history or value > history[-1][1]:
             history.append((seconds, value))
-    return LimitedRun(best, searched, refined, tuple(history), max(run.build_seconds for run in runs))
+    return LimitedRun(
+        best, searched, refined, tuple(history), max(run.build_seconds for run in runs)
+    )
 
 
-def race(seconds: float, search: int, draw: Draw, process: int, seed: np.random.SeedSequence) -> LimitedRun:
+def race(
+    seconds: float, search: int, draw: Draw, process: int, seed: np.random.SeedSequence
+) -> LimitedRun:
     """Run one process's share."""
     return Race(seconds, search, draw, process, seed).run()
 
@@ -375,7 +429,9 @@ def limited_starts(
 
 def show(run: LimitedRun, seconds: float) -> None:
     """Print every solve, the best lambda_min by time and the switches of the best control."""
-    print(f"built in {run.build_seconds:.1f} s; {len(run.searched)} starts, {len(run.refined)} refined")
+    print(
+        f"built in {run.build_seconds:.1f} s; {len(run.searched)} starts, {len(run.refined)} refined"
+    )
     print("          process  start  lambda_min  violation  iter      s    at s")
     for name, solves in (("searched", run.searched), ("refined", run.refined)):
         for r in solves:
@@ -383,20 +439,29 @@ def show(run: LimitedRun, seconds: float) -> None:
             note = "" if r.converged else "  not converged"
             print(f"{name:8}  {result}  {r.seconds:5.1f}  {r.ended:6.1f}{note}")
     marks = [t for t in (10.0, 30.0, 60.0, 120.0) if t < seconds] + [np.inf]
-    print("best after " + ", ".join(f"{min(t, seconds):g} s: {run.information_at(t):.3f}" for t in marks))
+    print(
+        "best after "
+        + ", ".join(f"{min(t, seconds):g} s: {run.information_at(t):.3f}" for t in marks)
+    )
     if run.best is not None:
         print("switches of the best [s]: " + " ".join(f"{t:.2f}" for t in switches(run.best.u)))
 
 
 def main() -> None:
     """Solve as the command line says."""
-    parser = argparse.ArgumentParser(description="Multi-start of the hard-limited design with CasADi + IPOPT.")
+    parser = argparse.ArgumentParser(
+        description="Multi-start of the hard-limited design with CasADi + IPOPT."
+    )
     parser.add_argument("--seconds", type=float, default=60.0, help="wall time after building")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--processes", type=int, default=1)
-    parser.add_argument("--search", type=int, default=SEARCH, help="samples of the search grid, a divisor of 400")
+    parser.add_argument(
+        "--search", type=int, default=SEARCH, help="samples of the search grid, a divisor of 400"
+    )
     parser.add_argument("--starts", choices=sorted(STARTS), default="multisine")
-    parser.add_argument("--peak", type=float, nargs=2, default=(SMALL, SMALL), help="range of the starts' peak [N]")
+    parser.add_argument(
+        "--peak", type=float, nargs=2, default=(SMALL, SMALL), help="range of the starts' peak [N]"
+    )
     parser.add_argument("--save", help="write the best control [N] to this .npy file")
     given = parser.parse_args()
     draw = Draw(given.starts, tuple(given.peak))

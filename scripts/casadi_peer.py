@@ -86,7 +86,9 @@ class PeerRun:
     evaluations: int  # of J
     seconds: float  # solve only
     setup_seconds: float  # x_d and the solver object of this case
-    build_seconds: float  # differentiation, C generation and compilation; once per process, shared by all runs
+    build_seconds: (
+        float  # differentiation, C generation and compilation; once per process, shared by all runs
+    )
     history: tuple[tuple[float, float], ...]
     u: Array  # (400,) N
     compiled: bool
@@ -145,7 +147,9 @@ class Stage:
 
     step: ca.Function  # (z, u, theta) -> z after the sample
     linear: ca.Function  # (z, u, theta) -> A = dz+/dz, B = dz+/du
-    curvature: ca.Function  # (z, u, theta, costate) -> zz and zu blocks and uu entry of the costate-weighted Hessian
+    curvature: (
+        ca.Function
+    )  # (z, u, theta, costate) -> zz and zu blocks and uu entry of the costate-weighted Hessian
     rate: ca.Function  # z -> its addition to I
     rate_jacobian: ca.Function
     rate_hessian: ca.Function  # (entry weights) -> Hessian by z
@@ -169,10 +173,14 @@ def stage(dt: float = DT) -> Stage:
     return Stage(
         step=ca.Function("step", inputs, [z_after]),
         linear=ca.Function("linear", inputs, [ca.jacobian(z_after, z), ca.jacobian(z_after, u)]),
-        curvature=ca.Function("curvature", [*inputs, costate], [second[:NZ, :NZ], second[:NZ, NZ], second[NZ, NZ]]),
+        curvature=ca.Function(
+            "curvature", [*inputs, costate], [second[:NZ, :NZ], second[:NZ, NZ], second[NZ, NZ]]
+        ),
         rate=ca.Function("rate", [z], [rate]),
         rate_jacobian=ca.Function("rate_jacobian", [z], [ca.jacobian(rate, z)]),
-        rate_hessian=ca.Function("rate_hessian", [weights], [ca.hessian(ca.dot(weights, rate), z)[0]]),
+        rate_hessian=ca.Function(
+            "rate_hessian", [weights], [ca.hessian(ca.dot(weights, rate), z)[0]]
+        ),
         criterion=ca.Function("criterion", [info], [value, value_gradient, value_hessian]),
     )
 
@@ -227,7 +235,12 @@ def condensed_hessian(u: ca.MX, theta: ca.MX, z: ca.MX, slopes: Slopes, parts: S
     samples, rate_hessian = u.shape[0], parts.rate_hessian(slopes.info)
     slide = ca.DM.eye(NZ)[:, 0]
     start = ca.DM([*X0, *([0.0] * (NZ - NX))])
-    adjoint, p_slide, curve, columns = ca.MX.zeros(NZ, 6), ca.MX.zeros(NZ), ca.MX(NZ, NZ), ca.MX(NZ, 0)
+    adjoint, p_slide, curve, columns = (
+        ca.MX.zeros(NZ, 6),
+        ca.MX.zeros(NZ),
+        ca.MX(NZ, NZ),
+        ca.MX(NZ, 0),
+    )
     rows, info_slopes = [], []
     before = ca.horzsplit(ca.horzcat(start, z))
     for k in reversed(range(samples)):
@@ -238,7 +251,9 @@ def condensed_hessian(u: ca.MX, theta: ca.MX, z: ca.MX, slopes: Slopes, parts: S
         a, b = parts.linear(before[k], u[k], theta)
         h_zz, h_zu, h_uu = parts.curvature(before[k], u[k], theta, adjoint @ slopes.info + p_slide)
         curve_b = curve @ b
-        rows.append(ca.horzcat(ca.MX(1, k), h_uu + slopes.control_bend + b.T @ curve_b, b.T @ columns))
+        rows.append(
+            ca.horzcat(ca.MX(1, k), h_uu + slopes.control_bend + b.T @ curve_b, b.T @ columns)
+        )
         info_slopes.append(b.T @ adjoint)
         columns = ca.horzcat(h_zu + a.T @ curve_b, a.T @ columns)
         curve = h_zz + a.T @ curve @ a
@@ -253,7 +268,9 @@ class Problem:
 
     value: ca.Function  # J, entries of I
     gradient: ca.Function  # J, dJ/du
-    hessian: ca.Function  # multiplier of J times the upper triangle of d2J/du2, in IPOPT's signature
+    hessian: (
+        ca.Function
+    )  # multiplier of J times the upper triangle of d2J/du2, in IPOPT's signature
     compiled: bool
     build_seconds: float
 
@@ -265,7 +282,9 @@ def compile_c(functions: list[ca.Function], folder: str) -> list[ca.Function]:
         generator.add(function)
     source, library = generator.generate(folder + os.sep), os.path.join(folder, "peer.so")
     compiler = shutil.which(os.environ.get("CC", "gcc")) or "cc"
-    subprocess.run([compiler, "-O3", "-march=native", "-fPIC", "-shared", source, "-o", library], check=True)
+    subprocess.run(
+        [compiler, "-O3", "-march=native", "-fPIC", "-shared", source, "-o", library], check=True
+    )
     return [ca.external(function.name(), library) for function in functions]
 
 
@@ -279,7 +298,9 @@ def problem(use_c: bool = True) -> Problem:
     begin, parts, roll = time.perf_counter(), stage(), rollout()
     variables = [roll.u, roll.p]
     value = ca.Function("value", variables, [roll.objective, roll.info])
-    gradient = ca.Function("gradient", variables, [roll.objective, ca.gradient(roll.objective, roll.u)])
+    gradient = ca.Function(
+        "gradient", variables, [roll.objective, ca.gradient(roll.objective, roll.u)]
+    )
     compiled = False
     if use_c:
         try:
@@ -288,7 +309,10 @@ def problem(use_c: bool = True) -> Problem:
                 value, gradient, linear, curvature = compile_c(blocks, folder)
             parts, compiled = replace(parts, linear=linear, curvature=curvature), True
         except (OSError, subprocess.CalledProcessError) as error:
-            print(f"casadi_peer: no C compiler ({error}); using CasADi's virtual machine", file=sys.stderr)
+            print(
+                f"casadi_peer: no C compiler ({error}); using CasADi's virtual machine",
+                file=sys.stderr,
+            )
     factor, no_constraints = ca.MX.sym("factor"), ca.MX.sym("lam_g", 0)
     triangle = factor * condensed_hessian(roll.u, roll.p[:NP], roll.z, slopes_of(roll), parts)
     hessian = ca.Function("hessian", [*variables, factor, no_constraints], [triangle])
@@ -299,7 +323,9 @@ def parameters(case: Case) -> Array:
     """Return p = (theta, r_tau, q_slide, s^d); s^d [m] is the cart under u_ref with the same theta."""
     x, u, theta = ca.SX.sym("x", NX), ca.SX.sym("u"), ca.SX.sym("theta", NP)
     step = ca.Function("plain_step", [x, u, theta], [rk4(x, u, theta)])
-    states = step.mapaccum(N)(ca.DM(X0), ca.DM(reference_control()).T, ca.repmat(ca.DM(case.theta), 1, N))
+    states = step.mapaccum(N)(
+        ca.DM(X0), ca.DM(reference_control()).T, ca.repmat(ca.DM(case.theta), 1, N)
+    )
     return np.concatenate([case.theta, [case.r_tau, case.q_slide], states.full()[0]])
 
 
@@ -333,7 +359,9 @@ class Recorder:
 class IterateWatch(ca.Callback):
     """IPOPT's iteration callback: notes J of every accepted iterate."""
 
-    def __init__(self, unknowns: int = N, constraints: int = 0, parameters: int = NP + 2 + N) -> None:
+    def __init__(
+        self, unknowns: int = N, constraints: int = 0, parameters: int = NP + 2 + N
+    ) -> None:
         """Register with CasADi for a problem of this size."""
         super().__init__()
         self.recorder = Recorder()
@@ -363,7 +391,9 @@ class IterateWatch(ca.Callback):
         return [0]
 
 
-def ipopt_solver(case: Case, functions: Problem, watch: IterateWatch, max_iterations: int) -> ca.Function:
+def ipopt_solver(
+    case: Case, functions: Problem, watch: IterateWatch, max_iterations: int
+) -> ca.Function:
     """Return IPOPT over the controls, with J scaled so that the input penalty has curvature one."""
     u, p = ca.MX.sym("u", N), ca.MX.sym("p", NP + 2 + N)
     options: dict[str, Any] = {
@@ -414,7 +444,13 @@ def lbfgs(case: Case, use_c: bool = True, max_iterations: int = 2000) -> PeerRun
     """Solve by SciPy's L-BFGS-B from u_ref, on J / (R dt)."""
     functions, setup = problem(use_c), Recorder()
     p, scale = parameters(case), 1 / (case.r_tau * DT)
-    options = {"maxcor": MEMORY, "maxiter": max_iterations, "maxfun": 2 * max_iterations, "ftol": 1e-12, "gtol": 1e-5}
+    options = {
+        "maxcor": MEMORY,
+        "maxiter": max_iterations,
+        "maxfun": 2 * max_iterations,
+        "ftol": 1e-12,
+        "gtol": 1e-5,
+    }
     setup_seconds, recorder = setup.seconds(), Recorder()
 
     def scaled(u: Array) -> tuple[float, Array]:
@@ -444,13 +480,19 @@ def lbfgs(case: Case, use_c: bool = True, max_iterations: int = 2000) -> PeerRun
 
 def main() -> None:
     """Print one line per peer and case."""
-    parser = argparse.ArgumentParser(description="Solve cases of the cart-pendulum study with the peer solvers.")
+    parser = argparse.ArgumentParser(
+        description="Solve cases of the cart-pendulum study with the peer solvers."
+    )
     parser.add_argument("cases", nargs="+", choices=sorted(CASES))
-    parser.add_argument("--vm", action="store_true", help="do not compile, even where a C compiler exists")
+    parser.add_argument(
+        "--vm", action="store_true", help="do not compile, even where a C compiler exists"
+    )
     arguments = parser.parse_args()
     use_c = not arguments.vm
     built = problem(use_c)
-    print(f"built in {built.build_seconds:.1f} s, {'compiled C' if built.compiled else 'virtual machine'}")
+    print(
+        f"built in {built.build_seconds:.1f} s, {'compiled C' if built.compiled else 'virtual machine'}"
+    )
     counts = f"{'iter':>4}  {'eval':>4}  {'setup s':>7}  {'solve s':>7}"
     print(f"{'case':4}  {'solver':15}  {'J':>15}  {'lambda':>35}  {counts}")
     for name in arguments.cases:

@@ -39,7 +39,16 @@ from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
 
 ITERATIONS = 200
-HEADINGS = ("parameter", "true", "start", "mjfim", "formal σ", "95 % interval", "sysid\nweighted", "sysid\nas is")
+HEADINGS = (
+    "parameter",
+    "true",
+    "start",
+    "mjfim",
+    "formal σ",
+    "95 % interval",
+    "sysid\nweighted",
+    "sysid\nas is",
+)
 
 say = Console(highlight=False, soft_wrap=True)
 told = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -102,10 +111,24 @@ def report(exported: Exported, fit: Fitted) -> str:
 
 def table(setup: Setup, estimate: Estimate, weighted: Fitted, default: Fitted) -> Table:
     """Both estimators, parameter by parameter."""
-    rows = Table(title="The same data, two estimators", title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    rows = Table(
+        title="The same data, two estimators",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
     for heading in HEADINGS:
-        folds, side = heading in ("parameter", "95 % interval"), "left" if heading == "parameter" else "right"
-        rows.add_column(heading, justify=side, no_wrap=not folds, min_width=9 if folds else None, overflow="fold")  # type: ignore[arg-type]
+        folds, side = (
+            heading in ("parameter", "95 % interval"),
+            "left" if heading == "parameter" else "right",
+        )
+        rows.add_column(
+            heading,
+            justify=side,
+            no_wrap=not folds,
+            min_width=9 if folds else None,
+            overflow="fold",
+        )  # type: ignore[arg-type]
     for j, p in enumerate(setup.parameters.parameters):
         low, high = estimate.interval[j]
         rows.add_row(
@@ -119,12 +142,17 @@ def table(setup: Setup, estimate: Estimate, weighted: Fitted, default: Fitted) -
         )
     rows.add_section()
     fits = (estimate, weighted, default)
-    for heading, words in (("χ²", [f"{f.chi2:.6g}" for f in fits]), ("seconds", [f"{f.seconds:.2f}" for f in fits])):
+    for heading, words in (
+        ("χ²", [f"{f.chi2:.6g}" for f in fits]),
+        ("seconds", [f"{f.seconds:.2f}" for f in fits]),
+    ):
         rows.add_row(heading, "", "", words[0], "", "", *words[1:])
     return rows
 
 
-def summary(exported: Exported, estimate: Estimate, weighted: Fitted, default: Fitted) -> dict[str, Any]:
+def summary(
+    exported: Exported, estimate: Estimate, weighted: Fitted, default: Fitted
+) -> dict[str, Any]:
     """Contents of comparison.json."""
     setup = exported.setup
     return {
@@ -174,7 +202,9 @@ def run(experiment: Path, recordings: Sequence[Path], folder: Path) -> None:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("experiment", type=Path)
     parser.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")

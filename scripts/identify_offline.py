@@ -20,7 +20,9 @@ from mjfim.recordings.read import read_recording
 
 def main() -> int:
     """Fit, print, and write the identified model beside the recording."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("experiment", type=Path)
     parser.add_argument("recordings", type=Path, nargs="+")
     args = parser.parse_args()

@@ -39,7 +39,11 @@ from mjfim.parallel import cores
 
 MODEL = Path(__file__).resolve().parents[1] / "models" / "servo_arm.toml"
 KINDS = ("position", "velocity", "acceleration", "control", "control_rate", "force", "clearance")
-RESERVE = ("position=0.05", "velocity=0.3", "force=0.25")  # what 20 % wrong parameters take on the servo arm
+RESERVE = (
+    "position=0.05",
+    "velocity=0.3",
+    "force=0.25",
+)  # what 20 % wrong parameters take on the servo arm
 
 
 def example() -> Experiment:
@@ -52,10 +56,18 @@ def example() -> Experiment:
         cost={"control": 0.0},
         descent={"max_iterations": 150},
         boundary={"start": "rest", "end": "rest"},
-        parameters={"kp_shoulder": {"prior": 4.0}, "kp_elbow": {"prior": 3.0}},  # as wrong as all others
+        parameters={
+            "kp_shoulder": {"prior": 4.0},
+            "kp_elbow": {"prior": 3.0},
+        },  # as wrong as all others
         nuisance={"delay": True},
         limits={
-            "position": {"yaw": (-1.5, 1.5), "shoulder": (-0.6, 1.6), "elbow": (0.0, 2.2), "wrist": (-1.2, 1.6)},
+            "position": {
+                "yaw": (-1.5, 1.5),
+                "shoulder": (-0.6, 1.6),
+                "elbow": (0.0, 2.2),
+                "wrist": (-1.2, 1.6),
+            },
             "velocity": 3.0,
             "control_rate": 5.0,
             "bandwidth": 4.0,
@@ -69,7 +81,10 @@ def tightened(experiment: Experiment, reserve: Mapping[str, float]) -> Experimen
     for limit in Setup(experiment).limits:
         if reserve.get(limit.kind):
             inner = reserve[limit.kind] * limit.scale
-            tables.setdefault(limit.kind, {})[limit.name] = (limit.lower + inner, limit.upper - inner)
+            tables.setdefault(limit.kind, {})[limit.name] = (
+                limit.lower + inner,
+                limit.upper - inner,
+            )
     least = experiment.limits.clearance
     more = {} if least is None else {"clearance": least * (1.0 + reserve.get("clearance", 0.0))}
     return experiment.replace(limits={**tables, **more})
@@ -80,11 +95,16 @@ def made(experiment: Experiment, folder: Path, console: Console) -> Path:
     setup = Setup(experiment)
     with console.status("designing") as status:
         design = mjfim.design(
-            setup, monitor=lambda row: status.update(f"designing: iteration {row.iteration}, {row.seconds:.0f} s")
+            setup,
+            monitor=lambda row: status.update(
+                f"designing: iteration {row.iteration}, {row.seconds:.0f} s"
+            ),
         )
     write_design(folder, design, setup)
     margins = ", ".join(f"{kind} {margin:.3g}" for kind, margin in design.limits.items())
-    console.print(f"designed in {design.seconds:.0f} s: {design.status.value}\nmargins, reserve taken off: {margins}")
+    console.print(
+        f"designed in {design.seconds:.0f} s: {design.status.value}\nmargins, reserve taken off: {margins}"
+    )
     for warning in design.warnings:
         console.print(f"warning: {warning}", style="yellow")
     return folder / "design.csv"
@@ -100,27 +120,50 @@ def reserved(words: Sequence[str]) -> dict[str, float]:
         try:
             found[kind] = float(share)
         except ValueError:
-            raise ExperimentError(f"--reserve: {word!r} is not {kind}=SHARE, as in {kind}=0.2") from None
+            raise ExperimentError(
+                f"--reserve: {word!r} is not {kind}=SHARE, as in {kind}=0.2"
+            ) from None
         if not 0.0 <= found[kind] < 1.0:
-            raise ExperimentError(f"--reserve: {word!r}: a share of half of the range, at least 0 and below 1")
+            raise ExperimentError(
+                f"--reserve: {word!r}: a share of half of the range, at least 0 and below 1"
+            )
     return found
 
 
 def parsed() -> argparse.Namespace:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("experiment", type=Path, nargs="?", help="experiment file; default: the bundled servo arm")
-    parser.add_argument("design", type=Path, nargs="?", help="folder of a design; default: one is made")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "experiment", type=Path, nargs="?", help="experiment file; default: the bundled servo arm"
+    )
+    parser.add_argument(
+        "design", type=Path, nargs="?", help="folder of a design; default: one is made"
+    )
     parser.add_argument("-o", "--output", type=Path, default=Path("out/playback"))
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--wrong", type=float, default=0.2, help="share by which every parameter is off")
-    parser.add_argument("--latency", type=float, help="of the control [s], whole timesteps; default: 5 ms, rounded up")
-    parser.add_argument("--feedback", action="store_true", help="the controller uses the gains on what it measures")
-    parser.add_argument("--noise", type=float, default=1.0, help="the robot's noise over the stated one")
+    parser.add_argument(
+        "--wrong", type=float, default=0.2, help="share by which every parameter is off"
+    )
+    parser.add_argument(
+        "--latency",
+        type=float,
+        help="of the control [s], whole timesteps; default: 5 ms, rounded up",
+    )
+    parser.add_argument(
+        "--feedback", action="store_true", help="the controller uses the gains on what it measures"
+    )
+    parser.add_argument(
+        "--noise", type=float, default=1.0, help="the robot's noise over the stated one"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=cores())
     parser.add_argument(
-        "--reserve", nargs="+", metavar="KIND=SHARE", help="of half ranges that a design made here stays off its limits"
+        "--reserve",
+        nargs="+",
+        metavar="KIND=SHARE",
+        help="of half ranges that a design made here stays off its limits",
     )
     return parser.parse_args()
 
@@ -156,7 +199,9 @@ def played(args: argparse.Namespace, console: Console) -> int:
         console.print(f"• {escape(sentence)}")
     write_json(args.output / "playback.json", {**summary(verdict, conditions), "seconds": seconds})
     picture(verdict, args.output / "playback.png", conditions)
-    console.print(f"{args.runs} runs in {seconds:.0f} s; wrote playback.json, playback.png to {args.output}/")
+    console.print(
+        f"{args.runs} runs in {seconds:.0f} s; wrote playback.json, playback.png to {args.output}/"
+    )
     return 0 if verdict.ok else 1
 
 

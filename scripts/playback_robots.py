@@ -102,9 +102,14 @@ class Bench:
         self.plan = read_playback(table, self.stated)
         e, timestep = experiment, float(self.stated.model.opt.timestep)
         if abs(self.plan.t[-1] - e.horizon) > 0.5 * timestep:
-            raise ExperimentError(f"{table}: it lasts {self.plan.t[-1]:g} s, the experiment {e.horizon:g} s")
+            raise ExperimentError(
+                f"{table}: it lasts {self.plan.t[-1]:g} s, the experiment {e.horizon:g} s"
+            )
         self.timestep = timestep
-        self.every, self.late = round(self.plan.period / timestep), round(conditions.latency / timestep)
+        self.every, self.late = (
+            round(self.plan.period / timestep),
+            round(conditions.latency / timestep),
+        )
         if self.late < 0 or abs(conditions.latency - self.late * timestep) > 1e-6 * timestep:
             raise ExperimentError(
                 f"latency: {conditions.latency:g} s is no whole number of timesteps of {timestep:g} s"
@@ -112,7 +117,9 @@ class Bench:
         self.fence = fence_of(self.stated)
         self.limits = _looked_at(self.stated)
         self.rest = self._rest()
-        self._engine = Engine(self.stated.model_at(self.stated.theta), 1, self.stated.outputs.needs_sensors, threads=1)
+        self._engine = Engine(
+            self.stated.model_at(self.stated.theta), 1, self.stated.outputs.needs_sensors, threads=1
+        )
         self.setup, self.sensed = self.stated, _sensed(self.stated)
         if conditions.feedback and (self.sensed < 0).all():
             raise ExperimentError(
@@ -126,7 +133,9 @@ class Bench:
             return self.stated.hold
         except ExperimentError as error:
             if self.late:
-                raise ExperimentError(f"{error}; without a latency (--latency 0) it can be played") from None
+                raise ExperimentError(
+                    f"{error}; without a latency (--latency 0) it can be played"
+                ) from None
             return None
 
     def _read_as(self, e: Experiment) -> Experiment:
@@ -137,13 +146,19 @@ class Bench:
         moved = self._movable()
         if nuisance.get("initial") is None and moved:
             nuisance["initial"] = dict.fromkeys(moved, True)
-        rate = {"rate": 1.0 / self.timestep, "measure_rate": e.measure_rate or e.rate, "playback_rate": None}
+        rate = {
+            "rate": 1.0 / self.timestep,
+            "measure_rate": e.measure_rate or e.rate,
+            "playback_rate": None,
+        }
         return e.replace(nuisance=nuisance, **rate)
 
     def _movable(self) -> list[str]:
         """Positions at which a robot may stand still elsewhere than the model, because its parameters differ."""
         setup, moved = self.stated, np.zeros(self.stated.space.nv, dtype=bool)
-        for theta in (self._drawn(np.random.default_rng(i)) for i in range(2 * len(setup.parameters))):
+        for theta in (
+            self._drawn(np.random.default_rng(i)) for i in range(2 * len(setup.parameters))
+        ):
             start = self._start(setup.model_at(theta), theta, self.conditions.feedback)
             deviation = setup.space.minus(start, setup.plant.nominal_start)
             moved |= np.abs(deviation[: setup.space.nv]) > MOVED
@@ -164,11 +179,15 @@ class Bench:
             theta = self._with_delay(np.clip(theta, p.lower, p.upper))
             if not p.impossible(self.setup.plant.source, theta):
                 return theta
-        raise ExperimentError(f"{wrong:.0%} wrong parameters make bodies that cannot exist; try less")
+        raise ExperimentError(
+            f"{wrong:.0%} wrong parameters make bodies that cannot exist; try less"
+        )
 
     def _with_delay(self, theta: Array) -> Array:
         """theta with the true delay."""
-        return np.asarray(np.where(self.setup.parameters.delay != 0.0, self.late * self.timestep, theta))
+        return np.asarray(
+            np.where(self.setup.parameters.delay != 0.0, self.late * self.timestep, theta)
+        )
 
     def _command(self, state: Array, row: int, feedback: bool) -> Array:
         """(nu,) what the controller sends on reading a state."""
@@ -209,7 +228,13 @@ class Bench:
 
         for _ in range(NEWTON):
             now = push(state)
-            slope = np.stack([push(space.plus(state, 1e-6 * m)) - push(space.plus(state, -1e-6 * m)) for m in moves], 1)
+            slope = np.stack(
+                [
+                    push(space.plus(state, 1e-6 * m)) - push(space.plus(state, -1e-6 * m))
+                    for m in moves
+                ],
+                1,
+            )
             step = np.linalg.lstsq(slope / 2e-6, -now, rcond=1e-9)[0]
             state = space.plus(state, step @ moves)
             if np.abs(step).max(initial=0.0) < 1e-12:
@@ -221,7 +246,11 @@ class Bench:
             return np.array(self.stated.plant.nominal_start)
         raise SimulationDiverged(
             f"a robot with other parameters does not stand still at the start (it accelerates by {left:.2g} per s²): "
-            + ("play without a latency" if feedback else "play with --feedback, or without a latency")
+            + (
+                "play without a latency"
+                if feedback
+                else "play with --feedback, or without a latency"
+            )
         )
 
     def _sent(self, model: Any, start: Array, before: Array, noise: Array, feedback: bool) -> Array:
@@ -249,7 +278,14 @@ class Bench:
         theta = self._drawn(rng)
         noise = self.conditions.loudness * self.setup.noise.sample(len(self.plan.t), rng)
         blank = np.full(len(theta), np.nan)
-        failed = Run(theta, blank, np.full((len(theta),) * 2, np.nan), np.full(len(self.limits), -np.inf), np.nan, True)
+        failed = Run(
+            theta,
+            blank,
+            np.full((len(theta),) * 2, np.nan),
+            np.full(len(self.limits), -np.inf),
+            np.nan,
+            True,
+        )
         try:
             recording, margins, start = self.play(theta, noise, self.conditions.feedback)
             self._put_start(theta, start)
@@ -258,7 +294,9 @@ class Bench:
             return replace(failed, trouble=str(error))
         fit = estimate.chi2 / estimate.dof
         words = "" if estimate.success else estimate.status
-        return Run(theta, estimate.theta, estimate.covariance, margins, fit, estimate.misfit, again, words)
+        return Run(
+            theta, estimate.theta, estimate.covariance, margins, fit, estimate.misfit, again, words
+        )
 
     def _put_start(self, theta: Array, start: Array) -> None:
         """Write the true deviation of the start into theta, as far as it is an unknown.
@@ -278,7 +316,10 @@ class Bench:
         if not best.misfit:
             return best, False
         p = self.setup.parameters
-        starts = [p.guess, *(np.where(p.delay != 0.0, lag, p.guess) for lag in LAGS if p.delay.any())]
+        starts = [
+            p.guess,
+            *(np.where(p.delay != 0.0, lag, p.guess) for lag in LAGS if p.delay.any()),
+        ]
         for start in starts:
             try:
                 other = mjfim.identify(self.setup, [recording], "newton", start)
@@ -300,24 +341,36 @@ class Bench:
         before = self._before(start, feedback)
         noise = noise + setup.parameters.bias(len(setup.outputs)) @ theta
         sent = self._sent(model, start, before, noise, feedback)
-        applied = np.concatenate([np.tile(before, (self.late, 1)), np.repeat(sent, self.every, axis=0)])
+        applied = np.concatenate(
+            [np.tile(before, (self.late, 1)), np.repeat(sent, self.every, axis=0)]
+        )
         out = self._engine.rollout([model], start[None], applied[None], self.fence.taps)
         if not out.finite[0] or out.tapped is None:
             raise SimulationDiverged("the robot's simulation diverges")
         last = M * self.every + 1
-        y = setup.outputs(out.states[0, :last], None if out.sensors is None else out.sensors[0, :last])
+        y = setup.outputs(
+            out.states[0, :last], None if out.sensors is None else out.sensors[0, :last]
+        )
         y[:: self.every] += noise
         y[setup.noise.measured(last - 1) == 0.0] = np.nan
         t = np.arange(last, dtype=np.float64) * self.timestep
-        recording = Recording(t, np.repeat(sent, self.every, axis=0), y, setup.outputs.names, "robot")
-        margins = self._margins(out.tapped[0, :, 0], sent, before, out.states[0][:, : setup.space.nq], feedback)
+        recording = Recording(
+            t, np.repeat(sent, self.every, axis=0), y, setup.outputs.names, "robot"
+        )
+        margins = self._margins(
+            out.tapped[0, :, 0], sent, before, out.states[0][:, : setup.space.nq], feedback
+        )
         return recording, margins, start
 
-    def _margins(self, shown: Array, sent: Array, before: Array, qpos: Array, feedback: bool) -> Array:
+    def _margins(
+        self, shown: Array, sent: Array, before: Array, qpos: Array, feedback: bool
+    ) -> Array:
         """(l,) in the order of the limits. shown, qpos: at every engine step;  sent: (M, nu)"""
         fence, worst = self.fence, []
         inside = fence.shown.margin(shown).min(axis=0, initial=np.inf) / fence.shown.scale
-        ahead = round(fence.dt / self.plan.period)  # rates are over one sample, as they are in the design
+        ahead = round(
+            fence.dt / self.plan.period
+        )  # rates are over one sample, as they are in the design
         after = sent[-1] if feedback or fence.after is None else fence.after
         line = np.concatenate([np.tile(before, (ahead, 1)), sent, np.tile(after, (ahead, 1))])
         rates = (line[ahead:] - line[:-ahead]) / fence.dt
@@ -328,7 +381,9 @@ class Bench:
                 worst.append((fence.clearance.nearest(qpos)[0] - fence.least) / fence.least)
             else:
                 u = (sent if limit.kind == "control" else rates)[:, limit.index]
-                worst.append(float(np.minimum(u - limit.lower, limit.upper - u).min()) / limit.scale)
+                worst.append(
+                    float(np.minimum(u - limit.lower, limit.upper - u).min()) / limit.scale
+                )
         return np.array(worst)
 
     def planned(self) -> Array:
@@ -366,7 +421,10 @@ def _dof_labels(model: Any) -> Iterator[str]:
 def _sensed(setup: Setup) -> np.ndarray:
     """(ns,) output that measures each number of the state, -1 where none does."""
     model, found = setup.model, np.full(setup.space.nq + setup.space.nv + setup.space.na, -1)
-    kinds = {int(mujoco.mjtSensor.mjSENS_JOINTPOS): 0, int(mujoco.mjtSensor.mjSENS_JOINTVEL): setup.space.nq}
+    kinds = {
+        int(mujoco.mjtSensor.mjSENS_JOINTPOS): 0,
+        int(mujoco.mjtSensor.mjSENS_JOINTVEL): setup.space.nq,
+    }
     encoders = {}
     for i in range(model.nsensor):
         if int(model.sensor_type[i]) in kinds:
@@ -393,10 +451,20 @@ def _one(number: int) -> Run:
     return _BENCH[0].run(number)
 
 
-def play_all(experiment: Experiment, table: Path, conditions: Conditions, count: int, jobs: int) -> list[Run]:
+def play_all(
+    experiment: Experiment, table: Path, conditions: Conditions, count: int, jobs: int
+) -> list[Run]:
     """All runs, in parallel."""
     own = (experiment, table, conditions)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, count), context, _begin, own) as pool:
         console = Console(stderr=True)
-        return list(track(pool.map(_one, range(count)), "playing", total=count, console=console, transient=True))
+        return list(
+            track(
+                pool.map(_one, range(count)),
+                "playing",
+                total=count,
+                console=console,
+                transient=True,
+            )
+        )

@@ -19,7 +19,10 @@ from scipy.stats import binom, chi2
 from mjfim.arrays import Array
 from mjfim.output.plots import style
 
-CONFIDENCE, WANTED = 0.95, 0.90  # of the intervals;  share of the runs whose interval must hold the true value
+CONFIDENCE, WANTED = (
+    0.95,
+    0.90,
+)  # of the intervals;  share of the runs whose interval must hold the true value
 HALF = 1.959964  # standard deviations of such an interval to either side
 
 
@@ -88,7 +91,9 @@ class Verdict:
     @property
     def covered(self) -> bool:
         """Every parameter's interval holds often enough."""
-        return bool((self.inside[self.told] >= WANTED * self.runs - 1e-9).all()) and bool(self.told.any())
+        return bool((self.inside[self.told] >= WANTED * self.runs - 1e-9).all()) and bool(
+            self.told.any()
+        )
 
     @property
     def ok(self) -> bool:
@@ -116,7 +121,9 @@ def judge(bench: Bench, runs: Sequence[Run]) -> Verdict:
     regions = [np.flatnonzero(told & [name in stated for name in names]), np.flatnonzero(told)]
     joint = [sum(run.far(r) <= chi2.ppf(CONFIDENCE, len(r)) for run in good) for r in regions]
     margins = np.array([run.margins for run in runs])
-    clamped = np.array([limit.kind in ("force", "joint_force") for limit in bench.limits], dtype=bool)
+    clamped = np.array(
+        [limit.kind in ("force", "joint_force") for limit in bench.limits], dtype=bool
+    )
     return Verdict(
         bench=bench,
         names=names,
@@ -140,11 +147,23 @@ def judge(bench: Bench, runs: Sequence[Run]) -> Verdict:
 def parameter_table(verdict: Verdict) -> Table:
     """One row per unknown: how wrong, how well predicted, how well found."""
     n = verdict.runs
-    table = Table(title=f"Does information arrive? {n} robots, each identified from the guess", title_justify="left")
-    for heading in ("unknown", "wrong by", "sigma predicted", "sigma stated", "error, rms", f"inside 95 % of {n}"):
+    table = Table(
+        title=f"Does information arrive? {n} robots, each identified from the guess",
+        title_justify="left",
+    )
+    for heading in (
+        "unknown",
+        "wrong by",
+        "sigma predicted",
+        "sigma stated",
+        "error, rms",
+        f"inside 95 % of {n}",
+    ):
         table.add_column(heading, justify="left" if heading == "unknown" else "right")
     rows = zip(verdict.wrong, verdict.predicted, verdict.formal, verdict.observed, strict=True)
-    for name, unit, inside, numbers in zip(verdict.names, verdict.units, verdict.inside, rows, strict=True):
+    for name, unit, inside, numbers in zip(
+        verdict.names, verdict.units, verdict.inside, rows, strict=True
+    ):
         colour = "green" if inside >= WANTED * n else "red"
         cells = ("-" if not np.isfinite(value) else f"{value:.3g}" for value in numbers)
         counted = f"[{colour}]{inside}" if np.isfinite(numbers[2]) else "in combination only"
@@ -156,8 +175,17 @@ def limit_table(verdict: Verdict) -> Table:
     """The tightest limit of every kind."""
     title = "Do limits hold? Margins in percent of half of each range; negative: outside"
     table = Table(title=title, title_justify="left")
-    for heading in ("limit", "tightest of", "planned", "worst robot", "taken at most", "robots that keep it"):
-        table.add_column(heading, justify="left" if heading in ("limit", "tightest of") else "right")
+    for heading in (
+        "limit",
+        "tightest of",
+        "planned",
+        "worst robot",
+        "taken at most",
+        "robots that keep it",
+    ):
+        table.add_column(
+            heading, justify="left" if heading in ("limit", "tightest of") else "right"
+        )
     worst, limits = verdict.margins.min(axis=0), verdict.bench.limits
     for kind in dict.fromkeys(limit.kind for limit in limits):
         rows = [i for i, limit in enumerate(limits) if limit.kind == kind]
@@ -267,9 +295,16 @@ def draw_limits(axes: Axes, verdict: Verdict) -> None:
     for i, y in enumerate(place):
         colour = style.INITIAL if verdict.kept[:, i].all() else style.OPTIMIZED
         spread = y + rng.uniform(-0.22, 0.22, verdict.runs)
-        axes.plot(shown[:, i], spread, ".", color=colour, markersize=4.5, alpha=0.4, markeredgewidth=0.0)
-        axes.plot([100.0 * verdict.planned[i]] * 2, [y - 0.32, y + 0.32], color=style.INK, linewidth=1.6)
-    axes.set_yticks(place, [style.shorten(f"{limit.kind.replace('_', ' ')} {limit.name}", 26) for limit in limits])
+        axes.plot(
+            shown[:, i], spread, ".", color=colour, markersize=4.5, alpha=0.4, markeredgewidth=0.0
+        )
+        axes.plot(
+            [100.0 * verdict.planned[i]] * 2, [y - 0.32, y + 0.32], color=style.INK, linewidth=1.6
+        )
+    axes.set_yticks(
+        place,
+        [style.shorten(f"{limit.kind.replace('_', ' ')} {limit.name}", 26) for limit in limits],
+    )
     axes.set_xlim(low, max(100.0, 100.0 * float(verdict.planned.max(initial=0.0)) + 5.0))
     axes.set_ylim(-0.7, len(limits) - 0.3)
     title = f"Limits at every engine step: {verdict.all_kept} of {verdict.runs} robots keep all"
@@ -277,10 +312,22 @@ def draw_limits(axes: Axes, verdict: Verdict) -> None:
     handles = [
         Line2D([], [], color=style.INK, linewidth=1.6, label="plan"),
         Line2D([], [], color=style.INITIAL, marker=".", linestyle="", label="robots"),
-        Line2D([], [], color=style.OPTIMIZED, marker=".", linestyle="", label="robots, limit exceeded by some"),
+        Line2D(
+            [],
+            [],
+            color=style.OPTIMIZED,
+            marker=".",
+            linestyle="",
+            label="robots, limit exceeded by some",
+        ),
     ]
     axes.legend(
-        handles=handles, fontsize=style.SMALL, frameon=False, loc="upper left", bbox_to_anchor=(0.0, -0.06), ncols=3
+        handles=handles,
+        fontsize=style.SMALL,
+        frameon=False,
+        loc="upper left",
+        bbox_to_anchor=(0.0, -0.06),
+        ncols=3,
     )
 
 
@@ -295,9 +342,13 @@ def draw_errors(axes: Axes, verdict: Verdict) -> None:
         hit = np.abs(z) <= HALF
         x = j + rng.uniform(-0.28, 0.28, len(z))
         for some, colour in ((hit, style.MEASURED), (~hit, style.OPTIMIZED)):
-            axes.plot(x[some], z[some], ".", color=colour, markersize=4.0, alpha=0.7, markeredgewidth=0.0)
+            axes.plot(
+                x[some], z[some], ".", color=colour, markersize=4.0, alpha=0.7, markeredgewidth=0.0
+            )
     axes.set_ylim(-5.2, 5.2)
-    axes.set_title("Errors of the estimates; shaded: 95 %", fontsize=style.NORMAL, loc="left", color=style.INK)
+    axes.set_title(
+        "Errors of the estimates; shaded: 95 %", fontsize=style.NORMAL, loc="left", color=style.INK
+    )
 
 
 def draw_coverage(axes: Axes, verdict: Verdict) -> None:
@@ -311,7 +362,12 @@ def draw_coverage(axes: Axes, verdict: Verdict) -> None:
     axes.plot(x, share, "o", color=style.INK, markersize=5.0)
     for i, value in enumerate(share):
         axes.annotate(
-            f"{value:.0f}", (i, value), (6, 3), textcoords="offset points", fontsize=style.SMALL, color=style.INK
+            f"{value:.0f}",
+            (i, value),
+            (6, 3),
+            textcoords="offset points",
+            fontsize=style.SMALL,
+            color=style.INK,
         )
     axes.set_ylim(min(85.0, float(share.min(initial=100.0)) - 3.0), 103.0)
     title = "Coverage; dashed: wanted, shaded: what chance makes of 95 %"
@@ -326,11 +382,22 @@ def draw_arrival(axes: Axes, verdict: Verdict) -> None:
     for y, marker, colour, label in (
         (np.full(len(x), 100.0), "o", style.MUTED, "guess"),
         (100.0 * verdict.predicted / before, "_", style.INK, "σ predicted before any run"),
-        (100.0 * verdict.observed / before, ".", style.OPTIMIZED, "root mean square error of all robots"),
+        (
+            100.0 * verdict.observed / before,
+            ".",
+            style.OPTIMIZED,
+            "root mean square error of all robots",
+        ),
     ):
         size = {"o": 4.0, "_": 20.0, ".": 9.0}[marker]
         axes.plot(
-            x, y, marker, color=colour, markersize=size, markeredgewidth=1.8 if marker == "_" else 0.0, label=label
+            x,
+            y,
+            marker,
+            color=colour,
+            markersize=size,
+            markeredgewidth=1.8 if marker == "_" else 0.0,
+            label=label,
         )
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -338,5 +405,10 @@ def draw_arrival(axes: Axes, verdict: Verdict) -> None:
     axes.set_ylim(60.0 * low, 400.0)
     axes.set_xticks(x, [style.shorten(name, 24) for name in verdict.names], rotation=30, ha="right")
     axes.legend(
-        fontsize=style.SMALL, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.98), ncols=3, borderpad=0.0
+        fontsize=style.SMALL,
+        frameon=False,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 0.98),
+        ncols=3,
+        borderpad=0.0,
     )

@@ -34,7 +34,11 @@ from mjfim.records.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[1]
 STEP = 0.0005  # [s] of the robot
-JITTER, LATE, OFF = 0.002, 0.010, 0.1  # [s] of ticks, [s] of readings, standard deviation of the start
+JITTER, LATE, OFF = (
+    0.002,
+    0.010,
+    0.1,
+)  # [s] of ticks, [s] of readings, standard deviation of the start
 SIGMA = 0.05
 BIAS = {"qvel:hinge": 0.3, "qpos:hinge": -0.1}
 FRICTION = 0.5  # [N] in the slide, where the model has none
@@ -63,7 +67,9 @@ def prepared() -> tuple[Setup, Array]:
     return Setup(base.replace(nuisance=nuisance, fit={"noise": "estimated"}), 1), control
 
 
-def robot(setup: Setup, control: Array, friction: float, rng: np.random.Generator) -> tuple[Array, Recording]:
+def robot(
+    setup: Setup, control: Array, friction: float, rng: np.random.Generator
+) -> tuple[Array, Recording]:
     """True theta and what the robot logged."""
     p = setup.parameters
     theta, names = np.array(p.true), list(p.names)
@@ -81,17 +87,27 @@ def robot(setup: Setup, control: Array, friction: float, rng: np.random.Generato
     ticks = np.rint(ticks / STEP) * STEP
     states = stepped(model, setup, theta, control, ticks)
     read = np.clip(np.rint((ticks - LATE) / STEP).astype(int), 0, len(states) - 1)
-    y = states[read] + p.bias(len(setup.outputs)) @ theta + rng.normal(0.0, SIGMA, (N + 1, len(setup.outputs)))
+    y = (
+        states[read]
+        + p.bias(len(setup.outputs)) @ theta
+        + rng.normal(0.0, SIGMA, (N + 1, len(setup.outputs)))
+    )
     return theta, Recording(ticks, control, y, setup.outputs.names, "robot")
 
 
-def stepped(model: mujoco.MjModel, setup: Setup, theta: Array, control: Array, ticks: Array) -> Array:
+def stepped(
+    model: mujoco.MjModel, setup: Setup, theta: Array, control: Array, ticks: Array
+) -> Array:
     """States at every step; the control changes at the controller's own ticks."""
     data = mujoco.MjData(model)
     qpos, qvel, _ = setup.space.split(setup.plant.start(theta))
     data.qpos[:], data.qvel[:] = qpos, qvel
     count = round(ticks[-1] / STEP)
-    tick = np.clip(np.searchsorted(ticks, np.arange(count) * STEP + 1e-9, side="right") - 1, 0, len(control) - 1)
+    tick = np.clip(
+        np.searchsorted(ticks, np.arange(count) * STEP + 1e-9, side="right") - 1,
+        0,
+        len(control) - 1,
+    )
     states = np.empty((count + 1, len(qpos) + len(qvel)))
     states[0] = [*data.qpos, *data.qvel]
     for i in range(count):
@@ -123,12 +139,15 @@ def study(runs: int, seed: int, friction: float) -> list[Outcome]:
 def coverage_table(names: Sequence[str], found: list[Outcome]) -> Table:
     """How often the truth was inside."""
     table = Table(
-        title=f"Truth inside the 95 % interval, {len(found)} recordings (at least 90 % wanted)", title_justify="left"
+        title=f"Truth inside the 95 % interval, {len(found)} recordings (at least 90 % wanted)",
+        title_justify="left",
     )
     for heading in ("unknown", "interval", "formal interval", "rms error [formal σ]"):
         table.add_column(heading, justify="left" if heading == "unknown" else "right")
     for j, name in enumerate(names):
-        shares = [100.0 * np.mean([getattr(o, key)[j] for o in found]) for key in ("inside", "formally")]
+        shares = [
+            100.0 * np.mean([getattr(o, key)[j] for o in found]) for key in ("inside", "formally")
+        ]
         rms = float(np.sqrt(np.mean([o.error[j] ** 2 for o in found])))
         table.add_row(name, *(f"{share:.1f} %" for share in shares), f"{rms:.2f}")
     return table
@@ -136,7 +155,9 @@ def coverage_table(names: Sequence[str], found: list[Outcome]) -> Table:
 
 def main() -> int:
     """Run both studies and print; exit code 1 where a promise is not kept."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--output", type=Path, help="JSON file with the shares")
@@ -157,7 +178,13 @@ def main() -> int:
     console.print(f"  and this friction named first as what is missing: {100 * named:.1f} %")
     console.print(f"{2 * args.runs} fits in {time.perf_counter() - clock:.0f} s on {cores()} cores")
     if args.output is not None:
-        told = {"runs": args.runs, "inside": shares, "false_misfit": false, "misfit": caught, "named": named}
+        told = {
+            "runs": args.runs,
+            "inside": shares,
+            "false_misfit": false,
+            "misfit": caught,
+            "named": named,
+        }
         with replacing(args.output) as temporary:
             temporary.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
     return 0 if min(shares.values()) >= 0.9 and caught >= 0.95 else 1

@@ -90,12 +90,23 @@ def new_table(title: str, *headings: str) -> Table:
 
 def table_one(design: Design) -> Table:
     """Eigenvalues and cost. The printed cost leaves the weighted terms out: compared with the criterion 1/lambda_3."""
-    table = new_table("Table I: eigenvalues of the information, and cost", "quantity", "paper", "mjfim", "difference")
+    table = new_table(
+        "Table I: eigenvalues of the information, and cost",
+        "quantity",
+        "paper",
+        "mjfim",
+        "difference",
+    )
     for name, side in (("initial", design.initial), ("final", design.final)):
         ours = [*side.eigenvalues[::-1], side.criterion]
         printed = [*PAPER[name].eigenvalues[::-1], PAPER[name].cost]
         for quantity, theirs, value in zip(("λ1", "λ2", "λ3", "J"), printed, ours, strict=True):
-            row = (f"{TITLES[name]} {quantity}", f"{theirs:.5g}", f"{value:.5g}", difference(theirs, float(value)))
+            row = (
+                f"{TITLES[name]} {quantity}",
+                f"{theirs:.5g}",
+                f"{value:.5g}",
+                difference(theirs, float(value)),
+            )
             table.add_row(*row)
     return table
 
@@ -106,7 +117,17 @@ def matrix_table(name: str, trials: int, covariance: Array, information: Array) 
     table = new_table(
         f"Tables II and III, {TITLES[name]} trajectory, 25 Hz: covariance ({trials} trials), Fisher information, bound",
         "entry",
-        *("paper cov.", "mjfim", "diff.", "paper inf.", "mjfim", "diff.", "paper bound", "mjfim", "diff."),
+        *(
+            "paper cov.",
+            "mjfim",
+            "diff.",
+            "paper inf.",
+            "mjfim",
+            "diff.",
+            "paper bound",
+            "mjfim",
+            "diff.",
+        ),
     )
     for k, (i, j) in enumerate(UPPER):
         cells = [f"{'mℓc'[i]}{'mℓc'[j]}"]
@@ -123,11 +144,20 @@ def matrix_table(name: str, trials: int, covariance: Array, information: Array) 
 def efficiency_table(study: Study) -> Table:
     """Observed variances against mjfim's own bound."""
     headings = ("trajectory", "parameter", "variance", "bound", "variance / bound", "failed")
-    table = new_table(f"Monte Carlo at {study.measure_rate:g} Hz against mjfim's own bound", *headings)
+    table = new_table(
+        f"Monte Carlo at {study.measure_rate:g} Hz against mjfim's own bound", *headings
+    )
     for name, s in study.sets.items():
         for i, parameter in enumerate(study.parameters):
             variance, bound = s.covariance[i, i], s.crlb[i, i]
-            row = (TITLES[name], parameter, f"{variance:.3e}", f"{bound:.3e}", f"{variance / bound:.3f}", str(s.failed))
+            row = (
+                TITLES[name],
+                parameter,
+                f"{variance:.3e}",
+                f"{bound:.3e}",
+                f"{variance / bound:.3f}",
+                str(s.failed),
+            )
             table.add_row(*row)
     return table
 
@@ -148,7 +178,9 @@ def write_figures(folder: Path, setup: Setup, design: Design, study: Study) -> N
 
 def main() -> None:
     """Run the study and print every comparison."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("-o", "--output", type=Path, default=Path("out/paper"))
     parser.add_argument("--trials", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=0)
@@ -159,11 +191,14 @@ def main() -> None:
     console.print(table_one(design))
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     studies = {
-        rate: mjfim.monte_carlo(setup, curves, args.trials, args.seed, measure_rate=rate) for rate in (25.0, 100.0)
+        rate: mjfim.monte_carlo(setup, curves, args.trials, args.seed, measure_rate=rate)
+        for rate in (25.0, 100.0)
     }
     for name in PAPER:
         information = information_at(setup, curves[name], 25.0)
-        console.print(matrix_table(name, args.trials, studies[25.0].sets[name].covariance, information))
+        console.print(
+            matrix_table(name, args.trials, studies[25.0].sets[name].covariance, information)
+        )
     console.print(NOTE)
     for study in studies.values():
         console.print(efficiency_table(study))
@@ -172,7 +207,9 @@ def main() -> None:
     write_json(args.output / "montecarlo_25Hz.json", study_summary(studies[25.0]))
     write_json(args.output / "montecarlo_100Hz.json", study_summary(studies[100.0]))
     write_figures(args.output, setup, design, studies[25.0])
-    console.print(f"wrote {args.output}/: figures 2-6, tables, design.rrd (mjfim replay {args.output})")
+    console.print(
+        f"wrote {args.output}/: figures 2-6, tables, design.rrd (mjfim replay {args.output})"
+    )
 
 
 if __name__ == "__main__":

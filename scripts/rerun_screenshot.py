@@ -21,7 +21,9 @@ def screenshot(rrd: Path, png: Path, time_s: float = 0.0, iteration: int | None 
     """Save what the viewer shows at `sim_time` = time_s [s], or at an iteration of the optimiser instead."""
     # the wheel's own executable: PATH may not hold the environment
     viewer_path = str(files("rerun_cli") / "rerun")
-    with ViewerClient.spawn(headless=True, port=_free_port(), executable_path=viewer_path) as viewer:
+    with ViewerClient.spawn(
+        headless=True, port=_free_port(), executable_path=viewer_path
+    ) as viewer:
         viewer.open(str(rrd.resolve()))
         if iteration is None:
             viewer.set_time(timeline="sim_time", duration=time_s, play_state="paused")
@@ -44,7 +46,9 @@ def main() -> int:
     parser.add_argument("rrd", type=Path)
     parser.add_argument("png", type=Path)
     parser.add_argument("--time", type=float, default=0.0, help="simulated time [s]")
-    parser.add_argument("--iteration", type=int, help="show the timeline `iteration` at this number instead")
+    parser.add_argument(
+        "--iteration", type=int, help="show the timeline `iteration` at this number instead"
+    )
     args = parser.parse_args()
     try:
         screenshot(args.rrd, args.png, args.time, args.iteration)

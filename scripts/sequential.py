@@ -43,7 +43,14 @@ say = Console(highlight=False, soft_wrap=True)
 def table(campaign: Campaign, setup: Setup, simulated: bool) -> Table:
     """The last round."""
     rows = Table(title=str(campaign), title_justify="left")
-    for heading in ("parameter", "guess", "estimate", "formal σ", "wanted σ", *(["off by"] if simulated else [])):
+    for heading in (
+        "parameter",
+        "guess",
+        "estimate",
+        "formal σ",
+        "wanted σ",
+        *(["off by"] if simulated else []),
+    ):
         rows.add_column(heading, justify="left" if heading == "parameter" else "right")
     e = campaign.estimate
     for j in setup.parameters.interest.tolist() if e is not None else []:
@@ -51,8 +58,18 @@ def table(campaign: Campaign, setup: Setup, simulated: bool) -> Table:
             continue
         std, aim = float(e.std[j]), float(campaign.wanted[j])
         off = [f"{(e.theta[j] - setup.parameters.true[j]) / std:+.1f} σ"] if simulated else []
-        words = [e.parameters[j], f"{setup.parameters.guess[j]:.5g}", f"{e.theta[j]:.5g}", f"{std:.2g}"]
-        rows.add_row(*words, f"{aim:.2g}" if np.isfinite(aim) else "-", *off, style="" if std <= aim else "yellow")
+        words = [
+            e.parameters[j],
+            f"{setup.parameters.guess[j]:.5g}",
+            f"{e.theta[j]:.5g}",
+            f"{std:.2g}",
+        ]
+        rows.add_row(
+            *words,
+            f"{aim:.2g}" if np.isfinite(aim) else "-",
+            *off,
+            style="" if std <= aim else "yellow",
+        )
     return rows
 
 
@@ -65,7 +82,9 @@ def simulated(folder: Folder, rounds: int, seed: int) -> Campaign:
             "use --real"
         )
     if list(folder.path.glob("round_*")):
-        raise RecordingError(f"{folder.path}: holds a campaign already; take another folder, or go on with --real")
+        raise RecordingError(
+            f"{folder.path}: holds a campaign already; take another folder, or go on with --real"
+        )
 
     def measure(design: Design, number: int) -> Recording:
         folder.leave_design(design, number)
@@ -90,36 +109,60 @@ def real(folder: Folder, rounds: int, files: Sequence[Path]) -> Campaign:
     if waits and not done:
         return Campaign(folder.setup.parameters.names, wanted_of(folder.setup), (), Outcome.WAITING)
     limit = len(done) if waits else rounds
-    campaign = mjfim.sequential(experiment, measure, limit, threads=threads, report=folder.report, done=done)
+    campaign = mjfim.sequential(
+        experiment, measure, limit, threads=threads, report=folder.report, done=done
+    )
     if waits and campaign.status is Outcome.EXHAUSTED and len(done) < rounds:
         return replace(campaign, status=Outcome.WAITING)
     return campaign
 
 
-def with_wanted(experiment: Experiment, relative: float | None, names: Sequence[str], guess: Array) -> Experiment:
+def with_wanted(
+    experiment: Experiment, relative: float | None, names: Sequence[str], guess: Array
+) -> Experiment:
     """The experiment with a wanted σ, relative to the guess, of every parameter that states none."""
     if relative is None:
         return experiment
     tables = {}
     for name, value in zip(names, guess.tolist(), strict=True):
         spec = experiment.parameters.get(name)
-        if spec is not None and spec.wanted is None and spec.inertial is None and not spec.nuisance and value:
+        if (
+            spec is not None
+            and spec.wanted is None
+            and spec.inertial is None
+            and not spec.nuisance
+            and value
+        ):
             tables[name] = {"wanted": relative * abs(value)}
     return experiment.replace(parameters=tables)
 
 
 def main() -> int:
     """Run, say, leave files."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("experiment", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
     parser.add_argument("--rounds", type=int, default=10, help="at most so many (default 10)")
     parser.add_argument(
-        "--wanted", type=float, metavar="SHARE", help="of the guess, where the file states no `wanted` σ"
+        "--wanted",
+        type=float,
+        metavar="SHARE",
+        help="of the guess, where the file states no `wanted` σ",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the simulated noise")
-    parser.add_argument("--real", action="store_true", help="record on a real robot, a round a call")
-    parser.add_argument("--recordings", type=Path, nargs="+", default=[], metavar="CSV", help="of the round that waits")
+    parser.add_argument(
+        "--real", action="store_true", help="record on a real robot, a round a call"
+    )
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="CSV",
+        help="of the round that waits",
+    )
     parser.add_argument("--threads", type=int, help="for MuJoCo; default: all cores")
     args = parser.parse_args()
     try:
@@ -130,7 +173,11 @@ def main() -> int:
         folder = Folder(args.output, Setup(stated, args.threads))
         wanted_of(folder.setup)
         truth = not (args.real or args.recordings)
-        campaign = simulated(folder, args.rounds, args.seed) if truth else real(folder, args.rounds, args.recordings)
+        campaign = (
+            simulated(folder, args.rounds, args.seed)
+            if truth
+            else real(folder, args.rounds, args.recordings)
+        )
         folder.leave(campaign, truth)
     except MjfimError as error:
         told.print(f"sequential: {error}", markup=False)
@@ -141,7 +188,10 @@ def main() -> int:
     say.print(table(campaign, folder.setup, truth))
     if campaign.status is Outcome.WAITING:
         waiting = folder.round(folder.designed)
-        say.print(f"play {waiting}/design.csv, record, then repeat this call with --recordings FILE.csv", markup=False)
+        say.print(
+            f"play {waiting}/design.csv, record, then repeat this call with --recordings FILE.csv",
+            markup=False,
+        )
     told.print(f"wrote {args.output}/")
     return 0 if campaign.reached else 1
 

@@ -45,7 +45,11 @@ class Folder:
     @property
     def designed(self) -> int:
         """Number of rounds that have a design."""
-        return next(k for k in range(len(list(self.path.glob("round_*"))) + 1) if not self._has_design(k + 1))
+        return next(
+            k
+            for k in range(len(list(self.path.glob("round_*"))) + 1)
+            if not self._has_design(k + 1)
+        )
 
     @property
     def recorded(self) -> int:
@@ -84,7 +88,9 @@ class Folder:
             except (ValueError, KeyError, TypeError):
                 raise RecordingError(f"{file}: not a design.json of mjfim") from None
             if own != names or theta.shape != std.shape or len(theta) != len(names):
-                raise RecordingError(f"{file}: designed for {', '.join(own)}; the experiment has {', '.join(names)}")
+                raise RecordingError(
+                    f"{file}: designed for {', '.join(own)}; the experiment has {', '.join(names)}"
+                )
             trajectory = read_design(self.round(k) / "design.npz")["final"]
             check_fits(self.round(k) / "design.npz", trajectory, self.setup)
             recordings = tuple(read_recording(path, self.setup) for path in self.recordings(k))
@@ -99,7 +105,9 @@ class Folder:
     def report(self, now: Round) -> None:
         """Keep a round, and say what it told."""
         self.rounds.append(now)
-        write_json(self.round(now.number) / "estimate.json", estimate_summary(now.estimate, self.setup))
+        write_json(
+            self.round(now.number) / "estimate.json", estimate_summary(now.estimate, self.setup)
+        )
         told.print(f"round {now.number}: {described(now, self.setup)}", markup=False)
         for sentence in now.warnings:
             told.print(f"  warning: {sentence}", style="yellow", markup=False)
@@ -122,7 +130,9 @@ def described(now: Round, setup: Setup) -> str:
     e, parts = now.estimate, []
     for j, name in enumerate(e.parameters):
         if np.isfinite(aims[j]):
-            parts.append(f"{name} {style.with_error(float(e.theta[j]), float(e.std[j]))} (wanted {aims[j]:.3g})")
+            parts.append(
+                f"{name} {style.with_error(float(e.theta[j]), float(e.std[j]))} (wanted {aims[j]:.3g})"
+            )
     return ", ".join(parts)
 
 

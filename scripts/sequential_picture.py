@@ -35,7 +35,15 @@ def figure(campaign: Campaign, setup: Setup, simulated: bool) -> Figure:
     for column in (0, 1):
         new.align_ylabels(panels[:, column])
     handles = [
-        Line2D([], [], color=style.INITIAL, marker="o", mfc="white", linestyle="", label="promised before the round"),
+        Line2D(
+            [],
+            [],
+            color=style.INITIAL,
+            marker="o",
+            mfc="white",
+            linestyle="",
+            label="promised before the round",
+        ),
         Line2D([], [], color=style.OPTIMIZED, marker="o", label="after it, from all recordings"),
         Line2D([], [], color=style.INK, linestyle="--", label="wanted"),
     ]
@@ -52,7 +60,16 @@ def _draw_std(axes: Axes, campaign: Campaign, j: int) -> None:
     promised = np.array([r.predicted[j] for r in campaign.rounds])
     after = np.array([r.attained[j] for r in campaign.rounds])
     axes.set_yscale("log")
-    axes.plot(number, promised, color=style.INITIAL, marker="o", mfc="white", linestyle="", markersize=8, zorder=2)
+    axes.plot(
+        number,
+        promised,
+        color=style.INITIAL,
+        marker="o",
+        mfc="white",
+        linestyle="",
+        markersize=8,
+        zorder=2,
+    )
     axes.plot(number, after, color=style.OPTIMIZED, marker="o", markersize=4, zorder=3)
     aim = float(campaign.wanted[j])
     values = np.concatenate([promised, after, [aim]])
@@ -97,7 +114,16 @@ def _draw_estimate(axes: Axes, campaign: Campaign, j: int, true: float | None) -
     known = np.isfinite(std)
     bar = np.where(known, std, 0.0)
     axes.errorbar(number, theta, 2 * bar, color=style.OPTIMIZED, linestyle="", linewidth=0.9)
-    axes.errorbar(number, theta, bar, color=style.OPTIMIZED, linestyle="", linewidth=2.4, marker="o", markersize=4)
+    axes.errorbar(
+        number,
+        theta,
+        bar,
+        color=style.OPTIMIZED,
+        linestyle="",
+        linewidth=2.4,
+        marker="o",
+        markersize=4,
+    )
     if known[-1]:
         for times in (1, 2):
             band = (theta[-1] - times * bar[-1], theta[-1] + times * bar[-1])

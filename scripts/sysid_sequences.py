@@ -24,7 +24,12 @@ from mjfim.records.recording import Recording
 
 REACH = 1e3  # sizes of a parameter from its guess to a bound that is not stated; sysid wants finite ones
 PROBE = 1e-2  # sizes by which parameters are moved to see whether a compile follows
-WHOLE = {*INERTIAL_FIELDS, *SERVO, "rot", "springlength"}  # fields that are written as a whole, as a model has them
+WHOLE = {
+    *INERTIAL_FIELDS,
+    *SERVO,
+    "rot",
+    "springlength",
+}  # fields that are written as a whole, as a model has them
 
 
 def require_extra() -> None:
@@ -75,7 +80,9 @@ class Exported:
 
         def whole(x: Array, parameters: Any, **options: Any) -> tuple[list[Array], Any, Any]:
             residuals, predicted, measured = data(x, parameters, **options)
-            priors = (weight * (p.guess - x.T)).T[weight > 0.0]  # x: (p,), or (p, k) for differences
+            priors = (weight * (p.guess - x.T)).T[
+                weight > 0.0
+            ]  # x: (p,), or (p, k) for differences
             return [*residuals, priors], predicted, measured
 
         return whole if weighted and weight.any() else data
@@ -95,7 +102,9 @@ def export(setup: Setup, recordings: Sequence[Recording]) -> Exported:
     tracks = [track_of(setup, recording) for recording in recordings]
     nq, nv = setup.model.nq, setup.model.nv
     start = setup.plant.start(setup.parameters.guess)
-    state = sysid.create_initial_state(setup.model, start[:nq], start[nq : nq + nv], start[nq + nv :])
+    state = sysid.create_initial_state(
+        setup.model, start[:nq], start[nq : nq + nv], start[nq + nv :]
+    )
     with hushed():  # it counts state signals among sensors
         sequences = sysid.ModelSequences(
             setup.model_path.stem,
@@ -130,7 +139,9 @@ def parameters_of(setup: Setup) -> Any:
         def write(spec: Any, parameter: Any) -> None:
             theta[j] = float(parameter.value[0])
             if j == len(p) - 1:
-                write_spec(spec, setup.model, setup.model_at(theta) if whole else setup.model, p, theta)
+                write_spec(
+                    spec, setup.model, setup.model_at(theta) if whole else setup.model, p, theta
+                )
 
         return write
 
@@ -151,7 +162,9 @@ def _require_alike(setup: Setup) -> None:
             f"{e.source}: {name}: sysid fits numbers of the model only; take starts, biases, delays out"
         )
     if e.fit.segments is not None or e.fit.start != "stated":
-        raise ExperimentError(f"{e.source}: fit: sysid takes every start as stated; take segments and start out")
+        raise ExperimentError(
+            f"{e.source}: fit: sysid takes every start as stated; take segments and start out"
+        )
 
 
 def _require_followed(setup: Setup, parameters: Any, spec: Any) -> None:
@@ -167,17 +180,27 @@ def _require_followed(setup: Setup, parameters: Any, spec: Any) -> None:
                 return
         except ValueError as error:
             if settled:
-                raise ModelError(f"{setup.model_path}: MuJoCo refuses the parameters a little off: {error}") from None
-    raise ModelError(f"{setup.model_path}: a compile with other parameters gives another model than mjfim simulates")
+                raise ModelError(
+                    f"{setup.model_path}: MuJoCo refuses the parameters a little off: {error}"
+                ) from None
+    raise ModelError(
+        f"{setup.model_path}: a compile with other parameters gives another model than mjfim simulates"
+    )
 
 
 def _notes(setup: Setup) -> tuple[str, ...]:
     fit, p = setup.experiment.fit, setup.parameters
     told = [q.name for q in p.parameters if q.prior is not None]
-    unbounded = [n for n, low, high in zip(p.names, p.lower, p.upper, strict=True) if not np.isfinite(high - low)]
+    unbounded = [
+        n
+        for n, low, high in zip(p.names, p.lower, p.upper, strict=True)
+        if not np.isfinite(high - low)
+    ]
     said = [f"sysid as is gets no priors: {', '.join(told)}"] if told else []
     if unbounded:
-        said.append(f"sysid wants bounds: {', '.join(unbounded)} within {REACH:g} sizes of the guess")
+        said.append(
+            f"sysid wants bounds: {', '.join(unbounded)} within {REACH:g} sizes of the guess"
+        )
     if fit.loss != "linear":
         said.append(f"sysid minimises squares, mjfim the loss {fit.loss!r}")
     if fit.noise != "stated":

@@ -42,10 +42,16 @@ class Layout:
     def of(setup: Setup) -> Layout:
         """Whole signals, also where some of their components are not measured. Raises ExperimentError."""
         qpos, qvel, act, _ = sysid.TimeSeries.compute_all_state_mappings(setup.model)
-        wholes = {False: qpos | qvel | act, True: sysid.TimeSeries.compute_all_sensor_mapping(setup.model)}
+        wholes = {
+            False: qpos | qvel | act,
+            True: sysid.TimeSeries.compute_all_sensor_mapping(setup.model),
+        }
         mapping: dict[str, tuple[Any, np.ndarray]] = {}
         columns: list[tuple[bool, int]] = []
-        sought = [(o.sensor is not None, o.state if o.sensor is None else o.sensor) for o in setup.outputs.outputs]
+        sought = [
+            (o.sensor is not None, o.state if o.sensor is None else o.sensor)
+            for o in setup.outputs.outputs
+        ]
         for output, (sensed, place) in zip(setup.outputs.outputs, sought, strict=True):
             hits = [name for name, (_, indices) in wholes[sensed].items() if place in indices]
             if not hits or hits[0] in ("_qpos", "_qvel"):
@@ -89,7 +95,14 @@ class Compared:
     noise: Noise | None
 
     def __call__(
-        self, params: Any, predicted: Any, measured: Any, model: Any, everything: bool, state: Array, **_: Any
+        self,
+        params: Any,
+        predicted: Any,
+        measured: Any,
+        model: Any,
+        everything: bool,
+        state: Array,
+        **_: Any,
     ) -> tuple[Array, Any, Any]:
         """Residuals of what is measured, one after the other, and both TimeSeries after the start. everything: to be drawn"""
         layout, later = self.layout, measured.times > 0.0

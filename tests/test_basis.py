@@ -74,7 +74,11 @@ def test_a_periodic_basis_meets_itself_with_two_derivatives() -> None:
     np.testing.assert_allclose(turned, np.roll(basis, -1, axis=1), rtol=0, atol=1e-12)
     assert np.abs(basis[0] - basis[-1]).max() < 0.02 * np.abs(basis).max()
     jumps = []
-    for order in (1, 2, 3):  # the largest change of a derivative from sample to sample, over the derivative
+    for order in (
+        1,
+        2,
+        3,
+    ):  # the largest change of a derivative from sample to sample, over the derivative
         around = np.diff(np.concatenate([basis, basis[: order + 1]]), order, axis=0)
         jumps.append(np.abs(np.diff(around, axis=0)).max() / np.abs(around).max())
     assert jumps[0] < 0.02 and jumps[1] < 0.02 and jumps[2] > 0.5
@@ -92,7 +96,9 @@ def test_there_is_little_above_the_bandwidth_and_much_below() -> None:
     assert (power[f <= BANDWIDTH].sum(axis=0) / power.sum(axis=0)).min() > 0.8
     narrow = spline_basis(T, HORIZON, BANDWIDTH / 4.0, False, False, True)
     wave = np.sin(2 * np.pi * BANDWIDTH * T)
-    assert np.abs(narrow @ np.linalg.lstsq(narrow, wave)[0]).max() < 0.1  # what is too quick it does not follow
+    assert (
+        np.abs(narrow @ np.linalg.lstsq(narrow, wave)[0]).max() < 0.1
+    )  # what is too quick it does not follow
 
 
 def test_a_bandwidth_below_that_of_the_horizon_leaves_a_few_splines() -> None:
@@ -109,7 +115,9 @@ def waves(t: np.ndarray, frequency: float) -> np.ndarray:
     return np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
 
 
-@pytest.mark.parametrize(("begins", "ends"), [(False, False), (True, False), (False, True), (True, True)])
+@pytest.mark.parametrize(
+    ("begins", "ends"), [(False, False), (True, False), (False, True), (True, True)]
+)
 @pytest.mark.parametrize("frequency", [0.5, 0.37], ids=["period divides", "period does not divide"])
 def test_a_fourier_series_at_rest_differs_by_one_polynomial_of_least_degree(
     begins: bool, ends: bool, frequency: float
@@ -133,7 +141,9 @@ def test_a_fourier_series_at_rest_differs_by_one_polynomial_of_least_degree(
 
 @pytest.mark.parametrize(("begins", "ends"), [(False, False), (True, False), (True, True)])
 @pytest.mark.parametrize("frequency", [0.65, 1.0], ids=["period does not divide", "period divides"])
-def test_a_fourier_series_keeps_as_many_dimensions_as_it_has_waves(frequency: float, begins: bool, ends: bool) -> None:
+def test_a_fourier_series_keeps_as_many_dimensions_as_it_has_waves(
+    frequency: float, begins: bool, ends: bool
+) -> None:
     basis = fourier_basis(T, HORIZON, frequency, HARMONICS, begins, ends)
     values = np.linalg.svd(basis, compute_uv=False)
     assert len(values) == 2 * HARMONICS

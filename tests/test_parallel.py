@@ -56,7 +56,9 @@ def test_a_pool_that_was_stopped_serves_again_once_nothing_runs() -> None:
         assert pool.submit(until_told, 0.1).result(timeout=30.0) == (False, first[1])
 
 
-def test_what_has_ended_is_salvaged_in_order_and_the_rest_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_has_ended_is_salvaged_in_order_and_the_rest_is_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     done: list[Future[int]] = [Future() for _ in range(4)]
     for i, future in enumerate(done[:3]):
         future.set_running_or_notify_cancel()
@@ -101,10 +103,14 @@ def test_interrupted_by_what_watches_it_keeps_the_others_too(tmp_path: Path) -> 
     assert design.final.cost < design.initial.cost
 
 
-def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(tmp_path: Path) -> None:
+def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
+    tmp_path: Path,
+) -> None:
     """A terminal sends SIGINT to the whole process group."""
     hard = "[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] }\ncontrol_rate = 100.0"
-    path = write_experiment(tmp_path, tolerance="1e-12", max_iterations=f"100000\nstarts = 2000\n{hard}")
+    path = write_experiment(
+        tmp_path, tolerance="1e-12", max_iterations=f"100000\nstarts = 2000\n{hard}"
+    )
     words = [sys.executable, "-W", "error", "-m", "mjfim", "design", path, "-o", tmp_path / "out"]
     with subprocess.Popen(
         words, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -124,7 +130,9 @@ def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(tm
     assert "out" in names(tmp_path)
 
 
-def test_a_start_that_breaks_does_not_end_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_that_breaks_does_not_end_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     climb = Ladder.climb
 
     def broken(self: Ladder, control: np.ndarray, *rest: float) -> Iterator[Rung]:

@@ -36,7 +36,9 @@ def checkout(tmp_path: Path) -> Path:
 
 def run(command: list[str], folder: Path, code: int = 0) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "error"}
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment, check=False)
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, env=environment, check=False
+    )
     assert done.returncode == code, done.stdout + done.stderr
 
 
@@ -46,12 +48,18 @@ def test_python_blocks_run(block: str, checkout: Path) -> None:
 
 
 def test_command_lines_run(checkout: Path) -> None:
-    lines = [line for block in blocks("sh") for line in block.splitlines() if line.startswith("mjfim ")]
+    lines = [
+        line for block in blocks("sh") for line in block.splitlines() if line.startswith("mjfim ")
+    ]
     verbs = {"check", "design", "simulate", "identify", "montecarlo", "replay"}
     assert {line.split()[1] for line in lines} == verbs
     for line in lines:
         command, _, comment = line.partition("#")
-        run([sys.executable, "-m", *command.split()], checkout, 1 if "exits with 1" in comment else 0)
+        run(
+            [sys.executable, "-m", *command.split()],
+            checkout,
+            1 if "exits with 1" in comment else 0,
+        )
     assert (checkout / "out" / "replay.rrd").is_file()
 
 
@@ -69,7 +77,9 @@ def test_further_tables_extend_it() -> None:
         assert set(tables.get("parameters", {})) < set(setup.parameters.names)
         assert np.isfinite(setup.problem.point(setup.initial).cost)
         require_inside(setup)
-        assert len(list(starts_of(setup, None))) == len({start.name for start in starts_of(setup, None)})
+        assert len(list(starts_of(setup, None))) == len(
+            {start.name for start in starts_of(setup, None)}
+        )
 
 
 def test_every_example_is_in_the_tour() -> None:

@@ -30,10 +30,15 @@ T = np.arange(400) * 0.01
 def read(tmp_path: Path) -> Read:
     """Write columns as CSV and read the control back on a grid of period dt."""
 
-    def run(columns: Mapping[str, object], N: int, dt: float, names: tuple[str, ...] = ("u",)) -> Array:
+    def run(
+        columns: Mapping[str, object], N: int, dt: float, names: tuple[str, ...] = ("u",)
+    ) -> Array:
         path = tmp_path / "table.csv"
         rows = zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True)
-        lines = [",".join(columns), *(",".join("" if v != v else repr(v) for v in row) for row in rows)]
+        lines = [
+            ",".join(columns),
+            *(",".join("" if v != v else repr(v) for v in row) for row in rows),
+        ]
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return read_control(path, np.arange(N) * dt, dt, names)
 
@@ -113,7 +118,10 @@ def test_compressed_tables(tmp_path: Path) -> None:
     path = tmp_path / "table.csv.gz"
     path.write_bytes(gzip.compress(b"t,u\n0,1.5\n1,2.5\n"))
     table = read_table(path)
-    assert {name: column.tolist() for name, column in table.items()} == {"t": [0.0, 1.0], "u": [1.5, 2.5]}
+    assert {name: column.tolist() for name, column in table.items()} == {
+        "t": [0.0, 1.0],
+        "u": [1.5, 2.5],
+    }
 
 
 def test_table_keeps_every_digit(tmp_path: Path) -> None:
@@ -128,7 +136,10 @@ def test_table_keeps_every_digit(tmp_path: Path) -> None:
 def test_amplitude_bounds_the_signal(kind: str) -> None:
     """|u - offset| <= amplitude, per actuator, and nearly reached."""
     signal = Signal(
-        kind=kind, amplitude={"left": 2.0, "right": 0.5}, offset={"left": -1.0, "right": 3.0}, frequency=1.0
+        kind=kind,
+        amplitude={"left": 2.0, "right": 0.5},
+        offset={"left": -1.0, "right": 3.0},
+        frequency=1.0,
     )
     u = generate(signal, T, NAMES, REST)
     assert u.shape == (400, 2)
@@ -155,7 +166,9 @@ def test_sine() -> None:
 
 def test_chirp_sweeps_its_frequencies() -> None:
     """Starts at zero, its frequency grows linearly to the end; the next actuator sweeps 17 % higher."""
-    u = generate(Signal(kind="chirp", amplitude=2.0, frequency=1.0, frequency_end=5.0), T, NAMES, REST)
+    u = generate(
+        Signal(kind="chirp", amplitude=2.0, frequency=1.0, frequency_end=5.0), T, NAMES, REST
+    )
     turns = 1.0 * T + 0.5 * (5.0 - 1.0) * T**2 / T[-1]
     assert np.allclose(u[:, 0], 2.0 * np.sin(2 * np.pi * turns), rtol=0, atol=1e-9)
     assert np.allclose(u[:, 1], 2.0 * np.sin(2 * np.pi * 1.17 * turns), rtol=0, atol=1e-9)
@@ -177,13 +190,16 @@ def test_chirp_ends_at_five_times_its_start_by_default() -> None:
     """The end of the sweep may be left out."""
     default = generate(Signal(kind="chirp", frequency=0.5), T, ("u",), REST[:1])
     assert np.array_equal(
-        default, generate(Signal(kind="chirp", frequency=0.5, frequency_end=2.5), T, ("u",), REST[:1])
+        default,
+        generate(Signal(kind="chirp", frequency=0.5, frequency_end=2.5), T, ("u",), REST[:1]),
     )
 
 
 def test_multisine_holds_its_harmonics_only() -> None:
     """Over whole periods all power is at f, 2 f, ..., n f."""
-    u = generate(Signal(kind="multisine", frequency=0.5, harmonics=4, seed=2), T, ("u",), REST[:1])[:, 0]
+    u = generate(Signal(kind="multisine", frequency=0.5, harmonics=4, seed=2), T, ("u",), REST[:1])[
+        :, 0
+    ]
     spectrum = np.abs(np.fft.rfft(u))  # bins of 0.25 Hz
     expected = {2, 4, 6, 8}
     assert set(np.flatnonzero(spectrum > 1e-9 * spectrum.max())) == expected
@@ -192,7 +208,8 @@ def test_multisine_holds_its_harmonics_only() -> None:
 def test_multisine_seed() -> None:
     """Same seed, same signal; another seed, another; actuators differ."""
     first, again, other = (
-        generate(Signal(kind="multisine", amplitude=1.0, seed=seed), T, NAMES, REST) for seed in (1, 1, 2)
+        generate(Signal(kind="multisine", amplitude=1.0, seed=seed), T, NAMES, REST)
+        for seed in (1, 1, 2)
     )
     assert np.array_equal(first, again)
     assert np.abs(first - other).max() > 0.1
@@ -224,7 +241,9 @@ def test_setup_samples_the_signal_at_its_rate() -> None:
     assert np.allclose(slow.control, fine.control[::5], rtol=0, atol=1e-12)
     coarse = fine.coarser(4)
     assert coarse.dt == pytest.approx(4 * fine.dt)
-    assert np.allclose(coarse.control[:, 0], fine.control.reshape(-1, 4).mean(axis=1), rtol=0, atol=1e-12)
+    assert np.allclose(
+        coarse.control[:, 0], fine.control.reshape(-1, 4).mean(axis=1), rtol=0, atol=1e-12
+    )
 
 
 def test_setup_swings_about_the_control_of_the_keyframe(tmp_path: Path) -> None:
@@ -234,9 +253,13 @@ def test_setup_swings_about_the_control_of_the_keyframe(tmp_path: Path) -> None:
     assert held != model
     (tmp_path / "held.xml").write_text(held, encoding="utf-8")
     e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
-        model=str(tmp_path / "held.xml"), horizon=1.0, initial={"control": {"kind": "sine", "amplitude": 0.5}}
+        model=str(tmp_path / "held.xml"),
+        horizon=1.0,
+        initial={"control": {"kind": "sine", "amplitude": 0.5}},
     )
     control = Setup(e).control[:, 0]
     assert (control[0], control.max(), control.min()) == pytest.approx((1.5, 2.0, 1.5), abs=1e-2)
-    stated = Setup(e.replace(initial={"control": {"kind": "sine", "amplitude": 0.5, "offset": -1.0}}))
+    stated = Setup(
+        e.replace(initial={"control": {"kind": "sine", "amplitude": 0.5, "offset": -1.0}})
+    )
     assert stated.control[:, 0] == pytest.approx(control - 2.5, abs=1e-12)

@@ -23,10 +23,12 @@ def check(
         list[Path] | None, typer.Argument(metavar="[RECORDING...]", help="Logs to look at instead.")
     ] = None,
     design_file: Annotated[
-        Path | None, typer.Option("--design", metavar="DESIGN.npz", help="Look at this design instead.")
+        Path | None,
+        typer.Option("--design", metavar="DESIGN.npz", help="Look at this design instead."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder for check.json and check.png.")
+        Path | None,
+        typer.Option("--output", "-o", metavar="DIR", help="Folder for check.json and check.png."),
     ] = None,
     as_json: AsJson = False,
     threads: Threads = None,

@@ -32,9 +32,16 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 out = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
 
 
-ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")]
-DesignFile = Annotated[Path, typer.Argument(metavar="DESIGN.npz", help="design.npz that `mjfim design` left.")]
-Folder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results, made if absent.")]
+ExperimentFile = Annotated[
+    Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")
+]
+DesignFile = Annotated[
+    Path, typer.Argument(metavar="DESIGN.npz", help="design.npz that `mjfim design` left.")
+]
+Folder = Annotated[
+    Path,
+    typer.Option("--output", "-o", metavar="DIR", help="Folder for the results, made if absent."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary to stdout as JSON.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads for MuJoCo; default: all cores.")]
 
@@ -81,11 +88,15 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
             errors.print(f"mjfim: {error}", markup=False)
             raise typer.Exit(2) from None
         except OSError as error:
-            errors.print(f"mjfim: {error.filename or 'cannot write'}: {error.strerror or error}", markup=False)
+            errors.print(
+                f"mjfim: {error.filename or 'cannot write'}: {error.strerror or error}",
+                markup=False,
+            )
             raise typer.Exit(1) from None
         except Unfinished as unfinished:
             errors.print(
-                f"mjfim: interrupted; {unfinished}/ holds some of the results, each file complete", markup=False
+                f"mjfim: interrupted; {unfinished}/ holds some of the results, each file complete",
+                markup=False,
             )
             raise typer.Exit(1) from None
         except KeyboardInterrupt:

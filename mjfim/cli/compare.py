@@ -7,7 +7,17 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import AsJson, ExperimentFile, Folder, Threads, _say, errors, progress, verb, writing
+from mjfim.cli.common import (
+    AsJson,
+    ExperimentFile,
+    Folder,
+    Threads,
+    _say,
+    errors,
+    progress,
+    verb,
+    writing,
+)
 from mjfim.experiment.system import Setup
 from mjfim.output import archive
 from mjfim.output import text as report
@@ -21,9 +31,14 @@ def compare(
     experiment: ExperimentFile,
     output: Folder,
     seconds: Annotated[float, typer.Option(min=0.0, help="Budget of each method [s].")] = 60.0,
-    steps: Annotated[float | None, typer.Option(min=1.0, help="Budget of MuJoCo steps; default: time alone.")] = None,
+    steps: Annotated[
+        float | None, typer.Option(min=1.0, help="Budget of MuJoCo steps; default: time alone.")
+    ] = None,
     methods: Annotated[
-        str | None, typer.Option(metavar="NAME,...", help=f"Baselines to run before the design: {', '.join(METHODS)}.")
+        str | None,
+        typer.Option(
+            metavar="NAME,...", help=f"Baselines to run before the design: {', '.join(METHODS)}."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the baselines.")] = 0,
     as_json: AsJson = False,
@@ -31,7 +46,9 @@ def compare(
 ) -> None:
     """Hold the design against chirps, multisines, Fourier series, splines with the same budget; exit code 1 if one is better."""
     setup = Setup(mjfim.Experiment.from_file(experiment), threads)
-    chosen = None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
+    chosen = (
+        None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
+    )
     check_folder(output)
     with progress() as bar:
         task = bar.add_task("comparing", total=None)
@@ -39,12 +56,19 @@ def compare(
 
         def monitor(glance: Glance) -> None:
             text = f"{glance.place + 1}/{glance.count} {glance.title}  best J {glance.cost:.5g}"
-            bar.update(task, description=text, total=glance.count, completed=glance.place + min(glance.used, 1.0))
+            bar.update(
+                task,
+                description=text,
+                total=glance.count,
+                completed=glance.place + min(glance.used, 1.0),
+            )
             if not errors.is_terminal and glance.place > told[0]:
                 told[0] = glance.place
                 errors.print(f"{glance.place + 1}/{glance.count} {glance.title}", markup=False)
 
-        result = mjfim.compare(setup, seconds, steps, seed, chosen, monitor=monitor, threads=threads)
+        result = mjfim.compare(
+            setup, seconds, steps, seed, chosen, monitor=monitor, threads=threads
+        )
     if not result.rows:
         raise KeyboardInterrupt
     with writing(output) as results:

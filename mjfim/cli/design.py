@@ -10,7 +10,17 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import AsJson, ExperimentFile, Folder, Threads, _say, errors, progress, verb, writing
+from mjfim.cli.common import (
+    AsJson,
+    ExperimentFile,
+    Folder,
+    Threads,
+    _say,
+    errors,
+    progress,
+    verb,
+    writing,
+)
 from mjfim.excitation.shortest_horizon import OutOfReachError, Shortest
 from mjfim.experiment.system import Setup
 from mjfim.output import archive
@@ -37,9 +47,14 @@ def design(
     experiment: ExperimentFile,
     output: Folder,
     as_json: AsJson = False,
-    starts: Annotated[int | None, typer.Option(min=1, help="Number of starts; overrides [descent] starts.")] = None,
+    starts: Annotated[
+        int | None, typer.Option(min=1, help="Number of starts; overrides [descent] starts.")
+    ] = None,
     shortest: Annotated[
-        bool, typer.Option("--shortest", help="Find the shortest horizon at which every `wanted` σ is reached.")
+        bool,
+        typer.Option(
+            "--shortest", help="Find the shortest horizon at which every `wanted` σ is reached."
+        ),
     ] = False,
     threads: Threads = None,
 ) -> None:
@@ -53,9 +68,7 @@ def design(
         task = bar.add_task("designing", total=None)
 
         def monitor(row: HistoryRow) -> None:
-            text = (
-                f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}  slope {row.slope:.1e}"
-            )
+            text = f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}  slope {row.slope:.1e}"
             bar.update(task, description=text)
             if not errors.is_terminal and row.iteration % 10 == 0:
                 errors.print(text)
@@ -69,16 +82,25 @@ def design(
         if found is not None:
             archive.write_json(output / "shortest.json", found.summary())
     told = {} if found is None else {"shortest": found.summary()}
-    _say(as_json, {**archive.design_summary(result), **told}, report.design_report(result, setup.units))
+    _say(
+        as_json,
+        {**archive.design_summary(result), **told},
+        report.design_report(result, setup.units),
+    )
     if found is not None:
-        errors.print(f"{found}\nto go on with it, state horizon = {found.horizon:g} in {experiment}", markup=False)
+        errors.print(
+            f"{found}\nto go on with it, state horizon = {found.horizon:g} in {experiment}",
+            markup=False,
+        )
     errors.print(f"wrote {output}/ (see it move: mjfim replay {output})")
     if not result.success:
         errors.print(f"mjfim: {'; '.join([result.status.value, *result.warnings])}", markup=False)
     raise typer.Exit(0 if result.success and (found is None or found.closed) else 1)
 
 
-def _shortest(setup: Setup, monitor: Callable[[HistoryRow], None], executor: Executor | None) -> Shortest:
+def _shortest(
+    setup: Setup, monitor: Callable[[HistoryRow], None], executor: Executor | None
+) -> Shortest:
     """The shortest design, every duration told on the way; exit code 1 where none is long enough."""
     try:
         return mjfim.shortest(

@@ -8,7 +8,18 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import AsJson, ExperimentFile, Folder, Threads, _say, errors, out, progress, verb, writing
+from mjfim.cli.common import (
+    AsJson,
+    ExperimentFile,
+    Folder,
+    Threads,
+    _say,
+    errors,
+    out,
+    progress,
+    verb,
+    writing,
+)
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import Setup
 from mjfim.optimize.levenberg_marquardt import Progress as Progressed
@@ -21,15 +32,21 @@ from mjfim.recordings.read import read_log
 @verb
 def identify(
     experiment: ExperimentFile,
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Logs of any format that is read.")],
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING...", help="Logs of any format that is read.")
+    ],
     output: Folder,
     held_out: Annotated[
         list[Path] | None,
         typer.Option(
-            "--held-out", metavar="FILE", help="Log that is predicted, not fitted; may be given several times."
+            "--held-out",
+            metavar="FILE",
+            help="Log that is predicted, not fitted; may be given several times.",
         ),
     ] = None,
-    method: Annotated[str, typer.Option(help="least_squares (with bounds) or newton (the paper's).")] = "least_squares",
+    method: Annotated[
+        str, typer.Option(help="least_squares (with bounds) or newton (the paper's).")
+    ] = "least_squares",
     as_json: AsJson = False,
     threads: Threads = None,
 ) -> None:
@@ -40,7 +57,9 @@ def identify(
     check_folder(output)
     with progress() as bar:
         task = bar.add_task("reading", total=None)
-        loaded, kept = ([read_log(path, setup) for path in paths] for paths in (recordings, held_out or []))
+        loaded, kept = (
+            [read_log(path, setup) for path in paths] for paths in (recordings, held_out or [])
+        )
         if not as_json:
             out.print(report.looks_report([log.look for log in (*loaded, *kept)]))
 
@@ -60,6 +79,10 @@ def identify(
     with writing(output) as results:
         for sentence in results.leave_estimate(output, result, setup):
             errors.print(f"warning: {sentence}", markup=False)
-    _say(as_json, archive.estimate_summary(result, setup), report.estimate_report(result, setup.units))
+    _say(
+        as_json,
+        archive.estimate_summary(result, setup),
+        report.estimate_report(result, setup.units),
+    )
     errors.print(f"wrote {output}/")
     raise typer.Exit(0 if result.success and not result.misfit and not result.interrupted else 1)

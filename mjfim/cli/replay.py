@@ -21,12 +21,16 @@ from mjfim.output.labels import Labels
 
 @verb
 def replay(
-    source: Annotated[Path, typer.Argument(metavar="DIR | FILE.rrd | DESIGN.npz", help="What to show.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="DIR | FILE.rrd | DESIGN.npz", help="What to show.")
+    ],
     save: Annotated[
-        Path | None, typer.Option(metavar="FILE.rrd", help="Write a file instead of opening the viewer.")
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="Write a file instead of opening the viewer."),
     ] = None,
     experiment: Annotated[
-        Path | None, typer.Option(help="Experiment of a DESIGN.npz that has no design.json beside it.")
+        Path | None,
+        typer.Option(help="Experiment of a DESIGN.npz that has no design.json beside it."),
     ] = None,
 ) -> None:
     """Show a result in the Rerun viewer."""

@@ -8,7 +8,17 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import AsJson, DesignFile, ExperimentFile, Folder, _say, errors, progress, verb, writing
+from mjfim.cli.common import (
+    AsJson,
+    DesignFile,
+    ExperimentFile,
+    Folder,
+    _say,
+    errors,
+    progress,
+    verb,
+    writing,
+)
 from mjfim.experiment.system import Setup
 from mjfim.output import archive
 from mjfim.output import text as report
@@ -19,7 +29,9 @@ from mjfim.output.folders import check_file, check_folder
 def simulate(
     experiment: ExperimentFile,
     design_file: DesignFile,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.csv", help="Recording to write.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE.csv", help="Recording to write.")
+    ],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
 ) -> None:
     """Play a design on the model at its `true` values, with noise: a synthetic recording."""
@@ -65,4 +77,8 @@ def montecarlo(
     errors.print(f"wrote {output}/")
     if len(study.sets) < len(named):
         errors.print(f"mjfim: interrupted; only {', '.join(study.sets)} is finished")
-    raise typer.Exit(0 if len(study.sets) == len(named) and all(s.failed == 0 for s in study.sets.values()) else 1)
+    raise typer.Exit(
+        0
+        if len(study.sets) == len(named) and all(s.failed == 0 for s in study.sets.values())
+        else 1
+    )

@@ -23,9 +23,13 @@ from mjfim.parallel import stopped
 from mjfim.records.design import HistoryRow, Status
 from mjfim.signals import independent
 
-POWER = 40.0  # of the smooth E-criterion: several of the smallest eigenvalues meet under hard limits
+POWER = (
+    40.0  # of the smooth E-criterion: several of the smallest eigenvalues meet under hard limits
+)
 CALM = 100.0  # growth of deviations from which on feedback is worth the time: steps are short under hard limits
-FAINT = 3e-3  # weight of an eigenvector, over the largest, below which it is left out of the gradient
+FAINT = (
+    3e-3  # weight of an eigenvector, over the largest, below which it is left out of the gradient
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,15 +128,21 @@ def _stated(setup: Setup, ctrl: Array, fine: Array | None) -> Array:
     """A level's control on the stated grid of samples, made of the curves fine: (N * coarsen, M) there, or of anything."""
     if setup.coarsen == 1 or fine is None:
         return np.repeat(ctrl, setup.coarsen, axis=0)
-    return np.asarray(setup.centre + fine @ np.linalg.lstsq(setup.averaged(fine), ctrl - setup.centre)[0])
+    return np.asarray(
+        setup.centre + fine @ np.linalg.lstsq(setup.averaged(fine), ctrl - setup.centre)[0]
+    )
 
 
 def _row(rung: Rung, point: Point | None, rate: float, fence: Fence) -> HistoryRow:
     criterion = None if point is None else point.criterion
-    value, smallest = (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
+    value, smallest = (
+        (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
+    )
     cost, i = (np.inf if point is None else point.cost), rung.iterate
     margin = min(fence.shares(seen(i.point)).values(), default=np.nan)
-    return HistoryRow(i.index, cost, value, smallest, i.slope, i.gamma, 0.0, 0, rate, rung.mu, margin)
+    return HistoryRow(
+        i.index, cost, value, smallest, i.slope, i.gamma, 0.0, 0, rate, rung.mu, margin
+    )
 
 
 def perform(task: Task) -> Chase:

@@ -27,7 +27,9 @@ SHOWN = ("position", "velocity", "acceleration", "force", "joint_force")  # in t
 
 def looked_at(substeps: int) -> tuple[int, ...]:
     """Engine steps of a sample that derivatives look at: the first ones, where a held control jolts, to the last."""
-    return tuple(sorted({round(s) for s in np.geomspace(1, substeps, min(LOOKS, substeps)).tolist()}))
+    return tuple(
+        sorted({round(s) for s in np.geomspace(1, substeps, min(LOOKS, substeps)).tolist()})
+    )
 
 
 def _of(limits: tuple[Limit, ...], kind: str) -> list[Limit]:
@@ -53,9 +55,15 @@ def fence_of(setup: Setup, every: bool = False) -> Fence:
     limits = setup.limits if every or e.limits.enforce else ()
     rows = {kind: _of(limits, kind) for kind in SHOWN}
     flat = [limit for kind in SHOWN for limit in rows[kind]]
-    q, v, a, f, j = (np.array([limit.index for limit in rows[kind]], dtype=np.intp) for kind in SHOWN)
-    taps = Taps(q, v, a, f, j, looked_at(setup.substeps), float(setup.plant.engine.model.opt.timestep))
-    shown = Band.of(np.array([limit.lower for limit in flat]), np.array([limit.upper for limit in flat]))
+    q, v, a, f, j = (
+        np.array([limit.index for limit in rows[kind]], dtype=np.intp) for kind in SHOWN
+    )
+    taps = Taps(
+        q, v, a, f, j, looked_at(setup.substeps), float(setup.plant.engine.model.opt.timestep)
+    )
+    shown = Band.of(
+        np.array([limit.lower for limit in flat]), np.array([limit.upper for limit in flat])
+    )
     free = np.full(nu, np.inf)
     control = _dense(_of(limits, "control"), nu) or Band(-free, free, _sizes(setup))
     clearance, least = None, 0.0
@@ -173,9 +181,13 @@ class Fence:
             self,
             shown=self.shown.tightened(inner),
             control=self.control.tightened(shares.get("control", 0.0)),
-            rate=None if self.rate is None else self.rate.tightened(shares.get("control_rate", 0.0)),
+            rate=None
+            if self.rate is None
+            else self.rate.tightened(shares.get("control_rate", 0.0)),
             least=self._held_clear(shares.get("clearance", 0.0)),
-            end=None if self.end is None else self.end.tightened(np.repeat([*end, 0.0], self._parts)),
+            end=None
+            if self.end is None
+            else self.end.tightened(np.repeat([*end, 0.0], self._parts)),
         )
 
     def _held_clear(self, share: float) -> float:
@@ -262,7 +274,11 @@ class Fence:
         if self.clearance is None:
             raise ValueError("nothing is kept clear")
         m = distances.shape[1]
-        return Band(np.full(m, self.least), np.full(m, np.inf), np.full(m, self.clearance.reach - self.least))
+        return Band(
+            np.full(m, self.least),
+            np.full(m, np.inf),
+            np.full(m, self.clearance.reach - self.least),
+        )
 
     def expand(self, sight: Sight, rise: Array, delta: float) -> Hedge:
         """Expansion about a trajectory. rise: (N, looked-at substeps, w, nx+nu) derivative of what the taps show"""
@@ -297,8 +313,13 @@ class Fence:
             a[-1] += moved.T @ wall.slope
             Q[-1] += moved.T @ (wall.bend[:, None] * moved)
         if sight.distances is not None and sight.slopes is not None:
-            wall, nv = self._near(sight.distances).wall(sight.distances, delta, weight), self.space.nv
+            wall, nv = (
+                self._near(sight.distances).wall(sight.distances, delta, weight),
+                self.space.nv,
+            )
             a[1:, :nv] += np.einsum("km,kmi->ki", wall.slope, sight.slopes)
             Q[1:, :nv, :nv] += np.swapaxes(sight.slopes * wall.bend[..., None], 1, 2) @ sight.slopes
         step = np.full(nu, np.inf) if self.rate is None else self.rate.scale * self.dt
-        return Hedge(a, b, Weights(Q, S, R, W), rise / self.shown.scale[:, None], self.control.scale, step)
+        return Hedge(
+            a, b, Weights(Q, S, R, W), rise / self.shown.scale[:, None], self.control.scale, step
+        )

@@ -31,7 +31,12 @@ from mjfim.records.combinations import Group, listed
 from mjfim.records.design import Design, HistoryRow, StartResult, Status
 
 Monitor = Callable[[HistoryRow], None]
-LONGER = (5, 4, 3, 2)  # times that the timestep is longer on a coarse level under hard limits; the first that is borne
+LONGER = (
+    5,
+    4,
+    3,
+    2,
+)  # times that the timestep is longer on a coarse level under hard limits; the first that is borne
 HALF = 2  # the same where samples become longer too
 TOLERATED = 0.5  # relative change of the initial cost that it may make: all is optimised anew on the stated one
 
@@ -57,9 +62,15 @@ def design(
     if start is not None:
         start = np.asarray(start, dtype=np.float64)
         if start.shape != setup.control.shape:
-            raise ExperimentError(f"start: shape {start.shape}, wanted (samples, actuators) = {setup.control.shape}")
+            raise ExperimentError(
+                f"start: shape {start.shape}, wanted (samples, actuators) = {setup.control.shape}"
+            )
     starts = starts_of(setup, start)
-    begin = first if start is None else setup.problem.point(setup.plant.simulate(setup.theta, start), CENTRAL)
+    begin = (
+        first
+        if start is None
+        else setup.problem.point(setup.plant.simulate(setup.theta, start), CENTRAL)
+    )
     if first.information is None or begin.trajectory is None or begin.sensitivity is None:
         why = "when the parameters move a little along the initial control"
         if setup.pool is not None:
@@ -70,7 +81,9 @@ def design(
     stage = Stage(setup, seen.basis)
     first = stage.problem.judged(first)
     runs: list[Run] = []
-    with threadpool_limits(1, user_api="blas"):  # small matrices: threads of BLAS only wait for each other
+    with threadpool_limits(
+        1, user_api="blas"
+    ):  # small matrices: threads of BLAS only wait for each other
         rows = (
             _enclosed(stage, first, starts, executor, runs, clock)
             if setup.enforced
@@ -89,7 +102,12 @@ def design(
 
 
 def _free(
-    stage: Stage, first: Point, starts: Iterable[Start], runs: list[Run], clock: float, fence: Fence | None = None
+    stage: Stage,
+    first: Point,
+    starts: Iterable[Start],
+    runs: list[Run],
+    clock: float,
+    fence: Fence | None = None,
 ) -> Generator[HistoryRow, None, None]:
     """Descents without a barrier, from every start while there is time; with a fence, until one leaves it."""
     setup = stage.setup
@@ -100,7 +118,9 @@ def _free(
     for begin in starts:
         runs.append(Run(begin.name))
         elsewhere = sum(run.steps for run in runs)
-        for row in descend([Stage(level, stage.basis) for level in levels], begin.whole, runs[-1], fence):
+        for row in descend(
+            [Stage(level, stage.basis) for level in levels], begin.whole, runs[-1], fence
+        ):
             spent = sum(level.plant.steps for level in levels) - begun
             told = replace(row, seconds=time.perf_counter() - clock, steps=spent)
             runs[-1].history += (told,)
@@ -115,7 +135,12 @@ def _free(
 
 
 def _enclosed(
-    stage: Stage, first: Point, starts: Iterable[Start], executor: Executor | None, runs: list[Run], clock: float
+    stage: Stage,
+    first: Point,
+    starts: Iterable[Start],
+    executor: Executor | None,
+    runs: list[Run],
+    clock: float,
 ) -> Generator[HistoryRow, None, None]:
     """Descents inside the limits. Where soft weights alone keep them, there is no barrier to begin with."""
     setup, starts, elsewhere = stage.setup, list(starts), 0
@@ -179,7 +204,9 @@ def _coarser(stage: Stage, begin: Point, factor: int) -> Stage | None:
     setup = stage.setup
     stretch = setup.substeps % factor == 0
     parts = [setup.samples // count for count in (1, *setup.experiment.descent.repeats)]
-    if not (stretch or (all(N % factor == 0 for N in parts) and setup.samples >= COARSEST * factor)):
+    if not (
+        stretch or (all(N % factor == 0 for N in parts) and setup.samples >= COARSEST * factor)
+    ):
         return None
     try:
         coarse = Stage(setup.stretched(factor) if stretch else setup.coarser(factor), stage.basis)
@@ -190,7 +217,9 @@ def _coarser(stage: Stage, begin: Point, factor: int) -> Stage | None:
 
 def _settled(stage: Stage, chase: Chase, cut: bool) -> Run:
     """What came of a start, on the plant as it is. cut: the contest was, before anybody looked at it there"""
-    run = Run(chase.name, None, chase.control, chase.status, chase.slope, chase.history, steps=chase.steps)
+    run = Run(
+        chase.name, None, chase.control, chase.status, chase.slope, chase.history, steps=chase.steps
+    )
     if chase.control is not None:
         run.point = fine_point(stage, chase.control)
     run.inside = np.isfinite(chase.cost)
@@ -200,7 +229,9 @@ def _settled(stage: Stage, chase: Chase, cut: bool) -> Run:
     return run
 
 
-def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds: float, steps: int) -> Design:
+def _conclude(
+    stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds: float, steps: int
+) -> Design:
     setup = stage.setup
     if not runs:
         runs = [Run("initial control", status=Status.INTERRUPTED)]
@@ -210,11 +241,21 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
     interrupted = any(run.status is Status.INTERRUPTED for run in runs)
     if best.point is None and not interrupted:
         raise SimulationDiverged("the simulation diverges from every start")
-    chosen = first if best.point is None or (best.cost > first.cost and not setup.enforced) else best.point
-    initial, final, information = evaluate(stage, first), evaluate(stage, chosen), stage.problem.information
+    chosen = (
+        first
+        if best.point is None or (best.cost > first.cost and not setup.enforced)
+        else best.point
+    )
+    initial, final, information = (
+        evaluate(stage, first),
+        evaluate(stage, chosen),
+        stage.problem.information,
+    )
     found = audit(setup, final.trajectory)
     clamped = saturated(setup.model_at(setup.theta), final.trajectory)
-    rough = None if interrupted else roughness(setup, setup.theta, final.trajectory, chosen.sensitivity)
+    rough = (
+        None if interrupted else roughness(setup, setup.theta, final.trajectory, chosen.sensitivity)
+    )
     status = Status.INTERRUPTED if interrupted else best.status
     if status.success and (rough is not None or clamped):
         status = Status.ROUGH
@@ -234,11 +275,17 @@ def _conclude(stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds
         usage=found.usage,
         warnings=tuple(warnings_of(final, found, setup, clamped, rough)),
         found_by=best.name,
-        starts=tuple(StartResult(r.name, r.cost, r.status, r.history[-1].iteration if r.history else 0) for r in runs),
+        starts=tuple(
+            StartResult(r.name, r.cost, r.status, r.history[-1].iteration if r.history else 0)
+            for r in runs
+        ),
         nuisance=tuple(p.name for p in setup.parameters.parameters if p.nuisance),
         combinations=tuple(str(group) for group in seen.groups_always),
         combined=seen.combined(
-            information, setup.theta[setup.parameters.interest], initial.information, final.information
+            information,
+            setup.theta[setup.parameters.interest],
+            initial.information,
+            final.information,
         ),
         prior=setup.prior,
         data=shared(
@@ -253,7 +300,9 @@ def designable(setup: Setup) -> Survey:
     """Look along the initial control. Raises UnidentifiableError or SimulationDiverged where no design can begin there."""
     first = setup.problem.point(setup.initial, CENTRAL)
     if first.trajectory is None or first.sensitivity is None:
-        raise SimulationDiverged("the simulation diverges when the parameters move a little along the initial control")
+        raise SimulationDiverged(
+            "the simulation diverges when the parameters move a little along the initial control"
+        )
     seen = survey(setup, first.trajectory, first.sensitivity)
     require_designable(setup, seen)
     return seen

@@ -31,7 +31,12 @@ def fine_point(stage: Stage, control: Array) -> Point | None:
 def evaluate(stage: Stage, point: Point) -> Evaluation:
     """Everything that a trajectory tells, with the regulator about it."""
     setup, information = stage.setup, stage.problem.information
-    if point.trajectory is None or point.sensitivity is None or point.information is None or point.criterion is None:
+    if (
+        point.trajectory is None
+        or point.sensitivity is None
+        or point.information is None
+        or point.criterion is None
+    ):
         raise SimulationDiverged("the trajectory diverges")
     A, B, _, _ = setup.plant.jacobians(setup.theta, point.trajectory)
     r = regulator_for(setup)
@@ -88,7 +93,11 @@ def warnings_of(
 def left_open(setup: Setup) -> Iterator[str]:
     """What the limits and boundaries that an experiment states leave open."""
     e, model = setup.experiment, setup.model
-    rates = {limit.name for limit in setup.limits if limit.kind == "control_rate"} if e.limits.enforce else set()
+    rates = (
+        {limit.name for limit in setup.limits if limit.kind == "control_rate"}
+        if e.limits.enforce
+        else set()
+    )
     jumps = e.limits.bandwidth is None and not rates.issuperset(setup.controls)
     if "rest" in (e.boundary.start, e.boundary.end) and jumps:
         yield (

@@ -41,8 +41,13 @@ class Start:
 def starts_of(setup: Setup, given: Array | None) -> Iterator[Start]:
     """The given or initial control, then what the experiment's [descent] asks for. Raises for what is not there at once."""
     e, d = setup.experiment, setup.experiment.descent
-    found = [Start("initial control", setup.control) if given is None else Start("given control", given)]
-    found += [Start(f"previous design {path}", previous(setup, path)) for path in dict.fromkeys(d.previous)]
+    found = [
+        Start("initial control", setup.control) if given is None else Start("given control", given)
+    ]
+    found += [
+        Start(f"previous design {path}", previous(setup, path))
+        for path in dict.fromkeys(d.previous)
+    ]
     begins, ends = e.boundary.start == "rest", e.boundary.end == "rest"
     rng = np.random.default_rng(d.seed)
     for frequency in dict.fromkeys(d.fourier):
@@ -56,8 +61,16 @@ def starts_of(setup: Setup, given: Array | None) -> Iterator[Start]:
         fitted = series @ np.linalg.lstsq(series, _random(setup, rng) - setup.centre)[0]
         found.append(Start(f"Fourier series of {frequency:g} Hz", setup.centre + fitted, series))
     for count in dict.fromkeys(d.repeats):
-        found.append(Start(f"{count} times a design of {e.horizon / count:g} s", _part(setup, count), repeats=count))
-    multisines = (Start(f"multisine {i} of {d.starts - 1}", _random(setup, rng)) for i in range(1, d.starts))
+        found.append(
+            Start(
+                f"{count} times a design of {e.horizon / count:g} s",
+                _part(setup, count),
+                repeats=count,
+            )
+        )
+    multisines = (
+        Start(f"multisine {i} of {d.starts - 1}", _random(setup, rng)) for i in range(1, d.starts)
+    )
     return chain(found, multisines)
 
 
@@ -72,7 +85,9 @@ def _part(setup: Setup, count: int) -> Array:
     source = setup.experiment.source
     samples = setup.samples // count
     if setup.samples % count:
-        raise ExperimentError(f"{source}: descent.repeats: {count} does not divide the {setup.samples} samples")
+        raise ExperimentError(
+            f"{source}: descent.repeats: {count} does not divide the {setup.samples} samples"
+        )
     if samples < max(2, setup.stride):
         raise ExperimentError(
             f"{source}: descent.repeats: {count} leaves {samples} of {setup.samples} samples; needs {max(2, setup.stride)}"
@@ -81,7 +96,9 @@ def _part(setup: Setup, count: int) -> Array:
         raise ExperimentError(
             f"{source}: descent.repeats needs hard limits; without, start from a shorter design (previous)"
         )
-    return np.asarray(setup.centre + swell(setup, samples) * (setup.control[:samples] - setup.centre))
+    return np.asarray(
+        setup.centre + swell(setup, samples) * (setup.control[:samples] - setup.centre)
+    )
 
 
 def _random(setup: Setup, rng: np.random.Generator) -> Array:
@@ -99,7 +116,9 @@ def random_control(setup: Setup, rng: np.random.Generator, least: float, most: f
     peak = np.where(peak > 0.0, peak, 1.0)
     wave = multisine(setup.t, len(setup.controls), 1.0 / setup.experiment.horizon, HARMONICS, rng)
     swing = peak * rng.uniform(least, most) * wave
-    control = (setup.hold if setup.experiment.boundary.start == "rest" else mean) + swell(setup) * swing
+    control = (setup.hold if setup.experiment.boundary.start == "rest" else mean) + swell(
+        setup
+    ) * swing
     for limit in setup.limits:
         if limit.kind == "control":
             control[:, limit.index] = np.clip(control[:, limit.index], limit.lower, limit.upper)

@@ -74,14 +74,20 @@ class InteriorProblem:
         if not self.costs:
             return InteriorPoint(sight, None, 0.0, barrier)
         point = self.base.point(sight.trajectory, self.base.plant.draft)
-        return DIVERGED_POINT if point is DIVERGED else InteriorPoint(sight, point, self._merit(point), barrier)
+        return (
+            DIVERGED_POINT
+            if point is DIVERGED
+            else InteriorPoint(sight, point, self._merit(point), barrier)
+        )
 
     def again(self, point: InteriorPoint) -> InteriorPoint:
         """A point of a problem that differs from this one in criterion, mu, delta or the fence's bounds."""
         if point.sight is None or point.point is None:
             return point
         judged = self.base.judged(point.point)
-        return InteriorPoint(point.sight, judged, self._merit(judged), self.fence.value(point.sight, self.delta))
+        return InteriorPoint(
+            point.sight, judged, self._merit(judged), self.fence.value(point.sight, self.delta)
+        )
 
     def _merit(self, point: Point) -> float:
         if self.base.information.criterion == "D":
@@ -92,7 +98,9 @@ class InteriorProblem:
         """dJ over the change of the merit."""
         if point.point is None:
             return 1.0
-        return self._nats(point.point) if self.base.information.criterion == "D" else point.point.cost
+        return (
+            self._nats(point.point) if self.base.information.criterion == "D" else point.point.cost
+        )
 
     def _nats(self, point: Point) -> float:
         count = 1 if point.criterion is None else len(point.criterion.eigenvalues)
@@ -120,9 +128,13 @@ class InteriorProblem:
             rise = found
         share = self._share(point)
         hedge: Hedge = self.fence.expand(sight, rise, self.delta).times(self.mu)
-        return Expansion(e.A, e.B, e.a / share + hedge.a, e.b / share + hedge.b, None, hedge, e.spectral)
+        return Expansion(
+            e.A, e.B, e.a / share + hedge.a, e.b / share + hedge.b, None, hedge, e.spectral
+        )
 
-    def project(self, point: InteriorPoint, zeta: TangentCurve, gamma: float, K: Array) -> InteriorPoint:
+    def project(
+        self, point: InteriorPoint, zeta: TangentCurve, gamma: float, K: Array
+    ) -> InteriorPoint:
         """P(xi + gamma zeta), evaluated."""
         trajectory = seen(point).trajectory
         if not K.any():
@@ -142,12 +154,16 @@ class InteriorProblem:
 FACTOR = 3.0  # between rungs
 RELAXED = 0.3  # delta over mu
 WIDEST = 0.1  # delta at most
-SHRUNK = np.concatenate([[1.0, 0.997, 0.99, 0.97, 0.94, 0.9], 0.8 ** np.arange(1, 24)])  # of a start, tried in turn
+SHRUNK = np.concatenate(
+    [[1.0, 0.997, 0.99, 0.97, 0.94, 0.9], 0.8 ** np.arange(1, 24)]
+)  # of a start, tried in turn
 HOLDING = 4e-3  # mu from which on leaks are answered
 SPARE = 1.2  # what was outside at the end of a rung is held back on the next by that much of it
 SLACK = 1.5  # of the time that is left per rung, what one may take
 AGAIN = 3  # times that the last rung is repeated because of leaks, at most
-FARTHEST_START = 1.0  # of a start beyond its limits, over half of their ranges, that is begun with as it is
+FARTHEST_START = (
+    1.0  # of a start beyond its limits, over half of their ranges, that is begun with as it is
+)
 
 
 ROUNDS, FEW = 60, 20  # iterations towards the inside, the latter where shrinking leads there too
@@ -245,7 +261,9 @@ class Ladder:
         if point.sight is None:
             return False
         return all(
-            s > -FARTHEST_START for kind, s in self.fence.shares(point.sight).items() if not kind.startswith("end_")
+            s > -FARTHEST_START
+            for kind, s in self.fence.shares(point.sight).items()
+            if not kind.startswith("end_")
         )
 
     def _direction(self) -> StructuredBFGS:
@@ -257,7 +275,9 @@ class Ladder:
         """The nearest control that the basis can make."""
         if self.basis is None:
             return control
-        return np.asarray(self.centre + self.basis @ np.linalg.lstsq(self.basis, control - self.centre)[0])
+        return np.asarray(
+            self.centre + self.basis @ np.linalg.lstsq(self.basis, control - self.centre)[0]
+        )
 
     def inside(self, control: Array) -> Array | None:
         """A control shrunk about the centre until all limits hold; None where even the least one leaves them."""
@@ -265,7 +285,9 @@ class Ladder:
         for share in SHRUNK:
             candidate = control if share == 1.0 else self.centre + share * (control - self.centre)
             point = problem.point(candidate)
-            if point.sight is not None and all(m > 0.0 for m in self.fence.margins(point.sight).values()):
+            if point.sight is not None and all(
+                m > 0.0 for m in self.fence.margins(point.sight).values()
+            ):
                 return np.asarray(candidate)
         return None
 
@@ -275,14 +297,18 @@ class Ladder:
         begin = problem.point(control)
         if begin.sight is None:  # it diverges
             return
-        for iterate in optimize(problem, begin, self._direction(), self.regulate, Armijo(), 1e-6, budget):
+        for iterate in optimize(
+            problem, begin, self._direction(), self.regulate, Armijo(), 1e-6, budget
+        ):
             margins = self.fence.margins(seen(iterate.point))
             rung = Rung(iterate, np.inf, margins)
             yield rung
             if all(m > 0.0 for m in margins.values()) or time.perf_counter() > until:
                 return
 
-    def _down(self, control: Array, direction: StructuredBFGS, budget: int, until: float, done: int) -> Iterator[Rung]:
+    def _down(
+        self, control: Array, direction: StructuredBFGS, budget: int, until: float, done: int
+    ) -> Iterator[Rung]:
         r, held, budget = self.rungs, dict[str, float](), budget + done
         ladder = r.ladder()
         point = InteriorProblem(self.base, self.fence, r.first, WIDEST).point(control)
@@ -291,13 +317,20 @@ class Ladder:
         for i, mu in enumerate([*ladder, *ladder[-1:] * AGAIN]):
             left, last, now = max(len(ladder) - i, 1), i >= len(ladder) - 1, time.perf_counter()
             deadline = until if last else min(until, now + SLACK * (until - now) / left)
-            patience = min(r.patience * (2 if last else 1), -(-(budget - done) // left) if left > 1 else budget - done)
+            patience = min(
+                r.patience * (2 if last else 1),
+                -(-(budget - done) // left) if left > 1 else budget - done,
+            )
             fence = self.fence.tightened(held)
             problem = InteriorProblem(self.base, fence, mu, min(WIDEST, RELAXED * mu))
             point = problem.again(point)
             values: list[float] = []
-            tight = min(r.tolerance, Rungs.tolerance)  # what leaks is mended by less slope than many a stated tolerance
-            for iterate in optimize(problem, point, direction, self.regulate, Armijo(), tight, patience):
+            tight = min(
+                r.tolerance, Rungs.tolerance
+            )  # what leaks is mended by less slope than many a stated tolerance
+            for iterate in optimize(
+                problem, point, direction, self.regulate, Armijo(), tight, patience
+            ):
                 point, margins = iterate.point, self.fence.margins(seen(iterate.point))
                 kept = all(m >= 0.0 for m in margins.values())
                 status = Status.CONVERGED if iterate.slope <= r.tolerance else iterate.status
@@ -306,7 +339,9 @@ class Ladder:
                 if status is Status.CONVERGED:
                     return
                 values.append(iterate.value)
-                settled = len(values) > r.window and values[-1 - r.window] - values[-1] < r.settled * mu
+                settled = (
+                    len(values) > r.window and values[-1 - r.window] - values[-1] < r.settled * mu
+                )
                 if time.perf_counter() > deadline or (settled and not last):
                     break
             done += iterate.index
@@ -326,12 +361,20 @@ class Ladder:
         if control is not None:
             point = replace(problem, fence=self.fence).point(control)
             if point.sight is not None:
-                own = replace(iterate, index=done, point=point, value=problem.value(point), gamma=0.0, status=None)
+                own = replace(
+                    iterate,
+                    index=done,
+                    point=point,
+                    value=problem.value(point),
+                    gamma=0.0,
+                    status=None,
+                )
                 yield Rung(own, mu, self.fence.margins(point.sight), mended=True)
 
 
 def held_back(held: Mapping[str, float], shares: Mapping[str, float]) -> dict[str, float]:
     """How far each kind is held back from its bounds next: more where it was outside, less where it was well inside."""
     return {
-        kind: max(0.0, held.get(kind, 0.0) - share * (SPARE if share < 0.0 else 0.5)) for kind, share in shares.items()
+        kind: max(0.0, held.get(kind, 0.0) - share * (SPARE if share < 0.0 else 0.5))
+        for kind, share in shares.items()
     }

@@ -46,7 +46,9 @@ def design_together(
     for _ in range(rounds):
         designs = []
         for i, setup in enumerate(setups):
-            others = sum((tells[j] for j in range(len(setups)) if j != i), start=np.zeros_like(tells[0]))
+            others = sum(
+                (tells[j] for j in range(len(setups)) if j != i), start=np.zeros_like(tells[0])
+            )
             found = design(Setup(setup.experiment, threads, added=others), monitor, controls[i])
             controls[i] = found.trajectory.ctrl
             tells[i] = found.data
@@ -62,8 +64,14 @@ def _data(setup: Setup) -> Array:
     """What the initial control tells about the parameters that all experiments share."""
     point = setup.problem.point(setup.initial, CENTRAL)
     if point.information is None or point.sensitivity is None:
-        raise SimulationDiverged("the simulation diverges when the parameters move a little along the initial control")
+        raise SimulationDiverged(
+            "the simulation diverges when the parameters move a little along the initial control"
+        )
     seen = survey(setup, setup.initial, point.sensitivity)
     information = replace(setup.information, basis=seen.here.basis if seen.here.count else None)
     p = setup.parameters
-    return shared(information.visible(point.information - setup.information.prior), p.prior_information, p.private)
+    return shared(
+        information.visible(point.information - setup.information.prior),
+        p.prior_information,
+        p.private,
+    )

@@ -14,7 +14,12 @@ from mjfim.experiment.schema import Limits
 from mjfim.model.loading import Coordinate, actuator_names
 
 Range = tuple[float, float]
-JOINTS = ("position", "velocity", "acceleration", "joint_force")  # kinds by joint; the others are by actuator
+JOINTS = (
+    "position",
+    "velocity",
+    "acceleration",
+    "joint_force",
+)  # kinds by joint; the others are by actuator
 
 
 @dataclass(frozen=True)
@@ -49,14 +54,30 @@ def limits_of(
 ) -> tuple[Limit, ...]:
     """All limits. Raises ExperimentError for unknown names, inverted ranges and ranges that exclude the MJCF's."""
     joints = {c.name: c for c in coordinates}
-    scalar = {name: i for i, name in enumerate(actuator_names(model)) if int(model.actuator_outnum[i]) == 1}
+    scalar = {
+        name: i
+        for i, name in enumerate(actuator_names(model))
+        if int(model.actuator_outnum[i]) == 1
+    }
     tables = {
-        "position": (stated.position, {c.name: c.q for c in coordinates}, _position(model, coordinates)),
+        "position": (
+            stated.position,
+            {c.name: c.q for c in coordinates},
+            _position(model, coordinates),
+        ),
         "velocity": (stated.velocity, {c.name: c.v for c in coordinates}, {}),
         "acceleration": (stated.acceleration, {c.name: c.v for c in coordinates}, {}),
-        "control": (stated.control, {name: i for i, name in enumerate(controls)}, _control(model, controls)),
+        "control": (
+            stated.control,
+            {name: i for i, name in enumerate(controls)},
+            _control(model, controls),
+        ),
         "control_rate": (stated.control_rate, {name: i for i, name in enumerate(controls)}, {}),
-        "force": (stated.force, {n: int(model.actuator_outadr[i]) for n, i in scalar.items()}, _force(model, scalar)),
+        "force": (
+            stated.force,
+            {n: int(model.actuator_outadr[i]) for n, i in scalar.items()},
+            _force(model, scalar),
+        ),
         "joint_force": ({}, {c.name: c.v for c in coordinates}, _joint_force(model, joints)),
     }
     found: list[Limit] = []
@@ -65,16 +86,22 @@ def limits_of(
     return tuple(found)
 
 
-def _ranges(kind: str, stated: float | Mapping[str, float | Range], names: list[str]) -> dict[str, Range]:
+def _ranges(
+    kind: str, stated: float | Mapping[str, float | Range], names: list[str]
+) -> dict[str, Range]:
     """Ranges by name from one number, or from a table of numbers and ranges."""
     table = stated if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
     for name in table:
         if name not in names:
-            raise ExperimentError(f"limits.{kind}: {unknown('joint' if kind in JOINTS else 'actuator', name, names)}")
+            raise ExperimentError(
+                f"limits.{kind}: {unknown('joint' if kind in JOINTS else 'actuator', name, names)}"
+            )
     return {name: v if isinstance(v, tuple) else (-v, v) for name, v in table.items()}
 
 
-def _rows(kind: str, stated: Mapping[str, Range], index: Mapping[str, int], given: Mapping[str, Range]) -> list[Limit]:
+def _rows(
+    kind: str, stated: Mapping[str, Range], index: Mapping[str, int], given: Mapping[str, Range]
+) -> list[Limit]:
     rows = []
     for name, place in index.items():
         if name in stated:
@@ -85,24 +112,34 @@ def _rows(kind: str, stated: Mapping[str, Range], index: Mapping[str, int], give
         lower, upper = float(max(low for low, _ in both)), float(min(high for _, high in both))
         if len(both) == 2 and not lower < upper:
             own, models = (f"[{low:g}, {high:g}]" for low, high in both)
-            raise ExperimentError(f"limits.{kind}.{name}: {own} and the MJCF's range {models} exclude each other")
+            raise ExperimentError(
+                f"limits.{kind}.{name}: {own} and the MJCF's range {models} exclude each other"
+            )
         if np.isfinite(lower) or np.isfinite(upper):
             rows.append(Limit(kind, name, place, lower, upper))
     return rows
 
 
 def _position(model: Any, coordinates: tuple[Coordinate, ...]) -> dict[str, Range]:
-    return {c.name: tuple(model.jnt_range[c.joint]) for c in coordinates if model.jnt_limited[c.joint]}
+    return {
+        c.name: tuple(model.jnt_range[c.joint]) for c in coordinates if model.jnt_limited[c.joint]
+    }
 
 
 def _control(model: Any, controls: tuple[str, ...]) -> dict[str, Range]:
     return {
-        name: tuple(model.actuator_ctrlrange[i]) for i, name in enumerate(controls) if model.actuator_ctrllimited[i]
+        name: tuple(model.actuator_ctrlrange[i])
+        for i, name in enumerate(controls)
+        if model.actuator_ctrllimited[i]
     }
 
 
 def _force(model: Any, scalar: Mapping[str, int]) -> dict[str, Range]:
-    return {name: tuple(model.actuator_forcerange[i]) for name, i in scalar.items() if model.actuator_forcelimited[i]}
+    return {
+        name: tuple(model.actuator_forcerange[i])
+        for name, i in scalar.items()
+        if model.actuator_forcelimited[i]
+    }
 
 
 def _joint_force(model: Any, joints: Mapping[str, Coordinate]) -> dict[str, Range]:
@@ -114,11 +151,17 @@ def unwatched(model: Any) -> tuple[str, ...]:
     """What has a range in the MJCF that is not among the limits: ball joints, tendons, activations."""
 
     def named(kind: Any, rows: Any) -> list[str]:
-        return [mujoco.mj_id2name(model, kind, i) or f"number {i}" for i in np.flatnonzero(rows).tolist()]
+        return [
+            mujoco.mj_id2name(model, kind, i) or f"number {i}"
+            for i in np.flatnonzero(rows).tolist()
+        ]
 
     ball = (model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)) & (model.jnt_limited != 0)
     return (
         *(f"ball joint {name}" for name in named(mujoco.mjtObj.mjOBJ_JOINT, ball)),
         *(f"tendon {name}" for name in named(mujoco.mjtObj.mjOBJ_TENDON, model.tendon_limited)),
-        *(f"the activation of {name}" for name in named(mujoco.mjtObj.mjOBJ_ACTUATOR, model.actuator_actlimited)),
+        *(
+            f"the activation of {name}"
+            for name in named(mujoco.mjtObj.mjOBJ_ACTUATOR, model.actuator_actlimited)
+        ),
     )

@@ -23,16 +23,26 @@ from mjfim.records.design import HistoryRow, Status
 KEPT = 4  # one in so many goes on
 
 
-HALFWAY, SHARP = 0.01, 1e-3  # mu down to which starts compete, and where they are few, on samples as stated
+HALFWAY, SHARP = (
+    0.01,
+    1e-3,
+)  # mu down to which starts compete, and where they are few, on samples as stated
 
 
 SPAN = 3.0  # times mu there with which the second round begins
 
 
-PROOFS, LATE, PATIENCE = 3, 1e-3, 60  # repetitions of a winner that leaks, their first mu, their iterations
+PROOFS, LATE, PATIENCE = (
+    3,
+    1e-3,
+    60,
+)  # repetitions of a winner that leaks, their first mu, their iterations
 
 
-EARLY, SPARE = 0.5, 0.05  # share of the iterations and of the time for the first round, and of the time for repetitions
+EARLY, SPARE = (
+    0.5,
+    0.05,
+)  # share of the iterations and of the time for the first round, and of the time for repetitions
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,18 +91,32 @@ class Contest:
         d = self.fine.setup.experiment.descent
         reserve = SPARE * (d.seconds or 0.0)
         first = self.coarse or self.fine
-        if len(starts) == 1 and self.coarse is None and starts[0].basis is None and starts[0].repeats == 1:
-            yield from self._round(self.fine, starts, Rungs(), d.max_iterations, self._seconds - reserve, chases)
+        if (
+            len(starts) == 1
+            and self.coarse is None
+            and starts[0].basis is None
+            and starts[0].repeats == 1
+        ):
+            yield from self._round(
+                self.fine, starts, Rungs(), d.max_iterations, self._seconds - reserve, chases
+            )
             return
         share = EARLY * self._seconds / self._turns(len(starts))
         last = SHARP if len(starts) < KEPT and self._faithful else HALFWAY
-        yield from self._round(first, starts, Rungs(last=last), round(EARLY * d.max_iterations), share, chases)
+        yield from self._round(
+            first, starts, Rungs(last=last), round(EARLY * d.max_iterations), share, chases
+        )
         if any(chase.status is Status.INTERRUPTED for chase in chases):
             return
         leads = [Lead(chase.control, chase.cost) for chase in chases]
         if self.coarse is not None or any(start.repeats > 1 for start in starts):
-            leads = [self._judge(chase, start) for start, chase in zip(starts, chases, strict=False)]
-        order = sorted((i for i, lead in enumerate(leads) if lead.control is not None), key=lambda i: leads[i].cost)
+            leads = [
+                self._judge(chase, start) for start, chase in zip(starts, chases, strict=False)
+            ]
+        order = sorted(
+            (i for i, lead in enumerate(leads) if lead.control is not None),
+            key=lambda i: leads[i].cost,
+        )
         kept = order[: max(1, len(chases) // KEPT)]
         if not kept:
             return
@@ -119,7 +143,10 @@ class Contest:
                 if chases[i].name in found:
                     _continue(chases[i], found[chases[i].name])
             best = min(chases, key=lambda chase: chase.cost)
-            if np.isfinite(best.cost) and best.status in (Status.LEFT, Status.INFEASIBLE):  # better after all
+            if np.isfinite(best.cost) and best.status in (
+                Status.LEFT,
+                Status.INFEASIBLE,
+            ):  # better after all
                 best.status = Status.MAX_ITERATIONS
 
     def prove(self, chases: list[Chase]) -> Iterator[HistoryRow]:
@@ -136,7 +163,9 @@ class Contest:
             best, again = chases[i], list[Chase]()
             start = Start(best.name, np.asarray(best.control))
             try:
-                yield from self._round(self.fine, [start], Rungs(first=LATE), PATIENCE, self._seconds, again, held)
+                yield from self._round(
+                    self.fine, [start], Rungs(first=LATE), PATIENCE, self._seconds, again, held
+                )
             finally:  # also where the user interrupts
                 for chase in again:
                     if np.isfinite(chase.cost):
@@ -180,7 +209,10 @@ class Contest:
         if watched is None:
             return np.inf
         sight = fence.sight(*watched, slopes=False)
-        if min(fence.margins(sight).values(), default=0.0) < 0.0 or not audit(setup, sight.trajectory).kept:
+        if (
+            min(fence.margins(sight).values(), default=0.0) < 0.0
+            or not audit(setup, sight.trajectory).kept
+        ):
             return np.inf
         return self.fine.problem.point(sight.trajectory).cost
 
@@ -242,7 +274,9 @@ class Contest:
                     continue
                 chases.append(future.result())
                 yield from chases[-1].history
-        except BaseException:  # the user's Ctrl-C, that of what watches the iterates, or a fault: nothing may run on
+        except (
+            BaseException
+        ):  # the user's Ctrl-C, that of what watches the iterates, or a fault: nothing may run on
             chases += salvaged(self.executor, futures[len(chases) :])
             raise
 
@@ -263,5 +297,8 @@ def _joined(early: tuple[HistoryRow, ...], late: tuple[HistoryRow, ...]) -> tupl
     if not early:
         return late
     end = early[-1]
-    moved = (replace(r, iteration=r.iteration + end.iteration + 1, steps=r.steps + end.steps) for r in late)
+    moved = (
+        replace(r, iteration=r.iteration + end.iteration + 1, steps=r.steps + end.steps)
+        for r in late
+    )
     return (*early, *moved)

@@ -61,7 +61,11 @@ class RunningCost:
     def value(self, trajectory: Trajectory) -> float:
         """The integral."""
         dx = self.space.minus(trajectory.state, self.desired)[1:]
-        return float(0.5 * self.dt * (np.sum(dx**2 * self.Q) + np.sum((trajectory.ctrl - self.rest) ** 2 * self.R)))
+        return float(
+            0.5
+            * self.dt
+            * (np.sum(dx**2 * self.Q) + np.sum((trajectory.ctrl - self.rest) ** 2 * self.R))
+        )
 
     def gradient(self, trajectory: Trajectory) -> tuple[Array, Array]:
         """(a, b): derivative by x_k (N+1, nx) and u_k (N, nu)."""
@@ -88,7 +92,9 @@ class Point:
     @property
     def phi(self) -> tuple[float, ...]:
         """The criterion here and at the other samples."""
-        return tuple(np.inf if p.criterion is None else p.criterion.value for p in (self, *self.others))
+        return tuple(
+            np.inf if p.criterion is None else p.criterion.value for p in (self, *self.others)
+        )
 
 
 DIVERGED = Point(None, None, None, None, np.inf, FAST)
@@ -118,7 +124,9 @@ class DesignProblem:
         others = []
         for theta in () if self.pool is None else self.pool.thetas[1:]:
             try:
-                others.append(self._sensed(theta, self.plant.simulate(theta, trajectory.ctrl), accuracy))
+                others.append(
+                    self._sensed(theta, self.plant.simulate(theta, trajectory.ctrl), accuracy)
+                )
             except SimulationDiverged:
                 return DIVERGED
         return self._priced(replace(point, others=tuple(others)))
@@ -126,10 +134,14 @@ class DesignProblem:
     def judged(self, point: Point) -> Point:
         """A point of a problem that differs from this one in the criterion alone."""
         here, *others = (
-            p if p.information is None else replace(p, criterion=self.information.evaluate(p.information))
+            p
+            if p.information is None
+            else replace(p, criterion=self.information.evaluate(p.information))
             for p in (point, *point.others)
         )
-        return point if here.criterion is None else self._priced(replace(here, others=tuple(others)))
+        return (
+            point if here.criterion is None else self._priced(replace(here, others=tuple(others)))
+        )
 
     def _priced(self, point: Point) -> Point:
         trajectory, _, criterion = _computed(point)
@@ -142,7 +154,14 @@ class DesignProblem:
         if sensitivity is None:
             return DIVERGED
         information = self.information.matrix(sensitivity)
-        return Point(trajectory, sensitivity, information, self.information.evaluate(information), np.inf, accuracy)
+        return Point(
+            trajectory,
+            sensitivity,
+            information,
+            self.information.evaluate(information),
+            np.inf,
+            accuracy,
+        )
 
     def value(self, point: Point) -> float:
         """J; infinite for a diverged trial."""
@@ -169,22 +188,32 @@ class DesignProblem:
         if self.pool is not None:
             weights = self.pool.weights(point.phi)
             a, b = weights[0] * a, weights[0] * b
-            for weight, theta, other in zip(weights[1:], self.pool.thetas[1:], point.others, strict=True):
+            for weight, theta, other in zip(
+                weights[1:], self.pool.thetas[1:], point.others, strict=True
+            ):
                 own, a_own, b_own = self._slope(theta, other)
                 open_loop = np.zeros((len(b_own), b_own.shape[1], a_own.shape[1]))
                 b += weight * Expansion(own.A, own.B, a_own, b_own).gradient(open_loop)
         a_running, b_running = self.running.gradient(trajectory)
         extended = None
         if self.extended:
-            full = self.plant.bilinear(self.theta, trajectory, sensitivity.psi, np.eye(len(self.theta)), point.accuracy)
+            full = self.plant.bilinear(
+                self.theta, trajectory, sensitivity.psi, np.eye(len(self.theta)), point.accuracy
+            )
             a_psi, a_h, b_h = self.information.partials(criterion, sensitivity, full)
             extended = extend(full, a_running + a_h, b_running + b_h, a_psi)
-        return Expansion(bilinear.A, bilinear.B, a + a_running, b + b_running, extended, None, spectral), bilinear.taps
+        return Expansion(
+            bilinear.A, bilinear.B, a + a_running, b + b_running, extended, None, spectral
+        ), bilinear.taps
 
-    def _slope(self, theta: Array, point: Point, taps: Taps | None = None) -> tuple[Bilinear, Array, Array]:
+    def _slope(
+        self, theta: Array, point: Point, taps: Taps | None = None
+    ) -> tuple[Bilinear, Array, Array]:
         """Derivatives at a point, and those of phi by x (N+1, nx) and u (N, nu)."""
         trajectory, sensitivity, criterion = _computed(point)
-        bilinear = self.plant.bilinear(theta, trajectory, sensitivity.psi, criterion.directions, point.accuracy, taps)
+        bilinear = self.plant.bilinear(
+            theta, trajectory, sensitivity.psi, criterion.directions, point.accuracy, taps
+        )
         return bilinear, *self.information.gradient(criterion, sensitivity, bilinear)
 
     def project(self, point: Point, zeta: TangentCurve, gamma: float, K: Array) -> Point:
@@ -201,7 +230,11 @@ class DesignProblem:
         """The same point, to be expanded with central differences."""
         if self.draft or point.accuracy is CENTRAL:
             return None
-        return replace(point, accuracy=CENTRAL, others=tuple(replace(o, accuracy=CENTRAL) for o in point.others))
+        return replace(
+            point,
+            accuracy=CENTRAL,
+            others=tuple(replace(o, accuracy=CENTRAL) for o in point.others),
+        )
 
 
 def _computed(point: Point) -> tuple[Trajectory, Sensitivity, Criterion]:

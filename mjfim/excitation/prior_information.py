@@ -50,7 +50,15 @@ def _read(path: Path) -> tuple[list[str], Array, Array]:
     except OSError as error:
         raise ExperimentError(f"earlier: {path}: cannot read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, np.linalg.LinAlgError):
-        raise ExperimentError(f"earlier: {path}: neither a design.json nor an estimate.json of mjfim") from None
-    if matrix.shape != shape or prior.shape != shape or not (np.isfinite(matrix).all() and np.isfinite(prior).all()):
-        raise ExperimentError(f"earlier: {path}: its information is not {len(names)} x {len(names)} finite numbers")
+        raise ExperimentError(
+            f"earlier: {path}: neither a design.json nor an estimate.json of mjfim"
+        ) from None
+    if (
+        matrix.shape != shape
+        or prior.shape != shape
+        or not (np.isfinite(matrix).all() and np.isfinite(prior).all())
+    ):
+        raise ExperimentError(
+            f"earlier: {path}: its information is not {len(names)} x {len(names)} finite numbers"
+        )
     return names, matrix if "data" in values else matrix - prior, prior

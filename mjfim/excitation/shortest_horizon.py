@@ -79,11 +79,21 @@ class Shortest:
 
     def summary(self) -> dict[str, Any]:
         """Contents of shortest.json."""
-        tried = [{"horizon": t.horizon, "ratio": t.ratio, "parameter": t.parameter, "why": t.why} for t in self.tried]
-        return {"horizon": self.horizon, "tolerance": self.tolerance, "closed": self.closed, "tried": tried}
+        tried = [
+            {"horizon": t.horizon, "ratio": t.ratio, "parameter": t.parameter, "why": t.why}
+            for t in self.tried
+        ]
+        return {
+            "horizon": self.horizon,
+            "tolerance": self.tolerance,
+            "closed": self.closed,
+            "tried": tried,
+        }
 
     def __str__(self) -> str:
-        below = "nothing shorter was tried" if self.missed is None else f"too short is {self.missed}"
+        below = (
+            "nothing shorter was tried" if self.missed is None else f"too short is {self.missed}"
+        )
         ended = "" if self.closed else "; the search was interrupted, so it may be shorter still"
         return f"shortest horizon: {self.horizon:g} s ({below}){ended}"
 
@@ -138,7 +148,9 @@ class _Hunt:
         self.grid = _grid(self.base)
         self.longest = _longest(self.base) if longest is None else longest
         if self.longest * experiment.rate < self.grid.least:
-            raise ExperimentError(f"shortest: longest {self.longest:g} s is less than {self.grid.least} samples")
+            raise ExperimentError(
+                f"shortest: longest {self.longest:g} s is less than {self.grid.least} samples"
+            )
         self.tried: dict[int, Tried] = {}
         self.designs: dict[int, Design] = {}
 
@@ -156,13 +168,17 @@ class _Hunt:
 
     def slack(self, samples: int) -> int:
         """Tolerance in samples: no less than the grid resolves."""
-        wide = TOLERANCE * samples if self.tolerance is None else self.tolerance * self.experiment.rate
+        wide = (
+            TOLERANCE * samples if self.tolerance is None else self.tolerance * self.experiment.rate
+        )
         return max(int(wide + 1e-9), samples - self.grid.down(samples - 1))
 
     def at(self, samples: int) -> Experiment:
         """The experiment with so many samples."""
         dividing = tuple(count for count in self.experiment.descent.repeats if samples % count == 0)
-        return self.experiment.replace(horizon=samples / self.experiment.rate, descent={"repeats": dividing})
+        return self.experiment.replace(
+            horizon=samples / self.experiment.rate, descent={"repeats": dividing}
+        )
 
     def ratio(self, samples: int) -> float:
         """Of the worst σ to the wanted one, of the design of so many samples. Raises KeyboardInterrupt where that was one."""
@@ -197,14 +213,21 @@ class _Hunt:
         if found.status is Status.INFEASIBLE:
             return Tried(horizon, np.inf, why=f"{found.status.value} ({_outside(found)})")
         ratio, j = furthest(found.final.std, self.wanted)
-        if samples not in self.designs or ratio < furthest(self.designs[samples].final.std, self.wanted)[0]:
+        if (
+            samples not in self.designs
+            or ratio < furthest(self.designs[samples].final.std, self.wanted)[0]
+        ):
             self.designs[samples] = found
         return Tried(horizon, ratio, setup.parameters.names[j])
 
     def _fail(self, samples: int) -> NoReturn:
         last, found = self.tried[samples], self.designs.get(samples)
         names = self.base.parameters.names
-        far = last.why if found is None else f"it does not tell {missed(names, found.final.std, self.wanted)}"
+        far = (
+            last.why
+            if found is None
+            else f"it does not tell {missed(names, found.final.std, self.wanted)}"
+        )
         raise OutOfReachError(
             f"{self.experiment.source}: even {last.horizon:g} s is not enough: {far}. Allow a longer experiment (`longest`, "
             "or a longer table of the initial control) or a stronger control, or ask for less; `mjfim check` says how many "
@@ -214,7 +237,9 @@ class _Hunt:
 
 def _outside(design: Design) -> str:
     """The limits that a design misses."""
-    return ", ".join(f"{kind} by {-margin:.3g}" for kind, margin in design.limits.items() if margin < 0.0)
+    return ", ".join(
+        f"{kind} by {-margin:.3g}" for kind, margin in design.limits.items() if margin < 0.0
+    )
 
 
 def fitted(setup: Setup, control: Array) -> Array:

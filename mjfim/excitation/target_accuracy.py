@@ -14,7 +14,10 @@ def wanted_of(setup: Setup) -> Array:
     """(p,) standard deviations aimed at, infinite where none is. Raises ExperimentError where no parameter states one."""
     stated = [None if q.nuisance else q.wanted for q in setup.parameters.parameters]
     if not any(stated):
-        name = next((n for n, spec in setup.experiment.parameters.items() if spec.inertial is None), "<name>")
+        name = next(
+            (n for n, spec in setup.experiment.parameters.items() if spec.inertial is None),
+            "<name>",
+        )
         raise ExperimentError(
             f"{setup.experiment.source}: no parameter states which standard deviation is wanted; state it in the "
             f"parameter's unit, for example parameters.{name}.wanted = 0.01"

@@ -125,10 +125,14 @@ MEETING = 1.02  # second over smallest eigenvalue at which E-optimality turns sm
 NEAR = 1.2  # the same for a descent that stalled
 POWERS = (40.0, 160.0)
 CLOSE = 1.01  # smooth over exact criterion that is good enough
-CLAMPED = 10  # iterates in a row that may rest on a clamp of the model before a barrier keeps them off it
+CLAMPED = (
+    10  # iterates in a row that may rest on a clamp of the model before a barrier keeps them off it
+)
 
 
-def descend(stages: Sequence[Stage], control: Array, run: Run, fence: Fence | None = None) -> Iterator[HistoryRow]:
+def descend(
+    stages: Sequence[Stage], control: Array, run: Run, fence: Fence | None = None
+) -> Iterator[HistoryRow]:
     """Follow Algorithm 1 from one control through the levels, coarse to fine, keeping `run` up to date.
 
     With a fence it ends where an iterate leaves the limits, or several in a row rest on a clamp; its control is the last inside.
@@ -189,7 +193,9 @@ class _Pass:
     met: it was left because the smallest eigenvalues meet
     """
 
-    def __init__(self, stage: Stage, controls: Sequence[Array], run: Run, memory: Direction | None) -> None:
+    def __init__(
+        self, stage: Stage, controls: Sequence[Array], run: Run, memory: Direction | None
+    ) -> None:
         self.stage, self.controls, self.run = stage, controls, run
         self.control = controls[0]
         self.direction, self.problem = direction_for(stage)
@@ -213,7 +219,9 @@ class _Pass:
         done = run.history[-1].iteration + 1 if run.history else 0
         budget = max((d.max_iterations if fine else d.max_iterations // 2) - done, 0)
         run.rate = rate
-        for iterate in optimize(self.problem, start, self.direction, regulator_for(level), Armijo(), tolerance, budget):
+        for iterate in optimize(
+            self.problem, start, self.direction, regulator_for(level), Armijo(), tolerance, budget
+        ):
             trajectory, criterion = iterate.point.trajectory, iterate.point.criterion
             if trajectory is None or criterion is None:
                 raise SimulationDiverged("an iterate of Algorithm 1 diverged")
@@ -237,7 +245,9 @@ class _Pass:
         level, points = self.stage.setup, []
         for control in {id(c): c for c in self.controls}.values():
             try:
-                points.append(self.problem.point(level.plant.simulate(level.theta, level.averaged(control))))
+                points.append(
+                    self.problem.point(level.plant.simulate(level.theta, level.averaged(control)))
+                )
             except SimulationDiverged:
                 continue
         return min(points, key=lambda point: point.cost, default=DIVERGED)
@@ -251,5 +261,17 @@ class _Pass:
 
 def _row(iterate: Iterate[Point], done: int, rate: float) -> HistoryRow:
     criterion = iterate.point.criterion
-    value, smallest = (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
-    return HistoryRow(done + iterate.index, iterate.value, value, smallest, iterate.slope, iterate.gamma, 0.0, 0, rate)
+    value, smallest = (
+        (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
+    )
+    return HistoryRow(
+        done + iterate.index,
+        iterate.value,
+        value,
+        smallest,
+        iterate.slope,
+        iterate.gamma,
+        0.0,
+        0,
+        rate,
+    )

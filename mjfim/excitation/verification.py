@@ -43,10 +43,16 @@ class Audit:
 def audit(setup: Setup, trajectory: Trajectory) -> Audit:
     """Play a trajectory's control open loop on the untouched model at the design's theta."""
     fence = fence_of(setup, every=True)
-    told = frozenset() if setup.experiment.limits.enforce else {"clearance", *(limit.kind for limit in setup.limits)}
+    told = (
+        frozenset()
+        if setup.experiment.limits.enforce
+        else {"clearance", *(limit.kind for limit in setup.limits)}
+    )
     model = setup.model_at(setup.theta)
     engine = Engine(model, setup.substeps)
-    out = engine.rollout([model], setup.plant.start(setup.theta)[None], trajectory.ctrl[None], fence.taps)
+    out = engine.rollout(
+        [model], setup.plant.start(setup.theta)[None], trajectory.ctrl[None], fence.taps
+    )
     if not out.finite[0] or out.tapped is None:
         lost = dict.fromkeys((*fence.kinds, "simulation"), -np.inf)
         return Audit(lost, lost, np.inf, frozenset(told))
@@ -71,11 +77,20 @@ def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[Usage]:
     N, substeps, w = sight.tapped.shape
     tapped, ctrl = sight.tapped.reshape(N * substeps, w), sight.trajectory.ctrl
     t = np.arange(1, len(tapped) + 1) * setup.dt / setup.substeps
-    for kind, name, share in zip(fence.kinds, fence.names, fence.shown.share(tapped).T, strict=True):
+    for kind, name, share in zip(
+        fence.kinds, fence.names, fence.shown.share(tapped).T, strict=True
+    ):
         yield Usage(kind, name, t, share)
     bands = [("control", fence.control, ctrl, setup.t)]
     if fence.rate is not None:
-        bands.append(("control_rate", fence.rate, fence.rates(ctrl), np.append(setup.t, setup.t[-1] + setup.dt)))
+        bands.append(
+            (
+                "control_rate",
+                fence.rate,
+                fence.rates(ctrl),
+                np.append(setup.t, setup.t[-1] + setup.dt),
+            )
+        )
     for kind, band, values, times in bands:
         for i, name in enumerate(setup.controls):
             if np.isfinite(band.lower[i]) or np.isfinite(band.upper[i]):
@@ -86,7 +101,9 @@ def _positions(setup: Setup, engine: Engine, played: Trajectory) -> Array:
     """(N * substeps, nq) positions at every engine step."""
     fine = Engine(engine.model, 1)
     held = np.repeat(played.ctrl, setup.substeps, axis=0)
-    return np.asarray(fine.rollout([engine.model], played.state[:1], held[None]).states[0][1:, : setup.space.nq])
+    return np.asarray(
+        fine.rollout([engine.model], played.state[:1], held[None]).states[0][1:, : setup.space.nq]
+    )
 
 
 def require_inside(setup: Setup) -> None:
@@ -101,7 +118,10 @@ def require_inside(setup: Setup) -> None:
             for where, state in places.items():
                 _require_inside(setup, fence, where, state)
             start, end = setup.plant.start(setup.theta), setup.target
-            for where, state, hold in (("boundary.start", start, fence.before), ("boundary.end", end, fence.after)):
+            for where, state, hold in (
+                ("boundary.start", start, fence.before),
+                ("boundary.end", end, fence.after),
+            ):
                 if hold is not None:
                     _require_held(setup, where, state, hold)
     except ExperimentError as error:
@@ -138,9 +158,14 @@ def _require_held(setup: Setup, where: str, state: Array, hold: Array) -> None:
     mujoco.mj_forward(model, data)
     needed = {"control": hold, "force": data.actuator_force, "joint_force": data.qfrc_actuator}
     for limit in setup.limits:
-        if limit.kind in needed and not limit.lower <= needed[limit.kind][limit.index] <= limit.upper:
+        if (
+            limit.kind in needed
+            and not limit.lower <= needed[limit.kind][limit.index] <= limit.upper
+        ):
             what = (
-                "limits.force or the MJCF's actuatorfrcrange" if limit.kind == "joint_force" else f"limits.{limit.kind}"
+                "limits.force or the MJCF's actuatorfrcrange"
+                if limit.kind == "joint_force"
+                else f"limits.{limit.kind}"
             )
             raise ExperimentError(
                 f"{where}: holding still takes {limit.name} = {needed[limit.kind][limit.index]:.4g}, outside "

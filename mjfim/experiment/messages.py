@@ -11,7 +11,9 @@ from pydantic import BaseModel, ValidationError
 from mjfim.errors import unknown
 
 
-def explain(error: ValidationError, source: str, table: type[BaseModel], hidden: Sequence[str] = ()) -> str:
+def explain(
+    error: ValidationError, source: str, table: type[BaseModel], hidden: Sequence[str] = ()
+) -> str:
     """Explain every fault of an experiment in the user's own keys.
 
     Args:
@@ -29,10 +31,15 @@ def explain(error: ValidationError, source: str, table: type[BaseModel], hidden:
         faults_by_key.setdefault(".".join(keys), []).append(fault)
 
     # A fault inside a table is repeated for the table itself; the innermost one says most.
-    innermost = [key for key in faults_by_key if not any(other.startswith(f"{key}.") for other in faults_by_key)]
+    innermost = [
+        key
+        for key in faults_by_key
+        if not any(other.startswith(f"{key}.") for other in faults_by_key)
+    ]
 
     return "\n".join(
-        f"{source}: {key or 'experiment'}: {_sentence(faults_by_key[key], table, hidden)}" for key in innermost
+        f"{source}: {key or 'experiment'}: {_sentence(faults_by_key[key], table, hidden)}"
+        for key in innermost
     )
 
 
@@ -41,13 +48,17 @@ def valid_keys(table: Any, hidden: Sequence[str] = ()) -> list[str]:
     if not (isinstance(table, type) and issubclass(table, BaseModel)):
         return []
 
-    return [key for key, field in table.model_fields.items() if not field.exclude and key not in hidden]
+    return [
+        key for key, field in table.model_fields.items() if not field.exclude and key not in hidden
+    ]
 
 
 def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) -> str:
     """Say what is wrong with one key, about which every branch of a union complains."""
     # A branch whose type fits but whose value does not is the one that the user meant.
-    fault = next((f for f in faults if not f["type"].endswith(("_type", "literal_error"))), faults[0])
+    fault = next(
+        (f for f in faults if not f["type"].endswith(("_type", "literal_error"))), faults[0]
+    )
 
     if fault["type"] == "extra_forbidden":
         keys, _ = _walk(table, fault["loc"])
@@ -93,7 +104,12 @@ def _branches(annotation: Any) -> list[Any]:
     if get_origin(annotation) not in (Union, UnionType):
         return [annotation]
 
-    return [branch for part in get_args(annotation) if part is not type(None) for branch in _branches(part)]
+    return [
+        branch
+        for part in get_args(annotation)
+        if part is not type(None)
+        for branch in _branches(part)
+    ]
 
 
 def _chosen(branches: list[Any], tag: str) -> Any:
@@ -117,6 +133,8 @@ def _member(annotation: Any, key: str | int) -> Any:
     if get_origin(annotation) is dict:
         return members[1]
     if get_origin(annotation) is tuple and isinstance(key, int):
-        return members[0] if members[-1] is Ellipsis else members[key] if key < len(members) else None
+        return (
+            members[0] if members[-1] is Ellipsis else members[key] if key < len(members) else None
+        )
 
     return None

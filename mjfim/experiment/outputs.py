@@ -17,28 +17,44 @@ from mjfim.plant.outputs import Output, OutputMap
 from mjfim.plant.state_space import StateSpace
 
 
-def outputs_of(experiment: Experiment, model: Any, space: StateSpace, stride: int) -> tuple[OutputMap, Noise]:
+def outputs_of(
+    experiment: Experiment, model: Any, space: StateSpace, stride: int
+) -> tuple[OutputMap, Noise]:
     """Outputs and their noise. stride: of measure_rate. Raises ExperimentError naming the key."""
     everything = {c.name: c for c in components(model)}
     sensors = names_of(model, "sensor")
     matches = _matches(everything, model, sensors)
-    stated = dict(experiment.noise) or _from_mjcf(model, sensors, required=not experiment.correlated)
+    stated = dict(experiment.noise) or _from_mjcf(
+        model, sensors, required=not experiment.correlated
+    )
     for key in stated:
         if key not in matches:
             raise ExperimentError(f"noise: {unknown('sensor', key, list(matches))}")
     order = [*everything, *(label for s in sensors for label in _labels(model, s))]
-    covariance, strides, chosen = np.zeros((len(order), len(order))), np.full(len(order), stride), set[int]()
+    covariance, strides, chosen = (
+        np.zeros((len(order), len(order))),
+        np.full(len(order), stride),
+        set[int](),
+    )
     # what names fewer outputs wins over what names more of them
     for key in sorted(stated, key=lambda k: -len(matches[k])):
         rows = np.array([order.index(name) for name in matches[key]], dtype=np.intp)
         if not len(rows):
-            raise ExperimentError("noise.state: the model has no joint to measure; name sensors instead")
+            raise ExperimentError(
+                "noise.state: the model has no joint to measure; name sensors instead"
+            )
         value = stated[key]
         spec = value if isinstance(value, NoiseSpec) else NoiseSpec(sigma=value)
-        share = np.array([everything[order[i]].share if order[i] in everything else 1.0 for i in rows])
+        share = np.array(
+            [everything[order[i]].share if order[i] in everything else 1.0 for i in rows]
+        )
         covariance[rows] = covariance[:, rows] = 0.0
         covariance[np.ix_(rows, rows)] = _block(f"noise.{key}", spec, share)
-        strides[rows] = stride if spec.rate is None else _stride(f"noise.{key}.rate", experiment.rate, spec.rate)
+        strides[rows] = (
+            stride
+            if spec.rate is None
+            else _stride(f"noise.{key}.rate", experiment.rate, spec.rate)
+        )
         if spec.rate is not None and spec.rate * experiment.horizon < 1.0 - 1e-6:
             raise ExperimentError(
                 f"noise.{key}.rate: {spec.rate:g} Hz measures nothing within {experiment.horizon:g} s"
@@ -47,7 +63,11 @@ def outputs_of(experiment: Experiment, model: Any, space: StateSpace, stride: in
     for block in experiment.correlated:
         _correlate(block, order, chosen, covariance, strides)
     keep = sorted(chosen)
-    addresses = {label: int(model.sensor(s).adr[0]) + i for s in sensors for i, label in enumerate(_labels(model, s))}
+    addresses = {
+        label: int(model.sensor(s).adr[0]) + i
+        for s in sensors
+        for i, label in enumerate(_labels(model, s))
+    }
     sigma = np.sqrt(np.diag(covariance))
     made = []
     for i in keep:
@@ -59,7 +79,9 @@ def outputs_of(experiment: Experiment, model: Any, space: StateSpace, stride: in
     return OutputMap(tuple(made), space), Noise(covariance[np.ix_(keep, keep)], strides[keep])
 
 
-def _matches(everything: Mapping[str, Component], model: Any, sensors: list[str]) -> dict[str, list[str]]:
+def _matches(
+    everything: Mapping[str, Component], model: Any, sensors: list[str]
+) -> dict[str, list[str]]:
     """Outputs that each key of the noise table stands for."""
     found: dict[str, list[str]] = {"state": list(everything)}
     for c in everything.values():
@@ -91,7 +113,9 @@ def _block(key: str, spec: NoiseSpec, share: Array) -> Array:
         return _covariance(f"{key}.covariance", spec.covariance, n)
     sigma = np.asarray(spec.sigma, dtype=np.float64)
     if sigma.ndim and len(sigma) != n:
-        raise ExperimentError(f"{key}.sigma: {len(sigma)} numbers, wanted one, or one for each of {n} components")
+        raise ExperimentError(
+            f"{key}.sigma: {len(sigma)} numbers, wanted one, or one for each of {n} components"
+        )
     return np.diag((sigma * share) ** 2)
 
 
@@ -102,23 +126,35 @@ def _covariance(key: str, rows: tuple[tuple[float, ...], ...], n: int) -> Array:
     if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
         raise ExperimentError(f"{key}: not symmetric")
     if not np.linalg.eigvalsh(matrix)[0] > 1e-12 * np.abs(matrix).max():
-        raise ExperimentError(f"{key}: not positive definite; variances must exceed what the correlations imply")
+        raise ExperimentError(
+            f"{key}: not positive definite; variances must exceed what the correlations imply"
+        )
     return matrix
 
 
-def _correlate(block: Correlated, order: list[str], chosen: set[int], covariance: Array, strides: np.ndarray) -> None:
+def _correlate(
+    block: Correlated, order: list[str], chosen: set[int], covariance: Array, strides: np.ndarray
+) -> None:
     for name in block.outputs:
         if name not in order:
             raise ExperimentError(f"correlated.outputs: {unknown('output', name, order)}")
     rows = np.array([order.index(name) for name in block.outputs], dtype=np.intp)
     if len(set(rows.tolist())) < len(rows):
-        raise ExperimentError(f"correlated.outputs: an output stands there twice: {', '.join(block.outputs)}")
+        raise ExperimentError(
+            f"correlated.outputs: an output stands there twice: {', '.join(block.outputs)}"
+        )
     if len(set(strides[rows].tolist())) > 1:
-        raise ExperimentError(f"correlated.outputs: {', '.join(block.outputs)} are measured at different rates")
+        raise ExperimentError(
+            f"correlated.outputs: {', '.join(block.outputs)} are measured at different rates"
+        )
     others = np.setdiff1d(np.arange(len(order)), rows)
     if np.any(covariance[np.ix_(rows, others)]):
-        raise ExperimentError("correlated.outputs: one of them is correlated with an output outside already")
-    covariance[np.ix_(rows, rows)] = _covariance("correlated.covariance", block.covariance, len(rows))
+        raise ExperimentError(
+            "correlated.outputs: one of them is correlated with an output outside already"
+        )
+    covariance[np.ix_(rows, rows)] = _covariance(
+        "correlated.covariance", block.covariance, len(rows)
+    )
     chosen.update(rows.tolist())
 
 
@@ -128,7 +164,9 @@ def _stride(key: str, rate: float, wanted: float) -> int:
     stride = round(ratio)
     if stride < 1 or abs(ratio - stride) > 1e-6 * stride:
         valid = ", ".join(f"{rate / k:g}" for k in (1, 2, 4, 5, 10))
-        raise ExperimentError(f"{key}: {wanted:g} Hz does not divide rate {rate:g} Hz; valid: {valid}")
+        raise ExperimentError(
+            f"{key}: {wanted:g} Hz does not divide rate {rate:g} Hz; valid: {valid}"
+        )
     return stride
 
 

@@ -17,7 +17,11 @@ from mjfim.model.targets import inertial
 from mjfim.model.units import unit_of
 
 START = "initial "  # how names of the nuisance table's deviations of the start begin
-BARYCENTRIC = ("mass", *(f"firstmoment[{i}]" for i in range(3)), *(f"origininertia[{i}]" for i in range(6)))
+BARYCENTRIC = (
+    "mass",
+    *(f"firstmoment[{i}]" for i in range(3)),
+    *(f"origininertia[{i}]" for i in range(6)),
+)
 
 
 def parameters_of(experiment: Experiment, model: Any, outputs: Sequence[str]) -> list[Parameter]:
@@ -27,14 +31,22 @@ def parameters_of(experiment: Experiment, model: Any, outputs: Sequence[str]) ->
     """
     built: list[Parameter] = []
     for name, spec in experiment.parameters.items():
-        built += _inertial(name, spec, model) if spec.inertial is not None else [_single(name, spec, model, outputs)]
+        built += (
+            _inertial(name, spec, model)
+            if spec.inertial is not None
+            else [_single(name, spec, model, outputs)]
+        )
     built += _nuisance(experiment, model, outputs)
     names = [p.name for p in built]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
-        raise ExperimentError(f"parameters.{twice}: two parameters have this name; call one of them otherwise")
+        raise ExperimentError(
+            f"parameters.{twice}: two parameters have this name; call one of them otherwise"
+        )
     if all(p.nuisance for p in built):
-        raise ExperimentError("parameters: all are nuisance; a design needs at least one that is wanted")
+        raise ExperimentError(
+            "parameters: all are nuisance; a design needs at least one that is wanted"
+        )
     return built
 
 
@@ -58,7 +70,13 @@ def _single(name: str, spec: ParameterSpec, model: Any, outputs: Sequence[str]) 
             f"parameters.{name}.guess: the model's own value {guess:g} is outside bounds {list(bounds)}"
         )
     size = max(abs(guess), size)
-    scale = spec.scale if isinstance(spec.scale, float) else abs(guess) if spec.scale == "guess" else size
+    scale = (
+        spec.scale
+        if isinstance(spec.scale, float)
+        else abs(guess)
+        if spec.scale == "guess"
+        else size
+    )
     if scale == 0.0:
         raise ExperimentError(
             f"parameters.{name}.scale: the model's own value or guess is 0: state a guess, or a scale in the parameter's unit"
@@ -97,11 +115,17 @@ def _inertial(name: str, spec: ParameterSpec, model: Any) -> Iterator[Parameter]
         raise ExperimentError(
             f'parameters.{name}.inertial: body {spec.inertial!r}: {error}; use coordinates = "barycentric"'
         ) from None
-    fields = BARYCENTRIC if coordinates == "barycentric" else [f"logcholesky[{i}]" for i in range(10)]
-    for coordinate, path, unit, value, size in zip(chart.names, fields, chart.units, values, sizes, strict=True):
+    fields = (
+        BARYCENTRIC if coordinates == "barycentric" else [f"logcholesky[{i}]" for i in range(10)]
+    )
+    for coordinate, path, unit, value, size in zip(
+        chart.names, fields, chart.units, values, sizes, strict=True
+    ):
         scale = abs(float(value)) if spec.scale == "guess" else float(size)
         if scale == 0.0:
-            raise ExperimentError(f'parameters.{name}.scale: {coordinate} is 0; leave scale = "guess" out')
+            raise ExperimentError(
+                f'parameters.{name}.scale: {coordinate} is 0; leave scale = "guess" out'
+            )
         yield Parameter(
             f"{name}.{coordinate}",
             (Target(f"body/{spec.inertial}:{path}"),),
@@ -127,7 +151,9 @@ def _nuisance(experiment: Experiment, model: Any, outputs: Sequence[str]) -> Ite
     for label, prior in _by_name("nuisance.initial", stated.initial, list(starts)):
         yield _unwanted(f"{START}{label}", starts[label], prior, unit_of(model, starts[label]), 1.0)
     for label, prior in _by_name("nuisance.bias", stated.bias, outputs):
-        yield _unwanted(f"bias {label}", f"output/{label}:bias", prior, "", 1.0, stated.per_recording)
+        yield _unwanted(
+            f"bias {label}", f"output/{label}:bias", prior, "", 1.0, stated.per_recording
+        )
     if stated.delay is not None:
         yield _unwanted("delay", "output:delay", stated.delay, "s", 0.01, stated.per_recording)
 
@@ -153,7 +179,9 @@ def _by_name(key: str, stated: Any, names: Sequence[str]) -> Iterator[tuple[str,
         yield name, prior
 
 
-def _unwanted(name: str, path: str, prior: Any, unit: str, size: float, per_recording: bool = False) -> Parameter:
+def _unwanted(
+    name: str, path: str, prior: Any, unit: str, size: float, per_recording: bool = False
+) -> Parameter:
     known = None if prior is True else float(prior)
     return Parameter(
         name,

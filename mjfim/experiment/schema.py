@@ -43,7 +43,7 @@ class Initial(Section):
     qpos: tuple[Finite, ...] | None = None
     qvel: tuple[Finite, ...] | None = None
     act: tuple[Finite, ...] | None = None
-    control: str | Signal
+    control: str | Signal | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> Initial:
@@ -93,20 +93,37 @@ class ParameterSpec(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> ParameterSpec:
-        sources = (self.target is not None, bool(self.targets), self.function is not None, self.inertial is not None)
+        sources = (
+            self.target is not None,
+            bool(self.targets),
+            self.function is not None,
+            self.inertial is not None,
+        )
         if sum(sources) != 1:
-            raise ValueError("give exactly one of target and targets, or inertial (in Python also function)")
+            raise ValueError(
+                "give exactly one of target and targets, or inertial (in Python also function)"
+            )
         if self.function is not None and (not callable(self.function) or self.guess is None):
             raise ValueError("function must be callable, f(spec, value), and needs a guess")
         if self.inertial is not None:
-            one = [key for key in ("guess", "true", "bounds", "wanted") if getattr(self, key) is not None]
-            one += [key for key in ("unit", "scale") if getattr(self, key) not in ("", None, "guess")]
+            one = [
+                key
+                for key in ("guess", "true", "bounds", "wanted")
+                if getattr(self, key) is not None
+            ]
+            one += [
+                key for key in ("unit", "scale") if getattr(self, key) not in ("", None, "guess")
+            ]
             if one:
-                raise ValueError(f"inertial stands for ten parameters; {', '.join(one)} would fit only one")
+                raise ValueError(
+                    f"inertial stands for ten parameters; {', '.join(one)} would fit only one"
+                )
         elif self.coordinates is not None:
             raise ValueError("coordinates belongs to inertial")
         if self.per_recording and not self.nuisance:
-            raise ValueError("per_recording needs nuisance = true: what is wanted is common to all recordings")
+            raise ValueError(
+                "per_recording needs nuisance = true: what is wanted is common to all recordings"
+            )
         if self.bounds is not None:
             low, high = self.bounds
             if not low < high:
@@ -312,8 +329,8 @@ class Experiment(Section):
     rate: Positive
     measure_rate: Positive | None = None
     playback_rate: Positive | None = None
-    horizon: Positive
-    initial: Initial
+    horizon: Positive | None = None
+    initial: Initial = Initial()
     parameters: Annotated[dict[str, ParameterSpec], Field(min_length=1)]
     noise: dict[str, Positive | NoiseSpec] = Field(default_factory=dict)
     correlated: tuple[Correlated, ...] = ()
@@ -343,7 +360,9 @@ class Experiment(Section):
         try:
             values = tomllib.loads(path.read_text(encoding="utf-8"))
         except OSError as error:
-            raise ExperimentError(f"{path}: cannot read the experiment file: {error.strerror}") from None
+            raise ExperimentError(
+                f"{path}: cannot read the experiment file: {error.strerror}"
+            ) from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ExperimentError(f"{path}: not valid TOML: {error}") from None
         for reserved in ("directory", "source"):
@@ -366,13 +385,22 @@ class Experiment(Section):
         for key, value in tables.items():
             old = values.get(key)
             if key == "parameters":
-                values[key] = {**values[key], **{n: {**values[key].get(n, {}), **t} for n, t in value.items()}}
+                values[key] = {
+                    **values[key],
+                    **{n: {**values[key].get(n, {}), **t} for n, t in value.items()},
+                }
             else:
-                values[key] = {**old, **value} if isinstance(old, dict) and isinstance(value, Mapping) else value
+                values[key] = (
+                    {**old, **value}
+                    if isinstance(old, dict) and isinstance(value, Mapping)
+                    else value
+                )
         return Experiment(**{"directory": self.directory, "source": self.source, **values})
 
 
-def by_name(key: str, value: float | Mapping[str, float], names: tuple[str, ...], kind: str) -> Array:
+def by_name(
+    key: str, value: float | Mapping[str, float], names: tuple[str, ...], kind: str
+) -> Array:
     """(n,) from one number for all names or a table by name, 0 where it is silent. Raises ExperimentError."""
     if not isinstance(value, Mapping):
         return np.full(len(names), float(value))

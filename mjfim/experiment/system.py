@@ -21,7 +21,14 @@ from mjfim.experiment.parameters import parameters_of
 from mjfim.experiment.schema import Experiment, Signal, by_name
 from mjfim.information.fisher import Information
 from mjfim.model.coordinates import measurable
-from mjfim.model.loading import compile_spec, control_names, coordinates, decoration, joint_names, load_spec
+from mjfim.model.loading import (
+    compile_spec,
+    control_names,
+    coordinates,
+    decoration,
+    joint_names,
+    load_spec,
+)
 from mjfim.model.parameter_samples import sampled
 from mjfim.model.parameters import ParameterSet, moved_bodies
 from mjfim.model.paths import joint_width
@@ -36,7 +43,9 @@ from mjfim.signals import generate
 
 MAX_SAMPLES = 10_000_000
 HOLDS = 4  # Gauss-Newton steps towards a control that holds a state; one does where forces are linear in it
-HELD = 0.1  # [s] for which a control that holds a state has to keep it below the velocity of boundary
+HELD = (
+    0.1  # [s] for which a control that holds a state has to keep it below the velocity of boundary
+)
 NO_ROTATION = 1e-6  # norm of a quaternion that says nothing
 
 
@@ -71,7 +80,9 @@ class Setup:
         self.spec = load_spec(self.model_path)
         self.model = compile_spec(self.spec, self.model_path)
         if self.model.nu == 0:
-            raise ModelError(f"{self.model_path}: the model has no actuator; a design needs at least one")
+            raise ModelError(
+                f"{self.model_path}: the model has no actuator; a design needs at least one"
+            )
         if self.model.nhistory or self.model.nplugin:
             what = "delays or interval sensors" if self.model.nhistory else "engine plugins"
             raise ModelError(
@@ -85,10 +96,14 @@ class Setup:
         self.stride = measured_every if self.coarsen == 1 else 1
         self.samples = self._samples() // self.coarsen
         if self.stride > self.samples:
-            raise ExperimentError(f"measure_rate: {e.measure_rate:g} Hz measures nothing within {e.horizon:g} s")
+            raise ExperimentError(
+                f"measure_rate: {e.measure_rate:g} Hz measures nothing within {e.horizon:g} s"
+            )
         self.dt = self.substeps * float(self.model.opt.timestep) * self.coarsen
         if self.substeps % self.stretch:
-            raise ValueError(f"{self.substeps} engine steps of a sample do not divide by {self.stretch}")
+            raise ValueError(
+                f"{self.substeps} engine steps of a sample do not divide by {self.stretch}"
+            )
         self.substeps //= self.stretch
         self.t = np.arange(self.samples, dtype=np.float64) * self.dt
         self.outputs, noise = outputs_of(e, self.model, state_space(self.model), measured_every)
@@ -111,7 +126,11 @@ class Setup:
         self.plant = Plant(private, *common, smooth)
         self.tracking = self._weights()
         self.control_weight = by_name("cost.control", e.cost.control, self.controls, "actuator")
-        bounded = {limit.name for limit in self.limits if limit.kind == "control"} if e.limits.enforce else set()
+        bounded = (
+            {limit.name for limit in self.limits if limit.kind == "control"}
+            if e.limits.enforce
+            else set()
+        )
         for name, weight in zip(self.controls, self.control_weight.tolist(), strict=True):
             if weight <= 0.0 and name not in bounded:
                 raise ExperimentError(
@@ -120,7 +139,9 @@ class Setup:
                 )
         self.control_about = self.rest
         if e.cost.control_about is not None:
-            self.control_about = by_name("cost.control_about", e.cost.control_about, self.controls, "actuator")
+            self.control_about = by_name(
+                "cost.control_about", e.cost.control_about, self.controls, "actuator"
+            )
         self.control = self._control()
         self.contrast = self._contrast()
         files = [e.directory / path for path in e.earlier]
@@ -144,7 +165,11 @@ class Setup:
     @property
     def theta(self) -> Array:
         """(p,) where the design is made."""
-        return self.parameters.true if self.experiment.cost.linearize_at == "true" else self.parameters.guess
+        return (
+            self.parameters.true
+            if self.experiment.cost.linearize_at == "true"
+            else self.parameters.guess
+        )
 
     @property
     def measure_rate(self) -> float:
@@ -184,7 +209,10 @@ class Setup:
             self.noise,
             self.measure_rate,
             p.scale,
-            self.prior * (self.measure_rate / (e.measure_rate or e.rate)),  # the same per second on every level
+            self.prior
+            * (
+                self.measure_rate / (e.measure_rate or e.rate)
+            ),  # the same per second on every level
             e.cost.criterion,
             e.cost.information,
             p.interest if len(p.interest) < len(p) else None,
@@ -200,19 +228,29 @@ class Setup:
     @property
     def centre(self) -> Array:
         """(nu,) control about which controls swing: what holds the start where it is at rest, else the initial one's mean."""
-        return self.hold if self.experiment.boundary.start == "rest" else np.asarray(self.control.mean(axis=0))
+        return (
+            self.hold
+            if self.experiment.boundary.start == "rest"
+            else np.asarray(self.control.mean(axis=0))
+        )
 
     @property
     def enforced(self) -> bool:
         """True where hard limits hold, or the design has to begin, end or move in a certain way."""
         e = self.experiment
-        return self.shaped or (e.limits.enforce and (bool(self.limits) or e.limits.clearance is not None))
+        return self.shaped or (
+            e.limits.enforce and (bool(self.limits) or e.limits.clearance is not None)
+        )
 
     @property
     def shaped(self) -> bool:
         """True where the design has to begin, end or move in a certain way."""
         e = self.experiment
-        return e.boundary.start != "given" or e.boundary.end != "free" or e.limits.bandwidth is not None
+        return (
+            e.boundary.start != "given"
+            or e.boundary.end != "free"
+            or e.limits.bandwidth is not None
+        )
 
     @property
     def rest(self) -> Array:
@@ -232,7 +270,9 @@ class Setup:
         start = self.plant.start(self.theta)
         if self.experiment.boundary.end != "rest":
             return start
-        qpos, _, act = self.space.split(start if key is None else np.concatenate([key.qpos, key.qvel, key.act]))
+        qpos, _, act = self.space.split(
+            start if key is None else np.concatenate([key.qpos, key.qvel, key.act])
+        )
         return np.concatenate([qpos, np.zeros(self.space.nv), act])
 
     @cached_property
@@ -249,7 +289,9 @@ class Setup:
 
         def drift(controls: Array) -> Array:
             held = np.broadcast_to(state, (len(controls), len(state)))
-            return self.space.minus(plant.engine.step([plant.model(self.theta)], held, controls).states, state)
+            return self.space.minus(
+                plant.engine.step([plant.model(self.theta)], held, controls).states, state
+            )
 
         for _ in range(HOLDS):
             moves = np.concatenate([np.zeros((1, len(control))), 1e-4 * np.diag(size)])
@@ -280,7 +322,12 @@ class Setup:
     def problem(self) -> DesignProblem:
         """The cost as Algorithm 1 wants it."""
         running = RunningCost(
-            self.space, self.dt, self.initial.state, self.tracking, self.control_weight, self.control_about
+            self.space,
+            self.dt,
+            self.initial.state,
+            self.tracking,
+            self.control_weight,
+            self.control_about,
         )
         return DesignProblem(self.plant, self.theta, self.information, running, pool=self.pool)
 
@@ -325,29 +372,42 @@ class Setup:
             raise ExperimentError(f"horizon: {N:g} samples are too many; at most {MAX_SAMPLES:g}")
         return N
 
-    def _source(self, sensors: bool, friction: bool, coarsen: int, lifted: Lifted | None = None) -> Source:
+    def _source(
+        self, sensors: bool, friction: bool, coarsen: int, lifted: Lifted | None = None
+    ) -> Source:
         moved = None if self.parameters.compiled.any() else moved_bodies(self.parameters.parameters)
-        return Source(self.spec, self.model_path, moved, sensors, friction, coarsen, self._mocap, lifted)
+        return Source(
+            self.spec, self.model_path, moved, sensors, friction, coarsen, self._mocap, lifted
+        )
 
     def _private(self, soft: tuple[float, ...]) -> Source:
         """Of a plant with dry friction viscous below some speeds, empty: as it is."""
-        friction = any("frictionloss" in t.path for p in self.parameters.parameters for t in p.targets)
+        friction = any(
+            "frictionloss" in t.path for p in self.parameters.parameters for t in p.targets
+        )
         anything = friction or any(p.function is not None for p in self.parameters.parameters)
-        return self._source(self.outputs.needs_sensors, anything, self.coarsen * self.stretch, self._lifted(soft))
+        return self._source(
+            self.outputs.needs_sensors, anything, self.coarsen * self.stretch, self._lifted(soft)
+        )
 
     def _lifted(self, soft: tuple[float, ...]) -> Lifted | None:
         """What this level is without: whatever the limits of the experiment keep a design away from."""
         if not (self.level.lifted and self.experiment.limits.enforce):
             return Lifted(soft=soft) if soft else None
         named = {
-            kind: {limit.name for limit in self.limits if limit.kind == kind} for kind in ("position", "joint_force")
+            kind: {limit.name for limit in self.limits if limit.kind == kind}
+            for kind in ("position", "joint_force")
         }
         forced = {limit.index for limit in self.limits if limit.kind == "force"}
         stated = self.experiment.limits
         return Lifted(
             tuple(c.joint for c in self.coordinates if c.name in named["position"]),
             tuple(c.joint for c in self.coordinates if c.name in named["joint_force"]),
-            tuple(i for i in range(self.model.nactuator) if int(self.model.actuator_outadr[i]) in forced),
+            tuple(
+                i
+                for i in range(self.model.nactuator)
+                if int(self.model.actuator_outadr[i]) in forced
+            ),
             True,
             stated.clearance is not None and not stated.ignored,
             soft,
@@ -358,13 +418,21 @@ class Setup:
         p = self.parameters
         for key, theta in (("guess", p.guess), ("true", p.true)):
             for columns, fault in p.impossible(source, theta):
-                makers = dict.fromkeys(p.parameters[j].group or f"{p.parameters[j].name}.{key}" for j in columns)
+                makers = dict.fromkeys(
+                    p.parameters[j].group or f"{p.parameters[j].name}.{key}" for j in columns
+                )
                 raise ExperimentError(f"{', '.join(f'parameters.{m}' for m in makers)}: {fault}")
 
     def impossible(self, theta: Array) -> list[int]:
         """Indices of the parameters that make bodies which cannot exist at theta: (p,)."""
         try:
-            return sorted({j for columns, _ in self.parameters.impossible(self.plant.source, theta) for j in columns})
+            return sorted(
+                {
+                    j
+                    for columns, _ in self.parameters.impossible(self.plant.source, theta)
+                    for j in columns
+                }
+            )
         except ModelError:
             return np.flatnonzero(self.parameters.compiled).tolist()
 
@@ -377,7 +445,9 @@ class Setup:
         model = self.model
         if name is None:
             return None
-        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or "" for i in range(model.nkey)]
+        names = [
+            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) or "" for i in range(model.nkey)
+        ]
         if name not in names:
             raise ExperimentError(f"{where}: {unknown('keyframe', name, [n for n in names if n])}")
         return model.key(name)
@@ -394,10 +464,14 @@ class Setup:
         ):
             if given is not None:
                 if len(given) != len(default):
-                    raise ExperimentError(f"initial.{key_name}: {len(given)} numbers, the model has {len(default)}")
+                    raise ExperimentError(
+                        f"initial.{key_name}: {len(given)} numbers, the model has {len(default)}"
+                    )
                 default[:] = given
         for j, name in enumerate(joint_names(model)):
-            q = int(model.jnt_qposadr[j]) + (3 if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE) else 0)
+            q = int(model.jnt_qposadr[j]) + (
+                3 if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE) else 0
+            )
             if joint_width(model, j) > 1 and not np.linalg.norm(qpos[q : q + 4]) > NO_ROTATION:
                 raise ExperimentError(
                     f"initial.qpos: the quaternion of joint {name!r} (numbers {q} to {q + 3}) is zero; no rotation is 1, 0, 0, 0"
@@ -410,7 +484,9 @@ class Setup:
         cost, names = self.experiment.cost, joint_names(self.model)
         widths = [joint_width(self.model, j) for j in range(self.model.njnt)]
         position = np.repeat(by_name("cost.tracking", cost.tracking, names, "joint"), widths)
-        velocity = np.repeat(by_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint"), widths)
+        velocity = np.repeat(
+            by_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint"), widths
+        )
         return np.concatenate([position, velocity, np.zeros(self.model.na)])
 
     def _contrast(self) -> Array | None:
@@ -420,12 +496,16 @@ class Setup:
             return None
         wanted = tuple(p.names[j] for j in p.interest)
         scale = p.scale[p.interest]
-        key, chosen = ("combination", cost.combination) if cost.combination else ("subset", cost.subset or ())
+        key, chosen = (
+            ("combination", cost.combination) if cost.combination else ("subset", cost.subset or ())
+        )
         for name in chosen:
             if name not in wanted:
                 raise ExperimentError(f"cost.{key}: {unknown('wanted parameter', name, wanted)}")
         if cost.combination:
-            return np.asarray([[cost.combination.get(n, 0.0) * s] for n, s in zip(wanted, scale, strict=True)])
+            return np.asarray(
+                [[cost.combination.get(n, 0.0) * s] for n, s in zip(wanted, scale, strict=True)]
+            )
         if not chosen:
             raise ExperimentError(f"cost.subset: it is empty; valid: {', '.join(wanted)}")
         return np.asarray(np.eye(len(wanted))[:, [wanted.index(name) for name in chosen]])
@@ -435,7 +515,9 @@ class Setup:
         if robust is None:
             return None
         if self.experiment.descent.psi_weight:
-            raise ExperimentError("robust: descent.psi_weight belongs to a design at one parameter value")
+            raise ExperimentError(
+                "robust: descent.psi_weight belongs to a design at one parameter value"
+            )
         thetas = sampled(self.parameters, self.theta, robust.samples, robust.seed, self.impossible)
         return Pool(thetas, robust.over, self.experiment.cost.criterion == "D")
 
@@ -484,4 +566,6 @@ class Setup:
         return speeds_of(model, fastest)
 
     def _at(self, **changes: Any) -> Setup:
-        return Setup(self.experiment, self.plant.engine.threads, self.added, replace(self.level, **changes))
+        return Setup(
+            self.experiment, self.plant.engine.threads, self.added, replace(self.level, **changes)
+        )

@@ -112,7 +112,9 @@ def _honest(fit: Fit, solution: Solution, times: Sequence[float]) -> Uncertainty
     return uncertainty(solution.condensed, place, recording, rows, length, spec.bootstrap, rng)
 
 
-def _spread(fit: Fit, theta: Array, std: Array, honest: Uncertainty | None) -> tuple[Array, Array, Array]:
+def _spread(
+    fit: Fit, theta: Array, std: Array, honest: Uncertainty | None
+) -> tuple[Array, Array, Array]:
     """(p,) sandwich deviations, (p, 2) intervals, (p,) deviations between recordings; formal ones where there are none."""
     sandwich, between = np.array(std), np.zeros(len(std))
     interval = np.column_stack([theta - 1.96 * std, theta + 1.96 * std])
@@ -139,7 +141,9 @@ def _data(fit: Fit, condensed: Condensed) -> Array:
     return out
 
 
-def _sloppy(setup: Setup, theta: Array, interval: Array, covariance: Array) -> Iterator[tuple[str, str]]:
+def _sloppy(
+    setup: Setup, theta: Array, interval: Array, covariance: Array
+) -> Iterator[tuple[str, str]]:
     """Wanted parameters that the data hardly tell, and in words what they may be traded for."""
     p = setup.parameters
     told = np.isfinite(np.diag(covariance))
@@ -154,6 +158,8 @@ def _sloppy(setup: Setup, theta: Array, interval: Array, covariance: Array) -> I
         other = int(np.argmax(np.abs(together)))
         traded = f"; it is traded for {p.names[other]} (correlation {together[other]:+.2f})"
         known = (
-            f"is known to ±{100 * half / size:.0f} % only" if half < 10 * size else "may be anything in its interval"
+            f"is known to ±{100 * half / size:.0f} % only"
+            if half < 10 * size
+            else "may be anything in its interval"
         )
         yield p.names[j], known + (traded if abs(together[other]) > TRADED else "")

@@ -55,7 +55,9 @@ def track_of(setup: Setup, recording: Recording) -> Track:
     """A recording on the experiment's grid. Raises RecordingError where time, control or columns do not fit."""
     names, where, dt = setup.outputs.names, recording.name, setup.dt
     if len(recording.t) < 3:
-        raise RecordingError(f"{where}: too few rows ({len(recording.t)}); an identification needs at least 3")
+        raise RecordingError(
+            f"{where}: too few rows ({len(recording.t)}); an identification needs at least 3"
+        )
     t = recording.t - recording.t[0]
     if not (np.diff(t) > 0.0).all():  # also where one is NaN
         row = int(np.argmin(np.diff(t) > 0.0)) + 2
@@ -67,10 +69,14 @@ def track_of(setup: Setup, recording: Recording) -> Track:
         )
     if not np.isfinite(ctrl).all():
         row = int(np.argmax(~np.isfinite(ctrl).all(axis=1)))
-        raise RecordingError(f"{where}: the control in data row {row + 1} is NaN; only the last row may leave it out")
+        raise RecordingError(
+            f"{where}: the control in data row {row + 1} is NaN; only the last row may leave it out"
+        )
     shared = [name for name in names if name in recording.outputs]
     if not shared:
-        raise RecordingError(f"{where}: no measured column; {unknown('column', ', '.join(recording.outputs), names)}")
+        raise RecordingError(
+            f"{where}: no measured column; {unknown('column', ', '.join(recording.outputs), names)}"
+        )
     y = np.full((len(t), len(names)), np.nan)
     for name in shared:
         y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
@@ -89,7 +95,9 @@ def held(t: Array, ctrl: Array, dt: float) -> Array:
     """
     N = max(int(np.ceil(t[-1] / dt - ON_GRID)), 1)
     edges = np.arange(N + 1) * dt
-    total = np.concatenate([np.zeros((1, ctrl.shape[1])), np.cumsum(ctrl * np.diff(t)[:, None], axis=0)])
+    total = np.concatenate(
+        [np.zeros((1, ctrl.shape[1])), np.cumsum(ctrl * np.diff(t)[:, None], axis=0)]
+    )
     reach = np.append(t, max(edges[-1], t[-1]) + dt)
     total = np.concatenate([total, total[-1:] + ctrl[-1:] * (reach[-1] - t[-1])])
     at = np.column_stack([np.interp(edges, reach, column) for column in total.T])
@@ -119,8 +127,13 @@ def _quaternions(setup: Setup) -> list[list[int]]:
     """Outputs that are the components of one quaternion, of a joint or of a sensor."""
     outputs, model = setup.outputs.outputs, setup.model
     kinds = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
-    first = [int(model.sensor_adr[i]) for i in range(model.nsensor) if int(model.sensor_type[i]) in kinds]
-    joints = [[i for i, o in enumerate(outputs) if o.state in range(q, q + 4)] for q, _ in setup.space.quaternions]
+    first = [
+        int(model.sensor_adr[i]) for i in range(model.nsensor) if int(model.sensor_type[i]) in kinds
+    ]
+    joints = [
+        [i for i, o in enumerate(outputs) if o.state in range(q, q + 4)]
+        for q, _ in setup.space.quaternions
+    ]
     sensors = [[i for i, o in enumerate(outputs) if o.sensor in range(a, a + 4)] for a in first]
     return [found for found in (*joints, *sensors) if len(found) == 4]
 
@@ -142,6 +155,14 @@ def measured_trajectory(setup: Setup, recording: Recording) -> Trajectory | None
             return None
         qpos[:, q] = np.interp(recording.t, recording.t[seen], column[seen])
     for q, _ in setup.space.quaternions:
-        qpos[:, q : q + 4] /= np.maximum(np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True), 1e-12)
+        qpos[:, q : q + 4] /= np.maximum(
+            np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True), 1e-12
+        )
     n = len(qpos)
-    return Trajectory(recording.t, qpos, np.zeros((n, setup.model.nv)), np.zeros((n, setup.model.na)), recording.ctrl)
+    return Trajectory(
+        recording.t,
+        qpos,
+        np.zeros((n, setup.model.nv)),
+        np.zeros((n, setup.model.na)),
+        recording.ctrl,
+    )

@@ -25,7 +25,9 @@ MANY = 400_000  # samples of a fit to a part at most
 STEPS = 8  # Levenberg-Marquardt steps of a fit without a part, and of a start
 
 
-def predict(experiment: Experiment | Setup, theta: Array, recordings: Sequence[Recording]) -> tuple[Errors, ...]:
+def predict(
+    experiment: Experiment | Setup, theta: Array, recordings: Sequence[Recording]
+) -> tuple[Errors, ...]:
     """Errors of a model at theta: (p,) on recordings; only what belongs to a recording alone is found from it.
 
     Raises RecordingError for unusable recordings.
@@ -33,7 +35,8 @@ def predict(experiment: Experiment | Setup, theta: Array, recordings: Sequence[R
     setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
     fit = Fit(setup, recordings)
     return tuple(
-        _errors(fit, np.asarray(theta), _alone(fit.masks, i), fit.tracks[i].name) for i in range(len(fit.tracks))
+        _errors(fit, np.asarray(theta), _alone(fit.masks, i), fit.tracks[i].name)
+        for i in range(len(fit.tracks))
     )
 
 
@@ -42,7 +45,10 @@ def predicted(fit: Fit, at: Unknowns, held_out: Fit | None) -> tuple[Prediction,
     nominal = fit.setup.parameters.guess
     if held_out is not None:
         masks = held_out.masks
-        return tuple(_judged(held_out, at.theta, nominal, _alone(masks, i), (i,), True) for i in range(len(masks)))
+        return tuple(
+            _judged(held_out, at.theta, nominal, _alone(masks, i), (i,), True)
+            for i in range(len(masks))
+        )
     return tuple(_folds(fit, at, nominal))
 
 
@@ -57,7 +63,9 @@ def _folds(fit: Fit, at: Unknowns, nominal: Array) -> Iterator[Prediction]:
         if not len(some):
             continue
         begin = replace(at, starts=at.starts[some])
-        found = completed(rest.part(some), begin, Search(iterations=STEPS, tolerance=1e-2, fresh=False))
+        found = completed(
+            rest.part(some), begin, Search(iterations=STEPS, tolerance=1e-2, fresh=False)
+        )
         if found is not None:
             yield _judged(fit, found.unknowns.theta, nominal, masks, names, False)
 
@@ -80,7 +88,12 @@ def _alone(masks: Sequence[np.ndarray], *kept: int) -> list[np.ndarray]:
 
 
 def _judged(
-    fit: Fit, theta: Array, nominal: Array, masks: Sequence[np.ndarray], tracks: Sequence[int], held_out: bool
+    fit: Fit,
+    theta: Array,
+    nominal: Array,
+    masks: Sequence[np.ndarray],
+    tracks: Sequence[int],
+    held_out: bool,
 ) -> Prediction:
     name = ", ".join(fit.tracks[i].name for i in tracks)
     if len(fit.tracks) == 1 and not held_out:
@@ -98,9 +111,13 @@ def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> E
     now, nominal = fit.begin(theta), fit.setup.parameters.guess[fit.layout.private]
     if fit.size > len(fit.layout.shared):
         # a nuisance start of the fitted recordings says nothing of this one's
-        starts = np.zeros_like(now.starts) if fit.measured else np.tile(nominal, (len(fit.pieces), 1))
+        starts = (
+            np.zeros_like(now.starts) if fit.measured else np.tile(nominal, (len(fit.pieces), 1))
+        )
         search = Search(STEPS, 1e-2, fresh=False)
-        found = completed(fit.masked(_learned(fit, masks)).frozen(), replace(now, starts=starts), search)
+        found = completed(
+            fit.masked(_learned(fit, masks)).frozen(), replace(now, starts=starts), search
+        )
         now = now if found is None else found.unknowns
     values, outputs = fit.predicted(now), fit.setup.outputs.names
     rms, mae = np.full(len(outputs), np.nan), np.full(len(outputs), np.nan)

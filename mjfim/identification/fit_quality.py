@@ -52,7 +52,13 @@ def left(fit: Fit, solution: Solution) -> Left:
         if not len(r):
             continue
         rms[name] = float(np.sqrt(np.mean(r**2)))
-        moved = float(np.std(np.concatenate([t.y[m[:, j], j] for t, m in zip(fit.tracks, fit.masks, strict=True)])))
+        moved = float(
+            np.std(
+                np.concatenate(
+                    [t.y[m[:, j], j] for t, m in zip(fit.tracks, fit.masks, strict=True)]
+                )
+            )
+        )
         if rms[name] > HARDLY * moved and float(np.nanmean(columns[j] ** 2)) > 1.0 / HARDLY**2:
             unexplained.append(name)
     tracks = fit.tracks

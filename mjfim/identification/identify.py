@@ -29,7 +29,15 @@ from mjfim.identification.residuals import LARGE, Fit
 from mjfim.information.null_space import Null, invisible
 from mjfim.model.parameter_samples import sampled
 from mjfim.model.parameters import ParameterSet
-from mjfim.optimize.levenberg_marquardt import INTERRUPTED, Progress, Search, Solution, Unknowns, completed, minimise
+from mjfim.optimize.levenberg_marquardt import (
+    INTERRUPTED,
+    Progress,
+    Search,
+    Solution,
+    Unknowns,
+    completed,
+    minimise,
+)
 from mjfim.plant.noise import Noise
 from mjfim.recordings.plausibility import doubts
 from mjfim.records.estimate import Estimate, Suspect
@@ -75,7 +83,9 @@ def identify(
         )
     if method == "least_squares":
         theta0 = np.clip(theta0, setup.parameters.lower, setup.parameters.upper)
-    with threadpool_limits(1, user_api="blas"):  # small matrices: threads of BLAS only wait for each other
+    with threadpool_limits(
+        1, user_api="blas"
+    ):  # small matrices: threads of BLAS only wait for each other
         return _Identification(setup, recordings, method, theta0, held_out, tell).run()
 
 
@@ -138,7 +148,9 @@ class _Identification:
     def _null(self, fit: Fit) -> Null:
         """Directions of theta that neither the recordings nor the priors tell, at the start of the search."""
         p, some = self.setup.parameters, self._sample(fit)
-        J, error = (np.concatenate(part) for part in zip(*some.sensed(some.begin(self.theta0)), strict=True))
+        J, error = (
+            np.concatenate(part) for part in zip(*some.sensed(some.begin(self.theta0)), strict=True)
+        )
         weight = np.sqrt(np.diag(np.diag(p.prior_information)))
         J, error = np.concatenate([J, weight]), np.concatenate([error, np.zeros_like(weight)])
         return invisible(J, error, p.step, p.scale, np.arange(len(p)), np.zeros_like(weight))
@@ -179,7 +191,9 @@ class _Identification:
             self.interrupted = True
             return replace(found, interrupted=True, success=False, status=INTERRUPTED)
         if found is None:
-            raise SimulationDiverged(f"the simulation diverges next to the start of the fit ({what})")
+            raise SimulationDiverged(
+                f"the simulation diverges next to the start of the fit ({what})"
+            )
         return found
 
     def _placed(self, fit: Fit, begin: Unknowns, iterations: int) -> Unknowns:
@@ -198,11 +212,15 @@ class _Identification:
         placed = self._placed(some, self._sampled(begin), BRIEF)
         if whole and count == 1:
             return placed
-        found = [self._minimise(some, placed, replace(self._search, fresh=False), "some of the data")]
+        found = [
+            self._minimise(some, placed, replace(self._search, fresh=False), "some of the data")
+        ]
         for k, theta in enumerate([] if self.interrupted else self._thetas(count)):
             search = Search(iterations=BRIEF, tolerance=1e-2, fresh=False)
             try:
-                other = minimise(some, some.begin(theta), search, self._told(f"start {k + 2} of {count}"))
+                other = minimise(
+                    some, some.begin(theta), search, self._told(f"start {k + 2} of {count}")
+                )
             except KeyboardInterrupt:  # before its first iterate
                 self.interrupted = True
                 break
@@ -236,7 +254,9 @@ class _Identification:
             sigma = self._sigma(solution.unknowns)
             self.fit = self.fit.reweighted(Noise(np.diag(sigma**2), self.fit.noise.strides))
             change = float(np.abs(sigma / before - 1.0).max())
-            solution = self._minimise(self.fit, solution.unknowns, self._search, "all data, sigmas estimated")
+            solution = self._minimise(
+                self.fit, solution.unknowns, self._search, "all data, sigmas estimated"
+            )
             if change < SETTLED:
                 break
         return solution
@@ -250,7 +270,11 @@ class _Identification:
         sigma, free = np.array(fit.noise.sigma), fit.count / max(fit.count - fit.size, 1)
         for j, r in enumerate(fit.errors(values)):
             if len(r):
-                spread = 1.4826 * float(np.median(np.abs(r))) if robust else float(np.sqrt(np.mean(r**2) * free))
+                spread = (
+                    1.4826 * float(np.median(np.abs(r)))
+                    if robust
+                    else float(np.sqrt(np.mean(r**2) * free))
+                )
                 sigma[j] = max(spread, FLOOR * self.setup.noise.sigma[j])
         return sigma
 
@@ -340,7 +364,9 @@ class _Identification:
                 f"the fit hardly explains {', '.join(rest.unexplained)}: probably a local minimum. Shorter pieces (fit.segments),"
                 " more starts (fit.starts) or a better guess may find a better one"
             )
-        yield from (f"the recordings tell {group}; the rest was held at the start" for group in known.groups)
+        yield from (
+            f"the recordings tell {group}; the rest was held at the start" for group in known.groups
+        )
         if known.singular:
             yield "the recordings do not determine all parameters: the information is singular"
         if why:
@@ -364,7 +390,9 @@ class _Identification:
         yield from _far(p, fit.theta(solution.unknowns))
         yield from (f"sloppy: {name} {said}" for name, said in known.sloppy)
         yield from (
-            f"poor data in {Path(r.name).name}: {said}" for r in fit.recordings for said in doubts(self.setup, r)
+            f"poor data in {Path(r.name).name}: {said}"
+            for r in fit.recordings
+            for said in doubts(self.setup, r)
         )
 
 

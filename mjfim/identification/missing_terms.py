@@ -41,7 +41,9 @@ class Candidate:
     at: float
 
 
-def suspects(fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: Unknowns) -> tuple[Suspect, ...]:
+def suspects(
+    fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: Unknowns
+) -> tuple[Suspect, ...]:
     """Terms that would explain significant residuals, the strongest first; none where nothing does.
 
     fit: of some of the pieces that the recordings are cut into
@@ -50,7 +52,9 @@ def suspects(fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: 
     tested = list(_candidates(setup, fit.measured))[:MOST]
     if not tested:
         return ()
-    stated = {f"?{i}": {"target": c.path, "guess": c.at, "scale": FAINT} for i, c in enumerate(tested)}
+    stated = {
+        f"?{i}": {"target": c.path, "guess": c.at, "scale": FAINT} for i, c in enumerate(tested)
+    }
     try:
         wider = Setup(setup.experiment.replace(parameters=stated), setup.plant.engine.threads)
     except ExperimentError:
@@ -66,7 +70,9 @@ def suspects(fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: 
     unit = np.maximum(np.linalg.norm(J[:, :-1], axis=0), 1e-300)
     J[:, :-1] /= unit
     H, g = J[:, :-1].T @ J[:, :-1], J[:, :-1].T @ J[:, -1]
-    moved = np.zeros(len(H))  # to where sensitivities are taken; the residuals that count are those without it
+    moved = np.zeros(
+        len(H)
+    )  # to where sensitivities are taken; the residuals that count are those without it
     names = np.array(wider.parameters.names)[other.layout.places]
     columns = [int(np.flatnonzero(names == name)[0]) for name in stated]
     moved[columns] = [c.at - c.now for c in tested]
@@ -79,12 +85,23 @@ def suspects(fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: 
         left, score = H[i, i] - H[i, rest] @ cross, g[i] - g[rest] @ cross
         if left <= 1e-8 * H[i, i]:  # hardly told from the parameters that there are
             continue
-        value, sigmas, share = -score / left / unit[i], abs(score) / np.sqrt(left), score**2 / left / total
+        value, sigmas, share = (
+            -score / left / unit[i],
+            abs(score) / np.sqrt(left),
+            score**2 / left / total,
+        )
         wrong = candidate.positive and candidate.now + value < 0.0
         # more than all squares: the fit is too far from its minimum for a linear answer
         if not wrong and sigmas > norm.isf(0.5 * LEVEL / len(tested)) and WORTH < share < 1.0:
             named.append(
-                Suspect(candidate.words, candidate.path, float(value), candidate.unit, float(sigmas), float(share))
+                Suspect(
+                    candidate.words,
+                    candidate.path,
+                    float(value),
+                    candidate.unit,
+                    float(sigmas),
+                    float(share),
+                )
             )
     return tuple(sorted(named, key=lambda s: -s.sigmas)[:LISTED])
 
@@ -104,7 +121,9 @@ def _candidates(setup: Setup, measured: bool) -> Iterator[Candidate]:
         ):
             path = f"joint/{c.name}:{field}"
             if path not in sought:
-                yield Candidate(f"{words} of {c.name}", path, unit, True, float(now), float(now) or FAINT)
+                yield Candidate(
+                    f"{words} of {c.name}", path, unit, True, float(now), float(now) or FAINT
+                )
     for output in setup.outputs.outputs:
         path = f"output/{output.name}:bias"
         if path not in sought:

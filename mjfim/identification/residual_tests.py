@@ -80,18 +80,32 @@ def worst_place(
             if not seen.any():
                 continue
             edges = np.linspace(
-                t[0], t[-1] * (1 + 1e-12), min(WINDOWS, max(int(seen.sum()) // VALUES_PER_WINDOW, 1)) + 1
+                t[0],
+                t[-1] * (1 + 1e-12),
+                min(WINDOWS, max(int(seen.sum()) // VALUES_PER_WINDOW, 1)) + 1,
             )
             window = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(edges) - 2)
             counts = np.bincount(window[seen], minlength=len(edges) - 1)
             squares = np.bincount(window[seen], weights=z[seen, j] ** 2, minlength=len(edges) - 1)
-            rms = np.sqrt(squares / np.maximum(counts, VALUES_PER_WINDOW))  # a single value is no place
-            peak, floor = int(np.argmax(rms)), STICKS_OUT * float(np.sqrt(squares.sum() / counts.sum()))
-            first, last = _run(rms, peak, 0.5 * rms[peak]) if rms[peak] > floor else (0, len(rms) - 1)
+            rms = np.sqrt(
+                squares / np.maximum(counts, VALUES_PER_WINDOW)
+            )  # a single value is no place
+            peak, floor = (
+                int(np.argmax(rms)),
+                STICKS_OUT * float(np.sqrt(squares.sum() / counts.sum())),
+            )
+            first, last = (
+                _run(rms, peak, 0.5 * rms[peak]) if rms[peak] > floor else (0, len(rms) - 1)
+            )
             inside = slice(first, last + 1)
             size = float(np.sqrt(squares[inside].sum() / max(counts[inside].sum(), 1)))
             place = Place(
-                output, name, edges[first], edges[last + 1], size, float(squares[inside].sum() / max(total, 1e-300))
+                output,
+                name,
+                edges[first],
+                edges[last + 1],
+                size,
+                float(squares[inside].sum() / max(total, 1e-300)),
             )
             if best is None or place.size > best.size:
                 best = place
@@ -124,12 +138,18 @@ def whiteness(output: str, parts: Sequence[Array]) -> Whiteness:
         return Whiteness(output, count, square / max(count, 1), 0.0, 1.0, 1.0, 1.0)
     lags = min(LAGS, count // 5)
     rho = _autocorrelation(series, max(lags, _reach(series)))
-    statistic = count * (count + 2) * float(np.sum(rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))))
+    statistic = (
+        count
+        * (count + 2)
+        * float(np.sum(rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))))
+    )
     ratios = list(_ratios(series, square / count))
     chances = [float(chi2.sf(statistic, lags)), *(p for _, p in ratios)]
     inflation = max((ratio for ratio, _ in ratios), default=1.0)
     p = min(min(chances) * len(chances), 1.0)
-    return Whiteness(output, count, square / count, float(rho[1]), p, max(inflation, 1.0), _integrated(rho))
+    return Whiteness(
+        output, count, square / count, float(rho[1]), p, max(inflation, 1.0), _integrated(rho)
+    )
 
 
 def _autocorrelation(series: Sequence[Array], reach: int) -> Array:

@@ -66,7 +66,9 @@ class Fit:
     data_only: leave priors and bounds out
     """
 
-    def __init__(self, setup: Setup, recordings: Sequence[Recording], data_only: bool = False) -> None:
+    def __init__(
+        self, setup: Setup, recordings: Sequence[Recording], data_only: bool = False
+    ) -> None:
         if not recordings:
             raise RecordingError("identify needs at least one recording")
         self.setup, self.data_only = setup, data_only
@@ -136,7 +138,9 @@ class Fit:
     @property
     def occupied(self) -> np.ndarray:
         """Places of the pieces that hold a measured value."""
-        hold = [i for i, piece in enumerate(self.pieces) if self.masks[piece.track][piece.rows].any()]
+        hold = [
+            i for i, piece in enumerate(self.pieces) if self.masks[piece.track][piece.rows].any()
+        ]
         return np.array(hold, dtype=np.intp)
 
     @property
@@ -175,7 +179,10 @@ class Fit:
         """Recording and number of rows of every block."""
         counts = np.diff(self._offsets)
         tracks = np.repeat([piece.track for piece in self.pieces], counts)
-        rows = [(piece.rows.stop - piece.rows.start) / n for piece, n in zip(self.pieces, counts, strict=True)]
+        rows = [
+            (piece.rows.stop - piece.rows.start) / n
+            for piece, n in zip(self.pieces, counts, strict=True)
+        ]
         return tracks, np.repeat(rows, counts)
 
     def unbounded(self) -> Fit:
@@ -239,7 +246,11 @@ class Fit:
 
     def motion(self, at: Unknowns, track: int) -> Trajectory | None:
         """The fitted motion of one track on its grid, jumps between pieces and all; None where it diverges."""
-        plant, whole, theta = self.setup.plant, self.tracks[track], self.layout.of_recording(at, track)
+        plant, whole, theta = (
+            self.setup.plant,
+            self.tracks[track],
+            self.layout.of_recording(at, track),
+        )
         states = np.full((len(whole.ctrl) + 1, plant.nominal_start.size), np.nan)
         mine = [i for i, piece in enumerate(self.pieces) if piece.track == track]
         for i in mine:
@@ -319,7 +330,9 @@ class Fit:
         n = self.free.shape[1] if self.measured else 0
         for rows, other in zip_longest(fine, coarse):
             if rows is None:
-                raise SimulationDiverged(f"{self.tracks[0].name}: the simulation diverges under its control")
+                raise SimulationDiverged(
+                    f"{self.tracks[0].name}: the simulation diverges under its control"
+                )
             J = self._columns(rows)
             error = np.zeros_like(J) if other is None else self._columns(other) - J
             both = np.concatenate([J, error], axis=1)
@@ -363,8 +376,12 @@ class Fit:
     def _outer(self, at: Unknowns) -> Array:
         """(l, c+1) rows of priors and pins on the common unknowns."""
         rows = self.layout.priors(at)
-        pins = np.column_stack([self.layout.spread(self.pins, 0), self.pins @ (self.theta(at) - self.pinned_at)])
-        return np.concatenate([rows[: 0 if self.data_only else None], pins if self._apart else pins[:0]])
+        pins = np.column_stack(
+            [self.layout.spread(self.pins, 0), self.pins @ (self.theta(at) - self.pinned_at)]
+        )
+        return np.concatenate(
+            [rows[: 0 if self.data_only else None], pins if self._apart else pins[:0]]
+        )
 
     @property
     def _apart(self) -> bool:
@@ -387,7 +404,10 @@ class Fit:
         rows[:, np.arange(n), np.arange(n)] = weight
         rows[:, :n, -1] = weight * (at.starts - p.guess[private])
         if not self._apart:
-            rows[0, n:, :n], rows[0, n:, n:-1] = self.pins[:, private], self.layout.spread(self.pins, 0)
+            rows[0, n:, :n], rows[0, n:, n:-1] = (
+                self.pins[:, private],
+                self.layout.spread(self.pins, 0),
+            )
             rows[0, n:, -1] = self.pins @ (self.theta(at) - self.pinned_at)
         return rows
 
@@ -416,7 +436,9 @@ class Fit:
             longest = max(self.pieces[i].samples for i in batch)
             ctrl = np.stack([self._control(i, longest) for i in batch])
             free = self.free if derivatives else None
-            for response in plant.responses(theta, starts, ctrl, free, central, CHUNK, step, sought):
+            for response in plant.responses(
+                theta, starts, ctrl, free, central, CHUNK, step, sought
+            ):
                 if response is None:
                     yield None
                     return
@@ -467,12 +489,14 @@ class Fit:
         if track.even and not p.delay.any():
             at_samples = np.rint(wanted[hit]).astype(int) - response.first
             y, common, private = (
-                None if v is None else (v if i == 0 else v[place])[at_samples] for i, v in enumerate(values)
+                None if v is None else (v if i == 0 else v[place])[at_samples]
+                for i, v in enumerate(values)
             )
         else:
             lag = Lag.at(wanted[hit] - response.first, n + 1, track.dt)
             y, common, private = (
-                None if v is None else lag.apply(v if i == 0 else v[place]) for i, v in enumerate(values)
+                None if v is None else lag.apply(v if i == 0 else v[place])
+                for i, v in enumerate(values)
             )
             if common is not None and p.delay.any():
                 common = common + lag.rate(response.y[place])[..., None] * p.delay

@@ -20,7 +20,9 @@ from mjfim.records.estimate import Uncertainty
 LEVEL = 0.95
 APART = 1e-3  # probability below which recordings disagree
 TIMES = 4.0  # a block is that many times as long as residuals hang together
-MOST_SHARE = 20  # of the data that a block may take at most, inverse, so that enough of them are left
+MOST_SHARE = (
+    20  # of the data that a block may take at most, inverse, so that enough of them are left
+)
 CHUNK = 200  # replicates at once
 ALONE = 1e12  # condition of a recording's information, unknowns in units of their own, that still tells all of them
 DRAWN = 1e14  # and of that of a draw
@@ -57,7 +59,9 @@ def uncertainty(
     kept = merged_owner(recording, merged, count)
     owners = np.zeros(condensed.pieces, dtype=int)
     owners[condensed.piece] = recording
-    each, between, apart = _recordings(theta, scores, grams, kept, [known[owners == k] for k in range(kept.max() + 1)])
+    each, between, apart = _recordings(
+        theta, scores, grams, kept, [known[owners == k] for k in range(kept.max() + 1)]
+    )
     wide = float(student.ppf(0.5 + LEVEL / 2.0, max(count - 1, 1)))
     normal = float(student.ppf(0.5 + LEVEL / 2.0, 1e9))
     half = np.maximum(normal * np.hypot(formal, between), wide * np.hypot(sandwich, between))
@@ -65,7 +69,9 @@ def uncertainty(
     if len(replicates):
         tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, 0.5 + LEVEL / 2.0], axis=0)
         low, high = np.minimum(low, theta + tails[0]), np.maximum(high, theta + tails[1])
-    return Uncertainty(sandwich, np.column_stack([low, high]), between, apart, each, count, theta + replicates)
+    return Uncertainty(
+        sandwich, np.column_stack([low, high]), between, apart, each, count, theta + replicates
+    )
 
 
 def together(times: Sequence[float], total: int) -> float:
@@ -98,7 +104,9 @@ def merged_owner(recording: np.ndarray, merged: np.ndarray, count: int) -> np.nd
     return owner
 
 
-def _bootstrap(scores: Array, grams: Array, prior: Array, draws: int, rng: np.random.Generator) -> Array:
+def _bootstrap(
+    scores: Array, grams: Array, prior: Array, draws: int, rng: np.random.Generator
+) -> Array:
     """(n, c) Gauss-Newton steps to the estimates of drawn blocks; draws that do not tell everything are left out."""
     count, c = scores.shape
     known = prior.T @ prior
@@ -166,7 +174,9 @@ def _inflation(H: Array, scores: Array, recordings: int) -> tuple[Array, int]:
 def _inverse(H: Array) -> Array:
     """Pseudo-inverse of an information, whatever the units of the unknowns."""
     unit = _unit(H)
-    return np.asarray(np.linalg.pinv(H / np.outer(unit, unit), rcond=1e-14, hermitian=True) / np.outer(unit, unit))
+    return np.asarray(
+        np.linalg.pinv(H / np.outer(unit, unit), rcond=1e-14, hermitian=True) / np.outer(unit, unit)
+    )
 
 
 def _condition(H: Array) -> Array:

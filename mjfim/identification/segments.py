@@ -41,7 +41,9 @@ def whole(tracks: Sequence[Track], start: Array) -> tuple[Piece, ...]:
     return tuple(Piece(i, 0, len(t.ctrl), slice(0, len(t.t)), start) for i, t in enumerate(tracks))
 
 
-def cut(setup: Setup, tracks: Sequence[Track], length: float | None, lead: float) -> tuple[Piece, ...]:
+def cut(
+    setup: Setup, tracks: Sequence[Track], length: float | None, lead: float
+) -> tuple[Piece, ...]:
     """Pieces of a length [s], None: whole tracks, each with the start that the data show.
 
     lead: [s] by which a piece is simulated before its first row, the longest delay of the outputs
@@ -54,7 +56,9 @@ def cut(setup: Setup, tracks: Sequence[Track], length: float | None, lead: float
         starts = measured_starts(setup, track, np.array(begins))
         edges = np.searchsorted(track.t, bounds * track.dt - 1e-9 * track.dt)
         edges[-1] = len(track.t)
-        for begin, end, first, last, start in zip(begins, bounds[1:], edges[:-1], edges[1:], starts, strict=True):
+        for begin, end, first, last, start in zip(
+            begins, bounds[1:], edges[:-1], edges[1:], starts, strict=True
+        ):
             if last > first:
                 found.append(Piece(i, begin, int(end) - begin, slice(int(first), int(last)), start))
     return tuple(found)
@@ -132,7 +136,11 @@ def _nominal(setup: Setup, track: Track, begins: np.ndarray) -> Array:
 
 def _shown(setup: Setup, track: Track) -> dict[int, int]:
     """Output that shows a component of the state, by its address, where the track has values of it."""
-    return {state: i for state, i in states_shown(setup.model, setup.outputs).items() if len(track.seen[i])}
+    return {
+        state: i
+        for state, i in states_shown(setup.model, setup.outputs).items()
+        if len(track.seen[i])
+    }
 
 
 def groups(pieces: Sequence[Piece], most: int) -> Iterator[list[int]]:

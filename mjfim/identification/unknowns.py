@@ -40,12 +40,16 @@ class Layout:
         shared, each = np.flatnonzero(~p.private), np.flatnonzero(own)
         places = np.concatenate([shared, np.tile(each, recordings)])
         lower, upper = p.lower[places], p.upper[places]
-        found = Layout(p, shared, each, np.flatnonzero(p.deviations), recordings, lower, upper, free)
+        found = Layout(
+            p, shared, each, np.flatnonzero(p.deviations), recordings, lower, upper, free
+        )
         return found if bounded else found.unbounded()
 
     def unbounded(self) -> Layout:
         """The same without bounds."""
-        return replace(self, lower=np.full(self.columns, -np.inf), upper=np.full(self.columns, np.inf))
+        return replace(
+            self, lower=np.full(self.columns, -np.inf), upper=np.full(self.columns, np.inf)
+        )
 
     def frozen(self) -> Layout:
         """The same with the shared parameters staying as they are."""
@@ -78,7 +82,9 @@ class Layout:
         """At theta: (p,), every one of some pieces with a start of some width as stated or measured."""
         theta = np.array(theta, dtype=np.float64)
         start = np.zeros(width) if self.free else theta[self.private]
-        return Unknowns(theta, np.tile(start, (pieces, 1)), np.tile(theta[self.own], (self.recordings, 1)))
+        return Unknowns(
+            theta, np.tile(start, (pieces, 1)), np.tile(theta[self.own], (self.recordings, 1))
+        )
 
     def place(self, at: Unknowns) -> Array:
         """(c,) values of the common unknowns."""
@@ -116,5 +122,7 @@ class Layout:
         """(l, c+1) rows of the stated priors."""
         places = self.places
         weight = np.sqrt(np.diag(self.parameters.prior_information))[places]
-        rows = np.column_stack([np.diag(weight), weight * (self.place(at) - self.parameters.guess[places])])
+        rows = np.column_stack(
+            [np.diag(weight), weight * (self.place(at) - self.parameters.guess[places])]
+        )
         return np.asarray(rows[weight > 0.0])

@@ -42,7 +42,9 @@ def e_optimality(information: Array) -> Criterion:
     values, vectors, sound = _spectrum(information)
     if not sound:
         return _blind(values, vectors)
-    return Criterion(float(1.0 / values[0]), np.array([-(values[0] ** -2)]), vectors[:, :1].T, values)
+    return Criterion(
+        float(1.0 / values[0]), np.array([-(values[0] ** -2)]), vectors[:, :1].T, values
+    )
 
 
 def smooth_e_optimality(information: Array, power: float, faint: float = NEGLIGIBLE) -> Criterion:
@@ -57,7 +59,9 @@ def smooth_e_optimality(information: Array, power: float, faint: float = NEGLIGI
     total = float(np.sum(ratio**power))
     weights = total ** (1.0 / power - 1.0) * ratio ** (power + 1.0) / values[0] ** 2
     kept = weights > faint * weights[0]
-    return Criterion(total ** (1.0 / power) / values[0], -weights[kept], vectors.T[kept], values, power)
+    return Criterion(
+        total ** (1.0 / power) / values[0], -weights[kept], vectors.T[kept], values, power
+    )
 
 
 def a_optimality(information: Array) -> Criterion:
@@ -87,4 +91,8 @@ def c_optimality(information: Array, contrast: Array) -> Criterion:
     return Criterion(float(np.sum(Y * contrast.T)), -np.ones(len(Y)), Y, values)
 
 
-CRITERIA: dict[str, Callable[[Array], Criterion]] = {"E": e_optimality, "A": a_optimality, "D": d_optimality}
+CRITERIA: dict[str, Callable[[Array], Criterion]] = {
+    "E": e_optimality,
+    "A": a_optimality,
+    "D": d_optimality,
+}

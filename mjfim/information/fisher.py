@@ -18,7 +18,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.information.criteria import CRITERIA, NEGLIGIBLE, SINGULAR, Criterion, c_optimality, smooth_e_optimality
+from mjfim.information.criteria import (
+    CRITERIA,
+    NEGLIGIBLE,
+    SINGULAR,
+    Criterion,
+    c_optimality,
+    smooth_e_optimality,
+)
 from mjfim.information.marginal import standard_deviations
 from mjfim.optimize.eigenvalue_model import Spectral, divided
 from mjfim.optimize.lq import Recursion
@@ -62,7 +69,10 @@ class Information:
 
     def accumulated(self, sensitivity: Sensitivity) -> Array:
         """(N+1,) smallest eigenvalue of what the criterion sees, accumulated up to each sample."""
-        G = self.noise.whiten(sensitivity.G) * self.noise.measured(len(sensitivity.G) - 1)[..., None]
+        G = (
+            self.noise.whiten(sensitivity.G)
+            * self.noise.measured(len(sensitivity.G) - 1)[..., None]
+        )
         total = np.cumsum(np.swapaxes(G, 1, 2) @ G, axis=0) + self.prior
         return np.asarray(np.maximum(np.linalg.eigvalsh(self.reduced(total)[0])[:, 0], 0.0))
 
@@ -92,7 +102,12 @@ class Information:
             return Criterion(np.inf, np.zeros(0), np.zeros((0, len(information))), np.zeros(0))
         raw = self._criterion(R)
         directions = raw.directions @ P * self.scale
-        return replace(raw, value=self.weight * raw.value, weights=self.weight * raw.weights, directions=directions)
+        return replace(
+            raw,
+            value=self.weight * raw.value,
+            weights=self.weight * raw.weights,
+            directions=directions,
+        )
 
     def _criterion(self, R: Array) -> Criterion:
         if self.criterion == "E" and np.isfinite(self.power):
@@ -100,7 +115,9 @@ class Information:
         if self.criterion == "c":
             if self.contrast is None:
                 raise ValueError("criterion c needs a contrast")
-            return c_optimality(R, self.contrast if self.basis is None else self.basis.T @ self.contrast)
+            return c_optimality(
+                R, self.contrast if self.basis is None else self.basis.T @ self.contrast
+            )
         return CRITERIA[self.criterion](R)
 
     def covariance(self, information: Array) -> Array:
@@ -126,7 +143,9 @@ class Information:
         if values[0] <= SINGULAR * values[-1]:
             return np.full((len(t), len(t)), np.nan), basis
         known = basis @ (vectors / size[:, None])
-        covariance = (known / values) @ known.T * np.outer(self.scale[t], self.scale[t]) / self.measure_rate
+        covariance = (
+            (known / values) @ known.T * np.outer(self.scale[t], self.scale[t]) / self.measure_rate
+        )
         return covariance, basis
 
     def std(self, information: Array) -> Array:
@@ -145,7 +164,9 @@ class Information:
             return basis
         rest = np.linalg.qr(basis, mode="complete")[0][:, basis.shape[1] :]
         told, vectors = np.linalg.eigh(rest.T @ self.scaled(np.diag(stated))[np.ix_(t, t)] @ rest)
-        return np.concatenate([basis, rest @ vectors[:, told > ESTIMABLE * told.max(initial=0.0)]], axis=1)
+        return np.concatenate(
+            [basis, rest @ vectors[:, told > ESTIMABLE * told.max(initial=0.0)]], axis=1
+        )
 
     def visible(self, information: Array) -> Array:
         """(p, p) information without the round-off along invisible directions."""
@@ -176,7 +197,9 @@ class Information:
             return np.asarray(scale[:, None, None] * ((Gw * mask) @ self.noise.precision))
         return np.asarray(scale[:, None, None] * Gw / self.noise.sigma**2 * mask)
 
-    def gradient(self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear) -> tuple[Array, Array]:
+    def gradient(
+        self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear
+    ) -> tuple[Array, Array]:
         """(a, b): derivative of phi by x_k (N+1, nx) and u_k (N, nu), psi eliminated by the adjoint."""
         nx, rays = bilinear.A.shape[1], self._rays(criterion, sensitivity)
         backs = self._back(rays, bilinear)
@@ -184,7 +207,9 @@ class Information:
         total = np.sum(list(shares), axis=0)
         return total[:, :nx], total[:-1, nx:]
 
-    def spectral(self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear, cost: float) -> Spectral:
+    def spectral(
+        self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear, cost: float
+    ) -> Spectral:
         """Model of log J about a point of the smooth E-criterion, from the very derivatives that its gradient takes.
 
         With `V = 2 Sigma^-1 G w_i` the change of `w_i' I w_j` is half of what V_i makes of dG w_j and V_j of dG w_i.
@@ -201,7 +226,9 @@ class Information:
                     both = (both + self._through(backs, j, i, criterion, bilinear)) / np.sqrt(2.0)
                 rows.append(turn[i, j] * both)
         slopes = np.stack(rows)
-        return Spectral(values, criterion.power, criterion.value / cost, slopes[..., :nx], slopes[:, :-1, nx:])
+        return Spectral(
+            values, criterion.power, criterion.value / cost, slopes[..., :nx], slopes[:, :-1, nx:]
+        )
 
     def _back(self, rays: Array, bilinear: Bilinear) -> list[tuple[Array, Array, Array]]:
         """Each ray, as the outputs themselves see it, and its costate."""
@@ -227,10 +254,14 @@ class Information:
             share += np.einsum("kzy,ky->kz", bilinear.h_mixed[direction], own)
         if bilinear.lag is not None and bilinear.delay is not None:
             share += _delayed(bilinear, v * float(bilinear.delay @ criterion.directions[direction]))
-        share[-2, nx:] += share[-1, nx:]  # the last control is held for the outputs of the last sample
+        share[-2, nx:] += share[
+            -1, nx:
+        ]  # the last control is held for the outputs of the last sample
         return share
 
-    def partials(self, criterion: Criterion, sensitivity: Sensitivity, full: Bilinear) -> tuple[Array, Array, Array]:
+    def partials(
+        self, criterion: Criterion, sensitivity: Sensitivity, full: Bilinear
+    ) -> tuple[Array, Array, Array]:
         """Derivatives of phi with psi kept as a state: by psi (N+1, nx, p), by x (N+1, nx), by u (N, nu).
 
         full: bilinear along the unit directions of theta.
@@ -252,4 +283,6 @@ def _delayed(bilinear: Bilinear, v: Array) -> Array:
     if bilinear.lag is None:
         raise ValueError("nothing delays the outputs")
     e = bilinear.lag.rate_transposed(v)
-    return np.concatenate([np.einsum("kyx,ky->kx", bilinear.C, e), np.einsum("kyu,ky->ku", bilinear.D, e)], axis=1)
+    return np.concatenate(
+        [np.einsum("kyx,ky->kx", bilinear.C, e), np.einsum("kyu,ky->ku", bilinear.D, e)], axis=1
+    )

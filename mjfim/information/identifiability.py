@@ -43,7 +43,9 @@ class Survey:
         """(t, s) combinations that some experiment can see; None where all parameters are such."""
         return self.always.basis if self.always.count else None
 
-    def combined(self, information: Information, values: Array, before: Array, after: Array) -> tuple[Combined, ...]:
+    def combined(
+        self, information: Information, values: Array, before: Array, after: Array
+    ) -> tuple[Combined, ...]:
         """The visible combinations of `groups_always`: words, value and standard deviations of two informations (p, p).
 
         values: (t,) of the wanted parameters
@@ -51,7 +53,9 @@ class Survey:
         rows = rows_of(self.groups_always, self.names)
         words = [str(c) for group in self.groups_always for c in group.combinations]
         stds = (information.spread(told, rows).tolist() for told in (before, after))
-        return tuple(Combined(*column) for column in zip(words, (rows @ values).tolist(), *stds, strict=True))
+        return tuple(
+            Combined(*column) for column in zip(words, (rows @ values).tolist(), *stds, strict=True)
+        )
 
 
 def rows(setup: Setup, sensitivity: Sensitivity) -> Array:
@@ -77,7 +81,9 @@ def survey_rows(setup: Setup, trajectory: Trajectory, J: Array, error: Array) ->
     return _survey(setup, trajectory, J, error, _local(setup, [trajectory]))
 
 
-def _survey(setup: Setup, trajectory: Trajectory, J: Array, error: Array, local: Array | None) -> Survey:
+def _survey(
+    setup: Setup, trajectory: Trajectory, J: Array, error: Array, local: Array | None
+) -> Survey:
     here = _null(setup, [J], [error], local)
     if not here.count:
         return _words(setup, here, here)
@@ -118,13 +124,19 @@ def _local(setup: Setup, trajectories: Sequence[Trajectory]) -> Array | None:
     return _unseen_before(setup, out)
 
 
-def _stepped(setup: Setup, trajectories: Sequence[Trajectory], most: int) -> tuple[Array, Array] | None:
+def _stepped(
+    setup: Setup, trajectories: Sequence[Trajectory], most: int
+) -> tuple[Array, Array] | None:
     """Effects on single steps at no more than so many samples of each trajectory, and their error; None where all diverge."""
     stack, errors = [], []
     for trajectory in trajectories:
-        picked = np.unique(np.linspace(0, trajectory.samples - 1, min(most, trajectory.samples)).astype(int))
+        picked = np.unique(
+            np.linspace(0, trajectory.samples - 1, min(most, trajectory.samples)).astype(int)
+        )
         try:
-            first, second = (setup.plant.one_step(setup.theta, trajectory, picked, step) for step in ONE_STEPS)
+            first, second = (
+                setup.plant.one_step(setup.theta, trajectory, picked, step) for step in ONE_STEPS
+            )
         except SimulationDiverged:
             continue
         stack.append(first)
@@ -136,14 +148,20 @@ def _words(setup: Setup, here: Null, always: Null) -> Survey:
     p = setup.parameters
     names = tuple(p.names[j] for j in p.interest)
     size, units = p.step[p.interest], [p.parameters[j].unit for j in p.interest]
-    return Survey(names, here, always, grouped(here, names, size, units), grouped(always, names, size, units))
+    return Survey(
+        names, here, always, grouped(here, names, size, units), grouped(always, names, size, units)
+    )
 
 
-def _null(setup: Setup, stack: Sequence[Array], errors: Sequence[Array] | None, known: Array | None) -> Null:
+def _null(
+    setup: Setup, stack: Sequence[Array], errors: Sequence[Array] | None, known: Array | None
+) -> Null:
     p = setup.parameters
     before = _rows_of(setup.earlier)
     error = None if errors is None else np.concatenate([*errors, ROUND_OFF * np.abs(before)])
-    return invisible(np.concatenate([*stack, before]), error, p.step, p.scale, p.interest, setup.prior, known)
+    return invisible(
+        np.concatenate([*stack, before]), error, p.step, p.scale, p.interest, setup.prior, known
+    )
 
 
 def _rows_of(information: Array) -> Array:
@@ -157,7 +175,9 @@ def _unseen_before(setup: Setup, directions: Array) -> Array:
     """Those (t, k) directions of the wanted parameters that earlier experiments do not see either."""
     if not setup.earlier.any() or not directions.shape[1]:
         return directions
-    unit = directions / np.linalg.norm(directions / setup.parameters.step[setup.parameters.interest][:, None], axis=0)
+    unit = directions / np.linalg.norm(
+        directions / setup.parameters.step[setup.parameters.interest][:, None], axis=0
+    )
     before = _rows_of(setup.earlier)
     effect = before[:, setup.parameters.interest] @ unit
     _, values, V = np.linalg.svd(
@@ -179,5 +199,7 @@ def require_visible(setup: Setup, J: Array) -> None:
     p = setup.parameters
     null = invisible(J, None, p.step, p.scale, np.arange(len(p)), setup.prior)
     if null.count:
-        said = "; ".join(str(g) for g in grouped(null, p.names, p.step, [q.unit for q in p.parameters]))
+        said = "; ".join(
+            str(g) for g in grouped(null, p.names, p.step, [q.unit for q in p.parameters])
+        )
         raise UnidentifiableError(f"this trajectory does not show every parameter: {said}")

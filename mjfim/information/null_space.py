@@ -19,7 +19,9 @@ COARSER = 4.0  # the second step, times the first
 SURE = 1e-4  # a normalised singular value above it needs no second look
 TOLERANCE = (1e-9, 1e-5)
 BLIND = 1e-6  # standard deviations that the data move when a parameter changes by all its size: no effect
-FAINT = 1e-7  # of the strongest column; an error of the difference may exceed a column only below it
+FAINT = (
+    1e-7  # of the strongest column; an error of the difference may exceed a column only below it
+)
 CLEAN = 1e-4  # coefficients of a combination below it, in natural units, are round-off
 
 
@@ -83,7 +85,9 @@ def invisible(
     raw = own * size[interest][:, None]
     k = raw.shape[1]
     full = np.linalg.qr(raw / scale[interest][:, None], mode="complete")[0] if k else np.eye(t)
-    silent = np.sum(np.linalg.qr(own)[0] ** 2, axis=1) > 1.0 - CLEAN**2 if k else np.zeros(t, dtype=bool)
+    silent = (
+        np.sum(np.linalg.qr(own)[0] ** 2, axis=1) > 1.0 - CLEAN**2 if k else np.zeros(t, dtype=bool)
+    )
     return Null(raw, tuple(int(i) for i in np.flatnonzero(silent)), full[:, k:], smallest * share)
 
 
@@ -98,7 +102,9 @@ def _hidden(J: Array, error: Array, live: np.ndarray) -> tuple[Array, float]:
     hidden = values <= np.clip(3.0 * np.linalg.norm(error[:, columns] / unit, 2), *TOLERANCE)
     found = np.zeros((len(live), int(hidden.sum())))
     found[columns] = V[hidden].T / unit[:, None]
-    return found / np.maximum(np.linalg.norm(found, axis=0), 1e-300), float(values[~hidden].min(initial=1.0))
+    return found / np.maximum(np.linalg.norm(found, axis=0), 1e-300), float(
+        values[~hidden].min(initial=1.0)
+    )
 
 
 def _independent(directions: Array) -> Array:
@@ -115,7 +121,9 @@ def _range(A: Array) -> Array:
     return np.asarray(U[:, s > TOLERANCE[0]])
 
 
-def grouped(null: Null, names: Sequence[str], size: Array, units: Sequence[str]) -> tuple[Group, ...]:
+def grouped(
+    null: Null, names: Sequence[str], size: Array, units: Sequence[str]
+) -> tuple[Group, ...]:
     """The invisible directions in the user's words: groups of parameters and the combinations that remain of them.
 
     names, size, units: of the t wanted parameters; sizes decide which coefficients are round-off. Parameters without any
@@ -128,9 +136,12 @@ def grouped(null: Null, names: Sequence[str], size: Array, units: Sequence[str])
     base = np.setdiff1d(np.arange(len(N)), lumped)
     coefficients = -N[base] @ np.linalg.inv(N[lumped])
     relative = coefficients * size[lumped] / size[base][:, None]
-    coefficients = np.where(np.abs(relative) > CLEAN * max(1.0, np.abs(relative).max(initial=0.0)), coefficients, 0.0)
+    coefficients = np.where(
+        np.abs(relative) > CLEAN * max(1.0, np.abs(relative).max(initial=0.0)), coefficients, 0.0
+    )
     links = [
-        {int(f), *(int(b) for b, c in zip(base, coefficients[:, j], strict=True) if c)} for j, f in enumerate(lumped)
+        {int(f), *(int(b) for b, c in zip(base, coefficients[:, j], strict=True) if c)}
+        for j, f in enumerate(lumped)
     ]
     groups, none = [], [names[m] for m in null.silent]
     for members in _joined(links):
@@ -139,8 +150,16 @@ def grouped(null: Null, names: Sequence[str], size: Array, units: Sequence[str])
         rows = []
         for i, b in enumerate(base):
             if b in members:
-                parts = [(int(f), float(coefficients[i, j])) for j, f in enumerate(lumped) if coefficients[i, j]]
-                rows.append(Combination((names[b], *(names[f] for f, _ in parts)), (1.0, *(c for _, c in parts))))
+                parts = [
+                    (int(f), float(coefficients[i, j]))
+                    for j, f in enumerate(lumped)
+                    if coefficients[i, j]
+                ]
+                rows.append(
+                    Combination(
+                        (names[b], *(names[f] for f, _ in parts)), (1.0, *(c for _, c in parts))
+                    )
+                )
         groups.append(Group(tuple(names[m] for m in sorted(members)), tuple(rows)))
     return (*groups, Group(tuple(none), ())) if none else tuple(groups)
 
@@ -154,7 +173,11 @@ def _lumped(N: Array, units: Sequence[str]) -> np.ndarray:
     order = sorted(range(len(N)), key=lambda i: (rank.get(units[i], 3), -i))
     chosen: list[int] = []
     found = np.zeros((0, N.shape[1]))
-    for least in (0.05, 1e-3, 1e-6):  # rows that stand out come first, lest the coefficients explode
+    for least in (
+        0.05,
+        1e-3,
+        1e-6,
+    ):  # rows that stand out come first, lest the coefficients explode
         for i in order:
             if len(chosen) == N.shape[1]:
                 break

@@ -26,7 +26,9 @@ def disagreement(fine: Array, coarse: Array) -> Array:
     return np.asarray((np.abs(fine - coarse) / np.where(size > 0.0, size, 1.0)).max(axis=1))
 
 
-def roughness(setup: Setup, theta: Array, trajectory: Trajectory, fine: Sensitivity | None = None) -> Roughness | None:
+def roughness(
+    setup: Setup, theta: Array, trajectory: Trajectory, fine: Sensitivity | None = None
+) -> Roughness | None:
     """The worst disagreement along a trajectory, or None where it is below `TOLERANCE`. fine: by the first step, if known"""
     plant = setup.plant
     fine = plant.sensitivity(theta, trajectory) if fine is None else fine
@@ -48,11 +50,15 @@ def roughness(setup: Setup, theta: Array, trajectory: Trajectory, fine: Sensitiv
     if between is not None:
         less = disagreement(G, setup.noise.whiten(between.G))[:, kept]
         if (less.max(axis=0) * CURVED <= error.max(axis=0)).all():
-            return None  # the error of central differences falls ninefold: strongly curved, but smooth
+            return (
+                None  # the error of central differences falls ninefold: strongly curved, but smooth
+            )
     first = int(np.argmax(error[:, worst] > TOLERANCE))
     near = range(max(first - 2, 0), min(first + 1, trajectory.samples))
     causes = tuple(_active(setup.model_at(theta), trajectory, near))
-    return Roughness(float(error[:, worst].max()), names[kept[worst]], first, float(trajectory.t[first]), causes)
+    return Roughness(
+        float(error[:, worst].max()), names[kept[worst]], first, float(trajectory.t[first]), causes
+    )
 
 
 def visible_columns(setup: Setup, G: Array) -> np.ndarray:

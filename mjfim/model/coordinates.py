@@ -87,7 +87,9 @@ def output_label(model: mujoco.MjModel, output: str) -> str:
     if short in ("JOINTPOS", "JOINTVEL"):
         unit = _joint_unit(model, int(model.sensor_objid[sensor]))
         return f"{output} [{unit}{'/s' if short == 'JOINTVEL' else ''}]"
-    return next((f"{output} [{unit}]" for unit, kinds in SENSOR_UNITS.items() if short in kinds), output)
+    return next(
+        (f"{output} [{unit}]" for unit, kinds in SENSOR_UNITS.items() if short in kinds), output
+    )
 
 
 def split_unit(label: str) -> tuple[str, str]:
@@ -144,7 +146,11 @@ def components(model: Any) -> tuple[Component, ...]:
     """All of qpos, then all of qvel."""
     positions, velocities = [], []
     for j, name in enumerate(joint_names(model)):
-        q, v, kind = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j]), int(model.jnt_type[j])
+        q, v, kind = (
+            int(model.jnt_qposadr[j]),
+            model.nq + int(model.jnt_dofadr[j]),
+            int(model.jnt_type[j]),
+        )
         qpos, qvel = f"qpos:{name}", f"qvel:{name}"
         if kind in (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)):
             unit = "m" if kind == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"

@@ -90,8 +90,12 @@ def pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Pair, ...]:
             if name not in bodies:
                 raise ExperimentError(f"ignored: {unknown('body', name, bodies)}")
         if len(names) != 2:
-            raise ExperimentError(f"ignored: {sorted(names)} is no pair of bodies; needs two different names")
-    explicit = {frozenset(p) for p in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
+            raise ExperimentError(
+                f"ignored: {sorted(names)} is no pair of bodies; needs two different names"
+            )
+    explicit = {
+        frozenset(p) for p in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+    }
     excluded = {frozenset(divmod(s, 1 << 16)) for s in model.exclude_signature.tolist()}
     body, tree = model.geom_bodyid.tolist(), model.body_treeid.tolist()
     found = []
@@ -105,7 +109,11 @@ def pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Pair, ...]:
             or frozenset(bodies[i] for i in ids) in ignored
             or not (
                 frozenset((first, second)) in explicit
-                or (ids not in excluded and not _related(model, *ids) and _compatible(model, first, second))
+                or (
+                    ids not in excluded
+                    and not _related(model, *ids)
+                    and _compatible(model, first, second)
+                )
             )
         ):
             continue
@@ -122,7 +130,10 @@ def pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Pair, ...]:
 
 def _body_names(model: Any) -> list[str]:
     """nbody names; unnamed bodies are called by their number."""
-    return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i) or f"body{i}" for i in range(model.nbody)]
+    return [
+        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i) or f"body{i}"
+        for i in range(model.nbody)
+    ]
 
 
 def _related(model: Any, a: int, b: int) -> bool:
@@ -153,15 +164,22 @@ class Clearance:
     pairs: (p,) in the order of columns;  columns: m names
     """
 
-    def __init__(self, model: Any, chosen: Sequence[Pair], reach: float, grouped: bool = True) -> None:
+    def __init__(
+        self, model: Any, chosen: Sequence[Pair], reach: float, grouped: bool = True
+    ) -> None:
         if not chosen:
             raise ExperimentError(
                 "clearance: no two geoms can come near each other; needs a moving geom whose contype and conaffinity match"
             )
         if not 0.0 < reach < FAR:
-            raise ExperimentError(f"clearance: reach {reach:g} m; needs a positive, finite distance")
+            raise ExperimentError(
+                f"clearance: reach {reach:g} m; needs a positive, finite distance"
+            )
         body = model.geom_bodyid
-        keys = [(int(body[p.first]), int(body[p.second])) if grouped else (p.first, p.second) for p in chosen]
+        keys = [
+            (int(body[p.first]), int(body[p.second])) if grouped else (p.first, p.second)
+            for p in chosen
+        ]
         number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
         order = sorted(range(len(chosen)), key=lambda i: number[keys[i]])
         self.reach = float(reach)
@@ -171,10 +189,13 @@ class Clearance:
         leaders = [self.pairs[i] for i in self._starts]
         bodies = _body_names(model)
         self.columns = tuple(
-            f"{bodies[body[p.first]]} - {bodies[body[p.second]]}" if grouped else p.name for p in leaders
+            f"{bodies[body[p.first]]} - {bodies[body[p.second]]}" if grouped else p.name
+            for p in leaders
         )
         moved = _moved(model)
-        self._sign = moved[body[[p.second for p in leaders]]] - moved[body[[p.first for p in leaders]]]
+        self._sign = (
+            moved[body[[p.second for p in leaders]]] - moved[body[[p.first for p in leaders]]]
+        )
 
         self._model = own = copy.copy(model)
         own.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
@@ -202,9 +223,13 @@ class Clearance:
     def __call__(self, qpos: Array, slopes: bool) -> Distances:
         """Distances of every column at every configuration, qpos: (n, nq); with their slopes or without."""
         rows = max(BLOCK // len(self.pairs), 1)
-        blocks = [self._block(qpos[k : k + rows], slopes) for k in range(0, max(len(qpos), 1), rows)]
+        blocks = [
+            self._block(qpos[k : k + rows], slopes) for k in range(0, max(len(qpos), 1), rows)
+        ]
         d = np.concatenate([b.d for b in blocks])
-        return Distances(d, np.concatenate([b.slope for b in blocks if b.slope is not None]) if slopes else None)
+        return Distances(
+            d, np.concatenate([b.slope for b in blocks if b.slope is not None]) if slopes else None
+        )
 
     def nearest(self, qpos: Array) -> tuple[float, int, Pair]:
         """Smallest distance [m] at any configuration however far, its row and its geoms. qpos: (n, nq), n > 0, finite."""
@@ -214,7 +239,9 @@ class Clearance:
         places, frames, _ = self._poses(qpos, False)
         bounds, _ = self._bounds(places, frames)
         best, row, pair = np.inf, 0, self.pairs[0]
-        for k, p in zip(*np.unravel_index(np.argsort(bounds, axis=None), bounds.shape), strict=True):
+        for k, p in zip(
+            *np.unravel_index(np.argsort(bounds, axis=None), bounds.shape), strict=True
+        ):
             if bounds[k, p] >= best:
                 break
             distance = float(bounds[k, p])
@@ -222,14 +249,18 @@ class Clearance:
                 self._pose(places[k], frames[k])
                 model, first, second, taken = self._calls[p]
                 limit = min(best, FAR) + taken
-                distance = mujoco.mj_geomDistance(model, self._data, first, second, limit, None) - taken
+                distance = (
+                    mujoco.mj_geomDistance(model, self._data, first, second, limit, None) - taken
+                )
             if distance < best:
                 best, row, pair = distance, int(k), self.pairs[p]
         return best, row, pair
 
     def _block(self, qpos: Array, slopes: bool) -> Distances:
         finite = np.asarray(np.isfinite(qpos).all(axis=1))
-        places, frames, screws = self._poses(np.where(finite[:, None], qpos, self._model.qpos0), slopes)
+        places, frames, screws = self._poses(
+            np.where(finite[:, None], qpos, self._model.qpos0), slopes
+        )
         every, points = self._bounds(places, frames)
         every[every >= self.reach] = self.reach
         near = every < self.reach
@@ -261,7 +292,13 @@ class Clearance:
         model, data, n = self._model, self._data, len(qpos)
         places, frames = np.empty((n, model.ngeom, 3)), np.empty((n, model.ngeom, 9))
         screws, centres = np.empty((n, model.nv, 6)), np.empty((n, model.nbody, 3))
-        q, xpos, xmat, cdof, com = data.qpos, data.geom_xpos, data.geom_xmat, data.cdof, data.subtree_com
+        q, xpos, xmat, cdof, com = (
+            data.qpos,
+            data.geom_xpos,
+            data.geom_xmat,
+            data.cdof,
+            data.subtree_com,
+        )
         for k, now in enumerate(qpos):
             q[:] = now
             mujoco.mj_kinematics(model, data)
@@ -290,7 +327,9 @@ class Clearance:
             normal, frame = frames[:, second, :, 2], frames[:, first]
             points[:, i] = places[:, first]
             if self._exact[p]:
-                local = _farthest(int(kind[first]), size[first], -np.einsum("nij,ni->nj", frame, normal))
+                local = _farthest(
+                    int(kind[first]), size[first], -np.einsum("nij,ni->nj", frame, normal)
+                )
                 points[:, i] += np.einsum("nij,nj->ni", frame, local)
             bounds[:, p] = np.einsum("ni,ni->n", points[:, i] - places[:, second], normal)
             if not self._exact[p]:
@@ -306,12 +345,16 @@ class Clearance:
                 self._pose(places[k], frames[k])
                 last = k
             model, first, second, taken = calls[p]
-            distance = mujoco.mj_geomDistance(model, data, first, second, reach + taken, segments[i])
+            distance = mujoco.mj_geomDistance(
+                model, data, first, second, reach + taken, segments[i]
+            )
             if distance < reach + taken:
                 found[i] = distance - taken
         return found, segments
 
-    def _normals(self, rows: Ids, which: Ids, found: Array, segments: Array, places: Array, frames: Array) -> Array:
+    def _normals(
+        self, rows: Ids, which: Ids, found: Array, segments: Array, places: Array, frames: Array
+    ) -> Array:
         """Unit vectors (h, 3) from first to second geoms; where they touch, as seen once they are parted a little."""
         signed = found + self._taken[which]
         normals = (segments[:, 3:] - segments[:, :3]) * np.where(signed < 0.0, -1.0, 1.0)[:, None]
@@ -321,7 +364,9 @@ class Clearance:
             apart = parted[second] - parted[first]
             parted[second] += APART * apart / (np.linalg.norm(apart) or 1.0)
             self._pose(parted, frames[rows[i]])
-            distance = mujoco.mj_geomDistance(model, self._data, first, second, self.reach + taken, segment)
+            distance = mujoco.mj_geomDistance(
+                model, self._data, first, second, self.reach + taken, segment
+            )
             normals[i] = (segment[3:] - segment[:3]) * (-1.0 if distance < 0.0 else 1.0)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return np.asarray(normals / np.where(length > 0.0, length, 1.0))
@@ -347,7 +392,9 @@ def _farthest(kind: int, size: Array, direction: Array) -> Array:
     if kind == BOX:
         return np.asarray(size * np.sign(direction))
     if kind == ELLIPSOID:
-        return np.asarray(size**2 * direction / np.linalg.norm(size * direction, axis=1, keepdims=True))
+        return np.asarray(
+            size**2 * direction / np.linalg.norm(size * direction, axis=1, keepdims=True)
+        )
     point = np.asarray(size[0] * direction)
     if kind == CYLINDER:
         radial = np.linalg.norm(direction[:, :2], axis=1, keepdims=True)

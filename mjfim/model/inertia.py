@@ -16,7 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
 
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx yy zz xy xz yz, MJCF's order of fullinertia
+PAIRS = (
+    (0, 0),
+    (1, 1),
+    (2, 2),
+    (0, 1),
+    (0, 2),
+    (1, 2),
+)  # xx yy zz xy xz yz, MJCF's order of fullinertia
 
 
 ROWS, COLUMNS = np.array(PAIRS).T
@@ -70,7 +77,9 @@ def from_central(v: Array) -> Inertial:
 
 def barycentric(body: Inertial) -> Array:
     """(10,) mass, first moments m c, inertia about the body frame's origin: the dynamics are linear in them."""
-    about = body.inertia + body.mass * (body.com @ body.com * np.eye(3) - np.outer(body.com, body.com))
+    about = body.inertia + body.mass * (
+        body.com @ body.com * np.eye(3) - np.outer(body.com, body.com)
+    )
     return np.concatenate([[body.mass], body.mass * body.com, about[ROWS, COLUMNS]])
 
 
@@ -86,7 +95,9 @@ def logcholesky(body: Inertial) -> Array:
     per_mass = body.second / body.mass
     spread = np.linalg.eigvalsh(per_mass)
     if not spread[0] > DEGENERATE * max(spread[2], 1e-300):
-        raise ValueError("its inertia is that of a point, a rod or a plate (two principal moments add up to the third)")
+        raise ValueError(
+            "its inertia is that of a point, a rod or a plate (two principal moments add up to the third)"
+        )
     flipped = np.linalg.cholesky(per_mass[::-1, ::-1])
     U = flipped[::-1, ::-1]  # upper triangular, U U' = per_mass
     d = np.log(np.diag(U))

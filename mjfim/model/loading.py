@@ -46,9 +46,14 @@ def coordinates(model: Any) -> tuple[Coordinate, ...]:
     """All slide and hinge joints, in order."""
     found, names = [], joint_names(model)
     for j in range(model.njnt):
-        if int(model.jnt_type[j]) in (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)):
+        if int(model.jnt_type[j]) in (
+            int(mujoco.mjtJoint.mjJNT_SLIDE),
+            int(mujoco.mjtJoint.mjJNT_HINGE),
+        ):
             unit = "m" if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
-            found.append(Coordinate(names[j], unit, j, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])))
+            found.append(
+                Coordinate(names[j], unit, j, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
+            )
     return tuple(found)
 
 
@@ -106,4 +111,6 @@ def unconstrained(model: Any) -> bool:
         model.npair == 0 and not (np.any(model.geom_contype) and np.any(model.geom_conaffinity))
     )
     limited = model.jnt_limited.any() or model.tendon_limited.any()
-    return bool(no_contact and model.neq == 0 and model.nflex == 0 and not limited and not is_dry(model))
+    return bool(
+        no_contact and model.neq == 0 and model.nflex == 0 and not limited and not is_dry(model)
+    )

@@ -10,7 +10,9 @@ from typing import Any
 import mujoco
 
 _lock = Lock()
-_blocks: list[Any] = []  # settings from before, one per block that is open in any thread; those of the first count
+_blocks: list[
+    Any
+] = []  # settings from before, one per block that is open in any thread; those of the first count
 
 
 @contextmanager

@@ -33,10 +33,14 @@ def sampled(
     impossible: indices of the parameters that make bodies which cannot exist; nobody looks where it is left out
     """
     p, outside = len(parameters), parameters.outside
-    stated = [q.prior is not None or bool(np.isfinite(q.bounds).all()) for q in parameters.parameters]
+    stated = [
+        q.prior is not None or bool(np.isfinite(q.bounds).all()) for q in parameters.parameters
+    ]
     free = [j for j in range(p) if stated[j] and not outside[j]]
     if not free:
-        raise ExperimentError("robust: no parameter has a prior or bounds to sample from; state `prior` or `bounds`")
+        raise ExperimentError(
+            "robust: no parameter has a prior or bounds to sample from; state `prior` or `bounds`"
+        )
     out = np.tile(theta, (count, 1))
     if count > 1:
         u = qmc.LatinHypercube(len(free), rng=np.random.default_rng(seed)).random(count - 1)

@@ -81,7 +81,11 @@ class Parameter:
 def moved_bodies(parameters: Sequence[Parameter]) -> set[str]:
     """Names of bodies whose inertial frame a parameter may move (they must not be compiled as 'simple')."""
     matches = [PATH.match(t.path) for p in parameters for t in p.targets]
-    return {m["name"] for m in matches if m and m["kind"] == "body" and m["field"] in INERTIAL and m["name"]}
+    return {
+        m["name"]
+        for m in matches
+        if m and m["kind"] == "body" and m["field"] in INERTIAL and m["name"]
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +114,9 @@ class ParameterSet:
         slots: list[tuple[AnySlot, ...]] = []
         for parameter in parameters:
             try:
-                slots.append(tuple(resolve(model, t.path, outputs, decoration) for t in parameter.targets))
+                slots.append(
+                    tuple(resolve(model, t.path, outputs, decoration) for t in parameter.targets)
+                )
             except ExperimentError as error:
                 raise ExperimentError(f"parameters.{parameter.name}: {error}") from None
         slots = _in_charts(parameters, slots)
@@ -122,7 +128,9 @@ class ParameterSet:
                 other = owner.get(slot) or next((written[n] for n in numbers if n in written), None)
                 if other is not None:
                     taken = f"target {target.path!r} already belongs to parameters.{other}"
-                    raise ExperimentError(f"parameters.{parameter.name}: {taken}; one number takes one parameter")
+                    raise ExperimentError(
+                        f"parameters.{parameter.name}: {taken}; one number takes one parameter"
+                    )
                 _movable(model, parameter, slot, mocap)
                 owner[slot] = parameter.name
                 written |= dict.fromkeys(numbers, parameter.name)
@@ -210,7 +218,9 @@ class ParameterSet:
     @cached_property
     def delay(self) -> Array:
         """(p,) derivative of the time by which outputs lag."""
-        return np.asarray(self._linear(1, lambda slot: 0 if isinstance(slot, DelaySlot) else None)[0])
+        return np.asarray(
+            self._linear(1, lambda slot: 0 if isinstance(slot, DelaySlot) else None)[0]
+        )
 
     def _any(self, kind: Callable[[AnySlot], bool]) -> np.ndarray:
         """(p,) True where a parameter has a slot of a kind."""
@@ -235,7 +245,9 @@ class ParameterSet:
     @cached_property
     def private(self) -> np.ndarray:
         """(p,) True for deviations of the start and what else every experiment and recording has its own value of."""
-        return np.asarray(self.deviations | np.array([p.per_recording for p in self.parameters], dtype=bool))
+        return np.asarray(
+            self.deviations | np.array([p.per_recording for p in self.parameters], dtype=bool)
+        )
 
     @cached_property
     def in_model(self) -> np.ndarray:
@@ -264,7 +276,9 @@ class ParameterSet:
             if kind in CHARTS:
                 _write_inertia(model, row, kind, values)
             else:
-                turned = Rotation.from_quat(self.nominal[kind, row], scalar_first=True) * Rotation.from_rotvec(values)
+                turned = Rotation.from_quat(
+                    self.nominal[kind, row], scalar_first=True
+                ) * Rotation.from_rotvec(values)
                 getattr(model, kind)[row] = turned.as_quat(scalar_first=True)
                 if kind == "site_quat":
                     model.site_sameframe[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
@@ -301,7 +315,11 @@ class ParameterSet:
                 elif isinstance(slot, Slot) and slot.array in ("body_mass", "body_inertia"):
                     makers.setdefault(slot.rows[0], []).append(j)
         own = copy.copy(self.base(base, theta))
-        charted = {row: (kind, v) for (kind, row), v in self._write_numbers(own, theta).items() if kind in CHARTS}
+        charted = {
+            row: (kind, v)
+            for (kind, row), v in self._write_numbers(own, theta).items()
+            if kind in CHARTS
+        }
         found = []
         for body, columns in makers.items():
             fault = _fault(own, body, *charted.get(body, ("", None)))
@@ -332,7 +350,9 @@ class ParameterSet:
             return source
         if not self.compiled.any():
             return source.model
-        return source.edited(np.asarray(theta)[self.compiled].tobytes(), lambda spec: self._edit(spec, source, theta))
+        return source.edited(
+            np.asarray(theta)[self.compiled].tobytes(), lambda spec: self._edit(spec, source, theta)
+        )
 
     def _edit(self, spec: Any, source: Source, theta: Array) -> None:
         for j in np.flatnonzero(self.compiled):
@@ -341,7 +361,9 @@ class ParameterSet:
                 try:
                     parameter.function(spec, float(theta[j]))
                 except Exception as error:
-                    raise ExperimentError(f"parameters.{parameter.name}: its function failed: {error}") from error
+                    raise ExperimentError(
+                        f"parameters.{parameter.name}: its function failed: {error}"
+                    ) from error
             for target, slot in zip(parameter.targets, self.slots[j], strict=True):
                 if isinstance(slot, SpecSlot):
                     number = target.scale * float(theta[j]) + target.offset
@@ -356,7 +378,9 @@ def _fault(model: Any, body: int, chart: str, values: Array | None) -> str:
     mass, moments, missing = float(model.body_mass[body]), np.sort(model.body_inertia[body]), 0.0
     others = model.body_weldid == model.body_weldid[body]
     others[body] = False
-    least = 0.0 if model.body_weldid[body] == 0 or model.body_mass[others].any() else mujoco.mjMINVAL
+    least = (
+        0.0 if model.body_weldid[body] == 0 or model.body_mass[others].any() else mujoco.mjMINVAL
+    )
     if values is not None:
         mass = float(values[0]) if chart == "barycentric" else mass
         least = mujoco.mjMINVAL if chart == "barycentric" else least
@@ -402,7 +426,9 @@ def _write_inertia(model: Any, body: int, chart: str, values: Array) -> None:
     model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
-def _in_charts(parameters: Sequence[Parameter], slots: list[tuple[AnySlot, ...]]) -> list[tuple[AnySlot, ...]]:
+def _in_charts(
+    parameters: Sequence[Parameter], slots: list[tuple[AnySlot, ...]]
+) -> list[tuple[AnySlot, ...]]:
     """Give every body one chart: `mass` beside first moments is the barycentric mass. Raises where charts would mix."""
     charts: dict[int, set[str]] = {}
     plain: dict[int, set[str]] = {}
@@ -410,9 +436,17 @@ def _in_charts(parameters: Sequence[Parameter], slots: list[tuple[AnySlot, ...]]
         for slot in row:
             if isinstance(slot, InertiaSlot):
                 charts.setdefault(slot.body, set()).add(slot.chart)
-            elif isinstance(slot, Slot) and slot.array in ("body_mass", "body_ipos", "body_inertia"):
+            elif isinstance(slot, Slot) and slot.array in (
+                "body_mass",
+                "body_ipos",
+                "body_inertia",
+            ):
                 plain.setdefault(slot.rows[0], set()).add(slot.array)
-    allowed = {"central": {"body_mass", "body_ipos"}, "barycentric": {"body_mass"}, "logcholesky": set[str]()}
+    allowed = {
+        "central": {"body_mass", "body_ipos"},
+        "barycentric": {"body_mass"},
+        "logcholesky": set[str](),
+    }
 
     def settled(parameter: Parameter, slot: AnySlot) -> AnySlot:
         """The slot in the chart of its body."""

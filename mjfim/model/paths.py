@@ -10,7 +10,16 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
-from mjfim.model.targets import AnySlot, BiasSlot, DelaySlot, InertiaSlot, RotationSlot, Slot, SpecSlot, StartSlot
+from mjfim.model.targets import (
+    AnySlot,
+    BiasSlot,
+    DelaySlot,
+    InertiaSlot,
+    RotationSlot,
+    Slot,
+    SpecSlot,
+    StartSlot,
+)
 
 PATH = re.compile(r"^(?P<kind>\w+)(?:/(?P<name>.+))?:(?P<field>\w+)(?:\[(?P<index>\d+)\])?$")
 OBJECTS = {
@@ -56,7 +65,12 @@ FIELDS: dict[str, dict[str, str]] = {
         "armature": "tendon_armature",
         "springlength": "tendon_lengthspring",
     },
-    "option": {"gravity": "gravity", "wind": "wind", "density": "density", "viscosity": "viscosity"},
+    "option": {
+        "gravity": "gravity",
+        "wind": "wind",
+        "density": "density",
+        "viscosity": "viscosity",
+    },
 }
 
 
@@ -97,7 +111,9 @@ def fields_of(kind: str) -> list[str]:
 KINDS = (*FIELDS, "initial", "output")
 
 
-def resolve(model: Any, path: str, outputs: Sequence[str] = (), decoration: Collection[str] = frozenset()) -> AnySlot:
+def resolve(
+    model: Any, path: str, outputs: Sequence[str] = (), decoration: Collection[str] = frozenset()
+) -> AnySlot:
     """What a path leads to. Raises ExperimentError listing the valid kinds, names, fields or indices.
 
     outputs: names of the measured columns, which `output/name:bias` may name
@@ -111,7 +127,9 @@ def resolve(model: Any, path: str, outputs: Sequence[str] = (), decoration: Coll
     if kind not in KINDS:
         raise ExperimentError(f"in parameter path {path!r}: {unknown('kind', kind, KINDS)}")
     if field not in fields_of(kind):
-        raise ExperimentError(f"in parameter path {path!r}: {unknown(f'{kind} field', field, fields_of(kind))}")
+        raise ExperimentError(
+            f"in parameter path {path!r}: {unknown(f'{kind} field', field, fields_of(kind))}"
+        )
     if kind == "option":
         width = np.size(getattr(model.opt, FIELDS[kind][field]))
         return Slot(FIELDS[kind][field], (_checked(path, index, width),), None, in_options=True)
@@ -138,7 +156,9 @@ def resolve(model: Any, path: str, outputs: Sequence[str] = (), decoration: Coll
                 f"in parameter path {path!r}: the size of a mesh or height field is not a number of the geom"
             )
         plain = field in ("size", "pos") and name in decoration
-        return Slot(f"geom_{field}", (ident,), index) if plain else SpecSlot(kind, name, field, index)
+        return (
+            Slot(f"geom_{field}", (ident,), index) if plain else SpecSlot(kind, name, field, index)
+        )
     if field in SERVO and kind == "actuator":
         return _servo(model, path, ident, field)
     return _plain(model, path, kind, field, ident, index)
@@ -157,7 +177,9 @@ def _plain(model: Any, path: str, kind: str, field: str, ident: int, index: int)
     if holder.ndim == 1:
         _checked(path, index, 1)
     if field == "springlength" and not path.endswith("]") and holder[ident, 0] == holder[ident, 1]:
-        return Slot(array, (ident,), 0, also=((array, ident, 1, 1.0),))  # a rest length, not a range
+        return Slot(
+            array, (ident,), 0, also=((array, ident, 1, 1.0),)
+        )  # a rest length, not a range
     return Slot(array, _rows(model, array, ident, path), column)
 
 
@@ -166,11 +188,15 @@ def _servo(model: Any, path: str, ident: int, field: str) -> Slot:
     gain, bias = float(model.actuator_gainprm[ident, 0]), model.actuator_biasprm[ident]
     kinds = (int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_SO3))
     affine = int(model.actuator_biastype[ident]) in kinds
-    if int(model.actuator_gaintype[ident]) == int(mujoco.mjtGain.mjGAIN_PID):  # its own gain is the integral one
+    if int(model.actuator_gaintype[ident]) == int(
+        mujoco.mjtGain.mjGAIN_PID
+    ):  # its own gain is the integral one
         return Slot("actuator_biasprm", (ident,), {"kp": 1, "kv": 2}[field], factor=-1.0)
     if affine and field == "kp" and gain != 0.0 and bias[1] == -gain:
         return Slot("actuator_gainprm", (ident,), 0, also=(("actuator_biasprm", ident, 1, -1.0),))
-    if affine and field == "kv" and gain != 0.0 and bias[1] == 0.0 and bias[2] == -gain:  # a velocity servo
+    if (
+        affine and field == "kv" and gain != 0.0 and bias[1] == 0.0 and bias[2] == -gain
+    ):  # a velocity servo
         return Slot("actuator_gainprm", (ident,), 0, also=(("actuator_biasprm", ident, 2, -1.0),))
     if affine and field == "kv" and bias[1] == -gain:
         return Slot("actuator_biasprm", (ident,), 2, factor=-1.0)
@@ -183,10 +209,14 @@ def _servo(model: Any, path: str, ident: int, field: str) -> Slot:
 def _output(path: str, name: str, field: str, outputs: Sequence[str]) -> AnySlot:
     if field == "delay":
         if name:
-            raise ExperimentError(f"in parameter path {path!r}: one delay lags all outputs; write 'output:delay'")
+            raise ExperimentError(
+                f"in parameter path {path!r}: one delay lags all outputs; write 'output:delay'"
+            )
         return DelaySlot()
     if name not in outputs:
-        raise ExperimentError(f"in parameter path {path!r}: {unknown('output', name, list(outputs))}")
+        raise ExperimentError(
+            f"in parameter path {path!r}: {unknown('output', name, list(outputs))}"
+        )
     return BiasSlot(list(outputs).index(name))
 
 
@@ -196,24 +226,38 @@ def _initial(model: Any, path: str, name: str, field: str, index: int) -> AnySlo
         ident = mujoco.mj_name2id(model, OBJECTS["actuator"], name)
         count = int(model.actuator_actnum[ident]) if ident >= 0 else 0
         if count == 0:
-            stateful = [n for n in names_of(model, "actuator") if model.actuator_actnum[model.actuator(n).id]]
-            raise ExperimentError(f"in parameter path {path!r}: {unknown('actuator with a state', name, stateful)}")
-        return StartSlot(2 * model.nv + int(model.actuator_actadr[ident]) + _checked(path, index, count))
+            stateful = [
+                n
+                for n in names_of(model, "actuator")
+                if model.actuator_actnum[model.actuator(n).id]
+            ]
+            raise ExperimentError(
+                f"in parameter path {path!r}: {unknown('actuator with a state', name, stateful)}"
+            )
+        return StartSlot(
+            2 * model.nv + int(model.actuator_actadr[ident]) + _checked(path, index, count)
+        )
     ident = mujoco.mj_name2id(model, OBJECTS["joint"], name)
     if ident < 0:
-        raise ExperimentError(f"in parameter path {path!r}: {unknown('joint', name, names_of(model, 'joint'))}")
+        raise ExperimentError(
+            f"in parameter path {path!r}: {unknown('joint', name, names_of(model, 'joint'))}"
+        )
     dof = int(model.jnt_dofadr[ident]) + _checked(path, index, joint_width(model, ident))
     return StartSlot(dof + (model.nv if field == "qvel" else 0))
 
 
 def joint_width(model: Any, joint: int) -> int:
     """Degrees of freedom of a joint."""
-    return {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}.get(int(model.jnt_type[joint]), 1)
+    return {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}.get(
+        int(model.jnt_type[joint]), 1
+    )
 
 
 def _checked(path: str, index: int, width: int) -> int:
     if index >= width:
-        raise ExperimentError(f"in parameter path {path!r}: index {index} is out of range; valid: 0 to {width - 1}")
+        raise ExperimentError(
+            f"in parameter path {path!r}: index {index} is out of range; valid: 0 to {width - 1}"
+        )
     return index
 
 
@@ -223,7 +267,9 @@ def _rows(model: Any, array: str, ident: int, path: str) -> tuple[int, ...]:
         return tuple(range(first, first + joint_width(model, ident)))
     if array == "qpos_spring":
         if int(model.jnt_type[ident]) < 2:
-            raise ExperimentError(f"in parameter path {path!r}: springref exists on slide and hinge joints only")
+            raise ExperimentError(
+                f"in parameter path {path!r}: springref exists on slide and hinge joints only"
+            )
         return (int(model.jnt_qposadr[ident]),)
     if array == "actuator_gear":  # one row per force output
         first = int(model.actuator_outadr[ident])

@@ -28,7 +28,9 @@ def speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
     fastest: (nv,) speeds of the degrees of freedom
     """
     own = np.concatenate([_sticking(*rows) for rows in _frictions(model)])
-    return tuple(np.maximum(own, np.concatenate([SLOW * fastest, np.zeros(model.ntendon)])).tolist())
+    return tuple(
+        np.maximum(own, np.concatenate([SLOW * fastest, np.zeros(model.ntendon)])).tolist()
+    )
 
 
 def soften(model: Any, speeds: tuple[float, ...]) -> None:
@@ -37,7 +39,9 @@ def soften(model: Any, speeds: tuple[float, ...]) -> None:
     for loss, weight, impedance, reference in _frictions(model):
         s, rest = rest[: len(loss)], rest[len(loss) :]
         on = (loss > 0.0) & (s > 0.0)
-        s = np.maximum(s, loss * weight * model.opt.timestep)  # a longer timestep bears no steeper law
+        s = np.maximum(
+            s, loss * weight * model.opt.timestep
+        )  # a longer timestep bears no steeper law
         resistance = (1.0 - SOFT) / SOFT * weight
         impedance[on] = (SOFT, SOFT, 1e-3, 0.5, 2.0)
         reference[on, 0] = -1.0
@@ -48,7 +52,12 @@ def _frictions(model: Any) -> tuple[tuple[Array, Array, Array, Array], ...]:
     """Loss, inverse weight, impedance and reference of the friction of joints, and of tendons."""
     return (
         (model.dof_frictionloss, model.dof_invweight0, model.dof_solimp, model.dof_solref),
-        (model.tendon_frictionloss, model.tendon_invweight0, model.tendon_solimp_fri, model.tendon_solref_fri),
+        (
+            model.tendon_frictionloss,
+            model.tendon_invweight0,
+            model.tendon_solimp_fri,
+            model.tendon_solref_fri,
+        ),
     )
 
 
@@ -56,5 +65,7 @@ def _sticking(loss: Array, weight: Array, impedance: Array, reference: Array) ->
     """Speed from which the engine's friction, as strong as it may be, decelerates as it wants to."""
     most = np.maximum(impedance[:, 1], 1e-4)
     standard = reference[:, 0] > 0.0
-    damping = np.where(standard, 2.0 / np.where(standard, most * reference[:, 0], 1.0), -reference[:, 1] / most)
+    damping = np.where(
+        standard, 2.0 / np.where(standard, most * reference[:, 0], 1.0), -reference[:, 1] / most
+    )
     return np.asarray(loss * weight / np.maximum(damping, 1e-9))

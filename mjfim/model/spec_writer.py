@@ -23,7 +23,12 @@ def write_element(spec: Any, compiled: Any, wanted: Any, path: str, value: float
     match = PATH.match(path)
     if match is None:
         raise ValueError(f"parameter path {path!r} is not of the form kind/name:field[index]")
-    kind, name, field, index = match["kind"], match["name"], match["field"], int(match["index"] or 0)
+    kind, name, field, index = (
+        match["kind"],
+        match["name"],
+        match["field"],
+        int(match["index"] or 0),
+    )
     if kind in ("initial", "output"):
         return
     element = spec.option if kind == "option" else getattr(spec, kind)(name)
@@ -35,7 +40,10 @@ def write_element(spec: Any, compiled: Any, wanted: Any, path: str, value: float
         element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
         element.quat = getattr(wanted, kind)(name).quat
     elif field in SERVO and kind == "actuator":
-        element.gainprm, element.biasprm = wanted.actuator_gainprm[element.id], wanted.actuator_biasprm[element.id]
+        element.gainprm, element.biasprm = (
+            wanted.actuator_gainprm[element.id],
+            wanted.actuator_biasprm[element.id],
+        )
     elif field == "springlength":  # one rest length may stand for both ends of the range
         element.springlength = wanted.tendon_lengthspring[element.id]
     else:
@@ -43,9 +51,15 @@ def write_element(spec: Any, compiled: Any, wanted: Any, path: str, value: float
             spell_out_inertia(element, compiled)
         if kind == "geom" and np.isfinite(element.fromto[0]):
             spell_out_geom(element, compiled)
-        if kind == "geom" and field == "pos" and element.meshname:  # the compiler adds the mesh's own offset
+        if (
+            kind == "geom" and field == "pos" and element.meshname
+        ):  # the compiler adds the mesh's own offset
             value += float(element.pos[index] - compiled.geom(name).pos[index])
-        if field == "springref" and element.type == mujoco.mjtJoint.mjJNT_HINGE and spec.compiler.degree:
+        if (
+            field == "springref"
+            and element.type == mujoco.mjtJoint.mjJNT_HINGE
+            and spec.compiler.degree
+        ):
             value = float(np.rad2deg(value))
         _assign(element, field, index, value)
 
@@ -62,15 +76,26 @@ def _assign(element: Any, field: str, index: int, value: float) -> None:
 def leave_frame(element: Any, found: Any, path: str) -> None:
     """Say an element's place in its body's coordinates instead of those of a `<frame>`. found: it in the compiled model."""
     if getattr(element, "meshname", ""):
-        raise ExperimentError(f"{path!r}: a mesh inside a <frame> cannot be moved; take the geom out of the frame")
+        raise ExperimentError(
+            f"{path!r}: a mesh inside a <frame> cannot be moved; take the geom out of the frame"
+        )
     element.set_frame(element.parent.add_frame())
-    element.pos, element.quat, element.alt.type = found.pos, found.quat, mujoco.mjtOrientation.mjORIENTATION_QUAT
+    element.pos, element.quat, element.alt.type = (
+        found.pos,
+        found.quat,
+        mujoco.mjtOrientation.mjORIENTATION_QUAT,
+    )
 
 
 def spell_out_inertia(body: Any, compiled: Any) -> None:
     """Give a body of a spec the inertia that it has in a model."""
     found = compiled.body(body.id)
-    body.mass, body.ipos, body.iquat, body.inertia = float(found.mass[0]), found.ipos, found.iquat, found.inertia
+    body.mass, body.ipos, body.iquat, body.inertia = (
+        float(found.mass[0]),
+        found.ipos,
+        found.iquat,
+        found.inertia,
+    )
     body.fullinertia, body.explicitinertial = np.full(6, np.nan), True
 
 
@@ -94,7 +119,9 @@ def settle(spec: Any, compiled: Any) -> None:
         if np.any(np.asarray(joint.springdamper) > 0):
             joint.springdamper = np.zeros(2)
             joint.stiffness = _first(joint.stiffness, float(compiled.jnt_stiffness[joint.id]))
-            joint.damping = _first(joint.damping, float(compiled.dof_damping[compiled.jnt_dofadr[joint.id]]))
+            joint.damping = _first(
+                joint.damping, float(compiled.dof_damping[compiled.jnt_dofadr[joint.id]])
+            )
     for tendon in spec.tendons:
         tendon.springlength = compiled.tendon_lengthspring[tendon.id]
     for actuator in spec.actuators:

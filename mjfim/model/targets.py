@@ -16,7 +16,11 @@ import numpy as np
 from mjfim.errors import ExperimentError
 from mjfim.model.inertia import CHARTS, Inertial
 
-SAME_FRAME = {"body_ipos": "body_sameframe", "site_pos": "site_sameframe", "geom_pos": "geom_sameframe"}
+SAME_FRAME = {
+    "body_ipos": "body_sameframe",
+    "site_pos": "site_sameframe",
+    "geom_pos": "geom_sameframe",
+}
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,9 @@ class Slot:
     @property
     def numbers(self) -> set[tuple[str, int, int]]:
         """(array, row, column) of all that it writes."""
-        return {(self.array, row, self.column or 0) for row in self.rows} | {entry[:3] for entry in self.also}
+        return {(self.array, row, self.column or 0) for row in self.rows} | {
+            entry[:3] for entry in self.also
+        }
 
     def _holder(self, model: Any) -> Any:
         return getattr(model.opt if self.in_options else model, self.array)
@@ -88,7 +94,9 @@ class InertiaSlot:
             return float(CHARTS[self.chart].of(inertial(model, self.body))[self.component])
         except ValueError as error:
             name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, self.body)
-            raise ExperimentError(f"body {name!r} has no {self.chart} coordinates: {error}") from None
+            raise ExperimentError(
+                f"body {name!r} has no {self.chart} coordinates: {error}"
+            ) from None
 
     def size(self, model: Any) -> float:
         """Magnitude that a change is compared with."""
@@ -133,7 +141,9 @@ class SpecSlot:
         geom = model.geom(self.name)
         if self.field in ("size", "pos"):
             return float(getattr(geom, self.field)[self.index])
-        raise ExperimentError(f"the {self.field} of geom {self.name!r} is not in the compiled model: state `guess`")
+        raise ExperimentError(
+            f"the {self.field} of geom {self.name!r} is not in the compiled model: state `guess`"
+        )
 
     def size(self, model: Any) -> float:
         """The geom's bounding radius for positions."""
@@ -169,5 +179,8 @@ AnySlot = Slot | InertiaSlot | RotationSlot | SpecSlot | StartSlot | BiasSlot | 
 def inertial(model: Any, body: int) -> Inertial:
     """A body's inertia in a model."""
     return Inertial.principal(
-        model.body_mass[body], model.body_ipos[body], model.body_inertia[body], model.body_iquat[body]
+        model.body_mass[body],
+        model.body_ipos[body],
+        model.body_inertia[body],
+        model.body_iquat[body],
     )

@@ -39,7 +39,12 @@ def unit_of(model: Any, path: str) -> str:
     match = PATH.match(path)
     if match is None:
         return ""
-    kind, field, name, index = match["kind"], match["field"], match["name"] or "", int(match["index"] or 0)
+    kind, field, name, index = (
+        match["kind"],
+        match["field"],
+        match["name"] or "",
+        int(match["index"] or 0),
+    )
     if field in INERTIAL_FIELDS:
         chart, first, _ = INERTIAL_FIELDS[field]
         return CHARTS[chart].units[first + index]
@@ -59,5 +64,7 @@ def unit_of(model: Any, path: str) -> str:
 
 def _motion_unit(model: Any, joint: int, index: int) -> str:
     kind = int(model.jnt_type[joint])
-    linear = kind == int(mujoco.mjtJoint.mjJNT_SLIDE) or (kind == int(mujoco.mjtJoint.mjJNT_FREE) and index < 3)
+    linear = kind == int(mujoco.mjtJoint.mjJNT_SLIDE) or (
+        kind == int(mujoco.mjtJoint.mjJNT_FREE) and index < 3
+    )
     return "m" if linear else "rad"

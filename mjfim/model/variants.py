@@ -85,7 +85,9 @@ class Mocap:
         bodies = np.flatnonzero(model.body_mocapid >= 0)
         order = model.body_mocapid[bodies]
         places = np.concatenate([model.body_pos[bodies], model.body_quat[bodies]], axis=1)
-        start = np.concatenate([key.mpos.reshape(-1, 3)[order], key.mquat.reshape(-1, 4)[order]], axis=1)
+        start = np.concatenate(
+            [key.mpos.reshape(-1, 3)[order], key.mquat.reshape(-1, 4)[order]], axis=1
+        )
         moved = (places != start).any(axis=1)
         return Mocap(bodies[moved], places[moved], start[moved]) if moved.any() else None
 

@@ -33,7 +33,11 @@ def relaxed(s: Array, delta: float) -> tuple[Array, Array, Array]:
     safe = np.where(inside, s, 1.0)
     outside = (s - 2.0 * delta) / delta
     value = np.where(inside, -np.log(safe), 0.5 * (outside**2 - 1.0) - np.log(delta))
-    return value, np.where(inside, -1.0 / safe, outside / delta), np.where(inside, safe**-2.0, delta**-2.0)
+    return (
+        value,
+        np.where(inside, -1.0 / safe, outside / delta),
+        np.where(inside, safe**-2.0, delta**-2.0),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +68,9 @@ class Band:
     def share(self, r: Array) -> Array:
         """(..., w) where in its range each number is: -1 at the lower bound, 1 at the upper one; 0 where free."""
         upper, lower = 1.0 - (self.upper - r) / self.scale, (r - self.lower) / self.scale - 1.0
-        both = np.where(np.isfinite(self.upper), upper, np.where(np.isfinite(self.lower), lower, 0.0))
+        both = np.where(
+            np.isfinite(self.upper), upper, np.where(np.isfinite(self.lower), lower, 0.0)
+        )
         return np.asarray(both)
 
     def wall(self, r: Array, delta: float, weight: float) -> Wall:
@@ -72,7 +78,9 @@ class Band:
         value, slope, bend = 0.0, np.zeros(r.shape), np.zeros(r.shape)
         for sign, bound in ((1.0, self.lower), (-1.0, self.upper)):
             held = np.isfinite(bound)
-            b, first, second = relaxed(sign * (r[..., held] - bound[held]) / self.scale[held], delta)
+            b, first, second = relaxed(
+                sign * (r[..., held] - bound[held]) / self.scale[held], delta
+            )
             value += weight * float(np.sum(b))
             slope[..., held] += sign * weight * first / self.scale[held]
             bend[..., held] += weight * second / self.scale[held] ** 2

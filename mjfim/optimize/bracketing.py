@@ -85,14 +85,18 @@ def _factor(room: float, turn: int) -> float:
     return float(np.clip(room**-2, min(least, MOST), MOST))
 
 
-def _between(low: int, high: int, known: dict[int, float], grid: Grid, slack: int, turn: int) -> int | None:
+def _between(
+    low: int, high: int, known: dict[int, float], grid: Grid, slack: int, turn: int
+) -> int | None:
     """Where to look next inside a bracket: by the secant of logarithms, every third time in the middle; None: nowhere."""
     x = float(np.sqrt(low * high))
     if np.isfinite(known[low]) and known[high] < known[low] and turn % 3 < 2:
         share = np.log(known[low]) / np.log(known[low] / known[high])
         x = float(low * (high / low) ** share)
     if high - low > 2 * slack:
-        x = float(np.clip(x, low + 0.9 * slack, high - 0.9 * slack))  # a hit closes the bracket from one side
+        x = float(
+            np.clip(x, low + 0.9 * slack, high - 0.9 * slack)
+        )  # a hit closes the bracket from one side
     n = grid.up(x) if x * x > low * high else grid.down(x)
     n = n if n > low else grid.up(low + 1)
     n = n if n < high else grid.down(high - 1)

@@ -83,7 +83,9 @@ class Condensed:
         """(P, n, n) pseudo-inverse of the private triangles, whatever the units of the unknowns."""
         n = self.private
         unit = np.maximum(self.lengths[:n], 1e-300)
-        return np.asarray(np.linalg.pinv(self.triangles[:, :n, :n] / unit, rcond=1e-12) / unit[:, None])
+        return np.asarray(
+            np.linalg.pinv(self.triangles[:, :n, :n] / unit, rcond=1e-12) / unit[:, None]
+        )
 
     def profile(self) -> Array:
         """(k, c+1) rows of the common unknowns once the private ones follow them, `outer` left out."""
@@ -104,7 +106,11 @@ class Condensed:
         own = int(np.linalg.matrix_rank(R[:, :, :n] / length, tol=1e-8).sum()) if n else 0
         H = self.information()
         unit = np.sqrt(np.maximum(np.diag(H), 1e-300))
-        return own + (int(np.linalg.matrix_rank(H / np.outer(unit, unit), tol=1e-12, hermitian=True)) if len(H) else 0)
+        return own + (
+            int(np.linalg.matrix_rank(H / np.outer(unit, unit), tol=1e-12, hermitian=True))
+            if len(H)
+            else 0
+        )
 
     def information(self, outer: bool = True) -> Array:
         """(c, c) of the common unknowns, the private ones marginalised; outer: with the rows of `outer`."""
@@ -118,7 +124,9 @@ class Condensed:
         R = self.triangles[:, :, :-1]
         squares = np.sum(R**2, axis=1)
         own = np.sqrt(squares[:, : self.private].mean(axis=0))
-        rest = np.sqrt(squares[:, self.private :].sum(axis=0) + np.sum(self.outer[:, :-1] ** 2, axis=0))
+        rest = np.sqrt(
+            squares[:, self.private :].sum(axis=0) + np.sum(self.outer[:, :-1] ** 2, axis=0)
+        )
         return np.asarray(np.concatenate([own, rest]))
 
     def step(self, damping: float, scale: Array, lower: Array, upper: Array) -> Step:
@@ -131,7 +139,9 @@ class Condensed:
         weight = np.sqrt(damping) * scale
         if n:
             damp = np.zeros((self.pieces, n, R.shape[2]))
-            damp[:, np.arange(n), np.arange(n)] = np.maximum(weight[:n], 1e-12 * np.maximum(scale[:n], 1e-300))
+            damp[:, np.arange(n), np.arange(n)] = np.maximum(
+                weight[:n], 1e-12 * np.maximum(scale[:n], 1e-300)
+            )
             R = triangle(np.concatenate([R, damp], axis=1))
         rows = R[:, n:, n:].reshape(-1, c + 1)
         extra = np.concatenate([np.diag(weight[n:]), np.zeros((c, 1))], axis=1)
@@ -153,7 +163,13 @@ class Condensed:
         size = float(np.sqrt(d @ self.information() @ d)) if len(d) else 0.0
         n = self.private
         each = (R[:, :, :n] @ own[..., None])[..., 0]
-        return Step(d, own, gain, size, float(np.sqrt(np.mean(each**2) * R.shape[1] / max(n, 1))) if n else 0.0)
+        return Step(
+            d,
+            own,
+            gain,
+            size,
+            float(np.sqrt(np.mean(each**2) * R.shape[1] / max(n, 1))) if n else 0.0,
+        )
 
     @cached_property
     def scores(self) -> Array:

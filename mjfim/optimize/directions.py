@@ -24,7 +24,9 @@ class MetricDescent:
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
         """zeta by the Riccati equations."""
-        return descent(expansion.A, expansion.B, expansion.a, expansion.b, self.Q, self.R, self.terminal)
+        return descent(
+            expansion.A, expansion.B, expansion.a, expansion.b, self.Q, self.R, self.terminal
+        )
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
         """Nothing is learnt."""
@@ -49,7 +51,9 @@ class ExtendedMetricDescent:
         """zeta by the Riccati equations of the extended system, its psi-part dropped (P recomputes it)."""
         e, nx = expansion.extended, expansion.A.shape[1]
         if e is None:
-            raise ValueError("the problem must provide extended expansions for a metric with weight on psi")
+            raise ValueError(
+                "the problem must provide extended expansions for a metric with weight on psi"
+            )
         zeta = descent(e.A, e.B, e.a, e.b, self.Q, self.R, self.terminal)
         return TangentCurve(zeta.z[:, :nx], zeta.v)
 
@@ -120,7 +124,10 @@ class LBFGS:
 
     def refined(self, R: Array, factor: int) -> LBFGS:
         """The same memory on a grid that is `factor` times finer: s is held, y (an integral over a sample) is shared out."""
-        held = ((np.repeat(p.s, factor, axis=0), np.repeat(p.y, factor, axis=0) / factor) for p in self._pairs)
+        held = (
+            (np.repeat(p.s, factor, axis=0), np.repeat(p.y, factor, axis=0) / factor)
+            for p in self._pairs
+        )
         return LBFGS(R, self.memory, tuple(Pair(s, y, float(np.vdot(s, y))) for s, y in held))
 
     def reset(self) -> bool:

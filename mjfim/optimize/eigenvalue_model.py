@@ -68,7 +68,10 @@ class Spectral:
             H = np.eye(len(y)) + L.T @ self._hessian(d0 + L @ y) @ L
             step = -np.linalg.solve(0.5 * (H + H.T), g)
             here, length = self._pulled(y, L, d0), 1.0
-            while self._pulled(y + length * step, L, d0) > here + 1e-4 * length * float(g @ step) and length > 1e-8:
+            while (
+                self._pulled(y + length * step, L, d0) > here + 1e-4 * length * float(g @ step)
+                and length > 1e-8
+            ):
                 length *= 0.5
             y = y + length * step
         return self.gradient(d0 + L @ y)
@@ -80,7 +83,9 @@ class Spectral:
         """(m, m) by differences of the gradient, in so few coordinates the cheapest way."""
         step = 1e-5 / max(1.0, self.power)
         moves = step * np.eye(len(d))
-        return np.stack([(self.gradient(d + move) - self.gradient(d - move)) / (2.0 * step) for move in moves])
+        return np.stack(
+            [(self.gradient(d + move) - self.gradient(d - move)) / (2.0 * step) for move in moves]
+        )
 
 
 def matrix(d: Array, r: int) -> Array:

@@ -98,7 +98,10 @@ class Search:
 
 
 def minimise(
-    problem: Problem, start: Unknowns, search: Search, tell: Callable[[Progress], None] | None = None
+    problem: Problem,
+    start: Unknowns,
+    search: Search,
+    tell: Callable[[Progress], None] | None = None,
 ) -> Solution | None:
     """From a start to a local minimum; None where the start, or its neighbourhood, diverges. Ctrl-C returns the best so far."""
     now, cost = start, problem.cost(start)
@@ -123,7 +126,9 @@ def completed(problem: Problem, start: Unknowns, search: Search) -> Solution | N
 
 
 class _Loop:
-    def __init__(self, problem: Problem, search: Search, tell: Callable[[Progress], None] | None) -> None:
+    def __init__(
+        self, problem: Problem, search: Search, tell: Callable[[Progress], None] | None
+    ) -> None:
         self.problem, self.search, self.tell = problem, search, tell
         self.best: tuple[Unknowns, Condensed, float] | None = None
         self.count = 0
@@ -146,7 +151,9 @@ class _Loop:
                     return self._stuck(self._promised(now, linear, scale))
                 damping, growth = max(damping, 1e-12) * growth, 2.0 * growth
             promised = self._promised(now, linear, scale)
-            last = length == 1.0 and damping <= FIRST and self._small(step) and self._small(promised)
+            last = (
+                length == 1.0 and damping <= FIRST and self._small(step) and self._small(promised)
+            )
             hardly = cost - found <= min(STILL[0] * cost, STILL[1], 0.1 * promised.gain)
             still = still + 1 if hardly else 0
             if still == PATIENCE:
@@ -162,7 +169,10 @@ class _Loop:
             if last:
                 return self._concluded(now, cost, linear)
             if self.search.damped:
-                damping, growth = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-15), 2.0
+                damping, growth = (
+                    max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-15),
+                    2.0,
+                )
             fresh = self.problem.condense(now)
             if fresh is None:
                 return self.ended("stopped: the simulation diverges next to the estimate", False)
@@ -206,7 +216,8 @@ class _Loop:
         if step.size < FRACTION and step.each < FRACTION:
             return self.ended("converged: the residual stopped falling", True)
         return self.ended(
-            "stopped: no step lowers the residual any more, though the linearised model promises one", False
+            "stopped: no step lowers the residual any more, though the linearised model promises one",
+            False,
         )
 
     def _concluded(self, now: Unknowns, cost: float, linear: Condensed) -> Solution:

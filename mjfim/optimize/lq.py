@@ -43,10 +43,14 @@ class Recursion:
     def _solve(self, rhs: Array, transposed: bool) -> Array:
         N, n, _ = self.A.shape
         if rhs.shape != (N + 1, n):
-            raise ValueError(f"a recursion over {N} samples of {n} needs {(N + 1, n)} numbers, got {rhs.shape}")
+            raise ValueError(
+                f"a recursion over {N} samples of {n} needs {(N + 1, n)} numbers, got {rhs.shape}"
+            )
         flat = np.array(rhs, dtype=np.float64).reshape(-1)
         with np.errstate(over="ignore", invalid="ignore"):
-            solution = dtbsv(2 * n - 1, self._band, flat, lower=1, trans=int(transposed), diag=1, overwrite_x=1)
+            solution = dtbsv(
+                2 * n - 1, self._band, flat, lower=1, trans=int(transposed), diag=1, overwrite_x=1
+            )
         return np.asarray(solution).reshape(rhs.shape)
 
 
@@ -60,14 +64,20 @@ def growth(A: Array) -> float:
     unit = np.eye(nx)
     onward = np.stack([recursion.forward(e, zero) for e in unit], axis=2)
     back = np.stack([recursion.adjoint(np.concatenate([zero, e[None]])) for e in unit], axis=1)
-    return float(max(np.linalg.norm(onward, 2, axis=(1, 2)).max(), np.linalg.norm(back, 2, axis=(1, 2)).max()))
+    return float(
+        max(
+            np.linalg.norm(onward, 2, axis=(1, 2)).max(), np.linalg.norm(back, 2, axis=(1, 2)).max()
+        )
+    )
 
 
 def _solve(S: Array, rhs: Array) -> Array:
     """S^-1 rhs for a small symmetric positive definite S, without the overhead of NumPy's checks."""
     _, x, info = dposv(S, rhs)
     if info != 0:
-        raise np.linalg.LinAlgError("the Riccati recursion lost positive definiteness; its weights must be positive")
+        raise np.linalg.LinAlgError(
+            "the Riccati recursion lost positive definiteness; its weights must be positive"
+        )
     return np.asarray(x)
 
 
@@ -109,7 +119,9 @@ class Weights:
 
     def plus(self, other: Weights, share: float = 1.0) -> Weights:
         """The sum of this form and a share of another."""
-        return Weights(*(mine + share * theirs for mine, theirs in zip(self._parts, other._parts, strict=True)))
+        return Weights(
+            *(mine + share * theirs for mine, theirs in zip(self._parts, other._parts, strict=True))
+        )
 
     def times(self, share: float) -> Weights:
         """A share of this form."""
@@ -129,14 +141,21 @@ class Weights:
         return a, b + pull[:-1] - pull[1:]
 
 
-def descent(A: Array, B: Array, a: Array, b: Array, Q: Array, R: Array, terminal: Array) -> TangentCurve:
+def descent(
+    A: Array, B: Array, a: Array, b: Array, Q: Array, R: Array, terminal: Array
+) -> TangentCurve:
     """Minimiser of `sum a'z + b'v + 1/2 z'Qz + 1/2 v'Rv` subject to `z_{k+1} = A z_k + B v_k`, `z_0 = 0`.
 
     a: (N+1, nx);  b: (N, nu);  Q, terminal: (nx, nx), the metric on z_k for k < N and on z_N;  R: (nu, nu)
     The paper's problem (8), solved by its Riccati equations.
     """
     N, nx, nu = B.shape
-    held = Weights(np.stack([*[Q] * N, terminal]), np.zeros((N, nu, nx)), np.stack([R] * N), np.zeros((N + 1, nu)))
+    held = Weights(
+        np.stack([*[Q] * N, terminal]),
+        np.zeros((N, nu, nx)),
+        np.stack([R] * N),
+        np.zeros((N + 1, nu)),
+    )
     return Riccati.of(A, B, held).descent(a, b)
 
 
@@ -186,8 +205,12 @@ class Riccati:
         wide[:, : self.nx] = a
         wide[:-1] -= np.einsum("kui,ku->ki", self.K, b)
         costate = self.closed.adjoint(wide)
-        ahead = np.einsum("kuw,kw->ku", self.inverse, b + np.einsum("kiu,ki->ku", self.drive, costate[1:]))
-        z = self.closed.forward(np.zeros(wide.shape[1]), -np.einsum("kiu,ku->ki", self.drive, ahead))
+        ahead = np.einsum(
+            "kuw,kw->ku", self.inverse, b + np.einsum("kiu,ki->ku", self.drive, costate[1:])
+        )
+        z = self.closed.forward(
+            np.zeros(wide.shape[1]), -np.einsum("kiu,ku->ki", self.drive, ahead)
+        )
         return TangentCurve(z[:, : self.nx], -np.einsum("kui,ki->ku", self.K, z[:-1]) - ahead)
 
 

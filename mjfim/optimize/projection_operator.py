@@ -113,7 +113,13 @@ class Armijo:
             raise ValueError("Armijo needs 0 < sigma < 0.5, 0 < beta < 1 and trials > 0")
 
     def search(
-        self, problem: Problem[P], point: P, zeta: TangentCurve, slope: float, K: Array, first: float = 1.0
+        self,
+        problem: Problem[P],
+        point: P,
+        zeta: TangentCurve,
+        slope: float,
+        K: Array,
+        first: float = 1.0,
     ) -> tuple[P, float] | None:
         """The accepted point and its gamma, or None where even the shortest step does not lower J."""
         value, gamma = problem.value(point), first
@@ -191,7 +197,9 @@ def optimize(
             yield Iterate(index, point, value, abs(slope), gamma, Status.MAX_ITERATIONS)
             return
         yield Iterate(index, point, value, abs(slope), gamma)
-        first = min(1.0, -2.0 * size / slope)  # a step that promises to lose more than twice J is too long to try
+        first = min(
+            1.0, -2.0 * size / slope
+        )  # a step that promises to lose more than twice J is too long to try
         found = armijo.search(problem, point, zeta, slope, K, first) if slope < 0.0 else None
         if found is None:
             better = problem.refine(point)

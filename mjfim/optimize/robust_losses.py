@@ -30,7 +30,9 @@ class Loss:
         """Mean square of standard normal residuals that are no outliers."""
         if self.kind == "linear":
             return 1.0
-        return float(1.0 - 2.0 * self.outlier * norm.pdf(self.outlier) / (1.0 - 2.0 * norm.sf(self.outlier)))
+        return float(
+            1.0 - 2.0 * self.outlier * norm.pdf(self.outlier) / (1.0 - 2.0 * norm.sf(self.outlier))
+        )
 
     def value(self, r: Array) -> float:
         """Sum over residuals of any shape."""

@@ -18,14 +18,16 @@ BENT = 1e-8  # relative curvature of a pair that still counts
 LEAST = 1e-4  # damping that is worth it, in units of mu
 
 
-TRIES, RAISED, LOWERED = 5, (2.0, 10.0), (0.1, 1.0)  # dampings of a step at most, and factors between two of them
+TRIES, RAISED, LOWERED = (
+    5,
+    (2.0, 10.0),
+    (0.1, 1.0),
+)  # dampings of a step at most, and factors between two of them
 
 
 AIM = 1.5  # factor of the damping, over how far a step goes
 CUT = 0.3  # share of a step that was taken below which the next one is damped more, else less if it did not go far
-WORTH = (
-    0.01  # loss that a step promised from which on it is damped for having been cut; less would look like convergence
-)
+WORTH = 0.01  # loss that a step promised from which on it is damped for having been cut; less would look like convergence
 
 
 TINY = 1e-300
@@ -78,7 +80,9 @@ class Curves:
         N, nu, nx = weights.S.shape
         M = self.basis.shape[1]
         Qz = (weights.Q @ self.z).reshape(-1, M * nu)
-        Qz[: N * nx] += 2.0 * np.einsum("km,kui->kimu", self.basis, weights.S).reshape(N * nx, M * nu)
+        Qz[: N * nx] += 2.0 * np.einsum("km,kui->kimu", self.basis, weights.S).reshape(
+            N * nx, M * nu
+        )
         H = Qz.T @ self.z.reshape(-1, M * nu)
         pairs = np.einsum("km,kn->kmn", self.basis, self.basis).reshape(N, -1)
         own = (pairs.T @ weights.R.reshape(N, -1)).reshape(M, M, nu, nu)
@@ -142,7 +146,9 @@ class Local:
         """Of the weights, and a multiple of even ones."""
         even = _hedge(self.expansion).even
         if self.basis is None:
-            return Metric(self.chart, self.weights.plus(even, damping) if damping > 0.0 else self.weights)
+            return Metric(
+                self.chart, self.weights.plus(even, damping) if damping > 0.0 else self.weights
+            )
         form, spread = self._forms
         return BasisMetric(form + damping * spread if damping > 0.0 else form)
 
@@ -160,7 +166,9 @@ class Local:
         if model is None:
             return np.zeros_like(s)
         d = np.tensordot(self.slopes, s, axes=s.ndim)
-        return np.asarray(np.tensordot(model.gradient(d) - model.gradient(np.zeros_like(d)), self.slopes, axes=1))
+        return np.asarray(
+            np.tensordot(model.gradient(d) - model.gradient(np.zeros_like(d)), self.slopes, axes=1)
+        )
 
 
 @dataclass
@@ -241,14 +249,18 @@ class StructuredBFGS:
         gamma = float(np.vdot(told.v, moved.v)) / max(float(np.vdot(told.v, told.v)), TINY)
         if gamma > CUT:
             far = _hedge(before.expansion).motion(told) / self.reach
-            self.damping = self.damping * float(np.clip(AIM * far, *LOWERED)) if self.damping > LEAST else 0.0
+            self.damping = (
+                self.damping * float(np.clip(AIM * far, *LOWERED)) if self.damping > LEAST else 0.0
+            )
         elif before.expansion.slope(told) < -WORTH:
             self.damping = RAISED[0] * max(self.damping, LEAST)
         s = moved.v + np.einsum("kui,ki->ku", K, moved.z[:-1])
         if self.basis is not None:
             s = np.linalg.lstsq(self.basis, s)[0]
         after = self._local(expansion, K)
-        self._pairs = (*self._pairs, Learnt(s, after.cost - before.cost - before.modelled(s)))[-self.memory :]
+        self._pairs = (*self._pairs, Learnt(s, after.cost - before.cost - before.modelled(s)))[
+            -self.memory :
+        ]
 
     def reset(self) -> bool:
         """Forget all pairs."""
@@ -258,7 +270,11 @@ class StructuredBFGS:
 
     def _local(self, expansion: Expansion, K: Array) -> Local:
         """Everything about an expansion, once."""
-        if self._last is None or self._last.expansion is not expansion or self._last.chart.K is not K:
+        if (
+            self._last is None
+            or self._last.expansion is not expansion
+            or self._last.chart.K is not K
+        ):
             hedge, w = _hedge(expansion), _hedge(expansion).weights
             weights = Weights(w.Q, w.S, w.R + np.diag(self.ridge), w.W)
             chart = Chart(expansion.A, expansion.B, K)

@@ -68,10 +68,18 @@ def design_summary(design: Design) -> dict[str, Any]:
         "theta": design.theta,
         "initial": _evaluation(design.initial),
         "final": _evaluation(design.final),
-        "limits": {"margins": design.limits, "satisfied": all(m >= 0.0 for m in design.limits.values())},
+        "limits": {
+            "margins": design.limits,
+            "satisfied": all(m >= 0.0 for m in design.limits.values()),
+        },
         "found_by": design.found_by,
         "starts": [
-            {"name": s.name, "cost": s.cost, "status": s.status.name.lower(), "iterations": s.iterations}
+            {
+                "name": s.name,
+                "cost": s.cost,
+                "status": s.status.name.lower(),
+                "iterations": s.iterations,
+            }
             for s in design.starts
         ],
         "warnings": list(design.warnings),
@@ -102,7 +110,11 @@ def write_design(folder: Path, design: Design, setup: Setup) -> None:
     played = playback_of(setup, design.trajectory, design.final.gain)
     arrays: dict[str, Array] = {}
     for prefix, e in (("", design.final), ("initial_", design.initial)):
-        own = {**{n: getattr(e.trajectory, n) for n in ARRAYS[:5]}, "gain": e.gain, "sensitivity": e.sensitivity}
+        own = {
+            **{n: getattr(e.trajectory, n) for n in ARRAYS[:5]},
+            "gain": e.gain,
+            "sensitivity": e.sensitivity,
+        }
         arrays.update({prefix + name: value for name, value in own.items()})
     with replacing(folder / "design.npz") as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
@@ -134,16 +146,32 @@ def read_design(path: Path) -> dict[str, Trajectory]:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
-    except (ValueError, OSError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        reason = "it is not NumPy's, or holds pickles, which are refused" if "pickle" in str(error) else str(error)
-        raise RecordingError(f"{path}: not a design archive (npz without pickles): {reason}") from None
+    except (
+        ValueError,
+        OSError,
+        EOFError,
+        AttributeError,
+        TypeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        reason = (
+            "it is not NumPy's, or holds pickles, which are refused"
+            if "pickle" in str(error)
+            else str(error)
+        )
+        raise RecordingError(
+            f"{path}: not a design archive (npz without pickles): {reason}"
+        ) from None
     found = {}
     for name, prefix in (("initial", "initial_"), ("final", "")):
         missing = [prefix + key for key in ARRAYS[:5] if prefix + key not in arrays]
         if not missing:
             found[name] = _trajectory(path, prefix, arrays)
         elif name == "final":
-            raise RecordingError(f"{path}: array {missing[0]!r} is missing; a design holds {', '.join(ARRAYS)}")
+            raise RecordingError(
+                f"{path}: array {missing[0]!r} is missing; a design holds {', '.join(ARRAYS)}"
+            )
     return found
 
 
@@ -158,7 +186,9 @@ def _trajectory(path: Path, prefix: str, arrays: Mapping[str, Array]) -> Traject
             raise RecordingError(f"{path}: array '{prefix}{key}' must hold finite numbers only")
         if array.ndim != (1 if key == "t" else 2) or len(array) != wanted:
             shape = f"({wanted},)" if key == "t" else f"({wanted}, columns)"
-            raise RecordingError(f"{path}: array '{prefix}{key}' has shape {array.shape}, wanted {shape}")
+            raise RecordingError(
+                f"{path}: array '{prefix}{key}' has shape {array.shape}, wanted {shape}"
+            )
     return Trajectory(*(arrays[prefix + key] for key in ARRAYS[:5]))
 
 
@@ -173,9 +203,13 @@ def check_fits(path: Path, trajectory: Trajectory, setup: Setup) -> None:
     wanted = (setup.model.nq, setup.model.nv, len(setup.controls))
     got = (trajectory.qpos.shape[1], trajectory.qvel.shape[1], trajectory.ctrl.shape[1])
     if got != wanted:
-        raise RecordingError(f"{path}: made for (nq, nv, nu) = {got}, the experiment's model has {wanted}")
+        raise RecordingError(
+            f"{path}: made for (nq, nv, nu) = {got}, the experiment's model has {wanted}"
+        )
     if abs(trajectory.dt - setup.dt) > 1e-6 * setup.dt:
-        raise RecordingError(f"{path}: sampled at {1 / trajectory.dt:g} Hz, the experiment at {1 / setup.dt:g} Hz")
+        raise RecordingError(
+            f"{path}: sampled at {1 / trajectory.dt:g} Hz, the experiment at {1 / setup.dt:g} Hz"
+        )
 
 
 def write_recording(path: Path, recording: Recording, setup: Setup) -> None:
@@ -293,7 +327,9 @@ def check_summary(check: Check) -> dict[str, Any]:
         "information": check.information,
         "wanted": list(check.wanted),
         "correlation": check.correlation,
-        "confounded": [{"a": p.first, "b": p.second, "correlation": p.correlation} for p in check.confounded],
+        "confounded": [
+            {"a": p.first, "b": p.second, "correlation": p.correlation} for p in check.confounded
+        ],
         "combinations": [_group(g) for g in check.never],
         "combined": [{"words": c.words, "value": c.value, "std": c.final} for c in check.combined],
         "not_excited": [_group(g) for g in check.not_here],
@@ -356,6 +392,8 @@ def _compared(row: Row) -> dict[str, Any]:
 def _group(group: Group) -> dict[str, Any]:
     return {
         "members": list(group.members),
-        "identifiable": [dict(zip(c.members, c.coefficients, strict=True)) for c in group.combinations],
+        "identifiable": [
+            dict(zip(c.members, c.coefficients, strict=True)) for c in group.combinations
+        ],
         "words": str(group),
     }

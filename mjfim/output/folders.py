@@ -114,8 +114,13 @@ def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
     if estimate.predictions:
         plots.save(plots.predictions(estimate, labels), folder / "predictions.png")
     if estimate.motion is not None:
-        measured, model = measured_trajectory(setup, estimate.recordings[0]), setup.model_at(estimate.theta)
-        rerun_log.log_estimate(folder / "estimate.rrd", model, estimate, measured, estimate.motion, labels)
+        measured, model = (
+            measured_trajectory(setup, estimate.recordings[0]),
+            setup.model_at(estimate.theta),
+        )
+        rerun_log.log_estimate(
+            folder / "estimate.rrd", model, estimate, measured, estimate.motion, labels
+        )
     return missing
 
 

@@ -9,7 +9,13 @@ import mujoco
 
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import Setup
-from mjfim.model.coordinates import JOINT_DOFS, _control_labels, _coordinates, _joint_name, output_label
+from mjfim.model.coordinates import (
+    JOINT_DOFS,
+    _control_labels,
+    _coordinates,
+    _joint_name,
+    output_label,
+)
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,9 @@ class Labels:
     def __post_init__(self) -> None:
         names, units = len(self.parameters), len(self.parameter_units)
         if names != units:
-            raise MjfimError(f"labels name {names} parameters but {units} units; give one unit (or '') per parameter")
+            raise MjfimError(
+                f"labels name {names} parameters but {units} units; give one unit (or '') per parameter"
+            )
 
     @classmethod
     def of_model(cls, model: mujoco.MjModel) -> Labels:
@@ -47,7 +55,11 @@ class Labels:
             qpos=positions if model.nq == model.nv else _coordinates(model),
             positions=positions,
             velocities=tuple(f"{name} velocity [{unit}/s]" for name, unit in dofs),
-            controls=tuple(label for actuator in range(model.nactuator) for label in _control_labels(model, actuator)),
+            controls=tuple(
+                label
+                for actuator in range(model.nactuator)
+                for label in _control_labels(model, actuator)
+            ),
         )
 
     @classmethod
@@ -56,7 +68,13 @@ class Labels:
         base = cls.of_model(setup.model)
         outputs = {name: output_label(setup.model, name) for name in setup.outputs.names}
         return cls(
-            base.qpos, base.positions, base.velocities, base.controls, setup.parameters.names, setup.units, outputs
+            base.qpos,
+            base.positions,
+            base.velocities,
+            base.controls,
+            setup.parameters.names,
+            setup.units,
+            outputs,
         )
 
     def parameter(self, j: int) -> str:
@@ -72,4 +90,6 @@ class Labels:
         for name, size in sizes.items():
             have = len(getattr(self, name))
             if have != size:
-                raise MjfimError(f"labels.{name} has {have} entries, the data has {size}; give exactly {size}")
+                raise MjfimError(
+                    f"labels.{name} has {have} entries, the data has {size}; give exactly {size}"
+                )

@@ -27,7 +27,9 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
     table = Table(title="What one experiment will tell", title_justify="left")
     for heading in ("parameter", "value", "σ initial", "σ designed", "relative", "smaller by"):
         table.add_column(heading, justify="left" if heading == "parameter" else "right")
-    rows = zip(design.parameters, units, design.theta, design.initial.std, design.final.std, strict=True)
+    rows = zip(
+        design.parameters, units, design.theta, design.initial.std, design.final.std, strict=True
+    )
     for name, unit, value, before, after in rows:
         if name in design.nuisance:
             continue
@@ -38,7 +40,14 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
     for c in design.combined:
         relative = f"{100 * c.final / abs(c.value):.2g} %" if c.value else "-"
         stds = (f"{c.initial:.3g}", f"{c.final:.3g}")
-        table.add_row(escape(c.words), f"{c.value:.4g}", *stds, relative, _ratio(c.initial, c.final), style="cyan")
+        table.add_row(
+            escape(c.words),
+            f"{c.value:.4g}",
+            *stds,
+            relative,
+            _ratio(c.initial, c.final),
+            style="cyan",
+        )
     last = design.history[-1] if design.history else None
     before, after = design.initial.eigenvalues[0], design.final.eigenvalues[0]
     lines = [
@@ -52,7 +61,9 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
     together: list[RenderableType] = []
     if design.combinations:
         together.append("not identifiable alone, so designed for the combinations; see design.json")
-    return Group(table, *lines, *together, Text(BEST_CASE, style="dim"), *_warnings(design.warnings))
+    return Group(
+        table, *lines, *together, Text(BEST_CASE, style="dim"), *_warnings(design.warnings)
+    )
 
 
 def estimate_report(estimate: Estimate, units: tuple[str, ...]) -> RenderableType:
@@ -60,7 +71,14 @@ def estimate_report(estimate: Estimate, units: tuple[str, ...]) -> RenderableTyp
     table = Table(title="Estimated parameters", title_justify="left")
     for heading in ("parameter", "start", "estimate", "formal σ", "honest σ", "95 % interval"):
         table.add_column(heading, justify="left" if heading == "parameter" else "right")
-    columns = (estimate.parameters, units, estimate.initial_theta, estimate.theta, estimate.std, estimate.interval)
+    columns = (
+        estimate.parameters,
+        units,
+        estimate.initial_theta,
+        estimate.theta,
+        estimate.std,
+        estimate.interval,
+    )
     for name, unit, start, value, std, (low, high) in zip(*columns, strict=True):
         told = ("not alone", "-", "-")
         if np.isfinite(std):
@@ -97,17 +115,24 @@ def looks_report(looks: Sequence[Look]) -> RenderableType:
             f"{1e3 * own.longest:.3g} ms",
         )
         left = f"{own.dropped:,} rows" if own.dropped else "-"
-        table.add_row(escape(shortened(own.file, 34)), f"{own.rows:,}", f"{own.duration:.4g} s", *clock, left)
+        table.add_row(
+            escape(shortened(own.file, 34)), f"{own.rows:,}", f"{own.duration:.4g} s", *clock, left
+        )
     ranges = Table(title="Range of its columns (all logs)", title_justify="left")
     for heading in ("column", "from", "least", "largest", "resolution", "empty"):
         ranges.add_column(heading, justify="left" if heading in ("column", "from") else "right")
     for name in dict.fromkeys(column.name for own in looks for column in own.columns):
         some = [column for own in looks for column in own.columns if column.name == name]
-        low, high = (f([getattr(c, key) for c in some]) for f, key in ((np.nanmin, "minimum"), (np.nanmax, "maximum")))
+        low, high = (
+            f([getattr(c, key) for c in some])
+            for f, key in ((np.nanmin, "minimum"), (np.nanmax, "maximum"))
+        )
         finest = min((c.resolution for c in some if c.resolution > 0.0), default=0.0)
         empty = float(np.mean([c.empty for c in some]))
         told = f"{100 * empty:.0f} %" if empty else "-"
-        ranges.add_row(escape(name), escape(some[0].source), f"{low:.4g}", f"{high:.4g}", f"{finest:.2g}", told)
+        ranges.add_row(
+            escape(name), escape(some[0].source), f"{low:.4g}", f"{high:.4g}", f"{finest:.2g}", told
+        )
     return Group(table, ranges)
 
 
@@ -121,7 +146,9 @@ def _predictions(estimate: Estimate) -> Table:
     """Errors of predictions: identified / nominal."""
     found = estimate.predictions
     outputs = found[0].identified.outputs
-    shown = [j for j in range(len(outputs)) if any(np.isfinite(p.identified.rms[j]) for p in found)][:FEW]
+    shown = [
+        j for j in range(len(outputs)) if any(np.isfinite(p.identified.rms[j]) for p in found)
+    ][:FEW]
     title = "Prediction of what was not fitted: rms error of the identified / the nominal model"
     table = Table(title=title, title_justify="left")
     table.add_column("what")
@@ -132,7 +159,10 @@ def _predictions(estimate: Estimate) -> Table:
         cells = (f"{p.identified.rms[j]:.3g} / {p.nominal.rms[j]:.3g}" for j in shown)
         style = "yellow" if not p.ratio < 1.0 else ""
         table.add_row(
-            escape(shortened(p.name, 40)) + ("" if p.held_out else " *"), *cells, f"{p.ratio:.2f}", style=style
+            escape(shortened(p.name, 40)) + ("" if p.held_out else " *"),
+            *cells,
+            f"{p.ratio:.2f}",
+            style=style,
         )
     if not all(p.held_out for p in found):
         table.caption = "* by a fit to the rest; --held-out keeps recordings out of the fit"
@@ -145,9 +175,18 @@ def study_report(study: Study, units: tuple[str, ...]) -> RenderableType:
     parts: list[RenderableType] = []
     for name, s in study.sets.items():
         table = Table(
-            title=f"{name}: {s.trials} trials, {s.failed} failed, {study.measure_rate:g} Hz", title_justify="left"
+            title=f"{name}: {s.trials} trials, {s.failed} failed, {study.measure_rate:g} Hz",
+            title_justify="left",
         )
-        for heading in ("parameter", "true", "mean", "variance", "bound", "efficiency", "95 % interval"):
+        for heading in (
+            "parameter",
+            "true",
+            "mean",
+            "variance",
+            "bound",
+            "efficiency",
+            "95 % interval",
+        ):
             table.add_column(heading, justify="left" if heading == "parameter" else "right")
         for i, parameter in enumerate(study.parameters):
             low, high = s.efficiency_interval[i]
@@ -172,7 +211,16 @@ def check_report(check: Check) -> RenderableType:
         table.add_column(heading, justify="left" if heading == "parameter" else "right")
     for row in check.rows:
         if row.nuisance:
-            table.add_row(_named(row.name, row.unit), f"{row.value:.4g}", "nuisance", "", "", "", "", style="dim")
+            table.add_row(
+                _named(row.name, row.unit),
+                f"{row.value:.4g}",
+                "nuisance",
+                "",
+                "",
+                "",
+                "",
+                style="dim",
+            )
             continue
         alone = np.isfinite(row.std)
         relative = f"{100 * row.relative:.3g} %" if alone and np.isfinite(row.relative) else "-"
@@ -198,7 +246,9 @@ def check_report(check: Check) -> RenderableType:
             parts.append(Text(f"{title}:", style="bold"))
             parts += [Text(line) for group in groups for line in _lines(group, check)]
     few = check.eigenvalues
-    shown = ", ".join(f"{v:.3g}" for v in (few if len(few) <= 8 else np.concatenate([few[:4], few[-2:]])))
+    shown = ", ".join(
+        f"{v:.3g}" for v in (few if len(few) <= 8 else np.concatenate([few[:4], few[-2:]]))
+    )
     tested = check.self_test
     parts += [
         f"eigenvalues{' (smallest four, largest two)' if len(few) > 8 else ''}: {shown}; condition {check.condition:.3g}",
@@ -229,10 +279,21 @@ def compare_report(comparison: Comparison) -> RenderableType:
     for row in comparison.rows:
         table.add_row(*_compared(comparison, row), style=_style(comparison, row))
     each = [_spreads(comparison)] if len(comparison.wanted) <= FEW else []
-    remarks = [f"{row.title}: {'; '.join(_remarks(row))}" for row in comparison.rows if _remarks(row)]
+    remarks = [
+        f"{row.title}: {'; '.join(_remarks(row))}" for row in comparison.rows if _remarks(row)
+    ]
     said = "worst σ: of the worst combination of parameters, relative to their scales; worst margin: over half of its range"
-    verdict = [Text(sentence, style="bold" if comparison.ok else "bold yellow") for sentence in comparison.verdict]
-    return Group(table, *each, *(Text(line) for line in remarks), Text(f"{said}. {BEST_CASE}", style="dim"), *verdict)
+    verdict = [
+        Text(sentence, style="bold" if comparison.ok else "bold yellow")
+        for sentence in comparison.verdict
+    ]
+    return Group(
+        table,
+        *each,
+        *(Text(line) for line in remarks),
+        Text(f"{said}. {BEST_CASE}", style="dim"),
+        *verdict,
+    )
 
 
 def _spreads(comparison: Comparison) -> Table:
@@ -255,11 +316,23 @@ def _marked(comparison: Comparison, row: Row) -> str:
 def _compared(comparison: Comparison, row: Row) -> list[str]:
     """Cells of one method."""
     ours, (kind, share) = comparison.design, row.tightest
-    against = "" if ours is None or row is ours or np.isnan(row.cost) else f"{-100 * comparison.gain(row, ours):+.3g} %"
+    against = (
+        ""
+        if ours is None or row is ours or np.isnan(row.cost)
+        else f"{-100 * comparison.gain(row, ours):+.3g} %"
+    )
     first = [*([row.cost] if comparison.weighted else []), row.criterion]
     cells = [*(_number(n, 4) for n in first), against, _number(row.worst, 3)]
-    margin = f"{100.0 * share:.2g} % {kind.replace('_', ' ')}" if kind and np.isfinite(share) else "-"
-    return [_marked(comparison, row), *cells, f"{row.seconds:.1f} s", f"{row.steps / 1e6:.2f} M", margin]
+    margin = (
+        f"{100.0 * share:.2g} % {kind.replace('_', ' ')}" if kind and np.isfinite(share) else "-"
+    )
+    return [
+        _marked(comparison, row),
+        *cells,
+        f"{row.seconds:.1f} s",
+        f"{row.steps / 1e6:.2f} M",
+        margin,
+    ]
 
 
 def _number(value: float, digits: int) -> str:
@@ -282,7 +355,10 @@ def _lines(group: Combinations, check: Check) -> list[str]:
     if not group.combinations:
         return [f"  {group}"]
     known = {c.words: f" = {c.value:.4g} ± {c.final:.2g}" for c in check.combined}
-    return [f"  {', '.join(group.members)} only as", *(f"    {c}{known.get(str(c), '')}" for c in group.combinations)]
+    return [
+        f"  {', '.join(group.members)} only as",
+        *(f"    {c}{known.get(str(c), '')}" for c in group.combinations),
+    ]
 
 
 def _ratio(before: float, after: float) -> str:

@@ -14,11 +14,17 @@ from mjfim.records.trajectory import Trajectory
 CLAMPED = 1e-12  # relative distance from its bound at which a force counts as clamped
 
 
-def forwarded(model: Any, trajectory: Trajectory, samples: Iterable[int]) -> Iterator[tuple[int, Any]]:
+def forwarded(
+    model: Any, trajectory: Trajectory, samples: Iterable[int]
+) -> Iterator[tuple[int, Any]]:
     """Each sample k with MjData at which everything is computed; one MjData serves them all."""
     data = mujoco.MjData(model)
     for k in samples:
-        data.qpos[:], data.qvel[:], data.act[:] = trajectory.qpos[k], trajectory.qvel[k], trajectory.act[k]
+        data.qpos[:], data.qvel[:], data.act[:] = (
+            trajectory.qpos[k],
+            trajectory.qvel[k],
+            trajectory.act[k],
+        )
         data.ctrl[:] = trajectory.ctrl[k]
         mujoco.mj_forward(model, data)
         yield k, data
@@ -26,7 +32,9 @@ def forwarded(model: Any, trajectory: Trajectory, samples: Iterable[int]) -> Ite
 
 def clamped(model: Any, data: Any) -> list[int]:
     """Ids of actuators whose force is clamped by forcerange at this moment."""
-    return [i for i in np.flatnonzero(model.actuator_forcelimited).tolist() if _clamped(model, data, i)]
+    return [
+        i for i in np.flatnonzero(model.actuator_forcelimited).tolist() if _clamped(model, data, i)
+    ]
 
 
 def saturated(model: Any, trajectory: Trajectory) -> tuple[str, ...]:
@@ -41,7 +49,10 @@ def saturated(model: Any, trajectory: Trajectory) -> tuple[str, ...]:
 def _clamped(model: Any, data: Any, actuator: int) -> bool:
     """True where forcerange acts: on the force, or on the norm of an actuator's several forces."""
     first, count = int(model.actuator_outadr[actuator]), int(model.actuator_outnum[actuator])
-    force, (low, high) = data.actuator_force[first : first + count], model.actuator_forcerange[actuator]
+    force, (low, high) = (
+        data.actuator_force[first : first + count],
+        model.actuator_forcerange[actuator],
+    )
     if count == 1:
         return bool(force[0] <= low or force[0] >= high)
     return bool(np.linalg.norm(force) >= high * (1.0 - CLAMPED))
@@ -73,7 +84,10 @@ def _ranges(model: Any, actuators: Iterable[int]) -> Iterator[str]:
 
 def _at(model: Any, data: Any) -> Iterator[str]:
     for contact in data.contact[: data.ncon]:
-        names = (mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or f"geom{g}" for g in contact.geom)
+        names = (
+            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or f"geom{g}"
+            for g in contact.geom
+        )
         yield f"contact {' - '.join(names)}"
     joints = joint_names(model)
     for kind, ident in zip(data.efc_type, data.efc_id, strict=True):

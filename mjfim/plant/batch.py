@@ -46,7 +46,12 @@ def state_space(model: Any) -> StateSpace:
             scalar_q.append(q)
             scalar_v.append(v)
     return StateSpace(
-        model.nq, model.nv, model.na, np.array(scalar_q, np.intp), np.array(scalar_v, np.intp), tuple(quaternions)
+        model.nq,
+        model.nv,
+        model.na,
+        np.array(scalar_q, np.intp),
+        np.array(scalar_v, np.intp),
+        tuple(quaternions),
     )
 
 
@@ -74,7 +79,11 @@ class Taps:
 
     def rows(self, qpos: Array, qvel: Array, before: Array, read: Callable[[str], Array]) -> Array:
         """(..., w) from states after a step, velocities before it, and a reader of MjData fields."""
-        parts = [qpos[..., self.q], qvel[..., self.v], (qvel[..., self.a] - before[..., self.a]) / self.timestep]
+        parts = [
+            qpos[..., self.q],
+            qvel[..., self.v],
+            (qvel[..., self.a] - before[..., self.a]) / self.timestep,
+        ]
         if len(self.f):
             parts.append(read("actuator_force")[..., self.f])
         if len(self.j):
@@ -115,7 +124,9 @@ class Engine:
     steps: `mj_step` calls so far
     """
 
-    def __init__(self, model: Any, substeps: int = 1, sensors: bool = False, threads: int | None = None) -> None:
+    def __init__(
+        self, model: Any, substeps: int = 1, sensors: bool = False, threads: int | None = None
+    ) -> None:
         self.model = model
         self.space = state_space(model)
         self.substeps = substeps
@@ -125,7 +136,9 @@ class Engine:
         self._batches: dict[str, Batch] = {}
         self._data = mujoco.MjData(model)
         self._clocks = model.sensor_adr[model.sensor_type == CLOCK]
-        self._mocap = np.flatnonzero(model.body_mocapid >= 0)[np.argsort(model.body_mocapid[model.body_mocapid >= 0])]
+        self._mocap = np.flatnonzero(model.body_mocapid >= 0)[
+            np.argsort(model.body_mocapid[model.body_mocapid >= 0])
+        ]
 
     def _batch(self, kind: str, count: int) -> Batch:
         """A batch of at least `count` simulations; making one costs milliseconds, so it grows and is kept."""
@@ -148,21 +161,36 @@ class Engine:
             mocap_pos, mocap_quat = batch.bind("mocap_pos"), batch.bind("mocap_quat")
             for i, model in enumerate(models):
                 own = slice(None, n) if len(models) == 1 else i
-                mocap_pos[own], mocap_quat[own] = model.body_pos[self._mocap], model.body_quat[self._mocap]
+                mocap_pos[own], mocap_quat[own] = (
+                    model.body_pos[self._mocap],
+                    model.body_quat[self._mocap],
+                )
         return None if n == batch.nsim else np.arange(n)
 
-    def step(self, models: Sequence[Any], states: Array, ctrl: Array, taps: Taps | None = None) -> Stepped:
+    def step(
+        self, models: Sequence[Any], states: Array, ctrl: Array, taps: Taps | None = None
+    ) -> Stepped:
         """One sample of every simulation.
 
         states: (n, ns);  ctrl: (n, nu), held. Each model steps its equal, contiguous share. Diverged simulations are NaN.
         """
         share = len(states) // len(models)
         parts = [
-            self._share(model, states[i * share : (i + 1) * share], ctrl[i * share : (i + 1) * share], taps)
+            self._share(
+                model, states[i * share : (i + 1) * share], ctrl[i * share : (i + 1) * share], taps
+            )
             for i, model in enumerate(models)
         ]
-        sensed = np.concatenate([p.sensors for p in parts if p.sensors is not None]) if self.sensors else None
-        tapped = None if taps is None else np.concatenate([p.tapped for p in parts if p.tapped is not None])
+        sensed = (
+            np.concatenate([p.sensors for p in parts if p.sensors is not None])
+            if self.sensors
+            else None
+        )
+        tapped = (
+            None
+            if taps is None
+            else np.concatenate([p.tapped for p in parts if p.tapped is not None])
+        )
         return Stepped(np.concatenate([p.states for p in parts]), sensed, tapped)
 
     def _share(self, model: Any, states: Array, ctrl: Array, taps: Taps | None) -> Stepped:
@@ -182,7 +210,11 @@ class Engine:
                 if stop - done > 1 and stop in looks:
                     batch.step(ids, nstep=stop - done - 1)
                     done = stop - 1
-                before = np.array(batch.bind("qvel")[:count]) if taps is not None and len(taps.a) else np.empty((0, 0))
+                before = (
+                    np.array(batch.bind("qvel")[:count])
+                    if taps is not None and len(taps.a)
+                    else np.empty((0, 0))
+                )
                 batch.step(ids, nstep=stop - done)
                 done = stop
                 if self.sensors and stop == 1:
@@ -200,11 +232,15 @@ class Engine:
         out[bad | ~_acceptable(ctrl).all(axis=1)] = np.nan
         return Stepped(out, sensed, np.stack(tapped, axis=1) if tapped else None)
 
-    def rollout(self, models: Sequence[Any], start: Array, ctrl: Array, taps: Taps | None = None) -> Rollouts:
+    def rollout(
+        self, models: Sequence[Any], start: Array, ctrl: Array, taps: Taps | None = None
+    ) -> Rollouts:
         """Open-loop simulations from start: (m, ns) under ctrl: (m, N, nu), each sample held over its substeps."""
         count, N, _ = ctrl.shape
         batch = self._batch("rollout" if count <= FEW else "rollouts", count)
-        batch.set_models(models[0] if len(models) == 1 else [*models, *[models[-1]] * (batch.nsim - count)])
+        batch.set_models(
+            models[0] if len(models) == 1 else [*models, *[models[-1]] * (batch.nsim - count)]
+        )
         ids = self._load(batch, start, models)
         held = np.repeat(ctrl, self.substeps, axis=1)
         record: tuple[Any, ...] = (RECORD,)
@@ -218,17 +254,24 @@ class Engine:
         last = N * self.substeps
         rows = out[RECORD][:, self.substeps - 1 : last : self.substeps]
         states = np.concatenate([start[:, None], rows[:, :, 1:]], axis=1)
-        on_time = np.abs(rows[:, -1, 0] - START - last * self.model.opt.timestep) < 0.5 * self.model.opt.timestep
+        on_time = (
+            np.abs(rows[:, -1, 0] - START - last * self.model.opt.timestep)
+            < 0.5 * self.model.opt.timestep
+        )
         finite = on_time & np.isfinite(states).all(axis=(1, 2)) & _acceptable(ctrl).all(axis=(1, 2))
         sensed = self._sensed(out["sensordata"][:, :: self.substeps]) if self.sensors else None
-        return Rollouts(states, sensed, finite, None if taps is None else self._tapped(taps, start, out, last))
+        return Rollouts(
+            states, sensed, finite, None if taps is None else self._tapped(taps, start, out, last)
+        )
 
     def _tapped(self, taps: Taps, start: Array, out: dict[Any, Array], last: int) -> Array:
         """(m, N, substeps, w) from the records of a rollout of `last` engine steps."""
         qpos, qvel, _ = self.space.split(out[RECORD][:, :last, 1:])
         before = np.concatenate([self.space.split(start)[1][:, None], qvel[:, :-1]], axis=1)
         rows = taps.rows(qpos, qvel, before, lambda name: out[name][:, :last])
-        return np.asarray(rows.reshape(len(start), last // self.substeps, self.substeps, rows.shape[-1]))
+        return np.asarray(
+            rows.reshape(len(start), last // self.substeps, self.substeps, rows.shape[-1])
+        )
 
     def _sensed(self, data: Array) -> Array:
         """A copy of sensor data: (..., nsensordata), its clocks as if time had begun at zero."""
@@ -236,7 +279,9 @@ class Engine:
         out[..., self._clocks] -= START
         return out
 
-    def closed_loop(self, model: Any, reference: Array, mu: Array, K: Array) -> tuple[Array, Array, bool]:
+    def closed_loop(
+        self, model: Any, reference: Array, mu: Array, K: Array
+    ) -> tuple[Array, Array, bool]:
         """Projection: `u = mu + K (alpha - x)`. Returns states (N+1, ns), ctrl (N, nu), and False if it diverged.
 
         reference: alpha, (N+1, ns);  mu: (N, nu);  K: (N, nu, nx)
@@ -260,7 +305,9 @@ class Engine:
                 mujoco.mj_step(model, data, substeps)
                 q[:], v[:], a[:] = qpos, qvel, act
         self.steps += N * substeps
-        on_time = abs(data.time - START - N * substeps * model.opt.timestep) < 0.5 * model.opt.timestep
+        on_time = (
+            abs(data.time - START - N * substeps * model.opt.timestep) < 0.5 * model.opt.timestep
+        )
         return states, used, bool(on_time and np.isfinite(states).all() and _acceptable(used).all())
 
 

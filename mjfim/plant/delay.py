@@ -40,7 +40,10 @@ class Lag:
         slope *= np.where(inside, -1.0 / dt, 0.0)[:, None]
         rows = np.repeat(np.arange(len(wanted)), count)
         return Lag(
-            *(csr_array((w.ravel(), (rows, nodes.ravel())), shape=(len(wanted), samples)) for w in (value, slope))
+            *(
+                csr_array((w.ravel(), (rows, nodes.ravel())), shape=(len(wanted), samples))
+                for w in (value, slope)
+            )
         )
 
     def apply(self, values: Array) -> Array:
@@ -61,7 +64,9 @@ class Lag:
 
 
 def _apply(operator: Any, values: Array) -> Array:
-    return np.asarray(operator @ values.reshape(len(values), -1)).reshape(operator.shape[0], *values.shape[1:])
+    return np.asarray(operator @ values.reshape(len(values), -1)).reshape(
+        operator.shape[0], *values.shape[1:]
+    )
 
 
 def _lagrange(s: Array, count: int) -> tuple[Array, Array]:
@@ -72,5 +77,7 @@ def _lagrange(s: Array, count: int) -> tuple[Array, Array]:
         scale = np.prod([i - j for j in others])
         factors = np.concatenate([s - j for j in others], axis=1)
         value[:, i] = factors.prod(axis=1) / scale
-        slope[:, i] = sum(np.delete(factors, k, axis=1).prod(axis=1) for k in range(count - 1)) / scale
+        slope[:, i] = (
+            sum(np.delete(factors, k, axis=1).prod(axis=1) for k in range(count - 1)) / scale
+        )
     return value, slope

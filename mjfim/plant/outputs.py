@@ -47,7 +47,9 @@ class OutputMap:
     @cached_property
     def _sensors(self) -> np.ndarray:
         """Rows: output, address in sensordata."""
-        return _table([(i, o.sensor) for i, o in enumerate(self.outputs) if o.sensor is not None], 2)
+        return _table(
+            [(i, o.sensor) for i, o in enumerate(self.outputs) if o.sensor is not None], 2
+        )
 
     @cached_property
     def _scalar(self) -> np.ndarray:
@@ -61,7 +63,15 @@ class OutputMap:
     def _turned(self) -> np.ndarray:
         """Rows: output, component, qpos and dof address of its quaternion."""
         joints = self.space.quaternions
-        return _table([(i, s - q, q, v) for i, s in self._states.T.tolist() for q, v in joints if q <= s < q + 4], 4)
+        return _table(
+            [
+                (i, s - q, q, v)
+                for i, s in self._states.T.tolist()
+                for q, v in joints
+                if q <= s < q + 4
+            ],
+            4,
+        )
 
     def __len__(self) -> int:
         return len(self.outputs)
@@ -105,7 +115,9 @@ class OutputMap:
         dy = np.zeros((*np.broadcast_shapes(first.shape, second.shape)[:-1], len(self.outputs)))
         for output, component, q, v in self._turned.T:
             moved = quaternion_product(states[..., q : q + 4], _pure(0.5 * first[..., v : v + 3]))
-            dy[..., output] = quaternion_product(moved, _pure(0.5 * second[..., v : v + 3]))[..., component]
+            dy[..., output] = quaternion_product(moved, _pure(0.5 * second[..., v : v + 3]))[
+                ..., component
+            ]
         if dsensors is not None:
             dy[..., self._sensors[0]] = dsensors[..., self._sensors[1]]
         return dy

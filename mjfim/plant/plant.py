@@ -123,7 +123,9 @@ class Plant:
         found = self.sensitivity(theta, trajectory)
         if found is None:
             return
-        size = np.concatenate([self.steps_of(trajectory)[: self.space.nx], np.ones(len(self.outputs))])
+        size = np.concatenate(
+            [self.steps_of(trajectory)[: self.space.nx], np.ones(len(self.outputs))]
+        )
         both = np.concatenate([found.psi, found.G], axis=1) * self.parameters.step
         effect = (np.abs(both).max(axis=0) / size[:, None]).max(axis=0)
         self._reach = np.clip(FAINT / np.maximum(effect, 1e-300), 1.0, LONGEST)
@@ -169,7 +171,9 @@ class Plant:
 
     def simulate(self, theta: Array, ctrl: Array) -> Trajectory:
         """Open-loop trajectory from the start under ctrl: (N, nu). Raises SimulationDiverged."""
-        out = self.engine.rollout([self.model(theta)], self.start(theta)[None], np.asarray(ctrl)[None])
+        out = self.engine.rollout(
+            [self.model(theta)], self.start(theta)[None], np.asarray(ctrl)[None]
+        )
         if not out.finite[0]:
             raise SimulationDiverged(
                 "the simulation diverges under this control; a smaller amplitude or timestep may help"
@@ -184,7 +188,9 @@ class Plant:
         y = self.outputs(out.states, out.sensors) + (theta @ self._bias.T)[:, None]
         if self.parameters.delay.any():
             lags = (self.lag(row, y.shape[1]) for row in theta)
-            y = np.stack([own if lag is None else lag.apply(own) for lag, own in zip(lags, y, strict=True)])
+            y = np.stack(
+                [own if lag is None else lag.apply(own) for lag, own in zip(lags, y, strict=True)]
+            )
         return y, out.finite & sound
 
     def _many(self, theta: Array) -> tuple[list[Any], np.ndarray]:
@@ -203,7 +209,9 @@ class Plant:
         """Models, one per row of theta. Raises SimulationDiverged where one cannot be compiled."""
         models, sound = self._many(theta)
         if not sound.all():
-            raise SimulationDiverged("MuJoCo cannot compile the model when the parameters move a little")
+            raise SimulationDiverged(
+                "MuJoCo cannot compile the model when the parameters move a little"
+            )
         return models
 
     def _compiled(self, theta: Array) -> tuple[list[Any], np.ndarray]:
@@ -216,7 +224,9 @@ class Plant:
                 sound[i] = False
         return models, sound
 
-    def predict(self, theta: Array, ctrl: Array, step: float = SENSITIVITY_STEP) -> tuple[Array, Array] | None:
+    def predict(
+        self, theta: Array, ctrl: Array, step: float = SENSITIVITY_STEP
+    ) -> tuple[Array, Array] | None:
         """Outputs y: (N+1, ny) and their derivative G: (N+1, ny, p) by central differences; None if one diverged."""
         found = self._differences(theta, self.start(theta), ctrl, step, None)
         return None if found is None else (found[0], found[1].G)
@@ -263,8 +273,13 @@ class Plant:
                 yield None
                 return
             states = out.states.reshape(J, S, held.shape[1] + 1, -1)
-            sensors = None if out.sensors is None else out.sensors.reshape(J, S, held.shape[1] + 1, -1)
-            y = self.outputs(states[0], None if sensors is None else sensors[0]) + self._bias @ theta
+            sensors = (
+                None if out.sensors is None else out.sensors.reshape(J, S, held.shape[1] + 1, -1)
+            )
+            y = (
+                self.outputs(states[0], None if sensors is None else sensors[0])
+                + self._bias @ theta
+            )
             if free is None:
                 yield Response(first, y, None, None)
             else:
@@ -274,7 +289,9 @@ class Plant:
                 yield Response(first, y, common + self._bias, G[..., len(moving) :])
             now = states[:, :, -1]
 
-    def _quotients(self, states: Array, sensors: Array | None, width: Array, central: bool) -> Array:
+    def _quotients(
+        self, states: Array, sensors: Array | None, width: Array, central: bool
+    ) -> Array:
         """(S, n+1, ny, q) differences of outputs from states: (1 + q or 1 + 2q, S, n+1, ns) whose first is the origin."""
         q, here = len(width), states[0]
         over = width.reshape(-1, 1, 1, 1)
@@ -284,7 +301,9 @@ class Plant:
             ds = (sensors[1 : q + 1] - (sensors[q + 1 :] if central else sensors[0])) / over
         return np.moveaxis(self.outputs.tangent(here, dx, ds), 0, 3)
 
-    def project(self, theta: Array, base: Trajectory, zeta: TangentCurve, gamma: float, K: Array) -> Trajectory | None:
+    def project(
+        self, theta: Array, base: Trajectory, zeta: TangentCurve, gamma: float, K: Array
+    ) -> Trajectory | None:
         """P(xi + gamma zeta) about the base trajectory; None if it diverged. K: (N, nu, nx), all zero = open loop."""
         mu = base.ctrl + gamma * zeta.v
         model = self.model(theta)
@@ -301,7 +320,9 @@ class Plant:
 
         None if it diverged.
         """
-        out = self.engine.rollout([self.model(theta)], self.start(theta)[None], np.asarray(ctrl)[None], taps)
+        out = self.engine.rollout(
+            [self.model(theta)], self.start(theta)[None], np.asarray(ctrl)[None], taps
+        )
         if not out.finite[0] or out.tapped is None:
             return None
         return self.trajectory(out.states[0], ctrl), out.tapped[0]
@@ -315,19 +336,27 @@ class Plant:
         nv, na = self.space.nv, self.space.na
         dq = np.ones(nv)
         speed = np.maximum(1.0, np.abs(trajectory.qvel).max(axis=0, initial=0.0))
-        act = np.maximum(1.0, np.abs(trajectory.act).max(axis=0, initial=0.0)) if na else np.zeros(0)
+        act = (
+            np.maximum(1.0, np.abs(trajectory.act).max(axis=0, initial=0.0)) if na else np.zeros(0)
+        )
         ctrl = np.abs(trajectory.ctrl).max(axis=0)
         return np.concatenate([dq, speed, act, np.where(ctrl > 1e-3, ctrl, 1.0)])
 
     def sensitivity(
-        self, theta: Array, trajectory: Trajectory, step: float | Array = SENSITIVITY_STEP, central: bool = True
+        self,
+        theta: Array,
+        trajectory: Trajectory,
+        step: float | Array = SENSITIVITY_STEP,
+        central: bool = True,
     ) -> Sensitivity | None:
         """psi and G by differences of whole rollouts under the same control; None if one diverged.
 
         step: relative to `span`, one number or (p,);  central: else one-sided where no sensor is an output
         """
         central = central or self.outputs.needs_sensors
-        found = self._differences(theta, trajectory.state[0], trajectory.ctrl, step, trajectory.state, central)
+        found = self._differences(
+            theta, trajectory.state[0], trajectory.ctrl, step, trajectory.state, central
+        )
         return None if found is None else found[1]
 
     def _differences(
@@ -363,7 +392,9 @@ class Plant:
             if own:
                 here, sensors = out.states[-1], None if out.sensors is None else out.sensors[-1]
             width = (2.0 if central else 1.0) * h[:, None, None]
-            dx = self.space.minus(out.states[:m], out.states[m : 2 * m] if central else here) / width
+            dx = (
+                self.space.minus(out.states[:m], out.states[m : 2 * m] if central else here) / width
+            )
             ds = None if out.sensors is None else (out.sensors[:m] - out.sensors[m : 2 * m]) / width
             psi[..., moving] = np.moveaxis(dx, 0, 2)
             G[..., moving] = np.moveaxis(self.outputs.tangent(here, dx, ds), 0, 2)
@@ -374,18 +405,24 @@ class Plant:
             y = lag.apply(y)
         return y, Sensitivity(psi, G)
 
-    def linearize(self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP) -> Linearization:
+    def linearize(
+        self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
+    ) -> Linearization:
         """A, B, E, C, D, H by central differences in one batch per model. Raises SimulationDiverged."""
         p = len(self.parameters)
         states, ctrl = self._ends(trajectory)
         A, B, C, D = self.jacobians(theta, trajectory, step)
         dp, hp = self._by_theta(theta, states, ctrl, step)
         E = np.moveaxis(_finite(dp[:, :-1]), 0, 2)
-        H = np.moveaxis(self.outputs.tangent(states, np.zeros((p, len(states), self.space.nx)), hp), 0, 2)
+        H = np.moveaxis(
+            self.outputs.tangent(states, np.zeros((p, len(states), self.space.nx)), hp), 0, 2
+        )
         H = H + self._bias
         return Linearization(A, B, E, C, D, H)
 
-    def one_step(self, theta: Array, trajectory: Trajectory, samples: np.ndarray, step: float) -> Array:
+    def one_step(
+        self, theta: Array, trajectory: Trajectory, samples: np.ndarray, step: float
+    ) -> Array:
         """(n, p) effects of each parameter on the next state and on the sensors, at some samples, in natural units.
 
         Rows are relative to the sizes of states and to the largest effect on each sensor. Raises SimulationDiverged.
@@ -399,7 +436,9 @@ class Plant:
             parts.append(dy / np.where(size > 0.0, size, 1.0))
         return np.concatenate([part.reshape(p, -1) for part in parts], axis=1).T
 
-    def _by_theta(self, theta: Array, states: Array, ctrl: Array, step: float) -> tuple[Array, Array | None]:
+    def _by_theta(
+        self, theta: Array, states: Array, ctrl: Array, step: float
+    ) -> tuple[Array, Array | None]:
         """Derivatives of one sample by every parameter: (p, n, nx), and of the sensors (p, n, ns) or None."""
         p, h = len(self.parameters), step * self.span
         models = self._all(np.concatenate([theta + np.diag(h), theta - np.diag(h)]))
@@ -414,10 +453,14 @@ class Plant:
         nx = self.space.nx
         z_step = step * self.steps_of(trajectory)
         count = len(z_step)
-        xs, us = self._perturbed(*self._ends(trajectory), np.concatenate([np.diag(z_step), -np.diag(z_step)]))
+        xs, us = self._perturbed(
+            *self._ends(trajectory), np.concatenate([np.diag(z_step), -np.diag(z_step)])
+        )
         dz, hz = self._halves([self.model(theta)], xs, us, count, z_step)
         dx = np.moveaxis(_finite(dz[:, :-1]), 0, 2)
-        dy = np.moveaxis(self.outputs.tangent(trajectory.state, self._identity(dz.shape[1]), hz), 0, 2)
+        dy = np.moveaxis(
+            self.outputs.tangent(trajectory.state, self._identity(dz.shape[1]), hz), 0, 2
+        )
         return dx[..., :nx], dx[..., nx:], dy[..., :nx], dy[..., nx:]
 
     def tapped(
@@ -455,7 +498,9 @@ class Plant:
         us = ctrl[None] + moves[:, None, nx:]
         return xs.reshape(-1, states.shape[1]), us.reshape(-1, self.nu)
 
-    def _halves(self, models: list[Any], xs: Array, us: Array, count: int, step: Array) -> tuple[Array, Array | None]:
+    def _halves(
+        self, models: list[Any], xs: Array, us: Array, count: int, step: Array
+    ) -> tuple[Array, Array | None]:
         """Central quotients of a batch whose first half is the plus side: (count, n, nx) and sensors (count, n, ns)."""
         stepped = self.engine.step(models, xs, us)
         out, sensed = stepped.states, stepped.sensors
@@ -489,13 +534,21 @@ class Plant:
         return replace(found, F_mixed=smooth.F_mixed, h_mixed=smooth.h_mixed)
 
     def _paired(
-        self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array, accuracy: Accuracy, taps: Taps | None
+        self,
+        theta: Array,
+        trajectory: Trajectory,
+        psi: Array,
+        directions: Array,
+        accuracy: Accuracy,
+        taps: Taps | None,
     ) -> Bilinear:
         """Pairs +-epsilon along (psi w, w) at every (x, u) moved by +-delta (or +delta and none); their means give A and B."""
         states, ctrl = self._ends(trajectory)
         delta = accuracy.delta * self.steps_of(trajectory)
         count = len(delta)
-        moves = np.concatenate([np.diag(delta), -np.diag(delta) if accuracy.central else np.zeros((1, count))])
+        moves = np.concatenate(
+            [np.diag(delta), -np.diag(delta) if accuracy.central else np.zeros((1, count))]
+        )
         xs, us = self._perturbed(states, ctrl, moves)
         shape = (len(moves), len(states), -1)
         firsts, mixed, h_firsts, h_mixed = [], [], [], []
@@ -503,10 +556,14 @@ class Plant:
         for r, w in enumerate(directions):
             push = psi @ w
             epsilon = self._epsilon(accuracy, push, w)
-            shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
+            shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(
+                -1, push.shape[1]
+            )
             both = np.concatenate([self.space.plus(xs, shift), self.space.plus(xs, -shift)])
             models = self._all(np.stack([theta + epsilon * w, theta - epsilon * w]))
-            stepped = self.engine.step(models, both, np.concatenate([us, us]), taps if r == 0 else None)
+            stepped = self.engine.step(
+                models, both, np.concatenate([us, us]), taps if r == 0 else None
+            )
             sensed, pair = stepped.sensors, stepped.states.reshape(2, *shape)
             widths = (2.0 if accuracy.central else 1.0) * delta[:, None, None]
             if stepped.tapped is not None:
@@ -515,7 +572,9 @@ class Plant:
                 tapped = np.moveaxis(rise[:, :-1], 0, 3)
             slope = self.space.minus(pair[0], pair[1]) / (2.0 * epsilon)
             mixed.append((slope[:count] - slope[count:]) / widths)
-            firsts.append(np.mean(self.space.minus(pair[:, :count], pair[:, count:]), axis=0) / widths)
+            firsts.append(
+                np.mean(self.space.minus(pair[:, :count], pair[:, count:]), axis=0) / widths
+            )
             if sensed is not None:
                 s = sensed.reshape(2, *shape)
                 tilt = (s[0] - s[1]) / (2.0 * epsilon)
@@ -546,7 +605,13 @@ class Plant:
         )
 
     def _drafted(
-        self, theta: Array, trajectory: Trajectory, psi: Array, directions: Array, accuracy: Accuracy, taps: Taps | None
+        self,
+        theta: Array,
+        trajectory: Trajectory,
+        psi: Array,
+        directions: Array,
+        accuracy: Accuracy,
+        taps: Taps | None,
     ) -> Bilinear:
         """`bilinear` by one-sided differences, for outputs that are no sensors: a batch at the origin serves all directions."""
         states, ctrl = self._ends(trajectory)
@@ -559,7 +624,9 @@ class Plant:
         origin = stepped.states.reshape(shape)
         first = self.space.minus(origin[:count], origin[count:]) / widths
         if self.smooth is not self:
-            origin = self.smooth.engine.step([self.smooth.model(theta)], xs, us).states.reshape(shape)
+            origin = self.smooth.engine.step([self.smooth.model(theta)], xs, us).states.reshape(
+                shape
+            )
         tapped, mixed = None, []
         if stepped.tapped is not None:
             t = stepped.tapped.reshape(len(moves), len(states), *stepped.tapped.shape[1:])
@@ -567,7 +634,9 @@ class Plant:
         for w in directions:
             push = psi @ w
             epsilon = self._epsilon(accuracy, push, w)
-            shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(-1, push.shape[1])
+            shift = np.broadcast_to(epsilon * push, (len(moves), *push.shape)).reshape(
+                -1, push.shape[1]
+            )
             models = self.smooth._all((theta + epsilon * w)[None])
             out = self.smooth.engine.step(models, self.space.plus(xs, shift), us).states
             slope = self.space.minus(out.reshape(shape), origin) / epsilon
@@ -575,7 +644,9 @@ class Plant:
         unit = self._identity(len(states))
         second = None
         if self.outputs.curved:
-            second = np.moveaxis(np.array([self.outputs.bend(states, unit, psi @ w, None) for w in directions]), 1, 2)
+            second = np.moveaxis(
+                np.array([self.outputs.bend(states, unit, psi @ w, None) for w in directions]), 1, 2
+            )
         AB = np.moveaxis(first[:, :-1], 0, 2)
         CD = np.moveaxis(self.outputs.tangent(states, unit, None), 0, 2)
         F_mixed = np.moveaxis(np.array(mixed)[:, :, :-1], 1, 2)

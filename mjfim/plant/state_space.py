@@ -49,7 +49,9 @@ class StateSpace:
         out[..., self.scalar_q] += dx[..., self.scalar_v]
         out[..., nq:] += dx[..., nv:]
         for q, v in self.quaternions:
-            out[..., q : q + 4] = quaternion_product(out[..., q : q + 4], exponential(dx[..., v : v + 3]))
+            out[..., q : q + 4] = quaternion_product(
+                out[..., q : q + 4], exponential(dx[..., v : v + 3])
+            )
         return out
 
     def minus(self, state: Array, origin: Array) -> Array:

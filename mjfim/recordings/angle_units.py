@@ -16,14 +16,18 @@ from mjfim.recordings.plausibility import ways
 DEGREES = 180.0 / np.pi
 NEAR = 0.2  # relative distance from the factor that is still the factor
 ALIKE = 0.5  # correlation from which two columns are one motion
-STRETCH = 0.05  # [s] over which positions are differenced, so that resolution and noise do not count
+STRETCH = (
+    0.05  # [s] over which positions are differenced, so that resolution and noise do not count
+)
 BEYOND = 3.0  # ranges of a joint that nothing goes beyond
 
 
 FAR, FAST = 50.0, 200.0  # [rad, rad/s] that hardly any joint reaches, where no range is known
 
 
-def check_angles(where: str, model: Any, t: Array, columns: Mapping[str, Array], stated: Collection[str]) -> None:
+def check_angles(
+    where: str, model: Any, t: Array, columns: Mapping[str, Array], stated: Collection[str]
+) -> None:
     """Raise RecordingError where a hinge's column looks like degrees. stated: columns whose unit the user gave"""
     for j, joint in enumerate(joint_names(model)):
         if int(model.jnt_type[j]) != int(mujoco.mjtJoint.mjJNT_HINGE):
@@ -44,7 +48,11 @@ def check_angles(where: str, model: Any, t: Array, columns: Mapping[str, Array],
 
 
 def _check_pair(
-    where: str, t: Array, position: tuple[str, Array], velocity: tuple[str, Array], stated: Collection[str]
+    where: str,
+    t: Array,
+    position: tuple[str, Array],
+    velocity: tuple[str, Array],
+    stated: Collection[str],
 ) -> None:
     """The slope of a position is its velocity."""
     ratio = _ratio(t, position[1], velocity[1])

@@ -42,7 +42,11 @@ SENSORS = {
 }
 
 
-OPEN = (mujoco.mjtSensor.mjSENS_ACTUATORPOS, mujoco.mjtSensor.mjSENS_ACTUATORVEL, mujoco.mjtSensor.mjSENS_USER)
+OPEN = (
+    mujoco.mjtSensor.mjSENS_ACTUATORPOS,
+    mujoco.mjtSensor.mjSENS_ACTUATORVEL,
+    mujoco.mjtSensor.mjSENS_USER,
+)
 
 
 def units_of(model: Any) -> dict[str, str]:
@@ -54,9 +58,13 @@ def units_of(model: Any) -> dict[str, str]:
         unit = "any" if kind in OPEN else SENSORS.get(kind, "none")
         if kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL):
             slide = int(model.jnt_type[int(sensor.objid[0])]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
-            unit = ("m" if slide else "rad") + ("" if kind == mujoco.mjtSensor.mjSENS_JOINTPOS else "/s")
+            unit = ("m" if slide else "rad") + (
+                "" if kind == mujoco.mjtSensor.mjSENS_JOINTPOS else "/s"
+            )
         width = int(sensor.dim[0])
-        units.update(dict.fromkeys([name] if width == 1 else [f"{name}[{i}]" for i in range(width)], unit))
+        units.update(
+            dict.fromkeys([name] if width == 1 else [f"{name}[{i}]" for i in range(width)], unit)
+        )
     return units
 
 
@@ -64,9 +72,13 @@ def check_unit(where: str, spec: ColumnSpec, unit: str) -> None:
     """Raise ExperimentError where a column's unit is not one of what it stands for. unit: the model's, as in `units_of`"""
     fitting = list(EVERY) if unit == "any" else list(FACTORS.get(unit, {}))
     if spec.unit is not None and spec.unit not in fitting:
-        raise ExperimentError(f"{where}.unit: {unknown('unit', spec.unit, fitting)}; for others there is scale")
+        raise ExperimentError(
+            f"{where}.unit: {unknown('unit', spec.unit, fitting)}; for others there is scale"
+        )
     if spec.unwrap and unit not in ("rad", "any"):
-        raise ExperimentError(f"{where}.unwrap: only angles jump by whole turns; a counter has a period")
+        raise ExperimentError(
+            f"{where}.unwrap: only angles jump by whole turns; a counter has a period"
+        )
 
 
 def converted(table: Table, spec: ColumnSpec) -> Array:

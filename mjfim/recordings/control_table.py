@@ -13,7 +13,9 @@ from mjfim.recordings.formats.read import read_table
 OF_DESIGN = ("qpos:", "qvel:", "act:", "gain:")  # what a design.csv holds beside t and the control
 
 
-def read_control(path: Path, t: Array, dt: float, names: tuple[str, ...], repeat: bool = False) -> Array:
+def read_control(
+    path: Path, t: Array, dt: float, names: tuple[str, ...], repeat: bool = False
+) -> Array:
     """(N, nu) control at times t: (N,), held between rows. Columns: t and each actuator's name (`ctrl:` optional).
 
     repeat: where the table ends early, it begins again
@@ -39,9 +41,13 @@ def read_control(path: Path, t: Array, dt: float, names: tuple[str, ...], repeat
         raise RecordingError(f"{path}: {unknown('column', strays[0], ['t', *names])}")
     if not np.isfinite(values).all() or not np.isfinite(stamps).all():
         bad = int(np.argmax(~np.isfinite(np.column_stack([stamps, values])).all(axis=1)))
-        raise RecordingError(f"{path}: NaN or infinite value in data row {bad + 1}; every row must be finite")
+        raise RecordingError(
+            f"{path}: NaN or infinite value in data row {bad + 1}; every row must be finite"
+        )
     if len(stamps) < 2 or np.any(np.diff(stamps) <= 0):
-        raise RecordingError(f"{path}: column 't' must increase from row to row and have at least two rows")
+        raise RecordingError(
+            f"{path}: column 't' must increase from row to row and have at least two rows"
+        )
     period = float(np.median(np.diff(stamps)))
     if repeat:
         t = stamps[0] + np.mod(t - t[0] + 1e-6 * dt, stamps[-1] + period - stamps[0])

@@ -20,14 +20,18 @@ def read_playback(path: Path, setup: Setup) -> Playback:
     wanted = ("t", *state_names(setup.model), *controls, *gain_names(setup.model, setup.controls))
     missing = next((name for name in wanted if name not in table), None)
     if missing is not None:
-        raise RecordingError(f"{path}: column {missing!r} is missing; it is no design.csv of this model")
+        raise RecordingError(
+            f"{path}: column {missing!r} is missing; it is no design.csv of this model"
+        )
     t = table["t"]
     if len(t) < 3:
         raise RecordingError(f"{path}: too few rows ({len(t)}); a playback needs at least 3")
     period = (t[-1] - t[0]) / (len(t) - 1)
     timestep = float(setup.model.opt.timestep)
     steps = round(period / timestep)
-    if steps < 1 or not np.abs(t - np.arange(len(t)) * steps * timestep).max() <= 1e-6 * timestep * len(t):
+    if steps < 1 or not np.abs(
+        t - np.arange(len(t)) * steps * timestep
+    ).max() <= 1e-6 * timestep * len(t):
         raise RecordingError(
             f"{path}: column 't' does not go from 0 in equal periods of whole timesteps ({timestep:g} s)"
         )
@@ -40,9 +44,14 @@ def read_playback(path: Path, setup: Setup) -> Playback:
         values = np.column_stack([table[name][:rows] for name in names])
         if not np.isfinite(values).all():
             row, column = np.argwhere(~np.isfinite(values))[0]
-            raise RecordingError(f"{path}: column {names[column]!r} has no number in data row {row + 1}")
+            raise RecordingError(
+                f"{path}: column {names[column]!r} has no number in data row {row + 1}"
+            )
         parts.append(values)
     state, ctrl, gain = parts
     return Playback(
-        np.arange(len(t)) * (steps * timestep), state, ctrl, gain.reshape(len(ctrl), len(controls), space.nx)
+        np.arange(len(t)) * (steps * timestep),
+        state,
+        ctrl,
+        gain.reshape(len(ctrl), len(controls), space.nx),
     )

@@ -26,7 +26,11 @@ STRETCH = 0.2  # [s] over which they are compared
 def doubts(setup: Setup, recording: Recording) -> tuple[str, ...]:
     """Sentences; none where nothing speaks against the data."""
     t = recording.t[:ROWS]
-    return (*_controls(setup, recording.ctrl[:ROWS]), *_rough(setup, recording), *_contradictions(setup, t, recording))
+    return (
+        *_controls(setup, recording.ctrl[:ROWS]),
+        *_rough(setup, recording),
+        *_contradictions(setup, t, recording),
+    )
 
 
 def _controls(setup: Setup, ctrl: Array) -> Iterator[str]:

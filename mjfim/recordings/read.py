@@ -21,7 +21,14 @@ from mjfim.recordings.formats.read import read_columns
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import ColumnSpec, RecordingSpec
 from mjfim.recordings.summary import Look, look
-from mjfim.recordings.validity import SECONDS, check_clock, check_finite, check_held, check_measured, held
+from mjfim.recordings.validity import (
+    SECONDS,
+    check_clock,
+    check_finite,
+    check_held,
+    check_measured,
+    held,
+)
 from mjfim.records.recording import Recording
 
 ROUNDING = 1e-9  # [s] by which a time may miss the window
@@ -57,7 +64,9 @@ def read_log(path: Path, setup: Setup) -> Logged:
     check_angles(str(path), setup.model, t, columns, stated)
     ctrl = np.column_stack([columns[f"ctrl:{name}"][:-1] for name in setup.controls])
     y = np.column_stack([columns[name] for name in measured])
-    summary = look(str(path), t, columns, {name: source.column for name, source in plan.items()}, dropped)
+    summary = look(
+        str(path), t, columns, {name: source.column for name, source in plan.items()}, dropped
+    )
     return Logged(Recording(t, ctrl, y, measured, str(path)), summary)
 
 
@@ -86,12 +95,18 @@ def _plan(table: Table, setup: Setup) -> dict[str, ColumnSpec]:
         known = {*controls, *setup.measurable}
         for name in table.names:
             if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
-                raise RecordingError(f"{table.source}: {unknown('column', name, ['t', *sorted(known)])}")
-        measured = {name: ColumnSpec(column=own[name]) for name in setup.outputs.names if name in own}
+                raise RecordingError(
+                    f"{table.source}: {unknown('column', name, ['t', *sorted(known)])}"
+                )
+        measured = {
+            name: ColumnSpec(column=own[name]) for name in setup.outputs.names if name in own
+        }
     if not any(name in measured for name in setup.outputs.names):
         taken = {setup.experiment.recording.time, *(s.column for s in plan.values())}
         strays = ", ".join(measured or [c for c in table.names if c not in taken]) or "none"
-        raise RecordingError(f"{table.source}: no measured column; {unknown('column', strays, setup.outputs.names)}")
+        raise RecordingError(
+            f"{table.source}: no measured column; {unknown('column', strays, setup.outputs.names)}"
+        )
     return {**plan, **measured}
 
 
@@ -105,7 +120,11 @@ def _own(table: Table, setup: Setup) -> dict[str, str]:
         if name.startswith(kind)
     }
     state = [c.name for c in components(model)]
-    wholes = {"qpos": state[: model.nq], "qvel": state[model.nq :], "ctrl": [f"ctrl:{n}" for n in setup.controls]}
+    wholes = {
+        "qpos": state[: model.nq],
+        "qvel": state[model.nq :],
+        "ctrl": [f"ctrl:{n}" for n in setup.controls],
+    }
     stated = setup.experiment.recording.sources
     if any(not name.startswith("ctrl:") for name in stated):
         del wholes["qpos"], wholes["qvel"]

@@ -27,7 +27,12 @@ class ColumnSpec(Section):
     """
 
     column: str
-    unit: Literal["rad", "deg", "rev", "rad/s", "deg/s", "rev/s", "rpm", "m", "cm", "mm", "m/s", "mm/s"] | None = None
+    unit: (
+        Literal[
+            "rad", "deg", "rev", "rad/s", "deg/s", "rev/s", "rpm", "m", "cm", "mm", "m/s", "mm/s"
+        ]
+        | None
+    ) = None
     scale: Finite = 1.0
     offset: Finite = 0.0
     signed: Literal[8, 16, 32] | None = None
@@ -61,4 +66,6 @@ class RecordingSpec(Section):
     @property
     def sources(self) -> dict[str, ColumnSpec]:
         """The columns, however they were written."""
-        return {k: ColumnSpec(column=v) if isinstance(v, str) else v for k, v in self.columns.items()}
+        return {
+            k: ColumnSpec(column=v) if isinstance(v, str) else v for k, v in self.columns.items()
+        }

@@ -47,7 +47,9 @@ class Look:
     columns: tuple[ColumnLook, ...]
 
 
-def look(file: str, t: Array, columns: Mapping[str, Array], sources: Mapping[str, str], dropped: int) -> Look:
+def look(
+    file: str, t: Array, columns: Mapping[str, Array], sources: Mapping[str, str], dropped: int
+) -> Look:
     """t: (M,) [s], M > 1;  columns: (M,) each by name;  sources: what they are called in the log"""
     steps = np.diff(t)
     median = float(np.median(steps))
@@ -72,4 +74,11 @@ def _column(name: str, source: str, values: Array) -> ColumnLook:
         return ColumnLook(name, source, float("nan"), float("nan"), empty, 0.0)
     apart = np.diff(there)
     apart = apart[apart > ROUNDING * np.abs(there[[0, -1]]).max()]
-    return ColumnLook(name, source, float(there[0]), float(there[-1]), empty, float(apart.min()) if len(apart) else 0.0)
+    return ColumnLook(
+        name,
+        source,
+        float(there[0]),
+        float(there[-1]),
+        empty,
+        float(apart.min()) if len(apart) else 0.0,
+    )

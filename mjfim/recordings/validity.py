@@ -22,7 +22,9 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None:
     """t: (M,) [s], as read in a unit;  first: row of the file that t begins with, from 0. Raises RecordingError."""
     if len(t) < FEWEST:
-        raise RecordingError(f"{where}: too few rows ({len(t)}); an identification needs at least {FEWEST}")
+        raise RecordingError(
+            f"{where}: too few rows ({len(t)}); an identification needs at least {FEWEST}"
+        )
     if not np.isfinite(t).all():
         row = int(np.argmax(~np.isfinite(t)))
         raise RecordingError(
@@ -58,9 +60,7 @@ def _backwards(where: str, t: Array, steps: Array, first: int) -> str:
         count = int(np.sum(steps == 0.0))
         return f"{place} (a duplicate{f', one of {count}' if count > 1 else ''}); every row needs its own time"
     if t[row + 1] - t[0] < 0.1 * (t[row] - t[0]) and row + 2 < len(t):
-        return (
-            f"{place} (the clock began anew, or wrapped around); cut the log there by recording.window, or in two files"
-        )
+        return f"{place} (the clock began anew, or wrapped around); cut the log there by recording.window, or in two files"
     return f"{place} (rows out of order); sort them by time"
 
 
@@ -111,7 +111,9 @@ def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> N
     if np.isnan(values[0]):
         row = int(np.argmax(~np.isnan(values))) if np.isfinite(values).any() else None
         begins = "it holds no number" if row is None else f"it begins {t[row] - t[0]:g} s later"
-        raise RecordingError(f"{where} has no value in the first row; {begins}; every control is needed from the start")
+        raise RecordingError(
+            f"{where} has no value in the first row; {begins}; every control is needed from the start"
+        )
     limit = gap_limit(t, gap)
     if age.max() > limit:
         end = int(np.argmax(age))

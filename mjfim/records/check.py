@@ -102,7 +102,10 @@ class Roughness:
     causes: tuple[str, ...]
 
     def __str__(self) -> str:
-        cause = ", ".join(self.causes) or "no contact, friction or limit acts there: the motion may be chaotic"
+        cause = (
+            ", ".join(self.causes)
+            or "no contact, friction or limit acts there: the motion may be chaotic"
+        )
         size = f"{100 * self.error:.2g} %" if np.isfinite(self.error) else "without bound"
         return (
             f"not smooth: derivatives by two difference steps disagree by {size} for {self.parameter}, first at sample "

@@ -19,7 +19,9 @@ class Combination:
 
     def __str__(self) -> str:
         head, *rest = zip(self.members, self.coefficients, strict=True)
-        return " ".join([head[0], *(f"{'+' if c > 0 else '-'} {_number(abs(c))}{name}" for name, c in rest)])
+        return " ".join(
+            [head[0], *(f"{'+' if c > 0 else '-'} {_number(abs(c))}{name}" for name, c in rest)]
+        )
 
 
 def rows_of(groups: Sequence[Group], names: Sequence[str]) -> Array:

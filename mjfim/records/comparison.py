@@ -117,7 +117,11 @@ class Comparison:
         ours = self.design
         if ours is None:
             return ()
-        better = [r for r in self.rows if r.sound and r is not ours and (not ours.sound or self.gain(r, ours) > TIE)]
+        better = [
+            r
+            for r in self.rows
+            if r.sound and r is not ours and (not ours.sound or self.gain(r, ours) > TIE)
+        ]
         return tuple(sorted(better, key=lambda row: row.cost))
 
     def gain(self, row: Row, other: Row) -> float:
@@ -129,12 +133,20 @@ class Comparison:
     @property
     def ok(self) -> bool:
         """All ran, the design may be played, and nothing beats it."""
-        return not self.interrupted and self.design is not None and self.design.sound and not self.beating
+        return (
+            not self.interrupted
+            and self.design is not None
+            and self.design.sound
+            and not self.beating
+        )
 
     @property
     def verdict(self) -> tuple[str, ...]:
         """Sentences, the important one first."""
-        return (_verdict(self), *(("Interrupted: only the methods shown are finished.",) if self.interrupted else ()))
+        return (
+            _verdict(self),
+            *(("Interrupted: only the methods shown are finished.",) if self.interrupted else ()),
+        )
 
 
 def _verdict(c: Comparison) -> str:
@@ -147,7 +159,9 @@ def _verdict(c: Comparison) -> str:
     if not ours.sound:
         return f"The design {ours.outcome.value}; the best that may be played is {rival.title} ({sigmas})."
     if c.beating:
-        told = ", ".join(f"{row.title} (J {_percent(c.gain(row, ours))} lower)" for row in c.beating)
+        told = ", ".join(
+            f"{row.title} (J {_percent(c.gain(row, ours))} lower)" for row in c.beating
+        )
         return f"The design is beaten by {told}: {sigmas}."
     won = c.gain(ours, rival)
     if won <= TIE:

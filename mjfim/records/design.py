@@ -45,7 +45,9 @@ class Status(Enum):
     """How an optimisation ended; the value is a sentence for the user."""
 
     CONVERGED = "converged: the slope fell below tolerance × cost (a local optimum)"
-    SMOOTHED = "converged on a smooth λ_min, used because the smallest eigenvalues meet (a local optimum)"
+    SMOOTHED = (
+        "converged on a smooth λ_min, used because the smallest eigenvalues meet (a local optimum)"
+    )
     ROUGH = "ended where derivatives hardly exist (contact, dry friction or clamps): the numbers are indications, see warnings"
     STALLED = "stalled: no step along the descent lowers the cost any more, at the accuracy of the differences"
     MAX_ITERATIONS = "stopped at max_iterations or seconds before convergence; raise them, or start from the result"

@@ -75,7 +75,16 @@ class Estimate:
         for name, own in (("sandwich", self.std), ("between", np.zeros(count))):
             if len(getattr(self, name)) != count:
                 object.__setattr__(self, name, own)
-        names = ("theta", "std", "covariance", "initial_theta", "data", "sandwich", "interval", "between")
+        names = (
+            "theta",
+            "std",
+            "covariance",
+            "initial_theta",
+            "data",
+            "sandwich",
+            "interval",
+            "between",
+        )
         freeze(self, *names)
 
 
@@ -128,7 +137,9 @@ class Prediction:
         """Geometric mean over outputs of identified over nominal root mean square error."""
         own, plain = self.identified.rms, self.nominal.rms
         both = np.isfinite(own) & np.isfinite(plain) & (plain > 0.0) & (own > 0.0)
-        return float(np.exp(np.mean(np.log(own[both] / plain[both])))) if both.any() else float("nan")
+        return (
+            float(np.exp(np.mean(np.log(own[both] / plain[both])))) if both.any() else float("nan")
+        )
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,9 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import Past, redesigned, restated
 
-PROGRESS = 0.99  # of the last round's worst σ over the wanted one; a round that leaves more made none
+PROGRESS = (
+    0.99  # of the last round's worst σ over the wanted one; a round that leaves more made none
+)
 JUMP = 4.0  # standard deviations that an estimate moves from one round to the next only where something is wrong
 Measure = Callable[[Design, int], Recording | Sequence[Recording] | None]
 
@@ -105,7 +107,9 @@ class _Loop:
         recordings = (answer,) if isinstance(answer, Recording) else tuple(answer or ())
         if not recordings:
             return Outcome.WAITING
-        self._record(Played(recordings, found.theta, found.final.std, found.trajectory.ctrl), found, told)
+        self._record(
+            Played(recordings, found.theta, found.final.std, found.trajectory.ctrl), found, told
+        )
         self.pending = None
         return None
 
@@ -126,14 +130,19 @@ class _Loop:
             told = f"no design at the estimate, so it is made where the last was: {error}"
             return redesigned(self.base, past, last.theta, self.monitor, self.executor), (told,)
 
-    def _record(self, played: Played, found: Design | None = None, told: tuple[str, ...] = ()) -> None:
+    def _record(
+        self, played: Played, found: Design | None = None, told: tuple[str, ...] = ()
+    ) -> None:
         """Identify from all recordings and keep the round."""
         p, last = self.base.parameters, self.rounds[-1] if self.rounds else None
         theta = p.guess if played.theta is None else played.theta
         blank = np.full(len(p), np.nan)
         recordings = [*(r for each in self.rounds for r in each.recordings), *played.recordings]
         estimate = identified(self.base, recordings, theta if last is None else last.estimate.theta)
-        warnings = [*told, *(f"design: {sentence}" for sentence in (found.warnings if found is not None else ()))]
+        warnings = [
+            *told,
+            *(f"design: {sentence}" for sentence in (found.warnings if found is not None else ())),
+        ]
         warnings += [*estimate.warnings, *self._suspicions(estimate)]
         self.rounds.append(
             Round(
@@ -176,7 +185,9 @@ class _Loop:
     def _concluded(self, status: Outcome) -> Campaign:
         warnings = [f"round {r.number}: {sentence}" for r in self.rounds for sentence in r.warnings]
         names = self.base.parameters.names
-        return Campaign(names, self.wanted, tuple(self.rounds), status, self.pending, tuple(warnings))
+        return Campaign(
+            names, self.wanted, tuple(self.rounds), status, self.pending, tuple(warnings)
+        )
 
 
 def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Estimate:
@@ -199,7 +210,11 @@ def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Es
 
 def _doubts(estimate: Estimate, wanted: Array) -> Iterator[str]:
     """Why the formal standard deviations of wanted parameters are not to be trusted, besides a misfit."""
-    at = [n for n, w in zip(estimate.parameters, wanted, strict=True) if np.isfinite(w) and n in estimate.at_bound]
+    at = [
+        n
+        for n, w in zip(estimate.parameters, wanted, strict=True)
+        if np.isfinite(w) and n in estimate.at_bound
+    ]
     if at:
         yield f"wanted, but at a bound: {', '.join(at)}"
     if not estimate.success and not estimate.combinations and not at:

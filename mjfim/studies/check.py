@@ -40,14 +40,21 @@ def check(
     setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
     if recordings and trajectory is not None:
         raise RecordingError("check either recordings or a designed trajectory, not both")
-    curve = setup.initial if trajectory is None else setup.plant.simulate(setup.theta, trajectory.ctrl)
+    curve = (
+        setup.initial if trajectory is None else setup.plant.simulate(setup.theta, trajectory.ctrl)
+    )
     if recordings:
         fit = Fit(setup, recordings, data_only=True)
         longest = max(fit.tracks, key=lambda track: len(track.ctrl))
         curve = setup.plant.simulate(setup.theta, longest.ctrl[: setup.samples])
         recorded = fit.sensed(fit.begin(setup.theta))
-        seen = survey_rows(setup, curve, *(np.concatenate(part) for part in zip(*recorded, strict=True)))
-        tells, horizon = [J.T @ J for J, _ in recorded], float(sum(track.t[-1] for track in fit.tracks))
+        seen = survey_rows(
+            setup, curve, *(np.concatenate(part) for part in zip(*recorded, strict=True))
+        )
+        tells, horizon = (
+            [J.T @ J for J, _ in recorded],
+            float(sum(track.t[-1] for track in fit.tracks)),
+        )
         source = f"{len(recordings)} recording{'s' if len(recordings) > 1 else ''}"
     problem = setup.problem
     problem = replace(problem, running=replace(problem.running, desired=curve.state))
@@ -61,14 +68,21 @@ def check(
     judged = replace(problem, information=replace(problem.information, basis=seen.basis))
     tested = self_test(setup, judged, judged.judged(point))
     p = setup.parameters
-    common = sum((shared(each, p.prior_information, p.private) for each in tells), start=np.zeros_like(setup.prior))
+    common = sum(
+        (shared(each, p.prior_information, p.private) for each in tells),
+        start=np.zeros_like(setup.prior),
+    )
     return _concluded(setup, seen, common, horizon, source, tested)
 
 
-def _concluded(setup: Setup, seen: Survey, data: Array, horizon: float, source: str, tested: SelfTest) -> Check:
+def _concluded(
+    setup: Setup, seen: Survey, data: Array, horizon: float, source: str, tested: SelfTest
+) -> Check:
     """data: (p, p) of all that was looked at, each start's own nuisance marginalised"""
     p = setup.parameters
-    information = replace(setup.information, prior=setup.prior, basis=seen.here.basis if seen.here.count else None)
+    information = replace(
+        setup.information, prior=setup.prior, basis=seen.here.basis if seen.here.count else None
+    )
     total = data + setup.prior
     covariance = information.covariance(total)
     std = np.full(len(p), np.inf)
@@ -102,7 +116,9 @@ def _concluded(setup: Setup, seen: Survey, data: Array, horizon: float, source: 
     )
 
 
-def _rows(setup: Setup, information: Information, data: Array, std: Array, horizon: float) -> Iterator[Row]:
+def _rows(
+    setup: Setup, information: Information, data: Array, std: Array, horizon: float
+) -> Iterator[Row]:
     p = setup.parameters
     for j, parameter in enumerate(p.parameters):
         value = float(setup.theta[j])
@@ -110,7 +126,9 @@ def _rows(setup: Setup, information: Information, data: Array, std: Array, horiz
         size = abs(value) if plain else float(p.step[j])
         stated = parameter.wanted is not None
         wanted = parameter.wanted or DEFAULT_WANTED * size
-        needed = 0 if parameter.nuisance else _repetitions(information, data, setup.prior, j, wanted)
+        needed = (
+            0 if parameter.nuisance else _repetitions(information, data, setup.prior, j, wanted)
+        )
         yield Row(
             parameter.name,
             parameter.unit,
@@ -126,7 +144,9 @@ def _rows(setup: Setup, information: Information, data: Array, std: Array, horiz
         )
 
 
-def _repetitions(information: Information, data: Array, prior: Array, parameter: int, wanted: float) -> int:
+def _repetitions(
+    information: Information, data: Array, prior: Array, parameter: int, wanted: float
+) -> int:
     """Least number of repetitions whose information, with the prior, brings a parameter to the wanted sigma; 0: none do."""
     t = np.arange(len(data)) if information.interest is None else information.interest
     place = int(np.flatnonzero(t == parameter)[0])
@@ -205,7 +225,11 @@ def _verdict(
     if not late and tested.passed and not open_ and not not_here:
         yield f"all that can be told alone reaches its wanted sigma from {source}: nothing more is needed"
     elif late:
-        reach = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s)" if worst.repetitions else "no repetition"
+        reach = (
+            f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s)"
+            if worst.repetitions
+            else "no repetition"
+        )
         yield (
             f"not known to the wanted sigma from {source} alone: {len(late)} of {len(alone)} parameters, above all "
             f"{worst.name}: {reach} for {worst.wanted:.3g}. An excitation that is designed (`mjfim design`) tells more"

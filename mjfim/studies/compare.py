@@ -71,7 +71,17 @@ def compare(
     chosen = (*chosen_methods(setup, methods), DESIGN)
     judge = Judge(setup, _combinations(setup))
     most = np.inf if steps is None else float(steps)
-    job = Job(setup.experiment, DESIGN, seconds, most, seed, (0, 1), judge.stage.basis, setup.added, threads)
+    job = Job(
+        setup.experiment,
+        DESIGN,
+        seconds,
+        most,
+        seed,
+        (0, 1),
+        judge.stage.basis,
+        setup.added,
+        threads,
+    )
     rows: list[Row] = []
     interrupted = False
     try:
@@ -106,12 +116,16 @@ def compare(
 def chosen_methods(setup: Setup, methods: Sequence[str] | None) -> tuple[str, ...]:
     """Keys of the baselines that are to run. Raises ExperimentError for others."""
     if methods is None:
-        return tuple(key for key, baseline in METHODS.items() if setup.enforced or not baseline.limited)
+        return tuple(
+            key for key, baseline in METHODS.items() if setup.enforced or not baseline.limited
+        )
     for key in methods:
         if key not in METHODS and key != DESIGN:
             raise ExperimentError(f"methods: {unknown('method', key, [*METHODS, DESIGN])}")
         if key in METHODS and METHODS[key].limited and not setup.enforced:
-            raise ExperimentError(f"methods: {key} needs hard limits; {setup.experiment.source} has none that hold")
+            raise ExperimentError(
+                f"methods: {key} needs hard limits; {setup.experiment.source} has none that hold"
+            )
     return tuple(key for key in dict.fromkeys(methods) if key != DESIGN)
 
 
@@ -145,20 +159,28 @@ def _tried(job: Job, executor: Executor | None, tell: Tell) -> Attempt:
         salvaged(executor, futures)
         raise
     best = min(attempts, key=lambda attempt: (attempt.cost, -attempt.share))
-    return replace(best, seconds=max(a.seconds for a in attempts), steps=sum(a.steps for a in attempts))
+    return replace(
+        best, seconds=max(a.seconds for a in attempts), steps=sum(a.steps for a in attempts)
+    )
 
 
 def _designed(judge: Judge, job: Job, executor: Executor | None, tell: Tell) -> tuple[Row, bool]:
     """The design with the same budget, and whether the user interrupted it."""
     d = job.experiment.descent
-    stated = job.experiment.replace(descent={"seconds": job.seconds, "max_iterations": max(d.max_iterations, PLENTY)})
+    stated = job.experiment.replace(
+        descent={"seconds": job.seconds, "max_iterations": max(d.max_iterations, PLENTY)}
+    )
     meter = Meter(job, tell)
     try:
         found = design(Setup(stated, job.threads, added=job.added), meter, executor=executor)
     except SimulationDiverged:
         return judge.row(DESIGN, OURS, Attempt(seconds=meter.seconds, steps=meter.steps)), False
-    attempt = Attempt(found.trajectory.ctrl, found.final.cost, 0.0, found.found_by, found.seconds, found.steps)
-    row = judge.row(DESIGN, OURS, attempt, "" if meter.spent else found.status.value.split(":")[0].split(";")[0])
+    attempt = Attempt(
+        found.trajectory.ctrl, found.final.cost, 0.0, found.found_by, found.seconds, found.steps
+    )
+    row = judge.row(
+        DESIGN, OURS, attempt, "" if meter.spent else found.status.value.split(":")[0].split(";")[0]
+    )
     return row, found.status is Status.INTERRUPTED and not meter.spent
 
 
@@ -183,7 +205,9 @@ class Meter:
             self.cost = min(self.cost, row.cost)
         seconds, steps = self.seconds / self.job.seconds, self.steps / self.job.steps
         self.tell(max(seconds, steps), self.cost)
-        if seconds > LATE or steps > 1.0:  # a design keeps the time by itself, but for its last iterate
+        if (
+            seconds > LATE or steps > 1.0
+        ):  # a design keeps the time by itself, but for its last iterate
             self.spent = True
             raise KeyboardInterrupt
 
@@ -205,7 +229,9 @@ class Judge:
         if attempt.control is None:
             return self._nothing(method, title, attempt, note)
         first: Row | None = None
-        for share in [1.0] if method == DESIGN or not np.isfinite(attempt.cost) else SHRUNK.tolist():
+        for share in (
+            [1.0] if method == DESIGN or not np.isfinite(attempt.cost) else SHRUNK.tolist()
+        ):
             control = self.setup.centre + share * (attempt.control - self.setup.centre)
             told = note if share == 1.0 else f"shrunk to {100.0 * share:.3g} %"
             found = self._looked(method, title, replace(attempt, control=control), told)
@@ -218,7 +244,12 @@ class Judge:
         """None where the simulation diverges."""
         setup = self.setup
         point = None if attempt.control is None else fine_point(self.stage, attempt.control)
-        if point is None or point.trajectory is None or point.criterion is None or point.information is None:
+        if (
+            point is None
+            or point.trajectory is None
+            or point.criterion is None
+            or point.information is None
+        ):
             return None
         found = audit(setup, point.trajectory)
         outcome = Outcome.INSIDE if found.kept else Outcome.OUTSIDE
@@ -252,4 +283,19 @@ class Judge:
         outcome = Outcome.NONE if attempt.control is None else Outcome.NOTHING
         blank = np.full(len(self.setup.parameters), np.nan)
         taken = (attempt.seconds, attempt.steps)
-        return Row(method, title, outcome, None, np.nan, np.nan, blank, np.nan, np.nan, *taken, {}, {}, "", note)
+        return Row(
+            method,
+            title,
+            outcome,
+            None,
+            np.nan,
+            np.nan,
+            blank,
+            np.nan,
+            np.nan,
+            *taken,
+            {},
+            {},
+            "",
+            note,
+        )

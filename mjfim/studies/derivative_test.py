@@ -34,10 +34,15 @@ def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
         return found
     active = first_active(setup.model_at(setup.theta), trajectory)
     if active is None:
-        return replace(found, suspect="the motion may be too unstable, or something switches (muscle activation)")
+        return replace(
+            found,
+            suspect="the motion may be too unstable, or something switches (muscle activation)",
+        )
     sample, causes = active
     where = f"sample {sample} (t = {trajectory.t[sample]:.4g} s)"
-    return replace(found, suspect=f"something that switches acts from {where} on: {', '.join(causes)}")
+    return replace(
+        found, suspect=f"something that switches acts from {where} on: {', '.join(causes)}"
+    )
 
 
 def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivity) -> float:
@@ -48,7 +53,9 @@ def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivi
         return np.inf
     psi = sensitivity.psi
     recursion = Recursion(line.A)
-    own = np.stack([recursion.forward(psi[0, :, j], line.E[..., j]) for j in range(psi.shape[2])], axis=2)
+    own = np.stack(
+        [recursion.forward(psi[0, :, j], line.E[..., j]) for j in range(psi.shape[2])], axis=2
+    )
     size = np.abs(psi).max(axis=(0, 1))
     moving = (size > 0.0) & visible_columns(setup, setup.noise.whiten(sensitivity.G))
     if not moving.any():
@@ -64,7 +71,10 @@ def slope_error(setup: Setup, problem: DesignProblem, point: Point) -> float:
     K = regulator_for(setup).gain(expansion)
     zeta = LBFGS(np.diag(setup.control_weight) * setup.dt)(expansion, K)
     size = setup.plant.steps_of(point.trajectory)
-    relative = max(np.abs(zeta.z / size[: zeta.z.shape[1]]).max(), np.abs(zeta.v / size[zeta.z.shape[1] :]).max())
+    relative = max(
+        np.abs(zeta.z / size[: zeta.z.shape[1]]).max(),
+        np.abs(zeta.v / size[zeta.z.shape[1] :]).max(),
+    )
     if relative == 0.0:
         return 0.0
     unit = TangentCurve(zeta.z / relative, zeta.v / relative)
@@ -72,7 +82,12 @@ def slope_error(setup: Setup, problem: DesignProblem, point: Point) -> float:
 
 
 def _slope_error(
-    problem: DesignProblem, point: Point, expansion: Expansion, zeta: TangentCurve, K: Array, step: float
+    problem: DesignProblem,
+    point: Point,
+    expansion: Expansion,
+    zeta: TangentCurve,
+    K: Array,
+    step: float,
 ) -> float:
     ends = [problem.value(problem.project(point, zeta, sign * step, K)) for sign in (1.0, -1.0)]
     expected = expansion.slope(zeta)

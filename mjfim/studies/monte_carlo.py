@@ -59,13 +59,17 @@ def monte_carlo(
         _exact(setup, curve)
     sets, information = {}, {}
     try:
-        for rng, (name, curve) in zip(np.random.default_rng(seed).spawn(len(named)), named.items(), strict=True):
+        for rng, (name, curve) in zip(
+            np.random.default_rng(seed).spawn(len(named)), named.items(), strict=True
+        ):
             tell = None if progress is None else (lambda share, name=name: progress(name, share))
             sets[name], information[name] = _trial_set(setup, curve, trials, rng, tell)
     except KeyboardInterrupt:
         if not sets:
             raise
-    return Study(setup.parameters.names, setup.parameters.true, setup.measure_rate, sets, information)
+    return Study(
+        setup.parameters.names, setup.parameters.true, setup.measure_rate, sets, information
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +108,11 @@ class Trials:
         y[mask] = measured
         y = np.where(mask, y @ noise.factor.T, np.nan)
         return Recording(
-            np.arange(len(y), dtype=np.float64) * self.setup.dt, self.ctrl, y, self.setup.outputs.names, "trial"
+            np.arange(len(y), dtype=np.float64) * self.setup.dt,
+            self.ctrl,
+            y,
+            self.setup.outputs.names,
+            "trial",
         )
 
     def jacobian(self, theta: Array, predicted: Array, relative: float = 1e-6) -> Array:
@@ -119,7 +127,11 @@ class Trials:
 
 
 def _trial_set(
-    setup: Setup, curve: Trajectory, count: int, rng: np.random.Generator, tell: Callable[[float], None] | None
+    setup: Setup,
+    curve: Trajectory,
+    count: int,
+    rng: np.random.Generator,
+    tell: Callable[[float], None] | None,
 ) -> tuple[TrialSet, Array]:
     clock = time.perf_counter()
     y, G = _exact(setup, curve)
@@ -134,14 +146,18 @@ def _trial_set(
         trials = Trials(setup, curve.ctrl, whitened)
         estimates.append(_solve(trials, _shared(setup, trials), tell))
     every = np.concatenate(estimates)
-    return _statistics(every, np.asarray(np.linalg.inv(information)), time.perf_counter() - clock), information
+    return _statistics(
+        every, np.asarray(np.linalg.inv(information)), time.perf_counter() - clock
+    ), information
 
 
 def _exact(setup: Setup, curve: Trajectory) -> tuple[Array, Array]:
     """Noise-free outputs (N+1, ny) at the true values and their derivative (N+1, ny, p)."""
     exact = setup.plant.predict(setup.parameters.true, curve.ctrl)
     if exact is None:
-        raise SimulationDiverged("the simulation diverges at the true parameters under this control")
+        raise SimulationDiverged(
+            "the simulation diverges at the true parameters under this control"
+        )
     return exact
 
 
@@ -158,14 +174,19 @@ def _shared(setup: Setup, trials: Trials) -> Shared:
         return setup.noise.rows(predicted[1])
 
     J = jacobian(theta)
-    bend = np.stack([(jacobian(theta + e) - jacobian(theta - e)) / (2 * e.max()) for e in np.diag(h)])
+    bend = np.stack(
+        [(jacobian(theta + e) - jacobian(theta - e)) / (2 * e.max()) for e in np.diag(h)]
+    )
     return Shared(theta, J, bend, np.sqrt(np.diag(np.linalg.inv(J.T @ J))))
 
 
 def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None) -> Array:
     """(m, p) estimates; NaN where a trial failed."""
     m = len(trials.measured)
-    theta = shared.theta + (trials.measured - trials.outputs(shared.theta[None])[0]) @ np.linalg.pinv(shared.J).T
+    theta = (
+        shared.theta
+        + (trials.measured - trials.outputs(shared.theta[None])[0]) @ np.linalg.pinv(shared.J).T
+    )
     for k in range(SHARED_STEPS - 1):
         predicted, finite = trials.outputs(theta)
         step = _gauss_newton(shared.jacobian(theta), trials.measured - predicted)

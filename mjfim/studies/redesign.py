@@ -93,7 +93,9 @@ def _phi(setup: Setup, control: Array) -> float:
     return value
 
 
-def restated(base: Setup, theta: Array | None = None, estimate: Estimate | None = None) -> Experiment:
+def restated(
+    base: Setup, theta: Array | None = None, estimate: Estimate | None = None
+) -> Experiment:
     """The experiment as a redesign states it: guesses at theta, (p,), scales as they are, no true values.
 
     Guesses keep a little inside bounds. A whole inertia moves only where the recordings show all of its coordinates. With
@@ -120,7 +122,9 @@ def restated(base: Setup, theta: Array | None = None, estimate: Estimate | None 
             tables[own.name] = {**alone, **_moved(base, j, theta, estimate)}
     values = e.model_dump(exclude_unset=True)
     cost = {**values.get("cost", {}), "linearize_at": "guess"}
-    return Experiment(**{**values, "parameters": tables, "cost": cost}, directory=e.directory, source=e.source)
+    return Experiment(
+        **{**values, "parameters": tables, "cost": cost}, directory=e.directory, source=e.source
+    )
 
 
 def _moved(base: Setup, j: int, theta: Array | None, estimate: Estimate | None) -> dict[str, Any]:
@@ -132,7 +136,9 @@ def _moved(base: Setup, j: int, theta: Array | None, estimate: Estimate | None) 
     gap = min(INSIDE * size, 0.25 * (high - low))
     guess = float(np.clip(theta[j], low + gap, high - gap))
     keys = {"guess": guess, "scale": own.scale}
-    drawn = base.experiment.robust is not None and (own.prior is not None or np.isfinite(own.bounds).all())
+    drawn = base.experiment.robust is not None and (
+        own.prior is not None or np.isfinite(own.bounds).all()
+    )
     if drawn and estimate is not None and np.isfinite(estimate.std[j]):
         reach = max(KNOWN * float(estimate.std[j]), 1e-9 * size)
         return {**keys, "bounds": (max(low, guess - reach), min(high, guess + reach))}

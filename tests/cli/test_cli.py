@@ -41,7 +41,13 @@ DESIGN = {
 ESTIMATE = {"estimate.json", "identified.xml", "estimate.rrd"} | {
     f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions")
 }
-STUDY = {"montecarlo.json", "histogram_m.png", "histogram_l.png", "histogram_c.png", "table_covariance.png"}
+STUDY = {
+    "montecarlo.json",
+    "histogram_m.png",
+    "histogram_l.png",
+    "histogram_c.png",
+    "table_covariance.png",
+}
 
 
 def run(*words: object) -> Result:
@@ -58,9 +64,18 @@ def write_experiment(home: Path, **lines: str) -> Path:
         if not (home / file).exists():
             shutil.copy(MODELS / file, home)
     text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
-    for key, value in {"horizon": "1.0", "tolerance": "0.1", "max_iterations": "40", **lines}.items():
-        name, found = ("control", '"') if key == "start" else (key, "")  # the cost has a key `control` too
-        text, count = re.subn(rf"^{name} = {found}.*$", f"{name} = {value}", text, flags=re.MULTILINE)
+    for key, value in {
+        "horizon": "1.0",
+        "tolerance": "0.1",
+        "max_iterations": "40",
+        **lines,
+    }.items():
+        name, found = (
+            ("control", '"') if key == "start" else (key, "")
+        )  # the cost has a key `control` too
+        text, count = re.subn(
+            rf"^{name} = {found}.*$", f"{name} = {value}", text, flags=re.MULTILINE
+        )
         if count != 1:
             raise ValueError(f"{key} does not stand exactly once in the experiment file")
     path = home / "study.toml"
@@ -158,7 +173,10 @@ def test_simulate_leaves_a_recording(study: Path, recorded: Path, archived: Path
 def test_simulate_keeps_its_seed(home: Path, study: Path, recorded: Path, archived: Path) -> None:
     """Same seed, same file; another seed, another."""
     for seed, same in ((1, True), (2, False)):
-        assert run("simulate", study, archived, "-o", home / "again.csv", "--seed", seed).exit_code == 0
+        assert (
+            run("simulate", study, archived, "-o", home / "again.csv", "--seed", seed).exit_code
+            == 0
+        )
         assert ((home / "again.csv").read_bytes() == recorded.read_bytes()) is same
 
 
@@ -177,8 +195,22 @@ def test_identify_several_recordings(
     home: Path, study: Path, recorded: Path, identified: Result, tmp_path: Path
 ) -> None:
     """Two recordings tell more than one, and each gets its picture; newton arrives at the same place."""
-    assert run("simulate", study, home / "out" / "design.npz", "-o", tmp_path / "b.csv", "--seed", 5).exit_code == 0
-    result = run("identify", study, recorded, tmp_path / "b.csv", "-o", tmp_path / "fit", "--method", "newton")
+    assert (
+        run(
+            "simulate", study, home / "out" / "design.npz", "-o", tmp_path / "b.csv", "--seed", 5
+        ).exit_code
+        == 0
+    )
+    result = run(
+        "identify",
+        study,
+        recorded,
+        tmp_path / "b.csv",
+        "-o",
+        tmp_path / "fit",
+        "--method",
+        "newton",
+    )
     assert result.exit_code == 0
     assert names(tmp_path / "fit") == (ESTIMATE - {"fit.png"}) | {"fit_1.png", "fit_2.png"}
     both, one = read(tmp_path / "fit" / "estimate.json"), loads(identified.stdout)
@@ -188,14 +220,28 @@ def test_identify_several_recordings(
 
 def test_montecarlo_leaves_its_files(home: Path, study: Path, archived: Path) -> None:
     """For the start and the design, at a lower measurement rate."""
-    words = ("montecarlo", study, archived, "-o", home / "mc", "--trials", 20, "--seed", 3, "--measure-rate", 25)
+    words = (
+        "montecarlo",
+        study,
+        archived,
+        "-o",
+        home / "mc",
+        "--trials",
+        20,
+        "--seed",
+        3,
+        "--measure-rate",
+        25,
+    )
     result = run(*words, "--json")
     assert result.exit_code == 0
     assert names(home / "mc") == STUDY
     data = read(home / "mc" / "montecarlo.json")
     assert loads(result.stdout) == data
     assert data["measure_rate"] == pytest.approx(25.0)
-    assert [(data[name]["trials"], data[name]["failed"]) for name in ("initial", "final")] == [(20, 0)] * 2
+    assert [(data[name]["trials"], data[name]["failed"]) for name in ("initial", "final")] == [
+        (20, 0)
+    ] * 2
     assert np.all(np.diag(data["final"]["crlb"]) < np.diag(data["initial"]["crlb"]))
 
 
@@ -216,7 +262,10 @@ def test_replay_of_a_lonely_archive(study: Path, archived: Path, tmp_path: Path)
     result = run("replay", tmp_path / "design.npz", "--save", target)
     assert (result.exit_code, target.exists()) == (2, False)
     assert "name the experiment with --experiment" in result.stderr
-    assert run("replay", tmp_path / "design.npz", "--save", target, "--experiment", study).exit_code == 0
+    assert (
+        run("replay", tmp_path / "design.npz", "--save", target, "--experiment", study).exit_code
+        == 0
+    )
     assert target.is_file()
 
 
@@ -268,11 +317,17 @@ def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
     ("lines", "status", "satisfied"),
     [
         ({"max_iterations": "1"}, "max_iterations", True),
-        ({"max_iterations": "40\n[limits]\nvelocity = { slide = 1e-3 }\nenforce = false"}, "converged", False),
+        (
+            {"max_iterations": "40\n[limits]\nvelocity = { slide = 1e-3 }\nenforce = false"},
+            "converged",
+            False,
+        ),
     ],
     ids=["not-converged", "limits-violated"],
 )
-def test_design_that_misses_its_goal(tmp_path: Path, lines: dict[str, str], status: str, satisfied: bool) -> None:
+def test_design_that_misses_its_goal(
+    tmp_path: Path, lines: dict[str, str], status: str, satisfied: bool
+) -> None:
     """Exit code 1 and a summary that says why."""
     result = run("design", write_experiment(tmp_path, **lines), "-o", tmp_path / "out", "--json")
     data = loads(result.stdout)
@@ -280,7 +335,9 @@ def test_design_that_misses_its_goal(tmp_path: Path, lines: dict[str, str], stat
     assert bool(data["warnings"]) is not satisfied
 
 
-def test_misfit(study: Path, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_misfit(
+    study: Path, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A recording that the model cannot explain: results are written, the exit code and the text say so."""
     header, *rows = recorded.read_text(encoding="utf-8").splitlines()
     cells = [row.split(",") for row in rows]
@@ -309,7 +366,10 @@ def misused(result: Result, *fragments: str) -> None:
 
 
 BAD_LINES: dict[str, tuple[dict[str, str], list[str]]] = {
-    "unknown key": ({"horizon": "1.0\nhorizn = 2"}, ["study.toml", "horizn", "unknown key", "horizon"]),
+    "unknown key": (
+        {"horizon": "1.0\nhorizn = 2"},
+        ["study.toml", "horizn", "unknown key", "horizon"],
+    ),
     "bad value": ({"rate": "-1"}, ["study.toml", "rate", "greater than 0"]),
     "bad rate": ({"rate": "33.0"}, ["study.toml", "rate: 33 Hz", "valid"]),
     "bad syntax": ({"rate": ""}, ["study.toml", "not valid TOML"]),
@@ -331,20 +391,34 @@ def test_bad_experiment(name: str, tmp_path: Path) -> None:
 def test_missing_inputs(study: Path, archived: Path, tmp_path: Path) -> None:
     """No experiment, no design, no recording, nothing to replay."""
     out = tmp_path / "out"
-    misused(run("design", tmp_path / "gone.toml", "-o", out), "gone.toml", "cannot read the experiment file")
-    misused(run("simulate", study, tmp_path / "gone.npz", "-o", out / "r.csv"), "gone.npz: no such design file")
-    misused(run("montecarlo", study, tmp_path / "gone.npz", "-o", out), "gone.npz: no such design file")
+    misused(
+        run("design", tmp_path / "gone.toml", "-o", out),
+        "gone.toml",
+        "cannot read the experiment file",
+    )
+    misused(
+        run("simulate", study, tmp_path / "gone.npz", "-o", out / "r.csv"),
+        "gone.npz: no such design file",
+    )
+    misused(
+        run("montecarlo", study, tmp_path / "gone.npz", "-o", out), "gone.npz: no such design file"
+    )
     misused(run("identify", study, tmp_path / "gone.csv", "-o", out), "gone.csv: no such file")
     misused(run("replay", tmp_path / "gone", "--save", out / "x.rrd"), "no such file or folder")
     (tmp_path / "notes.txt").touch()
     misused(
-        run("replay", tmp_path / "notes.txt", "--save", out / "x.rrd"), "folder of results, an .rrd file or a design"
+        run("replay", tmp_path / "notes.txt", "--save", out / "x.rrd"),
+        "folder of results, an .rrd file or a design",
     )
     misused(run("replay", tmp_path / "notes.txt", "--save", out / "x.txt"), "ends in .rrd")
     (tmp_path / "notes.txt").unlink()
     misused(run("replay", tmp_path / "gone.rrd", "--save", out / "x.rrd"), "gone.rrd: no such file")
     misused(run("replay", tmp_path, "--save", out / "x.rrd"), "no design.rrd or estimate.rrd")
-    misused(run("identify", study, archived, "-o", out, "--method", "magic"), "'magic'", "least_squares, newton")
+    misused(
+        run("identify", study, archived, "-o", out, "--method", "magic"),
+        "'magic'",
+        "least_squares, newton",
+    )
     assert names(tmp_path) == set()
 
 
@@ -359,7 +433,9 @@ def test_missing_inputs(study: Path, archived: Path, tmp_path: Path) -> None:
         ("dessign", "study.toml", "-o", "x"),
     ],
 )
-def test_wrong_options(words: tuple[str, ...], home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_options(
+    words: tuple[str, ...], home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Exit code 2 with a hint at --help."""
     monkeypatch.chdir(tmp_path)
     result = run(*words)
@@ -375,8 +451,13 @@ def test_output_is_a_file(study: Path, archived: Path, recorded: Path, tmp_path:
     taken.write_text("mine", encoding="utf-8")
     for place in (taken, taken / "below"):
         misused(run("design", study, "-o", place), "taken: is a file; -o needs a folder")
-        misused(run("identify", study, recorded, "-o", place), "taken: is a file; -o needs a folder")
-        misused(run("montecarlo", study, archived, "-o", place, "--trials", 2), "taken: is a file; -o needs a folder")
+        misused(
+            run("identify", study, recorded, "-o", place), "taken: is a file; -o needs a folder"
+        )
+        misused(
+            run("montecarlo", study, archived, "-o", place, "--trials", 2),
+            "taken: is a file; -o needs a folder",
+        )
     assert taken.read_text(encoding="utf-8") == "mine"
 
 
@@ -390,7 +471,10 @@ def test_unwritable_folder(study: Path, tmp_path: Path, monkeypatch: pytest.Monk
         return mode != os.W_OK
 
     monkeypatch.setattr(os, "access", deny)
-    misused(run("design", study, "-o", tmp_path / "new" / "out"), f"{tmp_path}: no permission to write here")
+    misused(
+        run("design", study, "-o", tmp_path / "new" / "out"),
+        f"{tmp_path}: no permission to write here",
+    )
     assert asked == [tmp_path]
     assert names(tmp_path) == set()
 
@@ -400,13 +484,17 @@ def test_really_unwritable_folder(study: Path, tmp_path: Path) -> None:
     """The same, with a folder that the system protects."""
     tmp_path.chmod(0o500)
     try:
-        misused(run("design", study, "-o", tmp_path / "out"), f"{tmp_path}: no permission to write here")
+        misused(
+            run("design", study, "-o", tmp_path / "out"), f"{tmp_path}: no permission to write here"
+        )
     finally:
         tmp_path.chmod(0o700)
 
 
 @pytest.mark.parametrize("place", ["folder", "file/below.csv"])
-def test_recording_cannot_be_written(place: str, study: Path, archived: Path, tmp_path: Path) -> None:
+def test_recording_cannot_be_written(
+    place: str, study: Path, archived: Path, tmp_path: Path
+) -> None:
     """A folder, a path below a file."""
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()
@@ -443,7 +531,9 @@ def test_design_of_another_model(archived: Path, tmp_path: Path) -> None:
     said = ("design.npz: made for (nq, nv, nu) = (2, 2, 1)", "(3, 3, 1)")
     misused(run("simulate", path, archived, "-o", tmp_path / "out" / "r.csv"), *said)
     misused(run("montecarlo", path, archived, "-o", tmp_path / "out"), *said)
-    misused(run("replay", archived, "--experiment", path, "--save", tmp_path / "out" / "x.rrd"), *said)
+    misused(
+        run("replay", archived, "--experiment", path, "--save", tmp_path / "out" / "x.rrd"), *said
+    )
     assert "out" not in names(tmp_path)
 
 
@@ -451,16 +541,30 @@ def test_bad_recordings(study: Path, recorded: Path, tmp_path: Path) -> None:
     """Named with file and column; the good one beside it does not help."""
     header, *rows = recorded.read_text(encoding="utf-8").splitlines()
     cases = {
-        "no-control.csv": ([header.replace("ctrl:force", "force"), *rows], "'ctrl:force' is missing"),
+        "no-control.csv": (
+            [header.replace("ctrl:force", "force"), *rows],
+            "'ctrl:force' is missing",
+        ),
         "short.csv": ([header, *rows[:2]], "too few rows (2)"),
         "gap.csv": ([header, *rows[:20], *rows[30:]], "a hole of 0.11 s after data row 20"),
-        "text.csv": ([header, *rows[:5], "0.05,0,0,high,0,0", *rows[6:]], "'qpos:hinge' is not numeric"),
-        "hole.csv": ([header, "0,,0,0,0,0", *rows[1:]], "'ctrl:force') has no value in the first row"),
-        "unmeasured.csv": ([header.replace("qpos", "q").replace("qvel", "v"), *rows], "no measured column"),
+        "text.csv": (
+            [header, *rows[:5], "0.05,0,0,high,0,0", *rows[6:]],
+            "'qpos:hinge' is not numeric",
+        ),
+        "hole.csv": (
+            [header, "0,,0,0,0,0", *rows[1:]],
+            "'ctrl:force') has no value in the first row",
+        ),
+        "unmeasured.csv": (
+            [header.replace("qpos", "q").replace("qvel", "v"), *rows],
+            "no measured column",
+        ),
     }
     for name, (lines, said) in cases.items():
         (tmp_path / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
-        misused(run("identify", study, recorded, tmp_path / name, "-o", tmp_path / "out"), name, said)
+        misused(
+            run("identify", study, recorded, tmp_path / name, "-o", tmp_path / "out"), name, said
+        )
     assert names(tmp_path) == set(cases)
 
 
@@ -483,12 +587,17 @@ def test_parameter_that_does_nothing(tmp_path: Path) -> None:
     path = write_experiment(tmp_path)
     more = '[parameters.paint]\ntarget = "geom/cart:size[0]"\n'
     path.write_text(path.read_text(encoding="utf-8") + more, encoding="utf-8")
-    misused(run("design", path, "-o", tmp_path / "out"), "parameters.paint changes nothing in the measured outputs")
+    misused(
+        run("design", path, "-o", tmp_path / "out"),
+        "parameters.paint changes nothing in the measured outputs",
+    )
 
 
 def test_start_that_excites_next_to_nothing(tmp_path: Path) -> None:
     """Hanging at rest without control: what rounding moves is not information."""
-    path = write_experiment(tmp_path, start='{ kind = "constant", amplitude = 0.0 }', max_iterations="1")
+    path = write_experiment(
+        tmp_path, start='{ kind = "constant", amplitude = 0.0 }', max_iterations="1"
+    )
     misused(
         run("design", path, "-o", tmp_path / "out"),
         "the start excites nothing along: ",
@@ -522,10 +631,14 @@ def test_trials_that_diverge(
         return trial
 
     monkeypatch.setattr(mjfim.plant.plant.Plant, "project", spy)
-    experiment = mjfim.Experiment.from_file(write_experiment(tmp_path, horizon="0.5", tolerance="1e-7"))
+    experiment = mjfim.Experiment.from_file(
+        write_experiment(tmp_path, horizon="0.5", tolerance="1e-7")
+    )
     for amplitude in np.geomspace(1.2e4, 4.8e4, 7):
         wave = {"kind": "sine", "frequency": 2.0, "amplitude": float(amplitude)}
-        result = mjfim.design(experiment.replace(initial={"control": wave}, descent={"max_iterations": 4}))
+        result = mjfim.design(
+            experiment.replace(initial={"control": wave}, descent={"max_iterations": 4})
+        )
         assert result.final.cost < result.initial.cost
     assert any(diverged), "no trial diverged: this test has lost its object"
     assert capfd.readouterr() == ("", "")
@@ -555,7 +668,12 @@ def interrupt(*_: object, **__: object) -> None:
 
 @pytest.mark.parametrize("verb", ["design", "identify", "montecarlo"])
 def test_interrupted_before_a_result(
-    verb: str, study: Path, archived: Path, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    verb: str,
+    study: Path,
+    archived: Path,
+    recorded: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Exit code 1, one message, nothing on disk."""
     monkeypatch.setattr(cli, "Setup", interrupt)
@@ -566,7 +684,9 @@ def test_interrupted_before_a_result(
     assert names(tmp_path) == set()
 
 
-def test_interrupted_while_writing(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_while_writing(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The message must not deny files that are there."""
     monkeypatch.setattr(plots, "save", interrupt)
     result = run("design", study, "-o", tmp_path / "out")
@@ -597,7 +717,9 @@ MJFIM = [sys.executable, "-W", "error", "-m", "mjfim"]
 
 def test_help() -> None:
     """Names what each verb does, writes nothing to stderr."""
-    done = subprocess.run([*MJFIM, "--help"], capture_output=True, text=True, check=False, timeout=60)
+    done = subprocess.run(
+        [*MJFIM, "--help"], capture_output=True, text=True, check=False, timeout=60
+    )
     assert (done.returncode, done.stderr) == (0, "")
     for verb in ("design", "simulate", "identify", "montecarlo", "replay"):
         assert re.search(rf"^\W*{verb}\s+[A-Z]", done.stdout, re.MULTILINE), verb
@@ -618,7 +740,9 @@ def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
     """SIGINT in the middle: exit code 1, all files, readable, better than the start."""
     path = write_experiment(tmp_path, tolerance="1e-12", max_iterations="200\nstarts = 10000")
     words = [*MJFIM, "design", path, "-o", tmp_path / "out", "--threads", "1"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stderr is not None
         told = iter(process.stderr.readline, "")
         try:
@@ -637,12 +761,16 @@ def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
     assert data["final"]["eigenvalues"][0] > 5 * data["initial"]["eigenvalues"][0]
     setup = Setup(mjfim.Experiment.from_file(path))
     curves = archive.read_design(out / "design.npz")
-    assert mjfim.evaluate_trajectory(setup, curves["final"]).cost == pytest.approx(data["final"]["cost"], rel=1e-6)
+    assert mjfim.evaluate_trajectory(setup, curves["final"]).cost == pytest.approx(
+        data["final"]["cost"], rel=1e-6
+    )
     assert all(file.read_bytes()[:4] == b"\x89PNG" for file in out.glob("*.png"))
     assert (out / "design.rrd").read_bytes()[:4] == b"RRF2"
 
 
-def test_replay_of_an_archive_leaves_the_full_picture_alone(home: Path, designed: Result, monkeypatch) -> None:
+def test_replay_of_an_archive_leaves_the_full_picture_alone(
+    home: Path, designed: Result, monkeypatch
+) -> None:
     """design.rrd holds more than the archive beside it."""
     shown: list[Path] = []
     monkeypatch.setattr(rerun_log, "show", shown.append)
@@ -659,7 +787,9 @@ def test_version() -> None:
     assert (result.exit_code, result.stdout) == (0, f"{mjfim.__version__}\n")
 
 
-def test_stale_pictures_of_an_older_estimate_are_removed(study: Path, recorded: Path, tmp_path: Path) -> None:
+def test_stale_pictures_of_an_older_estimate_are_removed(
+    study: Path, recorded: Path, tmp_path: Path
+) -> None:
     """Two recordings, then one, into the same folder."""
     run("identify", study, recorded, recorded, "-o", tmp_path / "e")
     (tmp_path / "e" / "fitness.png").touch()  # the user's own

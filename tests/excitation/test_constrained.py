@@ -12,7 +12,14 @@ import mujoco
 import numpy as np
 import pytest
 from excitation.test_constraints import ARM
-from support.numerics import CART_PARAMETERS, CART_PENDULUM, Array, cart_setup, make_setup, relative_error
+from support.numerics import (
+    CART_PARAMETERS,
+    CART_PENDULUM,
+    Array,
+    cart_setup,
+    make_setup,
+    relative_error,
+)
 
 import mjfim
 from mjfim.excitation import interior_point as ladder_module
@@ -40,7 +47,12 @@ def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -
         for _ in range(substeps):
             before = data.qvel.copy()
             mujoco.mj_step(model, data)
-            now = (data.qpos, data.qvel, (data.qvel - before) / model.opt.timestep, data.actuator_force)
+            now = (
+                data.qpos,
+                data.qvel,
+                (data.qvel - before) / model.opt.timestep,
+                data.actuator_force,
+            )
             for key, value in zip(rows, now, strict=True):
                 rows[key].append(np.array(value))
     return {key: np.array(value) for key, value in rows.items()}
@@ -57,7 +69,9 @@ def paper() -> Design:
     return mjfim.design(experiment.replace(cost={"control": 0.0, "tracking": {}}, limits=hard))
 
 
-def test_the_paper_s_study_under_hard_limits_tells_more_than_a_solver_made_for_them(paper: Design) -> None:
+def test_the_paper_s_study_under_hard_limits_tells_more_than_a_solver_made_for_them(
+    paper: Design,
+) -> None:
     assert paper.status is Status.CONVERGED
     assert paper.success
     assert paper.final.eigenvalues[0] >= 399.0
@@ -71,7 +85,11 @@ def test_the_paper_s_study_under_hard_limits_tells_more_than_a_solver_made_for_t
     )
     start = (model.key("hanging").qpos.copy(), np.zeros(2))
     bob, columns = model.body("bob").id, []
-    for array, place in ((model.body_mass, bob), (model.body_pos, (bob, 2)), (model.dof_damping, 1)):
+    for array, place in (
+        (model.body_mass, bob),
+        (model.body_pos, (bob, 2)),
+        (model.dof_damping, 1),
+    ):
         ends, value = [], float(array[place])
         for moved in (value + h, value - h):
             array[place] = moved
@@ -91,16 +109,25 @@ def test_and_no_engine_step_leaves_them(paper: Design) -> None:
     assert np.abs(paper.trajectory.ctrl).max() <= 5.0
     assert np.abs(rows["q"][:, 0]).max() <= 1.0
     # both are used to the full, and told
-    margins = {"control": 5.0 - np.abs(paper.trajectory.ctrl).max(), "position": 1.0 - np.abs(rows["q"][:, 0]).max()}
+    margins = {
+        "control": 5.0 - np.abs(paper.trajectory.ctrl).max(),
+        "position": 1.0 - np.abs(rows["q"][:, 0]).max(),
+    }
     assert paper.limits == pytest.approx(margins, abs=1e-9)
     assert max(margins.values()) < 0.01
-    assert [row.mu for row in paper.history] == sorted((row.mu for row in paper.history), reverse=True)
+    assert [row.mu for row in paper.history] == sorted(
+        (row.mu for row in paper.history), reverse=True
+    )
     assert paper.history[-1].margin >= 0.0
 
 
 # ---- ways to the inside
 
-HARD = {"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}, "velocity": {"hinge": 3.0}}
+HARD = {
+    "control": {"force": (-5.0, 5.0)},
+    "position": {"slide": (-0.3, 0.5)},
+    "velocity": {"hinge": 3.0},
+}
 
 
 def cart_inside(folder: Path, **tables: Any) -> Setup:
@@ -133,21 +160,31 @@ def test_a_start_that_leaves_the_limits_is_driven_inside(tmp_path: Path) -> None
     outside = fence_of(setup)
     watched = setup.plant.watch(setup.theta, setup.control, outside.taps)
     assert watched is not None
-    assert set(outside.margins(outside.sight(*watched, slopes=False))) == {"control", "position", "velocity"}
+    assert set(outside.margins(outside.sight(*watched, slopes=False))) == {
+        "control",
+        "position",
+        "velocity",
+    }
     assert max(outside.margins(outside.sight(*watched, slopes=False)).values()) < 0.0
     design = mjfim.design(setup)
     assert design.limits == pytest.approx({k: max(v, 0.0) for k, v in design.limits.items()})
     assert_inside(setup, design.trajectory.ctrl)
     # it begins with as much of the start as keeps them
     free = setup.free()
-    ladder = Ladder(Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free))
+    ladder = Ladder(
+        Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free)
+    )
     begun = ladder.inside(setup.control)
     assert begun is not None
     share = float(begun[10, 0] / setup.control[10, 0])
-    np.testing.assert_allclose(begun, free.centre + share * (setup.control - free.centre), rtol=1e-9)
+    np.testing.assert_allclose(
+        begun, free.centre + share * (setup.control - free.centre), rtol=1e-9
+    )
     assert_inside(setup, begun)
     tried = sorted(SHRUNK.tolist())
-    larger = free.centre + tried[tried.index(pytest.approx(share)) + 1] * (setup.control - free.centre)
+    larger = free.centre + tried[tried.index(pytest.approx(share)) + 1] * (
+        setup.control - free.centre
+    )
     with pytest.raises(AssertionError):
         assert_inside(setup, larger)
     first = setup.problem.point(setup.plant.simulate(setup.theta, begun))
@@ -161,7 +198,11 @@ SWINGING = CART_PENDULUM.format(integrator="RK4").replace(
 
 def swinging_setup(folder: Path, **tables: Any) -> Setup:
     """A pendulum that swings at first and has to hang still elsewhere after 1.5 s."""
-    first = {"qpos": (0.0, 2.6), "qvel": (0.4, 1.0), "control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.7}}
+    first = {
+        "qpos": (0.0, 2.6),
+        "qvel": (0.4, 1.0),
+        "control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.7},
+    }
     defaults: dict[str, Any] = {
         "horizon": 1.5,
         "rate": 50.0,
@@ -179,7 +220,12 @@ def swinging_setup(folder: Path, **tables: Any) -> Setup:
 def assert_ends(setup: Setup, design: Design) -> None:
     """It hangs still where it has to, by a plain loop, within all limits."""
     assert design.status is not Status.INFEASIBLE
-    rows = played(setup.model, (np.array([0.0, 2.6]), np.array([0.4, 1.0])), design.trajectory.ctrl, setup.substeps)
+    rows = played(
+        setup.model,
+        (np.array([0.0, 2.6]), np.array([0.4, 1.0])),
+        design.trajectory.ctrl,
+        setup.substeps,
+    )
     np.testing.assert_allclose(rows["q"][-1], [0.3, np.pi], rtol=0, atol=0.02)
     np.testing.assert_allclose(rows["v"][-1], 0.0, rtol=0, atol=0.05)
     assert_inside(setup, design.trajectory.ctrl)
@@ -189,7 +235,9 @@ def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> N
     """The relaxed barrier brings it there, and the cost has its say from the first iterate on."""
     setup = swinging_setup(tmp_path)
     free = setup.free()
-    ladder = Ladder(Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free))
+    ladder = Ladder(
+        Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free)
+    )
     first = next(ladder.climb(setup.control, 5))
     assert first.mu == Rungs().first
     assert not first.feasible
@@ -197,12 +245,16 @@ def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> N
     assert_ends(setup, mjfim.design(setup))
 
 
-def test_a_start_that_no_shrinking_brings_inside_is_steered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_that_no_shrinking_brings_inside_is_steered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where it is too far outside to begin with: here by decree."""
     monkeypatch.setattr(ladder_module, "FARTHEST_START", -np.inf)
     setup = swinging_setup(tmp_path)
     free = setup.free()
-    ladder = Ladder(Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free))
+    ladder = Ladder(
+        Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free)
+    )
     assert ladder.inside(setup.control) is None
     first = next(ladder.climb(setup.control, 5))
     assert first.mu == np.inf
@@ -229,7 +281,12 @@ def test_what_no_control_can_keep_ends_as_infeasible(tmp_path: Path) -> None:
 
 def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path: Path) -> None:
     setup = cart_inside(tmp_path, descent={"max_iterations": 4})
-    task = Task(setup.experiment, Start("wild", 1e9 * np.ones((100, 1)) * np.sin(9.0 * setup.t)[:, None]), Rungs(), 4)
+    task = Task(
+        setup.experiment,
+        Start("wild", 1e9 * np.ones((100, 1)) * np.sin(9.0 * setup.t)[:, None]),
+        Rungs(),
+        4,
+    )
     chase = perform(task)
     assert chase.status is Status.INFEASIBLE
     assert chase.cost == np.inf
@@ -250,7 +307,11 @@ def test_where_weights_keep_the_limits_there_is_no_barrier(tmp_path: Path) -> No
     assert kept.final.cost == free.final.cost
     assert {row.mu for row in kept.history} == {0.0}
     assert np.isnan(kept.history[-1].margin)
-    left = mjfim.design(cart_inside(tmp_path, **{**heavy, "cost": {"control": 1e-3}, "descent": {"max_iterations": 6}}))
+    left = mjfim.design(
+        cart_inside(
+            tmp_path, **{**heavy, "cost": {"control": 1e-3}, "descent": {"max_iterations": 6}}
+        )
+    )
     assert left.history[-1].mu > 0.0
     assert left.found_by == "initial control"
     assert min(left.limits.values()) >= 0.0
@@ -258,7 +319,9 @@ def test_where_weights_keep_the_limits_there_is_no_barrier(tmp_path: Path) -> No
 
 def test_a_design_does_not_rest_on_a_clamp(tmp_path: Path) -> None:
     """What clamps a force keeps it at its range, whatever the control: not as a limit is kept."""
-    weak = CART_PENDULUM.format(integrator="RK4").replace('joint="slide"/>', 'joint="slide" forcerange="-1.5 1.5"/>')
+    weak = CART_PENDULUM.format(integrator="RK4").replace(
+        'joint="slide"/>', 'joint="slide" forcerange="-1.5 1.5"/>'
+    )
     for cost in ({"control": 1e-3}, {"control": {"force": 1e-5}}):
         setup = make_setup(
             weak,
@@ -266,20 +329,33 @@ def test_a_design_does_not_rest_on_a_clamp(tmp_path: Path) -> None:
             horizon=1.0,
             parameters={"m": {"target": "body/bob:mass"}, "c": {"target": "joint/hinge:damping"}},
             noise={"state": 0.05},
-            initial={"qpos": (0.0, 3.0), "control": {"kind": "sine", "amplitude": 1.0, "frequency": 0.9}},
+            initial={
+                "qpos": (0.0, 3.0),
+                "control": {"kind": "sine", "amplitude": 1.0, "frequency": 0.9},
+            },
             cost=cost,
             descent={"max_iterations": 25},
         )
         design = mjfim.design(setup)
-        rows = played(setup.model, (np.array([0.0, 3.0]), np.zeros(2)), design.trajectory.ctrl, setup.substeps)
+        rows = played(
+            setup.model, (np.array([0.0, 3.0]), np.zeros(2)), design.trajectory.ctrl, setup.substeps
+        )
         assert 1.2 < np.abs(rows["f"]).max() < 1.5
         assert 0.0 < design.limits["force"] < 0.3
         assert not any("clamp" in sentence for sentence in design.warnings)
 
 
 def test_what_is_not_enforced_may_be_left_while_the_boundary_holds(tmp_path: Path) -> None:
-    tables = {"limits": {"position": {"slide": (-0.01, 1.0)}, "control": {"force": (-3.0, 3.0)}, "enforce": False}}
-    setup = swinging_setup(tmp_path, **tables, cost={"control": 1e-4}, descent={"max_iterations": 12, "coarse": 1})
+    tables = {
+        "limits": {
+            "position": {"slide": (-0.01, 1.0)},
+            "control": {"force": (-3.0, 3.0)},
+            "enforce": False,
+        }
+    }
+    setup = swinging_setup(
+        tmp_path, **tables, cost={"control": 1e-4}, descent={"max_iterations": 12, "coarse": 1}
+    )
     design = mjfim.design(setup)
     assert design.status is not Status.INFEASIBLE
     assert min(design.limits["end_position"], design.limits["end_velocity"]) >= 0.0
@@ -303,7 +379,8 @@ def test_the_stated_tolerance_ends_the_last_rung_once_the_limits_hold(tmp_path: 
 
 def test_more_is_held_back_where_a_rung_leaked_and_less_where_it_was_well_inside() -> None:
     held = held_back(
-        {"position": 0.1, "control": 0.1, "force": 0.02}, {"position": -0.05, "control": 0.06, "force": 0.5}
+        {"position": 0.1, "control": 0.1, "force": 0.02},
+        {"position": -0.05, "control": 0.06, "force": 0.5},
     )
     assert held == pytest.approx({"position": 0.16, "control": 0.07, "force": 0.0})
     assert held_back({}, {"velocity": -0.1}) == pytest.approx({"velocity": 0.12})
@@ -319,7 +396,9 @@ def several(folder: Path, **tables: Any) -> Setup:
 
 
 @pytest.mark.parametrize("criterion", ["E", "D"])
-def test_starts_in_parallel_find_what_they_find_one_after_the_other(criterion: str, tmp_path: Path) -> None:
+def test_starts_in_parallel_find_what_they_find_one_after_the_other(
+    criterion: str, tmp_path: Path
+) -> None:
     setup = several(tmp_path, cost={"control": 0.0, "criterion": criterion})
     alone = mjfim.design(setup)
     with ThreadPoolExecutor(2) as executor:
@@ -328,7 +407,9 @@ def test_starts_in_parallel_find_what_they_find_one_after_the_other(criterion: s
     assert [(s.name, s.status, s.iterations) for s in together.starts] == [
         (s.name, s.status, s.iterations) for s in alone.starts
     ]
-    assert [s.cost for s in together.starts] == pytest.approx([s.cost for s in alone.starts], rel=1e-9)
+    assert [s.cost for s in together.starts] == pytest.approx(
+        [s.cost for s in alone.starts], rel=1e-9
+    )
     np.testing.assert_allclose(together.trajectory.ctrl, alone.trajectory.ctrl, rtol=0, atol=1e-9)
     assert together.limits == pytest.approx(alone.limits, abs=1e-9)
     # one of four goes on, the others are left behind; the best one won
@@ -400,7 +481,9 @@ def arm_design(folder: Path, **tables: Any) -> tuple[Setup, Design]:
     return setup, mjfim.design(setup)
 
 
-def assert_arm(setup: Setup, design: Design, before: Array | None, after: Array | None) -> dict[str, Array]:
+def assert_arm(
+    setup: Setup, design: Design, before: Array | None, after: Array | None
+) -> dict[str, Array]:
     """Ranges and rates of the control, by hand; returns what a plain loop shows."""
     ctrl, dt = design.trajectory.ctrl, setup.dt
     assert np.abs(ctrl).max() <= 1.0
@@ -429,18 +512,26 @@ def test_a_design_from_rest_to_rest_begins_and_ends_at_what_holds(tmp_path: Path
     assert np.abs(rows["q"][-1]).max() <= 0.005
     assert np.abs(rows["v"][-1]).max() <= 0.03
     assert np.abs(rows["q"]).max() > 0.1  # it moved
-    assert design.limits["end_position"] == pytest.approx(0.005 - np.abs(rows["q"][-1]).max(), abs=1e-8)
-    assert design.limits["end_velocity"] == pytest.approx(0.03 - np.abs(rows["v"][-1]).max(), abs=1e-7)
+    assert design.limits["end_position"] == pytest.approx(
+        0.005 - np.abs(rows["q"][-1]).max(), abs=1e-8
+    )
+    assert design.limits["end_velocity"] == pytest.approx(
+        0.03 - np.abs(rows["v"][-1]).max(), abs=1e-7
+    )
 
 
 def test_a_periodic_design_can_be_repeated(tmp_path: Path) -> None:
     """Its control has no jump at the seam, its state comes back."""
-    setup, design = arm_design(tmp_path, boundary={"end": "periodic", "position": 0.005, "velocity": 0.05})
+    setup, design = arm_design(
+        tmp_path, boundary={"end": "periodic", "position": 0.005, "velocity": 0.05}
+    )
     ctrl = design.trajectory.ctrl
     rows = assert_arm(setup, design, None, ctrl[0])
     assert np.abs(rows["q"][-1]).max() <= 0.005
     assert np.abs(rows["v"][-1]).max() <= 0.05
-    twice = played(setup.model, (np.zeros(2), np.zeros(2)), np.concatenate([ctrl, ctrl]), setup.substeps)["q"]
+    twice = played(
+        setup.model, (np.zeros(2), np.zeros(2)), np.concatenate([ctrl, ctrl]), setup.substeps
+    )["q"]
     assert np.abs(twice[len(rows["q"]) :] - rows["q"]).max() < 0.05
 
 
@@ -449,7 +540,10 @@ def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_p
     """On the stated samples, from the coarse level as well; from rest its first control is what holds, without a slope."""
     boundary = {"start": "rest", "end": "rest", "position": 0.02, "velocity": 0.1}
     setup, design = arm_design(
-        tmp_path, boundary=boundary, limits={"bandwidth": 9.0}, descent={"max_iterations": 24, "coarse": coarse}
+        tmp_path,
+        boundary=boundary,
+        limits={"bandwidth": 9.0},
+        descent={"max_iterations": 24, "coarse": coarse},
     )
     hold, ctrl = standstill(setup), design.trajectory.ctrl
     basis = spline_basis(setup.t, 0.5, 9.0, True, True, False)
@@ -467,9 +561,15 @@ def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_p
 
 
 @pytest.mark.parametrize("bandwidth", [30.0, 50.0])
-def test_a_bandwidth_near_that_of_the_samples_is_no_trouble(bandwidth: float, tmp_path: Path) -> None:
+def test_a_bandwidth_near_that_of_the_samples_is_no_trouble(
+    bandwidth: float, tmp_path: Path
+) -> None:
     """There are then as many splines as samples or more, of a coarse level twice as many."""
-    setup = cart_inside(tmp_path, limits={**HARD, "bandwidth": bandwidth}, descent={"max_iterations": 6, "coarse": 2})
+    setup = cart_inside(
+        tmp_path,
+        limits={**HARD, "bandwidth": bandwidth},
+        descent={"max_iterations": 6, "coarse": 2},
+    )
     fine = basis_of(setup, setup.t)
     assert fine is not None and fine.shape[1] > 0.6 * setup.samples
     design = mjfim.design(setup)
@@ -480,13 +580,18 @@ def test_a_bandwidth_near_that_of_the_samples_is_no_trouble(bandwidth: float, tm
 def nearest(setup: Setup, ctrl: Array) -> float:
     """Smallest distance of the arm to post and floor at any engine step of a plain loop, by MuJoCo's own distances."""
     model = setup.model
-    data, geoms = mujoco.MjData(model), [model.geom(name).id for name in ("fore", "post", "floor", "upper")]
+    data, geoms = (
+        mujoco.MjData(model),
+        [model.geom(name).id for name in ("fore", "post", "floor", "upper")],
+    )
     near = []
     for qpos in played(model, (np.zeros(2), np.zeros(2)), ctrl, setup.substeps)["q"]:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         pairs = ((0, 1), (0, 2), (3, 1), (3, 2))
-        near += [mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 1.0, None) for a, b in pairs]
+        near += [
+            mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 1.0, None) for a, b in pairs
+        ]
     return min(near)
 
 
@@ -511,7 +616,9 @@ def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
     kept = nearest(setup, design.trajectory.ctrl) >= 0.15
     assert kept is (shrunk or bool(proofs))
     assert (design.status is Status.INFEASIBLE) is not kept
-    assert design.limits["clearance"] == pytest.approx(nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6)
+    assert design.limits["clearance"] == pytest.approx(
+        nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6
+    )
 
 
 def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
@@ -519,11 +626,15 @@ def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
     setup, design = arm_design(tmp_path, limits={"clearance": 0.15})
     free = arm_design(tmp_path)[1]
     assert nearest(setup, design.trajectory.ctrl) >= 0.15 > nearest(setup, free.trajectory.ctrl)
-    assert design.limits["clearance"] == pytest.approx(nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6)
+    assert design.limits["clearance"] == pytest.approx(
+        nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("executor", [None, ThreadPoolExecutor])
-def test_a_shorter_design_played_twice_is_a_start(tmp_path: Path, executor: type[ThreadPoolExecutor] | None) -> None:
+def test_a_shorter_design_played_twice_is_a_start(
+    tmp_path: Path, executor: type[ThreadPoolExecutor] | None
+) -> None:
     """Half of the horizon alone tells about as much per second; together they are judged over all of it."""
     rest = {"start": "rest", "end": "rest"}
     descent = {"repeats": (2,), "max_iterations": 60}
@@ -531,7 +642,12 @@ def test_a_shorter_design_played_twice_is_a_start(tmp_path: Path, executor: type
     control = {"kind": "sine", "amplitude": 2.0, "frequency": 0.9}
     limits = {**HARD, "control_rate": 200.0}
     setup = cart_inside(
-        tmp_path, horizon=2.0, boundary=rest, descent=descent, limits=limits, initial={**hanging, "control": control}
+        tmp_path,
+        horizon=2.0,
+        boundary=rest,
+        descent=descent,
+        limits=limits,
+        initial={**hanging, "control": control},
     )
     with executor(2) if executor is not None else nullcontext() as pool:
         design = mjfim.design(setup, executor=pool)
@@ -542,7 +658,9 @@ def test_a_shorter_design_played_twice_is_a_start(tmp_path: Path, executor: type
     assert design.final.cost == min(start.cost for start in design.starts)
 
 
-@pytest.mark.parametrize(("count", "tables"), [(2, {"cost": {"control": 1e-3}}), (4, {"rate": 100.0})])
+@pytest.mark.parametrize(
+    ("count", "tables"), [(2, {"cost": {"control": 1e-3}}), (4, {"rate": 100.0})]
+)
 def test_and_where_weights_bound_the_design_or_samples_are_odd(
     tmp_path: Path, count: int, tables: dict[str, Any]
 ) -> None:
@@ -564,11 +682,18 @@ def test_and_where_weights_bound_the_design_or_samples_are_odd(
     ids=["A", "D", "c", "robust"],
 )
 def test_every_criterion_gains_within_limits(tmp_path: Path, tables: dict[str, Any]) -> None:
-    known = {name: {**stated, **tables.get("parameters", {}).get(name, {})} for name, stated in CART_PARAMETERS.items()}
+    known = {
+        name: {**stated, **tables.get("parameters", {}).get(name, {})}
+        for name, stated in CART_PARAMETERS.items()
+    }
     setup = cart_inside(tmp_path, **{**tables, "parameters": known})
     design = mjfim.design(setup)
-    first = setup.problem.point(setup.plant.simulate(setup.theta, 0.2 * setup.control)).cost  # inside as well
-    assert design.final.cost < (first - 1.0 if tables["cost"].get("criterion") == "D" else 0.7 * first)
+    first = setup.problem.point(
+        setup.plant.simulate(setup.theta, 0.2 * setup.control)
+    ).cost  # inside as well
+    assert design.final.cost < (
+        first - 1.0 if tables["cost"].get("criterion") == "D" else 0.7 * first
+    )
     assert_inside(setup, design.trajectory.ctrl)
     assert min(design.limits.values()) >= 0.0
 
@@ -576,12 +701,16 @@ def test_every_criterion_gains_within_limits(tmp_path: Path, tables: dict[str, A
 def test_what_leaks_a_little_goes_on_and_the_start_is_kept_beside_it(tmp_path: Path) -> None:
     free = cart_inside(tmp_path).free()
     rivals = Contest(Stage(free, None), None)
-    start, leaking, inside = (Start("x", s * free.control) for s in (0.2, 3.0, 0.1))  # here the smaller one tells more
+    start, leaking, inside = (
+        Start("x", s * free.control) for s in (0.2, 3.0, 0.1)
+    )  # here the smaller one tells more
     chase = Chase("x", leaking.control, 1e-3)
     lead = rivals._judge(chase, start)
     assert (lead.control is leaking.control, lead.cost) == (True, 1e-3)
     assert chase.control is not leaking.control
-    assert chase.cost == pytest.approx(free.problem.point(free.plant.simulate(free.theta, start.control)).cost)
+    assert chase.cost == pytest.approx(
+        free.problem.point(free.plant.simulate(free.theta, start.control)).cost
+    )
     chase = Chase("x", inside.control, 1e-3)
     lead = rivals._judge(chase, start)
     assert lead.control is chase.control is inside.control

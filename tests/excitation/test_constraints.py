@@ -40,7 +40,10 @@ ARM = """
   </actuator>
 </mujoco>
 """
-WIDE = {"position": 0.5, "velocity": 5.0}  # so that an end that is missed does not drown everything else
+WIDE = {
+    "position": 0.5,
+    "velocity": 5.0,
+}  # so that an end that is missed does not drown everything else
 # tight enough that the swing below is outside some and close to others
 ALONE: dict[str, dict[str, Any]] = {
     "position": {"limits": {"position": {"shoulder": (-0.3, 0.7), "elbow": (-0.3, 0.5)}}},
@@ -56,12 +59,18 @@ ALONE: dict[str, dict[str, Any]] = {
         "boundary": {"end": "periodic", **WIDE},
         "limits": {"control_rate": {"elbow": 2.0, "shoulder": (-9.0, 2.0)}},
     },
-    "rest and seam": {"boundary": {"start": "rest", "end": "periodic", **WIDE}, "limits": {"control_rate": 4.0}},
+    "rest and seam": {
+        "boundary": {"start": "rest", "end": "periodic", **WIDE},
+        "limits": {"control_rate": 4.0},
+    },
 }
 EVERY = {key: value for name in list(ALONE)[:7] for key, value in ALONE[name]["limits"].items()}
 TOGETHER: dict[str, dict[str, Any]] = {
     "every kind, anywhere": {"limits": EVERY},
-    "every kind, rest to rest": {"limits": EVERY, "boundary": {"start": "rest", "end": "rest", **WIDE}},
+    "every kind, rest to rest": {
+        "limits": EVERY,
+        "boundary": {"start": "rest", "end": "rest", **WIDE},
+    },
     "every kind, periodic": {"limits": EVERY, "boundary": {"end": "periodic", **WIDE}},
 }
 KINDS = {"position", "velocity", "acceleration", "control", "control_rate", "force", "clearance"}
@@ -74,7 +83,12 @@ def arm_setup(folder: Path, **tables: Any) -> Setup:
         "horizon": 0.4,
         "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/elbow:damping"}},
         "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01},
-        "control": {"kind": "sine", "amplitude": swing, "offset": {"shoulder": 0.1, "elbow": 0.2}, "frequency": 1.5},
+        "control": {
+            "kind": "sine",
+            "amplitude": swing,
+            "offset": {"shoulder": 0.1, "elbow": 0.2},
+            "frequency": 1.5,
+        },
     }
     return make_setup(ARM, folder, **{**defaults, **tables}).free()
 
@@ -83,7 +97,10 @@ def directions_of(setup: Setup, count: int, seed: int = 0) -> Array:
     """(count, N, nu) random changes of the control, smooth ones and rough ones."""
     rng, t = np.random.default_rng(seed), setup.t[:, None] / setup.experiment.horizon
     nu = setup.control.shape[1]
-    smooth = [np.sin(2 * np.pi * rng.uniform(0.5, 3.0, nu) * t + rng.uniform(0, 6, nu)) for _ in range(count // 2)]
+    smooth = [
+        np.sin(2 * np.pi * rng.uniform(0.5, 3.0, nu) * t + rng.uniform(0, 6, nu))
+        for _ in range(count // 2)
+    ]
     return np.array([*smooth, *rng.normal(size=(count - count // 2, *setup.control.shape))])
 
 
@@ -101,7 +118,9 @@ def barrier_check(setup: Setup, delta: float, h: float = 2e-5) -> float:
 
 @pytest.mark.parametrize("delta", [0.1, 3e-3])
 @pytest.mark.parametrize("name", [*ALONE, *TOGETHER])
-def test_the_slope_of_the_barrier_is_that_of_simulated_controls(name: str, delta: float, tmp_path: Path) -> None:
+def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
+    name: str, delta: float, tmp_path: Path
+) -> None:
     setup = arm_setup(tmp_path, **{**ALONE, **TOGETHER}[name])
     fence = fence_of(setup)
     watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
@@ -118,9 +137,14 @@ def test_the_slope_of_the_barrier_is_that_of_simulated_controls(name: str, delta
 def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -> None:
     """Half a turn away the difference of rotations bends; a floating hull comes nowhere near its start."""
     wild = {
-        "initial": {"qvel": (0.1, 0.0, 0.2, 3.5, -2.4, 4.3, 1.0, -2.0), "control": {"kind": "sine", "amplitude": 0.3}}
+        "initial": {
+            "qvel": (0.1, 0.0, 0.2, 3.5, -2.4, 4.3, 1.0, -2.0),
+            "control": {"kind": "sine", "amplitude": 0.3},
+        }
     }
-    setup = floating_setup(tmp_path, boundary={"end": "periodic", "position": 0.5, "velocity": 50.0}, **wild).free()
+    setup = floating_setup(
+        tmp_path, boundary={"end": "periodic", "position": 0.5, "velocity": 50.0}, **wild
+    ).free()
     rotation = setup.space.minus(setup.initial.state[-1], setup.target)[3:6]
     assert np.linalg.norm(rotation) > 1.0
     assert barrier_check(setup, 0.1) < 2e-3
@@ -172,13 +196,19 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         wanted = [float(np.sum(bend * move**2)) for bend, move in zip(bends, moves, strict=True)]
         if fence.end is not None and fence.target is not None:
             ended = setup.space.minus(sight.trajectory.state[-1], fence.target)
-            wanted.append(float(np.sum(fence.end.wall(ended, delta, END_WEIGHT).bend * zeta.z[-1] ** 2)))
+            wanted.append(
+                float(np.sum(fence.end.wall(ended, delta, END_WEIGHT).bend * zeta.z[-1] ** 2))
+            )
         assert min(wanted) > 1e-6 * sum(wanted)
         a, b = w.force(zeta)
-        assert float(np.sum(a * zeta.z) + np.sum(b * zeta.v)) == pytest.approx(sum(wanted), rel=1e-9)
+        assert float(np.sum(a * zeta.z) + np.sum(b * zeta.v)) == pytest.approx(
+            sum(wanted), rel=1e-9
+        )
     # and of what is linear in the control it is the curvature of the barrier itself
     endless = np.full(len(fence.kinds), np.inf)
-    narrow = replace(fence, shown=replace(fence.shown, lower=-endless, upper=endless), clearance=None, end=None)
+    narrow = replace(
+        fence, shown=replace(fence.shown, lower=-endless, upper=endless), clearance=None, end=None
+    )
     problem = InteriorProblem(setup.problem, narrow, 1.0, delta, costs=False)
     hedge = problem.expand(problem.point(ctrl)).hedge
     assert hedge is not None
@@ -197,7 +227,9 @@ def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> Non
     for way in 1e-4 * directions_of(setup, 4, seed=2):
         zeta = expansion.lift(np.zeros((setup.samples, 2, setup.space.nx)), way)
         up, down = (seen(problem.point(setup.control + s * way)).tapped for s in (1.0, -1.0))
-        moved = (0.5 * np.abs(up - down) / fence.shown.scale)[:, np.array(fence.taps.substeps) - 1].max()
+        moved = (0.5 * np.abs(up - down) / fence.shown.scale)[
+            :, np.array(fence.taps.substeps) - 1
+        ].max()
         wanted = max(moved, np.abs(way / fence.control.scale).max())
         assert expansion.hedge.motion(zeta) == pytest.approx(wanted, rel=1e-3)
 
@@ -205,7 +237,9 @@ def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> Non
 def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> None:
     """Every kind at once, in its own unit, at every engine step; shares are the same over half of the range."""
     setup = arm_setup(
-        tmp_path, limits=EVERY, boundary={"start": "rest", "end": "rest", "position": 0.2, "velocity": 3.0}
+        tmp_path,
+        limits=EVERY,
+        boundary={"start": "rest", "end": "rest", "position": 0.2, "velocity": 3.0},
     )
     fence, model, limits = fence_of(setup), mujoco.MjModel.from_xml_string(ARM), setup.limits
     watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
@@ -231,27 +265,40 @@ def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> Non
             near.append(mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 1.0, None))
     held = setup.final_hold  # the start is the end
     rows["control"] = list(setup.control)
-    rows["control_rate"] = list(np.diff(setup.control, axis=0, prepend=setup.hold[None], append=held[None]) / 0.01)
+    rows["control_rate"] = list(
+        np.diff(setup.control, axis=0, prepend=setup.hold[None], append=held[None]) / 0.01
+    )
     wanted, shares = {}, {}
     for kind in KINDS - {"clearance"}:
         found = [
             (m, m / (0.5 * (x.upper - x.lower)))
             for x in limits
             if x.kind == kind
-            for m in np.minimum(np.array(rows[kind])[:, x.index] - x.lower, x.upper - np.array(rows[kind])[:, x.index])
+            for m in np.minimum(
+                np.array(rows[kind])[:, x.index] - x.lower,
+                x.upper - np.array(rows[kind])[:, x.index],
+            )
         ]
         wanted[kind], shares[kind] = (min(column) for column in zip(*found, strict=True))
     wanted["clearance"] = min(near) - 0.03
     shares["clearance"] = wanted["clearance"] / 0.03
-    wanted["end_position"], wanted["end_velocity"] = 0.2 - np.abs(data.qpos).max(), 3.0 - np.abs(data.qvel).max()
-    shares["end_position"], shares["end_velocity"] = wanted["end_position"] / 0.2, wanted["end_velocity"] / 3.0
+    wanted["end_position"], wanted["end_velocity"] = (
+        0.2 - np.abs(data.qpos).max(),
+        3.0 - np.abs(data.qvel).max(),
+    )
+    shares["end_position"], shares["end_velocity"] = (
+        wanted["end_position"] / 0.2,
+        wanted["end_velocity"] / 3.0,
+    )
     sight = fence.sight(*watched, slopes=False)
     assert fence.margins(sight) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
     assert fence.shares(sight) == pytest.approx(shares, rel=1e-5, abs=1e-7)
 
 
 def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> None:
-    setup = arm_setup(tmp_path, limits=EVERY, boundary={"end": "periodic", "position": 0.2, "velocity": 3.0})
+    setup = arm_setup(
+        tmp_path, limits=EVERY, boundary={"end": "periodic", "position": 0.2, "velocity": 3.0}
+    )
     fence = fence_of(setup)
     watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
     assert watched is not None
@@ -259,7 +306,9 @@ def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> 
     shares = {kind: 0.01 * (i + 1) for i, kind in enumerate(sorted(fence.margins(sight)))}
     tighter = {kind: fence.shares(sight)[kind] - share for kind, share in shares.items()}
     found = fence.tightened(shares).shares(sight)
-    least = 0.03 * (1.0 + shares["clearance"])  # its share is of the least distance, which is raised
+    least = 0.03 * (
+        1.0 + shares["clearance"]
+    )  # its share is of the least distance, which is raised
     assert fence.tightened(shares).least == pytest.approx(least)
     assert sight.distances is not None
     tighter["clearance"] = float(sight.distances.min()) / least - 1.0
@@ -278,8 +327,12 @@ def test_rates_begin_and_end_where_the_boundary_says(tmp_path: Path) -> None:
     np.testing.assert_allclose(fence.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
     before, after = np.array([0.7, 0.1]), np.array([-0.2, 0.3])
     rested = replace(fence, before=before, after=after).rates(ctrl)
-    np.testing.assert_allclose(rested[[0, -1]], [(ctrl[0] - before) / 0.01, (after - ctrl[-1]) / 0.01])
-    np.testing.assert_allclose(replace(fence, seam=True).rates(ctrl)[[0, -1]], [[0, 0], (ctrl[0] - ctrl[-1]) / 0.01])
+    np.testing.assert_allclose(
+        rested[[0, -1]], [(ctrl[0] - before) / 0.01, (after - ctrl[-1]) / 0.01]
+    )
+    np.testing.assert_allclose(
+        replace(fence, seam=True).rates(ctrl)[[0, -1]], [[0, 0], (ctrl[0] - ctrl[-1]) / 0.01]
+    )
 
 
 def test_without_enforcement_only_the_boundary_is_left(tmp_path: Path) -> None:

@@ -23,12 +23,16 @@ def experiment() -> Experiment:
     return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
 
 
-def altered(tmp_path: Path, experiment: Experiment, old: str, new: str, **tables: Any) -> Experiment:
+def altered(
+    tmp_path: Path, experiment: Experiment, old: str, new: str, **tables: Any
+) -> Experiment:
     """The cart-pendulum with a change in its MJCF."""
     text = (ROOT / "models" / "cart_pendulum.xml").read_text()
     assert old in text
     (tmp_path / "cart_pendulum.xml").write_text(text.replace(old, new))
-    (tmp_path / "cart_pendulum.csv").write_bytes((ROOT / "models" / "cart_pendulum.csv").read_bytes())
+    (tmp_path / "cart_pendulum.csv").write_bytes(
+        (ROOT / "models" / "cart_pendulum.csv").read_bytes()
+    )
     values = experiment.replace(**tables).model_dump(exclude_unset=True)
     return Experiment(**values, directory=tmp_path)
 
@@ -58,7 +62,9 @@ def test_saturation_is_said(experiment: Experiment, tmp_path: Path) -> None:
     old, new = 'joint="slide"/>', 'joint="slide" forcelimited="true" forcerange="-1.5 1.5"/>'
     # hard limits, the default now, keep a design off the clamp: only what is not enforced can rest on it
     tables = {"descent": {"max_iterations": 8}, "limits": {"enforce": False}}
-    weak = altered(tmp_path, experiment, f'<motor name="force" {old}', f'<motor name="force" {new}', **tables)
+    weak = altered(
+        tmp_path, experiment, f'<motor name="force" {old}', f'<motor name="force" {new}', **tables
+    )
     design = mjfim.design(weak)
     assert any("forcerange clamps force" in sentence for sentence in design.warnings)
     assert not any("forcerange" in sentence for sentence in mjfim.design(experiment).warnings)
@@ -125,7 +131,9 @@ def test_where_the_smallest_eigenvalues_meet_the_descent_goes_on_smoothly(tmp_pa
     assert second < 1.2 * first
     # what is reported is the exact criterion, and the best that any iterate had
     assert made.final.criterion == pytest.approx(1.0 / first, rel=1e-9)
-    assert made.final.cost == pytest.approx(1.0 / first + setup.problem.running.value(made.trajectory), rel=1e-9)
+    assert made.final.cost == pytest.approx(
+        1.0 / first + setup.problem.running.value(made.trajectory), rel=1e-9
+    )
     fine = [row.cost for row in made.history if row.rate == 100.0]
     assert made.final.cost == pytest.approx(min(fine), rel=1e-12)
     assert [row.iteration for row in made.history] == list(range(len(made.history)))
@@ -149,7 +157,9 @@ def test_a_design_that_knows_of_its_nuisances_beats_one_that_does_not(tmp_path: 
     there = mjfim.evaluate_trajectory(unsure, naive.trajectory)
     assert aware.final.cost < 0.95 * there.cost
     # the trajectory is judged by the block of the full inverse that belongs to the wanted parameters
-    block = np.linalg.inv(aware.final.information)[:3, :3] / np.outer(unsure.theta[:3], unsure.theta[:3])
+    block = np.linalg.inv(aware.final.information)[:3, :3] / np.outer(
+        unsure.theta[:3], unsure.theta[:3]
+    )
     seen = np.sort(1.0 / np.linalg.eigvalsh(block)) / unsure.measure_rate
     np.testing.assert_allclose(aware.final.eigenvalues, seen, rtol=1e-6)
 
@@ -169,7 +179,9 @@ LEVELS = {
     "plain": {},
     "sensors at their own rates": {"noise": RATED},
     "nuisances": {"nuisance": {"initial": 0.1, "bias": 0.05, "delay": 0.01}},
-    "priors": {"parameters": {name: {**target, "prior": 0.01} for name, target in CART_PARAMETERS.items()}},
+    "priors": {
+        "parameters": {name: {**target, "prior": 0.01} for name, target in CART_PARAMETERS.items()}
+    },
     "slow": {"measure_rate": 20.0, "noise": {"state": 0.05}},
 }
 
@@ -195,6 +207,11 @@ def test_the_choice_of_a_group_needs_no_error_where_members_are_invisible(tmp_pa
 def test_a_coarse_factor_that_does_not_divide_the_samples_is_refused(tmp_path: Path) -> None:
     """By default it is just not used."""
     tables = {"horizon": 4.06, "descent": {"max_iterations": 1}}
-    with pytest.raises(ExperimentError, match=r"descent\.coarse: 4 does not divide the 406 samples; .*: 1, 2, 7, 14$"):
-        mjfim.design(cart_setup(tmp_path, **{**tables, "descent": {"max_iterations": 1, "coarse": 4}}))
+    with pytest.raises(
+        ExperimentError,
+        match=r"descent\.coarse: 4 does not divide the 406 samples; .*: 1, 2, 7, 14$",
+    ):
+        mjfim.design(
+            cart_setup(tmp_path, **{**tables, "descent": {"max_iterations": 1, "coarse": 4}})
+        )
     mjfim.design(cart_setup(tmp_path, **tables))

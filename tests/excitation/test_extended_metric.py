@@ -33,7 +33,9 @@ def expanded(setup: Setup) -> Expansion:
     return problem.expand(problem.point(setup.initial, CENTRAL))
 
 
-def both_directions(setup: Setup, psi_weight: float) -> tuple[Expansion, TangentCurve, TangentCurve]:
+def both_directions(
+    setup: Setup, psi_weight: float
+) -> tuple[Expansion, TangentCurve, TangentCurve]:
     """Expansion, metric descent, extended metric descent with a weight on psi."""
     dt, p, nx = setup.dt, len(setup.theta), setup.space.nx
     Q, R = np.diag(setup.tracking + 0.02) * dt, np.diag(setup.control_weight) * dt
@@ -41,7 +43,11 @@ def both_directions(setup: Setup, psi_weight: float) -> tuple[Expansion, Tangent
     wide[:nx, :nx] = Q
     wide[nx:, nx:] = psi_weight * dt * np.eye(nx * p)
     expansion, K = expanded(setup), np.zeros((setup.samples, setup.plant.nu, nx))
-    return expansion, MetricDescent(Q, R, 3.0 * Q)(expansion, K), extended_direction(expansion, K, wide, R, 3.0 * wide)
+    return (
+        expansion,
+        MetricDescent(Q, R, 3.0 * Q)(expansion, K),
+        extended_direction(expansion, K, wide, R, 3.0 * wide),
+    )
 
 
 def extended_direction(e: Expansion, K: Array, Q: Array, R: Array, terminal: Array) -> TangentCurve:
@@ -52,16 +58,23 @@ def extended_direction(e: Expansion, K: Array, Q: Array, R: Array, terminal: Arr
 CASES = {
     "cart E": lambda f: cart_setup(f, cost=TRACKING),
     "cart A": lambda f: cart_setup(f, cost={**TRACKING, "criterion": "A"}),
-    "cart D sensors": lambda f: cart_setup(f, "Euler", noise=SENSED, cost={**TRACKING, "criterion": "D"}),
+    "cart D sensors": lambda f: cart_setup(
+        f, "Euler", noise=SENSED, cost={**TRACKING, "criterion": "D"}
+    ),
     "cart, correlated, nuisances": lambda f: cart_setup(
-        f, noise=SENSED, correlated=CORRELATED, nuisance={"initial": 0.05, "bias": 0.1, "delay": 0.02}
+        f,
+        noise=SENSED,
+        correlated=CORRELATED,
+        nuisance={"initial": 0.05, "bias": 0.1, "delay": 0.02},
     ),
     "free body": body_setup,
 }
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_without_weight_on_psi_the_extended_direction_is_that_of_metric_descent(case: str, tmp_path) -> None:
+def test_without_weight_on_psi_the_extended_direction_is_that_of_metric_descent(
+    case: str, tmp_path
+) -> None:
     _, plain, wide = both_directions(CASES[case](tmp_path), 0.0)
     assert relative_error(wide.v, plain.v) < 5e-6  # the accuracy of the mixed differences of both
     assert relative_error(wide.z, plain.z) < 5e-6
@@ -78,7 +91,9 @@ def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None
     rng, (N, nx, nu, ny, p) = np.random.default_rng(2), (9, 3, 2, 2, 3)
     A, B = 0.5 * rng.normal(size=(N, nx, nx)), rng.normal(size=(N, nx, nu))
     C, D = rng.normal(size=(N + 1, ny, nx)), rng.normal(size=(N + 1, ny, nu))
-    unit = Bilinear(A, B, C, D, rng.normal(size=(p, N, nx + nu, nx)), rng.normal(size=(p, N + 1, nx + nu, ny)))
+    unit = Bilinear(
+        A, B, C, D, rng.normal(size=(p, N, nx + nu, nx)), rng.normal(size=(p, N + 1, nx + nu, ny))
+    )
     S = Sensitivity(rng.normal(size=(N + 1, nx, p)), rng.normal(size=(N + 1, ny, p)))
     noise = Noise.independent([0.3, 2.0])
     made = Information(noise, 20.0, np.array([1.0, 0.5, 3.0]), np.zeros((p, p)), criterion)
@@ -90,7 +105,10 @@ def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None
     v = rng.normal(size=(N, nu))
     z = Recursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
     full = Recursion(wide.A).forward(np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v))
-    reduced, slope = Expansion(A, B, a, b).slope(TangentCurve(z, v)), wide.slope(TangentCurve(full, v))
+    reduced, slope = (
+        Expansion(A, B, a, b).slope(TangentCurve(z, v)),
+        wide.slope(TangentCurve(full, v)),
+    )
     assert slope == pytest.approx(reduced, rel=1e-10)
     R, Q = np.eye(nu), np.diag([1.0, 2.0, 0.0])
     plain = MetricDescent(Q, R, Q)(Expansion(A, B, a, b), np.zeros((N, nu, nx)))
@@ -108,12 +126,18 @@ def test_extended_slope_is_the_reduced_slope(case: str, tmp_path) -> None:
     for _ in range(3):
         v = rng.normal(size=setup.control.shape)
         z = Recursion(e.A).forward(np.zeros(e.A.shape[1]), np.einsum("kij,kj->ki", e.B, v))
-        full = Recursion(wide.A).forward(np.zeros(wide.A.shape[1]), np.einsum("kij,kj->ki", wide.B, v))
+        full = Recursion(wide.A).forward(
+            np.zeros(wide.A.shape[1]), np.einsum("kij,kj->ki", wide.B, v)
+        )
         np.testing.assert_allclose(full[:, : z.shape[1]], z, rtol=1e-5, atol=1e-5 * np.abs(z).max())
-        assert wide.slope(TangentCurve(full, v)) == pytest.approx(e.slope(TangentCurve(z, v)), rel=1e-4)
+        assert wide.slope(TangentCurve(full, v)) == pytest.approx(
+            e.slope(TangentCurve(z, v)), rel=1e-4
+        )
         partial = np.zeros_like(full)
         partial[:, : z.shape[1]] = z
-        assert wide.slope(TangentCurve(partial, v)) != pytest.approx(e.slope(TangentCurve(z, v)), rel=0.1)
+        assert wide.slope(TangentCurve(partial, v)) != pytest.approx(
+            e.slope(TangentCurve(z, v)), rel=0.1
+        )
 
 
 @pytest.mark.parametrize("case", ["cart E", "free body"])
@@ -132,7 +156,9 @@ def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_t
         assert relative_error(moved[:, j], change[:, j]) < 1e-3
 
 
-def psi_step(setup: Setup, thetas: tuple[Loop, Loop], h: float, x: Array, u: Array, psi: Array, j: int) -> Array:
+def psi_step(
+    setup: Setup, thetas: tuple[Loop, Loop], h: float, x: Array, u: Array, psi: Array, j: int
+) -> Array:
     """psi_{k+1} of parameter j as a function of (x, u, psi): a plain difference of two steps at theta_j +- h."""
     up, down = thetas
     ahead, back = up.plus(x, h * psi), up.plus(x, -h * psi)
@@ -149,16 +175,24 @@ def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tm
         h = 1e-3 * abs(setup.theta[j])
         shift = h * np.eye(p)[j]
         pair = tuple(
-            Loop(setup.parameters.model(setup.plant.source.model, setup.theta + s * shift), 1) for s in (1, -1)
+            Loop(setup.parameters.model(setup.plant.source.model, setup.theta + s * shift), 1)
+            for s in (1, -1)
         )
         x, u, psi, loop = curve.state[k], curve.ctrl[k], S.psi[k][:, j], pair[0]
         columns = []
         for i in range(nx + nu):
             e = d * np.eye(nx + nu)[i]
-            moved = [psi_step(setup, pair, h, loop.plus(x, s * e[:nx]), u + s * e[nx:], psi, j) for s in (1, -1)]
+            moved = [
+                psi_step(setup, pair, h, loop.plus(x, s * e[:nx]), u + s * e[nx:], psi, j)
+                for s in (1, -1)
+            ]
             columns.append((moved[0] - moved[1]) / (2 * d))
         by_psi = [
-            (psi_step(setup, pair, h, x, u, psi + s, j) - psi_step(setup, pair, h, x, u, psi - s, j)) / 2
+            (
+                psi_step(setup, pair, h, x, u, psi + s, j)
+                - psi_step(setup, pair, h, x, u, psi - s, j)
+            )
+            / 2
             for s in np.eye(nx)
         ]
         rows = slice(nx * (1 + j), nx * (2 + j))
@@ -167,7 +201,9 @@ def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tm
         assert np.abs(wide.B[k, rows] - mixed[:, nx:]).max() < 1e-4 * np.abs(mixed).max()
         assert relative_error(wide.A[k, rows, rows], np.array(by_psi).T) < 1e-5
         others = [c for c in range(nx, nx * (1 + p)) if not rows.start <= c < rows.stop]
-        np.testing.assert_array_equal(wide.A[k, rows][:, others], 0.0)  # one parameter's psi does not see another's
+        np.testing.assert_array_equal(
+            wide.A[k, rows][:, others], 0.0
+        )  # one parameter's psi does not see another's
 
 
 def test_x_does_not_depend_on_psi_in_the_extended_system(tmp_path) -> None:
@@ -188,7 +224,9 @@ def test_an_expansion_without_psi_is_refused(tmp_path) -> None:
 
 
 def test_the_experiment_chooses_the_extended_metric_and_it_lowers_the_cost(tmp_path: Path) -> None:
-    setup = cart_setup(tmp_path, descent={"method": "metric", "psi_weight": 1e-4, "max_iterations": 3})
+    setup = cart_setup(
+        tmp_path, descent={"method": "metric", "psi_weight": 1e-4, "max_iterations": 3}
+    )
     direction, problem = direction_for(Stage(setup, None))
     assert isinstance(direction, ExtendedMetricDescent)
     assert problem.extended

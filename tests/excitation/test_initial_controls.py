@@ -15,7 +15,12 @@ from mjfim.excitation.initial_controls import starts_of
 from mjfim.experiment.system import Setup
 from mjfim.signals import fourier_basis
 
-SWING = {"kind": "sine", "amplitude": {"shoulder": 0.1, "elbow": 0.3}, "offset": 0.2, "frequency": 1.0}
+SWING = {
+    "kind": "sine",
+    "amplitude": {"shoulder": 0.1, "elbow": 0.3},
+    "offset": 0.2,
+    "frequency": 1.0,
+}
 RANGE = {"shoulder": (-0.35, 0.3)}
 
 
@@ -47,7 +52,9 @@ def test_the_given_control_takes_the_place_of_the_initial_one(tmp_path: Path) ->
     assert not np.array_equal(other[1].control, starts[2].control)
 
 
-def test_random_starts_swing_about_the_middle_up_to_six_times_as_far_within_their_range(tmp_path: Path) -> None:
+def test_random_starts_swing_about_the_middle_up_to_six_times_as_far_within_their_range(
+    tmp_path: Path,
+) -> None:
     setup = arm(tmp_path, descent={"starts": 40})
     shoulder, elbow = np.array([s.control for s in starts_of(setup, None)][1:]).transpose(2, 0, 1)
     assert shoulder.max() == 0.3 and shoulder.min() == -0.35
@@ -81,13 +88,19 @@ def test_a_fourier_start_brings_its_series(begins: bool, ends: bool, tmp_path: P
         setup = arm(tmp_path, boundary=boundary, limits=limits, descent={"fourier": (1.5,)})
         series = list(starts_of(setup, None))[1].basis
         assert series is not None
-        np.testing.assert_array_equal(series, fourier_basis(setup.t, 1.0, 1.5, harmonics, begins, ends))
+        np.testing.assert_array_equal(
+            series, fourier_basis(setup.t, 1.0, 1.5, harmonics, begins, ends)
+        )
 
 
 @pytest.mark.parametrize(("limits", "most"), [({}, 50), ({"bandwidth": 5.0}, 5)])
-def test_a_series_without_a_single_harmonic_is_refused(limits: dict[str, float], most: int, tmp_path: Path) -> None:
+def test_a_series_without_a_single_harmonic_is_refused(
+    limits: dict[str, float], most: int, tmp_path: Path
+) -> None:
     setup = arm(tmp_path, limits=limits, descent={"fourier": (60.0,)})
-    with pytest.raises(ExperimentError, match=rf"descent\.fourier: 60 Hz is above the bandwidth of {most} Hz"):
+    with pytest.raises(
+        ExperimentError, match=rf"descent\.fourier: 60 Hz is above the bandwidth of {most} Hz"
+    ):
         list(starts_of(setup, None))
 
 
@@ -98,22 +111,35 @@ def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) ->
     for name, count in (("old.csv", 21), ("short.csv", 5)):
         text = "\n".join(["t,ctrl:shoulder,ctrl:elbow,qpos:elbow", *lines[:count]])
         (tmp_path / name).write_text(text + "\n", encoding="utf-8")
-    setup = arm(tmp_path, descent={"previous": (str(tmp_path / "old.csv"), str(tmp_path / "short.csv"))})
+    setup = arm(
+        tmp_path, descent={"previous": (str(tmp_path / "old.csv"), str(tmp_path / "short.csv"))}
+    )
     (_, old, short) = starts_of(setup, None)
-    assert (old.name, short.name) == (f"previous design {tmp_path}/old.csv", f"previous design {tmp_path}/short.csv")
+    assert (old.name, short.name) == (
+        f"previous design {tmp_path}/old.csv",
+        f"previous design {tmp_path}/short.csv",
+    )
     for start, length in ((old, 20), (short, 5)):
         row = (np.arange(100) // 2) % length
-        np.testing.assert_allclose(start.control, np.stack([0.01 * row, -0.02 * row], axis=1), atol=1e-12)
+        np.testing.assert_allclose(
+            start.control, np.stack([0.01 * row, -0.02 * row], axis=1), atol=1e-12
+        )
     missing = arm(tmp_path, descent={"previous": ("gone.csv",)})
     with pytest.raises(RecordingError, match=r"gone\.csv: no such file"):
         list(starts_of(missing, None))
 
 
-def test_a_repeated_start_is_the_first_part_of_the_initial_control_faded_to_rest(tmp_path: Path) -> None:
+def test_a_repeated_start_is_the_first_part_of_the_initial_control_faded_to_rest(
+    tmp_path: Path,
+) -> None:
     boundary, limits = {"start": "rest", "end": "rest"}, {"control": RANGE, "control_rate": 5.0}
     setup = arm(tmp_path, boundary=boundary, limits=limits, descent={"repeats": (2, 4)})
     half, quarter = list(starts_of(setup, None))[1:]
-    assert (half.name, half.repeats, len(half.control)) == ("2 times a design of 0.5 s", 2, setup.samples // 2)
+    assert (half.name, half.repeats, len(half.control)) == (
+        "2 times a design of 0.5 s",
+        2,
+        setup.samples // 2,
+    )
     assert (quarter.repeats, len(quarter.control)) == (4, setup.samples // 4)
     np.testing.assert_allclose(half.control[0], setup.centre)
     middle = slice(len(half.control) // 10 + 1, 3 * len(half.control) // 4)
@@ -122,9 +148,13 @@ def test_a_repeated_start_is_the_first_part_of_the_initial_control_faded_to_rest
 
 
 def test_repeats_that_do_not_divide_or_lack_limits_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, match=r"descent\.repeats: 7 does not divide the 100 samples"):
+    with pytest.raises(
+        ExperimentError, match=r"descent\.repeats: 7 does not divide the 100 samples"
+    ):
         starts_of(arm(tmp_path, descent={"repeats": (7,)}), None)
-    with pytest.raises(ExperimentError, match=r"descent\.repeats: 100 leaves 1 of 100 samples; needs 2"):
+    with pytest.raises(
+        ExperimentError, match=r"descent\.repeats: 100 leaves 1 of 100 samples; needs 2"
+    ):
         starts_of(arm(tmp_path, descent={"repeats": (100,)}), None)
     weights = {"limits": {}, "cost": {"control": 1.0}, "descent": {"repeats": (2,)}}
     with pytest.raises(ExperimentError, match=r"descent\.repeats needs hard limits"):

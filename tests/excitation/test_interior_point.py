@@ -53,7 +53,9 @@ def check(setup: Setup, problem: InteriorProblem, expansion: Expansion, h: float
     """Largest relative error of the slope of the problem's value along random controls."""
     gradient = expansion.gradient(np.zeros((setup.samples, 1, setup.space.nx)))
     ways = directions_of(setup, 4)
-    curves = [lambda s, way=way: problem.value(problem.point(setup.control + s * way)) for way in ways]
+    curves = [
+        lambda s, way=way: problem.value(problem.point(setup.control + s * way)) for way in ways
+    ]
     return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
 
 
@@ -121,7 +123,9 @@ def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
     inward = replace(problem, mu=1.0, costs=False)
     begun = setup.plant.engine.steps
     point = inward.point(setup.control)
-    assert setup.plant.engine.steps - begun == setup.samples * setup.substeps  # one rollout, no sensitivity
+    assert (
+        setup.plant.engine.steps - begun == setup.samples * setup.substeps
+    )  # one rollout, no sensitivity
     assert (point.point, point.merit) == (None, 0.0)
     assert inward.value(point) == point.barrier == problem.point(setup.control).barrier
     assert inward.size(point) == max(1.0, abs(point.barrier))
@@ -160,5 +164,7 @@ def test_a_projected_point_is_one_that_is_played_open_loop(tmp_path: Path) -> No
         assert np.abs(change).max() < 0.05
         difference = problem.difference(moved, point)
         np.testing.assert_allclose(difference.v, moved.ctrl - setup.control, rtol=0, atol=1e-15)
-        np.testing.assert_allclose(difference.z, seen(moved).trajectory.state - setup.initial.state, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(
+            difference.z, seen(moved).trajectory.state - setup.initial.state, rtol=0, atol=1e-12
+        )
     assert problem.refine(point) is None

@@ -10,8 +10,16 @@ import mjfim
 from mjfim.errors import ExperimentError, UnidentifiableError
 from mjfim.experiment.system import Setup
 
-NEAR = {"qpos": (0.0, 3.0), "qvel": (0.0, 0.0), "control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.6}}
-FAR = {"qpos": (0.2, 1.5), "qvel": (0.3, 0.0), "control": {"kind": "sine", "amplitude": 3.0, "frequency": 1.1}}
+NEAR = {
+    "qpos": (0.0, 3.0),
+    "qvel": (0.0, 0.0),
+    "control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.6},
+}
+FAR = {
+    "qpos": (0.2, 1.5),
+    "qvel": (0.3, 0.0),
+    "control": {"kind": "sine", "amplitude": 3.0, "frequency": 1.1},
+}
 
 
 def pair(folder, **tables) -> list[mjfim.Experiment]:
@@ -30,7 +38,10 @@ def test_the_sum_is_at_least_as_good_as_that_of_separate_designs(tmp_path) -> No
     setup = Setup(experiments[0])
     together = mjfim.design_together(experiments, rounds=2)
     apart = [mjfim.design(e) for e in experiments]
-    phi = [setup.information.evaluate(sum(own(d) for d in designs)).value for designs in (together, apart)]
+    phi = [
+        setup.information.evaluate(sum(own(d) for d in designs)).value
+        for designs in (together, apart)
+    ]
     assert phi[0] <= 1.0001 * phi[1]
 
 
@@ -46,7 +57,9 @@ def test_what_one_experiment_cannot_see_another_may(tmp_path) -> None:
     with pytest.raises(UnidentifiableError):
         mjfim.design(blind)
     told = seeing.problem.point(seeing.initial).information
-    helped = mjfim.design(Setup(blind.experiment.replace(descent={"max_iterations": 2}), added=told))
+    helped = mjfim.design(
+        Setup(blind.experiment.replace(descent={"max_iterations": 2}), added=told)
+    )
     assert np.isfinite(helped.final.std).all()
 
 

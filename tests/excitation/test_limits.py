@@ -50,15 +50,24 @@ def limits(model: mujoco.MjModel, **tables: object) -> tuple[Limit, ...]:
 
 def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajectory:
     """Three samples at rest but for the named columns."""
-    arrays = {"qpos": np.zeros((3, model.nq)), "qvel": np.zeros((3, model.nv)), "ctrl": np.zeros((2, model.nu))}
+    arrays = {
+        "qpos": np.zeros((3, model.nq)),
+        "qvel": np.zeros((3, model.nv)),
+        "ctrl": np.zeros((2, model.nu)),
+    }
     for name, (index, values) in columns.items():
         arrays[name][:, index] = values
-    return Trajectory(np.arange(3) * 0.1, arrays["qpos"], arrays["qvel"], np.zeros((3, 0)), arrays["ctrl"])
+    return Trajectory(
+        np.arange(3) * 0.1, arrays["qpos"], arrays["qvel"], np.zeros((3, 0)), arrays["ctrl"]
+    )
 
 
 def test_model_ranges_are_the_default(model: mujoco.MjModel) -> None:
     """Ranges of joints and controls; what has none is free. Columns skip the ball joint."""
-    assert limits(model) == (Limit("position", "lift", 4, -0.5, 0.25), Limit("control", "push", 0, -2.0, 3.0))
+    assert limits(model) == (
+        Limit("position", "lift", 4, -0.5, 0.25),
+        Limit("control", "push", 0, -2.0, 3.0),
+    )
 
 
 def test_file_narrows_and_adds(model: mujoco.MjModel) -> None:
@@ -84,15 +93,25 @@ def test_one_number_stands_for_all_names(model: mujoco.MjModel) -> None:
     found = limits(model, velocity=2.0, acceleration=9.0, control_rate=7.0, force=1.5)
     joints, places = (("lift", 3), ("turn", 4)), (("push", 0), ("twist", 1))
     assert set(found) - set(limits(model)) == {
-        *(Limit(kind, name, v, -b, b) for kind, b in (("velocity", 2.0), ("acceleration", 9.0)) for name, v in joints),
-        *(Limit(kind, name, u, -b, b) for kind, b in (("control_rate", 7.0), ("force", 1.5)) for name, u in places),
+        *(
+            Limit(kind, name, v, -b, b)
+            for kind, b in (("velocity", 2.0), ("acceleration", 9.0))
+            for name, v in joints
+        ),
+        *(
+            Limit(kind, name, u, -b, b)
+            for kind, b in (("control_rate", 7.0), ("force", 1.5))
+            for name, u in places
+        ),
     }
     assert limits(model, force={"push": (-1.0, 2.0)})[-1] == Limit("force", "push", 0, -1.0, 2.0)
 
 
 def test_every_range_of_the_model_is_a_limit() -> None:
     """Of positions, controls, forces of actuators and forces of actuators on joints, at their own places."""
-    text = XML.replace('name="turn" type="hinge"', 'name="turn" type="hinge" actuatorfrcrange="-6 7"')
+    text = XML.replace(
+        'name="turn" type="hinge"', 'name="turn" type="hinge" actuatorfrcrange="-6 7"'
+    )
     text = text.replace('joint="turn"/>', 'joint="turn" forcerange="-1 8"/>')
     found = limits(mujoco.MjModel.from_xml_string(text), force=5.0)
     assert {x for x in found if "force" in x.kind} == {
@@ -105,18 +124,36 @@ def test_every_range_of_the_model_is_a_limit() -> None:
 @pytest.mark.parametrize(
     ("tables", "message"),
     [
-        ({"position": {"ball": (-1, 1)}}, r"limits\.position: unknown joint 'ball'.*; valid: lift, turn"),
-        ({"velocity": {"turm": 1.0}}, r"limits\.velocity: unknown joint 'turm' \(did you mean 'turn'\?\)"),
-        ({"control": {"lift": (-1, 1)}}, r"limits\.control: unknown actuator 'lift'; valid: push, twist"),
-        ({"position": {"lift": (1, -1)}}, r"limits\.position\.lift: \[1, -1\] is inverted; needs lower < upper"),
+        (
+            {"position": {"ball": (-1, 1)}},
+            r"limits\.position: unknown joint 'ball'.*; valid: lift, turn",
+        ),
+        (
+            {"velocity": {"turm": 1.0}},
+            r"limits\.velocity: unknown joint 'turm' \(did you mean 'turn'\?\)",
+        ),
+        (
+            {"control": {"lift": (-1, 1)}},
+            r"limits\.control: unknown actuator 'lift'; valid: push, twist",
+        ),
+        (
+            {"position": {"lift": (1, -1)}},
+            r"limits\.position\.lift: \[1, -1\] is inverted; needs lower < upper",
+        ),
         ({"velocity": {"turn": (1.0, 1.0)}}, r"limits\.velocity\.turn: \[1, 1\]"),
         ({"control": {"push": (0.0, float("nan"))}}, r"limits\.control\.push: \[0, nan\]"),
         (
             {"position": {"lift": (0.3, 1.0)}},
             r"limits\.position\.lift: \[0\.3, 1\] and the MJCF's range \[-0\.5, 0\.25\] excl",
         ),
-        ({"acceleration": {"ball": 1.0}}, r"limits\.acceleration: unknown joint 'ball'; valid: lift, turn"),
-        ({"control_rate": {"lift": 1.0}}, r"limits\.control_rate: unknown actuator 'lift'; valid: push, twist"),
+        (
+            {"acceleration": {"ball": 1.0}},
+            r"limits\.acceleration: unknown joint 'ball'; valid: lift, turn",
+        ),
+        (
+            {"control_rate": {"lift": 1.0}},
+            r"limits\.control_rate: unknown actuator 'lift'; valid: push, twist",
+        ),
         ({"force": {"turn": 1.0}}, r"limits\.force: unknown actuator 'turn'.*; valid: push, twist"),
     ],
 )
@@ -138,7 +175,9 @@ def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -
     )
     fence = fence_of(setup)
     assert not len(fence.taps.f)
-    shown = fence.taps.rows(trajectory.qpos[1:], trajectory.qvel[1:], trajectory.qvel[:-1], dict[str, np.ndarray]().get)
+    shown = fence.taps.rows(
+        trajectory.qpos[1:], trajectory.qvel[1:], trajectory.qvel[:-1], dict[str, np.ndarray]().get
+    )
     return fence.margins(Sight(trajectory, shown[:, None]))
 
 
@@ -161,7 +200,10 @@ def test_no_limits_no_margins(model: mujoco.MjModel, tmp_path: Path) -> None:
     ],
 )
 def test_margins(
-    model: mujoco.MjModel, columns: dict[str, tuple[int, list[float]]], expected: dict[str, float], tmp_path: Path
+    model: mujoco.MjModel,
+    columns: dict[str, tuple[int, list[float]]],
+    expected: dict[str, float],
+    tmp_path: Path,
 ) -> None:
     """The worst distance over samples and over both ends, negative outside; zero on the limit."""
     assert margins(XML, tmp_path, curve(model, **columns)) == pytest.approx(expected)
@@ -175,10 +217,18 @@ def test_margin_is_the_worst_of_its_kind(model: mujoco.MjModel, tmp_path: Path) 
         assert found["velocity"] == pytest.approx(-0.5)
 
 
-def test_accelerations_and_rates_of_the_control_are_changes_over_their_time(model: mujoco.MjModel, tmp_path) -> None:
+def test_accelerations_and_rates_of_the_control_are_changes_over_their_time(
+    model: mujoco.MjModel, tmp_path
+) -> None:
     """Of the velocity over an engine step (2 ms), of the control over a sample (10 ms); the first control may be any."""
     moving = curve(model, qvel=(4, [0.0, 0.01, -0.02]), ctrl=(1, [0.5, 0.2]))
-    found = margins(XML, tmp_path, moving, acceleration={"turn": 10.0}, control_rate={"twist": 40.0, "push": 1.0})
+    found = margins(
+        XML,
+        tmp_path,
+        moving,
+        acceleration={"turn": 10.0},
+        control_rate={"twist": 40.0, "push": 1.0},
+    )
     assert found["acceleration"] == pytest.approx(10.0 - 0.03 / 0.002)
     assert found["control_rate"] == pytest.approx(1.0)  # the other one stands still
     quick = margins(XML, tmp_path, moving, control_rate={"twist": 20.0})
@@ -206,22 +256,35 @@ def test_every_control_of_an_actuator_has_its_range() -> None:
     """MuJoCo keeps ranges of controls per control. The range of a single force is a limit too, that of a norm is none."""
     found = limits(mujoco.MjModel.from_xml_string(SERVOED))
     aims = [Limit("control", f"aim[{i}]", i, -1.0, 1.0) for i in range(3)]
-    assert found == (*aims, Limit("control", "actuator1", 3, -5.0, 5.0), Limit("force", "actuator1", 3, -3.0, 4.0))
+    assert found == (
+        *aims,
+        Limit("control", "actuator1", 3, -5.0, 5.0),
+        Limit("force", "actuator1", 3, -3.0, 4.0),
+    )
 
 
 @pytest.mark.parametrize(
     ("ctrl", "names"),
     [
         ([0.1, 0.1, 0.1, 2.0], ()),
-        ([0.15, 0.15, 0.0, -2.0], ("aim",)),  # the norm of three forces is clamped, none of them alone is that large
+        (
+            [0.15, 0.15, 0.0, -2.0],
+            ("aim",),
+        ),  # the norm of three forces is clamped, none of them alone is that large
         ([0.1, 0.1, 0.1, -3.5], ("actuator1",)),
         ([-0.5, 0.0, 0.0, 4.5], ("aim", "actuator1")),
     ],
 )
-def test_clamped_forces_are_found_beside_actuators_with_several(ctrl: list[float], names: tuple[str, ...]) -> None:
+def test_clamped_forces_are_found_beside_actuators_with_several(
+    ctrl: list[float], names: tuple[str, ...]
+) -> None:
     model = mujoco.MjModel.from_xml_string(SERVOED)
     still = Trajectory(
-        np.arange(3) * 0.1, np.tile(model.qpos0, (3, 1)), np.zeros((3, 4)), np.zeros((3, 0)), np.array([ctrl] * 2)
+        np.arange(3) * 0.1,
+        np.tile(model.qpos0, (3, 1)),
+        np.zeros((3, 4)),
+        np.zeros((3, 0)),
+        np.array([ctrl] * 2),
     )
     assert saturated(model, still) == names
 
@@ -236,4 +299,9 @@ def test_every_control_has_its_label_also_where_an_actuator_has_several() -> Non
     )
     labels = Labels.of_model(model)
     assert len(labels.controls) == model.nu == model.nactuator + 2
-    assert labels.controls == ("o[0] (control)", "o[1] (control)", "o[2] (control)", "actuator1 [N m]")
+    assert labels.controls == (
+        "o[0] (control)",
+        "o[1] (control)",
+        "o[2] (control)",
+        "actuator1 [N m]",
+    )

@@ -16,20 +16,32 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.output import folders as results
 
-MOTOR = ('<motor name="force" joint="slide"/>', '<motor name="force" joint="slide" ctrlrange="-4 4"/>')
-SIDE = ("</keyframe>", '<key name="side" qpos="0 1"/><key name="far" qpos="2.5 3.141592653589793"/></keyframe>')
+MOTOR = (
+    '<motor name="force" joint="slide"/>',
+    '<motor name="force" joint="slide" ctrlrange="-4 4"/>',
+)
+SIDE = (
+    "</keyframe>",
+    '<key name="side" qpos="0 1"/><key name="far" qpos="2.5 3.141592653589793"/></keyframe>',
+)
 SOLID = ('contype="0" conaffinity="0" mass="0"', 'mass="0"')
 
 # name: lines at the end of the file, what the message must hold; edits of the model
 FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "start outside": (
         "[limits]\nposition = { hinge = [-1.0, 1.0] }",
-        ["limits.position.hinge: the start is at 3.14159 rad, outside [-1, 1]; widen the limit", "or move the start"],
+        [
+            "limits.position.hinge: the start is at 3.14159 rad, outside [-1, 1]; widen the limit",
+            "or move the start",
+        ],
         [],
     ),
     "start outside the model's range": (
         "",
-        ["limits.position.slide: the start is at 0 m, outside [0.5, 2]", "where it is the MJCF's, there"],
+        [
+            "limits.position.slide: the start is at 0 m, outside [0.5, 2]",
+            "where it is the MJCF's, there",
+        ],
         [('type="slide" axis="1 0 0"', 'type="slide" axis="1 0 0" range="0.5 2"')],
     ),
     "start too slow": (
@@ -97,7 +109,11 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     ),
     "start in collision": (
         "[limits]\nclearance = 0.01",
-        ["limits.clearance: the start is in collision: cart - rail are -0.", "wanted 0.01 m", "limits.ignored"],
+        [
+            "limits.clearance: the start is in collision: cart - rail are -0.",
+            "wanted 0.01 m",
+            "limits.ignored",
+        ],
         [SOLID],
     ),
     "start too close": (
@@ -112,7 +128,9 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     ),
     "unknown body": (
         '[limits]\nclearance = 0.01\nignored = [["bob", "carts"]]',
-        ["limits.ignored: unknown body 'carts' (did you mean 'cart'?); valid: bob, cart, pendulum, world"],
+        [
+            "limits.ignored: unknown body 'carts' (did you mean 'cart'?); valid: bob, cart, pendulum, world"
+        ],
         [],
     ),
     "a body and itself": (
@@ -147,7 +165,11 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
         ["limits.force: unknown actuator 'slide'", "valid: force"],
         [],
     ),
-    "negative rate": ("[limits]\ncontrol_rate = -1.0", ["limits.control_rate: ", "greater than 0"], []),
+    "negative rate": (
+        "[limits]\ncontrol_rate = -1.0",
+        ["limits.control_rate: ", "greater than 0"],
+        [],
+    ),
 }
 
 
@@ -176,11 +198,20 @@ def with_control_weight(folder: Path, lines: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("lines", ["", "[limits]\ncontrol = { force = [-5.0, 5.0] }\nenforce = false"])
-def test_a_control_with_neither_weight_nor_hard_range_is_refused(lines: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "lines", ["", "[limits]\ncontrol = { force = [-5.0, 5.0] }\nenforce = false"]
+)
+def test_a_control_with_neither_weight_nor_hard_range_is_refused(
+    lines: str, tmp_path: Path
+) -> None:
     path = with_control_weight(tmp_path, lines)
     said = "cost.control: actuator 'force' has neither a weight nor a range"
-    misused(run("design", path, "-o", tmp_path / "out"), "study.toml: ", said, "limits.control.force = [lower, upper]")
+    misused(
+        run("design", path, "-o", tmp_path / "out"),
+        "study.toml: ",
+        said,
+        "limits.control.force = [lower, upper]",
+    )
 
 
 def test_a_hard_range_stands_for_the_weight(tmp_path: Path) -> None:
@@ -189,7 +220,9 @@ def test_a_hard_range_stands_for_the_weight(tmp_path: Path) -> None:
     assert Setup(Experiment.from_file(path)).control_weight.tolist() == [0.0]
     model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
     (tmp_path / "cart_pendulum.xml").write_text(model.replace(*MOTOR), encoding="utf-8")
-    assert Setup(Experiment.from_file(with_control_weight(tmp_path, ""))).control_weight.tolist() == [0.0]
+    assert Setup(
+        Experiment.from_file(with_control_weight(tmp_path, ""))
+    ).control_weight.tolist() == [0.0]
 
 
 @pytest.mark.parametrize("rate", [100.0, 2000.0])
@@ -205,26 +238,37 @@ def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) 
         boundary={"start": "rest"},
     )
     with pytest.raises(
-        ExperimentError, match=r"no control holds the start: joint 'hinge' still accelerates by \d\.\d+ per s²"
+        ExperimentError,
+        match=r"no control holds the start: joint 'hinge' still accelerates by \d\.\d+ per s²",
     ):
         mjfim.design(setup)
 
 
-def test_limits_that_no_control_can_keep_are_no_misuse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_that_no_control_can_keep_are_no_misuse(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The pendulum falls faster than it may: exit code 1 after the work, and said which limit is missed."""
     monkeypatch.setattr(results, "leave_design", lambda *_: [])
     hard = "[limits]\nvelocity = { hinge = 0.5 }\ncontrol = { force = [-0.01, 0.01] }"
     path = write_experiment(tmp_path, max_iterations=f"4\n{hard}")
     model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
-    (tmp_path / "cart_pendulum.xml").write_text(model.replace("3.141592653589793", "2.0"), encoding="utf-8")
+    (tmp_path / "cart_pendulum.xml").write_text(
+        model.replace("3.141592653589793", "2.0"), encoding="utf-8"
+    )
     result = run("design", path, "-o", tmp_path / "out", "--json")
     told = loads(result.stdout)
-    assert (result.exit_code, told["status"], told["limits"]["satisfied"]) == (1, "infeasible", False)
+    assert (result.exit_code, told["status"], told["limits"]["satisfied"]) == (
+        1,
+        "infeasible",
+        False,
+    )
     assert "velocity limits are exceeded by" in result.stderr
 
 
 def test_a_fourier_start_above_the_bandwidth_is_refused(tmp_path: Path) -> None:
-    path = write_experiment(tmp_path, max_iterations="3\nfourier = [7.0]\n[limits]\nbandwidth = 5.0")
+    path = write_experiment(
+        tmp_path, max_iterations="3\nfourier = [7.0]\n[limits]\nbandwidth = 5.0"
+    )
     misused(
         run("design", path, "-o", tmp_path / "out"),
         "study.toml: descent.fourier: 7 Hz is above the bandwidth of 5 Hz",

@@ -32,12 +32,19 @@ from mjfim.optimize.lq import TangentCurve, regulator
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.plant import CENTRAL, FAST, Accuracy
 
-TRACKING = {"tracking": {"slide": 0.3, "hinge": 0.1}, "tracking_velocity": {"slide": 0.2}, "control": 1e-2}
+TRACKING = {
+    "tracking": {"slide": 0.3, "hinge": 0.1},
+    "tracking_velocity": {"slide": 0.2},
+    "control": 1e-2,
+}
 
 
 def cartpole(folder: Path) -> Setup:
     """dm_control's cart-pole, RK4. |u| <= 0.3 of 1 and the slide stays inside its +-1.8 m: no constraint acts."""
-    parameters = {"m": {"target": "body/pole_1:mass"}, "drag": {"target": "joint/slider:damping", "guess": 0.1}}
+    parameters = {
+        "m": {"target": "body/pole_1:mass"},
+        "drag": {"target": "joint/slider:damping", "guess": 0.1},
+    }
     control = {"kind": "sine", "amplitude": 0.3, "frequency": 1.0}
     setup = make_setup(
         shared_model("dmc_cartpole/cartpole.xml"),
@@ -68,7 +75,9 @@ def furuta(folder: Path) -> Setup:
     control = {"kind": "sine", "amplitude": 5e-3, "frequency": 1.5}
     initial = {"qpos": (0.1, 0.3), "control": control}
     model = shared_model("qube_furuta/furuta_pendulum_implicitfast.xml")
-    return make_setup(model, folder, initial=initial, parameters=parameters, noise={"state": 0.01}, horizon=0.4)
+    return make_setup(
+        model, folder, initial=initial, parameters=parameters, noise={"state": 0.01}, horizon=0.4
+    )
 
 
 def cart(integrator: str = "RK4", **tables: Any) -> Callable[[Path], Setup]:
@@ -78,10 +87,15 @@ def cart(integrator: str = "RK4", **tables: Any) -> Callable[[Path], Setup]:
 
 def servo(folder: Path) -> Setup:
     """Cart under a position servo whose gain and damping are unknown but not wanted."""
-    motor, position = '<motor name="force" joint="slide"/>', '<position name="force" joint="slide" kp="30" kv="4"/>'
+    motor, position = (
+        '<motor name="force" joint="slide"/>',
+        '<position name="force" joint="slide" kp="30" kv="4"/>',
+    )
     xml = CART_PENDULUM.format(integrator="implicitfast")
     assert motor in xml
-    unwanted = {n: {"target": f"actuator/force:{n}", "nuisance": True, "prior": 2.0} for n in ("kp", "kv")}
+    unwanted = {
+        n: {"target": f"actuator/force:{n}", "nuisance": True, "prior": 2.0} for n in ("kp", "kv")
+    }
     control = {"kind": "sine", "amplitude": 0.3, "frequency": 1.2}
     return make_setup(
         xml.replace(motor, position),
@@ -99,7 +113,13 @@ def staged(setup: Setup, basis: Array | None = None, power: float = np.inf) -> S
 
 
 # Components of one quaternion measured alike would hold the same information at every orientation.
-BALL = {"qpos:ball.qw": 0.01, "qpos:ball.qx": 0.05, "qpos:float": 0.02, "qvel:ball": 0.05, "gyro": 0.05}
+BALL = {
+    "qpos:ball.qw": 0.01,
+    "qpos:ball.qx": 0.05,
+    "qpos:float": 0.02,
+    "qvel:ball": 0.05,
+    "gyro": 0.05,
+}
 COVARIANCE = ((1e-4, 3e-4, 0.0), (3e-4, 2.5e-3, 5e-4), (0.0, 5e-4, 0.01))
 CORRELATED = ({"outputs": ("angle", "rate", "drive"), "covariance": COVARIANCE},)
 SENSED = {"angle": 0.01, "rate": 0.05, "drive": 0.1, "acc": 0.3}
@@ -127,20 +147,31 @@ SETUPS: dict[str, Callable[[Path], Setup]] = {
     "free body D": lambda folder: body_setup(folder, "Euler", cost={"criterion": "D"}),
     "activation": filtered_setup,
     "start unknown": cart(nuisance={"initial": 0.05}, cost={"criterion": "A"}),
-    "ball joint, start unknown": lambda folder: body_setup(folder, nuisance={"initial": {"qvel:ball[1]": True}}),
+    "ball joint, start unknown": lambda folder: body_setup(
+        folder, nuisance={"initial": {"qvel:ball[1]": True}}
+    ),
     "bias and delay unknown": cart(nuisance={"bias": True, "delay": True}, cost={"criterion": "D"}),
     "delay wanted": cart(
-        parameters={**CART_PARAMETERS, "lag": {"target": "output:delay", "guess": 0.013}}, noise=SENSED
+        parameters={**CART_PARAMETERS, "lag": {"target": "output:delay", "guess": 0.013}},
+        noise=SENSED,
     ),
-    "sensors, all nuisances": cart("implicitfast", noise=SENSED, nuisance=LATE, cost={"criterion": "A"}),
+    "sensors, all nuisances": cart(
+        "implicitfast", noise=SENSED, nuisance=LATE, cost={"criterion": "A"}
+    ),
     "servo of unknown gain": servo,
     "correlated noise": cart(noise=SENSED, correlated=CORRELATED),
-    "correlated noise, nuisances": cart(noise=SENSED, correlated=CORRELATED, nuisance=LATE, measure_rate=50.0),
+    "correlated noise, nuisances": cart(
+        noise=SENSED, correlated=CORRELATED, nuisance=LATE, measure_rate=50.0
+    ),
     "every sensor at its own rate": cart(noise={**SENSED, "acc": {"sigma": 0.3, "rate": 20.0}}),
     "quaternions measured": lambda folder: body_setup(folder, noise=BALL),
     "all states of a free body": lambda folder: body_setup(folder, noise={"state": 0.02}),
-    "quaternions measured late": lambda folder: body_setup(folder, noise=BALL, nuisance={"delay": 0.01}),
-    "cart c combination": cart(cost={"criterion": "c", "combination": {"m": 1.0, "l": -0.5}}, nuisance=LATE),
+    "quaternions measured late": lambda folder: body_setup(
+        folder, noise=BALL, nuisance={"delay": 0.01}
+    ),
+    "cart c combination": cart(
+        cost={"criterion": "c", "combination": {"m": 1.0, "l": -0.5}}, nuisance=LATE
+    ),
     "cart c subset": cart(cost={"criterion": "c", "subset": ("l", "c")}),
     "cart E smooth": lambda folder: staged(cart_setup(folder, nuisance=LATE), power=40.0),
     "cart E smooth, nearly a sum": lambda folder: staged(cart_setup(folder), power=1.5),
@@ -150,7 +181,9 @@ SETUPS: dict[str, Callable[[Path], Setup]] = {
     ),
     "robust mean": cart(parameters=KNOWN, robust={"over": "mean", "samples": 4}, nuisance=LATE),
     "robust worst": cart(parameters=KNOWN, robust={"over": "worst", "samples": 4}, noise=SENSED),
-    "robust worst D": cart(parameters=KNOWN, robust={"over": "worst", "samples": 3}, cost={"criterion": "D"}),
+    "robust worst D": cart(
+        parameters=KNOWN, robust={"over": "worst", "samples": 3}, cost={"criterion": "D"}
+    ),
     "dmc_cartpole": cartpole,
     "dmc_acrobot": acrobot,
     "qube_furuta": furuta,
@@ -184,7 +217,9 @@ def expansion_of(setup: Setup, accuracy: Accuracy) -> tuple[Point, Expansion]:
     return point, setup.problem.expand(point)
 
 
-def gradient_error(setup: Setup, K: Array, accuracy: Accuracy, h: float, factor: float = 1.0) -> float:
+def gradient_error(
+    setup: Setup, K: Array, accuracy: Accuracy, h: float, factor: float = 1.0
+) -> float:
     """Error of the slope (times a factor) along lifted tangent vectors, against J(P(xi + t zeta))."""
     point, expansion = expansion_of(setup, accuracy)
     slopes, curves = [], []
@@ -217,7 +252,13 @@ def test_gradient_by_fast_differences_is_close(case: str, feedback: bool, tmp_pa
     assert gradient_error(setup, K, FAST, 5e-3) < 1e-3
 
 
-OFF = ["cart E tracking", "free body with ball joint", "activation", "sensors, all nuisances", "robust worst"]
+OFF = [
+    "cart E tracking",
+    "free body with ball joint",
+    "activation",
+    "sensors, all nuisances",
+    "robust worst",
+]
 
 
 @pytest.mark.parametrize("case", OFF)
@@ -246,12 +287,20 @@ def test_leaving_out_what_psi_does_to_the_information_would_be_rejected(tmp_path
 
 @pytest.mark.parametrize(
     ("case", "term"),
-    [("bias and delay unknown", "delay"), ("delay wanted", "lag"), ("quaternions measured", "h_mixed")],
+    [
+        ("bias and delay unknown", "delay"),
+        ("delay wanted", "lag"),
+        ("quaternions measured", "h_mixed"),
+    ],
 )
-def test_leaving_out_a_term_of_the_measurement_would_be_rejected(case: str, term: str, tmp_path, monkeypatch) -> None:
+def test_leaving_out_a_term_of_the_measurement_would_be_rejected(
+    case: str, term: str, tmp_path, monkeypatch
+) -> None:
     setup = SETUPS[case](tmp_path)
     K, whole = np.zeros((setup.samples, setup.plant.nu, setup.space.nx)), setup.plant.bilinear
-    monkeypatch.setattr(setup.plant, "bilinear", lambda *given: replace(whole(*given), **{term: None}))
+    monkeypatch.setattr(
+        setup.plant, "bilinear", lambda *given: replace(whole(*given), **{term: None})
+    )
     assert gradient_error(setup, K, CENTRAL, 5e-3) > 1e-3
 
 
@@ -277,9 +326,13 @@ def test_gradient_and_lift_are_dual_to_the_slope_under_any_feedback(case: str, t
     for K in (gain(setup), 0.0 * gain(setup)):
         c = rng.normal(size=setup.control.shape)
         zeta = expansion.lift(K, c)
-        assert expansion.slope(zeta) == pytest.approx(float(np.sum(expansion.gradient(K) * c)), rel=1e-9)
+        assert expansion.slope(zeta) == pytest.approx(
+            float(np.sum(expansion.gradient(K) * c)), rel=1e-9
+        )
         residual = zeta.z[1:] - np.einsum("kij,kj->ki", expansion.A, zeta.z[:-1])
-        np.testing.assert_allclose(residual, np.einsum("kij,kj->ki", expansion.B, zeta.v), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            residual, np.einsum("kij,kj->ki", expansion.B, zeta.v), rtol=0, atol=1e-9
+        )
         coordinate = zeta.v + np.einsum("kui,ki->ku", K, zeta.z[:-1])
         np.testing.assert_allclose(coordinate, c, rtol=0, atol=1e-9)
 
@@ -293,19 +346,27 @@ def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
         d = curve.state[k + 1] - setup.initial.state[k + 1]
         total += 0.5 * 0.01 * (d @ np.diag(Q) @ d + 1e-2 * curve.ctrl[k, 0] ** 2)
     assert running.value(curve) == pytest.approx(total, rel=1e-12)
-    assert running.value(setup.initial) == pytest.approx(0.5 * 0.01 * 1e-2 * np.sum(setup.control**2), rel=1e-12)
+    assert running.value(setup.initial) == pytest.approx(
+        0.5 * 0.01 * 1e-2 * np.sum(setup.control**2), rel=1e-12
+    )
     a, b = running.gradient(curve)
-    np.testing.assert_allclose(a[1:], 0.01 * (curve.state - setup.initial.state)[1:] * Q, rtol=1e-12)
+    np.testing.assert_allclose(
+        a[1:], 0.01 * (curve.state - setup.initial.state)[1:] * Q, rtol=1e-12
+    )
     np.testing.assert_array_equal(a[0], 0.0)
     np.testing.assert_allclose(b, 0.01 * 1e-2 * curve.ctrl, rtol=1e-12)
 
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])
-def test_slopes_are_compared_with_J_or_where_J_may_vanish_with_what_cannot(criterion: str, tmp_path) -> None:
+def test_slopes_are_compared_with_J_or_where_J_may_vanish_with_what_cannot(
+    criterion: str, tmp_path
+) -> None:
     setup = cart_setup(tmp_path, cost={**TRACKING, "criterion": criterion, "information": 0.3})
     point = setup.problem.point(setup.initial)
     if criterion == "D":
-        assert setup.problem.size(point) == pytest.approx(0.3 * 3 + setup.problem.running.value(setup.initial))
+        assert setup.problem.size(point) == pytest.approx(
+            0.3 * 3 + setup.problem.running.value(setup.initial)
+        )
         assert point.cost < 0.0
     else:
         assert setup.problem.size(point) == point.cost > 0.0

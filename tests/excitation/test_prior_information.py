@@ -41,7 +41,9 @@ def test_designs_and_estimates_add_up_by_name(tmp_path: Path) -> None:
     wanted = np.zeros((3, 3))
     wanted[np.ix_([1, 0], [1, 0])] += first
     wanted[np.ix_([2, 0], [2, 0])] += second
-    np.testing.assert_allclose(information_of([design, estimate], ("a", "b", "c")), wanted, rtol=1e-12)
+    np.testing.assert_allclose(
+        information_of([design, estimate], ("a", "b", "c")), wanted, rtol=1e-12
+    )
     assert not information_of([], ("a", "b")).any()
 
 
@@ -50,8 +52,12 @@ def test_what_the_file_knows_besides_is_marginalised(tmp_path: Path) -> None:
     matrix = information(2, 4)
     path = design_file(tmp_path / "design.json", ["x", "a", "y", "b"], matrix)
     found = information_of([path], ("a", "b"))
-    np.testing.assert_allclose(np.linalg.inv(found), np.linalg.inv(matrix)[np.ix_([1, 3], [1, 3])], rtol=1e-11)
-    assert np.abs(found - matrix[np.ix_([1, 3], [1, 3])]).max() > 0.1, "nothing to marginalise: a weak test"
+    np.testing.assert_allclose(
+        np.linalg.inv(found), np.linalg.inv(matrix)[np.ix_([1, 3], [1, 3])], rtol=1e-11
+    )
+    assert np.abs(found - matrix[np.ix_([1, 3], [1, 3])]).max() > 0.1, (
+        "nothing to marginalise: a weak test"
+    )
 
 
 def test_what_cannot_be_told_apart_from_the_rest_is_not_known(tmp_path: Path) -> None:
@@ -90,17 +96,47 @@ FAULTS: dict[str, tuple[str, str]] = {
     "not JSON": ("{", "neither a design.json nor an estimate.json"),
     "a list": ("[1, 2]", "neither a design.json nor an estimate.json"),
     "no parameters": ('{"covariance": [[1.0]]}', "neither a design.json nor an estimate.json"),
-    "a study": ('{"parameters": ["a"], "theta": [1.0]}', "neither a design.json nor an estimate.json"),
-    "no information": ('{"parameters": ["a"], "final": {}}', "neither a design.json nor an estimate.json"),
-    "final is no table": ('{"parameters": ["a"], "final": 3}', "neither a design.json nor an estimate.json"),
-    "singular covariance": ('{"parameters": ["a"], "covariance": [[0.0]]}', "neither a design.json nor an estimate"),
-    "text": ('{"parameters": ["a"], "final": {"information": [["many"]]}}', "neither a design.json nor"),
-    "ragged": ('{"parameters": ["a", "b"], "final": {"information": [[1.0], [1.0, 2.0]]}}', "neither a design.json"),
+    "a study": (
+        '{"parameters": ["a"], "theta": [1.0]}',
+        "neither a design.json nor an estimate.json",
+    ),
+    "no information": (
+        '{"parameters": ["a"], "final": {}}',
+        "neither a design.json nor an estimate.json",
+    ),
+    "final is no table": (
+        '{"parameters": ["a"], "final": 3}',
+        "neither a design.json nor an estimate.json",
+    ),
+    "singular covariance": (
+        '{"parameters": ["a"], "covariance": [[0.0]]}',
+        "neither a design.json nor an estimate",
+    ),
+    "text": (
+        '{"parameters": ["a"], "final": {"information": [["many"]]}}',
+        "neither a design.json nor",
+    ),
+    "ragged": (
+        '{"parameters": ["a", "b"], "final": {"information": [[1.0], [1.0, 2.0]]}}',
+        "neither a design.json",
+    ),
     "unknown": ('{"parameters": ["a"], "covariance": [[null]]}', "not 1 x 1 finite numbers"),
-    "infinite": ('{"parameters": ["a"], "final": {"information": [[null]]}}', "not 1 x 1 finite numbers"),
-    "wrong size": ('{"parameters": ["a", "b"], "final": {"information": [[1.0]]}}', "not 2 x 2 finite numbers"),
-    "wrong prior": ('{"parameters": ["a"], "final": {"information": [[1.0]]}, "prior": [1, 2]}', "not 1 x 1 finite"),
-    "strangers": ('{"parameters": ["x", "y"], "final": {"information": [[1, 0], [0, 1]]}}', r"knows x, y, but .* a, b"),
+    "infinite": (
+        '{"parameters": ["a"], "final": {"information": [[null]]}}',
+        "not 1 x 1 finite numbers",
+    ),
+    "wrong size": (
+        '{"parameters": ["a", "b"], "final": {"information": [[1.0]]}}',
+        "not 2 x 2 finite numbers",
+    ),
+    "wrong prior": (
+        '{"parameters": ["a"], "final": {"information": [[1.0]]}, "prior": [1, 2]}',
+        "not 1 x 1 finite",
+    ),
+    "strangers": (
+        '{"parameters": ["x", "y"], "final": {"information": [[1, 0], [0, 1]]}}',
+        r"knows x, y, but .* a, b",
+    ),
 }
 
 
@@ -125,13 +161,19 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
 def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
     """Its data's information becomes part of the next experiment's prior, and of that one's file no more than its own."""
     tables = {"descent": {"max_iterations": 1}, "cost": {"criterion": "A"}}
-    priors = {"m": {"target": "body/bob:mass", "prior": 0.1}, "c": {"target": "joint/hinge:damping"}}
+    priors = {
+        "m": {"target": "body/bob:mass", "prior": 0.1},
+        "c": {"target": "joint/hinge:damping"},
+    }
     first = cart_setup(tmp_path, parameters=priors, **tables)
     design = mjfim.design(first)
     archive.write_design(tmp_path / "one", design, first)
     own = design.final.information - np.diag([100.0, 0.0])
     earlier = str(tmp_path / "one" / "design.json")
-    turned = {"c": {"target": "joint/hinge:damping", "prior": 2.0}, "m": {"target": "body/bob:mass"}}
+    turned = {
+        "c": {"target": "joint/hinge:damping", "prior": 2.0},
+        "m": {"target": "body/bob:mass"},
+    }
     second = cart_setup(tmp_path, parameters=turned, earlier=(earlier,), **tables)
     np.testing.assert_allclose(second.prior, own[::-1, ::-1] + np.diag([0.25, 0.0]), rtol=1e-9)
     again = mjfim.design(second)

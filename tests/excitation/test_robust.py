@@ -18,7 +18,12 @@ from mjfim.experiment.system import Setup
 from mjfim.model.parameter_samples import sampled
 from mjfim.model.parameters import Parameter, ParameterSet
 
-KINDS = {"mean": ("mean", False), "worst": ("worst", False), "worst D": ("worst", True), "mean D": ("mean", True)}
+KINDS = {
+    "mean": ("mean", False),
+    "worst": ("worst", False),
+    "worst D": ("worst", True),
+    "mean D": ("mean", True),
+}
 
 
 def pool(kind: str, count: int = 4) -> Pool:
@@ -49,7 +54,9 @@ def test_the_mean_is_the_mean_and_the_worst_lies_just_below_the_largest() -> Non
     assert pool("mean").value(phi) == 4.0
     np.testing.assert_array_equal(pool("mean").weights(phi), 0.25)
     assert pool("worst").value(phi) == pytest.approx(4.0 ** (-1.0 / 20.0) * 10.0, rel=1e-9)
-    assert pool("worst").weights(phi) @ phi == pytest.approx(pool("worst").value(phi))  # homogeneous in phi
+    assert pool("worst").weights(phi) @ phi == pytest.approx(
+        pool("worst").value(phi)
+    )  # homogeneous in phi
     assert pool("worst").weights(phi)[2] > 0.9
     # D is a logarithm, so its pool is that of exp(phi)
     expected = pool("worst").value(np.exp(phi))
@@ -58,7 +65,9 @@ def test_the_mean_is_the_mean_and_the_worst_lies_just_below_the_largest() -> Non
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_samples_that_agree_pool_to_what_they_are_and_one_that_is_blind_makes_all_blind(kind: str) -> None:
+def test_samples_that_agree_pool_to_what_they_are_and_one_that_is_blind_makes_all_blind(
+    kind: str,
+) -> None:
     assert pool(kind).value(np.full(4, 3.0)) == pytest.approx(3.0)
     assert pool(kind).weights(np.full(4, 3.0)) == pytest.approx(0.25)
     assert pool(kind).value([1.0, np.inf, 2.0, 3.0]) == np.inf
@@ -68,12 +77,18 @@ def test_samples_that_agree_pool_to_what_they_are_and_one_that_is_blind_makes_al
 def test_pooling_a_logarithm_below_zero_works_and_does_not_overflow() -> None:
     for shift in (-900.0, 900.0):
         phi = shift + np.array([0.0, 0.5, 1.0, 0.2])
-        assert pool("worst D").value(phi) - shift == pytest.approx(pool("worst D").value(phi - shift), rel=1e-9)
-        np.testing.assert_allclose(pool("worst D").weights(phi), pool("worst D").weights(phi - shift), rtol=1e-9)
+        assert pool("worst D").value(phi) - shift == pytest.approx(
+            pool("worst D").value(phi - shift), rel=1e-9
+        )
+        np.testing.assert_allclose(
+            pool("worst D").weights(phi), pool("worst D").weights(phi - shift), rtol=1e-9
+        )
 
 
 def test_samples_fill_bounds_evenly_and_begin_with_the_guess() -> None:
-    parameters = unknowns({"bounds": (1.0, 3.0), "guess": 2.5}, {"bounds": (-1e6, 1e6)}, {"guess": 7.0})
+    parameters = unknowns(
+        {"bounds": (1.0, 3.0), "guess": 2.5}, {"bounds": (-1e6, 1e6)}, {"guess": 7.0}
+    )
     theta = np.array([2.5, 0.0, 7.0])
     drawn = sampled(parameters, theta, 21, seed=3)
     assert drawn.shape == (21, 3)
@@ -86,7 +101,9 @@ def test_samples_fill_bounds_evenly_and_begin_with_the_guess() -> None:
 
 
 def test_samples_of_a_prior_are_normal_and_keep_within_bounds_and_reason() -> None:
-    parameters = unknowns({"prior": 0.5, "guess": 2.0}, {"prior": 1.0, "bounds": (-0.2, np.inf)}, {"prior": 1e3})
+    parameters = unknowns(
+        {"prior": 0.5, "guess": 2.0}, {"prior": 1.0, "bounds": (-0.2, np.inf)}, {"prior": 1e3}
+    )
     theta = np.array([2.0, 0.0, 0.0])
     drawn = sampled(parameters, theta, 2001, seed=0)[1:]
     z = (drawn - theta) / [0.5, 1.0, 1e3]
@@ -116,7 +133,9 @@ def test_parameters_without_prior_and_bounds_cannot_be_sampled(tmp_path) -> None
         cart_setup(tmp_path, robust={"samples": 1})
     bounded = {"m": {**CART_PARAMETERS["m"], "bounds": (1.0, 2.0)}}
     with pytest.raises(ExperimentError, match="psi_weight"):
-        cart_setup(tmp_path, parameters=bounded, robust={}, descent={"method": "metric", "psi_weight": 1.0})
+        cart_setup(
+            tmp_path, parameters=bounded, robust={}, descent={"method": "metric", "psi_weight": 1.0}
+        )
 
 
 # The pendulum's length is known to a factor of two only: what swings it well at one length does not at another.
@@ -165,7 +184,10 @@ def test_the_cost_is_the_pooled_criterion_of_separate_experiments_at_the_samples
 def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
     over: str, pooled: Callable[[Array], float], tmp_path
 ) -> None:
-    robust, nominal = vague_setup(tmp_path, robust={"over": over, "samples": 5, "seed": 2}), vague_setup(tmp_path)
+    robust, nominal = (
+        vague_setup(tmp_path, robust={"over": over, "samples": 5, "seed": 2}),
+        vague_setup(tmp_path),
+    )
     plain = design(nominal)
     made = design(robust, start=plain.trajectory.ctrl)
     assert plain.status.success and made.status.success
@@ -173,7 +195,8 @@ def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
     assert pooled(ours) < 0.9 * pooled(theirs)
     # each is the better one by its own cost
     crossed = [
-        s.problem.point(s.plant.simulate(s.theta, d.trajectory.ctrl)) for s, d in ((robust, plain), (nominal, made))
+        s.problem.point(s.plant.simulate(s.theta, d.trajectory.ctrl))
+        for s, d in ((robust, plain), (nominal, made))
     ]
     assert made.final.cost < 0.9 * crossed[0].cost
     assert plain.final.cost < 0.9 * crossed[1].cost
@@ -184,13 +207,20 @@ def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
 
 
 def test_samples_are_halved_until_their_bodies_can_exist() -> None:
-    parameters = unknowns({"bounds": (0.0, 8.0), "guess": 1.0}, {"bounds": (0.0, 8.0), "guess": 1.0})
-    theta, free = np.ones(2), sampled(unknowns({"bounds": (0.0, 8.0)}, {"bounds": (0.0, 8.0)}), np.ones(2), 9, 0)
+    parameters = unknowns(
+        {"bounds": (0.0, 8.0), "guess": 1.0}, {"bounds": (0.0, 8.0), "guess": 1.0}
+    )
+    theta, free = (
+        np.ones(2),
+        sampled(unknowns({"bounds": (0.0, 8.0)}, {"bounds": (0.0, 8.0)}), np.ones(2), 9, 0),
+    )
     drawn = sampled(parameters, theta, 9, 0, lambda row: [0] if row[0] > 2.0 else [])
     np.testing.assert_array_equal(drawn[:, 1], free[:, 1])
     assert (free[:, 0] > 2.0).sum() >= 4
     times = np.log2((free[1:, 0] - 1.0) / (drawn[1:, 0] - 1.0))
-    np.testing.assert_allclose(times, np.ceil(np.log2(np.maximum(free[1:, 0] - 1.0, 1.0))), atol=1e-9)
+    np.testing.assert_allclose(
+        times, np.ceil(np.log2(np.maximum(free[1:, 0] - 1.0, 1.0))), atol=1e-9
+    )
     assert (drawn[:, 0] <= 2.0).all()
     # where no halving helps they end at the guess, even those that are never right
     np.testing.assert_array_equal(sampled(parameters, theta, 3, 0, lambda row: [0, 1]), 1.0)
@@ -200,7 +230,9 @@ def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     table = {"B": {"inertial": "hull", "coordinates": "barycentric", "prior": 0.5}}
     setup = body_setup(tmp_path, parameters=table, robust={"samples": 8})
     assert setup.pool is not None
-    moments = np.array([setup.plant.model(theta).body("hull").inertia for theta in setup.pool.thetas])
+    moments = np.array(
+        [setup.plant.model(theta).body("hull").inertia for theta in setup.pool.thetas]
+    )
     assert (moments > 0.0).all()
     assert (2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)).all()
     free = sampled(setup.parameters, setup.theta, 8, 0)

@@ -31,7 +31,9 @@ SIGMA = {"m": 0.0115, "l": 0.02, "c": 0.0125}  # wanted: reached at about one se
 
 def wanting(sigma: dict[str, float], **tables: object) -> mjfim.Experiment:
     """The study with standard deviations to aim at."""
-    return STUDY.replace(parameters={name: {"wanted": value} for name, value in sigma.items()}, **tables)
+    return STUDY.replace(
+        parameters={name: {"wanted": value} for name, value in sigma.items()}, **tables
+    )
 
 
 def worst(experiment: mjfim.Experiment) -> float:
@@ -98,7 +100,9 @@ def test_it_reaches_what_is_wanted(shorter: mjfim.Shortest) -> None:
     told = mjfim.evaluate_trajectory(setup, shorter.design.trajectory)
     assert furthest(told.std, wanted_of(setup))[0] <= 1.0
     best = next(t for t in shorter.tried if t.horizon == shorter.horizon)
-    assert best.reached and best.ratio == pytest.approx(furthest(told.std, wanted_of(setup))[0], rel=1e-6)
+    assert best.reached and best.ratio == pytest.approx(
+        furthest(told.std, wanted_of(setup))[0], rel=1e-6
+    )
     assert shorter.summary()["horizon"] == shorter.horizon
 
 
@@ -121,7 +125,10 @@ def test_longer_than_stated_where_it_takes_longer(shorter: mjfim.Shortest) -> No
 
 def test_what_is_out_of_reach_is_said_with_numbers() -> None:
     hard = wanting({"m": 1e-3, "l": 0.02, "c": 0.0125}, horizon=0.6)
-    with pytest.raises(OutOfReachError, match=r"0\.8 s is not enough: it does not tell m \(σ 0\.\d+, wanted 0\.001\)"):
+    with pytest.raises(
+        OutOfReachError,
+        match=r"0\.8 s is not enough: it does not tell m \(σ 0\.\d+, wanted 0\.001\)",
+    ):
         mjfim.shortest(hard, longest=0.8)
 
 
@@ -130,7 +137,9 @@ def test_default_longest_is_what_a_table_covers(tmp_path: Path) -> None:
     for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
         shutil.copy(MODELS / name, tmp_path)
     text = (tmp_path / "cart_pendulum.csv").read_text(encoding="utf-8").splitlines()
-    (tmp_path / "half.csv").write_text("\n".join(["t,ctrl:force", *text[1:61], "0.60,"]) + "\n", encoding="utf-8")
+    (tmp_path / "half.csv").write_text(
+        "\n".join(["t,ctrl:force", *text[1:61], "0.60,"]) + "\n", encoding="utf-8"
+    )
     table = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").model_dump(exclude_unset=True)
     table = {**table, "horizon": 0.4, "initial": {"keyframe": "hanging", "control": "half.csv"}}
     hard = mjfim.Experiment(**table, directory=tmp_path).replace(
@@ -157,7 +166,10 @@ def test_interrupted_it_returns_the_shortest_so_far() -> None:
             raise KeyboardInterrupt
 
     found = mjfim.shortest(
-        wanting(SIGMA), tolerance=0.05, monitor=monitor, report=lambda tried: horizons.append(tried.horizon)
+        wanting(SIGMA),
+        tolerance=0.05,
+        monitor=monitor,
+        report=lambda tried: horizons.append(tried.horizon),
     )
     assert found.horizon == 1.5 and not found.closed and "interrupted" in str(found)
     with pytest.raises(KeyboardInterrupt):
@@ -168,7 +180,9 @@ def _stop(tried: Tried) -> None:
     raise KeyboardInterrupt
 
 
-def test_a_duration_that_cannot_be_simulated_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_duration_that_cannot_be_simulated_does_not_reach(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Except the stated one: there the fault is the user's to see."""
     real = mjfim.excitation.shortest_horizon.design  # type: ignore[attr-defined]
 
@@ -179,7 +193,11 @@ def test_a_duration_that_cannot_be_simulated_does_not_reach(monkeypatch: pytest.
 
     monkeypatch.setattr(mjfim.excitation.shortest_horizon, "design", faulty)
     found = mjfim.shortest(wanting(SIGMA), tolerance=0.05)
-    assert 1.4 <= found.horizon <= 1.45 and found.missed is not None and found.missed.why == "too short"
+    assert (
+        1.4 <= found.horizon <= 1.45
+        and found.missed is not None
+        and found.missed.why == "too short"
+    )
     with pytest.raises(SimulationDiverged):
         mjfim.shortest(wanting(SIGMA, horizon=1.0))
 
@@ -189,7 +207,11 @@ def test_control_of_another_duration(tmp_path: Path) -> None:
     control = np.arange(4.0)[:, None]
 
     def made(samples: int, **tables: object) -> list[float]:
-        return fitted(Setup(STUDY.replace(horizon=samples / 100.0, **tables)), control).ravel().tolist()
+        return (
+            fitted(Setup(STUDY.replace(horizon=samples / 100.0, **tables)), control)
+            .ravel()
+            .tolist()
+        )
 
     limited = {"limits": {"control": {"force": (-5.0, 5.0)}}}
     assert made(3) == [0.0, 1.0, 2.0] and made(4) == [0.0, 1.0, 2.0, 3.0]

@@ -38,7 +38,10 @@ def spring_setup(folder: Path, joint: str = "", motor: str = "", **tables: Any) 
         "horizon": 1.0,
         "parameters": {"m": {"target": "body/ball:mass"}},
         "noise": {"state": 0.01},
-        "initial": {"qvel": (SPEED,), "control": {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0}},
+        "initial": {
+            "qvel": (SPEED,),
+            "control": {"kind": "sine", "amplitude": 1e-3, "frequency": 1.0},
+        },
     }
     text = SPRING.format(joint=joint, motor=motor, integrator="RK4")
     return make_setup(text, folder, **{**defaults, **tables})
@@ -61,7 +64,9 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
     # by hand: a harmonic of 10 Hz
     assert found.margins["position"] == pytest.approx(0.1 - SWING, rel=1e-3)
     assert found.margins["velocity"] == pytest.approx(-1.9 * SPEED, rel=1e-3)
-    assert found.margins["acceleration"] == pytest.approx(300.0 - SWING * (2 * np.pi * 10.0) ** 2, rel=3e-3)
+    assert found.margins["acceleration"] == pytest.approx(
+        300.0 - SWING * (2 * np.pi * 10.0) ** 2, rel=3e-3
+    )
     assert found.deviation < SAME
     # what a fence at the samples alone would have said
     fence = fence_of(setup)
@@ -70,7 +75,9 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
     trajectory, tapped = watched
     at_samples = fence.margins(fence.sight(trajectory, tapped[:, -1:], slopes=False))
     assert min(at_samples.values()) > 0.0
-    assert fence.margins(fence.sight(trajectory, tapped, slopes=False)) == pytest.approx(found.margins)
+    assert fence.margins(fence.sight(trajectory, tapped, slopes=False)) == pytest.approx(
+        found.margins
+    )
 
 
 def test_clearance_between_the_samples_counts(tmp_path: Path) -> None:
@@ -119,12 +126,20 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
 
 
 @pytest.mark.parametrize("enforce", [True, False])
-def test_only_enforced_limits_take_the_clamps_out_of_the_plant(enforce: bool, tmp_path: Path) -> None:
+def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
+    enforce: bool, tmp_path: Path
+) -> None:
     """A boundary alone keeps no force within its clamp: the design's plant must have it."""
     motor = 'ctrlrange="-0.05 0.05" forcerange="-0.04 0.04"'
     control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
-    tables = {"rate": 50.0, "initial": {"qvel": (SPEED,), "control": control}, "cost": {"control": 1.0}}
-    setup = spring_setup(tmp_path, motor=motor, boundary={"end": "periodic"}, limits={"enforce": enforce}, **tables)
+    tables = {
+        "rate": 50.0,
+        "initial": {"qvel": (SPEED,), "control": control},
+        "cost": {"control": 1.0},
+    }
+    setup = spring_setup(
+        tmp_path, motor=motor, boundary={"end": "periodic"}, limits={"enforce": enforce}, **tables
+    )
     assert setup.enforced
     lifted = setup.free()
     designed = lifted.plant.simulate(lifted.theta, setup.control)
@@ -134,7 +149,11 @@ def test_only_enforced_limits_take_the_clamps_out_of_the_plant(enforce: bool, tm
 def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
     """What is asked of the end does."""
     limits = {"position": {"slide": (-0.1, 0.12)}, "clearance": 0.1, "enforce": False}
-    for boundary, kept in (({}, True), ({"end": "periodic"}, True), ({"end": "periodic", "position": 1e-7}, False)):
+    for boundary, kept in (
+        ({}, True),
+        ({"end": "periodic"}, True),
+        ({"end": "periodic", "position": 1e-7}, False),
+    ):
         setup = spring_setup(tmp_path, limits=limits, boundary=boundary)
         found = audit(setup, setup.initial)
         assert found.margins["position"] < 0.0

@@ -19,7 +19,9 @@ from mjfim.model.loading import control_names, coordinates, joint_names
 
 FREE = [f"qpos:float.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
 BALL = [f"qpos:ball.q{part}" for part in "wxyz"]
-RATES = [f"qvel:float.{part}" for part in ("x", "y", "z", "rx", "ry", "rz")] + [f"qvel:ball.r{a}" for a in "xyz"]
+RATES = [f"qvel:float.{part}" for part in ("x", "y", "z", "rx", "ry", "rz")] + [
+    f"qvel:ball.r{a}" for a in "xyz"
+]
 
 
 def sigmas(setup: Setup) -> dict[str, float]:
@@ -43,13 +45,29 @@ def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
     found = sigmas(setup)
     assert {found[n] for n in (*FREE[:3], *RATES)} == {0.02}
     assert {found[n] for n in (*FREE[3:], *BALL)} == {0.01}
-    sensors = ["gyro[0]", "gyro[1]", "gyro[2]", "acc[0]", "acc[1]", "acc[2]", "tip[0]", "tip[1]", "tip[2]"]
+    sensors = [
+        "gyro[0]",
+        "gyro[1]",
+        "gyro[2]",
+        "acc[0]",
+        "acc[1]",
+        "acc[2]",
+        "tip[0]",
+        "tip[1]",
+        "tip[2]",
+    ]
     assert list(measurable(setup.model)) == [*FREE, *BALL, *RATES, *sensors]
 
 
 def test_parts_of_a_joint_go_by_one_name(tmp_path: Path) -> None:
     """`.pos` and `.rot`, the whole joint, one component; what names fewer wins, whatever the order in the file."""
-    table = {"qpos:float.rot": 0.2, "qpos:float": 0.1, "qvel:float.pos": 0.3, "qpos:float.x": 0.7, "acc": 0.4}
+    table = {
+        "qpos:float.rot": 0.2,
+        "qpos:float": 0.1,
+        "qvel:float.pos": 0.3,
+        "qpos:float.x": 0.7,
+        "acc": 0.4,
+    }
     for noise in (table, dict(reversed(table.items()))):
         found = sigmas(body_setup(tmp_path, noise=noise))
         wanted = dict.fromkeys(FREE, 0.1) | {"qpos:float.x": 0.7} | dict.fromkeys(FREE[3:], 0.1)
@@ -59,10 +77,14 @@ def test_parts_of_a_joint_go_by_one_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("joint", ["ball", "float"])
-def test_four_components_hold_exactly_the_information_of_a_rotation_vector(joint: str, tmp_path: Path) -> None:
+def test_four_components_hold_exactly_the_information_of_a_rotation_vector(
+    joint: str, tmp_path: Path
+) -> None:
     """At every attitude of a tumbling body: derivatives of the quaternion by MuJoCo's own integration, over sigma / 2."""
     sigma = 0.05
-    setup = body_setup(tmp_path, noise={f"qpos:{joint}.rot": sigma} if joint == "float" else {"qpos:ball": sigma})
+    setup = body_setup(
+        tmp_path, noise={f"qpos:{joint}.rot": sigma} if joint == "float" else {"qpos:ball": sigma}
+    )
     trajectory, loop = setup.initial, Loop(setup.model, 1)
     q = {"ball": 7, "float": 3}[joint]
     v = {"ball": 6, "float": 3}[joint]
@@ -89,7 +111,9 @@ def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: P
     found = setup.plant.sensitivity(setup.theta, setup.initial)
     psi = found.psi[1:, 6:9] / 0.05
     wanted = np.einsum("kip,kiq->pq", psi, psi)
-    np.testing.assert_allclose(setup.information.matrix(found), wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max())
+    np.testing.assert_allclose(
+        setup.information.matrix(found), wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max()
+    )
     assert np.linalg.eigvalsh(wanted)[-1] > 1.0
 
 
@@ -98,7 +122,11 @@ def test_unnamed_joints_are_called_by_their_number(tmp_path: Path) -> None:
     xml = xml.replace('<motor name="twist" joint="ball" gear="0.2 0.1 0.3"/>', "")
     model = mujoco.MjModel.from_xml_string(xml)
     assert joint_names(model) == ("joint0", "joint1")
-    assert [c.name for c in components(model)][6:9] == ["qpos:joint0.qz", "qpos:joint1.qw", "qpos:joint1.qx"]
+    assert [c.name for c in components(model)][6:9] == [
+        "qpos:joint0.qz",
+        "qpos:joint1.qw",
+        "qpos:joint1.qx",
+    ]
 
 
 def test_an_unnamed_joint_does_not_take_the_name_of_another(tmp_path: Path) -> None:
@@ -115,7 +143,11 @@ def test_an_unnamed_joint_does_not_take_the_name_of_another(tmp_path: Path) -> N
 
 def test_rates_are_each_outputs_own(tmp_path: Path) -> None:
     """Slower than, and faster than, the measurement rate of the others."""
-    noise = {"state": 0.1, "qpos:hinge": {"sigma": 0.05, "rate": 100.0}, "acc": {"sigma": 0.3, "rate": 10.0}}
+    noise = {
+        "state": 0.1,
+        "qpos:hinge": {"sigma": 0.05, "rate": 100.0},
+        "acc": {"sigma": 0.3, "rate": 10.0},
+    }
     setup = cart_setup(tmp_path, measure_rate=50.0, noise=noise)
     plain = {"qpos:slide": 2, "qvel:slide": 2, "qvel:hinge": 2}
     assert strides(setup) == {**plain, "qpos:hinge": 1, **{f"acc[{i}]": 10 for i in range(3)}}
@@ -138,8 +170,12 @@ def test_information_of_rates_is_the_sum_over_the_measured_samples(tmp_path: Pat
 
 
 def test_components_of_a_sensor_have_their_own_sigmas(tmp_path: Path) -> None:
-    setup = cart_setup(tmp_path, noise={"acc": {"sigma": [0.1, 0.2, 0.3]}, "qpos:slide": {"sigma": [0.4]}})
-    assert sigmas(setup) == pytest.approx({"qpos:slide": 0.4, "acc[0]": 0.1, "acc[1]": 0.2, "acc[2]": 0.3})
+    setup = cart_setup(
+        tmp_path, noise={"acc": {"sigma": [0.1, 0.2, 0.3]}, "qpos:slide": {"sigma": [0.4]}}
+    )
+    assert sigmas(setup) == pytest.approx(
+        {"qpos:slide": 0.4, "acc[0]": 0.1, "acc[1]": 0.2, "acc[2]": 0.3}
+    )
 
 
 BLOCK = np.array([[0.09, 0.03, 0.0], [0.03, 0.16, -0.02], [0.0, -0.02, 0.04]])
@@ -169,12 +205,25 @@ def test_what_names_less_takes_a_component_out_of_a_covariance(tmp_path: Path) -
 def test_correlated_outputs_replace_their_sigmas(tmp_path: Path) -> None:
     """In the order in which the block names them, and measured even where the noise table does not name them."""
     names = ["acc[2]", "qpos:hinge", "drive"]
-    setup = cart_setup(tmp_path, noise={"state": 0.1}, correlated=[{"outputs": names, "covariance": BLOCK.tolist()}])
-    assert setup.outputs.names == ("qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge", "acc[2]", "drive")
+    setup = cart_setup(
+        tmp_path,
+        noise={"state": 0.1},
+        correlated=[{"outputs": names, "covariance": BLOCK.tolist()}],
+    )
+    assert setup.outputs.names == (
+        "qpos:slide",
+        "qpos:hinge",
+        "qvel:slide",
+        "qvel:hinge",
+        "acc[2]",
+        "drive",
+    )
     at = [setup.outputs.names.index(n) for n in names]
     np.testing.assert_allclose(setup.noise.covariance[np.ix_(at, at)], BLOCK, rtol=1e-15)
     rest = np.setdiff1d(np.arange(6), at)
-    np.testing.assert_allclose(setup.noise.covariance[np.ix_(rest, rest)], 0.01 * np.eye(3), rtol=1e-15)
+    np.testing.assert_allclose(
+        setup.noise.covariance[np.ix_(rest, rest)], 0.01 * np.eye(3), rtol=1e-15
+    )
     assert not setup.noise.covariance[np.ix_(rest, at)].any()
     assert sigmas(setup)["acc[2]"] == pytest.approx(0.3)
 
@@ -195,7 +244,9 @@ def test_correlated_outputs_alone_are_a_measurement(tmp_path: Path) -> None:
     setup = Setup(Experiment(**values, correlated=[plain]), threads=1)
     assert setup.outputs.names == ("qpos:slide", "qvel:hinge")
     np.testing.assert_allclose(setup.noise.covariance, [[0.04, 0.01], [0.01, 0.09]])
-    with pytest.raises(ExperimentError, match=r"noise: nothing is measured: .*state, qpos:slide, .*hinge_velocity"):
+    with pytest.raises(
+        ExperimentError, match=r"noise: nothing is measured: .*state, qpos:slide, .*hinge_velocity"
+    ):
         Setup(Experiment(**values), threads=1)
 
 
@@ -205,7 +256,9 @@ def test_the_joint_information_needs_the_correlation(tmp_path: Path) -> None:
     found = setup.plant.sensitivity(setup.theta, setup.initial)
     inverse = np.linalg.inv(BLOCK)
     wanted = sum(found.G[k].T @ inverse @ found.G[k] for k in range(2, 51, 2))
-    np.testing.assert_allclose(setup.information.matrix(found), wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+    np.testing.assert_allclose(
+        setup.information.matrix(found), wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max()
+    )
     apart = sum(found.G[k].T @ np.diag(1 / np.diag(BLOCK)) @ found.G[k] for k in range(2, 51, 2))
     assert np.abs(apart - wanted).max() > 0.01 * np.abs(wanted).max(), "a weak test"
 
@@ -217,21 +270,44 @@ def square(n: int, value: float = 1.0) -> list[list[float]]:
 
 def pair(*names: str, covariance: Any = None) -> list[dict[str, Any]]:
     """One correlated block."""
-    return [{"outputs": list(names), "covariance": square(len(names)) if covariance is None else covariance}]
+    return [
+        {
+            "outputs": list(names),
+            "covariance": square(len(names)) if covariance is None else covariance,
+        }
+    ]
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "unknown": ({"noise": {"accel": 0.1}}, r"noise: unknown sensor 'accel'.*'acc'.*valid: .*qpos:hinge.*state"),
+    "unknown": (
+        {"noise": {"accel": 0.1}},
+        r"noise: unknown sensor 'accel'.*'acc'.*valid: .*qpos:hinge.*state",
+    ),
     "one component": ({"noise": {"acc[0]": 0.1}}, r"noise: unknown sensor 'acc\[0\]'"),
-    "too few sigmas": ({"noise": {"acc": {"sigma": [1.0, 2.0]}}}, r"noise\.acc\.sigma: 2 numbers, .* each of 3"),
-    "sigmas of a scalar": ({"noise": {"rate": {"sigma": [1.0, 2.0]}}}, r"noise\.rate\.sigma: 2 numbers"),
-    "rate": ({"noise": {"acc": {"sigma": 1.0, "rate": 30.0}}}, r"noise\.acc\.rate: 30 Hz does not divide rate 100 Hz"),
-    "rate above": ({"noise": {"acc": {"sigma": 1.0, "rate": 200.0}}}, r"noise\.acc\.rate: 200 Hz .*100, 50, 25"),
+    "too few sigmas": (
+        {"noise": {"acc": {"sigma": [1.0, 2.0]}}},
+        r"noise\.acc\.sigma: 2 numbers, .* each of 3",
+    ),
+    "sigmas of a scalar": (
+        {"noise": {"rate": {"sigma": [1.0, 2.0]}}},
+        r"noise\.rate\.sigma: 2 numbers",
+    ),
+    "rate": (
+        {"noise": {"acc": {"sigma": 1.0, "rate": 30.0}}},
+        r"noise\.acc\.rate: 30 Hz does not divide rate 100 Hz",
+    ),
+    "rate above": (
+        {"noise": {"acc": {"sigma": 1.0, "rate": 200.0}}},
+        r"noise\.acc\.rate: 200 Hz .*100, 50, 25",
+    ),
     "rate too slow": (
         {"noise": {"acc": {"sigma": 1.0, "rate": 1.0}}},
         r"noise\.acc\.rate: 1 Hz measures nothing within",
     ),
-    "covariance size": ({"noise": {"acc": {"covariance": square(2)}}}, r"noise\.acc\.covariance: wanted 3 rows of 3"),
+    "covariance size": (
+        {"noise": {"acc": {"covariance": square(2)}}},
+        r"noise\.acc\.covariance: wanted 3 rows of 3",
+    ),
     "covariance ragged": (
         {"noise": {"acc": {"covariance": [[1.0, 0.0, 0.0], [0.0, 1.0], [0.0, 0.0, 1.0]]}}},
         r"noise\.acc\.covariance: wanted 3 rows of 3",
@@ -252,15 +328,30 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"noise": {"acc": {"sigma": 1.0, "covariance": square(3)}}},
         r"noise\.acc: .*exactly one of sigma and cov",
     ),
-    "neither": ({"noise": {"acc": {"rate": 10.0}}}, r"noise\.acc: .*exactly one of sigma and covariance"),
-    "sigma zero in a list": ({"noise": {"acc": {"sigma": [1.0, 0.0, 1.0]}}}, r"noise\.acc\.sigma\.1: .*greater than 0"),
+    "neither": (
+        {"noise": {"acc": {"rate": 10.0}}},
+        r"noise\.acc: .*exactly one of sigma and covariance",
+    ),
+    "sigma zero in a list": (
+        {"noise": {"acc": {"sigma": [1.0, 0.0, 1.0]}}},
+        r"noise\.acc\.sigma\.1: .*greater than 0",
+    ),
     "unknown key": (
         {"noise": {"acc": {"sigm": 1.0}}},
         r"noise\.acc\.sigm: unknown key .*'sigma'.*covariance, rate, sigma",
     ),
-    "correlated unknown": ({"correlated": pair("acc", "rate")}, r"correlated\.outputs: unknown output 'acc'.*acc\[0\]"),
-    "correlated twice": ({"correlated": pair("rate", "rate")}, r"correlated\.outputs: an output stands there twice"),
-    "correlated alone": ({"correlated": pair("rate")}, r"correlated\.0\.outputs: .*at least 2 items"),
+    "correlated unknown": (
+        {"correlated": pair("acc", "rate")},
+        r"correlated\.outputs: unknown output 'acc'.*acc\[0\]",
+    ),
+    "correlated twice": (
+        {"correlated": pair("rate", "rate")},
+        r"correlated\.outputs: an output stands there twice",
+    ),
+    "correlated alone": (
+        {"correlated": pair("rate")},
+        r"correlated\.0\.outputs: .*at least 2 items",
+    ),
     "correlated size": (
         {"correlated": pair("rate", "angle", covariance=square(3))},
         r"correlated\.covariance: wanted 2 rows of 2",
@@ -270,7 +361,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         r"correlated\.covariance: not positive definite",
     ),
     "correlated rates": (
-        {"noise": {"rate": 0.1, "angle": {"sigma": 0.1, "rate": 10.0}}, "correlated": pair("rate", "angle")},
+        {
+            "noise": {"rate": 0.1, "angle": {"sigma": 0.1, "rate": 10.0}},
+            "correlated": pair("rate", "angle"),
+        },
         r"correlated\.outputs: rate, angle are measured at different rates",
     ),
     "correlated outside": (
@@ -295,14 +389,19 @@ def test_wrong_tables_are_named(name: str, tmp_path: Path) -> None:
 def test_a_covariance_of_an_orientation_is_refused(tmp_path: Path) -> None:
     """Its four components are one rotation."""
     for key, size in (("qpos:ball", 4), ("qpos:float", 7), ("state", 20)):
-        with pytest.raises(ExperimentError, match=rf"noise\.{key}: orientations take one sigma \[rad\], no covariance"):
+        with pytest.raises(
+            ExperimentError,
+            match=rf"noise\.{key}: orientations take one sigma \[rad\], no covariance",
+        ):
             body_setup(tmp_path, noise={key: {"covariance": square(size)}})
     found = body_setup(tmp_path, noise={"qvel:ball": {"covariance": square(3, 0.25)}})
     assert set(sigmas(found).values()) == {0.5}
 
 
 def test_a_model_without_joints_has_no_state_to_measure(tmp_path: Path) -> None:
-    model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><site name="s"/></worldbody></mujoco>')
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><site name="s"/></worldbody></mujoco>'
+    )
     experiment = Experiment(
         model="x.xml",
         rate=100.0,

@@ -8,7 +8,14 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import CART_PARAMETERS, CART_PENDULUM, body_setup, cart_setup, filtered_setup, make_setup
+from support.numerics import (
+    CART_PARAMETERS,
+    CART_PENDULUM,
+    body_setup,
+    cart_setup,
+    filtered_setup,
+    make_setup,
+)
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError
 from mjfim.experiment.system import Setup
@@ -28,21 +35,33 @@ def named(setup: Setup) -> dict[str, Parameter]:
 def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path: Path) -> None:
     """Guess, size, unit of each from the body itself; at the guess the model is the model."""
     setup = body_setup(
-        tmp_path, parameters={"arm": {**ARM, "coordinates": coordinates}, "d": {"target": "joint/ball:damping"}}
+        tmp_path,
+        parameters={
+            "arm": {**ARM, "coordinates": coordinates},
+            "d": {"target": "joint/ball:damping"},
+        },
     )
     chart = CHARTS[coordinates or "logcholesky"]
     body = setup.model.body("arm").id
     assert setup.parameters.names == (*(f"arm.{n}" for n in chart.names), "d")
     ten = setup.parameters.parameters[:10]
-    np.testing.assert_allclose([p.guess for p in ten], chart.of(inertial(setup.model, body)), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        [p.guess for p in ten], chart.of(inertial(setup.model, body)), rtol=1e-12, atol=1e-15
+    )
     np.testing.assert_array_equal([p.scale for p in ten], chart.size(inertial(setup.model, body)))
-    np.testing.assert_array_equal(setup.parameters.step[:10], chart.size(inertial(setup.model, body)))
+    np.testing.assert_array_equal(
+        setup.parameters.step[:10], chart.size(inertial(setup.model, body))
+    )
     assert tuple(p.unit for p in ten) == chart.units
     assert {p.group for p in ten} == {"arm"} and setup.parameters.parameters[10].group == ""
     own = setup.model_at(setup.parameters.guess)
     for field in ("body_mass", "body_ipos", "dof_M0"):
-        np.testing.assert_allclose(getattr(own, field), getattr(setup.model, field), rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(inertial(own, body).inertia, inertial(setup.model, body).inertia, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            getattr(own, field), getattr(setup.model, field), rtol=1e-9, atol=1e-12
+        )
+    np.testing.assert_allclose(
+        inertial(own, body).inertia, inertial(setup.model, body).inertia, rtol=1e-9, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("coordinates", ["logcholesky", "barycentric"])
@@ -77,8 +96,12 @@ def test_scale_guess_of_an_inertial_is_each_coordinates_own_value(tmp_path: Path
     hull = {"hull": {"inertial": "hull", "scale": "guess", "coordinates": "barycentric"}}
     setup = body_setup(tmp_path, parameters=hull)
     np.testing.assert_allclose(setup.parameters.scale, np.abs(setup.parameters.guess), rtol=1e-15)
-    with pytest.raises(ExperimentError, match=r"parameters\.arm\.scale: my is 0; leave scale = \"guess\" out"):
-        body_setup(tmp_path, parameters={"arm": {**ARM, "scale": "guess", "coordinates": "barycentric"}})
+    with pytest.raises(
+        ExperimentError, match=r"parameters\.arm\.scale: my is 0; leave scale = \"guess\" out"
+    ):
+        body_setup(
+            tmp_path, parameters={"arm": {**ARM, "scale": "guess", "coordinates": "barycentric"}}
+        )
 
 
 PLATE = CART_PENDULUM.format(integrator="RK4").replace(
@@ -91,21 +114,41 @@ def test_rods_and_plates_are_told_which_coordinates_fit(moments: str, tmp_path: 
     """Log-Cholesky is the default and cannot hold them."""
     xml = PLATE.format(moments)
     if moments.startswith("2"):
-        with pytest.raises(ExperimentError, match=r"bob\.inertial: body 'bob': .*a rod or a plate.*\"barycentric\""):
+        with pytest.raises(
+            ExperimentError, match=r"bob\.inertial: body 'bob': .*a rod or a plate.*\"barycentric\""
+        ):
             make_setup(xml, tmp_path, parameters={"bob": {"inertial": "bob"}}, noise={"state": 0.1})
         table = {"s": {"target": "body/bob:logcholesky[4]"}}
-        with pytest.raises(ExperimentError, match=r"parameters\.s: body 'bob' has no logcholesky coordinates"):
+        with pytest.raises(
+            ExperimentError, match=r"parameters\.s: body 'bob' has no logcholesky coordinates"
+        ):
             make_setup(xml, tmp_path, parameters=table, noise={"state": 0.1})
     else:  # thin, but a body
-        assert len(make_setup(xml, tmp_path, parameters={"bob": {"inertial": "bob"}}, noise={"state": 0.1}).theta) == 10
+        assert (
+            len(
+                make_setup(
+                    xml, tmp_path, parameters={"bob": {"inertial": "bob"}}, noise={"state": 0.1}
+                ).theta
+            )
+            == 10
+        )
     table = {"bob": {"inertial": "bob", "coordinates": "barycentric"}}
     assert len(make_setup(xml, tmp_path, parameters=table, noise={"state": 0.1}).theta) == 10
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "no such body": ({"arm": {"inertial": "amr"}}, r"parameters\.arm\.inertial: unknown body 'amr'.*'arm'.*hull"),
-    "body without mass": ({"arm": {"inertial": "world"}}, r"parameters\.arm\.inertial: body 'world' has no mass"),
-    "guess for ten": ({"arm": {**ARM, "guess": 1.0}}, r"parameters\.arm: .*ten parameters; guess would fit only one"),
+    "no such body": (
+        {"arm": {"inertial": "amr"}},
+        r"parameters\.arm\.inertial: unknown body 'amr'.*'arm'.*hull",
+    ),
+    "body without mass": (
+        {"arm": {"inertial": "world"}},
+        r"parameters\.arm\.inertial: body 'world' has no mass",
+    ),
+    "guess for ten": (
+        {"arm": {**ARM, "guess": 1.0}},
+        r"parameters\.arm: .*ten parameters; guess would fit only one",
+    ),
     "more for ten": (
         {"arm": {**ARM, "bounds": [0.0, 1.0], "wanted": 0.1, "unit": "kg", "scale": 2.0}},
         r"parameters\.arm: .*bounds, wanted, unit, scale would fit only one",
@@ -126,7 +169,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"a": ARM, "b": ARM},
         r"parameters\.b\.alpha: target .* already belongs to parameters\.a\.alpha",
     ),
-    "mass beside": ({"a": ARM, "m": {"target": "body/arm:mass"}}, r"several coordinates at once \(logcholesky, mass\)"),
+    "mass beside": (
+        {"a": ARM, "m": {"target": "body/arm:mass"}},
+        r"several coordinates at once \(logcholesky, mass\)",
+    ),
     "clash with a coordinate": (
         {"arm": ARM, "arm.d1": {"target": "joint/ball:damping"}},
         r"parameters\.arm\.d1: two parameters have this name",
@@ -135,18 +181,30 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"f": {"function": print}},
         r"parameters\.f: .*callable, f\(spec, value\), and needs a guess",
     ),
-    "function that is none": ({"f": {"function": "print", "guess": 1.0}}, r"parameters\.f: .*must be callable"),
+    "function that is none": (
+        {"f": {"function": "print", "guess": 1.0}},
+        r"parameters\.f: .*must be callable",
+    ),
     "function and target": (
         {"f": {"function": print, "guess": 1.0, "target": "body/arm:mass"}},
         r"parameters\.f: .*exactly one of",
     ),
-    "all nuisance": ({"m": {"target": "body/arm:mass", "nuisance": True}}, r"parameters: all are nuisance"),
-    "no scale": ({"g": {"target": "body/arm:gravcomp"}}, r"parameters\.g\.scale: .* is 0: state a guess, or a scale"),
+    "all nuisance": (
+        {"m": {"target": "body/arm:mass", "nuisance": True}},
+        r"parameters: all are nuisance",
+    ),
+    "no scale": (
+        {"g": {"target": "body/arm:gravcomp"}},
+        r"parameters\.g\.scale: .* is 0: state a guess, or a scale",
+    ),
     "not in the model": (
         {"g": {"target": "output/acc:bias"}},
         r"parameters\.g: .*unknown output 'acc'.*valid: .*acc\[0\]",
     ),
-    "wanted zero": ({"m": {"target": "body/arm:mass", "wanted": 0.0}}, r"parameters\.m\.wanted: .*greater than 0"),
+    "wanted zero": (
+        {"m": {"target": "body/arm:mass", "wanted": 0.0}},
+        r"parameters\.m\.wanted: .*greater than 0",
+    ),
 }
 
 
@@ -208,10 +266,14 @@ def test_whole_numbers_are_scales_too(tmp_path: Path) -> None:
 
 def test_starts_of_all_components(tmp_path: Path) -> None:
     """One deviation for each degree of freedom in position and velocity, with the prior, unwanted."""
-    setup = body_setup(tmp_path, parameters={"m": {"target": "body/arm:mass"}}, nuisance={"initial": 0.02})
+    setup = body_setup(
+        tmp_path, parameters={"m": {"target": "body/arm:mass"}}, nuisance={"initial": 0.02}
+    )
     found = setup.parameters.parameters
     assert len(found) == 1 + 9 + 9
-    names = [f"initial qpos:float[{i}]" for i in range(6)] + [f"initial qpos:ball[{i}]" for i in range(3)]
+    names = [f"initial qpos:float[{i}]" for i in range(6)] + [
+        f"initial qpos:ball[{i}]" for i in range(3)
+    ]
     assert list(setup.parameters.names[1:10]) == names
     assert list(setup.parameters.names[10:]) == [n.replace("qpos", "qvel") for n in names]
     assert all(p.nuisance and p.prior == 0.02 and p.guess == 0.0 for p in found[1:])
@@ -223,9 +285,21 @@ def test_starts_of_all_components(tmp_path: Path) -> None:
 
 def test_starts_and_biases_by_name(tmp_path: Path) -> None:
     """Only what is named; `true` is unknown, a number is known that well."""
-    nuisance = {"initial": {"qpos:hinge": True, "qvel:slide": 0.1}, "bias": {"qpos:slide": 0.3}, "delay": 0.005}
+    nuisance = {
+        "initial": {"qpos:hinge": True, "qvel:slide": 0.1},
+        "bias": {"qpos:slide": 0.3},
+        "delay": 0.005,
+    }
     parameters = named(cart_setup(tmp_path, nuisance=nuisance))
-    assert list(parameters) == ["m", "l", "c", "initial qpos:hinge", "initial qvel:slide", "bias qpos:slide", "delay"]
+    assert list(parameters) == [
+        "m",
+        "l",
+        "c",
+        "initial qpos:hinge",
+        "initial qvel:slide",
+        "bias qpos:slide",
+        "delay",
+    ]
     assert [p.prior for p in parameters.values()] == [None, None, None, None, 0.1, 0.3, 0.005]
     assert [p.unit for p in parameters.values()][3:] == ["rad", "m/s", "", "s"]
     assert parameters["delay"].scale == 0.01
@@ -233,15 +307,28 @@ def test_starts_and_biases_by_name(tmp_path: Path) -> None:
 
 def test_biases_of_all_outputs(tmp_path: Path) -> None:
     setup = cart_setup(tmp_path, noise={"qpos:hinge": 0.1, "acc": 0.2}, nuisance={"bias": True})
-    assert setup.parameters.names[3:] == ("bias qpos:hinge", "bias acc[0]", "bias acc[1]", "bias acc[2]")
+    assert setup.parameters.names[3:] == (
+        "bias qpos:hinge",
+        "bias acc[0]",
+        "bias acc[1]",
+        "bias acc[2]",
+    )
     np.testing.assert_array_equal(setup.parameters.bias(4)[:, 3:], np.eye(4))
     y, _ = setup.plant.measure(np.array([setup.theta, setup.theta + np.eye(7)[4]]), setup.control)
-    np.testing.assert_allclose(y[1] - y[0], np.broadcast_to([0.0, 1.0, 0.0, 0.0], (51, 4)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        y[1] - y[0], np.broadcast_to([0.0, 1.0, 0.0, 0.0], (51, 4)), rtol=0, atol=1e-12
+    )
 
 
 NUISANCE: dict[str, tuple[dict[str, Any], str]] = {
-    "joint": ({"initial": {"qpos:hing": True}}, r"nuisance\.initial: unknown name 'qpos:hing'.*'qpos:hinge'"),
-    "output": ({"bias": {"acc": True}}, r"nuisance\.bias: unknown name 'acc'.*valid: qpos:hinge, qpos:slide"),
+    "joint": (
+        {"initial": {"qpos:hing": True}},
+        r"nuisance\.initial: unknown name 'qpos:hing'.*'qpos:hinge'",
+    ),
+    "output": (
+        {"bias": {"acc": True}},
+        r"nuisance\.bias: unknown name 'acc'.*valid: qpos:hinge, qpos:slide",
+    ),
     "false": ({"delay": False}, r"nuisance\.delay: "),
     "zero": ({"initial": 0.0}, r"nuisance\.initial: .*greater than 0"),
     "negative": ({"bias": {"qpos:slide": -1.0}}, r"nuisance\.bias\.qpos:slide: .*greater than 0"),
@@ -260,13 +347,21 @@ def test_wrong_nuisance_is_named(name: str, tmp_path: Path) -> None:
 def test_what_the_nuisance_table_names_cannot_be_a_parameter_too(tmp_path: Path) -> None:
     """Neither its number nor its name."""
     own = {**CART_PARAMETERS, "q": {"target": "initial/hinge:qpos"}}
-    with pytest.raises(ExperimentError, match=r"initial qpos:hinge: target .* already belongs to parameters\.q"):
+    with pytest.raises(
+        ExperimentError, match=r"initial qpos:hinge: target .* already belongs to parameters\.q"
+    ):
         cart_setup(tmp_path, parameters=own, nuisance={"initial": True})
     clash = {**CART_PARAMETERS, "delay": {"target": "joint/slide:damping"}}
-    with pytest.raises(ExperimentError, match=r"parameters\.delay: two parameters have this name; call one of them"):
+    with pytest.raises(
+        ExperimentError, match=r"parameters\.delay: two parameters have this name; call one of them"
+    ):
         cart_setup(tmp_path, parameters=clash, nuisance={"delay": True})
     with pytest.raises(ExperimentError, match=r"parameters: all are nuisance"):
-        cart_setup(tmp_path, parameters={"q": {"target": "body/bob:mass", "nuisance": True}}, nuisance={"delay": True})
+        cart_setup(
+            tmp_path,
+            parameters={"q": {"target": "body/bob:mass", "nuisance": True}},
+            nuisance={"delay": True},
+        )
 
 
 def test_joints_without_a_name_are_not_passed_over(tmp_path: Path) -> None:
@@ -277,13 +372,21 @@ def test_joints_without_a_name_are_not_passed_over(tmp_path: Path) -> None:
     table = {"m": {"target": "body/bob:mass"}}
     with pytest.raises(ExperimentError, match=r"nuisance\.initial: 1 joints have no name"):
         make_setup(xml, tmp_path, parameters=table, noise={"state": 0.1}, nuisance={"initial": 0.1})
-    setup = make_setup(xml, tmp_path, parameters=table, noise={"state": 0.1}, nuisance={"initial": {"qpos:slide": 0.1}})
+    setup = make_setup(
+        xml,
+        tmp_path,
+        parameters=table,
+        noise={"state": 0.1},
+        nuisance={"initial": {"qpos:slide": 0.1}},
+    )
     assert setup.parameters.names == ("m", "initial qpos:slide")
 
 
 def test_activations_are_starts_by_path(tmp_path: Path) -> None:
     """The state of a filter, after positions and velocities."""
-    setup = filtered_setup(tmp_path, parameters={"a": {"target": "initial/servo:act", "scale": 0.5}})
+    setup = filtered_setup(
+        tmp_path, parameters={"a": {"target": "initial/servo:act", "scale": 0.5}}
+    )
     assert setup.parameters.start(3).tolist() == [[0.0], [0.0], [1.0]]
     assert setup.plant.start(np.array([0.3]))[2] == pytest.approx(0.5)
 
@@ -300,9 +403,13 @@ def lengthen(spec: Any, value: float) -> None:
 def test_a_function_edits_what_no_path_can(tmp_path: Path) -> None:
     """Against two targets that say the same; the derivative too."""
     targets = [{"path": "body/bob:pos[2]"}, {"path": "body/cart:mass", "scale": 2.0}]
-    first = cart_setup(tmp_path, parameters={"l": {"function": lengthen, "guess": 0.7, "unit": "m"}})
+    first = cart_setup(
+        tmp_path, parameters={"l": {"function": lengthen, "guess": 0.7, "unit": "m"}}
+    )
     second = cart_setup(tmp_path, parameters={"l": {"targets": targets, "guess": 0.7}})
-    assert first.parameters.compiled.tolist() == [True] and second.parameters.compiled.tolist() == [False]
+    assert first.parameters.compiled.tolist() == [True] and second.parameters.compiled.tolist() == [
+        False
+    ]
     np.testing.assert_allclose(first.initial.state, second.initial.state, rtol=0, atol=1e-12)
     found = [s.plant.sensitivity(s.theta, s.initial).G for s in (first, second)]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-7, atol=1e-7)
@@ -317,7 +424,11 @@ def test_a_function_goes_with_paths(tmp_path: Path) -> None:
     table = {"l": {"function": lengthen, "guess": 0.7}, "m": {"target": "body/bob:mass"}}
     setup = cart_setup(tmp_path, parameters=table)
     own = setup.model_at(np.array([0.6, 2.5]))
-    assert (own.body("bob").pos[2], own.body("cart").mass[0], own.body("bob").mass[0]) == pytest.approx((0.6, 1.2, 2.5))
+    assert (
+        own.body("bob").pos[2],
+        own.body("cart").mass[0],
+        own.body("bob").mass[0],
+    ) == pytest.approx((0.6, 1.2, 2.5))
     assert setup.model.body("bob").mass[0] == 1.5
 
 
@@ -339,7 +450,11 @@ def another_joint(spec: Any, value: float) -> None:
 def another_sensor(spec: Any, value: float) -> None:
     """One more number in sensordata."""
     sensor = spec.add_sensor()
-    sensor.type, sensor.objtype, sensor.objname = mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtObj.mjOBJ_JOINT, "hinge"
+    sensor.type, sensor.objtype, sensor.objname = (
+        mujoco.mjtSensor.mjSENS_JOINTPOS,
+        mujoco.mjtObj.mjOBJ_JOINT,
+        "hinge",
+    )
 
 
 def another_site(spec: Any, value: float) -> None:
@@ -352,8 +467,16 @@ def another_site(spec: Any, value: float) -> None:
     [
         (failing, ExperimentError, r"parameters\.f: its function failed: "),
         (negative, ModelError, r"MuJoCo cannot compile the model: .*mass"),
-        (another_joint, ModelError, r"changes nq of the model from 2 to 3; it may change numbers only"),
-        (another_sensor, ModelError, r"changes nsensordata of the model from 6 to 7; it may change numbers only"),
+        (
+            another_joint,
+            ModelError,
+            r"changes nq of the model from 2 to 3; it may change numbers only",
+        ),
+        (
+            another_sensor,
+            ModelError,
+            r"changes nsensordata of the model from 6 to 7; it may change numbers only",
+        ),
         (another_site, ModelError, r"changes nsite of the model.*; it may change numbers only"),
     ],
 )

@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
-from mjfim.experiment.schema import Correlated, Cost, Descent, Experiment, Limits, NoiseSpec, Nuisance, Robust, Signal
+from mjfim.experiment.schema import (
+    Correlated,
+    Cost,
+    Descent,
+    Experiment,
+    Limits,
+    NoiseSpec,
+    Nuisance,
+    Robust,
+    Signal,
+)
 from mjfim.experiment.system import Setup
 
 MODELS = Path(__file__).parents[2] / "models"
@@ -188,7 +198,9 @@ def test_contract_parses(folder: Path) -> None:
         linearize_at="true",
     )
     assert e.descent == Descent(method="metric", tolerance=1e-5, max_iterations=20)
-    assert e.limits == Limits(position={"slide": (-1.0, 1.0)}, velocity={"hinge": 8.0}, control={"force": (-5.0, 5.0)})
+    assert e.limits == Limits(
+        position={"slide": (-1.0, 1.0)}, velocity={"hinge": 8.0}, control={"force": (-5.0, 5.0)}
+    )
     assert (e.directory, e.source) == (folder, str(path))
 
 
@@ -249,9 +261,13 @@ def test_extended_contract_parses_and_resolves(resolve: Callable[[str], Setup]) 
     e = setup.experiment
     assert e.noise["hinge_angle"] == NoiseSpec(sigma=(0.01,)) and e.noise["slide_position"] == 0.02
     assert e.correlated == (
-        Correlated(outputs=("hinge_angle", "slide_position"), covariance=((1e-4, 1e-5), (1e-5, 4e-4))),
+        Correlated(
+            outputs=("hinge_angle", "slide_position"), covariance=((1e-4, 1e-5), (1e-5, 4e-4))
+        ),
     )
-    assert e.nuisance == Nuisance(initial={"qpos:slide": 0.01, "qvel:hinge": True}, bias=True, delay=0.005)
+    assert e.nuisance == Nuisance(
+        initial={"qpos:slide": 0.01, "qvel:hinge": True}, bias=True, delay=0.005
+    )
     assert e.robust == Robust(over="worst", samples=3, seed=4)
     assert (e.parameters["c"].wanted, e.parameters["bob"].coordinates) == (0.01, "barycentric")
     assert (e.descent.starts, e.descent.coarse, e.descent.seed) == (3, 2, 5)
@@ -301,10 +317,20 @@ def test_defaults(resolve: Callable[[str], Setup]) -> None:
     """What a file need not say, as DESIGN.md promises it."""
     setup = resolve(LEAST)
     e = setup.experiment
-    assert (e.cost.criterion, e.cost.information, e.cost.control, e.cost.linearize_at) == ("E", 1.0, 1e-3, "guess")
+    assert (e.cost.criterion, e.cost.information, e.cost.control, e.cost.linearize_at) == (
+        "E",
+        1.0,
+        1e-3,
+        "guess",
+    )
     assert (e.descent.method, e.descent.tolerance, e.descent.max_iterations) == ("lbfgs", 1e-7, 200)
     assert setup.measure_rate == e.rate
-    assert setup.parameters.guess.tolist() == setup.parameters.true.tolist() == setup.parameters.scale.tolist() == [2.0]
+    assert (
+        setup.parameters.guess.tolist()
+        == setup.parameters.true.tolist()
+        == setup.parameters.scale.tolist()
+        == [2.0]
+    )
     assert not setup.tracking.any()
     assert setup.limits == ()
 
@@ -312,7 +338,12 @@ def test_defaults(resolve: Callable[[str], Setup]) -> None:
 def test_mjcf_noise_is_the_default(resolve: Callable[[str], Setup]) -> None:
     """Without a noise table the sensors that state their noise are measured."""
     setup = resolve(edited("state = 0.05", ""))
-    assert setup.outputs.names == ("slide_position", "hinge_angle", "slide_velocity", "hinge_velocity")
+    assert setup.outputs.names == (
+        "slide_position",
+        "hinge_angle",
+        "slide_velocity",
+        "hinge_velocity",
+    )
     assert setup.noise.sigma.tolist() == [0.05] * 4
 
 
@@ -320,7 +351,12 @@ def test_start_from_qpos(resolve: Callable[[str], Setup]) -> None:
     """Positions and velocities stand for themselves, what is missing is the model's."""
     setup = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
     assert setup.plant.nominal_start.tolist() == [0.5, 3.0, 0.0, -1.0]
-    assert resolve(edited('keyframe = "hanging"', "")).plant.nominal_start.tolist() == [0.0, 0.0, 0.0, 0.0]
+    assert resolve(edited('keyframe = "hanging"', "")).plant.nominal_start.tolist() == [
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    ]
 
 
 def test_rate_below_the_timestep(resolve: Callable[[str], Setup]) -> None:
@@ -346,7 +382,9 @@ def test_replace_merges_and_checks(folder: Path) -> None:
     assert (new.cost.tracking, new.initial.keyframe) == (e.cost.tracking, "hanging")
     assert (new.parameters, new.directory, new.source) == (e.parameters, e.directory, e.source)
     assert (e.horizon, e.cost.control) == (4.0, 1e-3)
-    with pytest.raises(ExperimentError, match=r"cart_pendulum\.toml: cost\.contrl: unknown key .* valid: .*control"):
+    with pytest.raises(
+        ExperimentError, match=r"cart_pendulum\.toml: cost\.contrl: unknown key .* valid: .*control"
+    ):
         e.replace(cost={"contrl": 1.0})
     with pytest.raises(ExperimentError, match=r"horizon: .*greater than 0"):
         e.replace(horizon=-1.0)
@@ -376,10 +414,26 @@ HOME = "bad.toml"
 # name: text, error, what the message must hold. The first fragment is the file.
 FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     # keys
-    "top-level key": ("modle = 1\n" + LEAST, E, [HOME, "modle", "unknown key", "'model'", "valid:", "horizon"]),
-    "nested key": (edited("[cost]", "[cost]\ncontrl = 1"), E, [HOME, "cost.contrl", "'control'", "tracking"]),
-    "initial key": (edited("keyframe =", "keyfrme ="), E, [HOME, "initial.keyfrme", "'keyframe'", "qpos"]),
-    "signal key": (control('{ kind = "sine", amp = 1 }'), E, [HOME, "initial.control.amp", "amplitude, "]),
+    "top-level key": (
+        "modle = 1\n" + LEAST,
+        E,
+        [HOME, "modle", "unknown key", "'model'", "valid:", "horizon"],
+    ),
+    "nested key": (
+        edited("[cost]", "[cost]\ncontrl = 1"),
+        E,
+        [HOME, "cost.contrl", "'control'", "tracking"],
+    ),
+    "initial key": (
+        edited("keyframe =", "keyfrme ="),
+        E,
+        [HOME, "initial.keyfrme", "'keyframe'", "qpos"],
+    ),
+    "signal key": (
+        control('{ kind = "sine", amp = 1 }'),
+        E,
+        [HOME, "initial.control.amp", "amplitude, "],
+    ),
     "parameter key": (
         parameter('target = "body/bob:mass"\ngues = 1'),
         E,
@@ -412,7 +466,11 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "reserved key": ('source = "x"\n' + LEAST, E, [HOME, "source", "valid:", "model"]),
     "missing key": (edited("rate = 100.0", ""), E, [HOME, "rate", "required"]),
     # names
-    "tracking joint": (edited("[cost]", "[cost]\ntracking = { slid = 1 }"), E, [HOME, "cost.tracking", "hinge, slide"]),
+    "tracking joint": (
+        edited("[cost]", "[cost]\ntracking = { slid = 1 }"),
+        E,
+        [HOME, "cost.tracking", "hinge, slide"],
+    ),
     "velocity joint": (
         edited("[cost]", "[cost]\ntracking_velocity = { slid = 1 }"),
         E,
@@ -443,43 +501,112 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "noise", "sensor 'angle'", "hinge_angle", "qpos:hinge", "state"],
     ),
-    "keyframe": (edited('"hanging"', '"hangin"'), E, [HOME, "initial.keyframe", "'hangin'", "did you mean 'hanging'"]),
+    "keyframe": (
+        edited('"hanging"', '"hangin"'),
+        E,
+        [HOME, "initial.keyframe", "'hangin'", "did you mean 'hanging'"],
+    ),
     # parameter paths
-    "path form": (target("body/bob"), E, [HOME, "parameters.m", "'body/bob'", "kind/name:field[index]"]),
+    "path form": (
+        target("body/bob"),
+        E,
+        [HOME, "parameters.m", "'body/bob'", "kind/name:field[index]"],
+    ),
     "path kind": (
         target("bdy/bob:mass"),
         E,
-        [HOME, "parameters.m", "kind 'bdy'", "actuator, body, geom, initial, joint, option, output, site, tendon"],
+        [
+            HOME,
+            "parameters.m",
+            "kind 'bdy'",
+            "actuator, body, geom, initial, joint, option, output, site, tendon",
+        ],
     ),
-    "path name": (target("body/bo:mass"), E, [HOME, "parameters.m", "body 'bo'", "'bob'", "cart, pendulum"]),
+    "path name": (
+        target("body/bo:mass"),
+        E,
+        [HOME, "parameters.m", "body 'bo'", "'bob'", "cart, pendulum"],
+    ),
     "path field": (
         target("body/bob:mas"),
         E,
         [HOME, "parameters.m", "field 'mas'", "'mass'", "inertia, ipos, logcholesky, mass"],
     ),
     "path index": (target("body/bob:pos[3]"), E, [HOME, "parameters.m", "index 3", "0 to 2"]),
-    "path index of a scalar": (target("joint/hinge:damping[1]"), E, [HOME, "parameters.m", "index 1", "0 to 0"]),
+    "path index of a scalar": (
+        target("joint/hinge:damping[1]"),
+        E,
+        [HOME, "parameters.m", "index 1", "0 to 0"],
+    ),
     "path without a name": (target("body:mass"), E, [HOME, "parameters.m", "bob, cart, pendulum"]),
     "option field": (target("option:grav"), E, [HOME, "parameters.m", "'grav'", "gravity"]),
     # model
-    "model missing": (edited("cart_pendulum.xml", "gone.xml"), M, ["gone.xml", "no such model file"]),
-    "model not XML": (edited("cart_pendulum.xml", "text.xml"), M, ["text.xml", "MuJoCo cannot read", "XML"]),
-    "model schema": (edited("cart_pendulum.xml", "schema.xml"), M, ["schema.xml", "MuJoCo cannot read", "worldbdy"]),
+    "model missing": (
+        edited("cart_pendulum.xml", "gone.xml"),
+        M,
+        ["gone.xml", "no such model file"],
+    ),
+    "model not XML": (
+        edited("cart_pendulum.xml", "text.xml"),
+        M,
+        ["text.xml", "MuJoCo cannot read", "XML"],
+    ),
+    "model schema": (
+        edited("cart_pendulum.xml", "schema.xml"),
+        M,
+        ["schema.xml", "MuJoCo cannot read", "worldbdy"],
+    ),
     "model not compiling": (
         edited("cart_pendulum.xml", "massless.xml"),
         M,
         ["massless.xml", "MuJoCo cannot compile", "mass and inertia", "thin"],
     ),
-    "no actuator": (edited("cart_pendulum.xml", "passive.xml"), M, ["passive.xml", "no actuator", "at least one"]),
+    "no actuator": (
+        edited("cart_pendulum.xml", "passive.xml"),
+        M,
+        ["passive.xml", "no actuator", "at least one"],
+    ),
     # time
-    "rate": (edited("rate = 100.0", "rate = 30.0"), E, [HOME, "rate: 30 Hz", "0.01 s", "100, 50, 25"]),
-    "rate above the timestep": (edited("rate = 100.0", "rate = 200.0"), E, [HOME, "rate: 200 Hz", "100, 50, 25"]),
-    "rate negative": (edited("rate = 100.0", "rate = -1.0"), E, [HOME, "rate", "greater than 0", "-1.0"]),
-    "measure rate": ("measure_rate = 30.0" + LEAST, E, [HOME, "measure_rate: 30 Hz", "100 Hz", "50, 25"]),
-    "measure rate above": ("measure_rate = 200.0" + LEAST, E, [HOME, "measure_rate: 200 Hz", "100 Hz", "50, 25"]),
-    "horizon": (edited("horizon = 1.0", "horizon = 1.005"), E, [HOME, "horizon: 1.005 s", "whole number", "samples"]),
-    "horizon of one sample": (edited("horizon = 1.0", "horizon = 0.01"), E, [HOME, "horizon: 0.01 s", ">= 2"]),
-    "horizon infinite": (edited("horizon = 1.0", "horizon = inf"), E, [HOME, "horizon", "finite", "inf"]),
+    "rate": (
+        edited("rate = 100.0", "rate = 30.0"),
+        E,
+        [HOME, "rate: 30 Hz", "0.01 s", "100, 50, 25"],
+    ),
+    "rate above the timestep": (
+        edited("rate = 100.0", "rate = 200.0"),
+        E,
+        [HOME, "rate: 200 Hz", "100, 50, 25"],
+    ),
+    "rate negative": (
+        edited("rate = 100.0", "rate = -1.0"),
+        E,
+        [HOME, "rate", "greater than 0", "-1.0"],
+    ),
+    "measure rate": (
+        "measure_rate = 30.0" + LEAST,
+        E,
+        [HOME, "measure_rate: 30 Hz", "100 Hz", "50, 25"],
+    ),
+    "measure rate above": (
+        "measure_rate = 200.0" + LEAST,
+        E,
+        [HOME, "measure_rate: 200 Hz", "100 Hz", "50, 25"],
+    ),
+    "horizon": (
+        edited("horizon = 1.0", "horizon = 1.005"),
+        E,
+        [HOME, "horizon: 1.005 s", "whole number", "samples"],
+    ),
+    "horizon of one sample": (
+        edited("horizon = 1.0", "horizon = 0.01"),
+        E,
+        [HOME, "horizon: 0.01 s", ">= 2"],
+    ),
+    "horizon infinite": (
+        edited("horizon = 1.0", "horizon = inf"),
+        E,
+        [HOME, "horizon", "finite", "inf"],
+    ),
     # parameter values
     "bounds inverted": (
         parameter('target = "body/bob:mass"\nbounds = [5, 1]'),
@@ -521,7 +648,11 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "parameters.m.scale", "'guess'", "'gues'"],
     ),
-    "no target": (parameter("guess = 1"), E, [HOME, "parameters.m", "exactly one of target and targets"]),
+    "no target": (
+        parameter("guess = 1"),
+        E,
+        [HOME, "parameters.m", "exactly one of target and targets"],
+    ),
     "target and targets": (
         parameter('target = "body/bob:mass"\ntargets = [{ path = "body/bob:mass" }]'),
         E,
@@ -534,11 +665,23 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     ),
     # noise and weights
     "sigma zero": (edited("state = 0.05", "state = 0"), E, [HOME, "noise.state", "greater than 0"]),
-    "sigma negative": (edited("state = 0.05", "state = -0.1"), E, [HOME, "noise.state", "greater than 0", "-0.1"]),
+    "sigma negative": (
+        edited("state = 0.05", "state = -0.1"),
+        E,
+        [HOME, "noise.state", "greater than 0", "-0.1"],
+    ),
     "sigma nan": (edited("state = 0.05", "state = nan"), E, [HOME, "noise.state", "finite", "nan"]),
     "sigma inf": (edited("state = 0.05", "state = inf"), E, [HOME, "noise.state", "finite", "inf"]),
-    "sigma text": (edited("state = 0.05", 'state = "loud"'), E, [HOME, "noise.state", "number", "'loud'"]),
-    "information weight": (edited("[cost]", "[cost]\ninformation = -1"), E, [HOME, "cost.information", "-1"]),
+    "sigma text": (
+        edited("state = 0.05", 'state = "loud"'),
+        E,
+        [HOME, "noise.state", "number", "'loud'"],
+    ),
+    "information weight": (
+        edited("[cost]", "[cost]\ninformation = -1"),
+        E,
+        [HOME, "cost.information", "-1"],
+    ),
     "tracking weight": (
         edited("[cost]", "[cost]\ntracking = { slide = -1 }"),
         E,
@@ -553,7 +696,12 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "no control weight": (
         edited("[cost]", "[cost]\ncontrol = {}"),
         E,
-        [HOME, "cost.control", "actuator 'force' has neither a weight nor a range", "limits.control.force"],
+        [
+            HOME,
+            "cost.control",
+            "actuator 'force' has neither a weight nor a range",
+            "limits.control.force",
+        ],
     ),
     "criterion": (
         edited("[cost]", '[cost]\ncriterion = "F"'),
@@ -590,7 +738,11 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "descent", "psi_weight belongs to method"],
     ),
-    "coarse word": (LEAST + '[descent]\ncoarse = "no"\n', E, [HOME, "descent.coarse", "integer", "'no'"]),
+    "coarse word": (
+        LEAST + '[descent]\ncoarse = "no"\n',
+        E,
+        [HOME, "descent.coarse", "integer", "'no'"],
+    ),
     # further tables
     "function in a file": (
         parameter('function = "f"\nguess = 1'),
@@ -607,7 +759,11 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "noise.state", "exactly one of sigma and covariance"],
     ),
-    "noise rate": (edited("state = 0.05", "state = { sigma = 1, rate = 0 }"), E, [HOME, "noise.state.rate", "greater"]),
+    "noise rate": (
+        edited("state = 0.05", "state = { sigma = 1, rate = 0 }"),
+        E,
+        [HOME, "noise.state.rate", "greater"],
+    ),
     "noise infinite": (
         edited("state = 0.05", "hinge_angle = { covariance = [[inf]] }"),
         E,
@@ -618,13 +774,37 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         E,
         [HOME, "correlated.0.output", "covariance, outputs"],
     ),
-    "nuisance key": (LEAST + "[nuisance]\nstart = true\n", E, [HOME, "nuisance.start", "bias, delay, initial"]),
+    "nuisance key": (
+        LEAST + "[nuisance]\nstart = true\n",
+        E,
+        [HOME, "nuisance.start", "bias, delay, initial"],
+    ),
     "nuisance false": (LEAST + "[nuisance]\ndelay = false\n", E, [HOME, "nuisance.delay", "True"]),
-    "robust key": (LEAST + "[robust]\ncount = 3\n", E, [HOME, "robust.count", "over, samples, seed"]),
-    "robust over": (LEAST + '[robust]\nover = "best"\n', E, [HOME, "robust.over", "'mean' or 'worst'", "'best'"]),
-    "robust of one": (LEAST + "[robust]\nsamples = 1\n", E, [HOME, "robust.samples", "greater than or equal to 2"]),
-    "robust without knowledge": (LEAST + "[robust]\n", E, [HOME, "robust", "state `prior` or `bounds`"]),
-    "earlier": ('earlier = ["gone.json"]\n' + LEAST, E, [HOME, "earlier", "gone.json", "cannot read"]),
+    "robust key": (
+        LEAST + "[robust]\ncount = 3\n",
+        E,
+        [HOME, "robust.count", "over, samples, seed"],
+    ),
+    "robust over": (
+        LEAST + '[robust]\nover = "best"\n',
+        E,
+        [HOME, "robust.over", "'mean' or 'worst'", "'best'"],
+    ),
+    "robust of one": (
+        LEAST + "[robust]\nsamples = 1\n",
+        E,
+        [HOME, "robust.samples", "greater than or equal to 2"],
+    ),
+    "robust without knowledge": (
+        LEAST + "[robust]\n",
+        E,
+        [HOME, "robust", "state `prior` or `bounds`"],
+    ),
+    "earlier": (
+        'earlier = ["gone.json"]\n' + LEAST,
+        E,
+        [HOME, "earlier", "gone.json", "cannot read"],
+    ),
     "earlier that is no file of ours": (
         'earlier = ["cart_pendulum.csv"]\n' + LEAST,
         E,
@@ -670,12 +850,20 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     # control tables
     "table missing": (control('"gone.csv"'), R, ["gone.csv", "no such file"]),
     "table empty": (control('"empty.csv"'), R, ["empty.csv", "Empty"]),
-    "table columns": (control('"columns.csv"'), R, ["columns.csv", "'force'", "wanted columns: t, force", "t, forc"]),
+    "table columns": (
+        control('"columns.csv"'),
+        R,
+        ["columns.csv", "'force'", "wanted columns: t, force", "t, forc"],
+    ),
     "table stray column": (control('"stray.csv"'), R, ["stray.csv", "'torque'", "force, t"]),
     "table without t": (control('"timeless.csv"'), R, ["timeless.csv", "'t' is missing", "force"]),
     "table NaN": (control('"nan.csv"'), R, ["nan.csv", "NaN", "row 2", "finite"]),
     "table hole": (control('"hole.csv"'), R, ["hole.csv", "NaN", "row 3", "finite"]),
-    "table too short": (control('"short.csv"'), R, ["short.csv", "too few rows", "3 rows", "0 ... 1 s", "100 samples"]),
+    "table too short": (
+        control('"short.csv"'),
+        R,
+        ["short.csv", "too few rows", "3 rows", "0 ... 1 s", "100 samples"],
+    ),
     "table starts late": (control('"late.csv"'), R, ["late.csv", "0.5 ...", "0 ... 1 s"]),
     "table repeats t": (control('"repeated.csv"'), R, ["repeated.csv", "'t' must increase"]),
     "table runs backward": (control('"backward.csv"'), R, ["backward.csv", "'t' must increase"]),
@@ -726,7 +914,9 @@ def test_not_toml(data: bytes, fragment: str, tmp_path: Path) -> None:
 
 def test_no_file(tmp_path: Path) -> None:
     """A path to nothing, a path to a folder."""
-    with pytest.raises(ExperimentError, match=r"gone\.toml: cannot read the experiment file: No such file"):
+    with pytest.raises(
+        ExperimentError, match=r"gone\.toml: cannot read the experiment file: No such file"
+    ):
         Experiment.from_file(tmp_path / "gone.toml")
     with pytest.raises(ExperimentError, match=r"cannot read the experiment file: Is a directory"):
         Experiment.from_file(tmp_path)
@@ -735,7 +925,11 @@ def test_no_file(tmp_path: Path) -> None:
 def test_all_faults_at_once(resolve: Callable[[str], Setup]) -> None:
     """One line per fault, each with the file and the key."""
     with pytest.raises(ExperimentError) as caught:
-        resolve(edited("rate = 100.0", "rate = -1.0").replace("state = 0.05", "state = 0").replace("[cost]", "[cst]"))
+        resolve(
+            edited("rate = 100.0", "rate = -1.0")
+            .replace("state = 0.05", "state = 0")
+            .replace("[cost]", "[cst]")
+        )
     lines = str(caught.value).splitlines()
     assert len(lines) == 3
     assert all(HOME in line for line in lines)
@@ -768,7 +962,10 @@ MISUSE: dict[str, tuple[str, list[str]]] = {
         LEAST + '[parameters.n]\ntarget = "body/bob:mass"\n',
         ["parameters.n", "body/bob:mass"],
     ),
-    "negative signal seed": (control('{ kind = "multisine", seed = -1 }'), ["initial.control.seed", "-1"]),
+    "negative signal seed": (
+        control('{ kind = "multisine", seed = -1 }'),
+        ["initial.control.seed", "-1"],
+    ),
     "negative descent seed": (LEAST + "[descent]\nseed = -1\n", ["descent.seed", "-1"]),
     "column twice": (control('"twice.csv"'), ["twice.csv", "force"]),
     "table not UTF-8": (control('"latin.csv"'), ["latin.csv"]),

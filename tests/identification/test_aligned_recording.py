@@ -30,7 +30,11 @@ def body(tmp_path_factory: pytest.TempPathFactory) -> Setup:
 
 def stamps(rng: np.random.Generator, mean: float) -> Array:
     """Random times from 0, some of them a hair apart, with a hole here and there."""
-    gaps = mean * rng.choice([0.001, 0.3, 1.0, 1.0, 1.0, 1.7, 9.0], rng.integers(2, 60)) * rng.uniform(0.5, 1.5)
+    gaps = (
+        mean
+        * rng.choice([0.001, 0.3, 1.0, 1.0, 1.0, 1.7, 9.0], rng.integers(2, 60))
+        * rng.uniform(0.5, 1.5)
+    )
     return np.concatenate([[0.0], np.cumsum(gaps)])
 
 
@@ -67,7 +71,9 @@ def test_on_the_grid_the_control_is_itself() -> None:
         ctrl = rng.standard_normal((count, 3))
         np.testing.assert_array_equal(held(np.arange(count + 1) * DT, ctrl, DT), ctrl)
     rows = rng.standard_normal((40, 1))
-    np.testing.assert_array_equal(held(np.arange(41) * 5 * DT, rows, DT), np.repeat(rows, 5, axis=0))
+    np.testing.assert_array_equal(
+        held(np.arange(41) * 5 * DT, rows, DT), np.repeat(rows, 5, axis=0)
+    )
     fine = held(np.arange(41) * DT / 4, rows, DT)
     np.testing.assert_allclose(fine, rows.reshape(10, 4, 1).mean(axis=1), rtol=0, atol=1e-14)
 
@@ -116,7 +122,9 @@ def test_a_recording_between_the_samples_keeps_its_times(setup: Setup) -> None:
     np.testing.assert_array_equal(track.y, plain.y)
     np.testing.assert_allclose(track.ctrl, held(t - t[0], plain.ctrl, setup.dt), rtol=0, atol=1e-9)
     kept = np.delete(np.arange(31), [4, 5, 20])
-    sparse = track_of(setup, log(setup, t=plain.t[kept], ctrl=plain.ctrl[kept[:-1]], y=plain.y[kept]))
+    sparse = track_of(
+        setup, log(setup, t=plain.t[kept], ctrl=plain.ctrl[kept[:-1]], y=plain.y[kept])
+    )
     assert sparse.even
     np.testing.assert_array_equal(sparse.ctrl[3:6], np.repeat(plain.ctrl[3:4], 3, axis=0))
     np.testing.assert_array_equal(sparse.ctrl[6:20], plain.ctrl[6:20])
@@ -136,12 +144,21 @@ def test_two_rows_of_one_sample_do_not_shift_the_control(setup: Setup) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"t": np.arange(2) * DT, "ctrl": np.zeros((1, 1)), "y": np.zeros((2, 4))}, "too few rows.*2.*at least 3"),
+        (
+            {"t": np.arange(2) * DT, "ctrl": np.zeros((1, 1)), "y": np.zeros((2, 4))},
+            "too few rows.*2.*at least 3",
+        ),
         ({"t": np.append(np.arange(30), 28.0) * DT}, "'t' does not increase in data row 31"),
-        ({"t": np.where(np.arange(31) == 12, np.nan, np.arange(31)) * DT}, "'t' does not increase in data row 13"),
+        (
+            {"t": np.where(np.arange(31) == 12, np.nan, np.arange(31)) * DT},
+            "'t' does not increase in data row 13",
+        ),
         ({"ctrl": np.zeros((20, 1))}, r"control has shape \(20, 1\), wanted 30 rows of 1"),
         ({"ctrl": np.zeros((30, 2))}, "wanted 30 rows of 1"),
-        ({"ctrl": np.where(np.arange(30) == 4, np.nan, 0.0)[:, None]}, "control in data row 5 is NaN"),
+        (
+            {"ctrl": np.where(np.arange(30) == 4, np.nan, 0.0)[:, None]},
+            "control in data row 5 is NaN",
+        ),
         ({"outputs": ("a", "b", "c", "d")}, "no measured column.*qpos:hinge"),
     ],
 )
@@ -171,7 +188,9 @@ def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
     some = body_setup(tmp_path, noise={"qpos:float.qx": 0.01, "qpos:ball.qy": 0.01}, horizon=3.0)
     y = some.plant.measure(some.parameters.guess[None], some.control)[0][0]
     assert (np.ptp(np.sign(y), axis=0) == 2.0).any(), "nothing crosses zero"
-    track = track_of(some, Recording(np.arange(len(y)) * some.dt, some.control, y, some.outputs.names))
+    track = track_of(
+        some, Recording(np.arange(len(y)) * some.dt, some.control, y, some.outputs.names)
+    )
     np.testing.assert_array_equal(track.y, y)
 
 

@@ -18,7 +18,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def base() -> mjfim.Experiment:
-    return mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(fit={"bootstrap": 0})
+    return mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(
+        fit={"bootstrap": 0}
+    )
 
 
 def recorded(setup: Setup, seed: int, swing: float = 1.0) -> Recording:
@@ -40,14 +42,20 @@ def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.
     assert (alone[0].mae < alone[0].rms).all()
 
 
-def test_without_held_out_recordings_each_is_predicted_by_the_others(base: mjfim.Experiment) -> None:
+def test_without_held_out_recordings_each_is_predicted_by_the_others(
+    base: mjfim.Experiment,
+) -> None:
     setup = Setup(base)
     recordings = [recorded(setup, seed) for seed in range(3)]
-    spoilt = Recording(recordings[2].t, recordings[2].ctrl, recordings[2].y + 0.2, recordings[2].outputs, "spoilt")
+    spoilt = Recording(
+        recordings[2].t, recordings[2].ctrl, recordings[2].y + 0.2, recordings[2].outputs, "spoilt"
+    )
     found = mjfim.identify(setup, [*recordings[:2], spoilt])
     assert [p.name for p in found.predictions] == ["simulated", "simulated", "spoilt"]
     assert not any(p.held_out for p in found.predictions)
-    assert (found.predictions[2].identified.rms > 0.15).all()  # the others know nothing of what spoils it
+    assert (
+        found.predictions[2].identified.rms > 0.15
+    ).all()  # the others know nothing of what spoils it
 
 
 def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
@@ -55,9 +63,13 @@ def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
     recording = recorded(setup, 0)
     late = np.array(recording.y)
     late[320:] += 1.0
-    (prediction,) = mjfim.identify(setup, [Recording(recording.t, recording.ctrl, late, recording.outputs)]).predictions
+    (prediction,) = mjfim.identify(
+        setup, [Recording(recording.t, recording.ctrl, late, recording.outputs)]
+    ).predictions
     assert prediction.name.startswith("last 25 %")
-    np.testing.assert_allclose(prediction.identified.rms[0], np.sqrt(0.8 + 0.05**2), rtol=0.1)  # 80 of 100 rows
+    np.testing.assert_allclose(
+        prediction.identified.rms[0], np.sqrt(0.8 + 0.05**2), rtol=0.1
+    )  # 80 of 100 rows
 
 
 def test_every_recording_has_its_own_bias(base: mjfim.Experiment) -> None:
@@ -75,7 +87,9 @@ def test_every_recording_has_its_own_bias(base: mjfim.Experiment) -> None:
     assert found.theta[j] == found.each["bias qpos:hinge"][0]
     assert np.all(np.abs(found.theta[:3] - setup.parameters.true[:3]) < 4.0 * found.std[:3])
     assert not found.misfit
-    assert mjfim.identify(Setup(base.replace(nuisance={"bias": {"qpos:hinge": True}})), recordings).misfit
+    assert mjfim.identify(
+        Setup(base.replace(nuisance={"bias": {"qpos:hinge": True}})), recordings
+    ).misfit
     alone = mjfim.identify(setup, recordings[:1])
     assert alone.theta[j] == pytest.approx(found.theta[j], abs=0.01)
     fit = Fit(setup, recordings)
@@ -97,11 +111,15 @@ def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experime
     rng = np.random.default_rng(0)
     y = np.array(good.y)
     y[:, 3] += rng.normal(0.0, 2.0, len(y))
-    noisy = Recording(good.t, good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape), y, good.outputs, "x")
+    noisy = Recording(
+        good.t, good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape), y, good.outputs, "x"
+    )
     said = " ".join(doubts(setup, noisy))
     assert "jumps from row to row" in said and "qvel:hinge is rough" in said
     swung = recorded(setup, 0, 20.0)
     assert doubts(setup, swung) == ()
     y = np.array(swung.y)
     y[:, 3] *= 2.0
-    assert any("part by" in s for s in doubts(setup, Recording(swung.t, swung.ctrl, y, swung.outputs, "x")))
+    assert any(
+        "part by" in s for s in doubts(setup, Recording(swung.t, swung.ctrl, y, swung.outputs, "x"))
+    )

@@ -45,13 +45,17 @@ def noiseless(setup: Setup, recording: Recording) -> Recording:
 
 
 @pytest.mark.parametrize("method", ["least_squares", "newton"])
-def test_noise_free_data_give_the_true_parameters(setup: Setup, recording: Recording, method: str) -> None:
+def test_noise_free_data_give_the_true_parameters(
+    setup: Setup, recording: Recording, method: str
+) -> None:
     estimate = identify(setup, [noiseless(setup, recording)], method)
     np.testing.assert_allclose(estimate.theta, setup.parameters.true, rtol=1e-7)
     assert estimate.success
 
 
-def test_both_methods_find_the_minimum_of_the_weighted_squares(setup: Setup, recording: Recording) -> None:
+def test_both_methods_find_the_minimum_of_the_weighted_squares(
+    setup: Setup, recording: Recording
+) -> None:
     fit = Fit(setup, [recording])
 
     def cost(theta: np.ndarray) -> float:
@@ -59,7 +63,9 @@ def test_both_methods_find_the_minimum_of_the_weighted_squares(setup: Setup, rec
         return float(np.sum(((y[0, 1:] - recording.y[1:]) / 0.05) ** 2))
 
     start = setup.parameters.true
-    slow = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-10, "maxiter": 400})
+    slow = minimize(
+        cost, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-10, "maxiter": 400}
+    )
     for solve in (least_squares, newton_raphson):
         solution = solve(fit, setup.parameters.guess)
         assert solution.success
@@ -108,7 +114,9 @@ def test_overstated_noise_is_said(setup: Setup, recording: Recording) -> None:
     assert any("overstated" in sentence for sentence in estimate.warnings)
 
 
-def test_two_recordings_carry_twice_the_information(setup: Setup, design: mjfim.Design, recording: Recording) -> None:
+def test_two_recordings_carry_twice_the_information(
+    setup: Setup, design: mjfim.Design, recording: Recording
+) -> None:
     again = simulate(setup, design.trajectory, seed=4)
     one, two = identify(setup, [recording]), identify(setup, [recording, again])
     np.testing.assert_allclose(two.std, one.std / np.sqrt(2), rtol=0.03)
@@ -124,7 +132,9 @@ def test_bounds_are_kept_and_named(design: mjfim.Design, recording: Recording) -
     assert estimate.at_bound == ("m",)
 
 
-def test_prior_pulls_the_estimate_and_shrinks_its_deviation(design: mjfim.Design, recording: Recording) -> None:
+def test_prior_pulls_the_estimate_and_shrinks_its_deviation(
+    design: mjfim.Design, recording: Recording
+) -> None:
     base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     parameters = base.model_dump(exclude_unset=True)["parameters"]
     parameters["m"] = {**parameters["m"], "prior": 1e-4}
@@ -133,7 +143,9 @@ def test_prior_pulls_the_estimate_and_shrinks_its_deviation(design: mjfim.Design
     assert estimate.std[0] < 1.01e-4
 
 
-def test_recording_with_fewer_outputs_and_gaps_still_fits(setup: Setup, recording: Recording) -> None:
+def test_recording_with_fewer_outputs_and_gaps_still_fits(
+    setup: Setup, recording: Recording
+) -> None:
     y = np.array(recording.y[:, :2])
     y[50:80, 1] = np.nan
     estimate = identify(setup, [Recording(recording.t, recording.ctrl, y, recording.outputs[:2])])
@@ -177,7 +189,9 @@ def test_unknown_method_and_wrong_start_are_refused(setup: Setup, recording: Rec
         identify(setup, [recording], start=np.ones(2))
 
 
-def test_interrupted_while_it_searches_it_keeps_the_best_so_far(setup: Setup, recording: Recording) -> None:
+def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
+    setup: Setup, recording: Recording
+) -> None:
     """Ctrl-C in the second iteration."""
     costs: list[float] = []
 
@@ -193,7 +207,9 @@ def test_interrupted_while_it_searches_it_keeps_the_best_so_far(setup: Setup, re
     assert found.predictions == ()
 
 
-@pytest.mark.parametrize("place", ["identify.suspects", "cross_validation.completed", "cross_validation._errors"])
+@pytest.mark.parametrize(
+    "place", ["identify.suspects", "cross_validation.completed", "cross_validation._errors"]
+)
 def test_interrupted_after_the_search_the_estimate_stays(
     setup: Setup, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,7 +227,9 @@ def test_interrupted_after_the_search_the_estimate_stays(
     assert any(sentence.startswith("interrupted after the search") for sentence in found.warnings)
 
 
-def test_half_a_search_is_no_answer(setup: Setup, recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_half_a_search_is_no_answer(
+    setup: Setup, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Who wants theta alone gets it whole or not at all; so does a round of a campaign."""
     fit, count = Fit(setup, [recording]), [0]
     condense = Fit.condense
@@ -252,7 +270,9 @@ def test_interrupted_where_a_further_start_begins(setup: Setup, recording: Recor
     np.testing.assert_allclose(found.theta, identify(setup, [recording]).theta, rtol=1e-3)
 
 
-def test_interrupted_before_the_last_search_nothing_more_is_searched(setup: Setup, recording: Recording) -> None:
+def test_interrupted_before_the_last_search_nothing_more_is_searched(
+    setup: Setup, recording: Recording
+) -> None:
     pieces = Setup(setup.experiment.replace(fit={"segments": 1.0}))
     seen: list[str] = []
 
@@ -268,7 +288,9 @@ def test_interrupted_before_the_last_search_nothing_more_is_searched(setup: Setu
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0])
-def test_a_robust_fit_judges_the_size_of_its_residuals(setup: Setup, recording: Recording, scale: float) -> None:
+def test_a_robust_fit_judges_the_size_of_its_residuals(
+    setup: Setup, recording: Recording, scale: float
+) -> None:
     """Right noise is neither too large nor too small, whatever counts as an outlier; noise of three times the size is said."""
     robust = Setup(setup.experiment.replace(fit={"loss": "soft_l1", "loss_scale": scale}))
     right = identify(robust, [recording])
@@ -276,13 +298,17 @@ def test_a_robust_fit_judges_the_size_of_its_residuals(setup: Setup, recording: 
     assert not right.misfit
     assert not any("overstated" in sentence for sentence in right.warnings)
     truth = noiseless(setup, recording).y
-    loud = Recording(recording.t, recording.ctrl, truth + 3.0 * (recording.y - truth), recording.outputs)
+    loud = Recording(
+        recording.t, recording.ctrl, truth + 3.0 * (recording.y - truth), recording.outputs
+    )
     assert any("x the stated noise" in reason for reason in identify(robust, [loud]).reasons)
 
 
 def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
     """Their covariance is infinite; what the others are traded for is told all the same (warnings are errors here)."""
     setup = Setup(Experiment.from_file(ROOT / "models" / "ball_pendulum.toml"))
-    estimate = identify(setup, [simulate(setup, setup.plant.simulate(setup.theta, setup.initial.ctrl), seed=1)])
+    estimate = identify(
+        setup, [simulate(setup, setup.plant.simulate(setup.theta, setup.initial.ctrl), seed=1)]
+    )
     assert estimate.combinations
     assert estimate.sloppy

@@ -17,9 +17,15 @@ from mjfim.records.estimate import Estimate
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
-PENDULUM, DOUBLE, SERVO = DATA / "dfki_simple_pendulum", DATA / "dfki_double_pendulum", DATA / "bam_xl330" / "raw"
+PENDULUM, DOUBLE, SERVO = (
+    DATA / "dfki_simple_pendulum",
+    DATA / "dfki_double_pendulum",
+    DATA / "bam_xl330" / "raw",
+)
 
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the measured recordings are not beside the repository")
+pytestmark = pytest.mark.skipif(
+    not DATA.is_dir(), reason="the measured recordings are not beside the repository"
+)
 
 # J, m c, viscous and Coulomb friction as published; atan(100 qd) levels off at pi/2
 PUBLISHED_PENDULUM = {"J": 0.06259, "mc": 0.1022, "damping": 0.04707, "coulomb": 0.1839 * np.pi / 2}
@@ -33,9 +39,17 @@ PUBLISHED_DOUBLE = {
 }
 
 
-def servo_values(kt: float, R: float, armature: float, offset: float, base: float, viscous: float) -> dict[str, float]:
+def servo_values(
+    kt: float, R: float, armature: float, offset: float, base: float, viscous: float
+) -> dict[str, float]:
     """BAM's parameters as those of models/bam_xl330.toml."""
-    values = {"gain": kt / R, "brake": kt**2 / R, "damping": viscous, "coulomb": base, "armature": armature}
+    values = {
+        "gain": kt / R,
+        "brake": kt**2 / R,
+        "damping": viscous,
+        "coulomb": base,
+        "armature": armature,
+    }
     return {**values, "mounting": offset}
 
 
@@ -46,7 +60,9 @@ HEAD_SERVO = servo_values(0.3866957, 4.0171292, 0.00181417, 0.030871, 0.01283272
 def experiment(name: str, guess: dict[str, float] | None = None, **fit: object) -> mjfim.Experiment:
     """An experiment of models/, its guesses moved."""
     found = mjfim.Experiment.from_file(ROOT / "models" / f"{name}.toml")
-    return found.replace(parameters={key: {"guess": value} for key, value in (guess or {}).items()}, fit=dict(fit))
+    return found.replace(
+        parameters={key: {"guess": value} for key, value in (guess or {}).items()}, fit=dict(fit)
+    )
 
 
 def identified(stated: mjfim.Experiment, files: list[Path], held_out: list[Path]) -> Estimate:
@@ -57,40 +73,58 @@ def identified(stated: mjfim.Experiment, files: list[Path], held_out: list[Path]
 
 
 @pytest.mark.parametrize(
-    ("fitted", "held_out"), [("dircol", "energy_shaping"), ("energy_shaping", "dircol")], ids=["dircol", "energy"]
+    ("fitted", "held_out"),
+    [("dircol", "energy_shaping"), ("energy_shaping", "dircol")],
+    ids=["dircol", "energy"],
 )
-def test_pendulum_predicts_the_other_file_far_better_than_published(fitted: str, held_out: str) -> None:
+def test_pendulum_predicts_the_other_file_far_better_than_published(
+    fitted: str, held_out: str
+) -> None:
     files = [PENDULUM / f"{name}_measured.csv" for name in (fitted, held_out)]
-    found = identified(experiment("dfki_simple_pendulum", PUBLISHED_PENDULUM, bootstrap=300), files[:1], files[1:])
+    found = identified(
+        experiment("dfki_simple_pendulum", PUBLISHED_PENDULUM, bootstrap=300), files[:1], files[1:]
+    )
     (prediction,) = found.predictions
     assert prediction.held_out
     assert (prediction.identified.rms < 0.5 * prediction.nominal.rms).all()
     theta = dict(zip(found.parameters, found.theta, strict=True))
     inside = dict(zip(found.parameters, found.interval, strict=True))
     assert 0.12 < theta["J"] < 0.24
-    assert 0.4 < theta["mc"] / theta["J"] / (0.3042 / 0.14) < 1.6  # the torque constant scales both alike
+    assert (
+        0.4 < theta["mc"] / theta["J"] / (0.3042 / 0.14) < 1.6
+    )  # the torque constant scales both alike
     low, high = inside["coulomb"]
     assert low < 0.25 and high > 0.10  # what other rollouts gave, and their spread
     honest = 0.25 * (found.interval[:, 1] - found.interval[:, 0])
-    assert (honest[:2] > 4.0 * found.std[:2]).all(), "formal deviations of a model that does not fit are no accuracy"
+    assert (honest[:2] > 4.0 * found.std[:2]).all(), (
+        "formal deviations of a model that does not fit are no accuracy"
+    )
     assert found.misfit
 
 
 def test_the_two_files_agree_within_honest_intervals() -> None:
     files = [PENDULUM / f"{name}_measured.csv" for name in ("dircol", "energy_shaping")]
-    one, two = (identified(experiment("dfki_simple_pendulum", bootstrap=300), [file], []) for file in files)
+    one, two = (
+        identified(experiment("dfki_simple_pendulum", bootstrap=300), [file], []) for file in files
+    )
     for name in ("J", "mc", "coulomb"):
         j = one.parameters.index(name)
-        assert max(one.interval[j, 0], two.interval[j, 0]) <= min(one.interval[j, 1], two.interval[j, 1]), name
+        assert max(one.interval[j, 0], two.interval[j, 0]) <= min(
+            one.interval[j, 1], two.interval[j, 1]
+        ), name
 
 
 def test_poor_data_are_named() -> None:
-    poor = identified(experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "sysid_measured.csv"], [])
+    poor = identified(
+        experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "sysid_measured.csv"], []
+    )
     said = [s for s in poor.warnings if s.startswith("poor data in sysid_measured.csv")]
     assert any("jumps from row to row" in s and "'torque'" in s for s in said)
     assert any("speed is rough" in s for s in said)
     assert any("ctrlrange" in s for s in said)
-    good = identified(experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "dircol_measured.csv"], [])
+    good = identified(
+        experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "dircol_measured.csv"], []
+    )
     assert not any(s.startswith("poor data") for s in good.warnings)
 
 

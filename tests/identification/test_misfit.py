@@ -128,7 +128,10 @@ def test_larger_and_smaller_need_probability_and_size() -> None:
 
 def test_noise_that_follows_itself_matters_where_it_is_large_enough() -> None:
     """Improbable, corrected for the number of outputs, and more than the noise hides; the worst first."""
-    assert [w.output for w in coloured([seen("a", 1e-9, 2.0), seen("b", 1e-9, 5.0), seen("c", 0.1, 9.0)])] == ["b", "a"]
+    assert [
+        w.output
+        for w in coloured([seen("a", 1e-9, 2.0), seen("b", 1e-9, 5.0), seen("c", 0.1, 9.0)])
+    ] == ["b", "a"]
     assert not coloured([seen(p=1e-9, inflation=1.1)])
     assert not coloured([seen(p=1e-9, inflation=5.0, variance=0.01)]), "far below the stated noise"
     assert coloured([seen(p=1e-9, inflation=1.0, time=3.0)])
@@ -140,13 +143,19 @@ def test_reasons_in_sentences() -> None:
     """Each cause one sentence; of noise that is as stated there is nothing to say."""
     assert reasons(1000.0, 1000, True, [seen()], ()) == ()
     assert reasons(4000.0, 1000, True, [seen()], ()) == ("residuals are 2.00 x the stated noise",)
-    assert reasons(4000.0, 1000, False, [seen()], ()) == (), "where sigmas are estimated, size tells nothing"
+    assert reasons(4000.0, 1000, False, [seen()], ()) == (), (
+        "where sigmas are estimated, size tells nothing"
+    )
     said = reasons(1000.0, 1000, False, [seen("speed", 1e-9, 4.0)], ())
     assert said == ("residuals follow one another in speed (+0.30 from one to the next)",)
     slow = reasons(1000.0, 1000, True, [seen("speed", 1e-9, 16.0, correlation=0.001)], ())
-    assert slow == ("residuals follow one another in speed (means of many scatter 4.0 x as much as those of noise)",)
+    assert slow == (
+        "residuals follow one another in speed (means of many scatter 4.0 x as much as those of noise)",
+    )
     assert len(reasons(4000.0, 1000, True, [seen("speed", 1e-9, 4.0)], ())) == 2
     many = reasons(1000.0, 1000, True, [seen(f"y{i}", 1e-9, 9.0 - i) for i in range(6)], ())
-    assert "y0 (" in many[0] and "y3 (" in many[0] and "y4" not in many[0] and "and 2 more" in many[0]
+    assert (
+        "y0 (" in many[0] and "y3 (" in many[0] and "y4" not in many[0] and "and 2 more" in many[0]
+    )
     lacking = reasons(1000.0, 1000, True, [seen()], ["dry friction"])
     assert len(lacking) == 1 and "model lacks" in lacking[0]

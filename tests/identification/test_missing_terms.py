@@ -26,7 +26,9 @@ def robot(folder: Path, old: str, new: str, seed: int = 0, **tables: object) -> 
     text = (ROOT / "models" / "cart_pendulum.xml").read_text(encoding="utf-8")
     assert text.count(old) == 1
     (folder / "cart_pendulum.xml").write_text(text.replace(old, new), encoding="utf-8")
-    other = mjfim.Experiment(**{**stated(**tables).model_dump(exclude_unset=True), "directory": folder})
+    other = mjfim.Experiment(
+        **{**stated(**tables).model_dump(exclude_unset=True), "directory": folder}
+    )
     setup = Setup(other)
     return mjfim.simulate(setup, setup.initial, seed)
 
@@ -69,7 +71,9 @@ def test_a_bias_and_a_lag_are_told(tmp_path: Path) -> None:
 
 def test_a_right_model_lacks_nothing() -> None:
     setup = Setup(stated())
-    found = [mjfim.identify(setup, [mjfim.simulate(setup, setup.initial, seed)]) for seed in range(12)]
+    found = [
+        mjfim.identify(setup, [mjfim.simulate(setup, setup.initial, seed)]) for seed in range(12)
+    ]
     assert not any(e.suspects or e.misfit for e in found)
 
 

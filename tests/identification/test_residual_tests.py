@@ -32,7 +32,9 @@ def test_white_noise_is_rarely_accused(lengths: tuple[int, ...]) -> None:
     """At each level no more often than the level says, within what chance allows for so many draws."""
     rng = np.random.default_rng(len(lengths))
     draws = 400
-    p = np.array([whiteness("y", [3.0 * rng.standard_normal(n) for n in lengths]).p for _ in range(draws)])
+    p = np.array(
+        [whiteness("y", [3.0 * rng.standard_normal(n) for n in lengths]).p for _ in range(draws)]
+    )
     for level in (0.2, 0.05, 0.01):
         assert (p < level).sum() <= binom.ppf(0.999, draws, level), f"at {level}"
     if max(lengths) > 1000:  # and not for want of looking
@@ -109,7 +111,10 @@ def test_the_statistic_is_that_of_ljung_and_box() -> None:
     for phi in (-0.06, -0.1):
         y = autoregressive(phi, 600, rng)
         n = len(y)
-        rho = [sum(y[i] * y[i + k] for i in range(n - k)) / sum(v * v for v in y) for k in range(LAGS + 1)]
+        rho = [
+            sum(y[i] * y[i + k] for i in range(n - k)) / sum(v * v for v in y)
+            for k in range(LAGS + 1)
+        ]
         statistic = n * (n + 2) * sum(rho[k] ** 2 / (n - k) for k in range(1, LAGS + 1))
         looks = 1 + sum(n // w >= 8 for w in (4, 16, 64))
         tails = [chi2.sf(statistic, LAGS)]
@@ -147,7 +152,8 @@ def test_variance_and_inflation() -> None:
 
 
 @pytest.mark.parametrize(
-    "parts", [[], [np.zeros(0)], [np.full(9, np.nan)], [np.ones(5)], [np.zeros(100)], [np.ones(1)] * 50]
+    "parts",
+    [[], [np.zeros(0)], [np.full(9, np.nan)], [np.ones(5)], [np.zeros(100)], [np.ones(1)] * 50],
 )
 def test_too_little_to_tell_accuses_nobody(parts: list[Array]) -> None:
     """No values, few, or none but zeros."""

@@ -38,11 +38,15 @@ class Linear:
         rows = np.eye(wide.shape[1])[K * n :] / self.prior
         found = np.linalg.lstsq(np.concatenate([wide, rows]), np.append(y.ravel(), np.zeros(c)))[0]
         r = (wide @ found - y.ravel()).reshape(K, N, 1)
-        stacked = np.concatenate([np.ones((K, N, n)), self.X, r], axis=2).reshape(-1, FINE, n + c + 1)
+        stacked = np.concatenate([np.ones((K, N, n)), self.X, r], axis=2).reshape(
+            -1, FINE, n + c + 1
+        )
         blocks = np.linalg.qr(np.pad(stacked, ((0, 0), (0, c), (0, 0))), mode="r")
         owner = np.repeat(np.arange(K), N // FINE)
         theta = found[K * n :]
-        known = np.column_stack([np.eye(c), theta])[: c * bool(np.isfinite(self.prior))] / self.prior
+        known = (
+            np.column_stack([np.eye(c), theta])[: c * bool(np.isfinite(self.prior))] / self.prior
+        )
         return theta, Condensed(blocks, owner, np.zeros((K, 0, n + c + 1)), known)
 
     def judged(self, y: Array, length: float, draws: int = 0) -> tuple[Array, Array, Uncertainty]:
@@ -50,16 +54,18 @@ class Linear:
         theta, condensed = self.fitted(y)
         rows = np.full(len(condensed.piece), float(FINE))
         formal = np.sqrt(np.diag(np.linalg.inv(condensed.information())))
-        said = uncertainty(condensed, theta, condensed.piece, rows, length, draws, np.random.default_rng(0))
+        said = uncertainty(
+            condensed, theta, condensed.piece, rows, length, draws, np.random.default_rng(0)
+        )
         return theta, formal, said
 
 
 def waves(K: int, N: int, c: int, slow: float = 3.0) -> Array:
     """(K, N, c) slow regressors, where noise that hangs together hurts."""
     t = np.arange(N) / N
-    return np.stack([[np.cos(2 * np.pi * slow * (j + 1) * t + j + k) for j in range(c)] for k in range(K)]).swapaxes(
-        1, 2
-    )
+    return np.stack(
+        [[np.cos(2 * np.pi * slow * (j + 1) * t + j + k) for j in range(c)] for k in range(K)]
+    ).swapaxes(1, 2)
 
 
 def noise(phi: float, shape: tuple[int, int], rng: np.random.Generator) -> Array:
@@ -91,15 +97,28 @@ def study(phi: float, own: bool = False, prior: float = np.inf, repetitions: int
     for _ in range(repetitions):
         truth = prior * rng.standard_normal(2) if np.isfinite(prior) else np.zeros(2)
         offsets = 3.0 * rng.standard_normal((K, 1)) * own
-        theta, formal, said = model.judged(model.X @ truth + offsets + noise(phi, (K, N), rng), length, draws=150)
+        theta, formal, said = model.judged(
+            model.X @ truth + offsets + noise(phi, (K, N), rng), length, draws=150
+        )
         low, high = said.interval.T
         covered = (low <= truth) & (truth <= high)
-        found.append((theta - truth, formal, said.sandwich, said.draws.std(axis=0), covered, bool(said.apart)))
+        found.append(
+            (
+                theta - truth,
+                formal,
+                said.sandwich,
+                said.draws.std(axis=0),
+                covered,
+                bool(said.apart),
+            )
+        )
     return Study(*(np.array(column) for column in zip(*found, strict=True)))
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_with_correlated_noise_the_sandwich_is_right_and_the_formal_deviation_is_not(own: bool) -> None:
+def test_with_correlated_noise_the_sandwich_is_right_and_the_formal_deviation_is_not(
+    own: bool,
+) -> None:
     """Against the spread of the estimates themselves: the formal one is several times too small."""
     s = study(0.9, own)
     true = s.theta.std(axis=0)
@@ -118,7 +137,9 @@ def test_with_white_noise_all_deviations_agree(own: bool) -> None:
     np.testing.assert_allclose(s.sandwich.mean(axis=0), s.formal.mean(axis=0), rtol=0.05)
 
 
-@pytest.mark.parametrize(("phi", "own"), [(0.0, False), (0.0, True), (0.6, False), (0.9, False), (0.9, True)])
+@pytest.mark.parametrize(
+    ("phi", "own"), [(0.0, False), (0.0, True), (0.6, False), (0.9, False), (0.9, True)]
+)
 def test_the_interval_covers_the_truth(phi: float, own: bool) -> None:
     """Nearly as often as 95 % and not always; without the allowance it would not."""
     s = study(phi, own)
@@ -148,7 +169,9 @@ def test_recordings_that_differ_are_told_apart() -> None:
         truth = np.array([0.4, 0.0]) * rng.standard_normal((K, 2))
         y = np.einsum("knc,kc->kn", model.X, truth)
         for other, found in ((0.0, equal), (1.0, apart)):
-            theta, _, said = model.judged(other * y + noise(0.5, (K, N), rng), together([3.0], K * N))
+            theta, _, said = model.judged(
+                other * y + noise(0.5, (K, N), rng), together([3.0], K * N)
+            )
             found.append(said.apart)
             if other:
                 between.append(said.between)
@@ -202,7 +225,9 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
     _, _, one = Linear(X).judged(y, 36.0, draws=50)
     theta, condensed = Linear(X).fitted(y)
     wide = np.append(unit, 1.0)
-    other = Condensed(condensed.blocks * wide, condensed.piece, condensed.inner * wide, condensed.outer * wide)
+    other = Condensed(
+        condensed.blocks * wide, condensed.piece, condensed.inner * wide, condensed.outer * wide
+    )
     rows = np.full(len(condensed.piece), float(FINE))
     two = uncertainty(other, theta / unit, other.piece, rows, 36.0, 50, np.random.default_rng(0))
     np.testing.assert_allclose(two.sandwich * unit, one.sandwich, rtol=1e-6)
@@ -219,8 +244,14 @@ def test_the_interval_is_the_hull() -> None:
     low, high = said.interval.T
     tails = np.quantile(said.draws, [0.025, 0.975], axis=0)
     low, high = low - 1e-12, high + 1e-12
-    assert (low <= np.minimum(theta - 1.96 * said.sandwich, np.minimum(theta - 1.959 * formal, tails[0]))).all()
-    assert (high >= np.maximum(theta + 1.96 * said.sandwich, np.maximum(theta + 1.959 * formal, tails[1]))).all()
+    assert (
+        low
+        <= np.minimum(theta - 1.96 * said.sandwich, np.minimum(theta - 1.959 * formal, tails[0]))
+    ).all()
+    assert (
+        high
+        >= np.maximum(theta + 1.96 * said.sandwich, np.maximum(theta + 1.959 * formal, tails[1]))
+    ).all()
     assert said.blocks == 20
     assert said.draws.shape == (400, 2)
     np.testing.assert_array_equal(said.between, 0.0)
@@ -240,7 +271,9 @@ def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
     rng = np.random.default_rng(3)
     for _ in range(200):
         counts = rng.integers(1, 12, rng.integers(1, 6))
-        recording = np.repeat(np.flatnonzero(rng.random(2 * len(counts)) < 2.0)[: len(counts)], counts)
+        recording = np.repeat(
+            np.flatnonzero(rng.random(2 * len(counts)) < 2.0)[: len(counts)], counts
+        )
         rows, length = rng.integers(1, 20, counts.sum()).astype(float), float(rng.integers(1, 60))
         merged = merge(recording, rows, length)
         assert merged[0] == 0

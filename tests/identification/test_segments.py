@@ -30,18 +30,29 @@ def body(tmp_path_factory: pytest.TempPathFactory) -> Setup:
 
 def truth(setup: Setup, factor: float = 1.1) -> Array:
     """(N+1, ny) of parameters that are not the guess."""
-    return np.asarray(setup.plant.measure(factor * setup.parameters.guess[None], setup.control)[0][0])
+    return np.asarray(
+        setup.plant.measure(factor * setup.parameters.guess[None], setup.control)[0][0]
+    )
 
 
-def track(setup: Setup, y: Array | None = None, rows: Array | None = None, hidden: tuple[str, ...] = ()) -> Track:
+def track(
+    setup: Setup, y: Array | None = None, rows: Array | None = None, hidden: tuple[str, ...] = ()
+) -> Track:
     """A noise-free log of some rows, some columns taken out."""
     y = np.array(truth(setup) if y is None else y)
     rows = np.arange(len(y)) if rows is None else rows
-    kept = [i for i, name in enumerate(setup.outputs.names) if not name.startswith(hidden)] if hidden else slice(None)
+    kept = (
+        [i for i, name in enumerate(setup.outputs.names) if not name.startswith(hidden)]
+        if hidden
+        else slice(None)
+    )
     names = tuple(np.array(setup.outputs.names)[kept].tolist())
     ctrl = setup.control[rows[:-1]]
     return track_of(
-        setup, Recording(rows * setup.dt, ctrl, y[np.ix_(rows, np.arange(y.shape[1])[kept])], names, "x.csv")
+        setup,
+        Recording(
+            rows * setup.dt, ctrl, y[np.ix_(rows, np.arange(y.shape[1])[kept])], names, "x.csv"
+        ),
     )
 
 
@@ -64,7 +75,9 @@ def test_every_row_is_in_one_piece(setup: Setup, length: float | None, lead: flo
     y = truth(setup)
     some = np.sort(rng.choice(len(y), 120, replace=False))
     some[0] = 0
-    off = Recording(np.sort(rng.uniform(0, 1.7, 90)), np.zeros((89, 1)), y[:90], setup.outputs.names, "off.csv")
+    off = Recording(
+        np.sort(rng.uniform(0, 1.7, 90)), np.zeros((89, 1)), y[:90], setup.outputs.names, "off.csv"
+    )
     tracks = [track(setup), track(setup, rows=some), track_of(setup, off)]
     assert [t.even for t in tracks] == [True, True, False]
     pieces = cut(setup, tracks, length, lead)
@@ -107,7 +120,9 @@ def test_stretches_without_rows_are_no_pieces(setup: Setup) -> None:
 
 def test_pieces_that_are_too_short_are_refused(setup: Setup) -> None:
     """In one sentence with the file, the key and what it takes."""
-    with pytest.raises(RecordingError, match=r"x\.csv: fit\.segments = 0\.03 s is too short.*4 samples of 0\.01 s"):
+    with pytest.raises(
+        RecordingError, match=r"x\.csv: fit\.segments = 0\.03 s is too short.*4 samples of 0\.01 s"
+    ):
         cut(setup, [track(setup)], 0.03, 0.0)
 
 
@@ -123,7 +138,9 @@ def test_whole_tracks_start_as_stated(setup: Setup) -> None:
 
 @pytest.mark.parametrize("hidden", [(), ("qvel",)])
 @pytest.mark.parametrize("gaps", [False, True])
-def test_measured_starts_are_where_the_motion_was(setup: Setup, hidden: tuple[str, ...], gaps: bool) -> None:
+def test_measured_starts_are_where_the_motion_was(
+    setup: Setup, hidden: tuple[str, ...], gaps: bool
+) -> None:
     """A slide and a hinge; velocities measured, or read off the positions. Against the motion itself."""
     y = truth(setup)
     begins = np.array([0, 3, 60, 117, 199])
@@ -155,8 +172,12 @@ def test_a_free_body_starts_with_its_orientation(body: Setup) -> None:
     noisy[:, 3:11] *= 1.01
     states = measured_starts(body, track(body, noisy), begins)
     for first in (3, 7):
-        np.testing.assert_allclose(np.linalg.norm(states[:, first : first + 4], axis=1), 1.0, rtol=1e-12)
-        np.testing.assert_allclose(states[:, first : first + 4], y[begins, first : first + 4], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            np.linalg.norm(states[:, first : first + 4], axis=1), 1.0, rtol=1e-12
+        )
+        np.testing.assert_allclose(
+            states[:, first : first + 4], y[begins, first : first + 4], rtol=0, atol=1e-9
+        )
     np.testing.assert_allclose(states[:, :3], y[begins, :3], rtol=0, atol=0.02 * np.ptp(y[:, :3]))
     np.testing.assert_allclose(states[:, 11:], y[begins, 11:], rtol=0, atol=0.1 * np.ptp(y[:, 11:]))
 
@@ -167,14 +188,18 @@ def test_what_is_not_measured_goes_as_the_model_at_the_guess(body: Setup) -> Non
     begins = np.array([0, 40, 120])
     slow = measured_starts(body, track(body, y, hidden=("qvel",)), begins)
     np.testing.assert_allclose(slow[:, 14:], guess[begins, 14:], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(slow[:, 11:14], y[begins, 11:14], rtol=0, atol=0.1 * np.ptp(y[:, 11:14]))
+    np.testing.assert_allclose(
+        slow[:, 11:14], y[begins, 11:14], rtol=0, atol=0.1 * np.ptp(y[:, 11:14])
+    )
     ball = measured_starts(body, track(body, y, hidden=("qpos:ball", "qvel")), begins)
     np.testing.assert_allclose(ball[:, 7:11], guess[begins, 7:11], rtol=0, atol=1e-9)
     np.testing.assert_allclose(ball[:, 3:7], y[begins, 3:7], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("hidden", [("qpos:slide",), ("qvel:hinge",), ("qpos:slide", "qvel")])
-def test_an_output_that_a_recording_lacks_does_not_spoil_its_starts(setup: Setup, hidden: tuple[str, ...]) -> None:
+def test_an_output_that_a_recording_lacks_does_not_spoil_its_starts(
+    setup: Setup, hidden: tuple[str, ...]
+) -> None:
     """One of several recordings without that column: the model stands in."""
     y, guess, begins = truth(setup), truth(setup, 1.0), np.array([0, 70, 150])
     states = measured_starts(setup, track(setup, y, hidden=hidden), begins)
@@ -182,7 +207,9 @@ def test_an_output_that_a_recording_lacks_does_not_spoil_its_starts(setup: Setup
     names = setup.outputs.names
     if "qpos:slide" in hidden:
         np.testing.assert_allclose(states[:, 0], guess[begins, 0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(states[:, 1], y[begins, names.index("qpos:hinge")], rtol=0, atol=0.02)
+    np.testing.assert_allclose(
+        states[:, 1], y[begins, names.index("qpos:hinge")], rtol=0, atol=0.02
+    )
 
 
 @pytest.mark.parametrize("fit", [{"start": "measured"}, {"segments": 0.5}])
@@ -195,7 +222,9 @@ def test_a_start_that_nothing_shows_does_no_harm(
     blind = cart_setup(tmp_path, horizon=3.0, noise=noise, fit={**fit, "bootstrap": 0})
     theta, y = 1.1 * blind.parameters.guess, truth(blind)
     y = y + 0.01 * np.random.default_rng(0).standard_normal(y.shape)
-    found = identify(blind, [Recording(np.arange(len(y)) * blind.dt, blind.control, y, names, "x.csv")])
+    found = identify(
+        blind, [Recording(np.arange(len(y)) * blind.dt, blind.control, y, names, "x.csv")]
+    )
     assert found.success, found.status
     assert not found.misfit, found.reasons
     assert (np.abs(found.theta - theta) < 4.0 * found.std).all()
@@ -213,7 +242,10 @@ def test_batches_hold_all_pieces_once_and_not_too_much() -> None:
         batches = list(groups(pieces, most))
         assert sorted(i for batch in batches for i in batch) == list(range(60))
         for batch in batches:
-            longest, shortest = max(pieces[i].samples for i in batch), min(pieces[i].samples for i in batch)
+            longest, shortest = (
+                max(pieces[i].samples for i in batch),
+                min(pieces[i].samples for i in batch),
+            )
             assert len(batch) == 1 or len(batch) * longest <= most
             assert longest <= 1.1 * shortest
     assert len(list(groups([piece(50)] * 40, 1000))) == 2

@@ -78,13 +78,18 @@ def test_earlier_information_of_a_design_leaves_every_sigma_known(tmp_path) -> N
     again = Setup(setup.experiment.replace(earlier=[str(tmp_path / "design.json")]))
     told = mjfim.check(again, trajectory=design.trajectory)
     alone = mjfim.check(setup, trajectory=design.trajectory)
-    ratio = np.array([b.std / a.std for a, b in zip(alone.rows, told.rows, strict=True) if np.isfinite(a.std)])
+    ratio = np.array(
+        [b.std / a.std for a, b in zip(alone.rows, told.rows, strict=True) if np.isfinite(a.std)]
+    )
     np.testing.assert_allclose(ratio, np.sqrt(0.5), rtol=1e-4)  # twice the same data
     assert {row.name for row in told.rows if not np.isfinite(row.std)} == {"m1r1", "I1", "m2"}
 
 
 def test_an_estimate_holds_what_no_recording_shows_and_knows_the_rest(tmp_path) -> None:
-    parameters = {**PARAMETERS, "d": {"target": "joint/shoulder:damping", "guess": 0.15, "true": 0.1}}
+    parameters = {
+        **PARAMETERS,
+        "d": {"target": "joint/shoulder:damping", "guess": 0.15, "true": 0.1},
+    }
     setup = pendulum(tmp_path, parameters=parameters)
     recording = mjfim.simulate(setup, setup.initial, seed=3)
     estimate = mjfim.identify(setup, [recording])
@@ -93,10 +98,14 @@ def test_an_estimate_holds_what_no_recording_shows_and_knows_the_rest(tmp_path) 
     assert "m1r1" in estimate.combinations[0]
     assert not estimate.misfit
     assert abs(estimate.theta[4] - 0.1) < 4.0 * estimate.std[4]
-    away = np.abs(estimate.theta[:3] - setup.parameters.guess[:3]) / np.abs(setup.parameters.guess[:3])
+    away = np.abs(estimate.theta[:3] - setup.parameters.guess[:3]) / np.abs(
+        setup.parameters.guess[:3]
+    )
     assert away.max() < 0.1  # not run away along what is invisible
     told = mjfim.check(setup, [recording])
-    np.testing.assert_allclose(estimate.std[3:], [row.std for row in told.rows[3:]], rtol=0.3)  # there at the guess
+    np.testing.assert_allclose(
+        estimate.std[3:], [row.std for row in told.rows[3:]], rtol=0.3
+    )  # there at the guess
 
 
 def test_an_estimate_of_combinations_serves_as_earlier_information(tmp_path) -> None:
@@ -114,11 +123,15 @@ def test_criterion_c_refuses_what_cannot_be_identified(tmp_path) -> None:
     visible = {"criterion": "c", "combination": {"I1": 1.0, "m2": 0.09}}
     design = mjfim.design(pendulum(tmp_path, cost=visible))
     known = {c.words.split()[0]: c for c in design.combined}
-    assert design.final.criterion == pytest.approx(known["I1"].final ** 2 * 100.0, rel=1e-6)  # per second, 100 Hz
+    assert design.final.criterion == pytest.approx(
+        known["I1"].final ** 2 * 100.0, rel=1e-6
+    )  # per second, 100 Hz
 
 
 def test_nothing_visible_is_a_verdict_not_a_crash(tmp_path) -> None:
-    found = mjfim.check(pendulum(tmp_path, parameters={"wind": {"target": "option:wind[0]", "guess": 1.0}}))
+    found = mjfim.check(
+        pendulum(tmp_path, parameters={"wind": {"target": "option:wind[0]", "guess": 1.0}})
+    )
     assert not found.ok
     assert any("nothing can be identified" in sentence for sentence in found.verdict)
 

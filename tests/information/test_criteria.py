@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from support.numerics import Array, richardson
 
-from mjfim.information.criteria import CRITERIA, Criterion, c_optimality, e_optimality, smooth_e_optimality
+from mjfim.information.criteria import (
+    CRITERIA,
+    Criterion,
+    c_optimality,
+    e_optimality,
+    smooth_e_optimality,
+)
 
 CONTRAST = np.array([[1.0, 0.0], [-2.0, 0.0], [0.5, 1.0], [0.0, 3.0]])
 ALL: dict[str, Callable[[Array], Criterion]] = {
@@ -97,17 +103,24 @@ def test_the_smooth_criterion_lies_above_the_exact_one_and_comes_down_to_it() ->
         assert (np.array(ratios) >= 1.0 - 1e-12).all()
         assert (np.diff(ratios) < 1e-12).all()
         assert all(
-            r <= 4.0 ** (1.0 / q) * (1.0 + 1e-12) for r, q in zip(ratios, (1.0, 4.0, 40.0, 160.0, 1e4), strict=True)
+            r <= 4.0 ** (1.0 / q) * (1.0 + 1e-12)
+            for r, q in zip(ratios, (1.0, 4.0, 40.0, 160.0, 1e4), strict=True)
         )
         assert ratios[-1] < 1.0 + 2e-4
     # the bound p^(1/q) is reached where all eigenvalues are one
-    assert smooth_e_optimality(np.eye(4), 40.0).value == pytest.approx(4.0 ** (1.0 / 40.0), rel=1e-12)
+    assert smooth_e_optimality(np.eye(4), 40.0).value == pytest.approx(
+        4.0 ** (1.0 / 40.0), rel=1e-12
+    )
 
 
 def test_smooth_E_to_the_power_one_is_A() -> None:
     info = matrix(SPECTRA["spread"])
-    assert smooth_e_optimality(info, 1.0).value == pytest.approx(CRITERIA["A"](info).value, rel=1e-12)
-    np.testing.assert_allclose(derivative(smooth_e_optimality(info, 1.0)), derivative(CRITERIA["A"](info)), rtol=1e-9)
+    assert smooth_e_optimality(info, 1.0).value == pytest.approx(
+        CRITERIA["A"](info).value, rel=1e-12
+    )
+    np.testing.assert_allclose(
+        derivative(smooth_e_optimality(info, 1.0)), derivative(CRITERIA["A"](info)), rtol=1e-9
+    )
 
 
 def test_powers_do_not_overflow_on_tiny_or_huge_information() -> None:
@@ -136,7 +149,9 @@ def test_where_two_eigenvalues_coincide_only_the_smooth_criterion_is_differentia
             right, left = one_sided(lambda info, q=power: smooth_e_optimality(info, q), info, d)
             assert right == pytest.approx(left, abs=1e-3)
             M = derivative(smooth_e_optimality(info, power))
-            measured = richardson(lambda t, d=d, q=power: smooth_e_optimality(info + t * d, q).value, 1e-4)
+            measured = richardson(
+                lambda t, d=d, q=power: smooth_e_optimality(info + t * d, q).value, 1e-4
+            )
             assert np.sum(M * d) == pytest.approx(measured, abs=1e-8)
     assert min(kinks) > 0.05
 
@@ -147,7 +162,9 @@ def test_the_exact_derivative_at_a_crossing_would_be_rejected() -> None:
     errors = []
     for _ in range(6):
         d = symmetric(rng)
-        errors.append(abs(np.sum(M * d) - richardson(lambda t, d=d: e_optimality(info + t * d).value, 1e-4)))
+        errors.append(
+            abs(np.sum(M * d) - richardson(lambda t, d=d: e_optimality(info + t * d).value, 1e-4))
+        )
     assert max(errors) > 0.05
 
 
@@ -176,14 +193,22 @@ def test_c_is_the_summed_variance_of_the_combinations() -> None:
 
 def test_c_of_all_parameters_is_A_and_of_one_its_variance() -> None:
     info = matrix(SPECTRA["spread"])
-    assert c_optimality(info, np.eye(4)).value == pytest.approx(CRITERIA["A"](info).value, rel=1e-12)
-    np.testing.assert_allclose(derivative(c_optimality(info, np.eye(4))), derivative(CRITERIA["A"](info)), rtol=1e-9)
-    assert c_optimality(info, np.eye(4)[:, 2:3]).value == pytest.approx(np.linalg.inv(info)[2, 2], rel=1e-12)
+    assert c_optimality(info, np.eye(4)).value == pytest.approx(
+        CRITERIA["A"](info).value, rel=1e-12
+    )
+    np.testing.assert_allclose(
+        derivative(c_optimality(info, np.eye(4))), derivative(CRITERIA["A"](info)), rtol=1e-9
+    )
+    assert c_optimality(info, np.eye(4)[:, 2:3]).value == pytest.approx(
+        np.linalg.inv(info)[2, 2], rel=1e-12
+    )
 
 
 def test_c_does_not_see_what_is_independent_of_the_combination() -> None:
     contrast = np.array([[1.0], [1.0], [0.0], [0.0]])
     info = np.diag([1.0, 2.0, 3.0, 4.0])
     found = c_optimality(info, contrast)
-    assert c_optimality(info + np.diag([0.0, 0.0, 9.0, 9.0]), contrast).value == pytest.approx(found.value)
+    assert c_optimality(info + np.diag([0.0, 0.0, 9.0, 9.0]), contrast).value == pytest.approx(
+        found.value
+    )
     np.testing.assert_array_equal(derivative(found)[2:], 0.0)

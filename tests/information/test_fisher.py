@@ -31,7 +31,9 @@ def random_sensitivity(seed: int, N: int = 12, p: int = 4, nx: int = 5) -> Sensi
 def information(stride: int = 1, criterion: str = "E", **changes) -> Information:
     """Three outputs, four parameters of different scale, no prior."""
     noise = Noise.independent(SIGMA, stride)
-    base = Information(noise, 50.0, np.array([1.0, 2.0, 0.1, 5.0]), np.zeros((4, 4)), criterion, 1.0)
+    base = Information(
+        noise, 50.0, np.array([1.0, 2.0, 0.1, 5.0]), np.zeros((4, 4)), criterion, 1.0
+    )
     return replace(base, **changes)
 
 
@@ -57,28 +59,40 @@ def test_information_leaves_out_the_known_start() -> None:
     S = random_sensitivity(2)
     G = np.array(S.G)
     G[0] += 100.0
-    np.testing.assert_array_equal(information().matrix(Sensitivity(S.psi, G)), information().matrix(S))
+    np.testing.assert_array_equal(
+        information().matrix(Sensitivity(S.psi, G)), information().matrix(S)
+    )
     G[1] += 100.0
     assert np.abs(information().matrix(Sensitivity(S.psi, G)) - information().matrix(S)).max() > 1.0
 
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])
 def test_criterion_is_that_of_the_scaled_information_per_second(criterion: str) -> None:
-    made, matrix = information(criterion=criterion, weight=3.0), spread_matrix(np.random.default_rng(3))
+    made, matrix = (
+        information(criterion=criterion, weight=3.0),
+        spread_matrix(np.random.default_rng(3)),
+    )
     S = np.diag(made.scale)
     values = np.linalg.eigvalsh(S @ matrix @ S / 50.0)
-    expected = {"E": 1 / values[0], "A": np.sum(1 / values), "D": -np.sum(np.log(values))}[criterion]
+    expected = {"E": 1 / values[0], "A": np.sum(1 / values), "D": -np.sum(np.log(values))}[
+        criterion
+    ]
     found = made.evaluate(matrix)
     assert found.value == pytest.approx(3.0 * expected, rel=1e-12)
     np.testing.assert_allclose(found.eigenvalues, values, rtol=1e-12)
 
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])
-def test_criterion_derivative_is_that_of_differences_in_random_symmetric_directions(criterion: str) -> None:
+def test_criterion_derivative_is_that_of_differences_in_random_symmetric_directions(
+    criterion: str,
+) -> None:
     rng, made = np.random.default_rng(4), information(criterion=criterion, weight=2.0)
     matrix = spread_matrix(rng)
     found = made.evaluate(matrix)
-    M = np.einsum("r,ri,rj->ij", found.weights, found.directions, found.directions) / made.measure_rate
+    M = (
+        np.einsum("r,ri,rj->ij", found.weights, found.directions, found.directions)
+        / made.measure_rate
+    )
     for _ in range(8):
         d = rng.normal(size=(4, 4))
         d = 0.01 * (d + d.T)
@@ -112,11 +126,16 @@ def seeing(phi: str, seen: str) -> Information:
 
 @pytest.mark.parametrize("seen", SEEN)
 @pytest.mark.parametrize("phi", PHI)
-def test_derivative_through_nuisance_and_combinations_is_that_of_differences(phi: str, seen: str) -> None:
+def test_derivative_through_nuisance_and_combinations_is_that_of_differences(
+    phi: str, seen: str
+) -> None:
     rng, made = np.random.default_rng(4), seeing(phi, seen)
     matrix = spread_matrix(rng)
     found = made.evaluate(matrix)
-    M = np.einsum("r,ri,rj->ij", found.weights, found.directions, found.directions) / made.measure_rate
+    M = (
+        np.einsum("r,ri,rj->ij", found.weights, found.directions, found.directions)
+        / made.measure_rate
+    )
     for _ in range(6):
         d = rng.normal(size=(4, 4))
         d = 0.01 * (d + d.T)
@@ -133,8 +152,12 @@ def test_nuisance_leaves_the_block_of_the_full_inverse() -> None:
     block = np.linalg.inv(scaled)[np.ix_(t, t)]
     np.testing.assert_allclose(R, np.linalg.inv(block), rtol=1e-10)
     np.testing.assert_allclose(R, P @ scaled @ P.T, rtol=1e-10)
-    np.testing.assert_allclose(made.covariance(matrix), np.linalg.inv(matrix)[np.ix_(t, t)], rtol=1e-10)
-    assert np.linalg.norm(R - scaled[np.ix_(t, t)]) > 0.1 * np.linalg.norm(R)  # forgetting the nuisance would be seen
+    np.testing.assert_allclose(
+        made.covariance(matrix), np.linalg.inv(matrix)[np.ix_(t, t)], rtol=1e-10
+    )
+    assert np.linalg.norm(R - scaled[np.ix_(t, t)]) > 0.1 * np.linalg.norm(
+        R
+    )  # forgetting the nuisance would be seen
 
 
 def test_a_nuisance_known_exactly_is_none_and_an_unknown_one_always_costs() -> None:
@@ -153,7 +176,9 @@ def test_nuisances_that_cannot_be_told_from_each_other_do_not_matter() -> None:
         [J[:, 0], J[:, 1], 1e3 * J[:, 1], J[:, 2], np.zeros(20)]
     )  # twice one nuisance, and one of no effect
     base = {"prior": np.zeros((5, 5)), "scale": np.ones(5), "interest": np.array([0, 3])}
-    plain = information(prior=np.zeros((3, 3)), scale=np.ones(3), interest=np.array([0, 2])).evaluate(J.T @ J)
+    plain = information(
+        prior=np.zeros((3, 3)), scale=np.ones(3), interest=np.array([0, 2])
+    ).evaluate(J.T @ J)
     found = information(**base).evaluate(same.T @ same)
     assert found.value == pytest.approx(plain.value, rel=1e-7)
     assert np.isfinite(found.directions).all()
@@ -169,7 +194,9 @@ def test_a_wanted_parameter_that_a_nuisance_imitates_costs_infinity() -> None:
 
 def test_combinations_project_the_information_and_tell_who_stands_alone() -> None:
     rng = np.random.default_rng(17)
-    J = rng.normal(size=(30, 3)) @ np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    J = rng.normal(size=(30, 3)) @ np.array(
+        [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    )
     scale, half = np.array([1.0, 2.0, 2.0, 5.0]), np.sqrt(0.5)
     basis = np.array([[1.0, 0.0, 0.0], [0.0, half, 0.0], [0.0, half, 0.0], [0.0, 0.0, 1.0]])
     made, matrix = information(basis=basis, scale=scale), J.T @ J
@@ -177,13 +204,17 @@ def test_combinations_project_the_information_and_tell_who_stands_alone() -> Non
     told = J[:, [0, 1, 3]]
     exact = np.linalg.inv(told.T @ told)
     covariance = made.covariance(matrix)
-    np.testing.assert_allclose(covariance[np.ix_([0, 3], [0, 3])], exact[np.ix_([0, 2], [0, 2])], rtol=1e-9)
+    np.testing.assert_allclose(
+        covariance[np.ix_([0, 3], [0, 3])], exact[np.ix_([0, 2], [0, 2])], rtol=1e-9
+    )
     assert np.isnan(covariance[1:3]).all()
     np.testing.assert_allclose(made.std(matrix)[[0, 3]], np.sqrt(np.diag(exact))[[0, 2]], rtol=1e-9)
     assert np.isinf(made.std(matrix)[1:3]).all()
     with_prior = replace(made, prior=np.diag([0.0, 4.0, 0.0, 0.0]))
     total = matrix + with_prior.prior
-    np.testing.assert_allclose(with_prior.covariance(total), np.linalg.inv(total), rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(
+        with_prior.covariance(total), np.linalg.inv(total), rtol=1e-7, atol=1e-12
+    )
 
 
 def test_correlated_noise_at_several_rates_weighs_every_sample_with_its_own_covariance() -> None:
@@ -210,7 +241,9 @@ VAGUE = {"initial": 0.1, "bias": 0.1, "delay": 0.01}
 
 
 def test_exactly_known_nuisances_change_neither_design_criterion_nor_estimate(tmp_path) -> None:
-    plain, exact, vague = (cart_setup(tmp_path, **t) for t in ({}, {"nuisance": EXACT}, {"nuisance": VAGUE}))
+    plain, exact, vague = (
+        cart_setup(tmp_path, **t) for t in ({}, {"nuisance": EXACT}, {"nuisance": VAGUE})
+    )
     here = [evaluate_trajectory(s, s.initial) for s in (plain, exact, vague)]
     assert here[1].criterion == pytest.approx(here[0].criterion, rel=1e-6)
     np.testing.assert_allclose(here[1].std[:3], here[0].std, rtol=1e-6)
@@ -242,7 +275,11 @@ def test_criterion_says_how_many_directions_its_gradient_needs(criterion: str, r
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])
 def test_singular_information_costs_infinity_without_a_warning(criterion: str) -> None:
-    for matrix in (np.zeros((4, 4)), np.diag([0.0, 1.0, 2.0, 3.0]), np.diag([-1e-9, 1.0, 1.0, 1.0])):
+    for matrix in (
+        np.zeros((4, 4)),
+        np.diag([0.0, 1.0, 2.0, 3.0]),
+        np.diag([-1e-9, 1.0, 1.0, 1.0]),
+    ):
         assert information(criterion=criterion).evaluate(matrix).value == np.inf
 
 
@@ -255,7 +292,9 @@ def test_accumulated_smallest_eigenvalue_is_monotone_and_ends_at_the_whole() -> 
         assert series[0] == 0.0
         assert series[-1] == pytest.approx(made.evaluate(made.matrix(S)).eigenvalues[0], rel=1e-10)
         half = replace(made, prior=np.zeros((4, 4))).matrix(Sensitivity(S.psi[:7], S.G[:7]))
-        assert series[6] == pytest.approx(np.linalg.eigvalsh(made.scaled(half))[0], rel=1e-9, abs=1e-12)
+        assert series[6] == pytest.approx(
+            np.linalg.eigvalsh(made.scaled(half))[0], rel=1e-9, abs=1e-12
+        )
 
 
 def test_accumulated_starts_at_the_prior() -> None:
@@ -264,7 +303,9 @@ def test_accumulated_starts_at_the_prior() -> None:
     assert made.accumulated(random_sensitivity(8))[0] == pytest.approx(4.0 / 50.0)
 
 
-def test_the_stated_rate_divides_the_sum_so_that_weights_mean_the_same_at_every_rate(tmp_path) -> None:
+def test_the_stated_rate_divides_the_sum_so_that_weights_mean_the_same_at_every_rate(
+    tmp_path,
+) -> None:
     (tmp_path / "b").mkdir()
     dense, thin = cart_setup(tmp_path), cart_setup(tmp_path / "b", measure_rate=25.0)
     a, b = (s.problem.point(s.initial) for s in (dense, thin))
@@ -296,7 +337,9 @@ def test_standard_deviations_survive_parameters_of_very_different_size() -> None
     unit = spread_matrix(rng)
     scale = np.array([1.0, 1e6, 1e-6, 1.0])
     expected = np.sqrt(np.diag(np.linalg.inv(unit))) / scale
-    np.testing.assert_allclose(standard_deviations(unit * np.outer(scale, scale)), expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        standard_deviations(unit * np.outer(scale, scale)), expected, rtol=1e-9
+    )
     assert np.isinf(standard_deviations(np.diag([0.0, 1.0]))).all()
 
 
@@ -329,7 +372,9 @@ def test_a_product_is_designed_on_what_can_be_identified_of_it(tmp_path) -> None
 def test_coefficients_of_a_combination_are_in_the_parameters_own_units(tmp_path) -> None:
     changed = {**PRODUCT, "gear": {"target": "actuator/force:gear[0]", "guess": 4.0}}
     result = design(cart_setup(tmp_path, parameters=changed, descent={"max_iterations": 0}))
-    assert result.combinations == ("gear and gain only as gear + 4 gain",)  # d(gear gain) = d gear + 4 d gain
+    assert result.combinations == (
+        "gear and gain only as gear + 4 gain",
+    )  # d(gear gain) = d gear + 4 d gain
 
 
 def test_a_prior_on_one_factor_of_the_product_gives_both_a_deviation(tmp_path) -> None:
@@ -337,10 +382,14 @@ def test_a_prior_on_one_factor_of_the_product_gives_both_a_deviation(tmp_path) -
     result = design(cart_setup(tmp_path, parameters=known, descent={"max_iterations": 0}))
     exact = np.sqrt(np.diag(np.linalg.inv(result.final.information)))
     np.testing.assert_allclose(result.final.std, exact, rtol=1e-4)
-    assert result.final.std[0] == pytest.approx(0.01, rel=1e-3)  # the data add nothing about the gear
+    assert result.final.std[0] == pytest.approx(
+        0.01, rel=1e-3
+    )  # the data add nothing about the gear
 
 
-@pytest.mark.parametrize("others", [{}, {"m": CART_PARAMETERS["m"]}], ids=["alone", "beside a mass"])
+@pytest.mark.parametrize(
+    "others", [{}, {"m": CART_PARAMETERS["m"]}], ids=["alone", "beside a mass"]
+)
 def test_a_parameter_that_changes_nothing_is_an_error_that_names_it(others: dict, tmp_path) -> None:
     blind = {"depth": {"target": "body/bob:pos[1]", "guess": 0.1}, **others}
     with pytest.raises(UnidentifiableError, match=r"parameters\.depth changes nothing") as caught:
@@ -350,7 +399,9 @@ def test_a_parameter_that_changes_nothing_is_an_error_that_names_it(others: dict
 
 @pytest.mark.parametrize("angle", [0.0, np.pi], ids=["upright", "hanging, rounded"])
 @pytest.mark.parametrize("count", [1, 3])
-def test_a_start_at_rest_without_control_is_unidentifiable(count: int, angle: float, tmp_path) -> None:
+def test_a_start_at_rest_without_control_is_unidentifiable(
+    count: int, angle: float, tmp_path
+) -> None:
     rest = {"qpos": (0.0, angle), "control": {"kind": "constant", "amplitude": 0.0}}
     parameters = dict(list(CART_PARAMETERS.items())[-count:])
     setup = cart_setup(tmp_path, initial=rest, parameters=parameters, descent={"max_iterations": 5})

@@ -58,7 +58,9 @@ def look(setup: Setup) -> Survey:
     return survey(setup, setup.initial, setup.plant.sensitivity(setup.theta, setup.initial))
 
 
-def test_an_experiment_that_shows_everything_needs_no_random_controls(tmp_path, monkeypatch) -> None:
+def test_an_experiment_that_shows_everything_needs_no_random_controls(
+    tmp_path, monkeypatch
+) -> None:
     def refused(setup: Setup, count: int) -> None:
         raise AssertionError("not needed")
 
@@ -109,9 +111,13 @@ def test_a_combination_hidden_at_the_start_alone_is_refused_with_a_way_out(tmp_p
     (group,) = seen.groups_here
     assert group.members == ("mass", "drag")
     # d(drag / mass) = 0 along (mass, drag) = (1, 0.3): what remains is drag - 0.3 mass, or mass - drag / 0.3
-    coefficients = dict(zip(group.combinations[0].members, group.combinations[0].coefficients, strict=True))
+    coefficients = dict(
+        zip(group.combinations[0].members, group.combinations[0].coefficients, strict=True)
+    )
     assert coefficients["mass"] / coefficients["drag"] == pytest.approx(-0.3, rel=1e-5)
-    with pytest.raises(UnidentifiableError, match=r"start excites nothing .* mass and drag only as .* multisine"):
+    with pytest.raises(
+        UnidentifiableError, match=r"start excites nothing .* mass and drag only as .* multisine"
+    ):
         require_designable(setup, seen)
 
 
@@ -120,10 +126,14 @@ def test_a_wanted_parameter_that_a_nuisance_imitates_is_named(sigma: float, tmp_
     """Where the cart starts and what its position sensor adds are the same to every measurement."""
     wanted = {"offset": {"target": "output/qpos:slide:bias"}}
     noise = {"qpos:slide": sigma, "qvel:slide": sigma}
-    setup = cart_setup(tmp_path, parameters=wanted, noise=noise, nuisance={"initial": {"qpos:slide": True}})
+    setup = cart_setup(
+        tmp_path, parameters=wanted, noise=noise, nuisance={"initial": {"qpos:slide": True}}
+    )
     with pytest.raises(UnidentifiableError, match=r"parameters\.offset changes nothing"):
         require_designable(setup, look(setup))
-    known = cart_setup(tmp_path, parameters=wanted, noise=noise, nuisance={"initial": {"qpos:slide": 0.1}})
+    known = cart_setup(
+        tmp_path, parameters=wanted, noise=noise, nuisance={"initial": {"qpos:slide": 0.1}}
+    )
     require_designable(known, look(known))
 
 
@@ -139,9 +149,14 @@ def test_members_of_an_inertia_may_be_invisible_but_not_all_of_them(tmp_path) ->
 
 
 def test_several_dead_parameters_are_all_named(tmp_path) -> None:
-    dead = {"y": {"target": "body/bob:pos[1]", "guess": 0.1}, "i": {"target": "body/cart:inertia[0]"}}
+    dead = {
+        "y": {"target": "body/bob:pos[1]", "guess": 0.1},
+        "i": {"target": "body/cart:inertia[0]"},
+    }
     setup = cart_setup(tmp_path, parameters={**CART_PARAMETERS, **dead})
-    with pytest.raises(UnidentifiableError, match=r"parameters\.y, parameters\.i change nothing .* take them out"):
+    with pytest.raises(
+        UnidentifiableError, match=r"parameters\.y, parameters\.i change nothing .* take them out"
+    ):
         require_designable(setup, look(setup))
 
 
@@ -166,10 +181,18 @@ def test_a_contact_shorter_than_a_sample_period_shows_its_stiffness(tmp_path) ->
     initial = {"qpos": (0.9,), "qvel": (-1.0,), "control": control}
     for horizon in (3.3, 3.7, 5.0):  # wherever the looked-at samples fall
         setup = make_setup(
-            COLLISION, tmp_path, horizon=horizon, parameters=parameters, noise={"state": 0.01}, initial=initial
+            COLLISION,
+            tmp_path,
+            horizon=horizon,
+            parameters=parameters,
+            noise={"state": 0.01},
+            initial=initial,
         )
         assert np.sum(setup.initial.qpos[:, 0] < 0.1) <= 2
-        assert np.abs(setup.plant.sensitivity(setup.theta, setup.initial).G[..., 0]).max() * 40000.0 > 0.1
+        assert (
+            np.abs(setup.plant.sensitivity(setup.theta, setup.initial).G[..., 0]).max() * 40000.0
+            > 0.1
+        )
         assert look(setup).here.count == 0
 
 
@@ -179,7 +202,11 @@ def controls(setup: Setup) -> list[Array]:
 
 
 def test_random_controls_keep_to_the_actuators_and_about_the_initial_one(tmp_path) -> None:
-    control = {"kind": "sine", "amplitude": {"left": 0.8, "right": 3.0}, "offset": {"left": 0.1, "right": 5.0}}
+    control = {
+        "kind": "sine",
+        "amplitude": {"left": 0.8, "right": 3.0},
+        "offset": {"left": 0.1, "right": 5.0},
+    }
     setup = two_setup(tmp_path, initial={"control": {**control, "frequency": 2.0}})
     made = controls(setup)
     assert len(made) == PROBES
@@ -191,7 +218,9 @@ def test_random_controls_keep_to_the_actuators_and_about_the_initial_one(tmp_pat
 
 
 def test_the_seed_decides_the_random_controls(tmp_path) -> None:
-    same, again, other = (controls(two_setup(tmp_path, descent={"seed": seed})) for seed in (1, 1, 2))
+    same, again, other = (
+        controls(two_setup(tmp_path, descent={"seed": seed})) for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(same, again)
     assert not np.array_equal(same, other)
 

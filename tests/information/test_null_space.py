@@ -56,7 +56,9 @@ def test_a_known_null_space_is_found_whatever_the_parameters_sizes(case: str, no
     assert same_span(found.directions / SIZES[:, None], null)
     assert found.basis.shape == (5, 5 - found.count)
     np.testing.assert_allclose(found.basis.T @ found.basis, np.eye(5 - found.count), atol=1e-12)
-    np.testing.assert_allclose(found.basis.T @ null, 0.0, atol=1e-8)  # the scales here are the sizes
+    np.testing.assert_allclose(
+        found.basis.T @ null, 0.0, atol=1e-8
+    )  # the scales here are the sizes
     assert np.linalg.matrix_rank(J * SIZES @ found.basis, tol=1e-6) == 5 - found.count
 
 
@@ -104,7 +106,9 @@ def test_parameters_that_change_nothing_are_silent(alive: int) -> None:
 def test_round_off_beside_strong_parameters_is_silent_and_a_clean_faint_effect_is_not() -> None:
     rng = np.random.default_rng(7)
     J = np.column_stack([1e5 * rng.normal(size=60), 1e-4 * rng.normal(size=60)])
-    assert look(J, np.column_stack([np.zeros(60), J[:, 1]]), np.ones(2)).silent == (1,)  # it changes with the step
+    assert look(J, np.column_stack([np.zeros(60), J[:, 1]]), np.ones(2)).silent == (
+        1,
+    )  # it changes with the step
     assert look(J, np.column_stack([np.zeros(60), 1e-3 * J[:, 1]]), np.ones(2)).silent == ()
 
 
@@ -119,7 +123,9 @@ def test_a_nuisance_hides_what_it_imitates_unless_it_is_known() -> None:
 
 
 @pytest.mark.parametrize("strength", [1.0, 1e5], ids=["weak", "strong"])
-def test_a_lone_wanted_parameter_that_a_nuisance_imitates_to_round_off_is_hidden(strength: float) -> None:
+def test_a_lone_wanted_parameter_that_a_nuisance_imitates_to_round_off_is_hidden(
+    strength: float,
+) -> None:
     rng = np.random.default_rng(8)
     wanted = strength * rng.normal(size=60)
     J = np.column_stack([wanted, -3.0 * wanted + 1e-11 * strength * rng.normal(size=60)])
@@ -176,7 +182,12 @@ def test_what_remains_in_words_is_blind_to_every_invisible_direction(case: str) 
 
 
 def test_nothing_invisible_gives_no_groups_and_silent_ones_are_said_once() -> None:
-    assert grouped(look(np.random.default_rng(9).normal(size=(60, 5)) / SIZES), "abcde", SIZES, [""] * 5) == ()
+    assert (
+        grouped(
+            look(np.random.default_rng(9).normal(size=(60, 5)) / SIZES), "abcde", SIZES, [""] * 5
+        )
+        == ()
+    )
     J = np.random.default_rng(9).normal(size=(60, 5)) / SIZES
     J[:, [1, 3]] = 0.0
     (group,) = grouped(look(J), "abcde", SIZES, [""] * 5)
@@ -207,7 +218,9 @@ def double_pendulum(folder: Path, coordinates: str) -> Setup:
     parameters = {name: {"inertial": name, "coordinates": coordinates} for name in "ab"}
     control = {"kind": "multisine", "amplitude": 2.0, "frequency": 1.0}
     initial = {"qpos": (0.4, 0.5), "control": control}
-    return make_setup(DOUBLE, folder, parameters=parameters, noise={"state": 1e-3}, initial=initial, horizon=1.0)
+    return make_setup(
+        DOUBLE, folder, parameters=parameters, noise={"state": 1e-3}, initial=initial, horizon=1.0
+    )
 
 
 def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
@@ -228,7 +241,9 @@ def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
     assert silent.combinations == ()
 
 
-def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_motion(tmp_path) -> None:
+def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_motion(
+    tmp_path,
+) -> None:
     setup = double_pendulum(tmp_path, "logcholesky")
     seen = survey(setup, setup.initial, setup.plant.sensitivity(setup.theta, setup.initial))
     assert seen.basis.shape == (20, 6)

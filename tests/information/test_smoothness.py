@@ -46,7 +46,12 @@ def slider(folder: Path, joint: str = "", motor: str = "", amplitude: float = 3.
     parameters = {"mass": {"target": "body/block:mass"}, "drag": {"target": "joint/rail:damping"}}
     control = {"kind": "sine", "amplitude": amplitude, "frequency": 1.0}
     xml = SLIDER.format(joint=joint, motor=motor)
-    setup = {"parameters": parameters, "noise": {"state": 0.01}, "initial": {"control": control}, "horizon": 1.5}
+    setup = {
+        "parameters": parameters,
+        "noise": {"state": 0.01},
+        "initial": {"control": control},
+        "horizon": 1.5,
+    }
     return make_setup(xml, folder, **setup)
 
 
@@ -54,7 +59,9 @@ def ball(folder: Path, horizon: float) -> Setup:
     """A ball that falls on the floor at about 0.2 s."""
     parameters = {"mass": {"target": "body/ball:mass"}}
     initial = {"control": {"kind": "constant", "amplitude": 1.0}}
-    return make_setup(BALL, folder, parameters=parameters, noise={"state": 0.01}, initial=initial, horizon=horizon)
+    return make_setup(
+        BALL, folder, parameters=parameters, noise={"state": 0.01}, initial=initial, horizon=horizon
+    )
 
 
 def along(setup: Setup) -> Roughness | None:
@@ -96,9 +103,14 @@ def test_dry_friction_at_the_verge_of_sliding_is_flagged_where_it_breaks_away(tm
     assert found.error > TOLERANCE
     assert found.parameter == "dry"
     assert found.causes == ("dry friction of rail",)
-    assert force[found.sample - 2 : found.sample + 1].max() > 0.99 * force.max()  # at a peak of the push
+    assert (
+        force[found.sample - 2 : found.sample + 1].max() > 0.99 * force.max()
+    )  # at a peak of the push
     assert found.time == pytest.approx(0.01 * found.sample)
-    for share in (0.2, 10.0):  # sliding nearly always, or never: far from the verge the derivative exists
+    for share in (
+        0.2,
+        10.0,
+    ):  # sliding nearly always, or never: far from the verge the derivative exists
         assert along(dry(tmp_path, share * force.max())) is None
 
 
@@ -116,7 +128,9 @@ def test_a_joint_limit_is_named(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(("amplitude", "flagged"), [(1.9, False), (2.0001, True)])
-def test_a_force_that_just_meets_its_range_is_named(amplitude: float, flagged: bool, tmp_path) -> None:
+def test_a_force_that_just_meets_its_range_is_named(
+    amplitude: float, flagged: bool, tmp_path
+) -> None:
     setup = slider(tmp_path, motor='forcelimited="true" forcerange="-2 2"', amplitude=amplitude)
     gain = {"gain": {"target": "actuator/push:gainprm[0]"}}
     found = along(Setup(setup.experiment.replace(parameters=gain), threads=1))
@@ -127,8 +141,16 @@ def test_a_force_that_just_meets_its_range_is_named(amplitude: float, flagged: b
 
 
 def test_the_sentence_says_parameter_sample_time_and_cause() -> None:
-    said = str(Roughness(0.2345, "mass", 17, 0.17, ("contact floor - ball", "dry friction of rail")))
-    for part in ("23 %", "mass", "sample 17", "t = 0.17 s", "contact floor - ball, dry friction of rail"):
+    said = str(
+        Roughness(0.2345, "mass", 17, 0.17, ("contact floor - ball", "dry friction of rail"))
+    )
+    for part in (
+        "23 %",
+        "mass",
+        "sample 17",
+        "t = 0.17 s",
+        "contact floor - ball, dry friction of rail",
+    ):
         assert part in said
     lost = str(Roughness(np.inf, "mass", 0, 0.0, ()))
     assert "without bound" in lost
@@ -138,7 +160,10 @@ def test_the_sentence_says_parameter_sample_time_and_cause() -> None:
 def test_the_design_warns_of_roughness(tmp_path) -> None:
     rough = Setup(ball(tmp_path, 1.0).experiment.replace(descent={"max_iterations": 0}), threads=1)
     assert any("not smooth" in w and "contact floor - ball" in w for w in design(rough).warnings)
-    assert not any("not smooth" in w for w in design(cart_setup(tmp_path, descent={"max_iterations": 1})).warnings)
+    assert not any(
+        "not smooth" in w
+        for w in design(cart_setup(tmp_path, descent={"max_iterations": 1})).warnings
+    )
 
 
 def sensed(seed: int = 0) -> Array:
@@ -172,11 +197,15 @@ def test_a_parameter_without_effect_is_not_called_rough(tmp_path) -> None:
     setup = slider(tmp_path, 'frictionloss="1.5"')
     depth = {"depth": {"target": "body/block:ipos[1]", "guess": 0.1}}
     assert along(Setup(setup.experiment.replace(parameters=depth), threads=1)) is None
-    alone = make_setup(SLIDER.format(joint="", motor=""), tmp_path, parameters=depth, noise={"state": 0.01})
+    alone = make_setup(
+        SLIDER.format(joint="", motor=""), tmp_path, parameters=depth, noise={"state": 0.01}
+    )
     assert along(alone) is None
 
 
-def test_a_model_that_diverges_under_the_longer_step_is_rough_without_bound(tmp_path, monkeypatch) -> None:
+def test_a_model_that_diverges_under_the_longer_step_is_rough_without_bound(
+    tmp_path, monkeypatch
+) -> None:
     setup = slider(tmp_path, 'frictionloss="1.5"')
     whole = setup.plant.sensitivity
 

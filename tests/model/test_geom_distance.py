@@ -60,7 +60,9 @@ def two(first: str, second: str) -> mujoco.MjModel:
 def on_floor(kind: str) -> mujoco.MjModel:
     """One free geom over a tilted floor. Contacts are found within 10 m."""
     body = f'<body name="B"><freejoint/><geom name="b" {kind} margin="10"/></body>'
-    return mujoco.MjModel.from_xml_string(f"<mujoco>{ASSETS}<worldbody>{FLOOR}{body}</worldbody></mujoco>")
+    return mujoco.MjModel.from_xml_string(
+        f"<mujoco>{ASSETS}<worldbody>{FLOOR}{body}</worldbody></mujoco>"
+    )
 
 
 def moved(model: mujoco.MjModel, qpos: Array, dq: Array) -> Array:
@@ -76,8 +78,12 @@ def scattered(model: mujoco.MjModel, count: int, spread: float, seed: int = 0) -
     size = np.full(model.nv, 2.0)
     for j in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)):
         size[model.jnt_dofadr[j] : model.jnt_dofadr[j] + 3] = spread
-    size[model.dof_jntid[np.isin(model.jnt_type[model.dof_jntid], int(mujoco.mjtJoint.mjJNT_SLIDE))]] = spread
-    return np.array([moved(model, model.qpos0, size * rng.normal(size=model.nv)) for _ in range(count)])
+    size[
+        model.dof_jntid[np.isin(model.jnt_type[model.dof_jntid], int(mujoco.mjtJoint.mjJNT_SLIDE))]
+    ] = spread
+    return np.array(
+        [moved(model, model.qpos0, size * rng.normal(size=model.nv)) for _ in range(count)]
+    )
 
 
 def asked(model: mujoco.MjModel, chosen: Clearance, qpos: Array, limit: float) -> Array:
@@ -86,7 +92,10 @@ def asked(model: mujoco.MjModel, chosen: Clearance, qpos: Array, limit: float) -
     for k, now in enumerate(qpos):
         data.qpos[:] = now
         mujoco.mj_kinematics(model, data)
-        out[k] = [mujoco.mj_geomDistance(model, data, p.first, p.second, limit, None) for p in chosen.pairs]
+        out[k] = [
+            mujoco.mj_geomDistance(model, data, p.first, p.second, limit, None)
+            for p in chosen.pairs
+        ]
     return out
 
 
@@ -95,14 +104,17 @@ def between(model: mujoco.MjModel, reach: float, grouped: bool = False) -> Clear
     return Clearance(model, pairs(model, ()), reach, grouped)
 
 
-def slope_errors(model: mujoco.MjModel, measured: Callable[[Array], Distances], qpos: Array, h: float = 2e-4) -> Array:
+def slope_errors(
+    model: mujoco.MjModel, measured: Callable[[Array], Distances], qpos: Array, h: float = 2e-4
+) -> Array:
     """Largest error of slopes of the first column against differences along every dof, of each configuration: (n,)."""
     slope = measured(qpos).slope
     assert slope is not None
     worst = []
     for now, claimed in zip(qpos, slope[:, 0], strict=True):
         curves = [
-            lambda t, now=now, e=e: float(measured(moved(model, now, t * e)[None]).d[0, 0]) for e in np.eye(model.nv)
+            lambda t, now=now, e=e: float(measured(moved(model, now, t * e)[None]).d[0, 0])
+            for e in np.eye(model.nv)
         ]
         worst.append(directional_check(claimed, curves, h))
     return np.array(worst)
@@ -151,7 +163,10 @@ def test_pairs_are_those_that_mujoco_lets_collide(flag: str) -> None:
 
 def test_pairs_are_found_where_contacts_are_off() -> None:
     """The flag says what is simulated, not what may touch."""
-    off, on = (mujoco.MjModel.from_xml_string(CROWD.format(flag=f'contact="{x}"')) for x in ("disable", "enable"))
+    off, on = (
+        mujoco.MjModel.from_xml_string(CROWD.format(flag=f'contact="{x}"'))
+        for x in ("disable", "enable")
+    )
     assert pairs(off, ()) == pairs(on, ())
 
 
@@ -172,7 +187,9 @@ def test_ignored_bodies_are_left_out() -> None:
     """All geoms of both, whichever comes first; the world has its name."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     every = {p.name for p in pairs(model, ())}
-    left = {p.name for p in pairs(model, {frozenset(("world", "wrist")), frozenset(("wrist", "hand"))})}
+    left = {
+        p.name for p in pairs(model, {frozenset(("world", "wrist")), frozenset(("wrist", "hand"))})
+    }
     assert every - left == {
         "wrist geom 3 - floor",
         "wrist geom 4 - floor",
@@ -206,7 +223,10 @@ def test_height_fields_are_refused_unless_ignored() -> None:
           <body name="b"><freejoint/><geom name="b" size="0.1"/></body></worldbody></mujoco>
         """
     )
-    with pytest.raises(ExperimentError, match=r"hills is a height field, .* ignore the bodies 'b' and 'world', or use"):
+    with pytest.raises(
+        ExperimentError,
+        match=r"hills is a height field, .* ignore the bodies 'b' and 'world', or use",
+    ):
         pairs(model, ())
     assert pairs(model, {frozenset(("b", "world"))}) == ()
 
@@ -230,12 +250,16 @@ def test_nothing_within_reach_is_lost(reach: float) -> None:
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-10, 200
     d, expected = chosen(qpos, False).d, asked(model, chosen, qpos, reach)
     shapes = [{int(model.geom_type[g]) for g in (p.first, p.second)} for p in chosen.pairs]
-    trusted = (d > -0.05) | np.array([s != {clearance.CAPSULE, clearance.BOX} for s in shapes])  # see below
+    trusted = (d > -0.05) | np.array(
+        [s != {clearance.CAPSULE, clearance.BOX} for s in shapes]
+    )  # see below
     assert trusted.mean() > 0.99
     np.testing.assert_allclose(d[trusted], expected[trusted], rtol=0, atol=1e-8)
     assert (d[expected == reach] == reach).all()
     assert d.max() <= reach
-    assert (d < 0.0).any() and ((d > 0.0) & (d < reach)).any() and (reach > 1.0 or (d == reach).any())
+    assert (
+        (d < 0.0).any() and ((d > 0.0) & (d < reach)).any() and (reach > 1.0 or (d == reach).any())
+    )
 
 
 def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -247,7 +271,11 @@ def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     cut, none = chosen(qpos, True), chosen(qpos[:0], True)
     np.testing.assert_array_equal(cut.d, whole.d)
     np.testing.assert_array_equal(cut.slope, whole.slope)
-    assert none.d.shape == (0, len(chosen.columns)) and none.slope.shape == (0, len(chosen.columns), model.nv)
+    assert none.d.shape == (0, len(chosen.columns)) and none.slope.shape == (
+        0,
+        len(chosen.columns),
+        model.nv,
+    )
 
 
 @pytest.mark.parametrize(
@@ -267,7 +295,9 @@ def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
         ("capsule", "box", (0.0, 0.02, 0.0), -0.05 - 0.05 + 0.02),
     ],
 )
-def test_distances_by_hand(first: str, second: str, place: tuple[float, float, float], expected: float) -> None:
+def test_distances_by_hand(
+    first: str, second: str, place: tuple[float, float, float], expected: float
+) -> None:
     """Upright geoms at a displacement, both ways round."""
     for a, b, shift in ((first, second, np.array(place)), (second, first, -np.array(place))):
         model = mujoco.MjModel.from_xml_string(
@@ -310,7 +340,9 @@ def test_a_box_may_stand_on_its_edge(eighths: int) -> None:
 
 def test_a_capsule_deep_in_a_box_is_in_it() -> None:
     """Against the same box as a mesh, through which MuJoCo sees capsules in another way."""
-    corners = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.05, 0.05) for z in (-0.2, 0.2))
+    corners = " ".join(
+        f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.05, 0.05) for z in (-0.2, 0.2)
+    )
     model = mujoco.MjModel.from_xml_string(
         f"""
         <mujoco><asset><mesh name="box" vertex="{corners}"/></asset><worldbody>
@@ -347,7 +379,9 @@ def test_the_check_of_slopes_can_fail() -> None:
     chosen, qpos = between(model, 2.0), scattered(model, 2, 0.4)
 
     def wrong(change: Callable[[Array], Array]) -> float:
-        return slope_errors(model, lambda q: Distances(chosen(q, True).d, change(chosen(q, True).slope)), qpos).min()
+        return slope_errors(
+            model, lambda q: Distances(chosen(q, True).d, change(chosen(q, True).slope)), qpos
+        ).min()
 
     assert wrong(lambda s: s) < 1e-6
     assert wrong(lambda s: -s) > 1.0
@@ -368,7 +402,9 @@ def test_slopes_to_the_floor_agree_with_differences(kind: str) -> None:
 # Depths of boxes and meshes have many edges, at which no slope is the right one.
 @pytest.mark.parametrize(
     ("first", "second"),
-    [("sphere", k) for k in KINDS] + [("capsule", k) for k in KINDS] + [("cylinder", "cylinder"), ("ellipsoid", "box")],
+    [("sphere", k) for k in KINDS]
+    + [("capsule", k) for k in KINDS]
+    + [("cylinder", "cylinder"), ("ellipsoid", "box")],
 )
 def test_slopes_in_penetration_agree_with_differences(first: str, second: str) -> None:
     """Distances are negative, slopes point out all the same; curved surfaces are found to fewer digits inside."""
@@ -414,14 +450,21 @@ def test_columns_are_pairs_of_bodies() -> None:
     chosen, single = between(model, 0.5, grouped=True), between(model, 0.5)
     qpos = scattered(model, 50, 0.4)
     bodies, geoms = chosen(qpos, True), single(qpos, True)
-    names = [" - ".join(model.body(model.geom_bodyid[g]).name for g in (p.first, p.second)) for p in single.pairs]
-    assert set(names) == set(chosen.columns) and len(set(chosen.columns)) == len(chosen.columns) < len(names)
+    names = [
+        " - ".join(model.body(model.geom_bodyid[g]).name for g in (p.first, p.second))
+        for p in single.pairs
+    ]
+    assert set(names) == set(chosen.columns) and len(set(chosen.columns)) == len(
+        chosen.columns
+    ) < len(names)
     assert single.columns == tuple(p.name for p in single.pairs)
     for i, column in enumerate(chosen.columns):
         own = [j for j, name in enumerate(names) if name == column]
         least = geoms.d[:, own].argmin(axis=1)
         np.testing.assert_array_equal(bodies.d[:, i], geoms.d[:, own].min(axis=1))
-        np.testing.assert_array_equal(bodies.slope[:, i], geoms.slope[np.arange(50), np.array(own)[least]])
+        np.testing.assert_array_equal(
+            bodies.slope[:, i], geoms.slope[np.arange(50), np.array(own)[least]]
+        )
 
 
 @pytest.mark.parametrize("spread", [0.4, 4.0])
@@ -468,7 +511,13 @@ def test_models_are_left_alone() -> None:
     sizes, kinds, options = model.geom_size.copy(), model.geom_type.copy(), str(model.opt)
     chosen, qpos = between(model, 0.5), scattered(model, 20, 0.4)
     before = chosen(qpos, False).d
-    np.testing.assert_array_equal(before, between(mujoco.MjModel.from_xml_string(ARMS), 0.5)(qpos, False).d)
-    assert (model.geom_size == sizes).all() and (model.geom_type == kinds).all() and str(model.opt) == options
+    np.testing.assert_array_equal(
+        before, between(mujoco.MjModel.from_xml_string(ARMS), 0.5)(qpos, False).d
+    )
+    assert (
+        (model.geom_size == sizes).all()
+        and (model.geom_type == kinds).all()
+        and str(model.opt) == options
+    )
     model.geom_size *= 2.0
     np.testing.assert_array_equal(chosen(qpos, False).d, before)

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mjfim.model.inertia import CHARTS, PAIRS, Inertial, barycentric, from_barycentric, from_logcholesky, logcholesky
+from mjfim.model.inertia import (
+    CHARTS,
+    PAIRS,
+    Inertial,
+    barycentric,
+    from_barycentric,
+    from_logcholesky,
+    logcholesky,
+)
 
 Array = NDArray[np.float64]
 
@@ -47,7 +55,10 @@ def solids(count: int, seed: int) -> list[Inertial]:
             Inertial(
                 float(weights.sum()),
                 com,
-                sum(w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, about, strict=True)),
+                sum(
+                    w * (r @ r * np.eye(3) - np.outer(r, r))
+                    for w, r in zip(weights, about, strict=True)
+                ),
             )
         )
     return found
@@ -113,10 +124,16 @@ def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
     rng = np.random.default_rng(2)
     weights, points = rng.uniform(0.1, 1.0, 5), rng.standard_normal((5, 3))
     com = weights @ points / weights.sum()
-    about = sum(w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, points - com, strict=True))
-    origin = sum(w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, points, strict=True))
+    about = sum(
+        w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, points - com, strict=True)
+    )
+    origin = sum(
+        w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, points, strict=True)
+    )
     v = barycentric(Inertial(float(weights.sum()), com, about))
-    np.testing.assert_allclose(v, [weights.sum(), *(weights @ points), *(origin[p] for p in PAIRS)], rtol=1e-12)
+    np.testing.assert_allclose(
+        v, [weights.sum(), *(weights @ points), *(origin[p] for p in PAIRS)], rtol=1e-12
+    )
 
 
 def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
@@ -162,7 +179,12 @@ def test_log_cholesky_is_the_factor_of_the_pseudo_inertia() -> None:
     v = 0.5 * rng.standard_normal(10)
     a, d1, d2, d3, s12, s23, s13, t1, t2, t3 = v
     U = np.exp(a) * np.array(
-        [[np.exp(d1), s12, s13, t1], [0, np.exp(d2), s23, t2], [0, 0, np.exp(d3), t3], [0, 0, 0, 1.0]]
+        [
+            [np.exp(d1), s12, s13, t1],
+            [0, np.exp(d2), s23, t2],
+            [0, 0, np.exp(d3), t3],
+            [0, 0, 0, 1.0],
+        ]
     )
     body = from_logcholesky(v)
     J, h = U @ U.T, body.mass * body.com
@@ -173,7 +195,14 @@ def test_log_cholesky_is_the_factor_of_the_pseudo_inertia() -> None:
 
 
 @pytest.mark.parametrize(
-    "moments", [(0.0, 0.0, 0.0), (0.1, 0.1, 0.0), (0.3, 0.2, 0.1), (0.3 * (1 + 1e-12), 0.2, 0.1), (0.5, 0.2, 0.1)]
+    "moments",
+    [
+        (0.0, 0.0, 0.0),
+        (0.1, 0.1, 0.0),
+        (0.3, 0.2, 0.1),
+        (0.3 * (1 + 1e-12), 0.2, 0.1),
+        (0.5, 0.2, 0.1),
+    ],
 )
 def test_points_rods_and_plates_have_no_log_cholesky(moments: tuple[float, ...]) -> None:
     """A singular pseudo-inertia, or one that nothing has; anything thicker is taken."""
@@ -183,8 +212,12 @@ def test_points_rods_and_plates_have_no_log_cholesky(moments: tuple[float, ...])
         logcholesky(body)
     for chart in ("central", "barycentric"):
         assert np.isfinite(CHARTS[chart].of(body)).all()
-    thick = Inertial.principal(2.0, np.array([0.1, 0.2, 0.3]), np.array([0.3 * (1 - 1e-6), 0.2, 0.1]), turned)
-    np.testing.assert_allclose(from_logcholesky(logcholesky(thick)).inertia, thick.inertia, rtol=1e-8, atol=1e-12)
+    thick = Inertial.principal(
+        2.0, np.array([0.1, 0.2, 0.3]), np.array([0.3 * (1 - 1e-6), 0.2, 0.1]), turned
+    )
+    np.testing.assert_allclose(
+        from_logcholesky(logcholesky(thick)).inertia, thick.inertia, rtol=1e-8, atol=1e-12
+    )
 
 
 def test_magnitudes_follow_the_units() -> None:
@@ -195,7 +228,9 @@ def test_magnitudes_follow_the_units() -> None:
     factor = {"kg": kilo, "kg m": kilo * centi, "kg m²": kilo * centi**2, "m": centi, "": 1.0}
     for chart in CHARTS.values():
         assert len(chart.names) == len(set(chart.names)) == len(chart.units) == 10
-        np.testing.assert_allclose(chart.size(other), chart.size(body) * [factor[u] for u in chart.units], rtol=1e-12)
+        np.testing.assert_allclose(
+            chart.size(other), chart.size(body) * [factor[u] for u in chart.units], rtol=1e-12
+        )
         assert (chart.size(body) > 0.0).all()
 
 

@@ -11,7 +11,9 @@ import mjfim
 from mjfim.experiment.system import Setup
 from mjfim.output import folders as results
 
-EXAMPLES = sorted(path.stem for path in MODELS.glob("*.toml") if not path.stem.startswith("cart_pendulum"))
+EXAMPLES = sorted(
+    path.stem for path in MODELS.glob("*.toml") if not path.stem.startswith("cart_pendulum")
+)
 ROUGH = {
     "sliding_block",
     "double_pendulum",
@@ -34,14 +36,19 @@ def test_check_says_what_the_example_is_about(name: str, tmp_path: Path) -> None
     assert told["self_test"]["passed"] == (name not in ROUGH)
     if name in ROUGH:
         assert told["self_test"]["rough"]["sample"] > 0
-        assert any("friction" in cause or "contact" in cause for cause in told["self_test"]["rough"]["causes"])
+        assert any(
+            "friction" in cause or "contact" in cause
+            for cause in told["self_test"]["rough"]["causes"]
+        )
     assert bool(told["combinations"]) == (name in TOGETHER)
     assert told["not_excited"] == []
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_a_short_design_improves_and_leaves_everything(name: str, tmp_path: Path) -> None:
-    setup = Setup(mjfim.Experiment.from_file(MODELS / f"{name}.toml").replace(descent={"max_iterations": 3}))
+    setup = Setup(
+        mjfim.Experiment.from_file(MODELS / f"{name}.toml").replace(descent={"max_iterations": 3})
+    )
     design = mjfim.design(setup)
     assert design.final.cost < design.initial.cost
     results.leave_design(tmp_path, design, setup)

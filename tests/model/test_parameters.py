@@ -202,7 +202,12 @@ COMPILES = [
     (ARM, "geom/g:pos[2]", 0.4, ("body_ipos", "dof_M0")),
     (ARM, "geom/g:size[1]", 0.4, ("body_inertia", "dof_M0")),
     (ARM, "geom/h:mass", 2.5, ("body_mass", "body_inertia", "dof_M0")),
-    (ARM.replace(' mass="1"', ""), "geom/h:density", 500.0, ("body_mass", "body_inertia", "dof_M0")),
+    (
+        ARM.replace(' mass="1"', ""),
+        "geom/h:density",
+        500.0,
+        ("body_mass", "body_inertia", "dof_M0"),
+    ),
 ]
 
 # Coordinates that are written together: an eigendecomposition or a product of quaternions lies between.
@@ -258,21 +263,33 @@ def both_ways(xml: str, path: str, value: float) -> tuple[Any, Any, Any]:
 
 
 def test_the_edits_below_cover_every_field_that_can_be_named() -> None:
-    named = [PATH.match(path) for path in (*(e[1] for e in EDITS), *(e[1] for e in COMPILES), *CHARTED)]
+    named = [
+        PATH.match(path) for path in (*(e[1] for e in EDITS), *(e[1] for e in COMPILES), *CHARTED)
+    ]
     covered = {(m["kind"], m["field"]) for m in named if m}
-    outside = {("initial", f) for f in fields_of("initial")} | {("output", f) for f in fields_of("output")}
+    outside = {("initial", f) for f in fields_of("initial")} | {
+        ("output", f) for f in fields_of("output")
+    }
     assert covered == {(kind, field) for kind in KINDS for field in fields_of(kind)} - outside
 
 
 @pytest.mark.parametrize(("xml", "path", "value", "derived"), EDITS, ids=[e[1] for e in EDITS])
-def test_writing_in_place_equals_a_recompile_bit_for_bit(xml: str, path: str, value: float, derived: tuple) -> None:
+def test_writing_in_place_equals_a_recompile_bit_for_bit(
+    xml: str, path: str, value: float, derived: tuple
+) -> None:
     base, own, again = both_ways(xml, path, value)
     spec, fresh = compiled(xml, [])
     assert resolve(own, path, decoration=decoration(spec, fresh)).read(own) == value
     before, mine, theirs = arrays(base), arrays(own), arrays(again)
     for name in derived:
-        assert not np.array_equal(before[name], theirs[name]), f"{name} does not depend on {path}: a weak test"
-    unequal = [n for n in theirs if not np.array_equal(mine[n], theirs[n], equal_nan=mine[n].dtype.kind == "f")]
+        assert not np.array_equal(before[name], theirs[name]), (
+            f"{name} does not depend on {path}: a weak test"
+        )
+    unequal = [
+        n
+        for n in theirs
+        if not np.array_equal(mine[n], theirs[n], equal_nan=mine[n].dtype.kind == "f")
+    ]
     # a tendon that gains inertia ends the shortcut of 'simple' bodies, which MuJoCo then does not take either
     assert unequal == (["body_simple"] if path == "tendon/t:armature" else [])
     moved = rollout(own)
@@ -329,21 +346,35 @@ def written_by_hand(spec: Any, base: Any, path: str, change: float) -> None:
 
 
 # A solid body: two boxes, so that no principal moments coincide; and one whose frames coincide where MuJoCo takes shortcuts.
-SOLID = ARM.replace('type="capsule" fromto="0 0 0 .3 .1 .5" size=".05"', 'type="box" pos=".1 .05 .2" size=".1 .2 .3"')
+SOLID = ARM.replace(
+    'type="capsule" fromto="0 0 0 .3 .1 .5" size=".05"',
+    'type="box" pos=".1 .05 .2" size=".1 .2 .3"',
+)
 
 
-@pytest.mark.parametrize("xml", [SOLID, SOLID.replace(' pos=".1 .05 .2"', "")], ids=["skew", "aligned"])
+@pytest.mark.parametrize(
+    "xml", [SOLID, SOLID.replace(' pos=".1 .05 .2"', "")], ids=["skew", "aligned"]
+)
 @pytest.mark.parametrize("path", CHARTED)
-def test_charts_and_rotations_written_in_place_equal_a_compile_of_what_they_mean(xml: str, path: str) -> None:
+def test_charts_and_rotations_written_in_place_equal_a_compile_of_what_they_mean(
+    xml: str, path: str
+) -> None:
     parameters = [one(path)]
     spec, base = compiled(xml, parameters)
     resolved = ParameterSet.build(parameters, base)
     slot = resolved.slots[0][0]
-    value, change = slot.read(base), 0.01 * slot.size(base) * (-1.0 if "firstmoment" in path else 1.0)
+    value, change = (
+        slot.read(base),
+        0.01 * slot.size(base) * (-1.0 if "firstmoment" in path else 1.0),
+    )
     other = spec.copy()
     written_by_hand(other, base, path, change)
     own, again = resolved.model(base, np.array([value + change])), other.compile()
-    written = CHARTS[slot.chart].of(inertial(own, slot.body))[slot.component] if "rot" not in path else value + change
+    written = (
+        CHARTS[slot.chart].of(inertial(own, slot.body))[slot.component]
+        if "rot" not in path
+        else value + change
+    )
     assert written == pytest.approx(value + change, rel=1e-9, abs=1e-12)
     for mine, theirs in zip(*(states_and_mass_matrix(m) for m in (own, again)), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-10, atol=1e-10)
@@ -351,9 +382,16 @@ def test_charts_and_rotations_written_in_place_equal_a_compile_of_what_they_mean
     np.testing.assert_allclose(rollout(before, 50), rollout(base, 50), rtol=1e-10, atol=1e-10)
     # what of body a lies across its only hinge cannot be felt
     if not path.startswith(
-        ("body/a:fullinertia", "body/a:origininertia", "body/a:logcholesky", "body/a:firstmoment[1]")
+        (
+            "body/a:fullinertia",
+            "body/a:origininertia",
+            "body/a:logcholesky",
+            "body/a:firstmoment[1]",
+        )
     ):
-        assert np.abs(rollout(own, 100) - rollout(base, 100)).max() > 1e-5, "the edit has no effect: a weak test"
+        assert np.abs(rollout(own, 100) - rollout(base, 100)).max() > 1e-5, (
+            "the edit has no effect: a weak test"
+        )
 
 
 def states_and_mass_matrix(model: Any) -> list[np.ndarray]:
@@ -370,40 +408,59 @@ def test_inertia_of_a_tendon_couples_simple_bodies_as_a_compile_would() -> None:
     """MuJoCo's shortcut for 'simple' bodies must not hide it."""
     base, own, again = both_ways(COUPLED, "tendon/t:armature", 0.3)
     assert base.body_simple.tolist() != again.body_simple.tolist()
-    for mine, theirs in zip((states_and_mass_matrix(own)), states_and_mass_matrix(again), strict=True):
-        if mine.ndim == 2:  # mass matrix and motion; the weights of constraints follow a compile only
+    for mine, theirs in zip(
+        (states_and_mass_matrix(own)), states_and_mass_matrix(again), strict=True
+    ):
+        if (
+            mine.ndim == 2
+        ):  # mass matrix and motion; the weights of constraints follow a compile only
             np.testing.assert_array_equal(mine, theirs)
     assert np.abs(rollout(own, 50) - rollout(base, 50)).max() > 1e-3
 
 
 def test_charts_of_simple_bodies_are_written_with_the_right_dynamics() -> None:
     """Bodies that MuJoCo would compile with a diagonal mass matrix."""
-    for path in ("body/flyer:fullinertia[3]", "body/flyer:firstmoment[1]", "body/slider:logcholesky[9]"):
+    for path in (
+        "body/flyer:fullinertia[3]",
+        "body/flyer:firstmoment[1]",
+        "body/slider:logcholesky[9]",
+    ):
         spec, base = compiled(SIMPLE, [one(path)])
         resolved = ParameterSet.build([one(path)], base)
         slot, other = resolved.slots[0][0], spec.copy()
         change = 0.05 * slot.size(base)
         written_by_hand(other, base, path, change)
         own = resolved.model(base, np.array([slot.read(base) + change]))
-        np.testing.assert_allclose(rollout(own, 100), rollout(other.compile(), 100), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            rollout(own, 100), rollout(other.compile(), 100), rtol=1e-9, atol=1e-9
+        )
         assert np.abs(rollout(own, 100) - rollout(base, 100)).max() > 1e-4
 
 
-@pytest.mark.parametrize(("xml", "path", "value", "derived"), COMPILES, ids=[e[1] for e in COMPILES])
-def test_geoms_that_matter_are_compiled_anew(xml: str, path: str, value: float, derived: tuple) -> None:
+@pytest.mark.parametrize(
+    ("xml", "path", "value", "derived"), COMPILES, ids=[e[1] for e in COMPILES]
+)
+def test_geoms_that_matter_are_compiled_anew(
+    xml: str, path: str, value: float, derived: tuple
+) -> None:
     """Against MuJoCo's own compile of the edited element."""
     parameters = [one(path)]
     spec, base = compiled(xml, parameters)
     resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
     assert isinstance(resolved.slots[0][0], SpecSlot)
     assert resolved.compiled.tolist() == resolved.in_model.tolist() == [True]
-    source = Source(spec, Path("model.xml"), [b.name for b in spec.bodies[1:]], sensors=True, friction=True)
+    source = Source(
+        spec, Path("model.xml"), [b.name for b in spec.bodies[1:]], sensors=True, friction=True
+    )
     before = arrays(source.model)
     own, theirs = resolved.model(source, np.array([value])), spec.copy()
     match = PATH.match(path)
     geom, field, i = theirs.geom(match["name"]), match["field"], int(match["index"] or 0)
     if np.isfinite(geom.fromto[0]):  # the same capsule by middle, direction and half length
-        middle, half = 0.5 * (geom.fromto[:3] + geom.fromto[3:]), 0.5 * (geom.fromto[3:] - geom.fromto[:3])
+        middle, half = (
+            0.5 * (geom.fromto[:3] + geom.fromto[3:]),
+            0.5 * (geom.fromto[3:] - geom.fromto[:3]),
+        )
         geom.size = [geom.size[0], float(np.linalg.norm(half)), 0.0]
         geom.pos, geom.fromto = middle, np.full(6, np.nan)
         geom.alt.type, geom.alt.zaxis = mujoco.mjtOrientation.mjORIENTATION_ZAXIS, half
@@ -418,11 +475,17 @@ def test_geoms_that_matter_are_compiled_anew(xml: str, path: str, value: float, 
     again = theirs.compile()
     mine, wanted = arrays(own), arrays(again)
     for name in derived:
-        assert not np.array_equal(before[name], wanted[name]), f"{name} does not depend on {path}: a weak test"
+        assert not np.array_equal(before[name], wanted[name]), (
+            f"{name} does not depend on {path}: a weak test"
+        )
     # a direction by two points or by a vector rounds differently
     if np.isfinite(spec.geom(match["name"]).fromto[0]):  # and a capsule is round
         mine["geom_quat"], mine["body_iquat"] = wanted["geom_quat"], wanted["body_iquat"]
-    unequal = [n for n in wanted if not np.allclose(mine[n], wanted[n], rtol=1e-12, atol=1e-14, equal_nan=True)]
+    unequal = [
+        n
+        for n in wanted
+        if not np.allclose(mine[n], wanted[n], rtol=1e-12, atol=1e-14, equal_nan=True)
+    ]
     assert unequal == []
     np.testing.assert_allclose(rollout(own, 100), rollout(again, 100), rtol=1e-9, atol=1e-9)
     assert np.abs(rollout(own) - rollout(base)).max() > 1e-6, "the edit has no effect: a weak test"
@@ -437,8 +500,11 @@ def test_decoration_is_what_neither_collides_nor_weighs() -> None:
         (DRAWN.replace('contype="0" conaffinity="0"', 'contype="0" conaffinity="1"'), False),
         (DRAWN.replace("<mujoco>", '<mujoco><compiler inertiafromgeom="true"/>'), False),
         (
-            DRAWN.replace("<mujoco>", '<mujoco><contact><pair geom1="skin" geom2="ground"/></contact>').replace(
-                "<worldbody>", '<worldbody><geom name="ground" type="plane" size="1 1 1" contype="0" conaffinity="0"/>'
+            DRAWN.replace(
+                "<mujoco>", '<mujoco><contact><pair geom1="skin" geom2="ground"/></contact>'
+            ).replace(
+                "<worldbody>",
+                '<worldbody><geom name="ground" type="plane" size="1 1 1" contype="0" conaffinity="0"/>',
             ),
             False,
         ),
@@ -478,8 +544,12 @@ FRAMED = """
 """
 
 
-@pytest.mark.parametrize("path", ["geom/g:pos[0]", "geom/g:size[1]", "site/s:pos[1]", "body/a:pos[0]", "site/s:rot[1]"])
-def test_elements_inside_frames_are_placed_in_the_coordinates_of_their_body(path: str, tmp_path) -> None:
+@pytest.mark.parametrize(
+    "path", ["geom/g:pos[0]", "geom/g:size[1]", "site/s:pos[1]", "body/a:pos[0]", "site/s:rot[1]"]
+)
+def test_elements_inside_frames_are_placed_in_the_coordinates_of_their_body(
+    path: str, tmp_path
+) -> None:
     """`<frame>` is MJCF's way to write, not the compiled model's: at its own value the model stays the model."""
     table = {"theta": {"target": path}}
     setup = make_setup(FRAMED, tmp_path, rate=500.0, parameters=table, noise={"acc": 0.1})
@@ -497,7 +567,9 @@ def test_elements_inside_frames_are_placed_in_the_coordinates_of_their_body(path
 
 
 TETRAHEDRON = "0 0 0 .2 0 0 0 .3 0 0 0 .4"
-MESHED = ARM.replace("<worldbody>", f'<asset><mesh name="tetra" vertex="{TETRAHEDRON}"/></asset><worldbody>').replace(
+MESHED = ARM.replace(
+    "<worldbody>", f'<asset><mesh name="tetra" vertex="{TETRAHEDRON}"/></asset><worldbody>'
+).replace(
     'type="box" pos=".1 0 .2" euler=".2 .3 .5" size=".1 .2 .3"',
     'type="mesh" mesh="tetra" pos=".1 0 .2" euler=".2 .3 .5"',
 )
@@ -511,10 +583,16 @@ def test_a_mesh_moves_from_where_it_compiles_to() -> None:
     resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
     now = resolved.slots[0][0].read(base)
     assert abs(now - 0.2) > 0.01, "no offset: a weak test"
-    np.testing.assert_allclose(resolved.model(source, np.array([now])).geom_pos, base.geom_pos, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        resolved.model(source, np.array([now])).geom_pos, base.geom_pos, rtol=0, atol=1e-14
+    )
     own = resolved.model(source, np.array([now + 0.1]))
-    np.testing.assert_allclose(own.geom("h").pos - base.geom("h").pos, [0.0, 0.0, 0.1], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(own.body("b").ipos - base.body("b").ipos, [0.0, 0.0, 0.1], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        own.geom("h").pos - base.geom("h").pos, [0.0, 0.0, 0.1], rtol=0, atol=1e-14
+    )
+    np.testing.assert_allclose(
+        own.body("b").ipos - base.body("b").ipos, [0.0, 0.0, 0.1], rtol=0, atol=1e-14
+    )
     with pytest.raises(ExperimentError, match="size of a mesh"):
         resolve(base, "geom/h:size")
 
@@ -542,13 +620,19 @@ def test_one_rest_length_stands_for_both_ends_of_the_range() -> None:
         ("position", '<position name="p" joint="k" kp="{}" kv="0.5"/>', "actuator/p:kp"),
         ("position", '<position name="p" joint="k" kp="10" kv="{}"/>', "actuator/p:kv"),
         ("velocity", '<velocity name="p" joint="k" kv="{}"/>', "actuator/p:kv"),
-        ("intvelocity", '<intvelocity name="p" joint="k" kp="{}" actrange="-2 2"/>', "actuator/p:kp"),
+        (
+            "intvelocity",
+            '<intvelocity name="p" joint="k" kp="{}" actrange="-2 2"/>',
+            "actuator/p:kp",
+        ),
     ],
 )
 def test_servo_gains_mean_what_mjcf_means_by_them(kind: str, written: str, path: str) -> None:
     """Against a compile of the MJCF with the other number in it."""
     servo = '<position name="p" joint="k" kp="10" kv="0.5"/>'
-    (_, base), (_, again) = (compiled(ARM.replace(servo, written.format(gain)), []) for gain in ("10", "7.25"))
+    (_, base), (_, again) = (
+        compiled(ARM.replace(servo, written.format(gain)), []) for gain in ("10", "7.25")
+    )
     resolved = ParameterSet.build([one(path)], base)
     assert resolved.slots[0][0].read(base) == 10.0
     own = resolved.model(base, np.array([7.25]))
@@ -559,12 +643,18 @@ def test_servo_gains_mean_what_mjcf_means_by_them(kind: str, written: str, path:
     assert np.abs(rollout(own) - rollout(base)).max() > 1e-3
 
 
-@pytest.mark.parametrize(("first", "second"), [("kp", "gainprm"), ("biasprm[1]", "kp"), ("kv", "biasprm[2]")])
+@pytest.mark.parametrize(
+    ("first", "second"), [("kp", "gainprm"), ("biasprm[1]", "kp"), ("kv", "biasprm[2]")]
+)
 def test_a_gain_by_two_names_is_one_number(first: str, second: str) -> None:
     _, base = compiled(ARM, [])
     with pytest.raises(ExperimentError, match=r"b: target .* already belongs to parameters\.a"):
         ParameterSet.build(
-            [Parameter(n, (Target(f"actuator/p:{field}"),), 1.0) for n, field in (("a", first), ("b", second))], base
+            [
+                Parameter(n, (Target(f"actuator/p:{field}"),), 1.0)
+                for n, field in (("a", first), ("b", second))
+            ],
+            base,
         )
 
 
@@ -589,7 +679,9 @@ BALL = """
 )
 def test_servos_with_several_controls_have_gains_too(written: str, path: str) -> None:
     """Bit for bit what a compile of the other number gives; a PID controller's first gain is another one."""
-    base, again = (mujoco.MjModel.from_xml_string(BALL.format(written.format(gain))) for gain in ("2", "3.5"))
+    base, again = (
+        mujoco.MjModel.from_xml_string(BALL.format(written.format(gain))) for gain in ("2", "3.5")
+    )
     resolved = ParameterSet.build([one(path)], base)
     assert resolved.slots[0][0].read(base) == 2.0
     mine, theirs = arrays(resolved.model(base, np.array([3.5]))), arrays(again)
@@ -600,7 +692,9 @@ def test_gears_are_counted_by_force_outputs() -> None:
     base = mujoco.MjModel.from_xml_string(BALL.format('<orientation name="s" joint="j" kp="2"/>'))
     resolved = ParameterSet.build([one("actuator/m:gear")], base)
     assert resolved.slots[0][0].read(base) == 1.5
-    np.testing.assert_array_equal(resolved.model(base, np.array([7.0])).actuator_gear[:, 0], [1.0, 1.0, 1.0, 7.0])
+    np.testing.assert_array_equal(
+        resolved.model(base, np.array([7.0])).actuator_gear[:, 0], [1.0, 1.0, 1.0, 7.0]
+    )
 
 
 def test_the_damping_of_a_servo_does_not_follow_its_gain() -> None:
@@ -628,7 +722,9 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
     assert abs(getattr(own, kind)(name).quat @ quat) == pytest.approx(1.0, abs=1e-14)
     element = getattr(spec, kind)(name)
     element.alt.type, element.quat = mujoco.mjtOrientation.mjORIENTATION_QUAT, quat
-    np.testing.assert_allclose(rollout(own, 100), rollout(spec.compile(), 100), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        rollout(own, 100), rollout(spec.compile(), 100), rtol=1e-9, atol=1e-9
+    )
     assert all(isinstance(s, RotationSlot) for row in resolved.slots for s in row)
     again = resolved.model(base, np.zeros(3))  # nothing of the first value is left
     np.testing.assert_allclose(rollout(again, 100), rollout(base, 100), rtol=1e-9, atol=1e-9)
@@ -646,12 +742,19 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
         ("firstmoment[0]", "logcholesky[3]"),
     ],
 )
-def test_coordinates_of_one_body_that_do_not_go_together_are_refused(fields: tuple[str, str]) -> None:
+def test_coordinates_of_one_body_that_do_not_go_together_are_refused(
+    fields: tuple[str, str],
+) -> None:
     """In either order; on two bodies they are free."""
     _, base = compiled(SOLID, [])
     for first, second in (fields, fields[::-1]):
-        pair = [Parameter(n, (Target(f"body/a:{f}"),), 1.0) for n, f in (("p", first), ("q", second))]
-        with pytest.raises(ExperimentError, match=r"parameters\.[pq]: .*several coordinates at once .*valid together"):
+        pair = [
+            Parameter(n, (Target(f"body/a:{f}"),), 1.0) for n, f in (("p", first), ("q", second))
+        ]
+        with pytest.raises(
+            ExperimentError,
+            match=r"parameters\.[pq]: .*several coordinates at once .*valid together",
+        ):
             ParameterSet.build(pair, base)
     apart = [
         Parameter("p", (Target(f"body/a:{fields[0]}"),), 1.0),
@@ -690,7 +793,10 @@ def test_a_model_without_a_source_serves_only_what_is_written_in_place(tmp_path)
 def test_outputs_and_starts_are_no_part_of_the_model() -> None:
     """Linear maps of theta outside the model, by the scale of their targets."""
     paths = ["initial/k:qvel", "initial/j:qpos", "output/b:bias", "output:delay", "body/a:mass"]
-    parameters = [Parameter(p, (Target(p, s),), 1.0) for p, s in zip(paths, (2.0, -1.0, 0.5, 3.0, 1.0), strict=True)]
+    parameters = [
+        Parameter(p, (Target(p, s),), 1.0)
+        for p, s in zip(paths, (2.0, -1.0, 0.5, 3.0, 1.0), strict=True)
+    ]
     _, base = compiled(ARM, [])
     resolved = ParameterSet.build(parameters, base, outputs=("a", "b"))
     start = np.zeros((4, 5))
@@ -732,17 +838,27 @@ def test_setup_gives_a_model_at_theta_with_the_right_dynamics_for_simple_bodies(
     _, _, again = both_ways(SIMPLE, "body/flyer:ipos[0]", 0.1)
     plain = mujoco.MjModel.from_xml_string(SIMPLE)
     assert np.abs(rollout(plain) - rollout(again)).max() > 1e-3
-    np.testing.assert_array_equal(rollout(setup.plant.model(np.array([0.1])))[:, :17], rollout(again)[:, :17])
+    np.testing.assert_array_equal(
+        rollout(setup.plant.model(np.array([0.1])))[:, :17], rollout(again)[:, :17]
+    )
     np.testing.assert_array_equal(rollout(setup.model_at(np.array([0.1]))), rollout(again))
 
 
 def test_several_targets_follow_one_parameter_by_scale_and_offset() -> None:
-    targets = (Target("body/a:mass"), Target("body/b:mass", 2.0, 0.5), Target("joint/j:damping", -1.0, 3.0))
+    targets = (
+        Target("body/a:mass"),
+        Target("body/b:mass", 2.0, 0.5),
+        Target("joint/j:damping", -1.0, 3.0),
+    )
     parameters = [Parameter("m", targets, 1.0), one("option:gravity[1]")]
     spec, base = compiled(ARM, parameters)
     resolved = ParameterSet.build(parameters, base)
     own = resolved.model(base, np.array([1.25, -0.5]))
-    assert (own.body("a").mass[0], own.body("b").mass[0], own.joint("j").damping[0]) == (1.25, 3.0, 1.75)
+    assert (own.body("a").mass[0], own.body("b").mass[0], own.joint("j").damping[0]) == (
+        1.25,
+        3.0,
+        1.75,
+    )
     assert own.opt.gravity[1] == -0.5
     other = spec.copy()
     write_spec(other, base, base, resolved, np.array([1.25, -0.5]))
@@ -783,14 +899,21 @@ def test_writing_twice_leaves_no_trace_of_the_first_value() -> None:
     parameters = [one("body/b:ipos[1]"), one("body/b:mass")]
     _, base = compiled(ARM, parameters)
     resolved = ParameterSet.build(parameters, base)
-    own, fresh = resolved.model(base, np.array([0.4, 9.0])), resolved.model(base, np.array([0.1, 2.0]))
+    own, fresh = (
+        resolved.model(base, np.array([0.4, 9.0])),
+        resolved.model(base, np.array([0.1, 2.0])),
+    )
     resolved.write(own, np.array([0.1, 2.0]))
     for name, value in arrays(own).items():
         np.testing.assert_array_equal(value, arrays(fresh)[name], err_msg=name)
 
 
-@pytest.mark.parametrize(("path", "rows"), [("joint/f:damping", range(2, 8)), ("joint/h:damping", [1])])
-def test_joint_fields_reach_every_degree_of_freedom_of_the_joint_and_no_other(path: str, rows) -> None:
+@pytest.mark.parametrize(
+    ("path", "rows"), [("joint/f:damping", range(2, 8)), ("joint/h:damping", [1])]
+)
+def test_joint_fields_reach_every_degree_of_freedom_of_the_joint_and_no_other(
+    path: str, rows
+) -> None:
     _, base = compiled(SIMPLE, [])
     own = ParameterSet.build([one(path)], base).model(base, np.array([0.7]))
     assert list(np.flatnonzero(own.dof_damping)) == list(rows)
@@ -798,7 +921,11 @@ def test_joint_fields_reach_every_degree_of_freedom_of_the_joint_and_no_other(pa
 
 def test_an_index_left_out_means_zero() -> None:
     _, base = compiled(ARM, [])
-    assert resolve(base, "body/b:pos") == resolve(base, "body/b:pos[0]") != resolve(base, "body/b:pos[1]")
+    assert (
+        resolve(base, "body/b:pos")
+        == resolve(base, "body/b:pos[0]")
+        != resolve(base, "body/b:pos[1]")
+    )
 
 
 def test_names_may_hold_slashes_and_spaces() -> None:
@@ -827,8 +954,17 @@ def test_names_may_hold_slashes_and_spaces() -> None:
                 "actuator, body, geom, initial, joint, option, output, site",
             ],
         ),
-        ("body/a:weight", ["unknown body field 'weight'", "valid: firstmoment, fullinertia, gravcomp, inertia, ipos"]),
-        ("joint/j:mass", ["unknown joint field 'mass'", "armature, damping, frictionloss, springref, stiffness"]),
+        (
+            "body/a:weight",
+            [
+                "unknown body field 'weight'",
+                "valid: firstmoment, fullinertia, gravcomp, inertia, ipos",
+            ],
+        ),
+        (
+            "joint/j:mass",
+            ["unknown joint field 'mass'", "armature, damping, frictionloss, springref, stiffness"],
+        ),
         ("body/world:fullinertia", ["body 'world' has no mass"]),
         ("body/a:rot[3]", ["index 3 is out of range", "valid: 0 to 2"]),
         ("body/a:logcholesky[10]", ["index 10 is out of range", "valid: 0 to 9"]),
@@ -889,12 +1025,18 @@ def test_theta_of_the_wrong_length_is_refused() -> None:
 def test_difference_steps_and_priors_follow_guess_and_scale() -> None:
     _, base = compiled(ARM, [])
     large = Parameter("large", (Target("body/a:mass"),), guess=-3.0, scale=0.5, prior=0.1)
-    zero = Parameter("zero", (Target("joint/j:damping"),), guess=0.0, scale=0.2, true=0.4, bounds=(0.0, 1.0))
+    zero = Parameter(
+        "zero", (Target("joint/j:damping"),), guess=0.0, scale=0.2, true=0.4, bounds=(0.0, 1.0)
+    )
     resolved = ParameterSet.build([large, zero], base)
     np.testing.assert_array_equal(resolved.step, [3.0, 0.2])
     np.testing.assert_allclose(resolved.prior_information, np.diag([100.0, 0.0]), rtol=1e-14)
     np.testing.assert_array_equal(resolved.true, [-3.0, 0.4])
-    assert (resolved.names, resolved.lower[0], resolved.upper[1]) == (("large", "zero"), -np.inf, 1.0)
+    assert (resolved.names, resolved.lower[0], resolved.upper[1]) == (
+        ("large", "zero"),
+        -np.inf,
+        1.0,
+    )
 
 
 HINGED = TENDON.replace('type="ball"', 'axis="0 1 0"').replace('springlength=".3"', "")
@@ -909,8 +1051,16 @@ AWKWARD = {
         0.7,
     ),
     "damping ratio of a servo": (ARM.replace('kv="0.5"', 'dampratio="1"'), "body/b:mass", 2.0),
-    "spring and damper by time constant": (ARM.replace('stiffness="2"', 'springdamper=".3 1"'), "body/a:mass", 2.0),
-    "inertia always from geoms": (ARM.replace("<compiler ", '<compiler inertiafromgeom="true" '), "body/b:mass", 2.0),
+    "spring and damper by time constant": (
+        ARM.replace('stiffness="2"', 'springdamper=".3 1"'),
+        "body/a:mass",
+        2.0,
+    ),
+    "inertia always from geoms": (
+        ARM.replace("<compiler ", '<compiler inertiafromgeom="true" '),
+        "body/b:mass",
+        2.0,
+    ),
     "size of a geom that also makes inertia": (ARM, "geom/h:size[1]", 0.25),
     "place of a geom that also makes inertia": (ARM, "geom/h:pos[2]", 0.25),
     "place of a geom given by its end points": (ARM, "geom/g:pos[2]", 0.3),
@@ -920,7 +1070,9 @@ AWKWARD = {
 
 
 @pytest.mark.parametrize("case", AWKWARD)
-def test_the_identified_model_file_has_the_identified_dynamics_or_is_refused(case: str, tmp_path) -> None:
+def test_the_identified_model_file_has_the_identified_dynamics_or_is_refused(
+    case: str, tmp_path
+) -> None:
     xml, path, value = AWKWARD[case]
     table = {"theta": {"target": path, "guess": value}}
     try:
@@ -928,10 +1080,15 @@ def test_the_identified_model_file_has_the_identified_dynamics_or_is_refused(cas
         write_identified(tmp_path / "identified.xml", setup, np.array([value]))
     except MjfimError:
         return  # refused with a message: also right
-    own, again = setup.plant.model(np.array([value])), mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
+    own, again = (
+        setup.plant.model(np.array([value])),
+        mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")),
+    )
     states = own.nq + own.nv
     # MuJoCo writes seven digits into XML
-    np.testing.assert_allclose(rollout(again, 100)[:, :states], rollout(own, 100)[:, :states], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        rollout(again, 100)[:, :states], rollout(own, 100)[:, :states], rtol=0, atol=1e-4
+    )
 
 
 def test_an_inertia_that_no_body_can_have_is_refused_by_a_message_of_ours(tmp_path) -> None:
@@ -944,10 +1101,16 @@ def test_an_inertia_that_no_body_can_have_is_refused_by_a_message_of_ours(tmp_pa
 @pytest.mark.parametrize(
     ("path", "guess"), [("geom/box:pos[0]", 0.1), ("geom/box:size[0]", 0.1), ("geom/box:mass", 1.0)]
 )
-def test_geoms_that_make_a_simple_bodys_inertia_are_followed(path: str, guess: float, tmp_path) -> None:
+def test_geoms_that_make_a_simple_bodys_inertia_are_followed(
+    path: str, guess: float, tmp_path
+) -> None:
     """The body would be 'simple' but for the parameter; psi is that of models compiled one by one."""
     setup = make_setup(
-        SIMPLE, tmp_path, parameters={"g": {"target": path, "guess": guess}}, noise={"state": 0.01}, horizon=0.2
+        SIMPLE,
+        tmp_path,
+        parameters={"g": {"target": path, "guess": guess}},
+        noise={"state": 0.01},
+        horizon=0.2,
     )
     found = setup.plant.sensitivity(setup.theta, setup.initial)
     assert found is not None
@@ -961,7 +1124,9 @@ def test_geoms_that_make_a_simple_bodys_inertia_are_followed(path: str, guess: f
         ends.append(state)
     reference = loop.minus(ends[0], ends[1]) / (2.0 * h)
     assert np.abs(reference).max() > 1e-6
-    np.testing.assert_allclose(found.psi[-1, :, 0], reference, rtol=1e-5, atol=1e-7 * np.abs(reference).max())
+    np.testing.assert_allclose(
+        found.psi[-1, :, 0], reference, rtol=1e-5, atol=1e-7 * np.abs(reference).max()
+    )
 
 
 def in_arm(folder: Path, tables: dict) -> Any:
@@ -994,8 +1159,14 @@ def test_bodies_that_cannot_exist_are_refused_before_anything_is_simulated(
 
 
 def test_both_makers_of_a_barycentric_inertia_are_named(tmp_path: Path) -> None:
-    table = {"m": {"target": "body/a:mass", "guess": -2.0}, "h": {"target": "body/a:firstmoment[2]"}}
-    with pytest.raises(ExperimentError, match=r"parameters\.m\.guess, parameters\.h\.guess: body 'a' has mass -2 kg"):
+    table = {
+        "m": {"target": "body/a:mass", "guess": -2.0},
+        "h": {"target": "body/a:firstmoment[2]"},
+    }
+    with pytest.raises(
+        ExperimentError,
+        match=r"parameters\.m\.guess, parameters\.h\.guess: body 'a' has mass -2 kg",
+    ):
         in_arm(tmp_path, table)
 
 
@@ -1003,10 +1174,14 @@ def test_both_makers_of_a_barycentric_inertia_are_named(tmp_path: Path) -> None:
 def test_plates_and_loads_without_mass_are_bodies(field: str, tmp_path: Path) -> None:
     """A plate typed with few digits; a load of no mass that is fixed to a link."""
     plate = '<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.02 0.03"/>'
-    load = '<body name="load" pos="0 0 .1"><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>'
+    load = (
+        '<body name="load" pos="0 0 .1"><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>'
+    )
     xml = BALL.format("").replace('<geom type="box" size=".1 .2 .3" mass="1"/>', plate + load)
     path = "body/load:mass" if field == "mass" else f"body/b:{field}"
-    table = {"theta": {"target": path, "guess": 0.0 if field == "mass" else 0.00999999999, "scale": 1.0}}
+    table = {
+        "theta": {"target": path, "guess": 0.0 if field == "mass" else 0.00999999999, "scale": 1.0}
+    }
     make_setup(xml, tmp_path, rate=100.0, horizon=0.1, parameters=table, noise={"state": 0.1})
 
 
@@ -1017,5 +1192,7 @@ def test_a_function_that_changes_the_timestep_is_refused(tmp_path: Path) -> None
         spec.option.timestep = value
 
     for guess in (0.001, 0.002):  # ARM's is the second
-        with pytest.raises(ExperimentError, match=r"changes option\.timestep of .*model\.xml from 0\.002 s to"):
+        with pytest.raises(
+            ExperimentError, match=r"changes option\.timestep of .*model\.xml from 0\.002 s to"
+        ):
             in_arm(tmp_path, {"dt": {"function": edit, "guess": guess}})

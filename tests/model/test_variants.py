@@ -67,7 +67,10 @@ def test_only_dry_plants_have_speeds_at_which_friction_turns_viscous(tmp_path: P
     assert smooth.level == FREE
     assert smooth.plant.smooth is smooth.plant
     assert smooth.plant.draft is DRAFT
-    limits = {"control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)}, "velocity": {"elbow": 20.0}}
+    limits = {
+        "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
+        "velocity": {"elbow": 20.0},
+    }
     setup = arm(tmp_path / "a", limits=limits).free()
     fastest = np.abs(setup.initial.qvel[:, 0]).max()
     assert setup.level.soft[1] == pytest.approx(SLOW * 20.0)
@@ -78,7 +81,9 @@ def test_only_dry_plants_have_speeds_at_which_friction_turns_viscous(tmp_path: P
     assert setup.softened().plant.source.soft
 
 
-def test_a_plant_with_dry_friction_moves_as_the_model_does_and_its_softened_level_nearly(tmp_path: Path) -> None:
+def test_a_plant_with_dry_friction_moves_as_the_model_does_and_its_softened_level_nearly(
+    tmp_path: Path,
+) -> None:
     setup = arm(tmp_path)
     model = mujoco.MjModel.from_xml_string(ARM.format(friction=0.1))
     model.opt.tolerance, data = 1e-14, mujoco.MjData(model)
@@ -106,7 +111,11 @@ def test_a_longer_timestep_keeps_the_samples_and_stays_near(tmp_path: Path) -> N
 
 
 def test_a_design_with_dry_joints_gains_and_keeps_its_limits(tmp_path: Path) -> None:
-    limits = {"control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)}, "control_rate": 20.0, "velocity": 6.0}
+    limits = {
+        "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
+        "control_rate": 20.0,
+        "velocity": 6.0,
+    }
     setup = arm(tmp_path, limits=limits, descent={"max_iterations": 60})
     design = mjfim.design(setup)
     assert design.status is not Status.INFEASIBLE
@@ -125,9 +134,14 @@ def test_steps_on_the_softened_copy_are_counted(tmp_path: Path) -> None:
     assert plant.steps - begun == 4 * batch  # and on the copy the origin and two directions
 
 
-def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(tmp_path: Path) -> None:
+def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(
+    tmp_path: Path,
+) -> None:
     setup = arm(tmp_path).free()
-    level, psi = setup.softened(), np.random.default_rng(0).normal(size=(setup.samples + 1, setup.space.nx, 3))
+    level, psi = (
+        setup.softened(),
+        np.random.default_rng(0).normal(size=(setup.samples + 1, setup.space.nx, 3)),
+    )
     found, soft, own = (
         plant._paired(setup.theta, setup.initial, psi, np.eye(3)[:1], plant.draft, None)
         for plant in (setup.plant, level.plant, setup.plant.smooth)
@@ -153,7 +167,9 @@ def test_the_gradient_of_the_softened_level_is_that_of_its_cost(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("amplitudes", [(1.0, -0.5), (0.5, 1.0), (1.0, 1.0)])
-def test_and_of_the_stated_one_it_points_where_long_moves_lead(tmp_path: Path, amplitudes: tuple[float, float]) -> None:
+def test_and_of_the_stated_one_it_points_where_long_moves_lead(
+    tmp_path: Path, amplitudes: tuple[float, float]
+) -> None:
     """Its cost jumps with every engine step that a joint sticks for: no size is right, and short moves mislead."""
     setup = arm(tmp_path).free()
     wave = np.sin(np.pi * setup.t)[:, None] ** 2 * np.array(amplitudes)
@@ -174,7 +190,9 @@ def slope(setup: Setup, wave: Array) -> float:
 def difference(setup: Setup, wave: Array, h: float) -> float:
     """The same by two evaluations."""
     there, back = (
-        setup.problem.point(setup.plant.simulate(setup.theta, setup.control + s * wave), setup.plant.draft).cost
+        setup.problem.point(
+            setup.plant.simulate(setup.theta, setup.control + s * wave), setup.plant.draft
+        ).cost
         for s in (h, -h)
     )
     return float(np.log(there / back) / (2.0 * h))

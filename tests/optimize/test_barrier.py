@@ -78,7 +78,9 @@ def test_a_wall_is_the_sum_of_the_barriers_of_its_bounds(delta: float) -> None:
 
     def value(numbers: Array) -> float:
         total = 0.0
-        for i, (low, high, scale) in enumerate(zip(band.lower, band.upper, band.scale, strict=True)):
+        for i, (low, high, scale) in enumerate(
+            zip(band.lower, band.upper, band.scale, strict=True)
+        ):
             for s in ((numbers[:, i] - low) / scale, (high - numbers[:, i]) / scale):
                 total += weight * float(np.sum(relaxed(s[np.isfinite(s)], delta)[0]))
         return total
@@ -91,7 +93,9 @@ def test_a_wall_is_the_sum_of_the_barriers_of_its_bounds(delta: float) -> None:
         e = np.zeros_like(r)
         e[k, i] = h
         size = max(abs(wall.slope[k, i]), 1.0)
-        assert wall.slope[k, i] == pytest.approx((value(r + e) - value(r - e)) / (2 * h), abs=1e-6 * size)
+        assert wall.slope[k, i] == pytest.approx(
+            (value(r + e) - value(r - e)) / (2 * h), abs=1e-6 * size
+        )
         up, down = band.wall(r + e, delta, weight).slope, band.wall(r - e, delta, weight).slope
         np.testing.assert_allclose((up - down)[k, i] / (2 * h), wall.bend[k, i], rtol=1e-4)
 
@@ -108,15 +112,33 @@ def test_a_hedge_tells_the_largest_move_of_anything_over_its_range() -> None:
     N, nx, nu = 4, 2, 1
     taps = np.zeros((N, 1, 2, nx + nu))
     taps[2, 0, 1] = [0.0, 3.0, 1.0]  # what is shown there moves by 3 z_1 + v over its scale
-    free = Weights(np.zeros((N + 1, nx, nx)), np.zeros((N, nu, nx)), np.zeros((N, nu, nu)), np.zeros((N + 1, nu)))
-    hedge = Hedge(np.zeros((N + 1, nx)), np.zeros((N, nu)), free, taps, np.array([8.0]), np.array([np.inf]))
+    free = Weights(
+        np.zeros((N + 1, nx, nx)),
+        np.zeros((N, nu, nx)),
+        np.zeros((N, nu, nu)),
+        np.zeros((N + 1, nu)),
+    )
+    hedge = Hedge(
+        np.zeros((N + 1, nx)), np.zeros((N, nu)), free, taps, np.array([8.0]), np.array([np.inf])
+    )
     z, v = np.zeros((N + 1, nx)), np.zeros((N, nu))
     v[0] = -2.0
     assert hedge.motion(TangentCurve(z, v)) == pytest.approx(0.25)  # the control alone
     z[2], v[2] = [9.0, -0.4], 0.1
     assert hedge.motion(TangentCurve(z, v)) == pytest.approx(1.1)
-    a, b, twice = hedge.a + 1.0, hedge.b + 2.0, Weights(free.Q + 1.0, free.S + 2.0, free.R + 3.0, free.W + 4.0)
+    a, b, twice = (
+        hedge.a + 1.0,
+        hedge.b + 2.0,
+        Weights(free.Q + 1.0, free.S + 2.0, free.R + 3.0, free.W + 4.0),
+    )
     double = Hedge(a, b, twice, taps, hedge.control, hedge.step).times(2.0)
-    found = [double.a, double.b, double.weights.Q, double.weights.S, double.weights.R, double.weights.W]
+    found = [
+        double.a,
+        double.b,
+        double.weights.Q,
+        double.weights.S,
+        double.weights.R,
+        double.weights.W,
+    ]
     assert [float(array.flat[0]) for array in found] == [2.0, 4.0, 2.0, 4.0, 6.0, 8.0]
     np.testing.assert_array_equal(double.taps, taps)  # ranges, not weights

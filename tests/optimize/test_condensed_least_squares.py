@@ -59,7 +59,15 @@ def spread(rows: Array, piece: int, P: int, n: int) -> Array:
     return wide
 
 
-def problem(seed: int, P: int = 4, n: int = 2, c: int = 3, inner: int = 1, outer: int = 2, lame: bool = False) -> Dense:
+def problem(
+    seed: int,
+    P: int = 4,
+    n: int = 2,
+    c: int = 3,
+    inner: int = 1,
+    outer: int = 2,
+    lame: bool = False,
+) -> Dense:
     """Random pieces of one to three blocks in shuffled order, with priors. lame: the last private unknown is never seen"""
     rng = np.random.default_rng(seed)
     m = n + c + 1
@@ -67,7 +75,10 @@ def problem(seed: int, P: int = 4, n: int = 2, c: int = 3, inner: int = 1, outer
     units = 10.0 ** rng.uniform(-2, 2, m)
     units[-1] = 1.0
     blocks = [rng.standard_normal((rng.integers(1, 9), m)) * units for _ in owner]
-    inside, outside = rng.standard_normal((P, inner, m)) * units, rng.standard_normal((outer, c + 1)) * units[n:]
+    inside, outside = (
+        rng.standard_normal((P, inner, m)) * units,
+        rng.standard_normal((outer, c + 1)) * units[n:],
+    )
     if lame and n:
         inside[:, :, n - 1] = 0.0
         for block in blocks:
@@ -87,12 +98,16 @@ FREE = np.inf
 def close(value: Array, wanted: Array, rtol: float = 1e-7) -> None:
     """Equal up to round-off of the largest entry."""
     assert value.shape == wanted.shape
-    np.testing.assert_allclose(value, wanted, rtol=rtol, atol=rtol * max(float(np.abs(wanted).max(initial=0.0)), 1e-12))
+    np.testing.assert_allclose(
+        value, wanted, rtol=rtol, atol=rtol * max(float(np.abs(wanted).max(initial=0.0)), 1e-12)
+    )
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 10.0])
-def test_a_step_is_that_of_the_full_stacked_problem(shape: tuple[int, int, int], damping: float) -> None:
+def test_a_step_is_that_of_the_full_stacked_problem(
+    shape: tuple[int, int, int], damping: float
+) -> None:
     """`min |J d + r|^2 + damping |scale d|^2`, the damping a further row of each unknown."""
     for seed in range(6):
         dense = problem(seed, *shape, inner=shape[1] + 1, outer=shape[2] + 1)
@@ -103,7 +118,9 @@ def test_a_step_is_that_of_the_full_stacked_problem(shape: tuple[int, int, int],
         step = dense.condensed.step(damping, scale, np.full(dense.c, -FREE), np.full(dense.c, FREE))
         unit = np.linalg.norm(rows, axis=0)
         close(np.concatenate([step.private.ravel(), step.common]) * unit, wanted * unit)
-        assert step.gain == pytest.approx(0.5 * float(dense.r @ dense.r) - dense.halves(step), rel=1e-8)
+        assert step.gain == pytest.approx(
+            0.5 * float(dense.r @ dense.r) - dense.halves(step), rel=1e-8
+        )
         assert dense.condensed.pieces == dense.P
         assert (dense.condensed.private, dense.condensed.common) == (dense.n, dense.c)
 
@@ -117,7 +134,10 @@ def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int
         free = np.full(dense.c, FREE)
         best = dense.condensed.step(0.0, np.ones(dense.n + dense.c), -free, free).common
         rng = np.random.default_rng(seed)
-        lower, upper = -np.abs(best) * rng.uniform(0.0, 1.5, dense.c), np.abs(best) * rng.uniform(0.0, 1.5, dense.c)
+        lower, upper = (
+            -np.abs(best) * rng.uniform(0.0, 1.5, dense.c),
+            np.abs(best) * rng.uniform(0.0, 1.5, dense.c),
+        )
         lower[0] *= dense.c == 1  # at a bound already
         step = dense.condensed.step(0.0, np.ones(dense.n + dense.c), lower, upper)
         assert (step.common >= lower).all()
@@ -125,26 +145,47 @@ def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int
         unit = np.linalg.norm(dense.J, axis=0)
         none = np.full(dense.P * dense.n, FREE)
         wide = (np.concatenate([-none, lower]) * unit, np.concatenate([none, upper]) * unit)
-        wanted = lsq_linear(dense.J / unit, -dense.r, wide, method="trf", tol=1e-15, lsq_solver="exact", max_iter=500)
+        wanted = lsq_linear(
+            dense.J / unit,
+            -dense.r,
+            wide,
+            method="trf",
+            tol=1e-15,
+            lsq_solver="exact",
+            max_iter=500,
+        )
         assert dense.halves(step) <= wanted.cost * (1 + 1e-9)
-        np.testing.assert_allclose(step.common * unit[-dense.c :], wanted.x[-dense.c :], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(
+            step.common * unit[-dense.c :], wanted.x[-dense.c :], rtol=1e-4, atol=1e-5
+        )
         active += int(((step.common == lower) | (step.common == upper)).sum())
     assert active > 5, "bounds that never bind show nothing"
 
 
 def test_many_bounds_are_sorted_out() -> None:
     """The conditions of optimality, with strongly correlated unknowns of which most end at a bound."""
-    for seed in (4, 1188, 1211, *range(100, 140)):  # the first three take more exchanges than there are unknowns
+    for seed in (
+        4,
+        1188,
+        1211,
+        *range(100, 140),
+    ):  # the first three take more exchanges than there are unknowns
         rng = np.random.default_rng(seed)
         c = int(rng.integers(2, 20))
         A = np.triu(rng.standard_normal((c + 1, c)))
         rng.standard_normal((c, c))
-        A = A @ (np.eye(c) + rng.choice([0, 1, 5]) * np.outer(rng.standard_normal(c), rng.standard_normal(c)))
+        A = A @ (
+            np.eye(c)
+            + rng.choice([0, 1, 5]) * np.outer(rng.standard_normal(c), rng.standard_normal(c))
+        )
         b = rng.standard_normal(c + 1) * 10
         lower = -rng.uniform(0, 2, c) * (rng.random(c) < 0.7)
         upper = rng.uniform(0, 2, c) * (rng.random(c) < 0.7)
         condensed = Condensed(
-            np.column_stack([A, -b])[None], np.zeros(1, int), np.zeros((1, 0, c + 1)), np.zeros((0, c + 1))
+            np.column_stack([A, -b])[None],
+            np.zeros(1, int),
+            np.zeros((1, 0, c + 1)),
+            np.zeros((0, c + 1)),
         )
         d = condensed.step(0.0, np.ones(c), lower, upper).common
         slope = A.T @ (A @ d - b) / (np.abs(A).sum(axis=0) * np.linalg.norm(b))
@@ -176,7 +217,9 @@ def test_what_is_left_of_the_private_unknowns(shape: tuple[int, int, int], lame:
     for seed in range(4):
         dense = problem(seed, *shape, lame=lame)
         C, P, n, c = dense.condensed, dense.P, dense.n, dense.c
-        inverse = np.linalg.pinv(dense.starts / (unit := np.maximum(np.linalg.norm(dense.starts, axis=0), 1e-30)))
+        inverse = np.linalg.pinv(
+            dense.starts / (unit := np.maximum(np.linalg.norm(dense.starts, axis=0), 1e-30))
+        )
         follow = -(inverse / unit[:, None]) @ dense.shared
         left = dense.shared + dense.starts @ follow
         close(C.information(), left.T @ left)
@@ -200,7 +243,9 @@ def test_lengths_are_those_of_the_columns() -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_scores_and_grams_of_the_blocks_sum_to_gradient_and_information(shape: tuple[int, int, int]) -> None:
+def test_scores_and_grams_of_the_blocks_sum_to_gradient_and_information(
+    shape: tuple[int, int, int],
+) -> None:
     """Block by block against the rows themselves; all together with the priors, against the full problem."""
     for seed in range(4):
         dense = problem(seed, *shape, inner=shape[1] + 1)
@@ -209,7 +254,9 @@ def test_scores_and_grams_of_the_blocks_sum_to_gradient_and_information(shape: t
             J = rows[:, n:-1] + rows[:, :n] @ C.eliminated[C.piece[b]]
             scale = np.abs(C.scores).max()
             np.testing.assert_allclose(C.scores[b], J.T @ rows[:, -1], rtol=1e-7, atol=1e-9 * scale)
-            np.testing.assert_allclose(C.grams[b], J.T @ J, rtol=1e-7, atol=1e-9 * np.abs(C.grams).max())
+            np.testing.assert_allclose(
+                C.grams[b], J.T @ J, rtol=1e-7, atol=1e-9 * np.abs(C.grams).max()
+            )
         known = np.concatenate([C.known.reshape(-1, dense.c + 1), C.outer])
         gradient = C.scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
         fitted = dense.starts @ np.linalg.lstsq(dense.starts, -dense.r)[0] if n else 0.0

@@ -41,7 +41,9 @@ def test_the_model_is_the_criterion_of_moved_information(values: str) -> None:
 
     def wanted(d: Array) -> float:
         moved = np.diag(np.log(model.values)) + matrix(d, 3)
-        return model.share * float(np.log(smooth_e_optimality(np.asarray(expm(moved)), model.power).value))
+        return model.share * float(
+            np.log(smooth_e_optimality(np.asarray(expm(moved)), model.power).value)
+        )
 
     zero = np.zeros(6)
     assert model.value(zero) == 0.0
@@ -86,7 +88,9 @@ def test_divided_differences_turn_a_change_into_one_of_the_logarithm() -> None:
 
 
 @pytest.mark.parametrize("information", ["plain", "nuisance", "delay and sensors"])
-def test_slopes_are_those_of_the_logarithm_of_simulated_information(information: str, tmp_path: Path) -> None:
+def test_slopes_are_those_of_the_logarithm_of_simulated_information(
+    information: str, tmp_path: Path
+) -> None:
     """Off the diagonal too: along random controls, in the eigenvectors of the point."""
     tables = {
         "plain": {},
@@ -120,7 +124,9 @@ def test_slopes_are_those_of_the_logarithm_of_simulated_information(information:
         way = np.cos(2 * np.pi * rng.uniform(0.3, 3.0) * setup.t + rng.uniform(0, 6))[:, None]
         zeta = expansion.lift(open_loop, way)
         found = np.einsum("mki,ki->m", model.a, zeta.z) + np.einsum("mku,ku->m", model.b, zeta.v)
-        slope = (logarithm(setup.control + 1e-3 * way) - logarithm(setup.control - 1e-3 * way)) / 2e-3
+        slope = (
+            logarithm(setup.control + 1e-3 * way) - logarithm(setup.control - 1e-3 * way)
+        ) / 2e-3
         assert relative_error(found, slope) < 5e-3
         # what the gradient of the cost holds besides is the running cost's
         running = problem.running.gradient(setup.initial)
@@ -132,6 +138,8 @@ def test_slopes_are_those_of_the_logarithm_of_simulated_information(information:
 def test_other_criteria_and_plain_expansions_have_no_model(tmp_path: Path) -> None:
     setup = cart_setup(tmp_path, limits={"control": {"force": (-9.0, 9.0)}}).free()
     point = setup.problem.point(setup.initial)
-    assert setup.problem.tapped(point, fence_of(setup).taps)[0].spectral is None  # 1 / lambda_min itself
+    assert (
+        setup.problem.tapped(point, fence_of(setup).taps)[0].spectral is None
+    )  # 1 / lambda_min itself
     smooth = replace(setup.problem, information=replace(setup.problem.information, power=40.0))
     assert smooth.expand(smooth.judged(point)).spectral is None

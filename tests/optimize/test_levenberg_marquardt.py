@@ -48,13 +48,17 @@ class Analytic:
         blocks = np.zeros((len(self.pieces), n + c + 1, n + c + 1))
         for i, (rows, r) in enumerate(zip(self.pieces, self.residuals(at), strict=True)):
             both = np.concatenate([at.starts[i], at.theta]).astype(complex)
-            J = np.stack([rows(*_split(both + 1e-30j * e, n)).imag / 1e-30 for e in np.eye(n + c)], axis=1)
+            J = np.stack(
+                [rows(*_split(both + 1e-30j * e, n)).imag / 1e-30 for e in np.eye(n + c)], axis=1
+            )
             R = np.linalg.qr(np.column_stack([self.spoil(J), r]), mode="r")
             blocks[i, : len(R)] = R
         if not np.isfinite(blocks).all():
             return None
         owners = np.arange(len(self.pieces))
-        return Condensed(blocks, owners, np.zeros((len(owners), 0, n + c + 1)), np.zeros((0, c + 1)))
+        return Condensed(
+            blocks, owners, np.zeros((len(owners), 0, n + c + 1)), np.zeros((0, c + 1))
+        )
 
     def moved(self, at: Unknowns, step: Step, length: float) -> Unknowns:
         theta = np.clip(at.theta + length * step.common, self.lower, self.upper)
@@ -68,7 +72,9 @@ def _split(both: Array, n: int) -> tuple[Array, Array]:
     return both[n:], both[:n]
 
 
-def problem(*pieces: Rows, lower: list[float], upper: list[float] | None = None, **more: object) -> Analytic:
+def problem(
+    *pieces: Rows, lower: list[float], upper: list[float] | None = None, **more: object
+) -> Analytic:
     """Bounds of the common unknowns; none above where not stated."""
     top = np.full(len(lower), FREE) if upper is None else np.array(upper)
     return Analytic(pieces, np.array(lower), top, **more)  # type: ignore[arg-type]
@@ -84,7 +90,9 @@ def reference(p: Analytic, start: Unknowns) -> tuple[Array, Array, float]:
     none = np.full(start.starts.size, FREE)
     bounds = (np.concatenate([p.lower, -none]), np.concatenate([p.upper, none]))
     z0 = np.concatenate([start.theta, start.starts.ravel()])
-    found = least_squares(f, z0, "cs", bounds, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=5000)
+    found = least_squares(
+        f, z0, "cs", bounds, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=5000
+    )
     return found.x[:c], found.x[c:].reshape(shape), float(found.cost)
 
 
@@ -102,7 +110,9 @@ def decays(sigma: float = 0.01) -> tuple[Rows, ...]:
     found = []
     for amplitude in (1.0, 0.4, -2.0):
         y = amplitude * np.exp(-1.7 * t) + 0.3 + sigma * rng.standard_normal(len(t))
-        found.append(lambda theta, own, y=y: (own[0] * np.exp(-theta[0] * t) + theta[1] - y) / sigma)
+        found.append(
+            lambda theta, own, y=y: (own[0] * np.exp(-theta[0] * t) + theta[1] - y) / sigma
+        )
     return tuple(found)
 
 
@@ -113,13 +123,17 @@ def rosenbrock(theta: Array, own: Array) -> Array:
 
 def powell(theta: Array, own: Array) -> Array:
     """Powell's badly scaled function: the minimum is near (1.1e-5, 9.1)."""
-    return np.array([1e4 * theta[0] * theta[1] - 1.0, np.exp(-theta[0]) + np.exp(-theta[1]) - 1.0001])
+    return np.array(
+        [1e4 * theta[0] * theta[1] - 1.0, np.exp(-theta[0]) + np.exp(-theta[1]) - 1.0001]
+    )
 
 
 def peak(theta: Array, own: Array) -> Array:
     """A Gaussian peak on noise."""
     x = np.linspace(-3.0, 3.0, 60)
-    y = 2.0 * np.exp(-((x - 0.4) ** 2) / (2 * 0.7**2)) + 0.05 * np.random.default_rng(1).standard_normal(60)
+    y = 2.0 * np.exp(-((x - 0.4) ** 2) / (2 * 0.7**2)) + 0.05 * np.random.default_rng(
+        1
+    ).standard_normal(60)
     return (theta[0] * np.exp(-((x - theta[1]) ** 2) / (2 * theta[2] ** 2)) - y) / 0.05
 
 
@@ -129,17 +143,32 @@ def alone(*theta: float) -> Unknowns:
 
 
 CASES = {
-    "decays": (lambda: problem(*decays(), lower=[0.0, -5.0]), Unknowns(np.array([0.3, 0.0]), np.ones((3, 1)))),
+    "decays": (
+        lambda: problem(*decays(), lower=[0.0, -5.0]),
+        Unknowns(np.array([0.3, 0.0]), np.ones((3, 1))),
+    ),
     "bounded decays": (
         lambda: problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0]),
         Unknowns(np.array([0.3, 1.0]), np.ones((3, 1))),
     ),
     "valley": (lambda: problem(rosenbrock, lower=[-5.0, -5.0], upper=[5.0, 5.0]), alone(-1.2, 1.0)),
-    "walled valley": (lambda: problem(rosenbrock, lower=[-2.0, -2.0], upper=[0.6, 5.0]), alone(-1.2, 1.0)),
-    "valley from the wall": (lambda: problem(rosenbrock, lower=[-2.0, 1.5], upper=[5.0, 3.0]), alone(-2.0, 1.5)),
+    "walled valley": (
+        lambda: problem(rosenbrock, lower=[-2.0, -2.0], upper=[0.6, 5.0]),
+        alone(-1.2, 1.0),
+    ),
+    "valley from the wall": (
+        lambda: problem(rosenbrock, lower=[-2.0, 1.5], upper=[5.0, 3.0]),
+        alone(-2.0, 1.5),
+    ),
     "badly scaled": (lambda: problem(powell, lower=[0.0, 0.0], upper=[1.0, 20.0]), alone(0.0, 1.0)),
-    "peak": (lambda: problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0]), alone(1.0, -0.5, 1.5)),
-    "held at a wall": (lambda: problem(peak, lower=[0.0, -3.0, 1.0], upper=[1.5, 3.0, 5.0]), alone(1.0, 1.0, 2.0)),
+    "peak": (
+        lambda: problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0]),
+        alone(1.0, -0.5, 1.5),
+    ),
+    "held at a wall": (
+        lambda: problem(peak, lower=[0.0, -3.0, 1.0], upper=[1.5, 3.0, 5.0]),
+        alone(1.0, 1.0, 2.0),
+    ),
 }
 
 
@@ -181,7 +210,9 @@ def test_gauss_newton_goes_where_damped_steps_go_and_ignores_bounds() -> None:
     valley = problem(rosenbrock, lower=[-FREE, -FREE])
     through = solved(valley, alone(-1.2, 1.0), Search(iterations=100, tolerance=1e-9, damped=False))
     np.testing.assert_allclose(through.unknowns.theta, 1.0, rtol=1e-6)
-    lengths = {np.abs(a.theta - b.theta).max() for a, b in zip(valley.seen[1:], valley.seen, strict=False)}
+    lengths = {
+        np.abs(a.theta - b.theta).max() for a, b in zip(valley.seen[1:], valley.seen, strict=False)
+    }
     assert len(lengths) > 3
 
 
@@ -247,7 +278,9 @@ def test_a_wrong_jacobian_is_noticed(damped: bool, fault: str) -> None:
     }
     p = problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0], spoil=spoils[fault])
     found = solved(p, alone(1.0, -0.5, 1.5), Search(damped=damped))
-    assert found.cost > 1.05 * reference(p, alone(1.0, -0.5, 1.5))[2], "it is at the minimum in spite of all"
+    assert found.cost > 1.05 * reference(p, alone(1.0, -0.5, 1.5))[2], (
+        "it is at the minimum in spite of all"
+    )
     assert not found.success
     assert found.status.startswith(("stopped", "not converged"))
 
@@ -260,7 +293,9 @@ def test_the_noise_of_a_simulation_does_not_hinder_convergence() -> None:
             ripple = np.sin(1e9 * (seed + 1) * np.sum(np.real(theta)) + np.arange(60.0))
             return peak(theta, own) * (1.0 + 1e-7 * ripple)
 
-        found = solved(problem(rough, lower=[0.0, -3.0, 0.1]), alone(1.0, -0.5, 1.5), Search(tolerance=1e-6))
+        found = solved(
+            problem(rough, lower=[0.0, -3.0, 0.1]), alone(1.0, -0.5, 1.5), Search(tolerance=1e-6)
+        )
         theta, _, cost = reference(problem(peak, lower=[0.0, -3.0, 0.1]), alone(2.0, 0.4, 0.7))
         assert found.success, found.status
         assert found.cost < cost + 1e-3
@@ -289,7 +324,9 @@ def test_a_flat_valley_is_not_mistaken_for_its_end() -> None:
 
         found = solved(problem(rows, lower=[-FREE, -FREE]), alone(1.0, 1.0), Search())
         assert found.success, found.status
-        np.testing.assert_allclose(thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02)
+        np.testing.assert_allclose(
+            thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02
+        )
 
 
 @pytest.mark.parametrize("stop", [2, 3, 7])

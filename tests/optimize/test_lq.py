@@ -11,7 +11,9 @@ from scipy.linalg import solve_discrete_are
 from mjfim.optimize.lq import Recursion, Riccati, TangentCurve, Weights, descent, growth, regulator
 
 
-def random_system(rng: np.random.Generator, N: int, nx: int, nu: int) -> tuple[np.ndarray, np.ndarray]:
+def random_system(
+    rng: np.random.Generator, N: int, nx: int, nu: int
+) -> tuple[np.ndarray, np.ndarray]:
     """A time-varying pair (A, B), mildly unstable."""
     return np.eye(nx) + 0.2 * rng.normal(size=(N, nx, nx)), rng.normal(size=(N, nx, nu))
 
@@ -55,7 +57,9 @@ def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:
     """The quadratic form, sample by sample."""
     total, before = float(z[-1] @ weights.Q[-1] @ z[-1]), np.zeros(v.shape[1])
     for k, now in enumerate(v):
-        total += z[k] @ weights.Q[k] @ z[k] + 2 * now @ weights.S[k] @ z[k] + now @ weights.R[k] @ now
+        total += (
+            z[k] @ weights.Q[k] @ z[k] + 2 * now @ weights.S[k] @ z[k] + now @ weights.R[k] @ now
+        )
         total += weights.W[k] @ (now - before) ** 2
         before = now
     return total + weights.W[-1] @ before**2
@@ -69,7 +73,9 @@ def test_forward_recursion_is_the_plain_loop(sizes: tuple[int, int]) -> None:
     z = [z0]
     for k in range(N):
         z.append(A[k] @ z[-1] + c[k])
-    np.testing.assert_allclose(Recursion(A).forward(z0, c), z, rtol=1e-12, atol=1e-12 * np.abs(z).max())
+    np.testing.assert_allclose(
+        Recursion(A).forward(z0, c), z, rtol=1e-12, atol=1e-12 * np.abs(z).max()
+    )
 
 
 @pytest.mark.parametrize("sizes", [(1, 1), (7, 1), (1, 3), (30, 4)])
@@ -80,7 +86,9 @@ def test_adjoint_recursion_is_the_plain_loop(sizes: tuple[int, int]) -> None:
     costate = [a[N]]
     for k in range(N - 1, -1, -1):
         costate.insert(0, A[k].T @ costate[0] + a[k])
-    np.testing.assert_allclose(Recursion(A).adjoint(a), costate, rtol=1e-12, atol=1e-12 * np.abs(costate).max())
+    np.testing.assert_allclose(
+        Recursion(A).adjoint(a), costate, rtol=1e-12, atol=1e-12 * np.abs(costate).max()
+    )
 
 
 def test_adjoint_is_the_transpose_of_forward() -> None:
@@ -124,7 +132,12 @@ def test_regulator_over_a_long_horizon_is_the_stationary_riccati_gain() -> None:
 
 def test_regulator_starting_from_the_stationary_cost_is_stationary_throughout() -> None:
     rng = np.random.default_rng(6)
-    A, B, Q, R = 1.1 * np.eye(2) + 0.1 * rng.normal(size=(2, 2)), np.eye(2), positive(rng, 2), positive(rng, 2)
+    A, B, Q, R = (
+        1.1 * np.eye(2) + 0.1 * rng.normal(size=(2, 2)),
+        np.eye(2),
+        positive(rng, 2),
+        positive(rng, 2),
+    )
     X = solve_discrete_are(A, B, Q, R)
     K = regulator(np.tile(A, (20, 1, 1)), np.tile(B, (20, 1, 1)), Q, R, X)
     np.testing.assert_allclose(K, np.broadcast_to(K[0], K.shape), rtol=1e-10)
@@ -147,7 +160,9 @@ def test_regulator_gain_minimises_its_cost_over_a_finite_time_varying_horizon() 
         step = 1e-3 * rng.normal(size=best.shape)
         rise = cost(best + step) - cost(best)
         assert rise > 0.0
-        assert cost(best - step) - cost(best) == pytest.approx(rise, rel=1e-5)  # stationary: no linear term
+        assert cost(best - step) - cost(best) == pytest.approx(
+            rise, rel=1e-5
+        )  # stationary: no linear term
 
 
 @pytest.mark.parametrize("sizes", [(1, 2, 1), (2, 1, 1), (8, 3, 2), (25, 4, 1)])
@@ -168,7 +183,12 @@ def test_descent_is_the_dense_kkt_solution(sizes: tuple[int, int, int]) -> None:
 def test_descent_without_weight_on_the_state_is_the_dense_kkt_solution() -> None:
     rng = np.random.default_rng(11)
     A, B = random_system(rng, 15, 3, 2)
-    a, b, R, none = rng.normal(size=(16, 3)), rng.normal(size=(15, 2)), positive(rng, 2), np.zeros((3, 3))
+    a, b, R, none = (
+        rng.normal(size=(16, 3)),
+        rng.normal(size=(15, 2)),
+        positive(rng, 2),
+        np.zeros((3, 3)),
+    )
     zeta = descent(A, B, a, b, none, R, none)
     z, v = dense_solution(A, B, a, b, none, R, none)
     np.testing.assert_allclose(zeta.z, z, rtol=0, atol=1e-10 * np.abs(z).max())
@@ -177,11 +197,17 @@ def test_descent_without_weight_on_the_state_is_the_dense_kkt_solution() -> None
 
 @pytest.mark.parametrize("steps", [False, True], ids=["free steps", "weighted steps"])
 @pytest.mark.parametrize("sizes", [(1, 2, 1), (2, 1, 1), (8, 3, 2), (25, 4, 1)])
-def test_weighted_descent_solves_the_dense_normal_equations(sizes: tuple[int, int, int], steps: bool) -> None:
+def test_weighted_descent_solves_the_dense_normal_equations(
+    sizes: tuple[int, int, int], steps: bool
+) -> None:
     N, nx, nu = sizes
     rng = np.random.default_rng(N + 10 * nx)
     A, B = random_system(rng, N, nx, nu)
-    a, b, weights = rng.normal(size=(N + 1, nx)), rng.normal(size=(N, nu)), random_weights(rng, N, nx, nu, steps)
+    a, b, weights = (
+        rng.normal(size=(N + 1, nx)),
+        rng.normal(size=(N, nu)),
+        random_weights(rng, N, nx, nu, steps),
+    )
 
     def response(v: np.ndarray) -> np.ndarray:
         return Recursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
@@ -197,11 +223,15 @@ def test_weighted_descent_solves_the_dense_normal_equations(sizes: tuple[int, in
     best = -np.linalg.solve(H, g).reshape(N, nu)
     zeta = Riccati.of(A, B, weights).descent(a, b)
     np.testing.assert_allclose(zeta.v, best, rtol=0, atol=1e-8 * np.abs(best).max())
-    np.testing.assert_allclose(zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0))
+    np.testing.assert_allclose(
+        zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0)
+    )
     # every weight is seen
     for name in ("S", "W") if steps else ("S",):
         other = Weights(**{**weights.__dict__, name: 0.5 * getattr(weights, name)})
-        assert np.abs(Riccati.of(A, B, other).descent(a, b).v - best).max() > 1e-4 * np.abs(best).max() or (
+        assert np.abs(Riccati.of(A, B, other).descent(a, b).v - best).max() > 1e-4 * np.abs(
+            best
+        ).max() or (
             name == "S" and N == 1  # z_0 = 0
         )
 
@@ -212,7 +242,9 @@ def test_force_is_half_the_derivative_of_the_form() -> None:
     weights = random_weights(rng, N, nx, nu, steps=True)
     z, v, dz, dv = (rng.normal(size=s) for s in ((N + 1, nx), (N, nu), (N + 1, nx), (N, nu)))
     a, b = weights.force(TangentCurve(z, v))
-    slope = 0.5 * (form(weights, z + dz, v + dv) - form(weights, z - dz, v - dv)) / 2.0  # a quadratic: exact
+    slope = (
+        0.5 * (form(weights, z + dz, v + dv) - form(weights, z - dz, v - dv)) / 2.0
+    )  # a quadratic: exact
     assert np.sum(a * dz) + np.sum(b * dv) == pytest.approx(slope, rel=1e-12)
     assert np.sum(a * z) + np.sum(b * v) == pytest.approx(form(weights, z, v), rel=1e-12)
 
@@ -225,12 +257,17 @@ def test_descent_is_feasible_optimal_and_goes_down_by_its_own_metric() -> None:
 
     def model(z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
         square = np.einsum("ki,ij,kj->", z[:-1], Q, z[:-1]) + z[-1] @ terminal @ z[-1]
-        return float(np.sum(a * z) + np.sum(b * v)), float(square + np.einsum("ki,ij,kj->", v, R, v))
+        return float(np.sum(a * z) + np.sum(b * v)), float(
+            square + np.einsum("ki,ij,kj->", v, R, v)
+        )
 
     zeta = descent(A, B, a, b, Q, R, terminal)
     recursion = Recursion(A)
     np.testing.assert_allclose(
-        zeta.z, recursion.forward(np.zeros(3), np.einsum("kij,kj->ki", B, zeta.v)), rtol=0, atol=1e-12
+        zeta.z,
+        recursion.forward(np.zeros(3), np.einsum("kij,kj->ki", B, zeta.v)),
+        rtol=0,
+        atol=1e-12,
     )
     slope, square = model(zeta.z, zeta.v)
     assert slope == pytest.approx(-square, rel=1e-10)  # DJ.zeta = -<zeta, zeta> at the minimiser

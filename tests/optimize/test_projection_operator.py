@@ -14,7 +14,14 @@ from support.numerics import Array, directional_check
 
 from mjfim.optimize.directions import LBFGS, MetricDescent
 from mjfim.optimize.lq import TangentCurve, growth
-from mjfim.optimize.projection_operator import Armijo, Direction, Expansion, Iterate, Regulator, optimize
+from mjfim.optimize.projection_operator import (
+    Armijo,
+    Direction,
+    Expansion,
+    Iterate,
+    Regulator,
+    optimize,
+)
 from mjfim.records.design import Status
 
 DT, N = 0.05, 60
@@ -95,7 +102,9 @@ class Pendulum:
         """The projection operator, sample by sample."""
         x, u = [START], []
         for k in range(N):
-            u.append(point.u[k] + gamma * zeta.v[k] + K[k] @ (point.x[k] + gamma * zeta.z[k] - x[-1]))
+            u.append(
+                point.u[k] + gamma * zeta.v[k] + K[k] @ (point.x[k] + gamma * zeta.z[k] - x[-1])
+            )
             x.append(step(x[-1], u[-1]))
         return Curve(np.array(x), np.array(u))
 
@@ -122,7 +131,13 @@ REGULATOR = Regulator(np.eye(2) * DT, np.eye(1) * DT, np.eye(2))
 
 def run(problem: Any, direction: Direction, **changes: Any) -> list[Iterate[Curve]]:
     """All iterates."""
-    settings = {"regulate": REGULATOR, "armijo": Armijo(), "tolerance": 1e-12, "max_iterations": 200, **changes}
+    settings = {
+        "regulate": REGULATOR,
+        "armijo": Armijo(),
+        "tolerance": 1e-12,
+        "max_iterations": 200,
+        **changes,
+    }
     return list(optimize(problem, start(problem), direction, **settings))
 
 
@@ -140,7 +155,10 @@ def optimum() -> float:
     return cost(u)
 
 
-DIRECTIONS: dict[str, Callable[[], Direction]] = {"metric": lambda: METRIC, "lbfgs": lambda: LBFGS(R * DT)}
+DIRECTIONS: dict[str, Callable[[], Direction]] = {
+    "metric": lambda: METRIC,
+    "lbfgs": lambda: LBFGS(R * DT),
+}
 
 
 @pytest.mark.parametrize("method", DIRECTIONS)
@@ -200,7 +218,10 @@ def test_metric_descent_slope_is_minus_the_squared_metric_length() -> None:
     problem = Pendulum()
     expansion = problem.expand(start(problem))
     zeta = METRIC(expansion, REGULATOR.gain(expansion))
-    square = np.einsum("ki,ij,kj->", zeta.z[:-1], METRIC.Q, zeta.z[:-1]) + zeta.z[-1] @ TERMINAL @ zeta.z[-1]
+    square = (
+        np.einsum("ki,ij,kj->", zeta.z[:-1], METRIC.Q, zeta.z[:-1])
+        + zeta.z[-1] @ TERMINAL @ zeta.z[-1]
+    )
     square += np.einsum("ki,ij,kj->", zeta.v, METRIC.R, zeta.v)
     assert expansion.slope(zeta) == pytest.approx(-square, rel=1e-10)
 
@@ -256,7 +277,9 @@ def test_a_direction_that_climbs_is_not_called_converged() -> None:
     assert iterates[-1].value <= iterates[0].value
 
 
-def searched(problem: Pendulum, factor: float, armijo: Armijo, first: float = 1.0) -> tuple[Any, float, float]:
+def searched(
+    problem: Pendulum, factor: float, armijo: Armijo, first: float = 1.0
+) -> tuple[Any, float, float]:
     """(what the line search found, J at the start, slope) along the metric direction times a factor."""
     point = start(problem)
     expansion = problem.expand(point)
@@ -269,13 +292,17 @@ def searched(problem: Pendulum, factor: float, armijo: Armijo, first: float = 1.
 
 @pytest.mark.parametrize("factor", [1.0, 10.0, 100.0, 1e4])
 @pytest.mark.parametrize("sigma", [1e-4, 0.3])
-def test_armijo_accepts_a_step_of_sufficient_decrease_however_long_the_direction(factor: float, sigma: float) -> None:
+def test_armijo_accepts_a_step_of_sufficient_decrease_however_long_the_direction(
+    factor: float, sigma: float
+) -> None:
     problem = Pendulum()
     (trial, gamma), value, slope = searched(problem, factor, Armijo(sigma=sigma))
     assert problem.value(trial) <= value + sigma * gamma * slope
     assert problem.value(trial) < value
     assert 0.0 < gamma <= 1.0
-    rejected = problem.values[1:-3]  # between J at the start and the three asked for after the accepted one
+    rejected = problem.values[
+        1:-3
+    ]  # between J at the start and the three asked for after the accepted one
     assert all(v > value + sigma * gamma * slope for v in rejected[:-1])
 
 
@@ -354,7 +381,9 @@ def test_a_constant_added_to_the_cost_does_not_keep_the_descent_from_the_optimum
     method: str, share: float, optimum: float
 ) -> None:
     begin = Pendulum()
-    shift = share * begin.value(start(begin))  # share = 1: the cost starts at exactly zero, as a log-determinant may
+    shift = share * begin.value(
+        start(begin)
+    )  # share = 1: the cost starts at exactly zero, as a log-determinant may
     iterates = run(Pendulum(shift=shift), DIRECTIONS[method](), max_iterations=300)
     assert iterates[-1].value + shift == pytest.approx(optimum, rel=1e-6)
 
@@ -375,14 +404,18 @@ def test_better_differences_are_used_before_a_stall_is_claimed() -> None:
 
 def test_the_consumer_may_stop_between_iterates() -> None:
     problem = Pendulum()
-    loop: Iterator[Iterate[Curve]] = optimize(problem, start(problem), METRIC, REGULATOR, Armijo(), 1e-12, 100)
+    loop: Iterator[Iterate[Curve]] = optimize(
+        problem, start(problem), METRIC, REGULATOR, Armijo(), 1e-12, 100
+    )
     first, second = next(loop), next(loop)
     loop.close()
     assert second.value < first.value
 
 
 def test_lbfgs_needs_fewer_iterations_than_metric_descent_for_the_same_digits() -> None:
-    metric = MetricDescent(np.zeros((2, 2)), R * DT, np.zeros((2, 2)))  # the same metric as the L-BFGS here starts from
+    metric = MetricDescent(
+        np.zeros((2, 2)), R * DT, np.zeros((2, 2))
+    )  # the same metric as the L-BFGS here starts from
     counts = [len(run(Pendulum(), d, max_iterations=120)) for d in (metric, LBFGS(R * DT))]
     assert counts[1] < 0.5 * counts[0]
 
@@ -390,7 +423,9 @@ def test_lbfgs_needs_fewer_iterations_than_metric_descent_for_the_same_digits() 
 def learned(memory: int, iterations: int = 9) -> tuple[LBFGS, Expansion, Array]:
     """An L-BFGS after some iterations, the expansion it will see next, and K."""
     problem, direction = Pendulum(), LBFGS(R * DT, memory)
-    iterates = run(problem, direction, max_iterations=iterations, regulate=replace(REGULATOR, period=1000))
+    iterates = run(
+        problem, direction, max_iterations=iterations, regulate=replace(REGULATOR, period=1000)
+    )
     K = REGULATOR.gain(problem.expand(iterates[0].point))
     return direction, problem.expand(iterates[-1].point), K
 
@@ -456,10 +491,15 @@ def test_lbfgs_carried_to_a_finer_grid_keeps_its_curvature_and_its_direction() -
     g = np.cos(np.arange(N))[:, None]
     still = Expansion(np.zeros((N, 1, 1)), np.zeros((N, 1, 1)), np.zeros((N + 1, 1)), g)
     dense = Expansion(
-        np.zeros((4 * N, 1, 1)), np.zeros((4 * N, 1, 1)), np.zeros((4 * N + 1, 1)), np.repeat(g, 4, axis=0) / 4
+        np.zeros((4 * N, 1, 1)),
+        np.zeros((4 * N, 1, 1)),
+        np.zeros((4 * N + 1, 1)),
+        np.repeat(g, 4, axis=0) / 4,
     )
     coarse = direction(still, np.zeros((N, 1, 1))).v
-    np.testing.assert_allclose(fine(dense, np.zeros((4 * N, 1, 1))).v, np.repeat(coarse, 4, axis=0), rtol=1e-9)
+    np.testing.assert_allclose(
+        fine(dense, np.zeros((4 * N, 1, 1))).v, np.repeat(coarse, 4, axis=0), rtol=1e-9
+    )
     assert direction._pairs[0].s.shape == (N, 1)  # the coarse memory is left alone
 
 

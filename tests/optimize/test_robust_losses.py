@@ -44,7 +44,9 @@ def test_the_optimum_is_that_of_scipy(kind: Kind, scale: float) -> None:
     """And so is the value there."""
     loss, y = Loss(kind, scale), points(0)
     x = reweighted(loss, y)
-    wanted = least_squares(residuals, x, args=(y,), loss=kind, f_scale=scale, xtol=1e-15, ftol=1e-15, gtol=1e-13)
+    wanted = least_squares(
+        residuals, x, args=(y,), loss=kind, f_scale=scale, xtol=1e-15, ftol=1e-15, gtol=1e-13
+    )
     np.testing.assert_allclose(x, wanted.x, rtol=1e-6)
     assert 0.5 * loss.value(residuals(wanted.x, y)) == pytest.approx(wanted.cost, rel=1e-12)
     far = np.array([5.0, -9.0])
@@ -57,7 +59,9 @@ def test_the_weight_follows_from_the_value(kind: Kind) -> None:
     """Half of the slope of the value is the squared weight times the residual, below and above the scale."""
     loss = Loss(kind, 2.0)
     for r in (-40.0, -2.5, -1.0, -1e-3, 0.3, 1.9, 2.1, 7.0, 1e3):
-        slope = 0.5 * richardson(lambda h, r=r: loss.value(np.array([r + h])), 1e-3 * max(abs(r), 0.1))
+        slope = 0.5 * richardson(
+            lambda h, r=r: loss.value(np.array([r + h])), 1e-3 * max(abs(r), 0.1)
+        )
         weight = loss.weight(np.array([r]))[0]
         assert weight**2 * r == pytest.approx(slope, rel=1e-6)
     assert loss.weight(np.zeros((3, 2))).shape == (3, 2)
@@ -84,12 +88,17 @@ def test_the_mean_square_of_what_is_no_outlier(scale: float) -> None:
     for kind in KINDS:
         loss = Loss(kind, scale)
         assert loss.outlier == (np.inf if kind == "linear" else max(scale, 3.0))
-        assert loss.inliers == pytest.approx(float(np.mean(r[np.abs(r) <= loss.outlier] ** 2)), rel=5e-3)
+        assert loss.inliers == pytest.approx(
+            float(np.mean(r[np.abs(r) <= loss.outlier] ** 2)), rel=5e-3
+        )
 
 
 def test_outliers_hardly_move_a_robust_line() -> None:
     """Against many draws: squares are pulled away, the robust ones stay within a few deviations."""
-    found = {kind: np.array([reweighted_few(Loss(kind, 1.5), points(seed)) for seed in range(30)]) for kind in KINDS}
+    found = {
+        kind: np.array([reweighted_few(Loss(kind, 1.5), points(seed)) for seed in range(30)])
+        for kind in KINDS
+    }
     off = {kind: abs(float(x[:, 0].mean()) - 2.0) for kind, x in found.items()}
     assert off["linear"] > 1.0
     assert off["huber"] < 0.5 * off["linear"]

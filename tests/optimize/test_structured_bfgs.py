@@ -44,12 +44,16 @@ def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: b
     np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(H)[0] > 0.0
     g = rng.normal(size=(N, NU))
-    np.testing.assert_allclose(metric.solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1)), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(
+        metric.solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1)), rtol=1e-7, atol=1e-9
+    )
     # its own form on the curve that a step makes
     s = rng.normal(size=(N, NU))
     zeta = expansion.lift(K, s)
     a, b = weights.force(zeta)
-    assert np.vdot(s, metric.apply(s)) == pytest.approx(np.sum(a * zeta.z) + np.sum(b * zeta.v), rel=1e-10)
+    assert np.vdot(s, metric.apply(s)) == pytest.approx(
+        np.sum(a * zeta.z) + np.sum(b * zeta.v), rel=1e-10
+    )
 
 
 def test_on_an_identity_basis_both_metrics_agree() -> None:
@@ -71,7 +75,11 @@ def test_on_fewer_curves_the_metric_is_the_projected_one() -> None:
     weights.Q[4:9], weights.S[4:9], weights.W[::2] = 0.0, 0.0, 0.0
     basis = rng.normal(size=(N, 5))
     wide = np.einsum("km,uw->kumw", basis, np.eye(NU)).reshape(N * NU, -1)
-    H = wide.T @ dense(Metric(Chart(expansion.A, expansion.B, np.zeros((N, NU, NX))), weights)) @ wide
+    H = (
+        wide.T
+        @ dense(Metric(Chart(expansion.A, expansion.B, np.zeros((N, NU, NX))), weights))
+        @ wide
+    )
     based = BasisMetric.of(expansion, weights, basis)
     assert relative_error(based.H, H) < 1e-9
     g = rng.normal(size=(5, NU))
@@ -101,7 +109,9 @@ class Toy:
     def plant(self) -> tuple[Array, Array]:
         """A oscillates, B pushes the second state; and one more state that follows."""
         A = np.array([[1.0, 0.2, 0.0], [-0.3, 0.95, 0.0], [0.1, 0.0, 0.9]])
-        return np.tile(A, (N, 1, 1)), np.tile(np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.3]]), (N, 1, 1))
+        return np.tile(A, (N, 1, 1)), np.tile(
+            np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 0.3]]), (N, 1, 1)
+        )
 
     wanted = np.array([3.0, 0.0, -1.0])
     start = np.array([0.2, 0.0, 0.1])
@@ -122,14 +132,19 @@ class Toy:
     def value(self, point: ToyPoint) -> float:
         """Cost and barrier."""
         cost = 0.01 * np.sum((point.x[1:] - self.wanted) ** 2) + 1e-4 * np.sum(point.u**2)
-        cost += 2e-3 * np.sum(point.x[1:, 2] ** 2 * point.u[:, 1] ** 2)  # a little that is not quadratic
+        cost += 2e-3 * np.sum(
+            point.x[1:, 2] ** 2 * point.u[:, 1] ** 2
+        )  # a little that is not quadratic
         if not self.mu:
             return float(cost)
         walls = (
-            self.shown.wall(point.x[1:, :1], self.delta, 1.0).value + self.control.wall(point.u, self.delta, 1.0).value
+            self.shown.wall(point.x[1:, :1], self.delta, 1.0).value
+            + self.control.wall(point.u, self.delta, 1.0).value
         )
         if self.steps:
-            walls += self.rate.wall(np.diff(point.u, axis=0, prepend=0.0, append=0.0), self.delta, 1.0).value
+            walls += self.rate.wall(
+                np.diff(point.u, axis=0, prepend=0.0, append=0.0), self.delta, 1.0
+            ).value
         return float(cost + self.mu * walls)
 
     def size(self, point: ToyPoint) -> float:
@@ -145,7 +160,10 @@ class Toy:
         b[:, 1] += 4e-3 * x[1:, 2] ** 2 * u[:, 1]
         if not self.mu:
             return Expansion(A, B, a, b)
-        shown, held = self.shown.wall(x[1:, :1], self.delta, self.mu), self.control.wall(u, self.delta, self.mu)
+        shown, held = (
+            self.shown.wall(x[1:, :1], self.delta, self.mu),
+            self.control.wall(u, self.delta, self.mu),
+        )
         Q, R, W = np.zeros((N + 1, NX, NX)), np.zeros((N, NU, NU)), np.zeros((N + 1, NU))
         Q[1:, 0, 0], R[:, range(NU), range(NU)] = shown.bend[:, 0], held.bend
         wall_a, wall_b = np.zeros_like(a), held.slope.copy()
@@ -157,7 +175,12 @@ class Toy:
         taps = np.zeros((N, 1, 1, NX + NU))
         taps[:, 0, 0, :NX], taps[:, 0, 0, NX:] = A[:, 0], B[:, 0]
         hedge = Hedge(
-            wall_a, wall_b, Weights(Q, np.zeros((N, NU, NX)), R, W), taps, self.control.scale, self.rate.scale
+            wall_a,
+            wall_b,
+            Weights(Q, np.zeros((N, NU, NX)), R, W),
+            taps,
+            self.control.scale,
+            self.rate.scale,
         )
         return Expansion(A, B, a + wall_a, b + wall_b, None, hedge)
 
@@ -195,16 +218,24 @@ def test_the_toy_is_driven_to_the_optimum_that_scipy_finds(kind: str, mu: float)
         return (curves.T @ gradient).reshape(-1)
 
     best = minimize(
-        cost, np.zeros(curves.shape[1] * NU), jac=slope, method="BFGS", options={"gtol": 1e-9, "maxiter": 5000}
+        cost,
+        np.zeros(curves.shape[1] * NU),
+        jac=slope,
+        method="BFGS",
+        options={"gtol": 1e-9, "maxiter": 5000},
     )
     direction = StructuredBFGS(np.full(NU, 1e-3), basis)
     regulate = FED_BACK if kind == "fed back" else CALM
-    iterates = list(optimize(toy, toy.point(np.zeros((N, NU))), direction, regulate, Armijo(), 1e-9, 150))
+    iterates = list(
+        optimize(toy, toy.point(np.zeros((N, NU))), direction, regulate, Armijo(), 1e-9, 150)
+    )
     values = [iterate.value for iterate in iterates]
     assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
     assert (np.diff(values) <= 0.0).all()
     assert values[-1] == pytest.approx(best.fun, abs=1e-6 * abs(best.fun))
-    np.testing.assert_allclose(iterates[-1].point.u, curves @ best.x.reshape(-1, NU), rtol=0, atol=2e-3)
+    np.testing.assert_allclose(
+        iterates[-1].point.u, curves @ best.x.reshape(-1, NU), rtol=0, atol=2e-3
+    )
     assert len(iterates) < 60
     if mu < 1e-2:  # the bound is reached, and kept
         assert 0.0 < toy.shown.margin(iterates[-1].point.x[:, :1]).min() < 0.05
@@ -213,7 +244,9 @@ def test_the_toy_is_driven_to_the_optimum_that_scipy_finds(kind: str, mu: float)
 def test_what_was_learnt_outlives_a_sharper_barrier() -> None:
     """Pairs hold the change of the cost's gradient alone: nothing of a barrier, blunt or sharp."""
     direction, blunt = StructuredBFGS(np.full(NU, 1e-3)), Toy(1e-1)
-    for iterate in optimize(blunt, blunt.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-6, 40):
+    for iterate in optimize(
+        blunt, blunt.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-6, 40
+    ):
         point = iterate.point
     pairs = direction._pairs
     assert len(pairs) > 2
@@ -239,7 +272,9 @@ def test_no_step_moves_anything_limited_too_far() -> None:
     assert 0.05 < e.hedge.motion(short) <= 0.25
     assert e.slope(short) < 0.0
     tiny = Expansion(e.A, e.B, 1e-9 * e.a, 1e-9 * e.b, None, e.hedge)
-    assert e.hedge.motion(StructuredBFGS(np.full(NU, 1.0))(tiny, K)) < 1e-6  # a short step stays as it is
+    assert (
+        e.hedge.motion(StructuredBFGS(np.full(NU, 1.0))(tiny, K)) < 1e-6
+    )  # a short step stays as it is
 
 
 def test_damping_shortens_what_nothing_holds_and_leaves_the_way_back_inside() -> None:
@@ -264,7 +299,9 @@ def test_damping_shortens_what_nothing_holds_and_leaves_the_way_back_inside() ->
 def test_damping_fades_where_steps_are_short() -> None:
     toy = Toy(1e-2)
     direction = StructuredBFGS(np.full(NU, 1e-3), damping=10.0)
-    iterates = list(optimize(toy, toy.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-9, 150))
+    iterates = list(
+        optimize(toy, toy.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-9, 150)
+    )
     assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
     assert direction.damping < 1e-3
 
@@ -283,7 +320,9 @@ def test_the_direction_goes_down_on_a_real_design(based: bool, tmp_path: Path) -
     from mjfim.excitation.interior_point import InteriorProblem
     from mjfim.signals import spline_basis
 
-    setup = cart_setup(tmp_path, limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}}).free()
+    setup = cart_setup(
+        tmp_path, limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}}
+    ).free()
     problem = InteriorProblem(setup.problem, fence_of(setup), 0.1, 0.03)
     point = problem.point(setup.control)
     expansion = problem.expand(point)

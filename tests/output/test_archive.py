@@ -99,16 +99,34 @@ def test_npz_round_trip(folder: Path, design: Design) -> None:
     assert set(named) == {"initial", "final"}
     for name, evaluation in (("initial", design.initial), ("final", design.final)):
         for key in ("t", "qpos", "qvel", "act", "ctrl"):
-            assert np.array_equal(getattr(named[name], key), getattr(evaluation.trajectory, key)), (name, key)
+            assert np.array_equal(getattr(named[name], key), getattr(evaluation.trajectory, key)), (
+                name,
+                key,
+            )
     assert np.abs(named["final"].ctrl - named["initial"].ctrl).max() > 1e-3
 
 
 def test_json_holds_what_is_promised(folder: Path, design: Design) -> None:
     """Keys of DESIGN.md and the numbers of the record."""
     data = strict_json((folder / "design.json").read_text(encoding="utf-8"))
-    wanted = {"status", "iterations", "seconds", "slope", "steps", "parameters", "theta", "initial", "final", "limits"}
+    wanted = {
+        "status",
+        "iterations",
+        "seconds",
+        "slope",
+        "steps",
+        "parameters",
+        "theta",
+        "initial",
+        "final",
+        "limits",
+    }
     assert wanted <= set(data)
-    assert (data["status"], data["iterations"], data["steps"]) == ("max_iterations", 2, design.steps)
+    assert (data["status"], data["iterations"], data["steps"]) == (
+        "max_iterations",
+        2,
+        design.steps,
+    )
     assert (data["parameters"], data["theta"]) == (["m", "l", "c"], [2.0, 1.0, 1.0])
     assert data["limits"]["satisfied"] is True
     for name, evaluation in (("initial", design.initial), ("final", design.final)):
@@ -117,9 +135,15 @@ def test_json_holds_what_is_promised(folder: Path, design: Design) -> None:
         assert part["cost"] == evaluation.cost
         assert np.array_equal(part["information"], evaluation.information)
         assert part["eigenvalues"] == sorted(part["eigenvalues"])
-        assert part["std"] == pytest.approx(np.sqrt(np.diag(np.linalg.inv(evaluation.information))), rel=1e-9)
+        assert part["std"] == pytest.approx(
+            np.sqrt(np.diag(np.linalg.inv(evaluation.information))), rel=1e-9
+        )
     assert data["final"]["cost"] < data["initial"]["cost"]
-    assert (data["nuisance"], data["combinations"], data["prior"]) == ([], [], np.zeros((P, P)).tolist())
+    assert (data["nuisance"], data["combinations"], data["prior"]) == (
+        [],
+        [],
+        np.zeros((P, P)).tolist(),
+    )
 
 
 def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
@@ -127,14 +151,26 @@ def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
     e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     table = {"m": {"prior": 0.5}, "c": {"nuisance": True}}
     known = Setup(
-        e.replace(horizon=0.4, parameters=table, nuisance={"delay": 0.1, "initial": 0.2}, descent={"max_iterations": 0})
+        e.replace(
+            horizon=0.4,
+            parameters=table,
+            nuisance={"delay": 0.1, "initial": 0.2},
+            descent={"max_iterations": 0},
+        )
     )
     archive.write_design(tmp_path, mjfim.design(known), known)
     data = strict_json((tmp_path / "design.json").read_text(encoding="utf-8"))
-    starts = ["initial qpos:slide", "initial qpos:hinge", "initial qvel:slide", "initial qvel:hinge"]
+    starts = [
+        "initial qpos:slide",
+        "initial qpos:hinge",
+        "initial qvel:slide",
+        "initial qvel:hinge",
+    ]
     assert data["parameters"] == ["m", "l", "c", *starts, "delay"]
     assert data["nuisance"] == ["c", *starts, "delay"]
-    assert np.allclose(data["prior"], np.diag([4.0, 0.0, 0.0, *[25.0] * 4, 100.0]), rtol=1e-12, atol=0)
+    assert np.allclose(
+        data["prior"], np.diag([4.0, 0.0, 0.0, *[25.0] * 4, 100.0]), rtol=1e-12, atol=0
+    )
     left = np.array(data["final"]["information"]) - np.array(data["prior"])
     assert np.linalg.eigvalsh(left)[0] > -1e-8 * np.linalg.eigvalsh(left)[-1]
 
@@ -150,7 +186,9 @@ def test_csv_plays_back(folder: Path, design: Design, setup: Setup) -> None:
     curve = design.trajectory
     assert [float(row[2]) for row in rows] == curve.qpos[:, 1].tolist()
     assert [float(row[5]) for row in rows[:-1]] == curve.ctrl[:, 0].tolist()
-    again = Setup(setup.experiment.replace(initial={"control": str((folder / "design.csv").resolve())}))
+    again = Setup(
+        setup.experiment.replace(initial={"control": str((folder / "design.csv").resolve())})
+    )
     assert np.array_equal(again.control, curve.ctrl)
 
 
@@ -163,9 +201,14 @@ def test_json_names_its_experiment(folder: Path) -> None:
 def test_json_has_no_nan(design: Design) -> None:
     """What is infinite or undefined becomes null."""
     blank = dataclasses.replace(
-        design.final, std=np.array([np.inf, np.nan, 1.0]), cost=float("inf"), information=np.full((3, 3), np.nan)
+        design.final,
+        std=np.array([np.inf, np.nan, 1.0]),
+        cost=float("inf"),
+        information=np.full((3, 3), np.nan),
     )
-    text = archive.as_json(archive.design_summary(dataclasses.replace(design, final=blank, slope=float("nan"))))
+    text = archive.as_json(
+        archive.design_summary(dataclasses.replace(design, final=blank, slope=float("nan")))
+    )
     data = strict_json(text)
     assert data["final"]["std"] == [None, None, 1.0]
     assert (data["final"]["cost"], data["slope"]) == (None, None)
@@ -174,7 +217,9 @@ def test_json_has_no_nan(design: Design) -> None:
 
 def test_unsatisfied_limits_are_said(design: Design) -> None:
     """One negative margin is enough."""
-    said = archive.design_summary(dataclasses.replace(design, limits={"position": 0.5, "control": -0.1}))["limits"]
+    said = archive.design_summary(
+        dataclasses.replace(design, limits={"position": 0.5, "control": -0.1})
+    )["limits"]
     assert (said["margins"], said["satisfied"]) == ({"position": 0.5, "control": -0.1}, False)
 
 
@@ -205,7 +250,9 @@ def spring() -> None:
 
 def test_pickles_are_refused(folder: Path, tmp_path: Path) -> None:
     """An object array is not even looked at."""
-    path = altered(folder / "design.npz", tmp_path / "hostile.npz", qpos=np.array([Trap()], dtype=object))
+    path = altered(
+        folder / "design.npz", tmp_path / "hostile.npz", qpos=np.array([Trap()], dtype=object)
+    )
     with pytest.raises(RecordingError, match=r"hostile\.npz: not a design archive"):
         archive.read_design(path)
     assert not Trap.sprung
@@ -215,7 +262,9 @@ def test_pickles_are_refused(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # NumPy leaves the file open
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # NumPy leaves the file open
 def test_truncated_archives_are_refused(folder: Path, tmp_path: Path, share: float) -> None:
     """Wherever the copy broke off."""
     data = (folder / "design.npz").read_bytes()
@@ -246,7 +295,9 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 def test_missing_arrays_are_named(folder: Path, tmp_path: Path) -> None:
     """And what a design holds."""
     path = altered(folder / "design.npz", tmp_path / "poor.npz", ctrl=None)
-    with pytest.raises(RecordingError, match=r"poor\.npz: array 'ctrl' is missing; a design holds t, qpos, .*ctrl"):
+    with pytest.raises(
+        RecordingError, match=r"poor\.npz: array 'ctrl' is missing; a design holds t, qpos, .*ctrl"
+    ):
         archive.read_design(path)
 
 
@@ -267,7 +318,9 @@ def test_a_design_without_a_start(folder: Path, tmp_path: Path) -> None:
     ],
     ids=["flat", "text", "no-rows", "nan", "too-short"],
 )
-def test_wrong_arrays_are_refused(folder: Path, tmp_path: Path, setup: Setup, arrays: dict[str, Array]) -> None:
+def test_wrong_arrays_are_refused(
+    folder: Path, tmp_path: Path, setup: Setup, arrays: dict[str, Array]
+) -> None:
     """Before they are simulated or drawn."""
     path = altered(folder / "design.npz", tmp_path / "odd.npz", **arrays)
     with pytest.raises(RecordingError, match=r"odd\.npz: "):
@@ -290,10 +343,15 @@ def test_designs_of_other_experiments_are_refused(folder: Path, setup: Setup) ->
     path, curve = folder / "design.npz", archive.read_design(folder / "design.npz")["final"]
     archive.check_fits(path, curve, setup)
     wide = Trajectory(curve.t, np.zeros((N + 1, 3)), np.zeros((N + 1, 3)), curve.act, curve.ctrl)
-    with pytest.raises(RecordingError, match=r"design\.npz: made for \(nq, nv, nu\) = \(3, 3, 1\), .* has \(2, 2, 1\)"):
+    with pytest.raises(
+        RecordingError,
+        match=r"design\.npz: made for \(nq, nv, nu\) = \(3, 3, 1\), .* has \(2, 2, 1\)",
+    ):
         archive.check_fits(path, wide, setup)
     slow = Trajectory(2 * curve.t, curve.qpos, curve.qvel, curve.act, curve.ctrl)
-    with pytest.raises(RecordingError, match=r"design\.npz: sampled at 50 Hz, the experiment at 100 Hz"):
+    with pytest.raises(
+        RecordingError, match=r"design\.npz: sampled at 50 Hz, the experiment at 100 Hz"
+    ):
         archive.check_fits(path, slow, setup)
 
 
@@ -346,9 +404,16 @@ def half_written(*args: Any, **kwargs: Any) -> None:
     raise OSError("no space left on device")
 
 
-@pytest.mark.parametrize("where", ["numpy.savez_compressed", "pyarrow.csv.write_csv", "pathlib.Path.write_text"])
+@pytest.mark.parametrize(
+    "where", ["numpy.savez_compressed", "pyarrow.csv.write_csv", "pathlib.Path.write_text"]
+)
 def test_failing_disk_keeps_the_old_design(
-    where: str, folder: Path, design: Design, setup: Setup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    where: str,
+    folder: Path,
+    design: Design,
+    setup: Setup,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each of the three files is the old one or the new one."""
     shutil.copytree(folder, tmp_path / "copy")
@@ -400,7 +465,9 @@ def test_extreme_numbers_survive(setup: Setup, tmp_path: Path) -> None:
 def test_foreign_recording(setup: Setup, tmp_path: Path) -> None:
     """A subset of the outputs, in any order, with an empty last control."""
     path = tmp_path / "lab.csv"
-    path.write_text("qpos:hinge,t,ctrl:force\n3.1,0,1\n3.2,0.01,2\n,0.02,3\n3.4,0.03,\n", encoding="utf-8")
+    path.write_text(
+        "qpos:hinge,t,ctrl:force\n3.1,0,1\n3.2,0.01,2\n,0.02,3\n3.4,0.03,\n", encoding="utf-8"
+    )
     r = logs.read_recording(path, setup)
     assert (r.outputs, r.ctrl.tolist()) == (("qpos:hinge",), [[1.0], [2.0], [3.0]])
     assert np.array_equal(r.y[:, 0], [3.1, 3.2, np.nan, 3.4], equal_nan=True)
@@ -415,7 +482,10 @@ def test_foreign_recording(setup: Setup, tmp_path: Path) -> None:
         ("t,ctrl:force,qpos:slid\n0,1,1\n0.01,1,1\n0.02,1,1\n", r".*'qpos:slid'.*'qpos:slide'"),
         ("t,ctrl:force,qpos:slide\n0,1,1\n0.01,1,1\n", r"too few rows \(2\)"),
         ("t,ctrl:force,qpos:slide\n0,1,1\n,1,1\n0.02,1,1\n", r"'t' holds NaN in data row 2"),
-        ("t,ctrl:force,qpos:slide\n0,1,1\n0.01,1,high\n0.02,1,1\n", r"column 'qpos:slide' is not numeric"),
+        (
+            "t,ctrl:force,qpos:slide\n0,1,1\n0.01,1,high\n0.02,1,1\n",
+            r"column 'qpos:slide' is not numeric",
+        ),
         ("", r"the file is empty"),
     ],
 )
@@ -430,7 +500,9 @@ def test_unusable_recordings(text: str, message: str, setup: Setup, tmp_path: Pa
 def test_misspelled_output_is_not_ignored(setup: Setup, tmp_path: Path) -> None:
     """Half of the data would be lost."""
     path = tmp_path / "lab.csv"
-    path.write_text("t,ctrl:force,qpos:slide,qpos:hing\n0,1,1,3\n0.01,1,1,3\n0.02,1,1,3\n", encoding="utf-8")
+    path.write_text(
+        "t,ctrl:force,qpos:slide,qpos:hing\n0,1,1,3\n0.01,1,1,3\n0.02,1,1,3\n", encoding="utf-8"
+    )
     with pytest.raises(RecordingError, match=r"'qpos:hing'.*'qpos:hinge'"):
         logs.read_recording(path, setup)
 
@@ -473,8 +545,13 @@ def arrays(model: mujoco.MjModel) -> dict[str, Array]:
 def changes(new: mujoco.MjModel, old: mujoco.MjModel) -> dict[str, list[tuple[int, ...]]]:
     """Indices at which two models of one structure differ by more than the six digits that MuJoCo prints."""
     left, right = arrays(new), arrays(old)
-    assert {name: value.shape for name, value in left.items()} == {name: value.shape for name, value in right.items()}
-    far = {n: np.argwhere(~np.isclose(left[n], right[n], rtol=1e-5, atol=1e-6 * (n != "opt"))) for n in left}
+    assert {name: value.shape for name, value in left.items()} == {
+        name: value.shape for name, value in right.items()
+    }
+    far = {
+        n: np.argwhere(~np.isclose(left[n], right[n], rtol=1e-5, atol=1e-6 * (n != "opt")))
+        for n in left
+    }
     return {name: [tuple(map(int, row)) for row in rows] for name, rows in far.items() if len(rows)}
 
 
@@ -483,14 +560,21 @@ def load(path: Path) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(path))
 
 
-def test_identified_model_differs_in_the_identified_values_only(setup: Setup, tmp_path: Path) -> None:
+def test_identified_model_differs_in_the_identified_values_only(
+    setup: Setup, tmp_path: Path
+) -> None:
     """Entry by entry over the whole MjModel."""
     path = tmp_path / "deep" / "identified.xml"
     write_identified(path, setup, VALUES)
     found = changes(load(path), setup.model)
     assert {name: rows for name, rows in found.items() if name not in DERIVED} == IDENTIFIED
     model = load(path)
-    written = [model.body_mass[3], model.body_pos[3, 2], model.dof_damping[1], 2 * model.geom_size[2, 1]]
+    written = [
+        model.body_mass[3],
+        model.body_pos[3, 2],
+        model.dof_damping[1],
+        2 * model.geom_size[2, 1],
+    ]
     assert written == pytest.approx([VALUES[0], VALUES[1], VALUES[2], VALUES[1]], rel=1e-5)
 
 
@@ -539,7 +623,12 @@ MESH_MODEL = """
 )
 @pytest.mark.parametrize("target", ["body/arm:mass", "joint/j:damping"])
 def test_meshes_are_found_from_another_folder(
-    meshdir: str, place: str, file: str, target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    meshdir: str,
+    place: str,
+    file: str,
+    target: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """identified.xml lies elsewhere, the experiment was named by a relative path."""
     for name in ("model", place):
@@ -587,7 +676,9 @@ def test_estimate_summary(setup: Setup, recording: Recording) -> None:
     """Keys of estimate.json, in standard JSON."""
     estimate = mjfim.identify(setup, [recording])
     data = strict_json(archive.as_json(archive.estimate_summary(estimate, setup)))
-    assert {"theta", "std", "covariance", "chi2", "dof", "status", "residual_rms", "misfit"} <= set(data)
+    assert {"theta", "std", "covariance", "chi2", "dof", "status", "residual_rms", "misfit"} <= set(
+        data
+    )
     assert np.array_equal(data["theta"], estimate.theta)
     assert np.array(data["covariance"]).shape == (P, P)
     assert np.sqrt(np.diag(data["covariance"])) == pytest.approx(data["std"], rel=1e-6)
@@ -600,7 +691,9 @@ def test_estimate_summary(setup: Setup, recording: Recording) -> None:
 def test_study_summary(setup: Setup, design: Design) -> None:
     """Keys of montecarlo.json, for each trajectory."""
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    data = strict_json(archive.as_json(archive.study_summary(mjfim.monte_carlo(setup, curves, trials=4))))
+    data = strict_json(
+        archive.as_json(archive.study_summary(mjfim.monte_carlo(setup, curves, trials=4)))
+    )
     for name in curves:
         assert {"mean", "covariance", "crlb", "efficiency", "trials", "failed"} <= set(data[name])
         assert (data[name]["trials"], np.array(data[name]["crlb"]).shape) == (4, (P, P))

@@ -72,21 +72,45 @@ RICH = """<?xml version="1.0"?>
 
 # path -> (value, how a line then reads)
 SAID: dict[str, tuple[float, str]] = {
-    "body/a:mass": (1.7, '      <inertial pos="0.010 0 0.20" mass="1.7" diaginertia="0.060 0.0660 0.030"/>'),
+    "body/a:mass": (
+        1.7,
+        '      <inertial pos="0.010 0 0.20" mass="1.7" diaginertia="0.060 0.0660 0.030"/>',
+    ),
     'body/b "2":mass': (2.5, ' mass="2.5" '),
     "body/a:pos[1]": (0.3, '    <body name="a" pos="0.10 0.3 1.00" euler="0 0 30">'),
-    "body/a:ipos[2]": (0.25, '      <inertial pos="0.010 0 0.25" mass="1.50" diaginertia="0.060 0.0660 0.030"/>'),
+    "body/a:ipos[2]": (
+        0.25,
+        '      <inertial pos="0.010 0 0.25" mass="1.50" diaginertia="0.060 0.0660 0.030"/>',
+    ),
     "body/a:rot[0]": (0.2, '    <body name="a" pos="0.10 0 1.00" quat="0.9'),
-    "body/a:inertia[1]": (0.07, '      <inertial pos="0.010 0 0.20" mass="1.50" diaginertia="0.060 0.07 0.030"/>'),
+    "body/a:inertia[1]": (
+        0.07,
+        '      <inertial pos="0.010 0 0.20" mass="1.50" diaginertia="0.060 0.07 0.030"/>',
+    ),
     "body/c:inertia[1]": (0.13, '      <inertial pos="0 0 0" mass="1" diaginertia="0.1371'),
     "body/c:fullinertia[3]": (0.013, '1" fullinertia="0.10 0.120 0.11 0.013'),
-    "body/a:fullinertia[3]": (0.004, '      <inertial pos="0.010 0 0.20" mass="1.50" fullinertia="0.06'),
+    "body/a:fullinertia[3]": (
+        0.004,
+        '      <inertial pos="0.010 0 0.20" mass="1.50" fullinertia="0.06',
+    ),
     "body/a:firstmoment[2]": (0.31, '      <inertial pos="0.010 0 0.2066'),
-    "body/a:origininertia[1]": (0.13, '      <inertial pos="0.010 0 0.20" mass="1.50" diaginertia="0.060 0.0698'),
-    "body/a:logcholesky[0]": (0.25, '      <inertial pos="0.010 0 0.20" mass="1.6487212707001282" diaginertia="'),
+    "body/a:origininertia[1]": (
+        0.13,
+        '      <inertial pos="0.010 0 0.20" mass="1.50" diaginertia="0.060 0.0698',
+    ),
+    "body/a:logcholesky[0]": (
+        0.25,
+        '      <inertial pos="0.010 0 0.20" mass="1.6487212707001282" diaginertia="',
+    ),
     "body/a:gravcomp": (0.4, '    <body name="a" pos="0.10 0 1.00" euler="0 0 30" gravcomp="0.4">'),
-    "joint/j:damping": (0.7, '      <joint name="j" axis="0 1 0" springref="20" stiffness="2.0" damping="0.7"/>'),
-    "joint/k:damping": (0.7, """<joint name='k' axis="1 0 0" damping="0.7 0.020" frictionloss="0.05"/>"""),
+    "joint/j:damping": (
+        0.7,
+        '      <joint name="j" axis="0 1 0" springref="20" stiffness="2.0" damping="0.7"/>',
+    ),
+    "joint/k:damping": (
+        0.7,
+        """<joint name='k' axis="1 0 0" damping="0.7 0.020" frictionloss="0.05"/>""",
+    ),
     "joint/j:frictionloss": (0.1 + 0.2, 'stiffness="2.0" frictionloss="0.30000000000000004"/>'),
     "joint/j:armature": (0.03, 'stiffness="2.0" armature="0.03"/>'),
     "joint/j:stiffness": (2.2, 'springref="20" stiffness="2.2"/>'),
@@ -122,38 +146,68 @@ SAID: dict[str, tuple[float, str]] = {
     "option:density": (1.2, '            wind="1 0 0" density="1.2"/>   <!-- two lines -->'),
     "option:viscosity": (1e-5, 'viscosity="1e-05"/>   <!-- two lines -->'),
 }
-OUTSIDE = ("initial/j:qpos", "initial/j:qvel", "initial/g:act", "output/seen[0]:bias", "output:delay")
+OUTSIDE = (
+    "initial/j:qpos",
+    "initial/j:qvel",
+    "initial/g:act",
+    "output/seen[0]:bias",
+    "output:delay",
+)
 
 
 def setup_of(xml: str | Path, folder: Path, *targets: Any, **tables: Any) -> Setup:
     """An experiment whose parameters p0, p1 ... are the targets: paths, or tables."""
-    given = {f"p{i}": {"target": t, "scale": 1.0} if isinstance(t, str) else t for i, t in enumerate(targets)}
-    return make_setup(xml, folder, rate=500.0, horizon=0.1, parameters=given, **{"noise": {"state": 0.1}, **tables})
+    given = {
+        f"p{i}": {"target": t, "scale": 1.0} if isinstance(t, str) else t
+        for i, t in enumerate(targets)
+    }
+    return make_setup(
+        xml,
+        folder,
+        rate=500.0,
+        horizon=0.1,
+        parameters=given,
+        **{"noise": {"state": 0.1}, **tables},
+    )
 
 
 def lines(old: Path, new: Path) -> tuple[list[str], list[str]]:
     """Lines taken out and put in."""
     texts = [path.read_text(encoding="utf-8").splitlines() for path in (old, new)]
     found = [line for line in difflib.ndiff(*texts) if line[0] in "-+"]
-    return [line[2:] for line in found if line[0] == "-"], [line[2:] for line in found if line[0] == "+"]
+    return [line[2:] for line in found if line[0] == "-"], [
+        line[2:] for line in found if line[0] == "+"
+    ]
 
 
 def assert_one_model(path: Path, setup: Setup, theta: Any) -> None:
     """The file loads as the identified model, to 1e-12 of each array's largest number."""
-    found, wanted = mujoco.MjModel.from_xml_path(str(path)), setup.model_at(np.asarray(theta, float), placed=False)
+    found, wanted = (
+        mujoco.MjModel.from_xml_path(str(path)),
+        setup.model_at(np.asarray(theta, float), placed=False),
+    )
     for name in dir(found):
-        if not name.startswith((*COMPARED, "opt", "eq_", "sensor_")) or name.startswith((*NOT_DYNAMICS, "opt")):
+        if not name.startswith((*COMPARED, "opt", "eq_", "sensor_")) or name.startswith(
+            (*NOT_DYNAMICS, "opt")
+        ):
             continue
         a, b = np.asarray(getattr(found, name)), np.asarray(getattr(wanted, name))
         if name == "body_invweight0":  # MuJoCo averages it otherwise where a body is 'simple'
             alike = (found.body_simple > 0) == (wanted.body_simple > 0)
             a, b = a[alike], b[alike]
         assert a.shape == b.shape, name
-        np.testing.assert_allclose(a, b, rtol=PRECISE, atol=PRECISE * np.abs(b).max(initial=0.0), err_msg=name)
+        np.testing.assert_allclose(
+            a, b, rtol=PRECISE, atol=PRECISE * np.abs(b).max(initial=0.0), err_msg=name
+        )
     for name in ("gravity", "wind", "density", "viscosity", "timestep"):
-        np.testing.assert_allclose(getattr(found.opt, name), getattr(wanted.opt, name), rtol=1e-15, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(found.opt, name), getattr(wanted.opt, name), rtol=1e-15, err_msg=name
+        )
     for b in range(found.nbody):
-        R, S = (Rotation.from_quat(m.body_iquat[b], scalar_first=True).as_matrix() for m in (found, wanted))
+        R, S = (
+            Rotation.from_quat(m.body_iquat[b], scalar_first=True).as_matrix()
+            for m in (found, wanted)
+        )
         mine, theirs = R * found.body_inertia[b] @ R.T, S * wanted.body_inertia[b] @ S.T
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=PRECISE * np.trace(theirs))
 
@@ -161,7 +215,9 @@ def assert_one_model(path: Path, setup: Setup, theta: Any) -> None:
 @pytest.mark.parametrize("path", SAID)
 def test_one_value_changes_one_element(path: str, tmp_path: Path) -> None:
     value, line = SAID[path]
-    target: Any = {"target": path, "guess": 1.0, "scale": 1.0} if path.endswith(("mass", "density")) else path
+    target: Any = (
+        {"target": path, "guess": 1.0, "scale": 1.0} if path.endswith(("mass", "density")) else path
+    )
     setup = setup_of(RICH, tmp_path, target)
     new = tmp_path / "identified.xml"
     assert write_identified(new, setup, np.array([value])) is None
@@ -172,7 +228,10 @@ def test_one_value_changes_one_element(path: str, tmp_path: Path) -> None:
 
 
 def test_every_field_is_tried() -> None:
-    tried = {(p.split("/")[0].split(":")[0], re.split(r"[:\[]", p.rsplit(":", 1)[1])[0]) for p in (*SAID, *OUTSIDE)}
+    tried = {
+        (p.split("/")[0].split(":")[0], re.split(r"[:\[]", p.rsplit(":", 1)[1])[0])
+        for p in (*SAID, *OUTSIDE)
+    }
     every = {(kind, field) for kind in KINDS for field in fields_of(kind)}
     assert tried == every
 
@@ -185,7 +244,9 @@ def test_what_is_not_in_the_model_changes_nothing(tmp_path: Path) -> None:
 
 # no values of geoms here: the compiled model does not hold a mass, and a body takes one chart of its inertia
 STILL = [
-    p for p in SAID if not p.startswith(("geom/h:mass", "geom/i:density")) and not re.match(r"body/[ac]:(?!pos)", p)
+    p
+    for p in SAID
+    if not p.startswith(("geom/h:mass", "geom/i:density")) and not re.match(r"body/[ac]:(?!pos)", p)
 ]
 STILL = [p for p in STILL if p not in ("actuator/g:biasprm[2]", "tendon/link:springlength[1]")]
 
@@ -200,7 +261,9 @@ STILL = [p for p in STILL if p not in ("actuator/g:biasprm[2]", "tendon/link:spr
     ],
     ids=["moments", "matrix", "barycentric", "logcholesky"],
 )
-def test_without_a_change_the_file_is_the_same_to_the_byte(more: tuple[str, ...], tmp_path: Path) -> None:
+def test_without_a_change_the_file_is_the_same_to_the_byte(
+    more: tuple[str, ...], tmp_path: Path
+) -> None:
     setup = setup_of(RICH, tmp_path, *(p for p in STILL if p != 'body/b "2":mass'), *more)
     assert write_identified(tmp_path / "identified.xml", setup, setup.parameters.guess) is None
     assert (tmp_path / "identified.xml").read_bytes() == (tmp_path / "model.xml").read_bytes()
@@ -208,20 +271,28 @@ def test_without_a_change_the_file_is_the_same_to_the_byte(more: tuple[str, ...]
 
 def test_an_identified_file_is_a_model_that_repeats_itself(tmp_path: Path) -> None:
     """What was written is read as it was meant: as the next experiment's model it changes no more."""
-    paths = [p for p in STILL if p != 'body/b "2":mass'] + ["body/a:firstmoment[0]", "body/c:fullinertia[3]"]
+    paths = [p for p in STILL if p != 'body/b "2":mass'] + [
+        "body/a:firstmoment[0]",
+        "body/c:fullinertia[3]",
+    ]
     first = setup_of(RICH, tmp_path, *paths)
     theta = first.parameters.guess * 1.013 + 1e-3 / 3
     assert write_identified(tmp_path / "identified.xml", first, theta) is None
     second = setup_of(tmp_path / "identified.xml", tmp_path, *paths)
     turned = np.array([":rot" in p for p in paths])
-    np.testing.assert_allclose(second.parameters.guess[~turned], theta[~turned], rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(
+        second.parameters.guess[~turned], theta[~turned], rtol=1e-12, atol=1e-13
+    )
     assert write_identified(tmp_path / "again.xml", second, second.parameters.guess) is None
     assert (tmp_path / "again.xml").read_bytes() == (tmp_path / "identified.xml").read_bytes()
 
 
 def test_scale_and_offset_reach_every_target(tmp_path: Path) -> None:
     both = {
-        "targets": [{"path": "joint/j:damping"}, {"path": "joint/k:damping", "scale": 2.0, "offset": 0.25}],
+        "targets": [
+            {"path": "joint/j:damping"},
+            {"path": "joint/k:damping", "scale": 2.0, "offset": 0.25},
+        ],
         "guess": 0.3,
     }
     setup = setup_of(RICH, tmp_path, both)
@@ -243,19 +314,30 @@ def test_line_ends_and_byte_order_marks_stay(ending: str, head: str, tmp_path: P
     assert found.startswith(head) and found.count(ending) == text.count(ending) + 1
     at = re.search(r'<body name="b[^>]*>(\s+)<inertial [^>]*/>(\s+)<joint', found)
     assert at is not None and at[1] == at[2] == f"{ending}        "
-    again = re.sub(r"\s+<inertial [^>]*mass=\"2.0\"[^>]*/>", "", found.replace('loss="0.25"', 'loss="0.05"'))
+    again = re.sub(
+        r"\s+<inertial [^>]*mass=\"2.0\"[^>]*/>", "", found.replace('loss="0.25"', 'loss="0.05"')
+    )
     assert again == head + text
 
 
 def test_empty_elements_without_spaces(tmp_path: Path) -> None:
     """A motor that ends where its section does is renamed once, an open one twice."""
-    xml = re.sub(r"<actuator>.*</actuator>", '<actuator><motor name="m" joint="j"{}</actuator>', RICH, flags=re.DOTALL)
-    for i, (end, wanted) in enumerate((("/>", ' gainprm="2.0"/>'), ("></motor >", ' gainprm="2.0"></general >'))):
+    xml = re.sub(
+        r"<actuator>.*</actuator>",
+        '<actuator><motor name="m" joint="j"{}</actuator>',
+        RICH,
+        flags=re.DOTALL,
+    )
+    for i, (end, wanted) in enumerate(
+        (("/>", ' gainprm="2.0"/>'), ("></motor >", ' gainprm="2.0"></general >'))
+    ):
         (tmp_path / str(i)).mkdir()
         setup = setup_of(xml.replace('"j"{}', f'"j"{end}'), tmp_path / str(i), "actuator/m:gainprm")
         new = tmp_path / str(i) / "identified.xml"
         assert write_identified(new, setup, np.array([2.0])) is None
-        assert f'<actuator><general name="m" joint="j"{wanted}</actuator>' in new.read_text(encoding="utf-8")
+        assert f'<actuator><general name="m" joint="j"{wanted}</actuator>' in new.read_text(
+            encoding="utf-8"
+        )
 
 
 ENTITIES = '<!DOCTYPE mujoco [<!ENTITY a "0.3"><!ENTITY b "&a;&a;&a;">]>\n'
@@ -273,12 +355,18 @@ def test_a_doctype_is_not_followed(tmp_path: Path) -> None:
     setup = setup_of("<!DOCTYPE mujoco>\n" + RICH.split("?>\n", 1)[1], tmp_path, "joint/j:damping")
     said = write_identified(tmp_path / "identified.xml", setup, np.array([0.7]))
     assert said is not None and "MuJoCo's own printing" in said and "DOCTYPE" in said
-    assert mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")).joint("j").damping[0] == 0.7
+    assert (
+        mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")).joint("j").damping[0] == 0.7
+    )
 
 
 # what the text cannot say: change of the model, path, words of the reason
 BEYOND = {
-    "frame": (('<body name="c" pos="1 0 0">', '<frame euler="0 0 9"><body name="c">'), "body/c:pos[0]", "<frame>"),
+    "frame": (
+        ('<body name="c" pos="1 0 0">', '<frame euler="0 0 9"><body name="c">'),
+        "body/c:pos[0]",
+        "<frame>",
+    ),
     "replicate": (
         (
             "</worldbody>",
@@ -289,7 +377,10 @@ BEYOND = {
         "<replicate>",
     ),
     "half a muscle": (
-        ("</actuator>", '<muscle name="x" joint="j" force="5" lengthrange="0 1" ctrlrange="0 1"/></actuator>'),
+        (
+            "</actuator>",
+            '<muscle name="x" joint="j" force="5" lengthrange="0 1" ctrlrange="0 1"/></actuator>',
+        ),
         "actuator/x:gainprm[2]",
         r"<muscle> has no attribute that says biasprm\[2\]|gainprm\[2\]",
     ),
@@ -306,9 +397,14 @@ def test_what_the_text_cannot_say_mujoco_prints(case: str, tmp_path: Path) -> No
     said = write_identified(tmp_path / "identified.xml", setup, np.array([0.6]))
     assert said is not None and said.startswith("identified.xml: it is MuJoCo's own printing")
     assert re.search(reason, said)
-    found, wanted = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")), setup.model_at(np.array([0.6]))
+    found, wanted = (
+        mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")),
+        setup.model_at(np.array([0.6])),
+    )
     for name in ("dof_damping", "body_pos", "actuator_gainprm", "body_mass"):
-        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(wanted, name), rtol=1e-5, atol=1e-6
+        )
 
 
 def stiffen(spec: Any, value: float) -> None:
@@ -329,7 +425,10 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
     part = '<mujocoinclude><body name="d" pos="3 0 0"><joint name="dj"/><geom size=".1"/></body></mujocoinclude>'
     (tmp_path / "parts" / "d.xml").write_text(part, encoding="utf-8")
     source = tmp_path / "model.xml"
-    source.write_text(RICH.replace("  </worldbody>", '<include file="parts/d.xml"/></worldbody>'), encoding="utf-8")
+    source.write_text(
+        RICH.replace("  </worldbody>", '<include file="parts/d.xml"/></worldbody>'),
+        encoding="utf-8",
+    )
     setup = setup_of(source, tmp_path, "joint/j:damping")
     new = tmp_path / "out" / "deep" / "identified.xml"
     assert write_identified(new, setup, np.array([0.7])) is None
@@ -345,11 +444,11 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
 
 def test_attached_models_are_printed_by_mujoco(tmp_path: Path) -> None:
     """Its elements stand in another file; from another folder that file would not be found by the text either."""
-    part = (
-        '<mujoco model="leg"><worldbody><body name="d"><joint name="dj"/><geom size=".1"/></body></worldbody></mujoco>'
-    )
+    part = '<mujoco model="leg"><worldbody><body name="d"><joint name="dj"/><geom size=".1"/></body></worldbody></mujoco>'
     (tmp_path / "leg.xml").write_text(part, encoding="utf-8")
-    xml = RICH.replace("  <worldbody>", '  <asset><model name="leg" file="leg.xml"/></asset>\n  <worldbody>')
+    xml = RICH.replace(
+        "  <worldbody>", '  <asset><model name="leg" file="leg.xml"/></asset>\n  <worldbody>'
+    )
     xml = xml.replace("  </worldbody>", '<attach model="leg" body="d" prefix="x_"/></worldbody>')
     for path, folder, reason in (
         ("joint/x_dj:damping", "", "joint 'x_dj' does not stand in the MJCF itself"),
@@ -369,18 +468,28 @@ MESH = "v 0 0 0\nv 0.2 0 0\nv 0 0.3 0\nv 0 0 0.4\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2
     ("compiler", "line"),
     [
         ("", '  <compiler assetdir="../model"/>'),
-        ("<compiler autolimits='true'/>", """  <compiler autolimits='true' assetdir="../model"/>"""),
-        ("<compiler meshdir='sub/' texturedir='none'/>", "  <compiler meshdir='../model/sub' texturedir='none'/>"),
+        (
+            "<compiler autolimits='true'/>",
+            """  <compiler autolimits='true' assetdir="../model"/>""",
+        ),
+        (
+            "<compiler meshdir='sub/' texturedir='none'/>",
+            "  <compiler meshdir='../model/sub' texturedir='none'/>",
+        ),
         ("<compiler assetdir='sub'/>", "  <compiler assetdir='../model/sub'/>"),
     ],
 )
-def test_asset_folders_change_only_where_files_are_read_from_them(compiler: str, line: str, tmp_path: Path) -> None:
+def test_asset_folders_change_only_where_files_are_read_from_them(
+    compiler: str, line: str, tmp_path: Path
+) -> None:
     for folder in ("model", "model/sub"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "t.obj").write_text(MESH, encoding="utf-8")
     assets = '<asset><mesh name="t" file="t.obj"/></asset>'
     xml = RICH.replace("  <default>\n", f"  {compiler}\n  {assets}\n  <default>\n", 1)
-    xml = xml.replace('type="sphere" size="0.10" density="300"', 'type="mesh" mesh="t" density="300"')
+    xml = xml.replace(
+        'type="sphere" size="0.10" density="300"', 'type="mesh" mesh="t" density="300"'
+    )
     setup = setup_of(xml, tmp_path / "model", "geom/i:pos[1]")
     beside, away = tmp_path / "model" / "identified.xml", tmp_path / "out" / "identified.xml"
     theta = setup.parameters.guess + 0.01
@@ -391,7 +500,9 @@ def test_asset_folders_change_only_where_files_are_read_from_them(compiler: str,
         assert (line in came) == (path is away)
         assert_one_model(path, setup, theta)
     plain = setup_of(
-        RICH.replace("  <default>\n", f"  {compiler}\n  <default>\n", 1), tmp_path / "model", "joint/j:damping"
+        RICH.replace("  <default>\n", f"  {compiler}\n  <default>\n", 1),
+        tmp_path / "model",
+        "joint/j:damping",
     )
     assert write_identified(away, plain, np.array([0.7])) is None
     assert len(lines(tmp_path / "model" / "model.xml", away)[1]) == 1
@@ -399,9 +510,24 @@ def test_asset_folders_change_only_where_files_are_read_from_them(compiler: str,
 
 # what the compiler would derive anew: (old, new), path, value, what is stated besides
 DERIVED = {
-    "damping ratio": (('kp="12.0" kv="0.60"', 'kp="12.0" dampratio="1"'), 'body/b "2":mass', 2.0, "actuator 'p'"),
-    "own damping ratio": (('class="servo"/>', 'dampratio="1.0" kp="7"/>'), "actuator/p:kp", 9.0, "actuator 'p'"),
-    "spring by time constant": (('stiffness="2.0"', 'springdamper=".3 1"'), "body/a:mass", 2.0, "joint 'j'"),
+    "damping ratio": (
+        ('kp="12.0" kv="0.60"', 'kp="12.0" dampratio="1"'),
+        'body/b "2":mass',
+        2.0,
+        "actuator 'p'",
+    ),
+    "own damping ratio": (
+        ('class="servo"/>', 'dampratio="1.0" kp="7"/>'),
+        "actuator/p:kp",
+        9.0,
+        "actuator 'p'",
+    ),
+    "spring by time constant": (
+        ('stiffness="2.0"', 'springdamper=".3 1"'),
+        "body/a:mass",
+        2.0,
+        "joint 'j'",
+    ),
     "rest length": ((' springlength="0.20 0.90"', ""), "site/t:pos[2]", 0.4, "tendon 'band'"),
 }
 
@@ -412,7 +538,10 @@ def test_what_the_compiler_would_derive_anew_is_stated(case: str, tmp_path: Path
     assert old in RICH
     setup = setup_of(RICH.replace(old, new), tmp_path, path)
     said = write_identified(tmp_path / "identified.xml", setup, np.array([value]))
-    assert said == f"identified.xml: it also states what MuJoCo would derive anew from the identified values: {stated}"
+    assert (
+        said
+        == f"identified.xml: it also states what MuJoCo would derive anew from the identified values: {stated}"
+    )
     assert "größer als ASCII" in (tmp_path / "identified.xml").read_text(encoding="utf-8")
     assert_one_model(tmp_path / "identified.xml", setup, [value])
 
@@ -434,7 +563,10 @@ def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: 
     xml = RICH.replace("</sensor>", watch).replace('mass="1.50"', f'mass="1.50"{turned}')
     setup = setup_of(xml, tmp_path, "body/a:fullinertia[3]")
     assert write_identified(tmp_path / "identified.xml", setup, np.array([0.004])) is None
-    found, wanted = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")), setup.model_at(np.array([0.004]))
+    found, wanted = (
+        mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")),
+        setup.model_at(np.array([0.004])),
+    )
     np.testing.assert_allclose(found.body_iquat, wanted.body_iquat, rtol=0, atol=1e-15)
     np.testing.assert_allclose(found.body_inertia, wanted.body_inertia, rtol=1e-14)
 
@@ -442,9 +574,11 @@ def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: 
 @pytest.mark.parametrize("element", SHORTCUTS)
 def test_shortcuts_fill_the_places_that_mujoco_fills(element: str) -> None:
     """One attribute after the other against MuJoCo's own reading."""
-    needs = {"intvelocity": 'actrange="-1 1"', "damper": 'ctrlrange="0 1"', "muscle": 'lengthrange="0 1"'}.get(
-        element, ""
-    )
+    needs = {
+        "intvelocity": 'actrange="-1 1"',
+        "damper": 'ctrlrange="0 1"',
+        "muscle": 'lengthrange="0 1"',
+    }.get(element, "")
     joint = 'body="b" ctrlrange="0 1"' if element == "adhesion" else 'joint="j"'
     for attribute, numbers in SHORTCUTS[element].items():
         values = [1.7 if attribute == "lmax" else 0.7 + 0.2 * i for i in range(len(numbers))]
@@ -455,13 +589,19 @@ def test_shortcuts_fill_the_places_that_mujoco_fills(element: str) -> None:
         )
         for value, number in zip(values, numbers, strict=True):
             for array, column, factor in number:
-                assert getattr(model, f"actuator_{array}")[0, column] == factor * value, (attribute, array, column)
+                assert getattr(model, f"actuator_{array}")[0, column] == factor * value, (
+                    attribute,
+                    array,
+                    column,
+                )
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in MODELS.glob("*.toml")))
 def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
     setup = Setup(mjfim.Experiment.from_file(MODELS / f"{name}.toml"))
-    theta = setup.parameters.guess * (1.0 + 0.004 * np.random.default_rng(1).uniform(-1.0, 1.0, len(setup.parameters)))
+    theta = setup.parameters.guess * (
+        1.0 + 0.004 * np.random.default_rng(1).uniform(-1.0, 1.0, len(setup.parameters))
+    )
     said = write_identified(tmp_path / "identified.xml", setup, theta)
     assert (said is None) == (name != "sliding_block"), said
     assert said is None or "body_invweight0" in said
@@ -478,7 +618,9 @@ def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
 def test_models_of_others(name: str, tmp_path: Path) -> None:
     shared_model(EXPERIMENTS[name]["model"])
     setup = Setup(mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED, source=name))
-    theta = setup.parameters.guess * (1.0 + 0.03 * np.random.default_rng(1).uniform(-1.0, 1.0, len(setup.parameters)))
+    theta = setup.parameters.guess * (
+        1.0 + 0.03 * np.random.default_rng(1).uniform(-1.0, 1.0, len(setup.parameters))
+    )
     said = write_identified(tmp_path / "identified.xml", setup, theta)
     if name == "so_arm100":  # its servos have damping ratios
         assert said is not None and "it also states" in said and "printing" not in said

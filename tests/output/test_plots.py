@@ -51,7 +51,9 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
     waves = size * np.sin(np.outer(t, 1.0 + np.arange(dofs)))
     control = np.asarray(size * np.cos(t[:-1, None]), dtype=np.float64)
     curve = Trajectory(t, waves, np.gradient(waves, t, axis=0), np.zeros((51, 0)), control)
-    psi = size * np.sin(np.multiply.outer(t, 1.0 + np.arange(2 * dofs * count))).reshape(51, 2 * dofs, count)
+    psi = size * np.sin(np.multiply.outer(t, 1.0 + np.arange(2 * dofs * count))).reshape(
+        51, 2 * dofs, count
+    )
     eigenvalues = np.asarray(size**2 * (1.0 + np.arange(count)), dtype=np.float64)
     std = 0.1 / size / np.sqrt(1.0 + np.arange(count))
     smallest = np.asarray(size**2 * t / 2.0, dtype=np.float64)
@@ -71,7 +73,10 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
 
 def make_design(dofs: int = 2, count: int = 3) -> Design:
     """Ten iterations from a small to a large motion."""
-    rows = tuple(HistoryRow(i, 2.0**-i, 2.0**-i, 2.0**i, -(4.0**-i), 1.0, 0.1 * i, 100 * i) for i in range(10))
+    rows = tuple(
+        HistoryRow(i, 2.0**-i, 2.0**-i, 2.0**i, -(4.0**-i), 1.0, 0.1 * i, 100 * i)
+        for i in range(10)
+    )
     return Design(
         status=Status.CONVERGED,
         parameters=tuple(f"p{j}" for j in range(count)),
@@ -98,7 +103,10 @@ def make_trials(theta: Array, std: float, failed: int, seed: int, trials: int = 
 def make_study(count: int = 3, failed: int = 5) -> Study:
     """Two sets, the second fifty times tighter."""
     theta = np.linspace(1.0, 2.0, count)
-    sets = {"initial": make_trials(theta, 0.2, failed, 0), "final": make_trials(theta, 0.004, failed, 1)}
+    sets = {
+        "initial": make_trials(theta, 0.2, failed, 0),
+        "final": make_trials(theta, 0.004, failed, 1),
+    }
     information = {name: np.diag(1.0 / np.diagonal(trials.crlb)) for name, trials in sets.items()}
     return Study(tuple(f"p{j}" for j in range(count)), theta, 25.0, sets, information)
 
@@ -109,7 +117,9 @@ def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estima
     predicted = np.sin(np.outer(t, 1.0 + np.arange(dofs)))
     measured = predicted + 0.05 * np.random.default_rng(2).normal(size=predicted.shape)
     measured[10:20, 0] = np.nan
-    recording = Recording(t, np.zeros((50, 1)), measured, tuple(f"qpos:joint_{i}" for i in range(dofs)), "swing")
+    recording = Recording(
+        t, np.zeros((50, 1)), measured, tuple(f"qpos:joint_{i}" for i in range(dofs)), "swing"
+    )
     theta = np.linspace(1.0, 2.0, count)
     return Estimate(
         parameters=tuple(f"p{j}" for j in range(count)),
@@ -163,7 +173,9 @@ FIGURES: dict[str, Draw] = {
     "convergence": lambda n, p: plots.convergence(make_design(n, p)),
     "std_bars": lambda n, p: plots.std_bars(make_design(n, p), make_labels(n, p)),
     "fit": lambda n, p: plots.fit(make_estimate(n, p), 0, make_labels(n, p), np.full(n, 0.05)),
-    "parameter_intervals": lambda n, p: plots.parameter_intervals(make_estimate(n, p), make_labels(n, p)),
+    "parameter_intervals": lambda n, p: plots.parameter_intervals(
+        make_estimate(n, p), make_labels(n, p)
+    ),
 }
 TABLES: dict[str, Draw] = {
     "design_table": lambda n, p: plots.design_table(make_design(n, p), make_labels(n, p)),
@@ -173,9 +185,13 @@ TABLES: dict[str, Draw] = {
 
 @pytest.mark.parametrize("name", FIGURES)
 @pytest.mark.parametrize(("dofs", "count"), SIZES)
-def test_figure_has_units_legend_and_pixels(name: str, dofs: int, count: int, tmp_path: Path) -> None:
+def test_figure_has_units_legend_and_pixels(
+    name: str, dofs: int, count: int, tmp_path: Path
+) -> None:
     figure = FIGURES[name](dofs, count)
-    axis_labels = [label for axes in figure.axes for label in (axes.get_xlabel(), axes.get_ylabel()) if label]
+    axis_labels = [
+        label for axes in figure.axes for label in (axes.get_xlabel(), axes.get_ylabel()) if label
+    ]
     assert axis_labels
     assert all(re.search(r"\[.+\]", label, re.DOTALL) for label in axis_labels)
     assert len(figure.legends) == 1 and figure.legends[0].get_texts()
@@ -184,7 +200,9 @@ def test_figure_has_units_legend_and_pixels(name: str, dofs: int, count: int, tm
 
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize(("dofs", "count"), SIZES)
-def test_table_names_every_parameter_and_unit(name: str, dofs: int, count: int, tmp_path: Path) -> None:
+def test_table_names_every_parameter_and_unit(
+    name: str, dofs: int, count: int, tmp_path: Path
+) -> None:
     figure = TABLES[name](dofs, count)
     text = all_text(figure)
     labels = make_labels(dofs, count)
@@ -193,7 +211,9 @@ def test_table_names_every_parameter_and_unit(name: str, dofs: int, count: int, 
     render(figure, tmp_path)
 
 
-@pytest.mark.parametrize("name", [n for n in (*FIGURES, *TABLES) if n not in ("fit", "parameter_intervals")])
+@pytest.mark.parametrize(
+    "name", [n for n in (*FIGURES, *TABLES) if n not in ("fit", "parameter_intervals")]
+)
 def test_both_trajectories_are_drawn_in_their_colours(name: str) -> None:
     assert {INITIAL, OPTIMIZED} <= all_colours((FIGURES | TABLES)[name](2, 3))
 
@@ -256,7 +276,10 @@ def test_histogram_ignores_outliers_in_its_range() -> None:
     study = make_study()
     estimates = study.sets["initial"].estimates.copy()
     estimates[10, 0] = 1e6
-    sets = {**study.sets, "initial": dataclasses.replace(study.sets["initial"], estimates=estimates)}
+    sets = {
+        **study.sets,
+        "initial": dataclasses.replace(study.sets["initial"], estimates=estimates),
+    }
     figure = plots.histogram(dataclasses.replace(study, sets=sets), 0, make_labels(2, 3))
     assert figure.axes[0].get_xlim()[1] < 10.0
     assert "1 outside this range" in all_text(figure)
@@ -264,8 +287,12 @@ def test_histogram_ignores_outliers_in_its_range() -> None:
 
 def test_histogram_without_a_finite_bound(tmp_path: Path) -> None:
     study = make_study()
-    endless = dataclasses.replace(study.sets["initial"], crlb=np.full((3, 3), np.inf), efficiency=np.full(3, np.nan))
-    figure = plots.histogram(dataclasses.replace(study, sets={**study.sets, "initial": endless}), 0, make_labels(2, 3))
+    endless = dataclasses.replace(
+        study.sets["initial"], crlb=np.full((3, 3), np.inf), efficiency=np.full(3, np.nan)
+    )
+    figure = plots.histogram(
+        dataclasses.replace(study, sets={**study.sets, "initial": endless}), 0, make_labels(2, 3)
+    )
     assert "bound ∞" in all_text(figure)
     render(figure, tmp_path)
 
@@ -278,13 +305,18 @@ def test_one_set_is_enough(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("everything", [False, True])
-def test_singular_information_breaks_neither_bars_nor_tables(everything: bool, tmp_path: Path) -> None:
+def test_singular_information_breaks_neither_bars_nor_tables(
+    everything: bool, tmp_path: Path
+) -> None:
     design = make_design()
     std = np.full(3, np.inf) if everything else np.array([np.inf, 0.1, 0.1])
     design = dataclasses.replace(design, initial=dataclasses.replace(design.initial, std=std))
     if everything:
         design = dataclasses.replace(design, final=dataclasses.replace(design.final, std=std))
-    bars, table = plots.std_bars(design, make_labels(2, 3)), plots.design_table(design, make_labels(2, 3))
+    bars, table = (
+        plots.std_bars(design, make_labels(2, 3)),
+        plots.design_table(design, make_labels(2, 3)),
+    )
     assert "∞" in all_text(bars) and "∞" in all_text(table)
     render(bars, tmp_path)
     render(table, tmp_path)
@@ -325,7 +357,9 @@ def test_fit_without_measurements_of_an_output(tmp_path: Path) -> None:
     estimate = make_estimate()
     y = estimate.recordings[0].y.copy()
     y[:, 1] = np.nan
-    estimate = dataclasses.replace(estimate, recordings=(dataclasses.replace(estimate.recordings[0], y=y),))
+    estimate = dataclasses.replace(
+        estimate, recordings=(dataclasses.replace(estimate.recordings[0], y=y),)
+    )
     figure = plots.fit(estimate, 0, make_labels(2, 3), [0.05, 0.05])
     assert "not measured" in all_text(figure)
     render(figure, tmp_path)
@@ -333,11 +367,15 @@ def test_fit_without_measurements_of_an_output(tmp_path: Path) -> None:
 
 def test_unnamed_output_shows_its_column() -> None:
     labels = dataclasses.replace(make_labels(2, 3), outputs={})
-    assert "qpos:joint_0\n[model unit]" in all_text(plots.fit(make_estimate(), 0, labels, [0.05, 0.05]))
+    assert "qpos:joint_0\n[model unit]" in all_text(
+        plots.fit(make_estimate(), 0, labels, [0.05, 0.05])
+    )
 
 
 def test_intervals_flag_bounds_and_misfit() -> None:
-    text = all_text(plots.parameter_intervals(make_estimate(misfit=True), make_labels(2, 3))).replace("\n", " ")
+    text = all_text(
+        plots.parameter_intervals(make_estimate(misfit=True), make_labels(2, 3))
+    ).replace("\n", " ")
     assert text.count("N m s/rad   at its bound") == 1
     assert "kg   at its bound" not in text
     assert "no interval covers what a wrong model does" in text
@@ -345,7 +383,9 @@ def test_intervals_flag_bounds_and_misfit() -> None:
 
 def test_intervals_with_infinite_std(tmp_path: Path) -> None:
     for std in ([np.inf, 0.1, 0.1], [np.inf] * 3):
-        figure = plots.parameter_intervals(dataclasses.replace(make_estimate(), std=np.array(std)), make_labels(2, 3))
+        figure = plots.parameter_intervals(
+            dataclasses.replace(make_estimate(), std=np.array(std)), make_labels(2, 3)
+        )
         assert "± ∞" in all_text(figure)
         render(figure, tmp_path)
 
@@ -398,7 +438,11 @@ def test_only_the_plot_modules_import_matplotlib() -> None:
     own = Path(plots.__file__).parent
     others = [p for p in own.parent.rglob("*.py") if own not in p.parents]
     assert others
-    assert [p.name for p in others if re.search(r"^\s*(import|from) matplotlib", p.read_text(), re.MULTILINE)] == []
+    assert [
+        p.name
+        for p in others
+        if re.search(r"^\s*(import|from) matplotlib", p.read_text(), re.MULTILINE)
+    ] == []
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,9 @@ def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Eva
 
 def designed(model: mujoco.MjModel) -> Design:
     """A hand-made design: a gentle and a vigorous control, three iterations."""
-    history = tuple(HistoryRow(k, 2.0 / 4**k, 1.0, 4.0**k, 0.1**k, 0.5, 0.1 * k, 100 * k) for k in range(3))
+    history = tuple(
+        HistoryRow(k, 2.0 / 4**k, 1.0, 4.0**k, 0.1**k, 0.5, 0.1 * k, 100 * k) for k in range(3)
+    )
     return Design(
         status=Status.MAX_ITERATIONS,
         parameters=("mass", "gear/ratio"),
@@ -121,7 +123,10 @@ def designed(model: mujoco.MjModel) -> Design:
         limits={"position": -0.1, "control": 2.0},
         warnings=("the two parameters are nearly confounded",),
         found_by="multisine 2",
-        starts=(StartResult("initial", 9.0, Status.STALLED, 5), StartResult("multisine 2", 0.125, Status.CONVERGED, 3)),
+        starts=(
+            StartResult("initial", 9.0, Status.STALLED, 5),
+            StartResult("multisine 2", 0.125, Status.CONVERGED, 3),
+        ),
     )
 
 
@@ -131,7 +136,9 @@ def estimated(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
     predicted = trajectory.qpos[:, :2]
     y = predicted + 0.01
     y[3, 0] = np.nan
-    recordings = tuple(Recording(trajectory.t, trajectory.ctrl, y, outputs, f"run {k}") for k in range(2))
+    recordings = tuple(
+        Recording(trajectory.t, trajectory.ctrl, y, outputs, f"run {k}") for k in range(2)
+    )
     return Estimate(
         parameters=("mass", "gear/ratio"),
         theta=np.array([2.0, 1.0]),
@@ -156,7 +163,9 @@ def entities(path: Path) -> set[str]:
     return {str(chunk.entity_path) for chunk in RrdReader(path).stream().to_chunks()}
 
 
-def column(path: Path, at: tuple[str, ...], timeline: str | None, component: str) -> tuple[Any, Array]:
+def column(
+    path: Path, at: tuple[str, ...], timeline: str | None, component: str
+) -> tuple[Any, Array]:
     """(times, values) of one component of one entity; timeline None: static."""
     times: list[int] = []
     values: list[Any] = []
@@ -195,15 +204,27 @@ class TestDesign:
     """design.rrd"""
 
     def test_holds_both_robots_and_every_panel(self, file: Path) -> None:
-        expected = [("summary",), ("phase", "gear/ratio", "axes"), ("bars", "log10 cost"), ("history", "step length")]
+        expected = [
+            ("summary",),
+            ("phase", "gear/ratio", "axes"),
+            ("bars", "log10 cost"),
+            ("history", "step length"),
+        ]
         for key in ("initial", "optimized"):
             expected += [
                 ("robots", key, "bodies", "bob"),
                 ("robots", key, "bodies", "bob", "bob"),
                 ("robots", key, "path"),
             ]
-            expected += [("positions", "slide [m]", key), ("velocities", "hinge velocity [rad/s]", key)]
-            expected += [("controls", "force [N]", key), ("information", key), ("phase", "mass", key, "now")]
+            expected += [
+                ("positions", "slide [m]", key),
+                ("velocities", "hinge velocity [rad/s]", key),
+            ]
+            expected += [
+                ("controls", "force [N]", key),
+                ("information", key),
+                ("phase", "mass", key, "now"),
+            ]
         assert {entity(path) for path in expected} <= entities(file)
 
     def test_has_no_warnings_and_one_blueprint(self, file: Path) -> None:
@@ -216,7 +237,9 @@ class TestDesign:
         chunks = reader.stream(store=reader.blueprints()[0]).to_chunks()
         batches = [chunk.to_record_batch() for chunk in chunks]
         name = "ViewBlueprint:space_origin"
-        origins = {v[0] for b in batches if name in b.schema.names for v in b.column(name).to_pylist() if v}
+        origins = {
+            v[0] for b in batches if name in b.schema.names for v in b.column(name).to_pylist() if v
+        }
         logged = entities(file)
         assert len(origins) >= 16
         for origin in origins:
@@ -237,7 +260,9 @@ class TestDesign:
             np.testing.assert_array_equal(times, nanoseconds[: len(expected)])
             np.testing.assert_array_equal(values[:, 0], expected)
 
-    def test_poses_are_those_of_mujoco(self, file: Path, cart: mujoco.MjModel, design: Design) -> None:
+    def test_poses_are_those_of_mujoco(
+        self, file: Path, cart: mujoco.MjModel, design: Design
+    ) -> None:
         data = mujoco.MjData(cart)
         path = ("robots", "optimized", "bodies", "bob")
         times, translation = column(file, path, "sim_time", "Transform3D:translation")
@@ -247,10 +272,14 @@ class TestDesign:
             data.qpos[:] = q
             mujoco.mj_forward(cart, data)
             np.testing.assert_allclose(translation[k, 0], data.body("bob").xpos, atol=1e-6)
-            np.testing.assert_allclose(np.roll(quaternion[k, 0], 1), data.body("bob").xquat, atol=1e-6)
+            np.testing.assert_allclose(
+                np.roll(quaternion[k, 0], 1), data.body("bob").xquat, atol=1e-6
+            )
 
     def test_the_line_is_the_path_of_the_bob(self, file: Path) -> None:
-        _, translation = column(file, ("robots", "initial", "bodies", "bob"), "sim_time", "Transform3D:translation")
+        _, translation = column(
+            file, ("robots", "initial", "bodies", "bob"), "sim_time", "Transform3D:translation"
+        )
         strip = column(file, ("robots", "initial", "path"), None, "LineStrips3D:strips")[1][0, 0]
         np.testing.assert_allclose(strip, translation[:, 0], atol=1e-6)
 
@@ -262,7 +291,9 @@ class TestDesign:
     def test_history_is_on_its_own_timeline_and_as_bars(self, file: Path, design: Design) -> None:
         iterations, cost = column(file, ("history", "log10 cost"), "iteration", "Scalars:scalars")
         assert list(iterations) == [0, 1, 2]
-        np.testing.assert_allclose(cost[:, 0], np.log10([row.cost for row in design.history]), rtol=0, atol=0)
+        np.testing.assert_allclose(
+            cost[:, 0], np.log10([row.cost for row in design.history]), rtol=0, atol=0
+        )
         assert len(column(file, ("bars", "log10 λ_min"), None, "BarChart:values")[1]) == 1
 
     def test_text_says_what_a_reader_needs(self, file: Path) -> None:
@@ -277,7 +308,9 @@ class TestDesign:
     def test_phase_plots_share_one_scale(self, file: Path) -> None:
         peak = {}
         for key in ("initial", "optimized"):
-            values = column(file, ("phase", "mass", key, "now"), "sim_time", "Points2D:positions")[1]
+            values = column(file, ("phase", "mass", key, "now"), "sim_time", "Points2D:positions")[
+                1
+            ]
             peak[key] = np.abs(values[:, 0]).max(axis=0)
         np.testing.assert_allclose(peak["optimized"], [1.5, 1.0], rtol=1e-6)
         np.testing.assert_allclose(peak["initial"], [1.5 / 16, 1.0 / 16], rtol=1e-6)
@@ -323,7 +356,11 @@ class TestAnyModel:
     def test_names_count_degrees_of_freedom(self, name: str, tmp_path: Path) -> None:
         model = load(name)
         names = Labels.of_model(model)
-        assert (len(names.positions), len(names.velocities), len(names.controls)) == (model.nv, model.nv, model.nu)
+        assert (len(names.positions), len(names.velocities), len(names.controls)) == (
+            model.nv,
+            model.nv,
+            model.nu,
+        )
         assert len(set(names.positions)) == model.nv
 
     def test_camera_sees_every_moving_body(self, name: str, tmp_path: Path) -> None:
@@ -352,7 +389,9 @@ class TestShapes:
 
     def geom(self, path: Path, body: str, geom: str, component: str) -> Array:
         """First row of a static component of a geom."""
-        return np.array(column(path, ("robots", "initial", "bodies", body, geom), None, component)[1][0])
+        return np.array(
+            column(path, ("robots", "initial", "bodies", body, geom), None, component)[1][0]
+        )
 
     def test_mesh_keeps_the_compiled_vertices_and_flat_normals(self, zoo_file: Path) -> None:
         model = load("zoo")
@@ -369,19 +408,27 @@ class TestShapes:
         mujoco.mj_kinematics(model, data)
         for x, y, z in vertices:
             start = np.array([0.99 * x, 1.0 + 0.99 * y, 2.0])
-            hit = mujoco.mj_ray(model, data, start, np.array([0.0, 0.0, -1.0]), None, 1, -1, np.zeros(1, np.int32))
+            hit = mujoco.mj_ray(
+                model, data, start, np.array([0.0, 0.0, -1.0]), None, 1, -1, np.zeros(1, np.int32)
+            )
             assert 2.0 - hit == pytest.approx(z, abs=0.02)
 
     def test_capsule_is_centred_on_its_frame(self, zoo_file: Path) -> None:
         assert self.geom(zoo_file, "a/b c", "limb", "Capsules3D:lengths")[0] == pytest.approx(0.5)
-        np.testing.assert_allclose(self.geom(zoo_file, "a/b c", "limb", "Capsules3D:translations")[0], [0, 0, -0.25])
+        np.testing.assert_allclose(
+            self.geom(zoo_file, "a/b c", "limb", "Capsules3D:translations")[0], [0, 0, -0.25]
+        )
 
     def test_bodies_without_geoms_become_sticks(self, zoo_file: Path) -> None:
-        assert self.geom(zoo_file, "bare", "sticks", "Capsules3D:lengths")[0] == pytest.approx(np.hypot(0.3, 0.5))
+        assert self.geom(zoo_file, "bare", "sticks", "Capsules3D:lengths")[0] == pytest.approx(
+            np.hypot(0.3, 0.5)
+        )
 
     def test_fixed_bodies_have_one_static_pose(self, zoo_file: Path) -> None:
         path = ("robots", "initial", "bodies", "fixed")
-        np.testing.assert_allclose(column(zoo_file, path, None, "Transform3D:translation")[1][0, 0], [0, -1, 0])
+        np.testing.assert_allclose(
+            column(zoo_file, path, None, "Transform3D:translation")[1][0, 0], [0, -1, 0]
+        )
 
     def test_infinite_planes_get_a_finite_board(self, zoo_file: Path) -> None:
         vertices = self.geom(zoo_file, "world", "floor", "Mesh3D:vertex_positions")
@@ -391,7 +438,9 @@ class TestShapes:
 class TestEstimate:
     """estimate.rrd"""
 
-    def test_measured_and_predicted_outputs_and_their_difference(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
+    def test_measured_and_predicted_outputs_and_their_difference(
+        self, cart: mujoco.MjModel, tmp_path: Path
+    ) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
         estimate = estimated(cart, trajectory)
         log_estimate(path, cart, estimate, trajectory, trajectory, Labels.of_model(cart))
@@ -402,11 +451,15 @@ class TestEstimate:
         np.testing.assert_array_equal(values[:, 0], estimate.recordings[0].y[kept, 0])
         residual = column(path, ("residuals", *at), "sim_time", "Scalars:scalars")[1][:, 0]
         np.testing.assert_allclose(residual, 0.01, atol=1e-12)
-        assert entity(("outputs", "recording 2", "hinge_angle [rad]", "predicted")) in entities(path)
+        assert entity(("outputs", "recording 2", "hinge_angle [rad]", "predicted")) in entities(
+            path
+        )
 
     def test_ghost_is_see_through(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
-        log_estimate(path, cart, estimated(cart, trajectory), trajectory, trajectory, Labels.of_model(cart))
+        log_estimate(
+            path, cart, estimated(cart, trajectory), trajectory, trajectory, Labels.of_model(cart)
+        )
         alpha = {}
         for key in ("measured", "predicted"):
             at = ("robots", key, "bodies", "bob", "bob")
@@ -414,9 +467,19 @@ class TestEstimate:
         assert alpha["measured"] < 128
         assert alpha["predicted"] == 255
 
-    def test_no_ghost_where_positions_were_not_measured(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
+    def test_no_ghost_where_positions_were_not_measured(
+        self, cart: mujoco.MjModel, tmp_path: Path
+    ) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
-        log_estimate(path, cart, estimated(cart, trajectory), None, trajectory, Labels.of_model(cart), "see the report")
+        log_estimate(
+            path,
+            cart,
+            estimated(cart, trajectory),
+            None,
+            trajectory,
+            Labels.of_model(cart),
+            "see the report",
+        )
         assert not [entry for entry in entities(path) if entry.startswith("/robots/measured")]
         text = str(column(path, ("summary",), None, "TextDocument:text")[1][0, 0])
         assert "no noise: σ is then not accuracy" in text
@@ -441,7 +504,9 @@ class TestLabels:
         model = load("zoo")
         qpos = np.array([model.qpos0])
         turn = np.array([0.3, -0.2, 0.1])
-        mujoco.mju_axisAngle2Quat(qpos[0, 7:11], turn / np.linalg.norm(turn), float(np.linalg.norm(turn)))
+        mujoco.mju_axisAngle2Quat(
+            qpos[0, 7:11], turn / np.linalg.norm(turn), float(np.linalg.norm(turn))
+        )
         out = dof_positions(model, qpos)
         np.testing.assert_allclose(out[0, 6:9], turn, atol=1e-12)
         np.testing.assert_array_equal(out[0, :3], qpos[0, :3])
@@ -483,7 +548,9 @@ class TestShow:
         show(file)
         assert FakeViewer.command[-1] == str(file)
 
-    def test_reports_a_viewer_that_cannot_start(self, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_reports_a_viewer_that_cannot_start(
+        self, file: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.setattr(subprocess, "Popen", FakeViewer)
         monkeypatch.setattr(FakeViewer, "code", 1)
         with pytest.raises(MjfimError, match="display"):

@@ -66,7 +66,9 @@ def residual(exported: Any, theta: Array, weighted: bool) -> Array:
     [{"state": 0.05}, UNEQUAL, {"slide_position": 0.05, "hinge_velocity": 0.005}],
     ids=["state", "unequal", "sensors"],
 )
-def test_sysid_recovers_the_truth_without_lag(script: ModuleType, noise: dict[str, float], weighted: bool) -> None:
+def test_sysid_recovers_the_truth_without_lag(
+    script: ModuleType, noise: dict[str, float], weighted: bool
+) -> None:
     setup = cart(noise=noise)
     exported = script.export(setup, [noiseless(setup)])
     fit = script.fitted(exported, weighted)
@@ -80,7 +82,9 @@ def test_states_are_compared_as_sysid_does_and_sensors_without_its_lag(script: M
     exported = script.export(setup, [mjfim.simulate(setup, setup.initial, 0)])
     own = sysid.build_residual_fn(models_sequences=[exported.sequences])
     theirs = np.concatenate(own(setup.parameters.guess, exported.parameters.copy())[0])
-    np.testing.assert_allclose(residual(exported, setup.parameters.guess, weighted=False), theirs, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        residual(exported, setup.parameters.guess, weighted=False), theirs, rtol=0, atol=1e-12
+    )
     names = ["slide_position", "hinge_angle", "slide_velocity", "hinge_velocity"]
     setup = cart(noise=dict.fromkeys(names, 0.05))
     exported = script.export(setup, [noiseless(setup)])
@@ -98,7 +102,12 @@ def coarse(folder: Path) -> tuple[Setup, Recording]:
         "measure_rate": 50.0,
         "noise": noise,
     }
-    values["initial"]["control"] = {"kind": "chirp", "amplitude": 2.0, "frequency": 0.3, "frequency_end": 1.0}
+    values["initial"]["control"] = {
+        "kind": "chirp",
+        "amplitude": 2.0,
+        "frequency": 0.3,
+        "frequency_end": 1.0,
+    }
     setup = Setup(Experiment(**values, directory=CART.parent))
     return setup, mjfim.simulate(setup, setup.initial, 1)
 
@@ -127,12 +136,19 @@ def model(name: str) -> Callable[[Path], tuple[Setup, Recording]]:
 
 
 MODELS = ("ball_pendulum", "servo_arm", "four_bar", "muscle_arm")
-CASES = {"coarse": coarse, "whole": whole, "activated": activated, **{name: model(name) for name in MODELS}}
+CASES = {
+    "coarse": coarse,
+    "whole": whole,
+    "activated": activated,
+    **{name: model(name) for name in MODELS},
+}
 
 
 @installed
 @pytest.mark.parametrize("case", CASES)
-def test_sysid_gets_the_same_model_data_and_weights(script: ModuleType, case: str, tmp_path: Path) -> None:
+def test_sysid_gets_the_same_model_data_and_weights(
+    script: ModuleType, case: str, tmp_path: Path
+) -> None:
     """Whitened residuals away from the guess, and what the MjSpec compiles to there."""
     setup, recording = CASES[case](tmp_path)
     exported, p = script.export(setup, [recording]), setup.parameters
@@ -150,7 +166,9 @@ def test_sysid_gets_the_same_model_data_and_weights(script: ModuleType, case: st
     np.testing.assert_allclose(np.sum(mine**2), np.sum(wanted.r**2), rtol=1e-6)
     data = fit.count  # priors follow the data
     np.testing.assert_allclose(np.sum(mine[:data] ** 2), script.chi2(exported, theta), rtol=1e-12)
-    np.testing.assert_allclose(np.sort(np.abs(mine[:data])), np.sort(np.abs(wanted.r[:data])), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        np.sort(np.abs(mine[:data])), np.sort(np.abs(wanted.r[:data])), rtol=1e-6, atol=1e-6
+    )
 
 
 @installed
@@ -170,7 +188,9 @@ def test_times_off_the_grid_are_read_between_the_steps(script: ModuleType) -> No
 
 
 @installed
-def test_the_report_draws_components_and_what_is_measured_now_and_then(script: ModuleType, tmp_path: Path) -> None:
+def test_the_report_draws_components_and_what_is_measured_now_and_then(
+    script: ModuleType, tmp_path: Path
+) -> None:
     """sysid's own report counts signals where it draws their components."""
     setup, recording = whole(tmp_path)
     exported = script.export(setup, [recording])
@@ -178,8 +198,15 @@ def test_the_report_draws_components_and_what_is_measured_now_and_then(script: M
     assert set(exported.layout.mapping) == {"hull_qpos", "ball_qvel", "gyro", "tip"}
     setup, recording = coarse(tmp_path)
     exported = script.export(setup, [recording])
-    _, _, records = exported.residual(weighted=True)(setup.parameters.guess, exported.parameters, return_pred_all=True)
-    assert list(records[0][0].signal_mapping) == ["slide_qpos", "hinge_qpos", "slide_qvel", "hinge_qvel"]
+    _, _, records = exported.residual(weighted=True)(
+        setup.parameters.guess, exported.parameters, return_pred_all=True
+    )
+    assert list(records[0][0].signal_mapping) == [
+        "slide_qpos",
+        "hinge_qpos",
+        "slide_qvel",
+        "hinge_qvel",
+    ]
     known, drawn = recording.y[1:, 2], records[0][0].data[:, 2]
     assert np.isnan(known).any() and np.isfinite(drawn).all()
     np.testing.assert_array_equal(drawn[np.isfinite(known)], known[np.isfinite(known)])
@@ -194,7 +221,9 @@ def test_the_command_compares_both_and_leaves_the_report(
     text = CART.read_text(encoding="utf-8").replace(
         "state = 0.05", "\n".join(f'"{k}" = {v}' for k, v in UNEQUAL.items())
     )
-    text = re.sub(r'"(cart_pendulum\.\w+)"', lambda match: f'"{(CART.parent / match[1]).as_posix()}"', text)
+    text = re.sub(
+        r'"(cart_pendulum\.\w+)"', lambda match: f'"{(CART.parent / match[1]).as_posix()}"', text
+    )
     experiment = tmp_path / "experiment.toml"
     experiment.write_text(text, encoding="utf-8")
     files = [tmp_path / f"recording_{seed}.csv" for seed in (0, 1)]
@@ -233,23 +262,32 @@ def test_the_command_compares_both_and_leaves_the_report(
         ({"fit": {"segments": 1.0}}, "every start as stated"),
     ],
 )
-def test_what_sysid_cannot_fit_is_refused(script: ModuleType, tables: dict[str, Any], said: str) -> None:
+def test_what_sysid_cannot_fit_is_refused(
+    script: ModuleType, tables: dict[str, Any], said: str
+) -> None:
     setup = Setup(Experiment.from_file(CART).replace(**tables))
     with pytest.raises(ExperimentError, match=said):
         script.export(setup, [noiseless(setup)])
 
 
 @installed
-def test_misuse_ends_with_a_sentence(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_misuse_ends_with_a_sentence(
+    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert script.main([str(CART), str(tmp_path / "none.csv"), "-o", str(tmp_path / "out")]) == 2
     assert "none.csv" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
 def test_without_the_extra_it_says_how_to_get_it(
-    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    script: ModuleType,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delattr(sysid, "ModelSequences", raising=False)
-    assert script.main([str(CART), str(tmp_path / "recording.csv"), "-o", str(tmp_path / "out")]) == 2
+    assert (
+        script.main([str(CART), str(tmp_path / "recording.csv"), "-o", str(tmp_path / "out")]) == 2
+    )
     assert "pip install 'mjfim[sysid]'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -56,7 +56,9 @@ def test_what_was_before_the_start_is_the_start() -> None:
     assert not lag.rate(y)[:6].any()
     assert lag.rate(y)[6:].any(axis=1).all()
     lead = Lag.of(len(T), -0.055, DT)
-    np.testing.assert_allclose(lead.apply(y)[-6:], np.broadcast_to(y[-1], (6, 2)), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        lead.apply(y)[-6:], np.broadcast_to(y[-1], (6, 2)), rtol=0, atol=1e-14
+    )
     assert not lead.rate(y)[-5:].any()
     np.testing.assert_allclose(lead.apply(y)[:-8], curve(T + 0.055)[:-8], rtol=0, atol=1e-5)
     late = Lag.of(len(T), 100.0, DT)
@@ -70,7 +72,9 @@ def test_the_rate_is_the_derivative_by_the_delay(delay: float) -> None:
     rate = Lag.of(len(T), delay, DT).rate(y)
     for k in range(0, len(T), 7):
         for i in range(2):
-            slope = richardson(lambda h, k=k, i=i: float(Lag.of(len(T), delay + h, DT).apply(y)[k, i]), 1e-4)
+            slope = richardson(
+                lambda h, k=k, i=i: float(Lag.of(len(T), delay + h, DT).apply(y)[k, i]), 1e-4
+            )
             assert rate[k, i] == pytest.approx(slope, rel=1e-7, abs=1e-8)
     t = T - delay
     inside = (t > 0) & (t < T[-1])
@@ -92,11 +96,16 @@ def test_adjoints_by_dot_products() -> None:
     lag = Lag.of(50, 0.0273, DT)
     for shape in ((50,), (50, 3), (50, 2, 4)):
         y, v = rng.standard_normal(shape), rng.standard_normal(shape)
-        for forward, backward in ((lag.apply, lag.apply_transposed), (lag.rate, lag.rate_transposed)):
+        for forward, backward in (
+            (lag.apply, lag.apply_transposed),
+            (lag.rate, lag.rate_transposed),
+        ):
             assert forward(y).shape == backward(v).shape == shape
             left, right = np.sum(v * forward(y)), np.sum(backward(v) * y)
             assert left == pytest.approx(right, rel=1e-12)
-            assert np.sum(v * backward(y)) != pytest.approx(left, rel=1e-3), "not its own adjoint: a weak test"
+            assert np.sum(v * backward(y)) != pytest.approx(left, rel=1e-3), (
+                "not its own adjoint: a weak test"
+            )
 
 
 @pytest.mark.parametrize("samples", [2, 3])
@@ -106,7 +115,9 @@ def test_short_recordings_are_interpolated_by_what_there_is(samples: int) -> Non
     y = 2.0 + (t**2 if samples == 3 else t)
     lagged = Lag.of(samples, 0.4, 1.0).apply(y)
     wanted = np.maximum(t - 0.4, 0.0)
-    np.testing.assert_allclose(lagged, 2.0 + (wanted**2 if samples == 3 else wanted), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        lagged, 2.0 + (wanted**2 if samples == 3 else wanted), rtol=0, atol=1e-12
+    )
 
 
 def test_the_sensitivity_to_a_delay_is_that_of_lagging_the_outputs(tmp_path: Path) -> None:
@@ -118,7 +129,9 @@ def test_the_sensitivity_to_a_delay_is_that_of_lagging_the_outputs(tmp_path: Pat
     y, G = setup.plant.predict(theta, setup.control)
     plain, _ = setup.plant.predict(setup.parameters.guess, setup.control)
     inside = setup.t[4:] - 0.0137
-    shifted = np.stack([np.interp(inside, np.arange(len(plain)) * setup.dt, c) for c in plain.T], axis=1)
+    shifted = np.stack(
+        [np.interp(inside, np.arange(len(plain)) * setup.dt, c) for c in plain.T], axis=1
+    )
     np.testing.assert_allclose(y[4:-1], shifted, rtol=0, atol=2e-3)
     for k, i in ((10, 1), (30, 3), (50, 2)):
 

@@ -11,7 +11,9 @@ from mjfim.plant.noise import Noise
 
 Array = NDArray[np.float64]
 
-ROOT = np.array([[1.0, 0.0, 0.0, 0.0], [0.8, 0.5, 0.0, 0.0], [-0.3, 0.4, 2.0, 0.0], [0.0, 0.0, 0.0, 0.1]])
+ROOT = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [0.8, 0.5, 0.0, 0.0], [-0.3, 0.4, 2.0, 0.0], [0.0, 0.0, 0.0, 0.1]]
+)
 FULL = ROOT @ ROOT.T  # the last output is uncorrelated with the others
 
 
@@ -31,9 +33,13 @@ def test_whitened_residuals_are_the_normal_density() -> None:
     values = rng.standard_normal((6, 4)) * [1.0, 2.0, 3.0, 0.2]
     density = multivariate_normal(np.zeros(4), FULL)
     for row, white in zip(values, correlated().whiten(values), strict=True):
-        assert density.logpdf(np.zeros(4)) - density.logpdf(row) == pytest.approx(half_square(white), rel=1e-10)
+        assert density.logpdf(np.zeros(4)) - density.logpdf(row) == pytest.approx(
+            half_square(white), rel=1e-10
+        )
     wrong = Noise.independent(np.sqrt(np.diag(FULL))).whiten(values)
-    assert half_square(wrong[0]) != pytest.approx(half_square(correlated().whiten(values)[0]), rel=1e-2)
+    assert half_square(wrong[0]) != pytest.approx(
+        half_square(correlated().whiten(values)[0]), rel=1e-2
+    )
 
 
 def test_independent_outputs_are_the_special_case() -> None:
@@ -97,7 +103,9 @@ def test_missing_values_are_marginalised() -> None:
             assert drop == pytest.approx(half_square(own), rel=1e-10)
         else:
             assert own.size == 0
-    np.testing.assert_array_equal(noise.whiten_present(np.where(present, values, 7.0), present), white)
+    np.testing.assert_array_equal(
+        noise.whiten_present(np.where(present, values, 7.0), present), white
+    )
     # taking rows of the joint whitening instead would condition on zeros
     conditioned = noise.whiten(np.where(present, values, 0.0))[present]
     assert np.abs(conditioned - white).max() > 0.1
@@ -106,7 +114,11 @@ def test_missing_values_are_marginalised() -> None:
 def test_missing_values_of_jacobians_go_with_those_of_residuals() -> None:
     """In the same order, for correlated and for independent outputs."""
     rng = np.random.default_rng(5)
-    y, G, present = rng.standard_normal((9, 4)), rng.standard_normal((9, 4, 3)), rng.random((9, 4)) < 0.5
+    y, G, present = (
+        rng.standard_normal((9, 4)),
+        rng.standard_normal((9, 4, 3)),
+        rng.random((9, 4)) < 0.5,
+    )
     for noise in (correlated(), Noise.independent([1.0, 2.0, 3.0, 4.0])):
         theta = np.array([0.3, -1.0, 2.0])
         together = noise.whiten_present(y + G @ theta, present)
@@ -135,6 +147,8 @@ def test_every_sample_keeps_the_information_per_second(coarsen: int) -> None:
     coarse = fine.every_sample(stride)
     after = coarse.rows(np.broadcast_to(G, (N // coarsen + 1, *G.shape)))
     assert coarse.strides.tolist() == [1] * 4
-    np.testing.assert_allclose(after.T @ after / (rate / coarsen), before.T @ before / (rate / stride), rtol=1e-11)
+    np.testing.assert_allclose(
+        after.T @ after / (rate / coarsen), before.T @ before / (rate / stride), rtol=1e-11
+    )
     ratio = coarse.covariance[:3, :3] / FULL[:3, :3]
     np.testing.assert_allclose(ratio, ratio[0, 0])  # correlations stay

@@ -43,7 +43,10 @@ def linear(setup: Setup) -> Linearization:
 
 def furuta(folder: Path) -> Setup:
     """The Qube, RK4 with 20 steps per sample; a torque that swings the pole without limits or contacts (it has none)."""
-    parameters = {"stiff": {"target": "joint/theta:damping"}, "weak": {"target": "joint/alpha:damping"}}
+    parameters = {
+        "stiff": {"target": "joint/theta:damping"},
+        "weak": {"target": "joint/alpha:damping"},
+    }
     control = {"kind": "sine", "amplitude": 2e-3, "frequency": 1.5}
     model = shared_model("qube_furuta/furuta_pendulum.xml")
     initial = {"qpos": (0.1, 0.3), "control": control}
@@ -66,7 +69,9 @@ def acrobot_without_rk4(folder: Path, integrator: str) -> Setup:
     parameters = {"m": {"target": "body/lower_arm:mass"}, "c": {"target": "joint/elbow:damping"}}
     control = {"kind": "sine", "amplitude": 0.8, "frequency": 1.0}
     initial = {"qpos": (2.5, 0.4), "control": control}
-    return make_setup(spec.to_xml(), folder, initial=initial, parameters=parameters, noise={"state": 0.05})
+    return make_setup(
+        spec.to_xml(), folder, initial=initial, parameters=parameters, noise={"state": 0.05}
+    )
 
 
 def transition(setup: Setup, k: int) -> tuple[Array, Array, Array, Array]:
@@ -82,7 +87,9 @@ def transition(setup: Setup, k: int) -> tuple[Array, Array, Array, Array]:
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
-@pytest.mark.parametrize("make", [cart_setup, body_setup, acrobot_without_rk4], ids=["cart", "body", "acrobot"])
+@pytest.mark.parametrize(
+    "make", [cart_setup, body_setup, acrobot_without_rk4], ids=["cart", "body", "acrobot"]
+)
 def test_A_and_B_are_those_of_mjd_transitionFD(make, integrator: str, tmp_path) -> None:
     setup = make(tmp_path, integrator)
     assert setup.substeps == 1
@@ -93,7 +100,9 @@ def test_A_and_B_are_those_of_mjd_transitionFD(make, integrator: str, tmp_path) 
         assert relative_error(found.B[k], B) < 1e-7
 
 
-@pytest.mark.parametrize("make", [body_setup, lambda f, i: cart_setup(f, i, noise=SENSED)], ids=["body", "cart"])
+@pytest.mark.parametrize(
+    "make", [body_setup, lambda f, i: cart_setup(f, i, noise=SENSED)], ids=["body", "cart"]
+)
 def test_C_and_D_of_sensors_are_those_of_mjd_transitionFD(make, tmp_path) -> None:
     setup = make(tmp_path, "implicitfast")
     found = linear(setup)
@@ -128,7 +137,9 @@ def test_these_setups_hold_one_and_several_steps_per_sample(tmp_path) -> None:
 
 def test_a_wrong_jacobian_would_be_noticed(tmp_path) -> None:
     setup = cart_setup(tmp_path)
-    A, _, _, _ = Loop(setup.plant.model(setup.theta), 2).jacobians(setup.initial.state[7], setup.initial.ctrl[7])
+    A, _, _, _ = Loop(setup.plant.model(setup.theta), 2).jacobians(
+        setup.initial.state[7], setup.initial.ctrl[7]
+    )
     assert relative_error(linear(setup).A[7], A) > 1e-3  # two steps instead of one
     assert relative_error(1.001 * linear(setup).A[7], linear(setup).A[7]) > 1e-7
 
@@ -149,7 +160,9 @@ def sensed(setup: Setup) -> tuple[list[int], list[int]]:
 
 
 @pytest.mark.parametrize(
-    ("make", "tolerance"), [(cart_setup, 1e-6), (body_setup, 1e-6), (filtered_setup, 1e-6)], ids=["cart", "body", "act"]
+    ("make", "tolerance"),
+    [(cart_setup, 1e-6), (body_setup, 1e-6), (filtered_setup, 1e-6)],
+    ids=["cart", "body", "act"],
 )
 def test_E_and_H_are_differences_of_rebuilt_models(make, tolerance: float, tmp_path) -> None:
     setup = make(tmp_path)
@@ -175,12 +188,20 @@ def test_H_of_sensors_is_not_zero_here(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     "make",
-    [cart_setup, body_setup, filtered_setup, lambda f: cart_setup(f, noise={**SENSED, "state": 0.1}), furuta],
+    [
+        cart_setup,
+        body_setup,
+        filtered_setup,
+        lambda f: cart_setup(f, noise={**SENSED, "state": 0.1}),
+        furuta,
+    ],
     ids=["cart", "body", "activation", "cart-sensors", "furuta"],
 )
 def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
     setup = make(tmp_path)
-    tolerance = 1e-5 if make is furuta else 1e-6  # its dampings are 1e-6, hardly above the round-off of a step
+    tolerance = (
+        1e-5 if make is furuta else 1e-6
+    )  # its dampings are 1e-6, hardly above the round-off of a step
     L, S = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial)
     psi = np.zeros((setup.space.nx, len(setup.theta)))
     for k in range(setup.samples):
@@ -190,7 +211,8 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
     assert (scale > 0).all()
     assert np.abs((S.psi[-1] - psi) / scale).max() < tolerance
     every = np.stack(
-        [Recursion(L.A).forward(np.zeros(setup.space.nx), L.E[:, :, j]) for j in range(len(scale))], axis=2
+        [Recursion(L.A).forward(np.zeros(setup.space.nx), L.E[:, :, j]) for j in range(len(scale))],
+        axis=2,
     )
     assert np.abs((S.psi - every) / scale).max() < tolerance
     G = np.einsum("kyx,kxp->kyp", L.C, S.psi) + L.H
@@ -208,7 +230,9 @@ def test_prediction_gives_the_same_outputs_and_derivative_as_the_sensitivity(tmp
     np.testing.assert_array_equal(measured[0], y)
 
 
-@pytest.mark.parametrize("make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"])
+@pytest.mark.parametrize(
+    "make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"]
+)
 @pytest.mark.parametrize("accuracy", [CENTRAL, FAST], ids=["central", "fast"])
 def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> None:
     setup = make(tmp_path)
@@ -221,7 +245,9 @@ def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> Non
             assert relative_error(getattr(found, name), getattr(L, name)) < tolerance
 
 
-@pytest.mark.parametrize("make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"])
+@pytest.mark.parametrize(
+    "make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"]
+)
 def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, tmp_path) -> None:
     setup = make(tmp_path)
     theta, curve, nx = setup.theta, setup.initial, setup.space.nx
@@ -242,7 +268,10 @@ def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, t
         F, H = [], []
         for i in range(nx + setup.plant.nu):
             step = d * np.eye(nx + setup.plant.nu)[i]
-            ahead, back = DF(plus.plus(x, step[:nx]), u + step[nx:]), DF(plus.plus(x, -step[:nx]), u - step[nx:])
+            ahead, back = (
+                DF(plus.plus(x, step[:nx]), u + step[nx:]),
+                DF(plus.plus(x, -step[:nx]), u - step[nx:]),
+            )
             F.append((ahead[0] - back[0]) / (2 * d))
             H.append((ahead[1] - back[1])[address] / (2 * d))
         assert relative_error(found.F_mixed[0, k], np.array(F)) < 1e-4
@@ -255,7 +284,9 @@ def test_outputs_belong_to_the_state_and_control_of_their_own_sample(tmp_path) -
     setup = cart_setup(tmp_path, noise=noise)
     y, _ = setup.plant.measure(setup.theta[None], setup.initial.ctrl)
     columns = {name: y[0][:, i] for i, name in enumerate(setup.outputs.names)}
-    np.testing.assert_array_equal(columns["angle"], columns["qpos:hinge"])  # no lag between sensor and state
+    np.testing.assert_array_equal(
+        columns["angle"], columns["qpos:hinge"]
+    )  # no lag between sensor and state
     np.testing.assert_array_equal(columns["rate"], columns["qvel:hinge"])
     assert np.abs(np.diff(columns["angle"])).max() > 1e-3
     np.testing.assert_array_equal(columns["drive"][:-1], setup.initial.ctrl[:, 0])
@@ -271,7 +302,9 @@ def test_rollout_and_sensors_are_those_of_a_plain_loop(make, tmp_path) -> None:
     for k in range(setup.samples):
         expected = loop.F(curve.state[k], curve.ctrl[k])
         np.testing.assert_allclose(curve.state[k + 1], expected, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(y[0, k], loop.h(curve.state[k], curve.ctrl[k]), rtol=0, atol=1e-11)
+        np.testing.assert_allclose(
+            y[0, k], loop.h(curve.state[k], curve.ctrl[k]), rtol=0, atol=1e-11
+        )
     last = loop.h(curve.state[-1], curve.ctrl[-1])
     np.testing.assert_allclose(y[0, -1], last, rtol=0, atol=1e-11)
     assert curve.t[-1] == pytest.approx(setup.samples * setup.substeps * setup.model.opt.timestep)
@@ -292,15 +325,21 @@ def tangent(setup: Setup, K: Array, size: float = 1.0) -> TangentCurve:
     return TangentCurve(z, c - np.einsum("kui,ki->ku", K, z[:-1]))
 
 
-STILL = pytest.mark.parametrize("make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"])
+STILL = pytest.mark.parametrize(
+    "make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"]
+)
 
 
 @STILL
 @pytest.mark.parametrize("open_loop", [True, False])
-def test_projecting_a_trajectory_onto_itself_changes_nothing(make, open_loop: bool, tmp_path) -> None:
+def test_projecting_a_trajectory_onto_itself_changes_nothing(
+    make, open_loop: bool, tmp_path
+) -> None:
     setup = make(tmp_path)
     K = gain(setup) * (not open_loop)
-    still = TangentCurve(np.zeros((setup.samples + 1, setup.space.nx)), np.zeros((setup.samples, setup.plant.nu)))
+    still = TangentCurve(
+        np.zeros((setup.samples + 1, setup.space.nx)), np.zeros((setup.samples, setup.plant.nu))
+    )
     same = setup.plant.project(setup.theta, setup.initial, still, 1.0, K)
     np.testing.assert_allclose(same.state, setup.initial.state, rtol=0, atol=1e-12)
     np.testing.assert_allclose(same.ctrl, setup.initial.ctrl, rtol=0, atol=1e-12)
@@ -315,7 +354,9 @@ def test_projection_is_idempotent_and_feasible(make, tmp_path) -> None:
     moved = plant.difference(once, setup.initial)
     assert np.abs(moved.z).max() > 1e-3
     # P(xi) is a trajectory: its own control in open loop gives it back
-    np.testing.assert_allclose(plant.simulate(theta, once.ctrl).state, once.state, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        plant.simulate(theta, once.ctrl).state, once.state, rtol=0, atol=1e-9
+    )
     # P(P(xi)) = P(xi), by asking again for where it has arrived
     twice = plant.project(theta, setup.initial, moved, 1.0, K)
     np.testing.assert_allclose(twice.state, once.state, rtol=0, atol=1e-9)
@@ -324,13 +365,19 @@ def test_projection_is_idempotent_and_feasible(make, tmp_path) -> None:
 
 @STILL
 @pytest.mark.parametrize("open_loop", [True, False])
-def test_projection_moves_along_its_tangent_vector_to_first_order(make, open_loop: bool, tmp_path) -> None:
+def test_projection_moves_along_its_tangent_vector_to_first_order(
+    make, open_loop: bool, tmp_path
+) -> None:
     setup = make(tmp_path)
     K = gain(setup) * (not open_loop)
     zeta, errors = tangent(setup, K), []
     for gamma in (1e-2, 5e-3):
-        moved = setup.plant.difference(setup.plant.project(setup.theta, setup.initial, zeta, gamma, K), setup.initial)
-        errors.append(np.abs(moved.z / gamma - zeta.z).max() + np.abs(moved.v / gamma - zeta.v).max())
+        moved = setup.plant.difference(
+            setup.plant.project(setup.theta, setup.initial, zeta, gamma, K), setup.initial
+        )
+        errors.append(
+            np.abs(moved.z / gamma - zeta.z).max() + np.abs(moved.v / gamma - zeta.v).max()
+        )
     assert errors[0] < 0.05 * np.abs(zeta.z).max()
     assert errors[1] < 0.6 * errors[0] or errors[1] < 1e-9  # the remainder is of second order
 
@@ -347,7 +394,14 @@ def test_feedback_is_that_of_the_projection_operator(tmp_path) -> None:
 def test_feedback_holds_an_upright_pendulum_that_open_loop_loses(tmp_path) -> None:
     start = {"qpos": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
     light = CART_PENDULUM.format(integrator="RK4").replace('damping="0.4"', 'damping="0.01"')
-    setup = make_setup(light, tmp_path, initial=start, horizon=4.0, parameters=CART_PARAMETERS, noise={"state": 0.1})
+    setup = make_setup(
+        light,
+        tmp_path,
+        initial=start,
+        horizon=4.0,
+        parameters=CART_PARAMETERS,
+        noise={"state": 0.1},
+    )
     K, kick = gain(setup), np.zeros((setup.samples, 1))
     kick[:20] = 0.5
     zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), kick)
@@ -391,7 +445,11 @@ def test_a_control_that_mujoco_would_silently_replace_by_zero_is_not_simulated(
 def test_an_acceleration_that_makes_mujoco_reset_is_noticed_at_any_sample(
     sample: int, open_loop: bool, tmp_path
 ) -> None:
-    light = CART_PENDULUM.format(integrator="RK4").replace('mass="1"', 'mass="0.01"').replace("1.5", "0.01")
+    light = (
+        CART_PENDULUM.format(integrator="RK4")
+        .replace('mass="1"', 'mass="0.01"')
+        .replace("1.5", "0.01")
+    )
     setup = make_setup(light, tmp_path, parameters=CART_PARAMETERS, noise={"state": 0.1})
     K, wild = gain(setup) * (not open_loop), np.zeros((setup.samples, 1))
     wild[sample] = 9e9
@@ -452,7 +510,8 @@ def test_results_do_not_depend_on_what_was_simulated_before_or_on_threads(tmp_pa
     other.plant.measure(1.3 * other.theta[None], -other.control)
     other.plant.linearize(0.8 * other.theta, other.initial)
     np.testing.assert_array_equal(
-        setup.plant.sensitivity(setup.theta, setup.initial).G, other.plant.sensitivity(other.theta, other.initial).G
+        setup.plant.sensitivity(setup.theta, setup.initial).G,
+        other.plant.sensitivity(other.theta, other.initial).G,
     )
 
 
@@ -460,7 +519,12 @@ def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None
     (tmp_path / "b").mkdir()
     setup, rng = filtered_setup(tmp_path), np.random.default_rng(5)
     thetas = setup.theta * rng.uniform(0.8, 1.2, (70, 2))
-    alone = np.stack([filtered_setup(tmp_path / "b").plant.measure(t[None], setup.control)[0][0] for t in thetas[:6]])
+    alone = np.stack(
+        [
+            filtered_setup(tmp_path / "b").plant.measure(t[None], setup.control)[0][0]
+            for t in thetas[:6]
+        ]
+    )
     for count in (2, 6, 1, 70, 3, 5):
         y, finite = setup.plant.measure(thetas[:count], setup.control)
         assert finite.shape == (count,)
@@ -472,7 +536,9 @@ def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None
     np.testing.assert_array_equal(y[[0, 2, 3]], alone[[0, 2, 3]])
     states, ctrl = setup.initial.state, np.repeat(setup.control, 1, axis=0)
     for count in (5, 50, 1, 12):
-        out = setup.plant.engine.step([setup.plant.model(setup.theta)], states[:count], ctrl[:count]).states
+        out = setup.plant.engine.step(
+            [setup.plant.model(setup.theta)], states[:count], ctrl[:count]
+        ).states
         np.testing.assert_array_equal(out, states[1 : count + 1])
 
 
@@ -484,7 +550,9 @@ def test_every_mj_step_is_counted(tmp_path) -> None:
     assert engine.steps - count == (N + 1) * n * (2 * (3 + 1) + 2 * 2)
     count = engine.steps
     setup.plant.sensitivity(setup.theta, curve)
-    assert engine.steps - count == 2 * 2 * (N * n + 1)  # one more for the sensors of the last sample
+    assert engine.steps - count == 2 * 2 * (
+        N * n + 1
+    )  # one more for the sensors of the last sample
     count = engine.steps
     zero = TangentCurve(np.zeros((N + 1, 3)), np.zeros((N, 1)))
     setup.plant.project(setup.theta, curve, zero, 1.0, np.ones((N, 1, 3)))
@@ -508,9 +576,14 @@ def written(folder: Path, xml: str) -> tuple[Any, Path]:
 
 
 @pytest.mark.parametrize("integrator", ["RK4", "Euler", "implicitfast"])
-def test_switching_off_solver_and_sensors_of_an_unconstrained_model_changes_no_bit(integrator: str, tmp_path) -> None:
+def test_switching_off_solver_and_sensors_of_an_unconstrained_model_changes_no_bit(
+    integrator: str, tmp_path
+) -> None:
     spec, path = written(tmp_path, CART_PENDULUM.format(integrator=integrator))
-    plain, lean = compile_spec(spec, path), Source(spec, path, ["bob"], sensors=False, friction=False).model
+    plain, lean = (
+        compile_spec(spec, path),
+        Source(spec, path, ["bob"], sensors=False, friction=False).model,
+    )
     assert (bits(plain), bits(lean)) == ((False, False), (True, True))
     states = []
     for model in (plain, lean):
@@ -528,7 +601,10 @@ FREE_OF_CONSTRAINTS = CART_PENDULUM.format(integrator="Euler")
 CONSTRAINED = {
     "joint limit": ('<joint name="slide"', '<joint name="slide" limited="true" range="-1 1"'),
     "dry friction": ('damping="0.4"', 'damping="0.4" frictionloss="0.1"'),
-    "equality": ("<actuator>", '<equality><joint joint1="slide" joint2="hinge"/></equality><actuator>'),
+    "equality": (
+        "<actuator>",
+        '<equality><joint joint1="slide" joint2="hinge"/></equality><actuator>',
+    ),
     "tendon limit": (
         "<actuator>",
         '<tendon><fixed limited="true" range="-1 1"><joint joint="slide" coef="1"/></fixed></tendon><actuator>',
@@ -587,7 +663,9 @@ def test_the_start_enters_the_sensitivity_as_its_own_initial_value(tmp_path) -> 
 
 
 def test_the_start_of_a_quaternion_moves_in_its_tangent_space(tmp_path) -> None:
-    setup = body_setup(tmp_path, nuisance={"initial": {"qpos:ball[2]": True, "qvel:float[4]": True}})
+    setup = body_setup(
+        tmp_path, nuisance={"initial": {"qpos:ball[2]": True, "qvel:float[4]": True}}
+    )
     S = setup.plant.sensitivity(setup.theta, setup.initial)
     np.testing.assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)
     loop, h = Loop(setup.plant.model(setup.theta), 1), 1e-4
@@ -618,13 +696,24 @@ def test_biases_add_to_their_own_output_and_to_nothing_else(tmp_path) -> None:
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.0237])
 def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
-    parameters = {**CART_PARAMETERS, "late": {"target": "output:delay", "guess": delay, "scale": 0.01}}
-    late, plain = cart_setup(tmp_path, **OUTSIDE, parameters=parameters), cart_setup(tmp_path, **OUTSIDE)
+    parameters = {
+        **CART_PARAMETERS,
+        "late": {"target": "output:delay", "guess": delay, "scale": 0.01},
+    }
+    late, plain = (
+        cart_setup(tmp_path, **OUTSIDE, parameters=parameters),
+        cart_setup(tmp_path, **OUTSIDE),
+    )
     (y, G), (exact, exact_G) = (s.plant.predict(s.theta, s.control) for s in (late, plain))
-    t, states = np.arange(51) * 0.01, slice(0, 4)  # smooth states; accelerations follow the steps of the control
+    t, states = (
+        np.arange(51) * 0.01,
+        slice(0, 4),
+    )  # smooth states; accelerations follow the steps of the control
     for i in range(4):
         moved = CubicSpline(t, exact[:, i])
-        np.testing.assert_allclose(y[5:, i], moved(t[5:] - delay), rtol=0, atol=1e-4 * np.ptp(exact[:, i]))
+        np.testing.assert_allclose(
+            y[5:, i], moved(t[5:] - delay), rtol=0, atol=1e-4 * np.ptp(exact[:, i])
+        )
         slope = -moved(t[5:-3] - delay, 1)
         np.testing.assert_allclose(G[5:-3, i, 3], slope, rtol=0, atol=1e-2 * np.abs(slope).max())
     if not delay:
@@ -655,7 +744,10 @@ def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> Non
     picked, L = np.array([3, 20, 41]), linear(setup)
     found = setup.plant.one_step(setup.theta, setup.initial, picked, 1e-5)
     nx, ny, p = setup.space.nx, len(setup.outputs), len(setup.theta)
-    states = found[: 3 * nx].reshape(3, nx, p) * (setup.dt * setup.plant.steps_of(setup.initial)[:nx])[:, None]
+    states = (
+        found[: 3 * nx].reshape(3, nx, p)
+        * (setup.dt * setup.plant.steps_of(setup.initial)[:nx])[:, None]
+    )
     assert relative_error(states, L.E[picked]) < 1e-6
     sensors = found[3 * nx :].reshape(3, ny, p)
     H = L.H[picked] * setup.parameters.step
@@ -664,7 +756,8 @@ def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> Non
     assert moving.sum() >= 3
     assert (
         relative_error(
-            sensors[:, moving] * setup.parameters.step, (H / np.where(moving, size, 1.0)[:, None])[:, moving]
+            sensors[:, moving] * setup.parameters.step,
+            (H / np.where(moving, size, 1.0)[:, None])[:, moving],
         )
         < 1e-5
     )
@@ -697,7 +790,10 @@ def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> Non
     """Against plain MuJoCo from `mj_resetDataKeyframe`, by every way of stepping."""
     damped: dict[str, Any] = {"target": "joint/x:damping"}
     if function:
-        damped = {"function": lambda spec, v: setattr(spec.joint("x"), "damping", [v, 0.0, 0.0]), "guess": 1.0}
+        damped = {
+            "function": lambda spec, v: setattr(spec.joint("x"), "damping", [v, 0.0, 0.0]),
+            "guess": 1.0,
+        }
     initial = {"keyframe": "moved", "control": {"kind": "sine", "amplitude": 2.0}}
     setup = make_setup(CARRIED, tmp_path, initial=initial, parameters={"d": damped})
     data = mujoco.MjData(setup.model)
@@ -723,7 +819,9 @@ def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> Non
     whole = setup.model_at(setup.theta)
     np.testing.assert_allclose(whole.eq_data, setup.model.eq_data, atol=1e-12)
     np.testing.assert_array_equal(mujoco.MjData(whole).mocap_pos, [[0.6, 0, 0], [0.2, 1.1, 0]])
-    np.testing.assert_array_equal(setup.model_at(setup.theta, placed=False).body_pos, setup.model.body_pos)
+    np.testing.assert_array_equal(
+        setup.model_at(setup.theta, placed=False).body_pos, setup.model.body_pos
+    )
 
 
 def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tmp_path) -> None:
@@ -736,14 +834,20 @@ def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tm
     assert np.abs(slope).max() > 0.1
     np.testing.assert_allclose(found.psi[-1, :, 0], slope, rtol=1e-4, atol=1e-6)
     initial = {"keyframe": "moved", "control": {"kind": "sine"}}
-    with pytest.raises(ExperimentError, match=r"parameters\.x: the keyframe says where mocap body 'near' is"):
+    with pytest.raises(
+        ExperimentError, match=r"parameters\.x: the keyframe says where mocap body 'near' is"
+    ):
         make_setup(CARRIED, tmp_path, parameters=place, initial=initial)
 
 
 def test_clocks_begin_at_zero(tmp_path) -> None:
-    xml = CART_PENDULUM.format(integrator="RK4").replace("<sensor>", '<sensor><clock name="clock" noise="0.1"/>')
+    xml = CART_PENDULUM.format(integrator="RK4").replace(
+        "<sensor>", '<sensor><clock name="clock" noise="0.1"/>'
+    )
     parameters = {"c": {"target": "joint/hinge:damping"}}
-    setup = make_setup(xml, tmp_path, rate=50.0, parameters=parameters, noise={"clock": 0.1, "rate": 0.1})
+    setup = make_setup(
+        xml, tmp_path, rate=50.0, parameters=parameters, noise={"clock": 0.1, "rate": 0.1}
+    )
     y, _ = setup.plant.measure(setup.theta[None], setup.control)
     t = np.arange(setup.samples + 1) * setup.dt
     np.testing.assert_allclose(y[0, :, setup.outputs.names.index("clock")], t, atol=1e-12)
@@ -755,13 +859,16 @@ def test_clocks_begin_at_zero(tmp_path) -> None:
 
 def test_quaternions_of_the_start_have_unit_length_or_are_refused(tmp_path) -> None:
     def start(*qpos: float) -> Array:
-        return body_setup(tmp_path, initial={"qpos": qpos, "control": {"kind": "sine"}}).plant.nominal_start
+        return body_setup(
+            tmp_path, initial={"qpos": qpos, "control": {"kind": "sine"}}
+        ).plant.nominal_start
 
     unit = start(1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0)
     np.testing.assert_array_equal(unit[:11], [1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0])
     np.testing.assert_allclose(start(1, 2, 3, 1.2, 0, 1.6, 0, 0, 0, 5, 0), unit, atol=1e-15)
     with pytest.raises(
-        ExperimentError, match=r"initial\.qpos: the quaternion of joint 'ball' \(numbers 7 to 10\) is zero"
+        ExperimentError,
+        match=r"initial\.qpos: the quaternion of joint 'ball' \(numbers 7 to 10\) is zero",
     ):
         start(1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 0, 1e-9)
     with pytest.raises(ExperimentError, match=r"joint 'float' \(numbers 3 to 6\)"):

@@ -45,7 +45,9 @@ def random_states(space, rng: np.random.Generator, count: int = COUNT) -> np.nda
 def random_rotations(count: int, longest: float, rng: np.random.Generator) -> np.ndarray:
     """Rotation vectors of every direction, up to a length [rad]."""
     axis = rng.normal(size=(count, 3))
-    return axis / np.linalg.norm(axis, axis=1, keepdims=True) * rng.uniform(0.0, longest, (count, 1))
+    return (
+        axis / np.linalg.norm(axis, axis=1, keepdims=True) * rng.uniform(0.0, longest, (count, 1))
+    )
 
 
 def random_steps(space, longest: float, rng: np.random.Generator, count: int = COUNT) -> np.ndarray:
@@ -86,7 +88,9 @@ def test_minus_is_mj_differentiatePos(model) -> None:
 def test_minus_undoes_plus(model, longest: float) -> None:
     space, rng = state_space(model), np.random.default_rng(3)
     states, dx = random_states(space, rng), random_steps(space, longest, rng)
-    np.testing.assert_allclose(space.minus(space.plus(states, dx), states), dx, rtol=0, atol=1e-13 * 1e2)
+    np.testing.assert_allclose(
+        space.minus(space.plus(states, dx), states), dx, rtol=0, atol=1e-13 * 1e2
+    )
 
 
 def test_plus_undoes_minus_up_to_the_sign_of_the_quaternion(model) -> None:
@@ -117,7 +121,9 @@ def test_rotations_are_taken_in_the_body_frame_not_the_world_frame(model) -> Non
     dx[0, v : v + 3] = [0.3, -0.4, 0.5]
     moved = space.plus(state, dx)[0, q : q + 4]
     turn, world = np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, dx[0, v : v + 3] / np.linalg.norm(dx[0, v : v + 3]), np.linalg.norm(dx))
+    mujoco.mju_axisAngle2Quat(
+        turn, dx[0, v : v + 3] / np.linalg.norm(dx[0, v : v + 3]), np.linalg.norm(dx)
+    )
     mujoco.mju_mulQuat(world, turn, state[0, q : q + 4])
     assert np.abs(moved - world).max() > 0.1
     body = np.zeros(4)
@@ -131,7 +137,9 @@ def test_states_and_steps_broadcast(model) -> None:
     grid = space.plus(states[None], dx[:, None])
     assert grid.shape == (3, 5, states.shape[1])
     np.testing.assert_array_equal(grid[2, 4], space.plus(states[4], dx[2]))
-    np.testing.assert_array_equal(space.minus(grid, states)[1, 3], space.minus(grid[1, 3], states[3]))
+    np.testing.assert_array_equal(
+        space.minus(grid, states)[1, 3], space.minus(grid[1, 3], states[3])
+    )
 
 
 def test_inputs_are_left_alone(model) -> None:
@@ -152,5 +160,7 @@ def test_the_slope_of_a_difference_is_that_of_nearby_differences(model) -> None:
         state = space.plus(origin, dx)
         moved = space.plus(state, h * np.eye(space.nx)), space.plus(state, -h * np.eye(space.nx))
         slope = (space.minus(moved[0], origin) - space.minus(moved[1], origin)).T / (2 * h)
-        np.testing.assert_allclose(space.minus_slope(space.minus(state, origin)), slope, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(
+            space.minus_slope(space.minus(state, origin)), slope, rtol=0, atol=1e-7
+        )
     assert np.abs(slope - np.eye(space.nx)).max() > 0.1

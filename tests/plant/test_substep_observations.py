@@ -75,7 +75,10 @@ def floating_setup(folder: Path, integrator: str = "implicitfast", **tables: Any
     }
     defaults: dict[str, Any] = {
         "horizon": 0.3,
-        "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/shoulder:damping"}},
+        "parameters": {
+            "m": {"target": "body/fore:mass"},
+            "c": {"target": "joint/shoulder:damping"},
+        },
         "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01, "qvel:elbow": 0.05},
         "limits": LIMITS,
         "initial": {
@@ -144,7 +147,9 @@ def test_what_is_watched_is_what_plain_steps_show_at_every_engine_step(
     watched = plant.watch(setup.theta, setup.control, taps_of(setup))
     assert watched is not None
     trajectory, tapped = watched
-    np.testing.assert_array_equal(trajectory.state, plant.simulate(setup.theta, setup.control).state)
+    np.testing.assert_array_equal(
+        trajectory.state, plant.simulate(setup.theta, setup.control).state
+    )
     wanted = played(model, setup.plant.start(setup.theta), setup.control, setup.substeps)
     assert tapped.shape == wanted.shape == (30, 5, len(SHOWN))
     for i, (kind, name) in enumerate(SHOWN):
@@ -165,9 +170,16 @@ def test_a_batch_of_samples_shows_the_same_as_the_whole_curve(tmp_path: Path) ->
         stepped = plant.engine.step(
             [plant.model(setup.theta)], trajectory.state[:-1][order], setup.control[order], taps
         )
-        np.testing.assert_allclose(stepped.tapped, tapped[order][:, np.array(taps.substeps) - 1], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(
+            stepped.tapped, tapped[order][:, np.array(taps.substeps) - 1], rtol=0, atol=1e-9
+        )
         np.testing.assert_allclose(stepped.states, trajectory.state[1:][order], rtol=0, atol=1e-12)
-    assert plant.engine.step([plant.model(setup.theta)], trajectory.state[:1], setup.control[:1]).tapped is None
+    assert (
+        plant.engine.step(
+            [plant.model(setup.theta)], trajectory.state[:1], setup.control[:1]
+        ).tapped
+        is None
+    )
 
 
 def test_a_control_that_diverges_shows_nothing(tmp_path: Path) -> None:
@@ -181,7 +193,9 @@ def test_taps_cost_no_further_steps(tmp_path: Path) -> None:
     counts = []
     for own in (None, taps):
         begun = plant.engine.steps
-        plant.engine.step([plant.model(setup.theta)], setup.initial.state[:7], setup.control[:7], own)
+        plant.engine.step(
+            [plant.model(setup.theta)], setup.initial.state[:7], setup.control[:7], own
+        )
         counts.append(plant.engine.steps - begun)
     assert counts == [35, 35]
 
@@ -209,7 +223,9 @@ def assert_slopes(found: Array, setup: Setup, taps: Taps, tolerance: float) -> N
 
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
-def test_derivatives_of_taps_are_differences_of_independent_simulations(integrator: str, tmp_path: Path) -> None:
+def test_derivatives_of_taps_are_differences_of_independent_simulations(
+    integrator: str, tmp_path: Path
+) -> None:
     setup = floating_setup(tmp_path, integrator).free()
     taps = taps_of(setup)
     A, B, slopes = setup.plant.tapped(setup.theta, setup.initial, taps)
@@ -222,9 +238,15 @@ def test_derivatives_of_taps_are_differences_of_independent_simulations(integrat
 
 @pytest.mark.parametrize("accuracy", [DRAFT, FAST, CENTRAL], ids=["draft", "fast", "central"])
 @pytest.mark.parametrize("sensors", [False, True], ids=["states", "sensors"])
-def test_derivatives_beside_those_of_the_information_are_the_same(sensors: bool, accuracy, tmp_path: Path) -> None:
+def test_derivatives_beside_those_of_the_information_are_the_same(
+    sensors: bool, accuracy, tmp_path: Path
+) -> None:
     """Whichever differences the information takes; with sensors all of them are made one direction at a time."""
-    noise = {"gyro": 0.1, "qpos:elbow": 0.01} if sensors else {"qpos:elbow": 0.01, "qpos:shoulder": 0.01}
+    noise = (
+        {"gyro": 0.1, "qpos:elbow": 0.01}
+        if sensors
+        else {"qpos:elbow": 0.01, "qpos:shoulder": 0.01}
+    )
     setup = floating_setup(tmp_path, noise=noise).free()
     assert setup.plant.engine.sensors is sensors
     taps, psi = taps_of(setup), setup.plant.sensitivity(setup.theta, setup.initial).psi

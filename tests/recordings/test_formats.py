@@ -42,7 +42,9 @@ def columns() -> Columns:
 
 def as_csv(path: Path, columns: Columns) -> None:
     """Empty fields for NaN."""
-    pyarrow.csv.write_csv(pyarrow.table({n: pyarrow.array(c, from_pandas=True) for n, c in columns.items()}), path)
+    pyarrow.csv.write_csv(
+        pyarrow.table({n: pyarrow.array(c, from_pandas=True) for n, c in columns.items()}), path
+    )
 
 
 def as_gzip(path: Path, columns: Columns) -> None:
@@ -66,19 +68,28 @@ def as_json(path: Path, columns: Columns) -> None:
     """A list of records, null for NaN."""
     rows = zip(*(c.tolist() for c in columns.values()), strict=True)
     path.write_text(
-        json.dumps([dict(zip(columns, (None if v != v else v for v in row), strict=True)) for row in rows]),
+        json.dumps(
+            [dict(zip(columns, (None if v != v else v for v in row), strict=True)) for row in rows]
+        ),
         encoding="utf-8",
     )
 
 
-WRITERS = {".csv": as_csv, ".csv.gz": as_gzip, ".parquet": as_parquet, ".npz": as_npz, ".json": as_json}
+WRITERS = {
+    ".csv": as_csv,
+    ".csv.gz": as_gzip,
+    ".parquet": as_parquet,
+    ".npz": as_npz,
+    ".json": as_json,
+}
 formats = pytest.mark.parametrize("ending", WRITERS)
 
 
 def same(table: Table, columns: Columns) -> bool:
     """To the last bit, in float64."""
     return set(table.columns) == set(columns) and all(
-        table.column(name).dtype == np.float64 and np.array_equal(table.column(name), column, equal_nan=True)
+        table.column(name).dtype == np.float64
+        and np.array_equal(table.column(name), column, equal_nan=True)
         for name, column in columns.items()
     )
 
@@ -96,7 +107,11 @@ def test_truncated_files(ending: str, columns: Columns, tmp_path: Path) -> None:
     path = tmp_path / f"log{ending}"
     WRITERS[ending](path, columns)
     whole = path.read_bytes()
-    cuts = [len(whole) // 2, len(whole) - 8] if ending != ".csv" else [whole.index(b",", len(whole) // 2)]
+    cuts = (
+        [len(whole) // 2, len(whole) - 8]
+        if ending != ".csv"
+        else [whole.index(b",", len(whole) // 2)]
+    )
     for cut in cuts:
         path.write_bytes(whole[:cut])
         with pytest.raises(RecordingError, match=rf"log\{ending}: not (a )?readable") as refused:
@@ -147,7 +162,8 @@ def test_unknown_endings(tmp_path: Path) -> None:
     """The message lists the known ones."""
     (tmp_path / "log.xlsx").write_text("x", encoding="utf-8")
     with pytest.raises(
-        RecordingError, match=r"log\.xlsx: not a known kind.*\.csv, \.csv\.gz, \.parquet, \.npz, \.json"
+        RecordingError,
+        match=r"log\.xlsx: not a known kind.*\.csv, \.csv\.gz, \.parquet, \.npz, \.json",
     ):
         read_columns(tmp_path / "log.xlsx", ALL)
     with pytest.raises(RecordingError, match=r"gone\.csv: no such file"):
@@ -162,14 +178,18 @@ def test_unknown_endings(tmp_path: Path) -> None:
 def test_text_is_no_fault_until_it_is_used(tmp_path: Path) -> None:
     """Numbers beside it are read in full."""
     path = tmp_path / "log.csv"
-    path.write_text("t,mode,q,big\n0,idle,1.5,1700000000000000123\n0.1,run,,1700000000000000124\n", encoding="utf-8")
+    path.write_text(
+        "t,mode,q,big\n0,idle,1.5,1700000000000000123\n0.1,run,,1700000000000000124\n",
+        encoding="utf-8",
+    )
     table = read_columns(path, ALL)
     assert np.array_equal(table.column("q"), [1.5, np.nan], equal_nan=True)
     assert table.column("big")[0] == 1.7e18
     with pytest.raises(RecordingError, match=r"log\.csv: column 'mode' is not numeric"):
         table.column("mode")
     pyarrow.parquet.write_table(
-        pyarrow.table({"t": [0.0, 1.0], "mode": ["1", "2"], "on": [True, False]}), tmp_path / "a.parquet"
+        pyarrow.table({"t": [0.0, 1.0], "mode": ["1", "2"], "on": [True, False]}),
+        tmp_path / "a.parquet",
     )
     table = read_columns(tmp_path / "a.parquet", ALL)
     assert table.column("on").tolist() == [1.0, 0.0]
@@ -208,9 +228,12 @@ def bomb_parquet(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "write"), [("log.csv.gz", bomb_csv), ("log.npz", bomb_npz), ("log.parquet", bomb_parquet)]
+    ("name", "write"),
+    [("log.csv.gz", bomb_csv), ("log.npz", bomb_npz), ("log.parquet", bomb_parquet)],
 )
-def test_bombs(name: str, write: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bombs(
+    name: str, write: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A few kB that unpack to MB: fine within the limits, refused beyond either of them."""
     path = tmp_path / name
     write(path)
@@ -222,11 +245,15 @@ def test_bombs(name: str, write: Callable[[Path], None], tmp_path: Path, monkeyp
             read_columns(path, ALL)
     if name != "log.parquet":
         monkeypatch.setattr(limits, "SUSPECT", 1_000_000)
-        with pytest.raises(RecordingError, match=rf"{name}: unpacks to more than 200 times its size"):
+        with pytest.raises(
+            RecordingError, match=rf"{name}: unpacks to more than 200 times its size"
+        ):
             read_columns(path, ALL)
 
 
-def test_packed_logs_are_no_bombs(columns: Columns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_packed_logs_are_no_bombs(
+    columns: Columns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The ratio alone tells."""
     monkeypatch.setattr(limits, "SUSPECT", 100)
     as_gzip(tmp_path / "log.csv.gz", columns)
@@ -248,9 +275,15 @@ class Trap:
 
 def test_pickles_are_not_loaded(tmp_path: Path) -> None:
     """Neither where the array is wanted nor where it is not; the trap itself works."""
-    np.savez(tmp_path / "log.npz", t=np.arange(3.0), q=np.array([Trap(tmp_path / "sprung")], dtype=object))
+    np.savez(
+        tmp_path / "log.npz",
+        t=np.arange(3.0),
+        q=np.array([Trap(tmp_path / "sprung")], dtype=object),
+    )
     for spec in (ALL, RecordingSpec(columns={"qpos:j": "t", "ctrl:m": "t"})):
-        with pytest.raises(RecordingError, match=r"log\.npz: array 'q' holds pickled objects, which are never read"):
+        with pytest.raises(
+            RecordingError, match=r"log\.npz: array 'q' holds pickled objects, which are never read"
+        ):
             read_columns(tmp_path / "log.npz", spec)
     assert not (tmp_path / "sprung").exists()
     pickle.loads(pickle.dumps(Trap(tmp_path / "sprung")))
@@ -260,7 +293,9 @@ def test_pickles_are_not_loaded(tmp_path: Path) -> None:
 def test_matrices_become_columns(tmp_path: Path) -> None:
     """`name[i]`; a control lacks its last row; a number alone holds for all rows; cubes are left out."""
     q = np.arange(8.0).reshape(4, 2)
-    np.savez(tmp_path / "log.npz", t=np.arange(4.0), qpos=q, ctrl=q[:3], kp=2.5, gain=np.zeros((3, 2, 2)))
+    np.savez(
+        tmp_path / "log.npz", t=np.arange(4.0), qpos=q, ctrl=q[:3], kp=2.5, gain=np.zeros((3, 2, 2))
+    )
     table = read_columns(tmp_path / "log.npz", ALL)
     assert table.names == ("t", "qpos[0]", "qpos[1]", "ctrl[0]", "ctrl[1]", "kp")
     assert table.column("qpos[1]").tolist() == [1.0, 3.0, 5.0, 7.0]
@@ -270,8 +305,12 @@ def test_matrices_become_columns(tmp_path: Path) -> None:
 
 def test_arrays_of_other_lengths(tmp_path: Path) -> None:
     """Only a control may lack a row, under whatever name."""
-    np.savez(tmp_path / "log.npz", t=np.arange(4.0), q=np.zeros(3), u=np.zeros(3), name=np.array(["a"]))
-    table = read_columns(tmp_path / "log.npz", RecordingSpec(columns={"qpos:j": "q", "ctrl:m": "u"}))
+    np.savez(
+        tmp_path / "log.npz", t=np.arange(4.0), q=np.zeros(3), u=np.zeros(3), name=np.array(["a"])
+    )
+    table = read_columns(
+        tmp_path / "log.npz", RecordingSpec(columns={"qpos:j": "q", "ctrl:m": "u"})
+    )
     assert np.isnan(table.column("u")[-1])
     with pytest.raises(RecordingError, match=r"column 'q' has 3 rows where 't' has 4"):
         table.column("q")
@@ -282,7 +321,9 @@ def test_arrays_of_other_lengths(tmp_path: Path) -> None:
 def header(shape: tuple[int, ...]) -> bytes:
     """Of an npy file without content."""
     stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(
+        stream, {"descr": "<f8", "fortran_order": False, "shape": shape}
+    )
     return stream.getvalue()
 
 
@@ -297,7 +338,9 @@ def test_headers_that_promise_too_much(tmp_path: Path) -> None:
 def test_rows_that_are_columns(tmp_path: Path) -> None:
     """A matrix whose time runs to the right; a time that is one."""
     np.savez(tmp_path / "log.npz", t=np.arange(5000.0), qpos=np.zeros((2, 5000)))
-    with pytest.raises(RecordingError, match=r"'qpos' of shape \(2, 5000\) has too many columns; time runs down"):
+    with pytest.raises(
+        RecordingError, match=r"'qpos' of shape \(2, 5000\) has too many columns; time runs down"
+    ):
         read_columns(tmp_path / "log.npz", ALL)
     np.savez(tmp_path / "log.npz", t=np.zeros((5, 1)))
     with pytest.raises(RecordingError, match=r"array 't' has shape \(5, 1\)"):
@@ -345,12 +388,20 @@ def test_json_records(tmp_path: Path) -> None:
 def test_json_place(tmp_path: Path) -> None:
     """Several lists of records need a word; that word must be right."""
     content = {"k": 1, "a": {"gain": 2, "left": [{"t": 0}], "right": [{"t": 1}, {"t": 2}]}}
-    with pytest.raises(RecordingError, match=r"several lists of records: a\.left, a\.right; .*recording\.records"):
+    with pytest.raises(
+        RecordingError, match=r"several lists of records: a\.left, a\.right; .*recording\.records"
+    ):
         read_json(content, tmp_path)
     table = read_json(content, tmp_path, RecordingSpec(records="a.right"))
-    assert {name: c.tolist() for name, c in table.columns.items()} == {"t": [1, 2], "k": [1, 1], "a.gain": [2, 2]}
+    assert {name: c.tolist() for name, c in table.columns.items()} == {
+        "t": [1, 2],
+        "k": [1, 1],
+        "a.gain": [2, 2],
+    }
     for wrong in ("a.rigth", "k.right"):
-        with pytest.raises(RecordingError, match=rf"recording\.records: .*'{wrong}'.*a\.left, a\.right"):
+        with pytest.raises(
+            RecordingError, match=rf"recording\.records: .*'{wrong}'.*a\.left, a\.right"
+        ):
             read_json(content, tmp_path, RecordingSpec(records=wrong))
     with pytest.raises(RecordingError, match=r"'k' is not a list of records"):
         read_json(content, tmp_path, RecordingSpec(records="k"))
@@ -358,7 +409,9 @@ def test_json_place(tmp_path: Path) -> None:
 
 def test_json_lists(tmp_path: Path) -> None:
     """One list per column; ragged ones are named when they are used."""
-    table = read_json({"t": [0, 1, 2], "q": [1, None, 3], "short": [1, 2], "k": 4, "s": ["a", 1, 2]}, tmp_path)
+    table = read_json(
+        {"t": [0, 1, 2], "q": [1, None, 3], "short": [1, 2], "k": 4, "s": ["a", 1, 2]}, tmp_path
+    )
     assert np.array_equal(table.column("q"), [1, np.nan, 3], equal_nan=True)
     assert table.column("k").tolist() == [4, 4, 4]
     with pytest.raises(RecordingError, match=r"column 'short' has 2 rows where 't' has 3"):
@@ -366,7 +419,9 @@ def test_json_lists(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"column 's' is not numeric"):
         table.column("s")
     ragged = read_json([{"t": 0, "q": [1, 2]}, {"t": 1, "q": [1]}], tmp_path)
-    with pytest.raises(RecordingError, match=r"column 'q\[0\]' is ragged: 1 numbers in record 2, 2 before"):
+    with pytest.raises(
+        RecordingError, match=r"column 'q\[0\]' is ragged: 1 numbers in record 2, 2 before"
+    ):
         ragged.column("q[0]")
 
 

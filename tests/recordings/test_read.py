@@ -144,7 +144,9 @@ def test_unit_of_a_control(read: Read) -> None:
     """A servo's target may be in degrees."""
     source = {"column": "goal", "unit": "deg"}
     logged = read({"goal": wave(90.0), "qpos:pin": wave()}, columns={"ctrl:turn": source})
-    assert np.allclose(logged.recording.ctrl[:, 1], np.pi / 180 * wave(90.0)[:-1], rtol=1e-14, atol=0)
+    assert np.allclose(
+        logged.recording.ctrl[:, 1], np.pi / 180 * wave(90.0)[:-1], rtol=1e-14, atol=0
+    )
     assert np.array_equal(logged.recording.ctrl[:, 0], CTRL["ctrl:push"][:-1])
 
 
@@ -152,7 +154,11 @@ def test_unit_of_a_control(read: Read) -> None:
     ("name", "source", "said"),
     [
         ("qpos:rail", {"unit": "deg"}, r"qpos:rail\.unit: unknown unit 'deg'.*valid: cm, m, mm"),
-        ("qpos:pin", {"unit": "deg/s"}, r"qpos:pin\.unit: unknown unit 'deg/s'.*valid: deg, rad, rev;"),
+        (
+            "qpos:pin",
+            {"unit": "deg/s"},
+            r"qpos:pin\.unit: unknown unit 'deg/s'.*valid: deg, rad, rev;",
+        ),
         ("qvel:pin", {"unit": "m/s"}, r"valid: deg/s, rad/s, rev/s, rpm"),
         ("ruler", {"unit": "rpm"}, r"ruler\.unit: .*valid: m/s, mm/s"),
         ("cell[0]", {"unit": "m"}, r"cell\[0\]\.unit: .*valid: none; for others there is scale"),
@@ -161,7 +167,9 @@ def test_unit_of_a_control(read: Read) -> None:
         ("ctrl:twist", {}, r"unknown column 'ctrl:twist'.*ctrl:turn"),
     ],
 )
-def test_columns_that_do_not_fit_the_model(name: str, source: dict[str, Any], said: str, read: Read) -> None:
+def test_columns_that_do_not_fit_the_model(
+    name: str, source: dict[str, Any], said: str, read: Read
+) -> None:
     """Said before the file is read, naming the experiment's key."""
     with pytest.raises(ExperimentError, match=rf"study\.toml: recording\.columns.*{said}"):
         read({"raw": wave()}, columns={name: {"column": "raw", **source}})
@@ -177,7 +185,10 @@ def test_signed(read: Read) -> None:
     assert np.allclose(column(logged, "motor"), 0.1 * truth, rtol=1e-14, atol=0)
     for wrong in (65536.0, -32769.0, 1.5):
         raw[9] = wrong
-        with pytest.raises(RecordingError, match=rf"column 'raw' holds {wrong:g} in data row 10, which is no integer"):
+        with pytest.raises(
+            RecordingError,
+            match=rf"column 'raw' holds {wrong:g} in data row 10, which is no integer",
+        ):
             read({"raw": raw}, columns={"motor": {"column": "raw", "signed": 16}})
 
 
@@ -187,7 +198,9 @@ def test_counters_begin_anew(read: Read) -> None:
     raw = np.mod(truth, 4096)
     raw[50:53] = np.nan
     scale = 2 * np.pi / 4096
-    logged = read({"raw": raw}, columns={"encoder": {"column": "raw", "period": 4096.0, "scale": scale}})
+    logged = read(
+        {"raw": raw}, columns={"encoder": {"column": "raw", "period": 4096.0, "scale": scale}}
+    )
     found = column(logged, "encoder")
     assert np.isnan(found[50:53]).all()
     there = np.isfinite(raw)
@@ -199,7 +212,9 @@ def test_angles_jump_by_turns(read: Read) -> None:
     truth = 4.0 * np.sin(2.0 * T)
     raw = np.degrees(np.angle(np.exp(1j * truth)))
     raw[::7] = np.nan
-    logged = read({"raw": raw}, columns={"qpos:pin": {"column": "raw", "unit": "deg", "unwrap": True}})
+    logged = read(
+        {"raw": raw}, columns={"qpos:pin": {"column": "raw", "unit": "deg", "unwrap": True}}
+    )
     there = np.isfinite(raw)
     assert np.abs(np.diff(raw[there])).max() > 300
     assert np.allclose(column(logged, "qpos:pin")[there], truth[there], rtol=0, atol=1e-12)
@@ -213,7 +228,9 @@ def test_time_units(unit: str, factor: float, read: Read) -> None:
     """Irregular times stay as they are, from zero; seconds since 1970 too."""
     rng = np.random.default_rng(1)
     t = T + rng.uniform(-1e-3, 1e-3, M)
-    logged = read({"stamp": (t + 1000.0) * factor, "qpos:pin": wave()}, time="stamp", time_unit=unit)
+    logged = read(
+        {"stamp": (t + 1000.0) * factor, "qpos:pin": wave()}, time="stamp", time_unit=unit
+    )
     assert np.allclose(logged.recording.t, t - t[0], rtol=0, atol=1e-9)
     assert logged.recording.t[0] == 0.0
 
@@ -228,7 +245,9 @@ def test_window(read: Read) -> None:
     assert np.allclose(r.t, T[:97], rtol=0, atol=1e-12)
     assert np.array_equal(column(logged, "qpos:pin"), wave()[104:201])
     assert r.ctrl[:4, 0].tolist() == [102.0, 105.0, 105.0, 105.0]
-    with pytest.raises(RecordingError, match=r"recording\.window: no row between 7 and 8 s; the log lasts 1\.995 s"):
+    with pytest.raises(
+        RecordingError, match=r"recording\.window: no row between 7 and 8 s; the log lasts 1\.995 s"
+    ):
         read(columns, window=(7.0, 8.0))
 
 
@@ -254,12 +273,18 @@ def test_window_cuts_what_is_wrong(read: Read) -> None:
             r"does not increase in data row 8: 0\.03 s, then 0\.03 s \(a duplicate\)",
         ),
         (lambda t: np.floor(t * 50) / 50, r"in data row 2: .*\(a duplicate, one of 3\d\d\)"),
-        (lambda t: np.mod(t, 1.2), r"in data row 241: 1\.195 s, then 0 s \(the clock began anew, or wrapped around\)"),
+        (
+            lambda t: np.mod(t, 1.2),
+            r"in data row 241: 1\.195 s, then 0 s \(the clock began anew, or wrapped around\)",
+        ),
         (lambda t: np.where(t == t[7], t[5] + 1e-4, t), r"in data row 8: .*\(rows out of order\)"),
         (lambda t: 1e3 * t, r'median step is 5 s, .* is it recording\.time_unit = "ms"\?'),
         (lambda t: 1e6 * t, r'recording\.time_unit = "us"\?'),
         (lambda t: 1e9 * t, r'recording\.time_unit = "ns"\?'),
-        (lambda t: t + 0.2 * (t > t[99]), r"a hole of 0\.205 s after data row 100 \(0\.495 s .*longer than 0\.1 s"),
+        (
+            lambda t: t + 0.2 * (t > t[99]),
+            r"a hole of 0\.205 s after data row 100 \(0\.495 s .*longer than 0\.1 s",
+        ),
     ],
 )
 def test_clocks_that_are_wrong(change: Callable[[Array], Array], said: str, read: Read) -> None:
@@ -296,10 +321,16 @@ def test_measured_at_several_rates(read: Read) -> None:
 
 def test_holes_in_columns(read: Read) -> None:
     """A run that is longer than the gap, in the middle and at the ends; shorter ones stay empty."""
-    for begin, end, said in ((100, 160, r"from 0\.495 to 0\.8 s"), (0, 30, "from 0 to 0.15 s"), (360, M, "to 1.995 s")):
+    for begin, end, said in (
+        (100, 160, r"from 0\.495 to 0\.8 s"),
+        (0, 30, "from 0 to 0.15 s"),
+        (360, M, "to 1.995 s"),
+    ):
         q = wave()
         q[begin:end] = np.nan
-        with pytest.raises(RecordingError, match=rf"column 'qpos:pin' is empty .*{said}; longer than 0\.1 s"):
+        with pytest.raises(
+            RecordingError, match=rf"column 'qpos:pin' is empty .*{said}; longer than 0\.1 s"
+        ):
             read({"qpos:pin": q})
         assert np.isnan(column(read({"qpos:pin": q}, gap=0.5), "qpos:pin")).sum() == end - begin
     q = wave()
@@ -317,13 +348,21 @@ def test_controls_are_held(read: Read) -> None:
     late = np.where(np.arange(M) < M - 21, u, np.nan)
     assert read({"qpos:pin": wave(), "ctrl:push": late}, gap=0.1025).recording.ctrl[-1, 0] == M - 22
     u[10:40] = np.nan
-    with pytest.raises(RecordingError, match=r"'ctrl:push'.* is empty for 0\.15 s until 0\.195 s; longer than 0\.1 s"):
+    with pytest.raises(
+        RecordingError,
+        match=r"'ctrl:push'.* is empty for 0\.15 s until 0\.195 s; longer than 0\.1 s",
+    ):
         read({"qpos:pin": wave(), "ctrl:push": u})
     assert read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2).recording.ctrl[39, 0] == 9.0
     u[:4] = np.nan
-    with pytest.raises(RecordingError, match=r"'ctrl:push'.*no value in the first row; it begins 0\.02 s later"):
+    with pytest.raises(
+        RecordingError, match=r"'ctrl:push'.*no value in the first row; it begins 0\.02 s later"
+    ):
         read({"qpos:pin": wave(), "ctrl:push": u})
-    assert read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2, window=(0.02, 1.0)).recording.ctrl[0, 0] == 4.0
+    assert (
+        read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2, window=(0.02, 1.0)).recording.ctrl[0, 0]
+        == 4.0
+    )
     with pytest.raises(RecordingError, match="it holds no number"):
         read({"qpos:pin": wave(), "ctrl:push": np.full(M, np.nan)})
 
@@ -331,13 +370,16 @@ def test_controls_are_held(read: Read) -> None:
 def test_dead_channels(read: Read) -> None:
     """A measured column that never moves is refused, a constant control is not."""
     with pytest.raises(
-        RecordingError, match=r"column 'enc' is 1\.5 in all of its 400 rows, a dead channel; leave it out"
+        RecordingError,
+        match=r"column 'enc' is 1\.5 in all of its 400 rows, a dead channel; leave it out",
     ):
         read({"enc": np.full(M, 1.5), "q": wave()}, columns={"encoder": "enc", "qpos:pin": "q"})
     with pytest.raises(RecordingError, match=r"column 'encoder' holds no number; leave it out"):
         read({"encoder": np.full(M, np.nan), "qpos:pin": wave()})
     few = np.where(np.arange(M) % 50 == 0, 1.5, np.nan)
-    assert len(read({"encoder": few, "qpos:pin": wave(), "ctrl:push": np.zeros(M)}).recording.t) == M
+    assert (
+        len(read({"encoder": few, "qpos:pin": wave(), "ctrl:push": np.zeros(M)}).recording.t) == M
+    )
 
 
 @pytest.mark.parametrize("name", ["qpos:pin", "ctrl:push", "kp"])
@@ -352,7 +394,10 @@ def test_infinite_values(name: str, read: Read) -> None:
 
 def test_columns_that_are_missing(read: Read) -> None:
     """Or text, where they are used."""
-    for name, said in (("lost", "column 'lost' is missing; found: .*note"), ("note", "column 'note' is not numeric")):
+    for name, said in (
+        ("lost", "column 'lost' is missing; found: .*note"),
+        ("note", "column 'note' is not numeric"),
+    ):
         for source in (name, {"column": "q", "times": [name]}):
             with pytest.raises(RecordingError, match=said):
                 read({"q": wave(), "note": np.array(["x"] * M)}, columns={"qpos:pin": source})
@@ -369,12 +414,20 @@ def test_slope_tells_degrees(read: Read) -> None:
     q = np.round((1 - np.cos(2 * T)) / 1e-3) * 1e-3
     v = 2.0 * np.sin(2 * T) + 0.1 * rng.standard_normal(M)
     assert len(read({"qpos:pin": q, "qvel:pin": v}).recording.t) == M
-    with pytest.raises(RecordingError, match=r"5\d\.\d times .* 'qpos:pin' is probably in deg: state unit = \"deg\""):
+    with pytest.raises(
+        RecordingError,
+        match=r"5\d\.\d times .* 'qpos:pin' is probably in deg: state unit = \"deg\"",
+    ):
         read({"qpos:pin": np.degrees(q), "qvel:pin": v})
-    with pytest.raises(RecordingError, match=r"0\.017.* 'qvel:pin' is probably in deg/s: state unit = \"deg/s\""):
+    with pytest.raises(
+        RecordingError, match=r"0\.017.* 'qvel:pin' is probably in deg/s: state unit = \"deg/s\""
+    ):
         read({"qpos:pin": q, "qvel:pin": np.degrees(v)})
     both = {"q": np.degrees(q), "v": np.degrees(v)}
-    fine = {"qpos:pin": {"column": "q", "unit": "deg"}, "qvel:pin": {"column": "v", "unit": "deg/s"}}
+    fine = {
+        "qpos:pin": {"column": "q", "unit": "deg"},
+        "qvel:pin": {"column": "v", "unit": "deg/s"},
+    }
     assert np.allclose(column(read(both, columns=fine), "qpos:pin"), q, rtol=0, atol=1e-12)
     silent = {"qpos:pin": {"column": "q", "unit": "rad"}, "qvel:pin": "v"}
     assert column(read({"q": np.degrees(q), "v": v}, columns=silent), "qpos:pin").max() > 100
@@ -392,7 +445,10 @@ def test_slopes_of_noise_say_nothing(read: Read) -> None:
 
 def test_range_tells_degrees(read: Read) -> None:
     """Far beyond the joint's range, and inside as degrees."""
-    with pytest.raises(RecordingError, match=r"'qpos:stop' goes from -\d+.* from -1\.047\d* to 1\.57\d* rad; .*in deg"):
+    with pytest.raises(
+        RecordingError,
+        match=r"'qpos:stop' goes from -\d+.* from -1\.047\d* to 1\.57\d* rad; .*in deg",
+    ):
         read({"qpos:stop": wave(50.0, 6.0)})
     for fine in (wave(1.5, 6.0), wave(4.0, 6.0), wave(700.0, 0.25)):
         assert len(read({"qpos:stop": fine, "qvel:stop": wave()}).recording.t) == M
@@ -402,11 +458,15 @@ def test_range_tells_degrees(read: Read) -> None:
 
 def test_speed_tells_degrees(read: Read) -> None:
     """Many turns, faster than a robot turns; also where the velocity is in degrees as well, and so no contradiction."""
-    with pytest.raises(RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"):
+    with pytest.raises(
+        RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"
+    ):
         read({"qpos:pin": wave(90.0, 6.0)})
     assert len(read({"qpos:pin": 60.0 * T}).recording.t) == M  # a motor that runs
     both = {"qpos:pin": wave(90.0, 6.0), "qvel:pin": 540.0 * np.cos(6.0 * T)}
-    with pytest.raises(RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"):
+    with pytest.raises(
+        RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"
+    ):
         read(both)
     stated = {"qpos:pin": {"column": "q", "unit": "rad"}, "qvel:pin": "v"}
     fast = dict(zip("qv", both.values(), strict=True))
@@ -455,9 +515,13 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     r = read_recording(tmp_path / "d.npz", setup)
     assert np.array_equal(r.ctrl, ctrl)
     order = [f"{kind}:{joint}" for kind in ("qpos", "qvel") for joint in ("rail", "pin", "stop")]
-    assert np.array_equal(r.y[:, [r.outputs.index(name) for name in order]], np.hstack([qpos, qvel]))
+    assert np.array_equal(
+        r.y[:, [r.outputs.index(name) for name in order]], np.hstack([qpos, qvel])
+    )
     np.savez(tmp_path / "d.npz", t=T, qpos=qpos[:, :2], ctrl=ctrl)
-    with pytest.raises(RecordingError, match=r"'qpos' has 2 columns, the model 3: qpos:rail, qpos:pin, qpos:stop"):
+    with pytest.raises(
+        RecordingError, match=r"'qpos' has 2 columns, the model 3: qpos:rail, qpos:pin, qpos:stop"
+    ):
         read_recording(tmp_path / "d.npz", setup)
     stated = setup_of(tmp_path, {"columns": {"qpos:pin": "qpos[1]"}})
     assert np.array_equal(read_recording(tmp_path / "d.npz", stated).y[:, 0], qpos[:, 1])
@@ -466,7 +530,12 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
 def test_names_beside_matrices(tmp_path: Path) -> None:
     """One array per column is fine too; a control of full length is cut."""
     setup = setup_of(tmp_path, {})
-    arrays = {"t": T, **CTRL, "qpos:pin": wave(), "gyro": np.column_stack([wave(), wave(2.0), wave(3.0)])}
+    arrays = {
+        "t": T,
+        **CTRL,
+        "qpos:pin": wave(),
+        "gyro": np.column_stack([wave(), wave(2.0), wave(3.0)]),
+    }
     np.savez(tmp_path / "r.npz", **arrays)
     r = read_recording(tmp_path / "r.npz", setup)
     assert r.outputs == ("qpos:pin", "gyro[0]", "gyro[1]", "gyro[2]")
@@ -481,13 +550,23 @@ def test_bags_are_recordings(tmp_path: Path) -> None:
     from rosbags.rosbag2 import StoragePlugin
 
     states = [
-        State(EPOCH + 5_000_000 * i, ["pin", "grip"], [wave()[i], 0.0], [2 * np.cos(2 * T[i]), 0.0], [T[i], 1.0])
+        State(
+            EPOCH + 5_000_000 * i,
+            ["pin", "grip"],
+            [wave()[i], 0.0],
+            [2 * np.cos(2 * T[i]), 0.0],
+            [T[i], 1.0],
+        )
         for i in range(M)
     ]
     path = write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": states})
-    with pytest.raises(RecordingError, match="column 'ctrl:push' is missing; found: t, position:pin"):
+    with pytest.raises(
+        RecordingError, match="column 'ctrl:push' is missing; found: t, position:pin"
+    ):
         read_recording(path, setup_of(tmp_path, {}))
-    spec = {"columns": {"ctrl:turn": "effort:pin", "ctrl:push": {"column": "effort:grip", "scale": 0.0}}}
+    spec = {
+        "columns": {"ctrl:turn": "effort:pin", "ctrl:push": {"column": "effort:grip", "scale": 0.0}}
+    }
     r = read_recording(path, setup_of(tmp_path, spec))
     assert r.outputs == ("qpos:pin", "qvel:pin")
     assert np.array_equal(r.y[:, 0], wave())
@@ -517,7 +596,12 @@ ROBOTS: dict[str, dict[str, Any]] = {
         "columns": {
             "qpos:one": "position",
             "qvel:one": "speed",
-            "ctrl:one": {"column": "load", "signed": 16, "scale": 1e-3, "times": ["torque_enable", "kp"]},
+            "ctrl:one": {
+                "column": "load",
+                "signed": 16,
+                "scale": 1e-3,
+                "times": ["torque_enable", "kp"],
+            },
         },
     },
     "dfki_simple_pendulum/*_measured.csv": {
@@ -541,7 +625,9 @@ def robot(pattern: str, folder: Path, **changes: Any) -> tuple[list[Path], Setup
     if not files:
         pytest.skip(f"no logs of robots at {DATA}")
     double = "double" in pattern
-    model = ONE.format(inner=INNER if double else "", motor='<motor name="two" joint="two"/>' if double else "")
+    model = ONE.format(
+        inner=INNER if double else "", motor='<motor name="two" joint="two"/>' if double else ""
+    )
     return files, setup_of(folder, {**ROBOTS[pattern], **changes}, model)
 
 

@@ -44,7 +44,9 @@ class State:
 def message(state: State) -> Any:
     """As ROS has it."""
     types = STORE.types
-    stamp = types["builtin_interfaces/msg/Time"](sec=state.stamp // 10**9, nanosec=state.stamp % 10**9)
+    stamp = types["builtin_interfaces/msg/Time"](
+        sec=state.stamp // 10**9, nanosec=state.stamp % 10**9
+    )
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="base")
     arrays = (np.array(v, dtype=np.float64) for v in (state.position, state.velocity, state.effort))
     return types["sensor_msgs/msg/JointState"](header, list(state.names), *arrays)
@@ -55,7 +57,9 @@ def write(path: Path, storage: Any, topics: dict[str, list[State]], text: bool =
     with Writer(path, version=9, storage_plugin=storage) as writer:
         if text:
             other = writer.add_connection("/log", "std_msgs/msg/String", typestore=STORE)
-            raw = STORE.serialize_cdr(STORE.types["std_msgs/msg/String"](data="hello"), "std_msgs/msg/String")
+            raw = STORE.serialize_cdr(
+                STORE.types["std_msgs/msg/String"](data="hello"), "std_msgs/msg/String"
+            )
             writer.write(other, EPOCH, raw)
         for topic, states in topics.items():
             kind = "sensor_msgs/msg/JointState"
@@ -72,7 +76,9 @@ def swing(count: int = 20) -> list[State]:
     for i in range(count):
         names = ["a", "b"] if i % 2 == 0 else ["b", "a"]
         sign = 1.0 if i % 2 == 0 else -1.0
-        states.append(State(EPOCH + i * PERIOD, names, [sign * i, -sign * i], [sign * 0.5, -sign * 0.5]))
+        states.append(
+            State(EPOCH + i * PERIOD, names, [sign * i, -sign * i], [sign * 0.5, -sign * 0.5])
+        )
     return states
 
 
@@ -94,24 +100,41 @@ def test_joints_are_found_by_name(storage: Any, tmp_path: Path) -> None:
 def test_topics_are_merged_by_time(storage: Any, tmp_path: Path) -> None:
     """A row per stamp, empty where a topic has none."""
     arm = [State(EPOCH + i * PERIOD, ["a"], [float(i)]) for i in range(4)]
-    hand = [State(EPOCH + i * PERIOD + (PERIOD // 2 if i else 0), ["a"], (), (), [10.0 * i]) for i in range(3)]
+    hand = [
+        State(EPOCH + i * PERIOD + (PERIOD // 2 if i else 0), ["a"], (), (), [10.0 * i])
+        for i in range(3)
+    ]
     path = write(tmp_path / "bag", storage, {"/arm": arm, "/hand": hand})
-    with pytest.raises(RecordingError, match=r"several topics of joint states: /arm, /hand; .*recording\.topics"):
+    with pytest.raises(
+        RecordingError, match=r"several topics of joint states: /arm, /hand; .*recording\.topics"
+    ):
         read_columns(path, ALL)
     assert read_columns(path, RecordingSpec(topics=("/hand",))).names == ("t", "effort:a")
     table = read_columns(path, RecordingSpec(topics=("/arm", "/hand")))
     nan = np.nan
-    assert np.allclose(table.column("t"), [0.0, 0.002, 0.003, 0.004, 0.005, 0.006], rtol=0, atol=1e-15)
+    assert np.allclose(
+        table.column("t"), [0.0, 0.002, 0.003, 0.004, 0.005, 0.006], rtol=0, atol=1e-15
+    )
     assert np.array_equal(table.column("/arm:position:a"), [0, 1, nan, 2, nan, 3], equal_nan=True)
-    assert np.array_equal(table.column("/hand:effort:a"), [0, nan, 10, nan, 20, nan], equal_nan=True)
-    with pytest.raises(RecordingError, match=r"recording\.topics: unknown topic '/amr' \(did you mean '/arm'\?\)"):
+    assert np.array_equal(
+        table.column("/hand:effort:a"), [0, nan, 10, nan, 20, nan], equal_nan=True
+    )
+    with pytest.raises(
+        RecordingError, match=r"recording\.topics: unknown topic '/amr' \(did you mean '/arm'\?\)"
+    ):
         read_columns(path, RecordingSpec(topics=("/amr",)))
 
 
 def test_two_publishers_of_one_topic(tmp_path: Path) -> None:
     """Each names its own joints, and their stamps interleave."""
-    left = [State(EPOCH + i * PERIOD, ["a"], [float(i)], received=EPOCH + i * PERIOD + 100) for i in range(3)]
-    right = [State(s.stamp - 1000 * (i > 0), ["b"], [5.0], received=s.stamp + 200) for i, s in enumerate(left)]
+    left = [
+        State(EPOCH + i * PERIOD, ["a"], [float(i)], received=EPOCH + i * PERIOD + 100)
+        for i in range(3)
+    ]
+    right = [
+        State(s.stamp - 1000 * (i > 0), ["b"], [5.0], received=s.stamp + 200)
+        for i, s in enumerate(left)
+    ]
     states = sorted([*left, *right], key=lambda s: s.received or 0)
     table = read_columns(write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": states}), ALL)
     nan = np.nan
@@ -133,10 +156,16 @@ def test_received_where_there_is_no_stamp(tmp_path: Path) -> None:
             "message 2: has the stamp of",
         ),
         (
-            [State(EPOCH, ["a"], [0.0], received=EPOCH), State(EPOCH - 10**9, ["a"], [1.0], received=EPOCH + 1)],
+            [
+                State(EPOCH, ["a"], [0.0], received=EPOCH),
+                State(EPOCH - 10**9, ["a"], [1.0], received=EPOCH + 1),
+            ],
             r"message 2: has a stamp before the last one's \(-1 s\)",
         ),
-        ([State(EPOCH, ["a", "b"], [0.0])], r"message 1: as many names as numbers are wanted \(2 names\)"),
+        (
+            [State(EPOCH, ["a", "b"], [0.0])],
+            r"message 1: as many names as numbers are wanted \(2 names\)",
+        ),
         ([State(EPOCH, ["a", "a"], [0.0, 1.0])], "message 1: a joint is named twice: a, a"),
         ([], "topic /j has no message"),
     ],
@@ -151,14 +180,17 @@ def test_no_joint_states(tmp_path: Path) -> None:
     """The message lists what there is."""
     path = write(tmp_path / "bag", StoragePlugin.MCAP, {}, text=True)
     with pytest.raises(
-        RecordingError, match=r"no topic of sensor_msgs/msg/JointState.*found: /log \(std_msgs/msg/String\)"
+        RecordingError,
+        match=r"no topic of sensor_msgs/msg/JointState.*found: /log \(std_msgs/msg/String\)",
     ):
         read_columns(path, ALL)
 
 
 def test_stamps_have_their_unit(tmp_path: Path) -> None:
     path = write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": swing()})
-    with pytest.raises(RecordingError, match=r"recording\.time_unit: the stamps of a bag are in seconds"):
+    with pytest.raises(
+        RecordingError, match=r"recording\.time_unit: the stamps of a bag are in seconds"
+    ):
         read_columns(path, RecordingSpec(time_unit="ns"))
 
 

@@ -19,7 +19,14 @@ from mjfim.experiment.system import Setup
 from mjfim.signals import Chirp, Frame, Multisine, Steps, fourier_basis, schroeder
 from mjfim.studies.baselines.budget import Arena, Attempt, Job, Spent
 from mjfim.studies.baselines.methods import METHODS, Shaper, perform, reflected, search
-from mjfim.studies.baselines.parametric import Descent, Series, fourier, scipy_own, splines, tournament
+from mjfim.studies.baselines.parametric import (
+    Descent,
+    Series,
+    fourier,
+    scipy_own,
+    splines,
+    tournament,
+)
 from mjfim.studies.compare import _tried
 
 MODELS = Path(__file__).parents[2] / "models"
@@ -31,7 +38,11 @@ def pendulum(bandwidth: float | None = None, **tables: Any) -> Experiment:
     """Two seconds of the cart-pendulum, by its limits alone."""
     hard = {
         "horizon": 2.0,
-        "limits": {"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.5, 0.5)}, "bandwidth": bandwidth},
+        "limits": {
+            "control": {"force": (-5.0, 5.0)},
+            "position": {"slide": (-0.5, 0.5)},
+            "bandwidth": bandwidth,
+        },
         "cost": {"control": 0.0, "tracking": {}},
     }
     return Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**{**hard, **tables})
@@ -82,7 +93,8 @@ def test_schroeder_phases_lower_the_peak(count: int) -> None:
     for power in (np.ones(count), order**-1.0):
         phases = schroeder(power)
         low, high = (
-            crest((np.sqrt(power) * np.cos(2 * np.pi * np.outer(t, order) + p)).sum(axis=1)) for p in (phases, 0.0)
+            crest((np.sqrt(power) * np.cos(2 * np.pi * np.outer(t, order) + p)).sum(axis=1))
+            for p in (phases, 0.0)
         )
         assert low < 0.75 * high
         assert low < 2.2
@@ -90,7 +102,9 @@ def test_schroeder_phases_lower_the_peak(count: int) -> None:
 
 def test_schroeder_phases_of_equal_powers_are_the_known_ones() -> None:
     k = np.arange(1, 9)
-    np.testing.assert_allclose(np.exp(1j * schroeder(np.ones(8))), np.exp(-1j * np.pi * k * (k - 1) / 8), atol=1e-12)
+    np.testing.assert_allclose(
+        np.exp(1j * schroeder(np.ones(8))), np.exp(-1j * np.pi * k * (k - 1) / 8), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("kind", [Chirp, Multisine, Steps])
@@ -123,7 +137,9 @@ def test_steps_are_held_or_pass_smoothly() -> None:
 
 
 def test_numbers_are_reflected_at_their_ends() -> None:
-    np.testing.assert_allclose(reflected(np.array([-0.2, 0.3, 1.1, 2.3, -1.4])), [0.2, 0.3, 0.9, 0.3, 0.6])
+    np.testing.assert_allclose(
+        reflected(np.array([-0.2, 0.3, 1.1, 2.3, -1.4])), [0.2, 0.3, 0.9, 0.3, 0.6]
+    )
 
 
 # ---- limits and budgets
@@ -141,7 +157,9 @@ def test_every_baseline_keeps_the_limits_and_its_budget(method: str) -> None:
     setup = Setup(pendulum())
     point = setup.problem.point(setup.plant.simulate(setup.theta, attempt.control))
     assert point.cost == pytest.approx(attempt.cost, rel=1e-3)
-    assert point.cost < 0.5 * setup.problem.point(setup.initial).cost  # of a start that even leaves the limits
+    assert (
+        point.cost < 0.5 * setup.problem.point(setup.initial).cost
+    )  # of a start that even leaves the limits
 
 
 def test_amplitudes_go_up_to_the_limits() -> None:
@@ -159,7 +177,9 @@ def test_seconds_end_a_search() -> None:
 
 
 def test_a_budget_of_steps_makes_it_repeatable() -> None:
-    first, again, other = (perform(Job(pendulum(), "chirp", 60.0, 30_000, seed=s)) for s in (4, 4, 5))
+    first, again, other = (
+        perform(Job(pendulum(), "chirp", 60.0, 30_000, seed=s)) for s in (4, 4, 5)
+    )
     assert first.control is not None
     assert other.control is not None
     np.testing.assert_array_equal(first.control, again.control)
@@ -227,12 +247,16 @@ def test_the_usual_frequencies_come_first_and_stay_within_the_bandwidth() -> Non
     first = [next(series) for _ in range(7)]
     assert [s.name for s in first[:5]] == ["0.2 Hz", "0.1 Hz", "0.4 Hz", "0.8 Hz", "0.15 Hz"]
     t = arena.setup.t
-    for s, frequency, harmonics in zip(first, (0.2, 0.1, 0.4, 0.8, 0.15), (5, 5, 2, 1, 5), strict=False):
+    for s, frequency, harmonics in zip(
+        first, (0.2, 0.1, 0.4, 0.8, 0.15), (5, 5, 2, 1, 5), strict=False
+    ):
         waves = fourier_basis(t, 2.0, frequency, harmonics, False, False)
         left = waves - s.basis @ np.linalg.lstsq(s.basis, waves)[0]
         assert np.abs(left).max() < 1e-3
     assert "at random" in first[5].name
-    assert all(s.basis.shape[1] <= 7 for s in (next(splines(arena)) for _ in range(2)))  # 1 Hz: four pieces
+    assert all(
+        s.basis.shape[1] <= 7 for s in (next(splines(arena)) for _ in range(2))
+    )  # 1 Hz: four pieces
 
 
 def test_slopes_for_scipy_are_the_derivatives() -> None:
@@ -245,8 +269,12 @@ def test_slopes_for_scipy_are_the_derivatives() -> None:
     for i in range(s.size):
         move = np.zeros(s.size)
         move[i] = 1e-4
-        sides = [descent._valued(problem, s + sign * move.reshape(s.shape))[0] for sign in (1.0, -1.0)]
-        assert (sides[0] - sides[1]) / 2e-4 == pytest.approx(slope[i], rel=5e-3, abs=2e-3 * np.abs(slope).max())
+        sides = [
+            descent._valued(problem, s + sign * move.reshape(s.shape))[0] for sign in (1.0, -1.0)
+        ]
+        assert (sides[0] - sides[1]) / 2e-4 == pytest.approx(
+            slope[i], rel=5e-3, abs=2e-3 * np.abs(slope).max()
+        )
 
 
 def test_a_tournament_ends_with_its_budget_and_sharpens_the_best() -> None:
@@ -259,7 +287,10 @@ def test_a_tournament_ends_with_its_budget_and_sharpens_the_best() -> None:
 
     with pytest.raises(Spent):
         tournament(arena, fourier(arena, 5), 5, optimise)
-    assert [name for name, _ in seen[:2]] == ["0.2 Hz", "0.1 Hz"]  # the budget does not bear all five
+    assert [name for name, _ in seen[:2]] == [
+        "0.2 Hz",
+        "0.1 Hz",
+    ]  # the budget does not bear all five
     assert seen[-1][1] < seen[0][1]
     assert 1.0 <= arena.used < 1.2
     assert arena.attempt.found_by in {name for name, _ in seen}
@@ -267,7 +298,9 @@ def test_a_tournament_ends_with_its_budget_and_sharpens_the_best() -> None:
 
 def test_the_best_of_a_search_only_gets_better() -> None:
     costs: list[float] = []
-    arena = Arena(Job(pendulum(), "steps", 60.0, 60_000), lambda used, attempt: costs.append(attempt.cost))
+    arena = Arena(
+        Job(pendulum(), "steps", 60.0, 60_000), lambda used, attempt: costs.append(attempt.cost)
+    )
     with pytest.raises(Spent):
         search(arena, Steps)
     assert len(costs) > 3

@@ -29,7 +29,9 @@ from mjfim.studies.redesign import restated
 
 SCRIPTS = MODELS.parent / "scripts"
 loop = importlib.import_module("mjfim.studies.campaign")  # `mjfim.sequential` is the function
-STUDY = mjfim.Experiment.from_file(MODELS / "cart_pendulum_guess.toml").replace(  # its guesses are 25 to 40 % off
+STUDY = mjfim.Experiment.from_file(
+    MODELS / "cart_pendulum_guess.toml"
+).replace(  # its guesses are 25 to 40 % off
     horizon=1.0,
     initial={"control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.8}},
     descent={"starts": 1, "tolerance": 1e-3, "max_iterations": 30},
@@ -89,17 +91,26 @@ def test_a_round_is_what_its_parts_say(campaign: Campaign) -> None:
     np.testing.assert_array_equal(campaign.rounds[0].theta, setup.parameters.guess)
     np.testing.assert_array_equal(last.theta, campaign.rounds[-2].estimate.theta)
     np.testing.assert_allclose(last.predicted, last.attained, rtol=0.05)
-    assert (np.abs(campaign.rounds[0].predicted / campaign.rounds[0].attained - 1.0) > 0.1).any(), "the guess was right"
+    assert (np.abs(campaign.rounds[0].predicted / campaign.rounds[0].attained - 1.0) > 0.1).any(), (
+        "the guess was right"
+    )
     assert len(campaign.designs) == len(campaign.estimates) == len(recordings)
 
 
 def gained(controls: Sequence[Array], truth: Setup) -> float:
     """Smallest eigenvalue of what the controls tell at the truth, over that of as many repetitions of the first."""
-    told = [mjfim.evaluate_trajectory(truth, truth.plant.simulate(truth.theta, c)).information for c in controls]
-    return float(np.linalg.eigvalsh(np.sum(told, axis=0))[0] / np.linalg.eigvalsh(len(told) * told[0])[0])
+    told = [
+        mjfim.evaluate_trajectory(truth, truth.plant.simulate(truth.theta, c)).information
+        for c in controls
+    ]
+    return float(
+        np.linalg.eigvalsh(np.sum(told, axis=0))[0] / np.linalg.eigvalsh(len(told) * told[0])[0]
+    )
 
 
-def test_a_redesign_tells_more_than_the_first_design_again(campaign: Campaign, truth: Setup) -> None:
+def test_a_redesign_tells_more_than_the_first_design_again(
+    campaign: Campaign, truth: Setup
+) -> None:
     """For about the same effort: information that is there already makes later rounds neither gentler nor wilder."""
     assert gained([r.control for r in campaign.rounds], truth) > 1.03
     efforts = [float((r.control**2).sum()) for r in campaign.rounds]
@@ -159,7 +170,9 @@ def test_friction_that_the_model_has_not_is_not_silent(tmp_path: Path) -> None:
     """Formally as good as wanted, and wrong by many sigma: not reached."""
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1.0"/>')
     easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
-    found = mjfim.sequential(easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=2)
+    found = mjfim.sequential(
+        easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=2
+    )
     assert found.estimate is not None and found.estimate.misfit
     assert found.status is Outcome.DOUBTFUL and not found.reached
     assert any("misfit" in sentence for sentence in found.warnings)
@@ -168,7 +181,9 @@ def test_friction_that_the_model_has_not_is_not_silent(tmp_path: Path) -> None:
 def test_friction_too_weak_for_chi_squared_shows_in_successive_residuals(tmp_path: Path) -> None:
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" damping="0.5"/>')
     easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
-    found = mjfim.sequential(easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=1)
+    found = mjfim.sequential(
+        easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=1
+    )
     assert found.estimate is not None and found.estimate.misfit
     assert not larger(found.estimate.chi2, found.estimate.dof)
     assert found.status is Outcome.DOUBTFUL
@@ -179,7 +194,10 @@ def test_a_round_that_tells_nothing_is_named(campaign: Campaign) -> None:
     """Three rows of a recording are no progress; the rounds are used up, and it says what is missing."""
     first = campaign.rounds[0]
     start = replace(
-        first.recordings[0], t=first.recordings[0].t[:3], ctrl=first.control[:2], y=first.recordings[0].y[:3]
+        first.recordings[0],
+        t=first.recordings[0].t[:3],
+        ctrl=first.control[:2],
+        y=first.recordings[0].y[:3],
     )
     done = [Played(first.recordings, first.theta, first.predicted, first.control), Played((start,))]
     found = mjfim.sequential(STUDY, never, rounds=2, done=done)
@@ -193,7 +211,10 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     first = campaign.rounds[0]
     light = STUDY.replace(parameters={"m": {"true": 1.8}})
     second = mjfim.simulate(light, campaign.designs[1].trajectory, seed=1)
-    done = [Played(first.recordings, first.theta, first.predicted, first.control), Played((second,))]
+    done = [
+        Played(first.recordings, first.theta, first.predicted, first.control),
+        Played((second,)),
+    ]
     found = mjfim.sequential(STUDY, never, rounds=2, done=done)
     assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
 
@@ -215,11 +236,17 @@ def test_interrupted_while_recording(campaign: Campaign) -> None:
         return robot(design, number)
 
     found = mjfim.sequential(STUDY, stop)
-    assert found.status is Outcome.INTERRUPTED and len(found.rounds) == 1 and found.pending is not None
-    np.testing.assert_allclose(found.rounds[0].estimate.theta, campaign.rounds[0].estimate.theta, rtol=1e-9)
+    assert (
+        found.status is Outcome.INTERRUPTED and len(found.rounds) == 1 and found.pending is not None
+    )
+    np.testing.assert_allclose(
+        found.rounds[0].estimate.theta, campaign.rounds[0].estimate.theta, rtol=1e-9
+    )
 
 
-def test_nothing_is_played_that_leaves_the_limits(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_played_that_leaves_the_limits(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
     outside = replace(campaign.designs[0], status=Status.INFEASIBLE)
     monkeypatch.setattr(loop, "design", lambda *args, **kwargs: outside)
     found = mjfim.sequential(STUDY, never)
@@ -256,7 +283,8 @@ def test_each_recording_has_its_own_start() -> None:
     def displaced(design: Design, number: int) -> Recording:
         shift = rng.normal(0.0, 0.05, 2)
         there = loose.replace(
-            initial={"keyframe": None, "qpos": (float(shift[0]), float(np.pi + shift[1]))}, nuisance={"initial": None}
+            initial={"keyframe": None, "qpos": (float(shift[0]), float(np.pi + shift[1]))},
+            nuisance={"initial": None},
         )
         return mjfim.simulate(there, design.trajectory, seed=number)
 
@@ -295,9 +323,13 @@ def test_faulty_requests_say_what_is_right(tmp_path: Path) -> None:
 
 def test_what_no_round_can_tell_is_said_before_anything_moves() -> None:
     """The cart's mass and what the drive adds to it: only their sum shows."""
-    tables = {"cart": {"target": "body/cart:mass"}, "rotor": {"target": "joint/slide:armature", "guess": 0.1}}
+    tables = {
+        "cart": {"target": "body/cart:mass"},
+        "rotor": {"target": "joint/slide:armature", "guess": 0.1},
+    }
     both = STUDY.replace(
-        parameters={name: {**table, "wanted": 0.01} for name, table in tables.items()}, descent={"max_iterations": 2}
+        parameters={name: {**table, "wanted": 0.01} for name, table in tables.items()},
+        descent={"max_iterations": 2},
     )
     with pytest.raises(UnidentifiableError, match=r"cart, rotor can be reached.*cart \+ rotor"):
         mjfim.sequential(both, never)
@@ -335,21 +367,28 @@ def write_study(folder: Path) -> Path:
 
 
 def test_round_by_round_is_the_simulated_campaign(
-    tmp_path: Path, script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    script: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Calls that know of each other by the folder alone design and estimate the same; then the misuses."""
     study = write_study(tmp_path)
     together, apart = tmp_path / "together", tmp_path / "apart"
 
     def call(*words: object) -> int:
-        monkeypatch.setattr(sys, "argv", ["sequential.py", str(study), *(str(word) for word in words)])
+        monkeypatch.setattr(
+            sys, "argv", ["sequential.py", str(study), *(str(word) for word in words)]
+        )
         return int(script.main())
 
     wanted = ("--wanted", 0.0055)
     assert call("-o", together, *wanted, "--seed", 5) == 0
     first = json.loads((together / "campaign.json").read_text(encoding="utf-8"))
     assert first["reached"] and len(first["rounds"]) >= 2
-    assert (together / "campaign.png").stat().st_size > 10_000 and (together / "identified.xml").is_file()
+    assert (together / "campaign.png").stat().st_size > 10_000 and (
+        together / "identified.xml"
+    ).is_file()
     assert call("-o", apart, *wanted, "--real") == 1
     files: list[Path] = []
     for k in range(1, len(first["rounds"]) + 1):
@@ -358,10 +397,16 @@ def test_round_by_round_is_the_simulated_campaign(
             assert call("-o", apart, *wanted, "--real") == 1, "asked again, it still waits"
         files.append(together / f"round_{k}" / "recording.csv")
         capsys.readouterr()
-        code = call("-o", apart, *wanted, "--recordings", *files)  # what is known already does no harm
+        code = call(
+            "-o", apart, *wanted, "--recordings", *files
+        )  # what is known already does no harm
         assert code == (0 if k == len(first["rounds"]) else 1)
     second = json.loads((apart / "campaign.json").read_text(encoding="utf-8"))
-    assert second["reached"] and not second["simulated"] and len(second["rounds"]) == len(first["rounds"])
+    assert (
+        second["reached"]
+        and not second["simulated"]
+        and len(second["rounds"]) == len(first["rounds"])
+    )
     for one, other in zip(first["rounds"], second["rounds"], strict=True):
         for key in ("theta", "std", "predicted", "designed_at"):
             np.testing.assert_allclose(one[key], other[key], rtol=1e-6)

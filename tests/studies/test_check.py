@@ -6,7 +6,15 @@ import gzip
 
 import numpy as np
 import pytest
-from support.numerics import CART_PARAMETERS, MODELS, SHARED, Array, cart_setup, make_setup, relative_error
+from support.numerics import (
+    CART_PARAMETERS,
+    MODELS,
+    SHARED,
+    Array,
+    cart_setup,
+    make_setup,
+    relative_error,
+)
 
 import mjfim
 from mjfim.experiment.system import Setup
@@ -18,7 +26,10 @@ from mjfim.records.recording import Recording
 from mjfim.studies.check import check
 
 RECORDED = SHARED.parent / "data" / "dfki_double_pendulum"
-PRODUCT = {"gear": {"target": "actuator/force:gear[0]"}, "gain": {"target": "actuator/force:gainprm[0]"}}
+PRODUCT = {
+    "gear": {"target": "actuator/force:gear[0]"},
+    "gain": {"target": "actuator/force:gainprm[0]"},
+}
 BLOCK = """
 <mujoco>
   <option timestep="0.005" integrator="implicitfast"/>
@@ -37,15 +48,22 @@ def test_sigmas_are_the_square_roots_of_the_inverse_information(tmp_path) -> Non
     found = check(cart_setup(tmp_path))
     expected = np.sqrt(np.diag(np.linalg.inv(found.information)))
     np.testing.assert_allclose([row.std for row in found.rows], expected, rtol=1e-8)
-    np.testing.assert_allclose([row.relative for row in found.rows], expected / [1.5, 0.8, 0.4], rtol=1e-8)
+    np.testing.assert_allclose(
+        [row.relative for row in found.rows], expected / [1.5, 0.8, 0.4], rtol=1e-8
+    )
     covariance = np.linalg.inv(found.information)
     assert relative_error(found.correlation, covariance / np.outer(expected, expected)) < 1e-8
     assert found.self_test.passed
 
 
 def test_sigmas_are_those_of_evaluate_trajectory_also_with_priors_and_nuisance(tmp_path) -> None:
-    parameters = {**CART_PARAMETERS, "gain": {"target": "actuator/force:gainprm[0]", "nuisance": True, "prior": 0.1}}
-    setup = cart_setup(tmp_path, parameters=parameters, nuisance={"initial": 0.02, "bias": {"qpos:hinge": True}})
+    parameters = {
+        **CART_PARAMETERS,
+        "gain": {"target": "actuator/force:gainprm[0]", "nuisance": True, "prior": 0.1},
+    }
+    setup = cart_setup(
+        tmp_path, parameters=parameters, nuisance={"initial": 0.02, "bias": {"qpos:hinge": True}}
+    )
     found, told = check(setup), mjfim.evaluate_trajectory(setup, setup.initial)
     wanted = [row.std for row in found.rows if not row.nuisance]
     np.testing.assert_allclose(wanted, told.std[:3], rtol=1e-6)
@@ -54,7 +72,11 @@ def test_sigmas_are_those_of_evaluate_trajectory_also_with_priors_and_nuisance(t
 
 
 def test_a_product_is_told_with_its_combination(tmp_path) -> None:
-    parameters = {**CART_PARAMETERS, **PRODUCT, "gear": {"target": "actuator/force:gear[0]", "guess": 4.0}}
+    parameters = {
+        **CART_PARAMETERS,
+        **PRODUCT,
+        "gear": {"target": "actuator/force:gear[0]", "guess": 4.0},
+    }
     found = check(cart_setup(tmp_path, parameters=parameters))
     assert not found.ok
     assert len(found.never) == 1
@@ -62,7 +84,9 @@ def test_a_product_is_told_with_its_combination(tmp_path) -> None:
     assert set(group.members) == {"gear", "gain"}
     assert len(group.combinations) == 1
     first, second = group.combinations[0].members
-    ratio = dict(zip(group.combinations[0].members, group.combinations[0].coefficients, strict=True))
+    ratio = dict(
+        zip(group.combinations[0].members, group.combinations[0].coefficients, strict=True)
+    )
     # d(gear gain) = gain dgear + gear dgain, gear = 4 and gain = 1
     assert ratio["gain"] / ratio["gear"] == pytest.approx(4.0, rel=1e-6)
     assert {first, second} == {"gear", "gain"}
@@ -73,7 +97,11 @@ def test_a_product_is_told_with_its_combination(tmp_path) -> None:
 
 
 def test_what_another_control_would_show_is_told_apart_from_what_none_would(tmp_path) -> None:
-    rest = {"qpos": (0.0, 0.0), "qvel": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
+    rest = {
+        "qpos": (0.0, 0.0),
+        "qvel": (0.0, 0.0),
+        "control": {"kind": "constant", "amplitude": 0.0},
+    }
     found = check(cart_setup(tmp_path, initial=rest, parameters=CART_PARAMETERS))
     assert not found.never
     assert {name for group in found.not_here for name in group.members} == {"m", "l", "c"}
@@ -84,7 +112,9 @@ def test_what_another_control_would_show_is_told_apart_from_what_none_would(tmp_
 def test_repetitions_are_the_least_that_reach_the_wanted_sigma(tmp_path) -> None:
     single = {row.name: row.std for row in check(cart_setup(tmp_path)).rows}
     wanted = {"m": single["m"] / 3.001, "l": 10.0 * single["l"], "c": single["c"] / 1.5}
-    parameters = {name: {**table, "wanted": wanted[name]} for name, table in CART_PARAMETERS.items()}
+    parameters = {
+        name: {**table, "wanted": wanted[name]} for name, table in CART_PARAMETERS.items()
+    }
     rows = {row.name: row for row in check(cart_setup(tmp_path, parameters=parameters)).rows}
     assert {name: row.repetitions for name, row in rows.items()} == {"m": 10, "l": 1, "c": 3}
     assert rows["m"].seconds == pytest.approx(10 * 0.5)
@@ -128,9 +158,14 @@ def test_a_given_trajectory_is_looked_at_instead(tmp_path) -> None:
 
 
 def test_dry_friction_is_flagged_with_its_sample_and_cause(tmp_path) -> None:
-    parameters = {"mass": {"target": "body/block:mass"}, "friction": {"target": "joint/x:frictionloss"}}
+    parameters = {
+        "mass": {"target": "body/block:mass"},
+        "friction": {"target": "joint/x:frictionloss"},
+    }
     sine = {"kind": "sine", "amplitude": 4.0, "frequency": 1.0}
-    setup = make_setup(BLOCK, tmp_path, parameters=parameters, control=sine, noise={"state": 0.01}, horizon=2.0)
+    setup = make_setup(
+        BLOCK, tmp_path, parameters=parameters, control=sine, noise={"state": 0.01}, horizon=2.0
+    )
     found = check(setup)
     assert not found.self_test.passed
     rough = found.self_test.rough
@@ -169,7 +204,10 @@ def test_a_wrong_gradient_is_caught_by_the_slope(tmp_path, monkeypatch) -> None:
 def double_pendulum_groups(found: mjfim.Check) -> dict[str, dict[str, float]]:
     """Combinations of the one group that is expected, by their first member."""
     assert [set(group.members) for group in found.never] == [{"m1r1", "I1", "m2"}]
-    return {c.members[0]: dict(zip(c.members, c.coefficients, strict=True)) for c in found.never[0].combinations}
+    return {
+        c.members[0]: dict(zip(c.members, c.coefficients, strict=True))
+        for c in found.never[0].combinations
+    }
 
 
 def test_the_double_pendulum_names_its_base_parameters() -> None:
@@ -185,7 +223,13 @@ def test_recordings_of_the_real_double_pendulum_tell_the_same() -> None:
     if not file.is_file():
         pytest.skip("the recordings of the double pendulum are not here")
     with gzip.open(file, "rt", encoding="utf-8") as stream:
-        columns = dict(zip(stream.readline().strip().split(","), np.loadtxt(stream, delimiter=",").T, strict=True))
+        columns = dict(
+            zip(
+                stream.readline().strip().split(","),
+                np.loadtxt(stream, delimiter=",").T,
+                strict=True,
+            )
+        )
     experiment = mjfim.Experiment.from_file(MODELS / "double_pendulum.toml")
     setup = Setup(experiment)
     every = round(500 / experiment.rate)
@@ -202,7 +246,9 @@ def test_recordings_of_the_real_double_pendulum_tell_the_same() -> None:
 
 def test_the_summary_is_strict_json(tmp_path) -> None:
     parameters = {**CART_PARAMETERS, **PRODUCT}
-    text = archive.as_json(archive.check_summary(check(cart_setup(tmp_path, parameters=parameters))))
+    text = archive.as_json(
+        archive.check_summary(check(cart_setup(tmp_path, parameters=parameters)))
+    )
     assert "NaN" not in text
     assert "Infinity" not in text
     assert '"identifiable"' in text

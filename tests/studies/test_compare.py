@@ -25,7 +25,9 @@ from mjfim.records.design import Design, HistoryRow
 from mjfim.studies.baselines.budget import Attempt
 from mjfim.studies.compare import Glance, Judge, Meter, chosen_methods
 
-compare = importlib.import_module("mjfim.studies.compare")  # the name in the package is the function's
+compare = importlib.import_module(
+    "mjfim.studies.compare"
+)  # the name in the package is the function's
 LIMITS = "\n[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] }\n"
 
 
@@ -38,13 +40,38 @@ def small() -> Comparison:
 def row(method: str, cost: float, outcome: Outcome = Outcome.INSIDE) -> Row:
     """A made-up result."""
     std = np.full(2, np.sqrt(abs(cost)))
-    return Row(method, method, outcome, np.zeros((4, 1)), cost, cost, std, 1.0 / cost, std[0], 1.0, 10, {}, {})
+    return Row(
+        method,
+        method,
+        outcome,
+        np.zeros((4, 1)),
+        cost,
+        cost,
+        std,
+        1.0 / cost,
+        std[0],
+        1.0,
+        10,
+        {},
+        {},
+    )
 
 
 def made(*rows: Row, nats: float = 0.0) -> Comparison:
     """A made-up comparison."""
     return Comparison(
-        "e", "D" if nats else "E", nats, ("a", "b"), ("", ""), np.ones(2), (), rows, 1.0, np.inf, 0, False
+        "e",
+        "D" if nats else "E",
+        nats,
+        ("a", "b"),
+        ("", ""),
+        np.ones(2),
+        (),
+        rows,
+        1.0,
+        np.inf,
+        0,
+        False,
     )
 
 
@@ -52,7 +79,11 @@ def made(*rows: Row, nats: float = 0.0) -> Comparison:
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short experiment under hard limits."""
     path = write_experiment(tmp_path_factory.mktemp("compare"))
-    text = path.read_text(encoding="utf-8").replace("control = 1e-3", "control = 0.0").replace("slide = 0.05", "")
+    text = (
+        path.read_text(encoding="utf-8")
+        .replace("control = 1e-3", "control = 0.0")
+        .replace("slide = 0.05", "")
+    )
     path.write_text(text + LIMITS, encoding="utf-8")
     return path
 
@@ -113,8 +144,16 @@ def test_the_designs_control_is_never_shrunk() -> None:
 
 
 def test_who_beats_whom() -> None:
-    c = made(row("a", 2.0), row("b", 0.5), row("c", 0.4, Outcome.OUTSIDE), row("d", 0.9995), row(DESIGN, 1.0))
-    assert [r.method for r in c.beating] == ["b"]  # not what leaves the limits, nor what is no better
+    c = made(
+        row("a", 2.0),
+        row("b", 0.5),
+        row("c", 0.4, Outcome.OUTSIDE),
+        row("d", 0.9995),
+        row(DESIGN, 1.0),
+    )
+    assert [r.method for r in c.beating] == [
+        "b"
+    ]  # not what leaves the limits, nor what is no better
     assert not c.ok
     assert "beaten by b (J 50 % lower)" in c.verdict[0]
     assert c.best is not None
@@ -192,12 +231,16 @@ def test_budgets_must_be_positive(budget: dict[str, float]) -> None:
 def test_the_picture_has_a_row_per_method() -> None:
     figure = compare_figure(small())
     cells, bars = figure.axes[:2]
-    assert [label.get_text() for label in cells.get_yticklabels()] == [r.title for r in small().rows]
+    assert [label.get_text() for label in cells.get_yticklabels()] == [
+        r.title for r in small().rows
+    ]
     assert [label.get_text() for label in cells.get_xticklabels()] == ["m", "l", "c"]
     shown = np.exp(np.asarray(cells.images[0].get_array()))
     np.testing.assert_allclose(shown[2], 1.0)
     np.testing.assert_allclose(shown[0], small().rows[0].std / small().rows[2].std)
-    assert [bar.get_width() for bar in bars.patches] == pytest.approx([r.worst for r in small().rows])
+    assert [bar.get_width() for bar in bars.patches] == pytest.approx(
+        [r.worst for r in small().rows]
+    )
 
 
 @pytest.mark.parametrize(
@@ -219,7 +262,18 @@ def test_the_picture_of_any_result_is_drawn(rows: tuple[Row, ...], tmp_path: Pat
 
 def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    words = (study, "-o", out, "--seconds", 60, "--steps", 60_000, "--methods", "chirp,steps", "--json")
+    words = (
+        study,
+        "-o",
+        out,
+        "--seconds",
+        60,
+        "--steps",
+        60_000,
+        "--methods",
+        "chirp,steps",
+        "--json",
+    )
     result = run("compare", *words)
     assert result.exit_code == 0, result.stderr
     assert "1/3 chirp" in result.stderr
@@ -232,9 +286,16 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     controls = {f"control_{m}.csv" for m in ("chirp", "steps", DESIGN)}
     assert names(out) == {"compare.json", "compare.png", *controls}
     assert imread(out / "compare.png").shape[0] > 300
-    again = run("compare", study, "-o", out, "--seconds", 60, "--steps", 20_000, "--methods", "chirp")
+    again = run(
+        "compare", study, "-o", out, "--seconds", 60, "--steps", 20_000, "--methods", "chirp"
+    )
     assert again.exit_code == 0, again.stderr
-    assert names(out) == {"compare.json", "compare.png", "control_chirp.csv", f"control_{DESIGN}.csv"}
+    assert names(out) == {
+        "compare.json",
+        "compare.png",
+        "control_chirp.csv",
+        f"control_{DESIGN}.csv",
+    }
     for word in (
         "chirp",
         "mjfim's design",
@@ -247,7 +308,9 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
         assert word in " ".join(again.stdout.split())
     assert "…" not in again.stdout  # every number whole
     # a control of it is the initial control of another experiment
-    text = study.read_text(encoding="utf-8").replace('"cart_pendulum.csv"', f'"{out / "control_chirp.csv"}"')
+    text = study.read_text(encoding="utf-8").replace(
+        '"cart_pendulum.csv"', f'"{out / "control_chirp.csv"}"'
+    )
     (study.parent / "next.toml").write_text(text, encoding="utf-8")
     setup = Setup(mjfim.Experiment.from_file(study.parent / "next.toml"))
     reached = next(m for m in read(out / "compare.json")["methods"] if m["method"] == "chirp")
@@ -269,7 +332,9 @@ def test_a_design_that_is_worse_is_said_to_be_beaten(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compare, "design", worse(compare.design))
-    result = run("compare", study, "-o", tmp_path, "--seconds", 60, "--steps", 20_000, "--methods", "chirp")
+    result = run(
+        "compare", study, "-o", tmp_path, "--seconds", 60, "--steps", 20_000, "--methods", "chirp"
+    )
     assert result.exit_code == 1
     assert "beaten by chirp" in " ".join(result.stdout.split())
     assert "beaten by chirp" in result.stderr
@@ -277,7 +342,9 @@ def test_a_design_that_is_worse_is_said_to_be_beaten(
     assert (told["ok"], told["best"], told["beating"]) == (False, "chirp", ["chirp"])
 
 
-def test_an_interrupted_comparison_is_written(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_comparison_is_written(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def interrupted(*args: Any, **kwargs: Any) -> Design:
         raise KeyboardInterrupt
 

@@ -45,8 +45,12 @@ def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Desig
     np.testing.assert_allclose(study.information["initial"][0, 0], 961, rtol=0.01)
 
 
-def test_each_trial_is_its_own_least_squares_estimate(experiment: Experiment, design: mjfim.Design) -> None:
-    study = monte_carlo(experiment, {"initial": design.initial.trajectory}, trials=20, seed=5, measure_rate=25.0)
+def test_each_trial_is_its_own_least_squares_estimate(
+    experiment: Experiment, design: mjfim.Design
+) -> None:
+    study = monte_carlo(
+        experiment, {"initial": design.initial.trajectory}, trials=20, seed=5, measure_rate=25.0
+    )
     setup = Setup(experiment.replace(measure_rate=25.0))
     rng = np.random.default_rng(5).spawn(1)[0]
     ctrl, rows = design.initial.trajectory.ctrl, np.arange(4, 401, 4)
@@ -57,12 +61,15 @@ def test_each_trial_is_its_own_least_squares_estimate(experiment: Experiment, de
         y = np.full((401, 4), np.nan)
         y[rows] = exact[0, rows] + 0.05 * noise[i]
         alone = identify(setup, [Recording(np.arange(401) * 0.01, ctrl, y, setup.outputs.names)])
-        np.testing.assert_array_less(np.abs(study.sets["initial"].estimates[i] - alone.theta), 0.01 * std)
+        np.testing.assert_array_less(
+            np.abs(study.sets["initial"].estimates[i] - alone.theta), 0.01 * std
+        )
 
 
 def test_seed_decides_the_result(experiment: Experiment, design: mjfim.Design) -> None:
     runs = [
-        monte_carlo(experiment, design.trajectory, trials=8, seed=seed).sets["final"].estimates for seed in (1, 1, 2)
+        monte_carlo(experiment, design.trajectory, trials=8, seed=seed).sets["final"].estimates
+        for seed in (1, 1, 2)
     ]
     np.testing.assert_array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0], runs[2])
@@ -95,7 +102,9 @@ def test_failed_trials_are_counted_not_averaged() -> None:
     assert np.isfinite(s.covariance).all()
 
 
-def test_simulated_noise_is_white_gaussian_of_the_stated_size(experiment: Experiment, design: mjfim.Design) -> None:
+def test_simulated_noise_is_white_gaussian_of_the_stated_size(
+    experiment: Experiment, design: mjfim.Design
+) -> None:
     setup = Setup(experiment)
     exact, _ = setup.plant.measure(setup.parameters.true[None], design.trajectory.ctrl)
     residual = ((simulate(setup, design.trajectory, seed=9).y - exact[0]) / 0.05).ravel()
@@ -105,46 +114,67 @@ def test_simulated_noise_is_white_gaussian_of_the_stated_size(experiment: Experi
 
 PAIR = ((0.05**2, 0.8 * 0.05**2), (0.8 * 0.05**2, 0.05**2))
 VARIED = {
-    "noise": {"qpos:hinge": {"sigma": 0.02, "rate": 25.0}, "hinge_velocity": {"sigma": 0.1, "rate": 50.0}},
+    "noise": {
+        "qpos:hinge": {"sigma": 0.02, "rate": 25.0},
+        "hinge_velocity": {"sigma": 0.1, "rate": 50.0},
+    },
     "correlated": ({"outputs": ("qpos:slide", "qvel:hinge"), "covariance": PAIR},),
 }
 
 
-def test_simulated_noise_is_correlated_and_sampled_as_stated(experiment: Experiment, design: mjfim.Design) -> None:
+def test_simulated_noise_is_correlated_and_sampled_as_stated(
+    experiment: Experiment, design: mjfim.Design
+) -> None:
     setup = Setup(experiment.replace(**VARIED))
     exact, _ = setup.plant.measure(setup.parameters.true[None], design.trajectory.ctrl)
-    residuals = np.stack([simulate(setup, design.trajectory, seed=s).y - exact[0] for s in range(8)])
+    residuals = np.stack(
+        [simulate(setup, design.trajectory, seed=s).y - exact[0] for s in range(8)]
+    )
     for i, stride in enumerate(setup.noise.strides):
-        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(residuals[0, :, i])), np.arange(0, 401, stride))
+        np.testing.assert_array_equal(
+            np.flatnonzero(np.isfinite(residuals[0, :, i])), np.arange(0, 401, stride)
+        )
     names = list(setup.outputs.names)
     assert dict(zip(names, setup.noise.strides, strict=True))["qpos:hinge"] == 4
     assert dict(zip(names, setup.noise.strides, strict=True))["hinge_velocity"] == 2
     every = residuals[:, ::4].reshape(-1, len(names))
-    error = (every.T @ every / len(every) - setup.noise.covariance) / np.outer(setup.noise.sigma, setup.noise.sigma)
+    error = (every.T @ every / len(every) - setup.noise.covariance) / np.outer(
+        setup.noise.sigma, setup.noise.sigma
+    )
     assert np.abs(error).max() < 4.5 * np.sqrt(2.0 / len(every))
 
 
 def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estimates(
     experiment: Experiment, design: mjfim.Design
 ) -> None:
-    setup = Setup(experiment.replace(**VARIED, nuisance={"bias": {"qpos:slide": 0.05}, "delay": 0.01}))
+    setup = Setup(
+        experiment.replace(**VARIED, nuisance={"bias": {"qpos:slide": 0.05}, "delay": 0.01})
+    )
     curve = design.trajectory
     study = monte_carlo(setup, {"final": curve}, trials=6, seed=5)
     exact, _ = setup.plant.measure(setup.parameters.true[None], curve.ctrl)
     mask = setup.noise.measured(400) > 0
     white = np.random.default_rng(5).spawn(1)[0].standard_normal((6, mask.sum()))
     std = np.sqrt(np.diag(study.sets["final"].crlb))
-    unprejudiced = experiment.replace(**VARIED, nuisance={"bias": {"qpos:slide": True}, "delay": True})
+    unprejudiced = experiment.replace(
+        **VARIED, nuisance={"bias": {"qpos:slide": True}, "delay": True}
+    )
     for i in range(3):
         z = np.zeros(mask.shape)
         z[mask] = white[i]
         y = np.where(mask, exact[0] + z @ setup.noise.factor.T, np.nan)
-        alone = identify(unprejudiced, [Recording(np.arange(401) * 0.01, curve.ctrl, y, setup.outputs.names)])
-        np.testing.assert_array_less(np.abs(study.sets["final"].estimates[i] - alone.theta), 0.01 * std)
+        alone = identify(
+            unprejudiced, [Recording(np.arange(401) * 0.01, curve.ctrl, y, setup.outputs.names)]
+        )
+        np.testing.assert_array_less(
+            np.abs(study.sets["final"].estimates[i] - alone.theta), 0.01 * std
+        )
         np.testing.assert_allclose(alone.std, std, rtol=0.2)
 
 
-def test_simulation_measures_at_the_measurement_rate(experiment: Experiment, design: mjfim.Design) -> None:
+def test_simulation_measures_at_the_measurement_rate(
+    experiment: Experiment, design: mjfim.Design
+) -> None:
     y = mjfim.simulate(experiment.replace(measure_rate=25.0), design.trajectory, seed=0).y
     measured = np.isfinite(y).all(axis=1)
     assert np.array_equal(np.flatnonzero(measured), np.arange(0, 401, 4))
@@ -155,7 +185,9 @@ def test_too_few_trials_are_refused(experiment: Experiment, design: mjfim.Design
         monte_carlo(experiment, design.trajectory, trials=1)
 
 
-def test_a_parameter_known_by_its_prior_alone_is_named(design: mjfim.Design, experiment: Experiment) -> None:
+def test_a_parameter_known_by_its_prior_alone_is_named(
+    design: mjfim.Design, experiment: Experiment
+) -> None:
     blind = {"target": "body/cart:inertia[0]", "guess": 0.01, "prior": 1e-4}
     with pytest.raises(UnidentifiableError, match="blind: no effect"):
         monte_carlo(experiment.replace(parameters={"blind": blind}), design.trajectory, trials=4)
@@ -164,7 +196,9 @@ def test_a_parameter_known_by_its_prior_alone_is_named(design: mjfim.Design, exp
 def test_priors_do_not_enter_the_study(design: mjfim.Design, experiment: Experiment) -> None:
     sure = experiment.replace(parameters={"m": {"prior": 1e-6}})
     plain, prior = (monte_carlo(e, design.trajectory, trials=6, seed=1) for e in (experiment, sure))
-    np.testing.assert_allclose(plain.sets["final"].estimates, prior.sets["final"].estimates, rtol=1e-9)
+    np.testing.assert_allclose(
+        plain.sets["final"].estimates, prior.sets["final"].estimates, rtol=1e-9
+    )
     np.testing.assert_allclose(np.linalg.inv(prior.information["final"]), prior.sets["final"].crlb)
 
 

@@ -113,7 +113,11 @@ def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Ar
     controls = [name.removeprefix("ctrl:") for name in rows if name.startswith("ctrl:")]
     K = np.stack([starting(rows, f"gain:{name}:") for name in controls], axis=1)
     steps = round(float(rows["t"][1]) / model.opt.timestep)
-    data.qpos[:], data.qvel[:], data.act[:] = qpos[0], qvel[0] + push[nv : 2 * nv], act[0] + push[2 * nv :]
+    data.qpos[:], data.qvel[:], data.act[:] = (
+        qpos[0],
+        qvel[0] + push[nv : 2 * nv],
+        act[0] + push[2 * nv :],
+    )
     mujoco.mj_integratePos(model, data.qpos, push[:nv], 1.0)
     states, used = [], []
     for k in range(len(qpos)):
@@ -121,7 +125,9 @@ def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Ar
         if k < len(qpos) - 1:
             error = np.zeros(nv)
             mujoco.mj_differentiatePos(model, error, 1.0, data.qpos, qpos[k])
-            data.ctrl[:] = ctrl[k] + K[k] @ np.concatenate([error, qvel[k] - data.qvel, act[k] - data.act])
+            data.ctrl[:] = ctrl[k] + K[k] @ np.concatenate(
+                [error, qvel[k] - data.qvel, act[k] - data.act]
+            )
             used.append(np.array(data.ctrl))
             mujoco.mj_step(model, data, steps)
     return np.array(states), np.array(used), np.concatenate([qpos, qvel, act], axis=1)
@@ -140,7 +146,9 @@ def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: P
     states, used, _ = closed_loop(path, tmp_path, push)
     model = setup.plant.model(setup.theta)
     reference = np.array(setup.initial.state)
-    expected = engine_loop(setup, model, setup.space.plus(reference[0], push), reference, played.gain)
+    expected = engine_loop(
+        setup, model, setup.space.plus(reference[0], push), reference, played.gain
+    )
     np.testing.assert_allclose(states, expected, rtol=0, atol=1e-9)
     assert np.abs(used - setup.initial.ctrl).max() > 1e-3
 
@@ -171,7 +179,9 @@ def test_gain_columns_name_what_they_act_on(tmp_path: Path) -> None:
     body = BUILD["body"](tmp_path)
     parts = ["x", "y", "z", "rx", "ry", "rz"]
     wanted = [f"float.{p}" for p in parts] + [f"ball.{p}" for p in parts[3:]]
-    assert list(tangent_names(body.model)) == [f"{kind}:{name}" for kind in ("qpos", "qvel") for name in wanted]
+    assert list(tangent_names(body.model)) == [
+        f"{kind}:{name}" for kind in ("qpos", "qvel") for name in wanted
+    ]
     rows = table(written(body, tmp_path)[0])
     names = [name for name in rows if name.startswith("gain:")]
     assert names[0] == "gain:push:qpos:float.x"
@@ -206,24 +216,33 @@ def test_reference_is_what_mujoco_says(kind: str, tmp_path: Path) -> None:
 
 def test_a_design_leaves_both_tables(tmp_path: Path) -> None:
     """At the controller's rate; design.csv is a control to start from and an earlier design, gains and all."""
-    setup = BUILD["filtered"](tmp_path, **FILTERED_FINE, descent={"max_iterations": 1}, cost={"control": 0.1})
+    setup = BUILD["filtered"](
+        tmp_path, **FILTERED_FINE, descent={"max_iterations": 1}, cost={"control": 0.1}
+    )
     design = mjfim.design(setup)
     archive.write_design(tmp_path / "out", design, setup)
     rows, motion = table(tmp_path / "out" / "design.csv"), table(tmp_path / "out" / "reference.csv")
     assert len(rows["t"]) == len(motion["t"]) == 2 * setup.samples + 1
     np.testing.assert_array_equal(rows["qpos:hinge"], motion["qpos:hinge"])
     np.testing.assert_array_equal(rows["qpos:hinge"][::2], design.trajectory.qpos[:, 0])
-    np.testing.assert_array_equal(starting(rows, "gain:")[:-1:2], design.final.gain.reshape(setup.samples, -1))
-    again = Setup(setup.experiment.replace(initial={"control": str(tmp_path / "out" / "design.csv")}))
+    np.testing.assert_array_equal(
+        starting(rows, "gain:")[:-1:2], design.final.gain.reshape(setup.samples, -1)
+    )
+    again = Setup(
+        setup.experiment.replace(initial={"control": str(tmp_path / "out" / "design.csv")})
+    )
     np.testing.assert_array_equal(again.control, design.trajectory.ctrl)
-    np.testing.assert_array_equal(previous(setup, str(tmp_path / "out" / "design.csv")), design.trajectory.ctrl)
+    np.testing.assert_array_equal(
+        previous(setup, str(tmp_path / "out" / "design.csv")), design.trajectory.ctrl
+    )
 
 
 @pytest.mark.parametrize("rate", [37.0, 75.0, 12.5, 400.0, 150.0])
 def test_playback_rate_must_fit(rate: float, tmp_path: Path) -> None:
     """A multiple of rate that divides the engine's; the message lists all of them."""
     with pytest.raises(
-        ExperimentError, match=r"playback_rate: .* multiple of rate \(50 Hz\).*200 Hz.*valid: 50, 100, 200"
+        ExperimentError,
+        match=r"playback_rate: .* multiple of rate \(50 Hz\).*200 Hz.*valid: 50, 100, 200",
     ):
         filtered_setup(tmp_path, rate=50.0, playback_rate=rate)
 
@@ -259,13 +278,21 @@ def change(path: Path, **fields: Any) -> None:
     [
         ("gain:servo:qvel:hinge", None, "column 'gain:servo:qvel:hinge' is missing"),
         ("act:servo", None, "column 'act:servo' is missing"),
-        ("ctrl:servo", lambda v: np.full_like(v, np.nan), "column 'ctrl:servo' has no number in data row 1"),
+        (
+            "ctrl:servo",
+            lambda v: np.full_like(v, np.nan),
+            "column 'ctrl:servo' has no number in data row 1",
+        ),
         (
             "qpos:hinge",
             lambda v: np.where(np.arange(len(v)) == 2, np.nan, v),
             "'qpos:hinge' has no number in data row 3",
         ),
-        ("t", lambda v: v * 1.01, "column 't' does not go from 0 in equal periods of whole timesteps"),
+        (
+            "t",
+            lambda v: v * 1.01,
+            "column 't' does not go from 0 in equal periods of whole timesteps",
+        ),
         ("t", lambda v: v + 0.02, "column 't' does not go from 0"),
     ],
 )
@@ -372,13 +399,19 @@ def test_a_robot_is_what_a_bare_loop_says(
             seen = np.concatenate([data.qpos, data.qvel]) + noise[step // 2]
             if (step // 2) % 2 == 0 and step:
                 np.testing.assert_allclose(recording.y[step], seen, rtol=0, atol=1e-9)
-            sent.append(rows["ctrl:force"][step // 2] + (K[step // 2] @ (plan[step // 2] - seen) if feedback else 0.0))
+            sent.append(
+                rows["ctrl:force"][step // 2]
+                + (K[step // 2] @ (plan[step // 2] - seen) if feedback else 0.0)
+            )
         data.ctrl[0] = before if step < 3 else sent[(step - 3) // 2]
         mujoco.mj_step(model, data)
         fastest = np.maximum(fastest, np.abs(data.qvel))
     np.testing.assert_allclose(recording.ctrl[::2, 0], sent, rtol=0, atol=1e-9)
     assert np.isnan(recording.y[1::2]).all() and np.isnan(recording.y[2::4]).all()
-    by_name = {(limit.kind, limit.name): margin for limit, margin in zip(bench.limits, margins, strict=True)}
+    by_name = {
+        (limit.kind, limit.name): margin
+        for limit, margin in zip(bench.limits, margins, strict=True)
+    }
     assert by_name["velocity", "slide"] == pytest.approx(1.0 - fastest[0] / 4.0, abs=1e-9)
     assert by_name["velocity", "hinge"] == pytest.approx(1.0 - fastest[1] / 9.0, abs=1e-9)
     assert by_name["control", "force"] == pytest.approx(1.0 - np.abs(sent).max() / 10.0, abs=1e-9)
@@ -395,14 +428,20 @@ def test_without_noise_the_truth_is_found(
         run = bench.run(number)
         off = run.theta[:3] / bench.setup.parameters.guess[:3]
         np.testing.assert_allclose(np.abs(off - 1.0), 0.2, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(run.estimate, run.theta, rtol=0, atol=float((1e-4 * run.std).max()))
+        np.testing.assert_allclose(
+            run.estimate, run.theta, rtol=0, atol=float((1e-4 * run.std).max())
+        )
 
 
 RUNS, FEW = 30, 12
 
 
 def judged(
-    robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path], runs: int = RUNS, **conditions: Any
+    robots: ModuleType,
+    verdict: ModuleType,
+    cart: tuple[mjfim.Experiment, Path],
+    runs: int = RUNS,
+    **conditions: Any,
 ) -> Any:
     bench = bench_of(robots, cart, **conditions)
     return verdict.judge(bench, [bench.run(number) for number in range(runs)])
@@ -447,14 +486,20 @@ def test_limits_that_the_plan_uses_up_are_missed(
     plenty = bench_of(robots, cart)
     planned = dict(zip([(i.kind, i.name) for i in plenty.limits], plenty.planned(), strict=True))
     fastest = 9.0 * (1.0 - planned["velocity", "hinge"])
-    tight = (experiment.replace(limits={"velocity": {"slide": 4.0, "hinge": 1.0001 * fastest}}), path)
+    tight = (
+        experiment.replace(limits={"velocity": {"slide": 4.0, "hinge": 1.0001 * fastest}}),
+        path,
+    )
     found = judged(robots, verdict, tight)
     assert found.inside.min() >= binom.ppf(1e-3, RUNS, 0.95) and not found.ok
     assert 0 < found.all_kept < RUNS
     words = " ".join(verdict.conclusions(found))
     assert "velocity of hinge is exceeded by up to" in words
     share = found.reserve()["velocity"]
-    roomy = (experiment.replace(limits={"velocity": {"slide": 4.0, "hinge": fastest / (1.0 - share)}}), path)
+    roomy = (
+        experiment.replace(limits={"velocity": {"slide": 4.0, "hinge": fastest / (1.0 - share)}}),
+        path,
+    )
     assert judged(robots, verdict, roomy).all_kept == RUNS
 
 

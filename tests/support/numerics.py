@@ -105,7 +105,10 @@ BODY_PARAMETERS = {
     "inertia": {"target": "body/hull:inertia[1]"},
     "damping": {"target": "joint/ball:damping"},
 }
-FILTERED_PARAMETERS = {"mass": {"target": "body/link:mass"}, "gain": {"target": "actuator/servo:gainprm"}}
+FILTERED_PARAMETERS = {
+    "mass": {"target": "body/link:mass"},
+    "gain": {"target": "actuator/servo:gainprm"},
+}
 
 
 def shared_model(relative: str) -> Path:
@@ -146,7 +149,10 @@ def body_setup(folder: Path, integrator: str = "RK4", **tables: Any) -> Setup:
     tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
     control = {"kind": "sine", "amplitude": 1.5, "frequency": 1.3, "offset": 0.4}
     qpos = (0.0, 0.0, 1.0, *(float(v) for v in tilt), 0.8, 0.6, 0.0, 0.0)
-    defaults = {"parameters": BODY_PARAMETERS, "initial": {"qpos": qpos, "qvel": spin, "control": control}}
+    defaults = {
+        "parameters": BODY_PARAMETERS,
+        "initial": {"qpos": qpos, "qvel": spin, "control": control},
+    }
     return make_setup(FREE_BODY.format(integrator=integrator), folder, **{**defaults, **tables})
 
 
@@ -167,7 +173,11 @@ class Loop:
         """Put a state (qpos, qvel, act) and a control into fresh data."""
         m, d = self.model, self.data
         mujoco.mj_resetData(m, d)
-        d.qpos[:], d.qvel[:], d.act[:] = state[: m.nq], state[m.nq : m.nq + m.nv], state[m.nq + m.nv :]
+        d.qpos[:], d.qvel[:], d.act[:] = (
+            state[: m.nq],
+            state[m.nq : m.nq + m.nv],
+            state[m.nq + m.nv :],
+        )
         d.ctrl[:] = ctrl
 
     def F(self, state: Array, ctrl: Array) -> Array:
@@ -196,14 +206,18 @@ class Loop:
         mujoco.mj_differentiatePos(m, dq, 1.0, np.array(origin[: m.nq]), np.array(state[: m.nq]))
         return np.concatenate([dq, state[m.nq :] - origin[m.nq :]])
 
-    def jacobians(self, state: Array, ctrl: Array, step: float = 1e-6) -> tuple[Array, Array, Array, Array]:
+    def jacobians(
+        self, state: Array, ctrl: Array, step: float = 1e-6
+    ) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D of one sample by central differences; C and D of all sensor data."""
         nx, nu = 2 * self.model.nv + self.model.na, self.model.nu
         dx, dy = [], []
         for i in range(nx + nu):
             e = step * np.eye(nx + nu)[i]
             up, down = self.plus(state, e[:nx]), self.plus(state, -e[:nx])
-            dx.append(self.minus(self.F(up, ctrl + e[nx:]), self.F(down, ctrl - e[nx:])) / (2 * step))
+            dx.append(
+                self.minus(self.F(up, ctrl + e[nx:]), self.F(down, ctrl - e[nx:])) / (2 * step)
+            )
             dy.append((self.h(up, ctrl + e[nx:]) - self.h(down, ctrl - e[nx:])) / (2 * step))
         x, y = np.array(dx).T, np.array(dy).T
         return x[:, :nx], x[:, nx:], y[:, :nx], y[:, nx:]
@@ -215,7 +229,9 @@ def richardson(f: Callable[[float], float], h: float) -> float:
     return (4 * narrow - wide) / 3
 
 
-def directional_check(slopes: Sequence[float], curves: Sequence[Callable[[float], float]], h: float) -> float:
+def directional_check(
+    slopes: Sequence[float], curves: Sequence[Callable[[float], float]], h: float
+) -> float:
     """Largest error of claimed slopes against differences of f(t) at 0, relative to the largest of those differences."""
     measured = np.array([richardson(f, h) for f in curves])
     return float(np.abs(np.array(slopes) - measured).max() / np.abs(measured).max())

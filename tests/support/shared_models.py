@@ -9,13 +9,26 @@ from typing import Any
 
 PI = 3.141592653589793
 SO_ARM = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
-ARM26 = {"SF": 0.489, "SE": 0.41, "EF": 0.389, "EE": 0.5, "BF": 0.36, "BE": 0.506}  # holds (0.9, 1.2)
+ARM26 = {
+    "SF": 0.489,
+    "SE": 0.41,
+    "EF": 0.389,
+    "EE": 0.5,
+    "BF": 0.36,
+    "BE": 0.506,
+}  # holds (0.9, 1.2)
 PANDA = tuple(f"joint{i}" for i in range(1, 8))
 
 
 def chirp(amplitude: float, low: float, high: float, **more: Any) -> dict[str, Any]:
     """A chirp from low to high [Hz] as initial control."""
-    return {"kind": "chirp", "amplitude": amplitude, "frequency": low, "frequency_end": high, **more}
+    return {
+        "kind": "chirp",
+        "amplitude": amplitude,
+        "frequency": low,
+        "frequency_end": high,
+        **more,
+    }
 
 
 def state_noise(joints: tuple[str, ...], q: float = 0.002, v: float = 0.02) -> dict[str, float]:
@@ -53,7 +66,11 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
             "pole_damping": {"target": "joint/hinge_1:damping", "guess": 2e-3},
         },
         "noise": state_noise(("slider", "hinge_1")),
-        "cost": {"criterion": "E", "control": 4e-3, "tracking": {"slider": 1e-3}},  # stay on the rail
+        "cost": {
+            "criterion": "E",
+            "control": 4e-3,
+            "tracking": {"slider": 1e-3},
+        },  # stay on the rail
         "descent": {"tolerance": 1e-3},
     },
     "acrobot": {

@@ -19,7 +19,10 @@ from mjfim.plant.plant import CENTRAL
 from mjfim.records.design import Status
 
 ROOT = Path(__file__).resolve().parents[2]
-EIGENVALUES = {"true": (0.87398028, 19.3587854, 38.1413276), "guess": (0.54702697, 18.1770570, 25.1244795)}
+EIGENVALUES = {
+    "true": (0.87398028, 19.3587854, 38.1413276),
+    "guess": (0.54702697, 18.1770570, 25.1244795),
+}
 # name: weights, place of the linearisation, best known J (two solvers, finer integration)
 CASES: dict[str, tuple[float, float, str, float]] = {
     "a": (6e-3, 0.0, "true", 0.0193931429),
@@ -35,7 +38,9 @@ def experiment(case: str = "b", **descent: Any) -> Experiment:
     """The cart-pendulum at the weights of one case."""
     control, slide, place, _ = CASES[case]
     cost = {"control": control, "tracking": {"slide": slide}, "linearize_at": place}
-    return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(cost=cost, descent=descent)
+    return Experiment.from_file(ROOT / "models" / "cart_pendulum.toml").replace(
+        cost=cost, descent=descent
+    )
 
 
 @pytest.mark.parametrize(("case", "place"), [("a", "true"), ("d", "guess")])
@@ -57,10 +62,14 @@ def test_gradient_of_the_information_term() -> None:
     a, b = setup.information.gradient(point.criterion, point.sensitivity, bilinear)
     gradient = Expansion(bilinear.A, bilinear.B, a, b).gradient(np.zeros((400, 1, 4)))[:, 0]
     assert np.linalg.norm(gradient) == pytest.approx(1.4318943623, rel=1e-4)
-    np.testing.assert_allclose(gradient[[0, 100, 250]], [0.1734982191, 0.0586059128, 0.0474071683], rtol=1e-4)
+    np.testing.assert_allclose(
+        gradient[[0, 100, 250]], [0.1734982191, 0.0586059128, 0.0474071683], rtol=1e-4
+    )
 
 
-@pytest.mark.parametrize(("case", "starts"), [("a", 1), ("b", 1), ("c", 1), ("d", 1), ("e", 4), ("f", 1)])
+@pytest.mark.parametrize(
+    ("case", "starts"), [("a", 1), ("b", 1), ("c", 1), ("d", 1), ("e", 4), ("f", 1)]
+)
 def test_reaches_the_best_known_cost(case: str, starts: int) -> None:
     design = mjfim.design(experiment(case, starts=starts))
     assert design.status is Status.CONVERGED
@@ -73,7 +82,9 @@ def test_the_shipped_guess_experiment_reports_every_start() -> None:
     design = mjfim.design(Experiment.from_file(ROOT / "models" / "cart_pendulum_guess.toml"))
     assert design.final.cost <= 1.000001 * CASES["e"][3]
     assert min(start.cost for start in design.starts) == pytest.approx(design.final.cost)
-    assert max(start.cost for start in design.starts) > 1.005 * design.final.cost  # the second optimum is seen too
+    assert (
+        max(start.cost for start in design.starts) > 1.005 * design.final.cost
+    )  # the second optimum is seen too
 
 
 def test_metric_descent_of_the_paper_reaches_the_same_optimum() -> None:
@@ -88,8 +99,14 @@ def test_weight_on_psi_in_the_metric_reaches_the_same_optimum() -> None:
 
 
 @pytest.mark.parametrize("coarse", [1, 4])
-def test_half_the_sample_period_changes_neither_cost_nor_iteration_count(coarse: int, tmp_path: Path) -> None:
-    text = (ROOT / "models" / "cart_pendulum.xml").read_text().replace('timestep="0.01"', 'timestep="0.005"')
+def test_half_the_sample_period_changes_neither_cost_nor_iteration_count(
+    coarse: int, tmp_path: Path
+) -> None:
+    text = (
+        (ROOT / "models" / "cart_pendulum.xml")
+        .read_text()
+        .replace('timestep="0.01"', 'timestep="0.005"')
+    )
     (tmp_path / "half.xml").write_text(text)
     # the same piecewise-constant reference on both grids
     table = np.loadtxt(ROOT / "models" / "cart_pendulum.csv", delimiter=",", skiprows=1)
@@ -109,7 +126,9 @@ def test_half_the_sample_period_changes_neither_cost_nor_iteration_count(coarse:
 def peer() -> ModuleType:
     """The benchmark's CasADi solvers on the hand-derived model."""
     pytest.importorskip("casadi", reason="casadi is a development dependency")
-    spec = importlib.util.spec_from_file_location("casadi_peer", ROOT / "scripts" / "casadi_peer.py")
+    spec = importlib.util.spec_from_file_location(
+        "casadi_peer", ROOT / "scripts" / "casadi_peer.py"
+    )
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -119,7 +138,9 @@ def peer() -> ModuleType:
 
 
 @pytest.mark.parametrize("case", ["b", "c"])
-def test_agrees_with_exact_derivatives_of_the_hand_derived_model(peer: ModuleType, case: str) -> None:
+def test_agrees_with_exact_derivatives_of_the_hand_derived_model(
+    peer: ModuleType, case: str
+) -> None:
     design = mjfim.design(experiment(case))
     J, eigenvalues = peer.objective(peer.CASES[case], design.trajectory.ctrl[:, 0], False)
     assert pytest.approx(design.final.cost, rel=1e-6) == J

@@ -42,7 +42,9 @@ def tumbling() -> Setup:
     )
 
 
-def flown(path: Path, change: dict[str, float], ctrl: Array, start: Array, substeps: int) -> tuple[Loop, Array]:
+def flown(
+    path: Path, change: dict[str, float], ctrl: Array, start: Array, substeps: int
+) -> tuple[Loop, Array]:
     """States (N+1, ns) of a model compiled anew from the MJCF with relative changes of its parameters."""
     spec = mujoco.MjSpec.from_file(str(path))
     body = spec.body("quadrotor")
@@ -72,13 +74,17 @@ def test_psi_of_a_tumbling_flight_is_that_of_re_simulation(name: str) -> None:
     def difference(h: float) -> Array:
         loop, up = flown(setup.model_path, {name: h}, curve.ctrl, start, setup.substeps)
         _, down = flown(setup.model_path, {name: -h}, curve.ctrl, start, setup.substeps)
-        return np.array([loop.minus(a, b) for a, b in zip(up, down, strict=True)]) / (2.0 * h * value)
+        return np.array([loop.minus(a, b) for a, b in zip(up, down, strict=True)]) / (
+            2.0 * h * value
+        )
 
     reference = (4.0 * difference(5e-4) - difference(1e-3)) / 3.0
     size = np.abs(reference).max(axis=0)
     size = np.maximum(size, 1e-3 * size.max())  # mass, say, turns nothing
     assert (np.abs(found.psi[..., j] - reference) / size).max() < 1e-6
-    assert (np.abs(1.00001 * found.psi[..., j] - reference) / size).max() > 1e-6  # an error of 1e-5 would be seen
+    assert (
+        np.abs(1.00001 * found.psi[..., j] - reference) / size
+    ).max() > 1e-6  # an error of 1e-5 would be seen
 
 
 def test_the_shipped_experiment_is_identifiable_and_designs() -> None:

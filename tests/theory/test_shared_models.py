@@ -28,7 +28,11 @@ def whole() -> list[Path]:
     """Every MJCF that stands alone: no parts that others include, none whose meshes were not copied."""
     files = sorted(SHARED.glob("*/*.xml"))
     texts = [path.read_text(encoding="utf-8") for path in files]
-    return [path for path, text in zip(files, texts, strict=True) if "<worldbody" in text and "<mesh " not in text]
+    return [
+        path
+        for path, text in zip(files, texts, strict=True)
+        if "<worldbody" in text and "<mesh " not in text
+    ]
 
 
 def test_every_shared_model_loads() -> None:
@@ -36,7 +40,9 @@ def test_every_shared_model_loads() -> None:
         pytest.skip(f"no shared models at {SHARED}")
     loaded = set()
     for path in whole():
-        if path.name == "arm26.xml":  # MuJoCo finds no length range for it; the variant beside it states one
+        if (
+            path.name == "arm26.xml"
+        ):  # MuJoCo finds no length range for it; the variant beside it states one
             with pytest.raises(ModelError, match="Lengthrange"):
                 compile_spec(load_spec(path), path)
             continue
@@ -64,7 +70,9 @@ def test_design_knows_ten_times_more_than_the_chirp(name: str) -> None:
     assert not any("clamps" in sentence for sentence in design.warnings), design.warnings
     if design.status is Status.ROUGH:  # joints with dry friction: said, with its sample
         assert name == "so_arm100"
-        assert any("not smooth" in sentence and "dry friction" in sentence for sentence in design.warnings)
+        assert any(
+            "not smooth" in sentence and "dry friction" in sentence for sentence in design.warnings
+        )
     else:
         assert design.status.success
 
@@ -80,4 +88,6 @@ def test_check_passes_or_names_the_sample(name: str) -> None:
         rough = found.self_test.rough
         assert rough is not None, found.self_test
         assert rough.sample > 0
-        assert any("friction" in cause or "contact" in cause or "limit" in cause for cause in rough.causes)
+        assert any(
+            "friction" in cause or "contact" in cause or "limit" in cause for cause in rough.causes
+        )

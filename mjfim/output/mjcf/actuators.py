@@ -19,7 +19,10 @@ LAG: tuple[Place, ...] = (("dynprm", 0, 1.0),)
 
 
 def _muscle(column: int) -> tuple[Place, ...]:
-    return (("gainprm", column, 1.0), ("biasprm", column, 1.0))  # the passive force has its own copy
+    return (
+        ("gainprm", column, 1.0),
+        ("biasprm", column, 1.0),
+    )  # the passive force has its own copy
 
 
 # Element -> attribute -> for each number of it, the places that it fills. `general` says everything itself.
@@ -39,7 +42,10 @@ SHORTCUTS: dict[str, dict[str, tuple[tuple[Place, ...], ...]]] = {
         "timeconst": tuple((("dynprm", i, 1.0),) for i in range(2)),
         "tausmooth": ((("dynprm", 2, 1.0),),),
         "range": (_muscle(0), _muscle(1)),
-        **{n: (_muscle(i),) for i, n in enumerate(("force", "scale", "lmin", "lmax", "vmax", "fpmax", "fvmax"), 2)},
+        **{
+            n: (_muscle(i),)
+            for i, n in enumerate(("force", "scale", "lmin", "lmax", "vmax", "fpmax", "fvmax"), 2)
+        },
     },
 }
 
@@ -66,11 +72,16 @@ def wordings(element: str, old: Any, wanted: Any, actuator: int) -> list[Wording
         places = {(array, column) for number in numbers for array, column, _ in number}
         if not places & changed:
             continue
-        if any(len({factor * after[array][column] for array, column, factor in number}) > 1 for number in numbers):
+        if any(
+            len({factor * after[array][column] for array, column, factor in number}) > 1
+            for number in numbers
+        ):
             continue
         changed -= places
         first = [number[0] for number in numbers]
-        old, new = (np.array([factor * m[array][i] for array, i, factor in first]) for m in (before, after))
+        old, new = (
+            np.array([factor * m[array][i] for array, i, factor in first]) for m in (before, after)
+        )
         found.append(Wording(attribute, old, new, len(first)))
     if changed:
         array, column = sorted(changed)[0]

@@ -31,7 +31,9 @@ def repoint(sheet: Sheet, spec: Any, source: Path, target: Path) -> None:
             if value is not None and read[folder]:
                 sheet.set(i, folder, _from(target, source, value))
                 said.add(folder)
-    if "assetdir" in said or not any(read[folder] and folder not in said for folder in ("meshdir", "texturedir")):
+    if "assetdir" in said or not any(
+        read[folder] and folder not in said for folder in ("meshdir", "texturedir")
+    ):
         return
     if compilers:
         sheet.set(compilers[-1], "assetdir", _from(target, source, ""))
@@ -46,4 +48,8 @@ def _beside(files: list[str]) -> bool:
 
 def _from(target: Path, source: Path, name: str) -> str:
     """A file or folder that is named from `source`, named from `target`."""
-    return name if Path(name).is_absolute() else Path(os.path.relpath(source / name, target)).as_posix()
+    return (
+        name
+        if Path(name).is_absolute()
+        else Path(os.path.relpath(source / name, target)).as_posix()
+    )

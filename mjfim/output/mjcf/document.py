@@ -53,7 +53,9 @@ class Sheet(Markup):
 
     def say(self, tag: int, attribute: str, value: str) -> None:
         """Set an attribute, and take out those that say the same in other words."""
-        others = [other for other in INSTEAD.get(attribute, ()) if self.attribute(tag, other) is not None]
+        others = [
+            other for other in INSTEAD.get(attribute, ()) if self.attribute(tag, other) is not None
+        ]
         for other in others:
             self.set(tag, other, None)
         if others and attribute not in self.tags[tag].attributes:
@@ -62,7 +64,13 @@ class Sheet(Markup):
             self.set(tag, attribute, value)
 
     def numbers(
-        self, tag: int, attribute: str, old: Array | float, new: Array | float, whole: int = 1, size: float = 0.0
+        self,
+        tag: int,
+        attribute: str,
+        old: Array | float,
+        new: Array | float,
+        whole: int = 1,
+        size: float = 0.0,
     ) -> None:
         """Write those of an attribute's numbers that differ between old and new: (n,); others stay as typed.
 
@@ -75,7 +83,11 @@ class Sheet(Markup):
         typed = self.typed(tag, attribute)
         count = max(len(typed), whole, *(i + 1 for i in changed))
         keeps = [i < len(typed) and i not in changed for i in range(count)]
-        self.say(tag, attribute, " ".join(typed[i] if keeps[i] else digits(after[i]) for i in range(count)))
+        self.say(
+            tag,
+            attribute,
+            " ".join(typed[i] if keeps[i] else digits(after[i]) for i in range(count)),
+        )
 
 
 def close(a: Array, b: Array, size: float = 0.0) -> np.ndarray:
@@ -98,7 +110,9 @@ def _named(tags: Sequence[Tag]) -> Iterator[tuple[tuple[str, str], int]]:
         kind = top.name if top.name in SECTIONS and top.parent == 0 else None
         if tag.parent in inside:
             kind = TREE.get(tag.name)
-        if (tag.name == "worldbody" and tag.parent == 0) or (tag.parent in inside and tag.name in ("body", "frame")):
+        if (tag.name == "worldbody" and tag.parent == 0) or (
+            tag.parent in inside and tag.name in ("body", "frame")
+        ):
             inside.add(i)
         if kind is not None and "name" in tag.attributes:
             yield (kind, tag.attributes["name"]), i

@@ -16,7 +16,11 @@ from mjfim.output.mjcf.actuators import ARRAYS, wordings
 from mjfim.output.mjcf.document import Sheet, close, digits
 from mjfim.output.mjcf.inertials import weigh
 
-WHOLE = {"pos": 3, "gravity": 3, "wind": 3}  # attributes that MuJoCo reads only with all of their numbers
+WHOLE = {
+    "pos": 3,
+    "gravity": 3,
+    "wind": 3,
+}  # attributes that MuJoCo reads only with all of their numbers
 MASS = ("mass", "ipos", "inertia")
 LONG = {
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): 1,
@@ -48,7 +52,9 @@ class Retouch:
     def write(self, parameters: ParameterSet, theta: Array) -> None:
         """Say theta: (p,), with which the wanted model was made. Called once."""
         weighed: dict[str, bool] = {}
-        for parameter, slots, value in zip(parameters.parameters, parameters.slots, theta, strict=True):
+        for parameter, slots, value in zip(
+            parameters.parameters, parameters.slots, theta, strict=True
+        ):
             if parameter.function is not None:
                 raise ModelError(f"parameters.{parameter.name} is a Python function of the MjSpec")
             for target, slot in zip(parameter.targets, slots, strict=True):
@@ -56,7 +62,9 @@ class Retouch:
                 if isinstance(slot, InertiaSlot) or (kind == "body" and field in MASS):
                     weighed[name] = weighed.get(name, False) or isinstance(slot, InertiaSlot)
                 else:
-                    self._target(kind, name, field, slot, target.scale * float(value) + target.offset)
+                    self._target(
+                        kind, name, field, slot, target.scale * float(value) + target.offset
+                    )
         for name, charted in weighed.items():
             weigh(self.sheet, name, self._old, self._wanted, charted)
         if self._option:
@@ -70,20 +78,31 @@ class Retouch:
         self._old, stated = found, []
         for kind, fields in DERIVED.items():
             for field, array in fields.items():
-                rows = found.jnt_dofadr if array.startswith("dof_") else range(len(getattr(found, array)))
+                rows = (
+                    found.jnt_dofadr
+                    if array.startswith("dof_")
+                    else range(len(getattr(found, array)))
+                )
                 for ident, row in enumerate(rows):
-                    own, other = (np.asarray(getattr(m, array)[int(row)]) for m in (found, self._wanted))
+                    own, other = (
+                        np.asarray(getattr(m, array)[int(row)]) for m in (found, self._wanted)
+                    )
                     if np.allclose(own, other, rtol=APART, atol=0.0):
                         continue
                     name = mujoco.mj_id2name(found, OBJECTS[kind], ident)
                     if not name:
-                        raise ModelError(f"MuJoCo derives the {field} of a {kind} anew that has no name")
+                        raise ModelError(
+                            f"MuJoCo derives the {field} of a {kind} anew that has no name"
+                        )
                     self._number(kind, name, field, Slot(array, (int(row),), None))
                     stated.append(f"{kind} {name!r}")
         return list(dict.fromkeys(stated))
 
     def _target(self, kind: str, name: str, field: str, slot: AnySlot, value: float) -> None:
-        if isinstance(slot, SpecSlot) and field in ("mass", "density"):  # the compiled model no longer has them
+        if isinstance(slot, SpecSlot) and field in (
+            "mass",
+            "density",
+        ):  # the compiled model no longer has them
             old = float(getattr(self._spec.geom(name), field))
             if not close(np.array(old), np.array(value)):
                 self.sheet.numbers(self.sheet.place("geom", name), field, old, value)
@@ -100,9 +119,14 @@ class Retouch:
             self._gain(name)
             return
         if slot.in_options:
-            old, new = (np.atleast_1d(getattr(m.opt, slot.array)) for m in (self._old, self._wanted))
+            old, new = (
+                np.atleast_1d(getattr(m.opt, slot.array)) for m in (self._old, self._wanted)
+            )
         else:
-            old, new = (np.atleast_1d(getattr(m, slot.array)[slot.rows[0]]) for m in (self._old, self._wanted))
+            old, new = (
+                np.atleast_1d(getattr(m, slot.array)[slot.rows[0]])
+                for m in (self._old, self._wanted)
+            )
         if close(old, new).all():
             return
         if kind == "option":
@@ -123,7 +147,10 @@ class Retouch:
         """Write into the `<option>` that says a field last, else into the last one; one is made where there is none."""
         found = self.sheet.top("option")
         if found:
-            tag = next((i for i in reversed(found) if self.sheet.attribute(i, field) is not None), found[-1])
+            tag = next(
+                (i for i in reversed(found) if self.sheet.attribute(i, field) is not None),
+                found[-1],
+            )
             self.sheet.numbers(tag, field, old, new, WHOLE.get(field, 1))
         else:
             self._option[field] = digits(*new)
@@ -132,7 +159,8 @@ class Retouch:
         """What makes an actuator's force: gain, bias and dynamics, in the words of its element."""
         i = int(self._old.actuator(name).id)
         old, wanted = (
-            np.concatenate([getattr(m, f"actuator_{a}")[i] for a in ARRAYS]) for m in (self._old, self._wanted)
+            np.concatenate([getattr(m, f"actuator_{a}")[i] for a in ARRAYS])
+            for m in (self._old, self._wanted)
         )
         if close(old, wanted).all():
             return
@@ -163,8 +191,12 @@ class Retouch:
             self._refuse_elsewhere(tag, "geom", name)
         if not np.isfinite(stated.fromto[0]):
             self.sheet.numbers(tag, "size", old.size, new.size)
-            place = stated.pos + moved if stated.meshname else new.pos  # the compiler adds the mesh's own offset
-            self.sheet.numbers(tag, "pos", stated.pos if stated.meshname else old.pos, place, 3, radius)
+            place = (
+                stated.pos + moved if stated.meshname else new.pos
+            )  # the compiler adds the mesh's own offset
+            self.sheet.numbers(
+                tag, "pos", stated.pos if stated.meshname else old.pos, place, 3, radius
+            )
             return
         along = LONG.get(int(stated.type), 2)
         ends = np.array(stated.fromto).reshape(2, 3)
@@ -185,5 +217,7 @@ def _parts(target: Target) -> tuple[str, str, str]:
     """Kind, name and field of a path."""
     match = PATH.match(target.path)
     if match is None:
-        raise ValueError(f"parameter path {target.path!r} is not of the form kind/name:field[index]")
+        raise ValueError(
+            f"parameter path {target.path!r} is not of the form kind/name:field[index]"
+        )
     return match["kind"], match["name"] or "", match["field"]

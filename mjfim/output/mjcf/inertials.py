@@ -25,16 +25,26 @@ def weigh(sheet: Sheet, name: str, old: Any, wanted: Any, charted: bool) -> None
     """
     b = int(old.body(name).id)
     before, after = inertial(old, b), inertial(wanted, b)
-    trace, radius = 10.0 * float(np.trace(before.inertia)), 10.0 * before.radius if before.mass > 0.0 else 0.0
+    trace, radius = (
+        10.0 * float(np.trace(before.inertia)),
+        10.0 * before.radius if before.mass > 0.0 else 0.0,
+    )
     turned = not close(before.inertia, after.inertia, trace).all()
     moved = not close(before.com, after.com, radius).all()
     if not turned and not moved and close(np.array(before.mass), np.array(after.mass)):
         return
     body = sheet.place("body", name)
-    own = next((i for i, tag in enumerate(sheet.tags) if tag.name == "inertial" and tag.parent == body), None)
+    own = next(
+        (i for i, tag in enumerate(sheet.tags) if tag.name == "inertial" and tag.parent == body),
+        None,
+    )
     if own is None:
-        matrix = _matrix(after.inertia) if charted and not _watched(old, b) else _principal(wanted, b)
-        sheet.insert(body, "inertial", {"pos": digits(*after.com), "mass": digits(after.mass), **matrix})
+        matrix = (
+            _matrix(after.inertia) if charted and not _watched(old, b) else _principal(wanted, b)
+        )
+        sheet.insert(
+            body, "inertial", {"pos": digits(*after.com), "mass": digits(after.mass), **matrix}
+        )
         return
     sheet.numbers(own, "mass", before.mass, after.mass)
     sheet.numbers(own, "pos", before.com, after.com, 3, radius)
@@ -84,7 +94,11 @@ def _rounded(inertia: Array) -> Array:
 
 def _principal(model: Any, b: int) -> dict[str, str]:
     """Moments and axes as they are in a model."""
-    quat = {} if close(model.body_iquat[b], IDENTITY, 1.0).all() else {"quat": digits(*model.body_iquat[b])}
+    quat = (
+        {}
+        if close(model.body_iquat[b], IDENTITY, 1.0).all()
+        else {"quat": digits(*model.body_iquat[b])}
+    )
     return {**quat, "diaginertia": digits(*model.body_inertia[b])}
 
 

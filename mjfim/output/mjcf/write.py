@@ -61,7 +61,9 @@ def write_identified(path: Path, setup: Setup, theta: Array) -> str | None:
     try:
         stated = _retouch(path, setup, theta, wanted)
         if stated:
-            said.append(f"it also states what MuJoCo would derive anew from the identified values: {', '.join(stated)}")
+            said.append(
+                f"it also states what MuJoCo would derive anew from the identified values: {', '.join(stated)}"
+            )
     except ModelError as error:
         _print(path, setup, theta, wanted)
         said.append(f"it is MuJoCo's own printing, six significant digits and no comments: {error}")
@@ -90,7 +92,9 @@ def _retouch(path: Path, setup: Setup, theta: Array, wanted: Any) -> list[str]:
             found = _written(temporary, sheet)
         unequal = _differences(found, wanted)
         if unequal:
-            raise ModelError(f"with the identified values the text compiles to another {', '.join(unequal)}")
+            raise ModelError(
+                f"with the identified values the text compiles to another {', '.join(unequal)}"
+            )
     return stated
 
 
@@ -100,7 +104,9 @@ def _written(path: Path, sheet: Sheet) -> Any:
         return mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, mujoco.FatalError) as error:
         said = " ".join(str(error).split())
-        raise ModelError(f"MuJoCo does not load the text with the identified values ({said})") from None
+        raise ModelError(
+            f"MuJoCo does not load the text with the identified values ({said})"
+        ) from None
 
 
 def _print(path: Path, setup: Setup, theta: Array, wanted: Any) -> None:
@@ -143,12 +149,20 @@ def _differences(a: Any, b: Any) -> list[str]:
     """Names of what moves two models and differs. Inertias are compared as matrices, whose axes may be named in any order."""
     names = [n for n in dir(a) if n.startswith(COMPARED) and not n.startswith(NOT_DYNAMICS)]
     pairs = {n: (np.asarray(getattr(a, n)), np.asarray(getattr(b, n))) for n in names}
-    pairs |= {n: (np.asarray(getattr(a.opt, n)), np.asarray(getattr(b.opt, n))) for n in FIELDS["option"]}
-    found = [n for n, (x, y) in pairs.items() if x.shape != y.shape or not np.allclose(x, y, rtol=1e-9, atol=1e-12)]
+    pairs |= {
+        n: (np.asarray(getattr(a.opt, n)), np.asarray(getattr(b.opt, n))) for n in FIELDS["option"]
+    }
+    found = [
+        n
+        for n, (x, y) in pairs.items()
+        if x.shape != y.shape or not np.allclose(x, y, rtol=1e-9, atol=1e-12)
+    ]
     if found == ["body_invweight0"] and not _weighed_otherwise(a, b, alike=True):
         found = []
     traces = np.sum(b.body_inertia, axis=1)[:, None, None]
-    unequal = a.nbody != b.nbody or bool((np.abs(_matrices(a) - _matrices(b)) > 1e-9 * traces).any())
+    unequal = a.nbody != b.nbody or bool(
+        (np.abs(_matrices(a) - _matrices(b)) > 1e-9 * traces).any()
+    )
     return [*found, "body_inertia"] if unequal else found
 
 
@@ -160,7 +174,10 @@ def _weighed_otherwise(a: Any, b: Any, alike: bool) -> list[str]:
     """
     far = ~np.isclose(a.body_invweight0, b.body_invweight0, rtol=1e-9, atol=1e-12).all(axis=1)
     rows = far & (((a.body_simple > 0) == (b.body_simple > 0)) == alike)
-    return [mujoco.mj_id2name(a, mujoco.mjtObj.mjOBJ_BODY, int(i)) or f"body{i}" for i in np.flatnonzero(rows)]
+    return [
+        mujoco.mj_id2name(a, mujoco.mjtObj.mjOBJ_BODY, int(i)) or f"body{i}"
+        for i in np.flatnonzero(rows)
+    ]
 
 
 def _matrices(model: Any) -> Array:
@@ -169,10 +186,14 @@ def _matrices(model: Any) -> Array:
     return np.asarray(np.einsum("bij,bj,bkj->bik", R, model.body_inertia, R))
 
 
-def write_spec(spec: Any, compiled: Any, wanted: Any, parameters: ParameterSet, theta: Array) -> None:
+def write_spec(
+    spec: Any, compiled: Any, wanted: Any, parameters: ParameterSet, theta: Array
+) -> None:
     """Write theta: (p,) into an MjSpec that the caller owns. compiled, wanted: its model as it is and at theta."""
     for parameter, value in zip(parameters.parameters, theta, strict=True):
         if parameter.function is not None:
             parameter.function(spec, float(value))
         for target in parameter.targets:
-            write_element(spec, compiled, wanted, target.path, target.scale * float(value) + target.offset)
+            write_element(
+                spec, compiled, wanted, target.path, target.scale * float(value) + target.offset
+            )

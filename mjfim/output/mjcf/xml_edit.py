@@ -49,7 +49,9 @@ class Markup:
         around: list[int] = []
 
         def start(name: str, attributes: dict[str, str]) -> None:
-            self.tags.append(Tag(name, attributes, parser.CurrentByteIndex, around[-1] if around else -1))
+            self.tags.append(
+                Tag(name, attributes, parser.CurrentByteIndex, around[-1] if around else -1)
+            )
             around.append(len(self.tags) - 1)
 
         def end(_: str) -> None:

@@ -44,7 +44,9 @@ def check_figure(check: Check) -> Figure:
         Patch(facecolor="white", edgecolor=OPTIMIZED, hatch="////", label="not identifiable alone"),
     ]
     verdict = "identifiable" if check.ok else "read the verdict in check.json"
-    headline(figure, f"What {check.source} ({check.horizon:g} s) can tell: {verdict}", handles, BEST_CASE)
+    headline(
+        figure, f"What {check.source} ({check.horizon:g} s) can tell: {verdict}", handles, BEST_CASE
+    )
     return figure
 
 
@@ -60,11 +62,23 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
     axes.set_xlim(low, high)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.barh(places[known], std[known], height=0.6, color=INITIAL)
-    axes.barh(places[~known], high, height=0.6, facecolor="white", edgecolor=OPTIMIZED, hatch="////", linewidth=0.8)
-    axes.plot(wanted, places, linestyle="", marker="|", color=INK, markersize=10, markeredgewidth=1.6)
+    axes.barh(
+        places[~known],
+        high,
+        height=0.6,
+        facecolor="white",
+        edgecolor=OPTIMIZED,
+        hatch="////",
+        linewidth=0.8,
+    )
+    axes.plot(
+        wanted, places, linestyle="", marker="|", color=INK, markersize=10, markeredgewidth=1.6
+    )
     if len(rows) <= 30:
         for x, y in zip(std[known], places[known], strict=True):
-            axes.text(high, y, percent(float(x)), ha="right", va="center", fontsize=SMALL, color=INITIAL)
+            axes.text(
+                high, y, percent(float(x)), ha="right", va="center", fontsize=SMALL, color=INITIAL
+            )
     axes.grid(False, axis="y")
     axes.set_yticks(places, [shorten(row.name) for row in rows], fontsize=font)
 
@@ -73,7 +87,10 @@ def _heat(axes: Axes, check: Check) -> None:
     alone = np.arange(len(check.wanted))
     if len(alone) > READABLE:
         alone = np.flatnonzero(np.isfinite(np.diag(check.correlation)))
-    matrix, names = check.correlation[np.ix_(alone, alone)], [shorten(check.wanted[i], 18) for i in alone]
+    matrix, names = (
+        check.correlation[np.ix_(alone, alone)],
+        [shorten(check.wanted[i], 18) for i in alone],
+    )
     count = len(names)
     if not np.isfinite(matrix).any():
         axes.set_axis_off()
@@ -96,7 +113,16 @@ def _heat(axes: Axes, check: Check) -> None:
                 strong = abs(value) > 0.6
                 weight = "bold" if abs(value) > CONFOUNDED else "normal"
                 colour = "white" if strong else INK
-                axes.text(j, i, f"{value:+.2f}", ha="center", va="center", fontsize=SMALL, color=colour, weight=weight)
+                axes.text(
+                    j,
+                    i,
+                    f"{value:+.2f}",
+                    ha="center",
+                    va="center",
+                    fontsize=SMALL,
+                    color=colour,
+                    weight=weight,
+                )
             elif abs(value) > CONFOUNDED:
                 axes.plot(j, i, marker="o", color=INK, markersize=2.0)
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.7, pad=0.02)

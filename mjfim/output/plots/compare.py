@@ -37,7 +37,8 @@ def compare_figure(comparison: Comparison) -> Figure:
     """Standard deviation of every parameter by method, over the design's (cells), beside that of the worst combination (bars)."""
     rows, count = comparison.rows, len(comparison.wanted)
     figure = new_figure(
-        float(np.clip(8.4 + 0.5 * count, 10.0, 20.0)), float(np.clip(1.9 + 0.36 * len(rows), 3.2, 12.0))
+        float(np.clip(8.4 + 0.5 * count, 10.0, 20.0)),
+        float(np.clip(1.9 + 0.36 * len(rows), 3.2, 12.0)),
     )
     left, right = figure.subplots(1, 2, width_ratios=[float(np.clip(0.55 * count, 2.2, 9.0)), 3.6])
     _cells(left, comparison)
@@ -85,18 +86,29 @@ def _cells(axes: Axes, comparison: Comparison) -> None:
     relative = comparison.design is not None and np.isfinite(comparison.design.std[wanted]).any()
     logs = np.log(np.where(np.isfinite(ratios), ratios, np.nan))
     middle, span = (
-        (0.0, np.log(SPAN)) if relative else (float(np.nanmean(logs)), max(float(np.nanstd(logs)) * 2.0, 0.1))
+        (0.0, np.log(SPAN))
+        if relative
+        else (float(np.nanmean(logs)), max(float(np.nanstd(logs)) * 2.0, 0.1))
     )
     axes.set_facecolor(FAINT)
     image = axes.imshow(
-        np.ma.masked_invalid(logs), cmap="RdBu_r", vmin=middle - span, vmax=middle + span, aspect="auto"
+        np.ma.masked_invalid(logs),
+        cmap="RdBu_r",
+        vmin=middle - span,
+        vmax=middle + span,
+        aspect="auto",
     )
     names = [shorten(comparison.parameters[j], 18) for j in wanted]
     upright = sum(len(name) for name in names) > 8 * len(names) or len(names) > READABLE
     axes.set_xticks(
-        range(len(names)), names, fontsize=SMALL if len(names) <= 30 else 5.0, rotation=90 if upright else 0
+        range(len(names)),
+        names,
+        fontsize=SMALL if len(names) <= 30 else 5.0,
+        rotation=90 if upright else 0,
     )
-    axes.set_yticks(range(len(rows)), [shorten(row.title, WIDTH) for row in rows], fontsize=NORMAL, color=INK)
+    axes.set_yticks(
+        range(len(rows)), [shorten(row.title, WIDTH) for row in rows], fontsize=NORMAL, color=INK
+    )
     for label, row in zip(axes.get_yticklabels(), rows, strict=True):
         label.set_color(_colour(comparison, row) if row.sound else MUTED)
         label.set_fontweight("bold" if row.method == DESIGN else "normal")
@@ -112,7 +124,9 @@ def _cells(axes: Axes, comparison: Comparison) -> None:
     for (i, j), ratio in np.ndenumerate(ratios):
         strong = np.isfinite(ratio) and abs(logs[i, j] - middle) > 0.6 * span
         text = number(float(ratio), 3) if np.isfinite(ratio) else "–"
-        axes.text(j, i, text, ha="center", va="center", fontsize=SMALL, color="white" if strong else INK)
+        axes.text(
+            j, i, text, ha="center", va="center", fontsize=SMALL, color="white" if strong else INK
+        )
 
 
 def _bars(axes: Axes, comparison: Comparison) -> None:
@@ -124,7 +138,9 @@ def _bars(axes: Axes, comparison: Comparison) -> None:
     axes.grid(False, axis="y")
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_yticks([])
-    axes.set_title("σ of the worst combination, and the worst margin of all limits", fontsize=NORMAL, color=INK)
+    axes.set_title(
+        "σ of the worst combination, and the worst margin of all limits", fontsize=NORMAL, color=INK
+    )
     if not len(known):
         say(axes, "nothing found")
         return
@@ -137,13 +153,24 @@ def _bars(axes: Axes, comparison: Comparison) -> None:
     axes.tick_params(which="both", labelsize=SMALL, color=MUTED, labelcolor=INK)
     for i, row in enumerate(rows):
         if not np.isfinite(row.worst):
-            axes.text(low + 0.02 * (high - low), i, row.outcome.value, va="center", fontsize=SMALL, color=MUTED)
+            axes.text(
+                low + 0.02 * (high - low),
+                i,
+                row.outcome.value,
+                va="center",
+                fontsize=SMALL,
+                color=MUTED,
+            )
             continue
         colour = _colour(comparison, row)
         bar = axes.barh(i, row.worst - low, left=low, height=0.62, color=colour, linewidth=0.8)
         if not row.sound:
             bar[0].set(facecolor="white", edgecolor=MUTED, hatch="////")
-        text = axes.text(row.worst, i, f"  {number(row.worst)}", va="center", fontsize=SMALL, color=INK)
+        text = axes.text(
+            row.worst, i, f"  {number(row.worst)}", va="center", fontsize=SMALL, color=INK
+        )
         kind, share = row.tightest
         said = f"  {percent(share)} {kind.replace('_', ' ')}" if kind and np.isfinite(share) else ""
-        axes.annotate(said, (1.0, 0.5), xycoords=text, va="center", fontsize=SMALL - 1.0, color=MUTED)
+        axes.annotate(
+            said, (1.0, 0.5), xycoords=text, va="center", fontsize=SMALL - 1.0, color=MUTED
+        )

@@ -83,7 +83,9 @@ def draw_information(axes: Axes, design: Design) -> None:
 def trajectories(design: Design, labels: Labels) -> Figure:
     """States, controls and the root of the smallest eigenvalue of the information up to time t (paper's figure 2)."""
     curve = design.trajectory
-    labels.check(qpos=curve.qpos.shape[1], velocities=curve.qvel.shape[1], controls=curve.ctrl.shape[1])
+    labels.check(
+        qpos=curve.qpos.shape[1], velocities=curve.qvel.shape[1], controls=curve.ctrl.shape[1]
+    )
     panels = state_panels(design, labels)
     columns = 2 if len(panels) <= 9 else 4
     rows = len(panels) // columns + 1
@@ -122,14 +124,18 @@ def draw_phase(axes: Axes, design: Design, dof: int, dofs: int, j: int) -> None:
     """Loop of (dq_i/dtheta_j, dv_i/dtheta_j) for both trajectories; the initial one lies on top, being the smaller."""
     for (evaluation, colour, width), order in zip(pair(design), (3, 2), strict=True):
         psi = evaluation.sensitivity
-        axes.plot(psi[:, dof, j], psi[:, dofs + dof, j], color=colour, linewidth=width, zorder=order)
+        axes.plot(
+            psi[:, dof, j], psi[:, dofs + dof, j], color=colour, linewidth=width, zorder=order
+        )
     axes.plot(0.0, 0.0, "o", color=INK, markersize=3.5, zorder=4)
 
 
 def enlarge_initial(axes: Axes, design: Design, dof: int, dofs: int, j: int) -> None:
     """Where the initial loop is tiny, draw it again in a box above the other one."""
     columns = [dof, dofs + dof]
-    small, large = (np.ptp(e.sensitivity[:, columns, j], axis=0) for e in (design.initial, design.final))
+    small, large = (
+        np.ptp(e.sensitivity[:, columns, j], axis=0) for e in (design.initial, design.final)
+    )
     if not (ZOOM * small < large).all() or not (small > 0.0).all():
         return
     low, high = axes.get_ylim()
@@ -162,7 +168,11 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
             draw_phase(axes, design, int(dof), dofs, int(j))
             enlarge_initial(axes, design, int(dof), dofs, int(j))
             theta, divisor = shorten(labels.parameters[j], 18), labels.parameter_units[j]
-            dress(axes, f"∂{name}/∂{theta}\n[{per(unit, divisor)}]", f"∂{name}′/∂{theta}\n[{per(rate, divisor)}]")
+            dress(
+                axes,
+                f"∂{name}/∂{theta}\n[{per(unit, divisor)}]",
+                f"∂{name}′/∂{theta}\n[{per(rate, divisor)}]",
+            )
     note = "Each loop starts at the dot (time 0, no sensitivity); ′ is the time derivative."
     note += " Blue boxes enlarge the initial loop."
     if len(rows) < dofs or len(columns) < count:
@@ -173,7 +183,9 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
     return figure
 
 
-def draw_history(axes: Axes, iterations: Array, values: Array, relative: Array | None = None) -> None:
+def draw_history(
+    axes: Axes, iterations: Array, values: Array, relative: Array | None = None
+) -> None:
     """One quantity over the iterations on a log axis (linear if it is never positive), ends in the pair's colours."""
     positive = np.where(values > 0.0, values, np.nan)
     usable = np.isfinite(positive)
@@ -186,8 +198,17 @@ def draw_history(axes: Axes, iterations: Array, values: Array, relative: Array |
         axes.set_yscale("log")
     axes.plot(iterations, positive, color=MUTED, linewidth=1.3, marker=".", markersize=3)
     if relative is not None:
-        axes.plot(iterations, np.where(relative > 0.0, relative, np.nan), color=MUTED, linewidth=1.0, linestyle=":")
-    for k, colour in ((np.flatnonzero(usable)[0], INITIAL), (np.flatnonzero(usable)[-1], OPTIMIZED)):
+        axes.plot(
+            iterations,
+            np.where(relative > 0.0, relative, np.nan),
+            color=MUTED,
+            linewidth=1.0,
+            linestyle=":",
+        )
+    for k, colour in (
+        (np.flatnonzero(usable)[0], INITIAL),
+        (np.flatnonzero(usable)[-1], OPTIMIZED),
+    ):
         axes.plot(iterations[k], positive[k], "o", color=colour, markersize=6)
     ends = positive[usable]
     text = f"{number(float(ends[0]))} → {number(float(ends[-1]))}"
@@ -205,7 +226,9 @@ def convergence(design: Design) -> Figure:
     top = figure.subplots(1, 3)
     draw_history(top[0], iterations, cost)
     mus = np.array([row.mu for row in history])
-    relative = None if mus.any() else slope / np.where(cost == 0.0, np.nan, np.abs(cost))  # of log J it is that already
+    relative = (
+        None if mus.any() else slope / np.where(cost == 0.0, np.nan, np.abs(cost))
+    )  # of log J it is that already
     draw_history(top[1], iterations, slope, relative)
     draw_history(top[2], iterations, smallest)
     rates = np.array([row.rate for row in history])
@@ -232,7 +255,9 @@ def convergence(design: Design) -> Figure:
         Line2D([], [], color=colour, marker="o", linestyle="", label=name)
         for name, colour in (("initial", INITIAL), ("optimized", OPTIMIZED))
     ]
-    line = [] if relative is None else [Line2D([], [], color=MUTED, linestyle=":", label="slope / J")]
+    line = (
+        [] if relative is None else [Line2D([], [], color=MUTED, linestyle=":", label="slope / J")]
+    )
     told = (
         " Dashed: the barrier of the limits gets sharper; slope and cost are then of log J and barrier."
         if mus.any()

@@ -69,7 +69,9 @@ def densities(values: Array, limits: tuple[float, float]) -> tuple[Array, Array]
 
 def normal(x: Array, mean: float, std: float) -> Array:
     """Normal density."""
-    return np.asarray(np.exp(-0.5 * ((x - mean) / std) ** 2) / (std * np.sqrt(2.0 * np.pi)), dtype=np.float64)
+    return np.asarray(
+        np.exp(-0.5 * ((x - mean) / std) ** 2) / (std * np.sqrt(2.0 * np.pi)), dtype=np.float64
+    )
 
 
 def describe(trials: TrialSet, index: int, unit: str, hidden: int) -> str:
@@ -79,11 +81,15 @@ def describe(trials: TrialSet, index: int, unit: str, hidden: int) -> str:
     text = f"variance {number(float(trials.covariance[index, index]))}{square}\n"
     text += f"bound {number(float(trials.crlb[index, index]))}{square}\n"
     text += f"efficiency {number(float(trials.efficiency[index]))}, 95 % interval [{low}, {high}]\n"
-    text += f"{trials.trials} trials, {trials.failed} failed" + (f", {hidden} outside this range" if hidden else "")
+    text += f"{trials.trials} trials, {trials.failed} failed" + (
+        f", {hidden} outside this range" if hidden else ""
+    )
     return text
 
 
-def draw_panel(axes: Axes, trials: TrialSet, index: int, theta: float, unit: str, style: tuple[str, str]) -> None:
+def draw_panel(
+    axes: Axes, trials: TrialSet, index: int, theta: float, unit: str, style: tuple[str, str]
+) -> None:
     """Histogram of one trajectory on its own range, with true value and the normal curve of the bound."""
     name, colour = style
     values = finite_column(trials, index)
@@ -111,8 +117,14 @@ def draw_overlay(axes: Axes, study: Study, index: int) -> None:
     """All trajectories on one axis, each scaled to its own peak."""
     theta = float(study.theta[index])
     columns = {name: finite_column(trials, index) for name, trials in study.sets.items()}
-    bounds = {name: float(np.sqrt(trials.crlb[index, index])) for name, trials in study.sets.items()}
-    ranges = [central_range(values, theta, bounds[name]) for name, values in columns.items() if values.size]
+    bounds = {
+        name: float(np.sqrt(trials.crlb[index, index])) for name, trials in study.sets.items()
+    }
+    ranges = [
+        central_range(values, theta, bounds[name])
+        for name, values in columns.items()
+        if values.size
+    ]
     if not ranges:
         say(axes, "no successful trials")
         return
@@ -120,7 +132,9 @@ def draw_overlay(axes: Axes, study: Study, index: int) -> None:
         if values.size:
             colour = STYLES.get(name, (name, OTHER))[1]
             heights, edges = densities(values, central_range(values, theta, np.inf))
-            axes.stairs(heights / max(heights.max(), 1e-300), edges, fill=True, color=colour, alpha=0.5)
+            axes.stairs(
+                heights / max(heights.max(), 1e-300), edges, fill=True, color=colour, alpha=0.5
+            )
     axes.axvline(theta, color=INK, linewidth=1.2, linestyle="--")
     axes.set_xlim(min(r[0] for r in ranges), max(r[1] for r in ranges))
     axes.set_ylim(0.0, 1.08)
@@ -135,16 +149,21 @@ def histogram(study: Study, index: int, labels: Labels) -> Figure:
     figure = new_figure(max(4.1 * len(study.sets), 5.0), 5.3)
     grid = figure.add_gridspec(2, len(study.sets), height_ratios=(2.6, 1.0))
     for k, (name, trials) in enumerate(study.sets.items()):
-        axes = dress(figure.add_subplot(grid[0, k]), labels.parameter(index), f"density [{per('', unit)}]")
+        axes = dress(
+            figure.add_subplot(grid[0, k]), labels.parameter(index), f"density [{per('', unit)}]"
+        )
         draw_panel(axes, trials, index, theta, unit, STYLES.get(name, (name, OTHER)))
     overlay = dress(figure.add_subplot(grid[1, :]), labels.parameter(index), "density / peak [–]")
     draw_overlay(overlay, study, index)
     overlay.set_title("common axis", loc="left", fontsize=SMALL, color=MUTED)
     handles = [
-        Patch(facecolor=STYLES.get(n, (n, OTHER))[1], alpha=0.5, label=STYLES.get(n, (n, OTHER))[0]) for n in study.sets
+        Patch(facecolor=STYLES.get(n, (n, OTHER))[1], alpha=0.5, label=STYLES.get(n, (n, OTHER))[0])
+        for n in study.sets
     ]
     lines = [
-        Line2D([], [], color=INK, linestyle="--", label=f"true value {number(theta)} {unit}".rstrip()),
+        Line2D(
+            [], [], color=INK, linestyle="--", label=f"true value {number(theta)} {unit}".rstrip()
+        ),
         Line2D([], [], color=INK, label="normal curve of the Cramér–Rao bound"),
     ]
     title = f"Monte-Carlo estimates of {labels.parameters[index]}"
@@ -191,11 +210,15 @@ def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] |
     sigma: (ny,) stated noise of each output [output's unit]
     """
     if not 0 <= index < len(estimate.recordings):
-        raise MjfimError(f"the estimate has no recording {index}; valid: 0 to {len(estimate.recordings) - 1}")
+        raise MjfimError(
+            f"the estimate has no recording {index}; valid: 0 to {len(estimate.recordings) - 1}"
+        )
     recording, predicted = estimate.recordings[index], estimate.predicted[index]
     noise = np.asarray(sigma, dtype=np.float64)
     if noise.shape != (len(recording.outputs),) or not (noise > 0.0).all():
-        raise MjfimError(f"sigma must hold one positive number for each of {', '.join(recording.outputs)}")
+        raise MjfimError(
+            f"sigma must hold one positive number for each of {', '.join(recording.outputs)}"
+        )
     residual = recording.y - predicted
     columns = shown_outputs(residual, noise)
     figure = new_figure(10.0, 1.45 * len(columns) + 1.1)

@@ -6,10 +6,30 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mjfim.output.plots.style import FAINT, INK, MUTED, OPTIMIZED, SMALL, dress, headline, new_figure, number, shorten
+from mjfim.output.plots.style import (
+    FAINT,
+    INK,
+    MUTED,
+    OPTIMIZED,
+    SMALL,
+    dress,
+    headline,
+    new_figure,
+    number,
+    shorten,
+)
 from mjfim.records.design import Design, Usage
 
-KINDS = ("position", "velocity", "acceleration", "force", "joint_force", "control", "control_rate", "clearance")
+KINDS = (
+    "position",
+    "velocity",
+    "acceleration",
+    "force",
+    "joint_force",
+    "control",
+    "control_rate",
+    "clearance",
+)
 CLOSEST = 3  # curves that are named
 
 
@@ -24,12 +44,22 @@ def limits(design: Design) -> Figure:
         axes = figure.add_subplot(grid[divmod(i, columns)])
         draw_usage(axes, [u for u in design.usage if u.kind == kind], kind == "clearance")
         bottom = i + columns >= len(kinds)
-        dress(axes, "time [s]" if bottom else "", "least / distance" if kind == "clearance" else "half ranges")
+        dress(
+            axes,
+            "time [s]" if bottom else "",
+            "least / distance" if kind == "clearance" else "half ranges",
+        )
         margin = design.limits.get(kind, np.nan)
         axes.set_title(
-            _said(kind, margin), loc="left", fontsize=SMALL + 1, color=OPTIMIZED if margin < 0.0 else INK, pad=17
+            _said(kind, margin),
+            loc="left",
+            fontsize=SMALL + 1,
+            color=OPTIMIZED if margin < 0.0 else INK,
+            pad=17,
         )
-    ends = [_said(kind, margin) for kind, margin in design.limits.items() if kind.startswith("end_")]
+    ends = [
+        _said(kind, margin) for kind, margin in design.limits.items() if kind.startswith("end_")
+    ]
     note = "Every engine step of the untouched model; the grey zones are out of bounds."
     if ends:
         note += f" At the end: {', '.join(ends)}."
@@ -48,9 +78,21 @@ def draw_usage(axes: Axes, curves: list[Usage], one_sided: bool) -> None:
     for rank, curve in enumerate(order):
         strong = rank < CLOSEST
         colour = (OPTIMIZED, "#ee7733", "#aa3377")[rank] if strong else MUTED
-        label = f"{shorten(curve.name, 24)} {100 * float(np.abs(curve.share).max()):.5g} %" if strong else None
+        label = (
+            f"{shorten(curve.name, 24)} {100 * float(np.abs(curve.share).max()):.5g} %"
+            if strong
+            else None
+        )
         width, alpha = (1.3, 1.0) if strong else (0.7, 0.5)
-        axes.plot(curve.t, curve.share, color=colour, label=label, linewidth=width, alpha=alpha, zorder=2 + strong)
+        axes.plot(
+            curve.t,
+            curve.share,
+            color=colour,
+            label=label,
+            linewidth=width,
+            alpha=alpha,
+            zorder=2 + strong,
+        )
     reach = max(1.08, 1.05 * float(np.abs(order[0].share).max()))
     low = 0.0 if one_sided else -reach
     axes.set_ylim(low, reach)
@@ -59,4 +101,10 @@ def draw_usage(axes: Axes, curves: list[Usage], one_sided: bool) -> None:
     if not one_sided:
         axes.axhspan(-reach, -1.0, color=FAINT, zorder=0)
         axes.axhline(-1.0, color=INK, linewidth=0.8, zorder=1)
-    axes.legend(loc="upper left", bbox_to_anchor=(-0.01, 1.17), ncols=CLOSEST, fontsize=SMALL - 1, frameon=False)
+    axes.legend(
+        loc="upper left",
+        bbox_to_anchor=(-0.01, 1.17),
+        ncols=CLOSEST,
+        fontsize=SMALL - 1,
+        frameon=False,
+    )

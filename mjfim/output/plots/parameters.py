@@ -53,9 +53,26 @@ def draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
         for x, y in zip(std[known], places[known], strict=True):
             axes.text(x, y, f" {number(float(x))}", va="center", fontsize=SMALL, color=colour)
     axes.barh(places[known], std[known], height=0.36, color=colour)
-    axes.barh(places[~known], high, height=0.36, facecolor="white", edgecolor=colour, hatch="////", linewidth=0.8)
+    axes.barh(
+        places[~known],
+        high,
+        height=0.36,
+        facecolor="white",
+        edgecolor=colour,
+        hatch="////",
+        linewidth=0.8,
+    )
     for y in places[~known]:
-        axes.text(high, y, "∞ ", ha="right", va="center", fontsize=NORMAL, color=colour, backgroundcolor="white")
+        axes.text(
+            high,
+            y,
+            "∞ ",
+            ha="right",
+            va="center",
+            fontsize=NORMAL,
+            color=colour,
+            backgroundcolor="white",
+        )
 
 
 def annotate_bars(axes: Axes, values: Array, before: Array, after: Array) -> None:
@@ -101,7 +118,10 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     """Predicted standard deviation of every wanted parameter and combination along both trajectories, with the gain."""
     labels.check(parameters=len(design.theta))
     shown = list(design.wanted)
-    names = [*(brief(labels.parameter(j)) for j in shown), *(shorten(c.words) for c in design.combined)]
+    names = [
+        *(brief(labels.parameter(j)) for j in shown),
+        *(shorten(c.words) for c in design.combined),
+    ]
     values = np.array([*design.theta[shown], *(c.value for c in design.combined)])
     before = np.array([*design.initial.std[shown], *(c.initial for c in design.combined)])
     after = np.array([*design.final.std[shown], *(c.final for c in design.combined)])
@@ -138,7 +158,9 @@ def relative_axis(offset: Array, ends: Array) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def draw_interval(axes: Axes, y: int, centre: float, half: float, wide: tuple[float, float], bound: bool) -> None:
+def draw_interval(
+    axes: Axes, y: int, centre: float, half: float, wide: tuple[float, float], bound: bool
+) -> None:
     """One estimate with its formal interval, thick, in the honest one, thin; arrows where that leaves the axis."""
     low, high = axes.get_xlim()
     if np.isfinite(half):
@@ -149,7 +171,15 @@ def draw_interval(axes: Axes, y: int, centre: float, half: float, wide: tuple[fl
     for end, marker, cut in ((ends[0], "<", wide[0] < low), (ends[1], ">", wide[1] > high)):
         axes.plot(end, y, marker if cut else "|", color=OPTIMIZED, markersize=7, clip_on=False)
     face = "white" if bound else OPTIMIZED
-    axes.plot(centre, y, "s" if bound else "o", color=OPTIMIZED, markerfacecolor=face, markersize=6.5, zorder=3)
+    axes.plot(
+        centre,
+        y,
+        "s" if bound else "o",
+        color=OPTIMIZED,
+        markerfacecolor=face,
+        markersize=6.5,
+        zorder=3,
+    )
 
 
 def interval_text(estimate: Estimate, j: int, unit: str) -> str:
@@ -157,7 +187,9 @@ def interval_text(estimate: Estimate, j: int, unit: str) -> str:
     low, high = estimate.interval[j]
     half = 0.5 * float(high - low) if np.isfinite(estimate.std[j]) else np.inf
     text = f"{number(float(estimate.initial_theta[j]), 4)} → {with_error(float(estimate.theta[j]), half)} {unit}"
-    return text.rstrip() + ("   at its bound" if estimate.parameters[j] in estimate.at_bound else "")
+    return text.rstrip() + (
+        "   at its bound" if estimate.parameters[j] in estimate.at_bound else ""
+    )
 
 
 def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
@@ -178,14 +210,30 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
             bound = estimate.parameters[j] in estimate.at_bound
             draw_interval(axes, j, float(offset[j]), float(half[j]), ends, bound)
         text = interval_text(estimate, j, labels.parameter_units[j])
-        axes.text(1.02, j, text, transform=axes.get_yaxis_transform(), va="center", fontsize=SMALL, color=INK)
+        axes.text(
+            1.02,
+            j,
+            text,
+            transform=axes.get_yaxis_transform(),
+            va="center",
+            fontsize=SMALL,
+            color=INK,
+        )
     dress(axes, "difference from the guess [% of the guess]")
     axes.set_yticks(range(count), [brief(labels.parameter(j)) for j in range(count)])
     handles = [
         Line2D([], [], color=INITIAL, label="guess", linewidth=1.6),
         Line2D([], [], color=OPTIMIZED, marker="o", alpha=0.9, label="estimate, 95 % interval"),
         Line2D([], [], color=OPTIMIZED, linewidth=5.0, alpha=0.3, label="formal 95 %"),
-        Line2D([], [], color=OPTIMIZED, marker="s", markerfacecolor="white", linestyle="", label="at its bound"),
+        Line2D(
+            [],
+            [],
+            color=OPTIMIZED,
+            marker="s",
+            markerfacecolor="white",
+            linestyle="",
+            label="at its bound",
+        ),
     ]
     note = "Formal: a best case that holds if the model and the noise are right. The thin line allows for residuals that are not."
     if estimate.misfit:

@@ -70,7 +70,9 @@ def draw_spectrum(axes: Axes, estimate: Estimate, column: int, sigma: float) -> 
     low, high = chi2.ppf([0.025, 0.975], 2.0 * count) / (2.0 * count)
     axes.axhspan(low, high, color=FAINT, alpha=0.8, linewidth=0)
     axes.axhline(1.0, color=INK, linewidth=0.8)
-    axes.plot(freq[1:-1], power[1:-1] / level, color=MEASURED, linewidth=1.1)  # the two ends have half the power
+    axes.plot(
+        freq[1:-1], power[1:-1] / level, color=MEASURED, linewidth=1.1
+    )  # the two ends have half the power
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.yaxis.set_minor_formatter(NullFormatter())
@@ -85,7 +87,9 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
     """Spectra of the residuals of every output, relative to white noise of the sigma that was stated or estimated."""
     outputs = estimate.recordings[0].outputs
     sigma = np.array([estimate.sigma[name] for name in outputs])
-    left = np.concatenate([r.y - y for r, y in zip(estimate.recordings, estimate.predicted, strict=True)])
+    left = np.concatenate(
+        [r.y - y for r, y in zip(estimate.recordings, estimate.predicted, strict=True)]
+    )
     columns = shown_outputs(left, sigma)
     rows = -(-len(columns) // 2)
     wide = min(2, len(columns))
@@ -94,7 +98,10 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
     for axes in grid.ravel()[len(columns) :]:
         axes.set_visible(False)
     for axes, column in zip(grid.ravel(), columns, strict=False):
-        dress(axes, ylabel=f"{two_lines(split_unit(labels.output(outputs[column]))[0])}\nover white noise [–]")
+        dress(
+            axes,
+            ylabel=f"{two_lines(split_unit(labels.output(outputs[column]))[0])}\nover white noise [–]",
+        )
         draw_spectrum(axes, estimate, int(column), float(sigma[column]))
     for axes in grid[-1]:
         axes.set_xlabel("frequency [Hz]")
@@ -117,7 +124,9 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
     """Errors of predictions of what was not fitted: identified against nominal model, every output on its own axis."""
     found = estimate.predictions
     names_of = found[0].identified.outputs
-    outputs = [j for j in range(len(names_of)) if any(np.isfinite(p.identified.rms[j]) for p in found)][:12]
+    outputs = [
+        j for j in range(len(names_of)) if any(np.isfinite(p.identified.rms[j]) for p in found)
+    ][:12]
     figure = new_figure(10.0, 1.5 + len(outputs) * (0.5 + 0.32 * len(found)))
     grid = figure.subplots(len(outputs), 1, squeeze=False)[:, 0]
     names = [shorten(p.name.rsplit("/", 1)[-1], 34) + ("" if p.held_out else " *") for p in found]
@@ -125,7 +134,9 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
         dress(axes, ylabel=two_lines(split_unit(labels.output(names_of[j]))[0]))
         place = np.arange(len(found))
         axes.barh(place - 0.19, [p.nominal.rms[j] for p in found], 0.34, color=INITIAL, alpha=0.75)
-        axes.barh(place + 0.19, [p.identified.rms[j] for p in found], 0.34, color=OPTIMIZED, alpha=0.85)
+        axes.barh(
+            place + 0.19, [p.identified.rms[j] for p in found], 0.34, color=OPTIMIZED, alpha=0.85
+        )
         axes.set_yticks(place, names)
         axes.set_ylim(len(found) - 0.5, -0.5)
         axes.grid(False, axis="y")
@@ -133,8 +144,13 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
             text = f"{number(float(p.identified.rms[j]))}  (× {number(_share(p, j), 2)})"
             where = {"transform": axes.get_yaxis_transform(), "va": "center"}
             axes.text(1.01, k, text, fontsize=SMALL, color=INK, **where)
-        axes.set_xlabel(f"rms prediction error [{split_unit(labels.output(names_of[j]))[1] or '–'}]")
-    handles = [Patch(color=INITIAL, label="nominal model"), Patch(color=OPTIMIZED, label="identified model")]
+        axes.set_xlabel(
+            f"rms prediction error [{split_unit(labels.output(names_of[j]))[1] or '–'}]"
+        )
+    handles = [
+        Patch(color=INITIAL, label="nominal model"),
+        Patch(color=OPTIMIZED, label="identified model"),
+    ]
     note = "The identified parameters were fitted to everything but what is predicted; only its start is found from it."
     if not all(p.held_out for p in found):
         note += " *: fitted in the end; predicted here by a fit to the rest."

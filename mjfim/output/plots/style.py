@@ -35,7 +35,10 @@ SMALL, NORMAL, LARGE = 8.0, 9.0, 11.0
 
 
 # How the two trajectories of a design or study are named and coloured.
-STYLES: dict[str, tuple[str, str]] = {"initial": ("initial", INITIAL), "final": ("optimized", OPTIMIZED)}
+STYLES: dict[str, tuple[str, str]] = {
+    "initial": ("initial", INITIAL),
+    "final": ("optimized", OPTIMIZED),
+}
 BEST_CASE = "Predicted standard deviations are a best case: they hold if the model and the stated noise are right."
 
 
@@ -125,7 +128,16 @@ def dress(axes: Axes, xlabel: str = "", ylabel: str = "") -> Axes:
 
 def say(axes: Axes, sentence: str) -> None:
     """A sentence in the middle of a panel that has nothing to draw."""
-    axes.text(0.5, 0.5, sentence, transform=axes.transAxes, ha="center", va="center", fontsize=NORMAL, color=MUTED)
+    axes.text(
+        0.5,
+        0.5,
+        sentence,
+        transform=axes.transAxes,
+        ha="center",
+        va="center",
+        fontsize=NORMAL,
+        color=MUTED,
+    )
 
 
 def headline(figure: Figure, title: str, handles: Sequence[Artist] = (), note: str = "") -> None:
@@ -151,7 +163,9 @@ def headline(figure: Figure, title: str, handles: Sequence[Artist] = (), note: s
 
 def pair_handles() -> list[Line2D]:
     """Legend entries of the two trajectories."""
-    return [Line2D([], [], color=colour, label=name, linewidth=2.0) for name, colour in STYLES.values()]
+    return [
+        Line2D([], [], color=colour, label=name, linewidth=2.0) for name, colour in STYLES.values()
+    ]
 
 
 def save(figure: Figure, path: str | os.PathLike[str], dpi: float = 200.0) -> Path:

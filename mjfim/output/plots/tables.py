@@ -104,7 +104,9 @@ def draw_block(axes: Axes, block: Block, top: float, total: float) -> None:
         for group in block.groups:
             left = edges[group.first - 1] + GAP if group.first else MARGIN
             middle = (left + edges[group.last]) / 2
-            axes.text(middle, y, group.text, fontsize=NORMAL, color=group.colour, ha="center", va="center")
+            axes.text(
+                middle, y, group.text, fontsize=NORMAL, color=group.colour, ha="center", va="center"
+            )
             rule(axes, left, edges[group.last], y + 0.45 * ROW, 0.5)
         y += 0.55 * ROW
     for k, row in enumerate((block.header, *block.rows)):
@@ -135,7 +137,9 @@ def draw_tables(title: str, blocks: Sequence[Block], notes: Sequence[str]) -> Fi
         draw_block(axes, block, top, total)
         top += block.height
     for k, note in enumerate(notes):
-        axes.text(MARGIN, top + 0.1 + 0.17 * k, note, fontsize=SMALL - 0.5, color=MUTED, va="center")
+        axes.text(
+            MARGIN, top + 0.1 + 0.17 * k, note, fontsize=SMALL - 0.5, color=MUTED, va="center"
+        )
     return figure
 
 
@@ -181,9 +185,13 @@ def bound_block(design: Design, labels: Labels) -> Block:
                 )
             )
         for c in design.combined:
-            relative = [percent(abs(std / c.value)) if c.value else "–" for std in (c.initial, c.final)]
+            relative = [
+                percent(abs(std / c.value)) if c.value else "–" for std in (c.initial, c.final)
+            ]
             stds = (number(c.initial), relative[0], number(c.final), relative[1])
-            rows.append((shorten(c.words), number(c.value, 4), *stds, f"{number(c.initial / c.final)}×"))
+            rows.append(
+                (shorten(c.words), number(c.value, 4), *stds, f"{number(c.initial / c.final)}×")
+            )
     return Block(
         "Cramér–Rao standard deviation",
         ("parameter [unit]", "value", "std", "of value", "std", "of value", "ratio"),
@@ -199,7 +207,9 @@ def design_table(design: Design, labels: Labels) -> Figure:
         "λ in s / (unit of θ)²: information per unit of measurement rate; std in the parameter's unit.",
         BEST_CASE,
     )
-    return draw_tables("Designed experiment", [eigenvalue_block(design), bound_block(design, labels)], notes)
+    return draw_tables(
+        "Designed experiment", [eigenvalue_block(design), bound_block(design, labels)], notes
+    )
 
 
 def matrix_block(study: Study, labels: Labels, title: str, matrix: Callable[[str], Array]) -> Block:
@@ -223,7 +233,9 @@ def variance_block(study: Study, labels: Labels) -> Block:
     for k, (name, trials) in enumerate(study.sets.items()):
         text, colour = STYLES.get(name, (name, OTHER))
         groups.append(Group(text, 1 + 3 * k, 3 + 3 * k, colour))
-        diagonals = [np.diagonal(m) for m in (trials.covariance, study.information[name], trials.crlb)]
+        diagonals = [
+            np.diagonal(m) for m in (trials.covariance, study.information[name], trials.crlb)
+        ]
         for j, row in enumerate(rows):
             row += [number(float(d[j])) for d in diagonals]
     header = ("parameter [unit]", *(("observed", "information", "bound") * len(study.sets)))
@@ -238,18 +250,30 @@ def efficiency_block(study: Study, labels: Labels) -> Block:
         groups.append(Group(text, 1 + 2 * k, 2 + 2 * k, colour))
         for j, row in enumerate(rows):
             low, high = trials.efficiency_interval[j]
-            row += [number(float(trials.efficiency[j])), f"[{number(float(low))}, {number(float(high))}]"]
+            row += [
+                number(float(trials.efficiency[j])),
+                f"[{number(float(low))}, {number(float(high))}]",
+            ]
     header = ("parameter [unit]", *(("efficiency", "95 % interval") * len(study.sets)))
-    return Block("Efficiency: bound / observed variance", header, tuple(tuple(r) for r in rows), tuple(groups))
+    return Block(
+        "Efficiency: bound / observed variance",
+        header,
+        tuple(tuple(r) for r in rows),
+        tuple(groups),
+    )
 
 
 def study_table(study: Study, labels: Labels) -> Figure:
     """Monte-Carlo covariance, Fisher information, Cramer-Rao bound and efficiency (paper's tables II and III)."""
     labels.check(parameters=len(study.theta))
-    notes = ["Symmetric matrices, upper triangle; entry i, j in unit of θᵢ × unit of θⱼ (information: its inverse)."]
+    notes = [
+        "Symmetric matrices, upper triangle; entry i, j in unit of θᵢ × unit of θⱼ (information: its inverse)."
+    ]
     if len(study.theta) <= MAX_MATRIX:
         blocks = [
-            matrix_block(study, labels, "Monte-Carlo covariance", lambda name: study.sets[name].covariance),
+            matrix_block(
+                study, labels, "Monte-Carlo covariance", lambda name: study.sets[name].covariance
+            ),
             matrix_block(study, labels, "Fisher information", lambda name: study.information[name]),
             matrix_block(study, labels, "Cramér–Rao bound", lambda name: study.sets[name].crlb),
         ]
@@ -257,7 +281,8 @@ def study_table(study: Study, labels: Labels) -> Figure:
         blocks = [variance_block(study, labels)]
         notes = ["Observed variance and bound in (unit of θ)², information in its inverse."]
     trials = [
-        f"{STYLES.get(name, (name, OTHER))[0]} {s.trials - s.failed} of {s.trials}" for name, s in study.sets.items()
+        f"{STYLES.get(name, (name, OTHER))[0]} {s.trials - s.failed} of {s.trials}"
+        for name, s in study.sets.items()
     ]
     notes.append(f"Usable trials: {', '.join(trials)}; measured at {study.measure_rate:g} Hz.")
     title = "Monte-Carlo study against the Cramér–Rao bound"

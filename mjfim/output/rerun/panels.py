@@ -40,21 +40,34 @@ def dof_positions(model: mujoco.MjModel, qpos: Array) -> Array:
 # Series over simulated time
 
 
-def log_line(rec: rr.RecordingStream, path: Route, t: Array, values: Array, name: str, look: Look) -> None:
+def log_line(
+    rec: rr.RecordingStream, path: Route, t: Array, values: Array, name: str, look: Look
+) -> None:
     """One curve on `sim_time`. t, values: (n,); rows without a finite value are left out."""
-    rec.log(entity(path), rr.SeriesLines(colors=[look.accent], names=[name], widths=[2.0]), static=True, strict=True)
+    rec.log(
+        entity(path),
+        rr.SeriesLines(colors=[look.accent], names=[name], widths=[2.0]),
+        static=True,
+        strict=True,
+    )
     _send(rec, path, t, values)
 
 
-def log_steps(rec: rr.RecordingStream, path: Route, t: Array, values: Array, name: str, look: Look) -> None:
+def log_steps(
+    rec: rr.RecordingStream, path: Route, t: Array, values: Array, name: str, look: Look
+) -> None:
     """A value held from each sample to the next. t, values: (n,)."""
     hold = rr.components.InterpolationMode.StepAfter
-    style = rr.SeriesLines(colors=[look.accent], names=[name], widths=[2.0], interpolation_mode=hold)
+    style = rr.SeriesLines(
+        colors=[look.accent], names=[name], widths=[2.0], interpolation_mode=hold
+    )
     rec.log(entity(path), style, static=True, strict=True)
     _send(rec, path, t, values)
 
 
-def log_dots(rec: rr.RecordingStream, path: Route, t: Array, values: Array, name: str, look: Look) -> None:
+def log_dots(
+    rec: rr.RecordingStream, path: Route, t: Array, values: Array, name: str, look: Look
+) -> None:
     """Measured samples as dots. t, values: (n,)."""
     style = rr.SeriesPoints(colors=[look.accent], names=[name], marker_sizes=[1.5])
     rec.log(entity(path), style, static=True, strict=True)
@@ -93,7 +106,10 @@ def grid(name: str, views: Sequence[rrb.View], columns: int = 3, page: int = 9) 
     pages = [views[k : k + page] for k in range(0, len(views), page)]
     titles = [f"{name} {k + 1}" for k in range(len(pages))] if len(pages) > 1 else [name]
     columns = min(columns, len(views))
-    grids = [rrb.Grid(*part, grid_columns=columns, name=title) for part, title in zip(pages, titles, strict=False)]
+    grids = [
+        rrb.Grid(*part, grid_columns=columns, name=title)
+        for part, title in zip(pages, titles, strict=False)
+    ]
     if not grids:
         return []
     rows = -(-len(pages[0]) // columns)
@@ -102,7 +118,9 @@ def grid(name: str, views: Sequence[rrb.View], columns: int = 3, page: int = 9) 
 
 def stack(blocks: Sequence[Block], name: str | None = None) -> rrb.Vertical:
     """Blocks above each other, each as high as it wants."""
-    return rrb.Vertical(*(b.content for b in blocks), row_shares=[b.rows for b in blocks], name=name)
+    return rrb.Vertical(
+        *(b.content for b in blocks), row_shares=[b.rows for b in blocks], name=name
+    )
 
 
 # Phase plots of the sensitivity
@@ -113,7 +131,11 @@ MAX_PHASES = 9
 
 def shown_parameters(design: Design) -> list[int]:
     """Wanted parameters that move something; of many, those of the largest relative standard deviation."""
-    moving = [j for j in design.wanted if any(e.sensitivity[..., j].any() for e in (design.initial, design.final))]
+    moving = [
+        j
+        for j in design.wanted
+        if any(e.sensitivity[..., j].any() for e in (design.initial, design.final))
+    ]
     size = np.where(design.theta == 0.0, 1.0, np.abs(design.theta))
     known = np.where(np.isfinite(design.final.std), design.final.std, 0.0) / size
     return sorted(sorted(moving, key=lambda j: -known[j])[:MAX_PHASES])
@@ -137,7 +159,10 @@ class Phase:
         psi = np.abs(design.final.sensitivity[:, :, index])
         dof = int(np.argmax(psi[:, :nv].max(axis=0)))
         both = np.concatenate(
-            [np.abs(e.sensitivity[:, [dof, nv + dof], index]) for e in (design.initial, design.final)]
+            [
+                np.abs(e.sensitivity[:, [dof, nv + dof], index])
+                for e in (design.initial, design.final)
+            ]
         )
         scale = both.max(axis=0)
         return cls(index, dof, design.parameters[index], np.where(scale > 0.0, scale, 1.0))
@@ -154,18 +179,28 @@ class Phase:
 
     def log_axes(self, rec: rr.RecordingStream, names: Labels) -> None:
         """Axes through zero, with the value at each positive end, per unit of the parameter."""
-        units = [split_unit(name)[1] for name in (names.positions[self.dof], names.velocities[self.dof])]
+        units = [
+            split_unit(name)[1] for name in (names.positions[self.dof], names.velocities[self.dof])
+        ]
         ends = np.array([[1.65, 0.0], [0.0, -1.1]])
         lines, grey = [[-ends[0], ends[0]], [-ends[1], ends[1]]], [150, 150, 150]
         style = rr.LineStrips2D(lines, colors=[grey] * 2, radii=rr.Radius.ui_points(0.5))
         rec.log(entity((*self.route, "axes")), style, static=True, strict=True)
-        labels = [f"{1.1 * value:.2g} {unit}" for value, unit in zip(self.scale, units, strict=True)]
+        labels = [
+            f"{1.1 * value:.2g} {unit}" for value, unit in zip(self.scale, units, strict=True)
+        ]
         marks = rr.Points2D(
-            ends * (0.8, 1.0), labels=labels, colors=[grey] * 2, radii=rr.Radius.ui_points(1.0), show_labels=True
+            ends * (0.8, 1.0),
+            labels=labels,
+            colors=[grey] * 2,
+            radii=rr.Radius.ui_points(1.0),
+            show_labels=True,
         )
         rec.log(entity((*self.route, "ends")), marks, static=True, strict=True)
 
-    def log_curve(self, rec: rr.RecordingStream, t: Array, points: Array, name: str, look: Look) -> None:
+    def log_curve(
+        self, rec: rr.RecordingStream, t: Array, points: Array, name: str, look: Look
+    ) -> None:
         """The whole curve, and a dot that moves along it with `sim_time`. points: (N+1, 2)."""
         line = rr.LineStrips2D([points], colors=[look.accent], radii=rr.Radius.ui_points(1.0))
         rec.log(entity((*self.route, name)), line, static=True, strict=True)
@@ -198,13 +233,18 @@ def history_series(history: Sequence[HistoryRow]) -> dict[str, tuple[NDArray[np.
         finite = np.isfinite(values) & ((values != 0.0) if title != "cost" else True)
         n, values = iterations[finite], values[finite]
         logarithmic = len(values) > 0 and bool(np.all(values > 0.0))
-        out[f"log10 {title}" if logarithmic else title] = n, np.log10(values) if logarithmic else values
+        out[f"log10 {title}" if logarithmic else title] = (
+            n,
+            np.log10(values) if logarithmic else values,
+        )
     steps = np.array([row.gamma for row in history], dtype=np.float64)
     out["step length"] = iterations[np.isfinite(steps)], steps[np.isfinite(steps)]
     return out
 
 
-def log_history(rec: rr.RecordingStream, history: Sequence[HistoryRow], looks: Sequence[Look]) -> None:
+def log_history(
+    rec: rr.RecordingStream, history: Sequence[HistoryRow], looks: Sequence[Look]
+) -> None:
     """Every series on `iteration`, and as static bars over the iteration number."""
     for (title, (n, values)), look in zip(history_series(history).items(), looks, strict=False):
         path = ("history", title)
@@ -212,7 +252,9 @@ def log_history(rec: rr.RecordingStream, history: Sequence[HistoryRow], looks: S
         rec.log(entity(path), style, static=True, strict=True)
         if len(n):
             columns = rr.Scalars.columns(scalars=values)
-            rec.send_columns(entity(path), [rr.TimeColumn("iteration", sequence=n)], columns, strict=True)
+            rec.send_columns(
+                entity(path), [rr.TimeColumn("iteration", sequence=n)], columns, strict=True
+            )
             bars = rr.BarChart(values, abscissa=n, color=look.accent)
             rec.log(entity(("bars", title)), bars, static=True, strict=True)
 
@@ -221,7 +263,9 @@ def history_bars(history: Sequence[HistoryRow]) -> rrb.Tabs:
     """Bars of each series by iteration, the same on every timeline."""
     hidden = rrb.PlotLegend(visible=False)
     bars = [
-        rrb.BarChartView(origin=entity(("bars", title)), name=f"{title} by iteration", plot_legend=hidden)
+        rrb.BarChartView(
+            origin=entity(("bars", title)), name=f"{title} by iteration", plot_legend=hidden
+        )
         for title, (n, _) in history_series(history).items()
         if len(n)
     ]

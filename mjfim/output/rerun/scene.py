@@ -12,7 +12,15 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.output.rerun.shapes import DEFAULT_RGBA, GeomType, Look, drawn_geoms, geom_rgba, shape, sticks
+from mjfim.output.rerun.shapes import (
+    DEFAULT_RGBA,
+    GeomType,
+    Look,
+    drawn_geoms,
+    geom_rgba,
+    shape,
+    sticks,
+)
 
 Route = tuple[str, ...]
 FIELD_OF_VIEW = np.radians(50.0)  # a little less than the viewer's own, which leaves a margin
@@ -32,7 +40,9 @@ class Motion:
     def world(self, bodies: NDArray[np.intp], points: Array, every: int = 1) -> Array:
         """(rows, n, 3) world path [m] of points fixed to bodies. bodies: (n,), points: (n, 3) in the bodies' frames."""
         w, v = self.quat[::every, bodies, :1], self.quat[::every, bodies, 1:]
-        return np.asarray(self.pos[::every, bodies] + points + 2.0 * np.cross(v, np.cross(v, points) + w * points))
+        return np.asarray(
+            self.pos[::every, bodies] + points + 2.0 * np.cross(v, np.cross(v, points) + w * points)
+        )
 
 
 def motion(model: mujoco.MjModel, t: Array, qpos: Array) -> Motion:
@@ -48,7 +58,9 @@ def motion(model: mujoco.MjModel, t: Array, qpos: Array) -> Motion:
 
 def time_column(t: Array) -> rr.TimeColumn:
     """Simulated time on `sim_time`, rounded to whole nanoseconds. t: (n,) [s]."""
-    return rr.TimeColumn("sim_time", duration=np.rint(np.asarray(t) * 1e9).astype("timedelta64[ns]"))
+    return rr.TimeColumn(
+        "sim_time", duration=np.rint(np.asarray(t) * 1e9).astype("timedelta64[ns]")
+    )
 
 
 def entity(path: Route) -> str:
@@ -67,7 +79,12 @@ def is_moving(model: mujoco.MjModel, body: int) -> bool:
 
 
 def log_robot(
-    rec: rr.RecordingStream, model: mujoco.MjModel, root: Route, poses: Motion, look: Look, iteration: bool = False
+    rec: rr.RecordingStream,
+    model: mujoco.MjModel,
+    root: Route,
+    poses: Motion,
+    look: Look,
+    iteration: bool = False,
 ) -> None:
     """One robot: shapes and poses on `sim_time`.
 
@@ -80,16 +97,25 @@ def log_robot(
             log_pose(rec, model, entity(path), poses, body, iteration)
 
 
-def log_trail(rec: rr.RecordingStream, model: mujoco.MjModel, root: Route, poses: Motion, look: Look) -> None:
+def log_trail(
+    rec: rr.RecordingStream, model: mujoco.MjModel, root: Route, poses: Motion, look: Look
+) -> None:
     """Path of a robot's end as a line."""
     line = trail(model, poses)
     if len(line):
-        strips = rr.LineStrips3D([line], colors=[[*look.accent, 255]], radii=rr.Radius.ui_points(1.0))
+        strips = rr.LineStrips3D(
+            [line], colors=[[*look.accent, 255]], radii=rr.Radius.ui_points(1.0)
+        )
         rec.log(entity((*root, "path")), strips, static=True, strict=True)
 
 
 def log_pose(
-    rec: rr.RecordingStream, model: mujoco.MjModel, path: str, poses: Motion, body: int, iteration: bool
+    rec: rr.RecordingStream,
+    model: mujoco.MjModel,
+    path: str,
+    poses: Motion,
+    body: int,
+    iteration: bool,
 ) -> None:
     """World pose of a body: static where nothing moves it, else a row per sample (static data would win over it)."""
     xyz, xyzw = poses.pos[:, body], np.roll(poses.quat[:, body], -1, axis=1)
@@ -98,14 +124,19 @@ def log_pose(
         rec.log(path, pose, static=True, strict=True)
         return
     rec.send_columns(
-        path, [time_column(poses.t)], rr.Transform3D.columns(translation=xyz, quaternion=xyzw), strict=True
+        path,
+        [time_column(poses.t)],
+        rr.Transform3D.columns(translation=xyz, quaternion=xyzw),
+        strict=True,
     )
     if iteration:
         first = rr.Transform3D.columns(translation=xyz[:1], quaternion=xyzw[:1])
         rec.send_columns(path, [rr.TimeColumn("iteration", sequence=[0])], first, strict=True)
 
 
-def log_shapes(rec: rr.RecordingStream, model: mujoco.MjModel, path: Route, body: int, look: Look) -> None:
+def log_shapes(
+    rec: rr.RecordingStream, model: mujoco.MjModel, path: Route, body: int, look: Look
+) -> None:
     """The geoms of one body in its frame; a stick figure where a moving body has none."""
     moving = is_moving(model, body)
     geoms = drawn_geoms(model, body)
@@ -113,12 +144,17 @@ def log_shapes(rec: rr.RecordingStream, model: mujoco.MjModel, path: Route, body
         drawn = shape(model, geom, look.paint(geom_rgba(model, geom), moving))
         if drawn is not None:
             x, y, z, w = np.roll(model.geom_quat[geom], -1)
-            pose = rr.Transform3D(translation=model.geom_pos[geom], quaternion=rr.Quaternion(xyzw=[x, y, z, w]))
+            pose = rr.Transform3D(
+                translation=model.geom_pos[geom], quaternion=rr.Quaternion(xyzw=[x, y, z, w])
+            )
             name = model.geom(geom).name or f"geom{geom}"
             rec.log(entity((*path, name)), pose, drawn, static=True, strict=True)
     if moving and not geoms:
         rec.log(
-            entity((*path, "sticks")), *sticks(model, body, look.paint(DEFAULT_RGBA, True)), static=True, strict=True
+            entity((*path, "sticks")),
+            *sticks(model, body, look.paint(DEFAULT_RGBA, True)),
+            static=True,
+            strict=True,
         )
 
 
@@ -132,7 +168,10 @@ def moving_centres(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
 
 def moving_corners(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
     """As `moving_centres`, with the eight corners of each geom's bounding box instead of its centre."""
-    bodies, points = [*np.flatnonzero(model.body_weldid)], [*np.zeros((np.count_nonzero(model.body_weldid), 3))]
+    bodies, points = (
+        [*np.flatnonzero(model.body_weldid)],
+        [*np.zeros((np.count_nonzero(model.body_weldid), 3))],
+    )
     signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
     for geom in np.flatnonzero(model.body_weldid[model.geom_bodyid]):
         rotation = np.empty(9)
@@ -183,7 +222,9 @@ class Camera:
 
     def controls(self) -> rrb.EyeControls3D:
         """For a 3D view's blueprint."""
-        return rrb.EyeControls3D(position=self.position, look_target=self.target, eye_up=(0.0, 0.0, 1.0))
+        return rrb.EyeControls3D(
+            position=self.position, look_target=self.target, eye_up=(0.0, 0.0, 1.0)
+        )
 
 
 def camera(model: mujoco.MjModel, motions: Sequence[Motion], views: int, aspect: float) -> Camera:
@@ -203,12 +244,17 @@ def camera(model: mujoco.MjModel, motions: Sequence[Motion], views: int, aspect:
         middle, reach = axes @ model.stat.center, float(model.stat.extent)
         low, high = middle - reach, middle + reach
     width, height, depth = np.maximum(high - low, 1e-6)
-    stacked = min(1.0 / (views * height), aspect / width) > min(1.0 / height, aspect / (views * width))
+    stacked = min(1.0 / (views * height), aspect / width) > min(
+        1.0 / height, aspect / (views * width)
+    )
     frame = max(height, width / (aspect * views if stacked else aspect / views))
     distance = 0.56 * frame / np.tan(FIELD_OF_VIEW / 2.0) + depth / 2.0
     target = (low + high) / 2.0 @ axes
     return Camera(
-        tuple(map(float, target + distance * back)), tuple(map(float, target)), bool(stacked), bool(back[2] < 0.3)
+        tuple(map(float, target + distance * back)),
+        tuple(map(float, target)),
+        bool(stacked),
+        bool(back[2] < 0.3),
     )
 
 

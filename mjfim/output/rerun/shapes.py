@@ -29,13 +29,19 @@ class Look:
         grey = np.full(3, 255.0 * float(own[:3] @ (0.30, 0.59, 0.11)))
         share = self.share if moving else 0.1
         colour = share * np.array(self.accent) + (1.0 - share) * grey
-        return [round(float(c)) for c in (*colour, 255.0 * own[3] * (self.opacity if moving else 1.0))]
+        return [
+            round(float(c)) for c in (*colour, 255.0 * own[3] * (self.opacity if moving else 1.0))
+        ]
 
 
 def drawn_geoms(model: mujoco.MjModel, body: int) -> list[int]:
     """Geoms as MuJoCo's viewer shows them (groups 0 to 2); those of the hidden groups where a body has no others."""
     first = int(model.body_geomadr[body])
-    geoms = [g for g in range(first, first + int(model.body_geomnum[body])) if geom_rgba(model, g)[3] > 0.0]
+    geoms = [
+        g
+        for g in range(first, first + int(model.body_geomnum[body]))
+        if geom_rgba(model, g)[3] > 0.0
+    ]
     return [g for g in geoms if model.geom_group[g] <= 2] or geoms
 
 
@@ -50,7 +56,10 @@ def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
 
 def shape(model: mujoco.MjModel, geom: int, rgba: list[int]) -> rr.AsComponents | None:
     """Archetype of one geom in its own frame; sizes are half sizes [m]. None for types without a surface."""
-    kind, (a, b, c) = GeomType(int(model.geom_type[geom])), (float(s) for s in model.geom_size[geom])
+    kind, (a, b, c) = (
+        GeomType(int(model.geom_type[geom])),
+        (float(s) for s in model.geom_size[geom]),
+    )
     solid, colors = rr.components.FillMode.Solid, [rgba]
     match kind:
         case GeomType.mjGEOM_SPHERE:
@@ -76,7 +85,9 @@ def shape(model: mujoco.MjModel, geom: int, rgba: list[int]) -> rr.AsComponents 
 def capsule(start: Array, length: float, radius: float, rgba: list[int]) -> rr.Capsules3D:
     """Capsule that begins at `start` and runs along z [m]."""
     solid = rr.components.FillMode.Solid
-    return rr.Capsules3D(lengths=[length], radii=[radius], translations=[start], colors=[rgba], fill_mode=solid)
+    return rr.Capsules3D(
+        lengths=[length], radii=[radius], translations=[start], colors=[rgba], fill_mode=solid
+    )
 
 
 def sticks(model: mujoco.MjModel, body: int, rgba: list[int]) -> tuple[rr.AsComponents, ...]:
@@ -101,15 +112,21 @@ def sticks(model: mujoco.MjModel, body: int, rgba: list[int]) -> tuple[rr.AsComp
 
 def checkerboard(half_x: float, half_y: float, rgba: list[int], cells: int = 12) -> rr.Mesh3D:
     """Plane z = 0 as a two-tone board of squares, so that depth can be read. half_x, half_y [m]."""
-    i, j = (index.ravel() for index in np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"))
-    corners = np.stack([np.stack([i + di, j + dj], axis=1) for di, dj in ((0, 0), (1, 0), (1, 1), (0, 1))], axis=1)
+    i, j = (
+        index.ravel() for index in np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")
+    )
+    corners = np.stack(
+        [np.stack([i + di, j + dj], axis=1) for di, dj in ((0, 0), (1, 0), (1, 1), (0, 1))], axis=1
+    )
     xy = (2.0 * corners / cells - 1.0) * (half_x, half_y)
     vertices = np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=2).reshape(-1, 3)
     tone = np.where((i + j) % 2, 1.0, 0.8)[:, None] * np.array(rgba[:3])
     quads = 4 * np.arange(cells * cells)[:, None]
     return rr.Mesh3D(
         vertex_positions=vertices,
-        triangle_indices=np.concatenate([quads + np.array(half) for half in ((0, 1, 2), (0, 2, 3))]),
+        triangle_indices=np.concatenate(
+            [quads + np.array(half) for half in ((0, 1, 2), (0, 2, 3))]
+        ),
         vertex_normals=np.broadcast_to((0.0, 0.0, 1.0), vertices.shape),
         vertex_colors=np.repeat(tone, 4, axis=0).astype(np.uint8),
     )
@@ -117,7 +134,11 @@ def checkerboard(half_x: float, half_y: float, rgba: list[int], cells: int = 12)
 
 def height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh3D:
     """Top surface of a height field; rows run along y, columns along x."""
-    rows, cols, first = int(model.hfield_nrow[field]), int(model.hfield_ncol[field]), int(model.hfield_adr[field])
+    rows, cols, first = (
+        int(model.hfield_nrow[field]),
+        int(model.hfield_ncol[field]),
+        int(model.hfield_adr[field]),
+    )
     half_x, half_y, top, _ = model.hfield_size[field]
     z = top * model.hfield_data[first : first + rows * cols].reshape(rows, cols)
     x, y = np.meshgrid(np.linspace(-half_x, half_x, cols), np.linspace(-half_y, half_y, rows))
@@ -135,7 +156,9 @@ def height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh3
 
 def mesh(model: mujoco.MjModel, index: int, rgba: list[int]) -> rr.Mesh3D:
     """A compiled mesh (already re-centred by MuJoCo), one vertex per distinct (vertex, normal) pair."""
-    faces = slice(int(model.mesh_faceadr[index]), int(model.mesh_faceadr[index] + model.mesh_facenum[index]))
+    faces = slice(
+        int(model.mesh_faceadr[index]), int(model.mesh_faceadr[index] + model.mesh_facenum[index])
+    )
     pairs = np.stack([model.mesh_face[faces].ravel(), model.mesh_facenormal[faces].ravel()], axis=1)
     distinct, triangles = np.unique(pairs, axis=0, return_inverse=True)
     return rr.Mesh3D(

@@ -15,16 +15,24 @@ def design_text(design: Design, summary: str = "") -> str:
     first, last = design.initial, design.final
     rows = [
         (name, f"{theta:.4g}", f"{a:.3g}", f"{b:.3g}", f"{a / b:.3g}×" if 0.0 < b < np.inf else "")
-        for name, theta, a, b in zip(design.parameters, design.theta, first.std, last.std, strict=True)
+        for name, theta, a, b in zip(
+            design.parameters, design.theta, first.std, last.std, strict=True
+        )
         if name not in design.nuisance
     ]
     low, high = float(first.eigenvalues[0]), float(last.eigenvalues[0])
     ratio = f" (×{high / low:.3g})" if low > 0.0 else ""
     table = _table(("parameter", "θ", "σ initial", "σ optimized", "better by"), rows)
-    limits = _table(("limit", "worst margin (negative: violated)"), [(k, f"{v:.3g}") for k, v in design.limits.items()])
+    limits = _table(
+        ("limit", "worst margin (negative: violated)"),
+        [(k, f"{v:.3g}") for k, v in design.limits.items()],
+    )
     starts = _table(
         ("start", "cost", "iterations", "outcome"),
-        [(s.name, f"{s.cost:.5g}", str(s.iterations), s.status.name.lower()) for s in design.starts],
+        [
+            (s.name, f"{s.cost:.5g}", str(s.iterations), s.status.name.lower())
+            for s in design.starts
+        ],
     )
     iterations = max((row.iteration for row in design.history), default=0)
     violated = [kind for kind, margin in design.limits.items() if margin < 0.0]
@@ -41,7 +49,9 @@ def design_text(design: Design, summary: str = "") -> str:
         f" Cost: {first.cost:.4g} → {last.cost:.4g}."
         f" {iterations} iterations, {design.steps} MuJoCo steps, {design.seconds:.1f} s.",
         limits if design.limits else "",
-        f"Best of {len(design.starts)} starts: {design.found_by}." if len(design.starts) > 1 else "",
+        f"Best of {len(design.starts)} starts: {design.found_by}."
+        if len(design.starts) > 1
+        else "",
         starts if len(design.starts) > 1 else "",
         "The plots of ψ show sensitivities: how far a position (→) and its velocity (↑) move per unit of a parameter.",
         summary,
@@ -50,7 +60,13 @@ def design_text(design: Design, summary: str = "") -> str:
 
 def estimate_text(estimate: Estimate, summary: str = "") -> str:
     """Markdown: outcome, estimated parameters, fit per output, warnings."""
-    columns = (estimate.parameters, estimate.initial_theta, estimate.theta, estimate.std, estimate.interval)
+    columns = (
+        estimate.parameters,
+        estimate.initial_theta,
+        estimate.theta,
+        estimate.std,
+        estimate.interval,
+    )
     rows = [
         (
             name,
@@ -70,7 +86,9 @@ def estimate_text(estimate: Estimate, summary: str = "") -> str:
         *_warnings(estimate.warnings),
         _table(("parameter", "start", "estimate", "formal σ", "95 % interval", "at bound"), rows),
         f"Residuals: χ² = {estimate.chi2:.4g} for {estimate.dof} degrees of freedom, {verdict}.",
-        _table(("output", "residual rms"), [(k, f"{v:.3g}") for k, v in estimate.residual_rms.items()]),
+        _table(
+            ("output", "residual rms"), [(k, f"{v:.3g}") for k, v in estimate.residual_rms.items()]
+        ),
         "#### Predictions of what was not fitted" if estimate.predictions else "",
         _table(
             ("what", "error over the nominal model's"),
@@ -89,10 +107,14 @@ def _sections(*parts: str) -> str:
 
 def _warnings(sentences: Sequence[str]) -> list[str]:
     """Heading and list, or nothing."""
-    return ["#### Warnings", "\n".join(f"- {sentence}" for sentence in sentences)] if sentences else []
+    return (
+        ["#### Warnings", "\n".join(f"- {sentence}" for sentence in sentences)] if sentences else []
+    )
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+    )

@@ -28,7 +28,9 @@ def read_nested(path: Path, spec: RecordingSpec) -> Table:
         content = json.loads(path.read_text(encoding="utf-8"))
         return _table(path, content, spec)
     except (ValueError, OSError) as error:
-        raise RecordingError(f"{path}: not readable JSON (damaged or truncated?): {said(error)}") from None
+        raise RecordingError(
+            f"{path}: not readable JSON (damaged or truncated?): {said(error)}"
+        ) from None
     except RecursionError:
         raise RecordingError(f"{path}: not readable JSON: nested too deeply") from None
 
@@ -59,20 +61,28 @@ def _place(path: Path, content: Any, spec: RecordingSpec) -> tuple[str, ...] | N
         for key in place:
             if not isinstance(found, Mapping) or key not in found:
                 valid = [".".join(p) for p in _lists_of_objects(content)]
-                raise RecordingError(f"{path}: recording.records: {unknown('list of records', spec.records, valid)}")
+                raise RecordingError(
+                    f"{path}: recording.records: {unknown('list of records', spec.records, valid)}"
+                )
             found = found[key]
         if not _is_records(found):
-            raise RecordingError(f"{path}: recording.records: {spec.records!r} is not a list of records (objects)")
+            raise RecordingError(
+                f"{path}: recording.records: {spec.records!r} is not a list of records (objects)"
+            )
         return place
     lists = list(_lists_of_objects(content))
     if len(lists) > 1:
         listed = ", ".join(".".join(p) for p in lists)
-        raise RecordingError(f"{path}: several lists of records: {listed}; say which by recording.records")
+        raise RecordingError(
+            f"{path}: several lists of records: {listed}; say which by recording.records"
+        )
     if lists:
         return lists[0]
     if isinstance(content, Mapping) and any(isinstance(v, list) for v in content.values()):
         return None
-    raise RecordingError(f"{path}: holds no list of records (objects); a log is one, or an object that holds one")
+    raise RecordingError(
+        f"{path}: holds no list of records (objects); a log is one, or an object that holds one"
+    )
 
 
 def _is_records(value: Any) -> bool:
@@ -114,7 +124,9 @@ def _fields(records: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Array], dic
                 leaves = [(f"{field}[{i}]", v) for i, v in enumerate(value)]
                 if widths.setdefault(field, len(value)) != len(value):
                     ragged = f"is ragged: {len(value)} numbers in record {row + 1}, {widths[field]} before"
-                    faults.update({f"{field}[{i}]": ragged for i in range(max(len(value), widths[field]))})
+                    faults.update(
+                        {f"{field}[{i}]": ragged for i in range(max(len(value), widths[field]))}
+                    )
             for name, leaf in leaves:
                 if leaf is None or isinstance(leaf, NUMBERS):
                     column = columns.get(name)
@@ -130,13 +142,19 @@ def _lists(path: Path, content: Mapping[str, Any], time: str) -> Table:
     """One list of numbers per column."""
     lists = {name: value for name, value in _flat(content) if isinstance(value, list)}
     if time not in lists:
-        raise RecordingError(f"{path}: column {time!r} is missing; found: {', '.join(lists) or 'none'}")
+        raise RecordingError(
+            f"{path}: column {time!r} is missing; found: {', '.join(lists) or 'none'}"
+        )
     rows, columns, faults = len(lists[time]), dict[str, Array](), dict[str, str]()
     for name, value in _flat(content):
         if isinstance(value, list) and len(value) != rows:
-            faults[name] = f"has {len(value)} rows where {time!r} has {rows}; all columns need equally many"
+            faults[name] = (
+                f"has {len(value)} rows where {time!r} has {rows}; all columns need equally many"
+            )
         elif isinstance(value, list) and all(v is None or isinstance(v, NUMBERS) for v in value):
-            columns[name] = np.array([np.nan if v is None else _number(v) for v in value], dtype=np.float64)
+            columns[name] = np.array(
+                [np.nan if v is None else _number(v) for v in value], dtype=np.float64
+            )
         elif isinstance(value, NUMBERS):
             columns[name] = np.full(rows, _number(value))
         else:

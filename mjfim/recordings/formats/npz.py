@@ -19,7 +19,16 @@ from mjfim.recordings.spec import RecordingSpec
 
 WIDEST = 4096  # columns of one matrix
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-BROKEN = (ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
+BROKEN = (
+    ValueError,
+    OSError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,11 @@ class Member:
     @property
     def labels(self) -> list[str]:
         """Columns that it makes: its name, or `name[i]` of a matrix."""
-        return [self.name] if len(self.shape) < 2 else [f"{self.name}[{i}]" for i in range(self.shape[1])]
+        return (
+            [self.name]
+            if len(self.shape) < 2
+            else [f"{self.name}[{i}]" for i in range(self.shape[1])]
+        )
 
 
 def read_arrays(path: Path, spec: RecordingSpec) -> Table:
@@ -49,7 +62,9 @@ def read_arrays(path: Path, spec: RecordingSpec) -> Table:
     try:
         with zipfile.ZipFile(path) as archive:
             infos = [info for info in archive.infolist() if info.filename.endswith(".npy")]
-            refuse_bomb(path, path.stat().st_size, sum(info.file_size for info in archive.infolist()))
+            refuse_bomb(
+                path, path.stat().st_size, sum(info.file_size for info in archive.infolist())
+            )
             members = [_member(path, archive, info) for info in infos]
             flat = [m for m in members if len(m.shape) <= 2]
             wide = next((m for m in flat if len(m.shape) == 2 and m.shape[1] > WIDEST), None)
@@ -60,7 +75,9 @@ def read_arrays(path: Path, spec: RecordingSpec) -> Table:
             wanted = set(chosen([label for m in flat for label in m.labels], spec))
             return _table(path, archive, flat, wanted, spec)
     except BROKEN as error:
-        raise RecordingError(f"{path}: not a readable npz archive (damaged or truncated?): {said(error)}") from None
+        raise RecordingError(
+            f"{path}: not a readable npz archive (damaged or truncated?): {said(error)}"
+        ) from None
 
 
 def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Member:
@@ -85,7 +102,13 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     return shape, fortran, dtype
 
 
-def _table(path: Path, archive: zipfile.ZipFile, members: list[Member], wanted: set[str], spec: RecordingSpec) -> Table:
+def _table(
+    path: Path,
+    archive: zipfile.ZipFile,
+    members: list[Member],
+    wanted: set[str],
+    spec: RecordingSpec,
+) -> Table:
     time = next((m for m in members if m.name == spec.time), None)
     if time is None or len(time.shape) != 1:
         what = "is missing" if time is None else f"has shape {time.shape}, wanted one row of times"
@@ -112,7 +135,9 @@ def _fault(member: Member, rows: int, held: bool, time: str) -> str | None:
     if not member.numeric:
         return "is not numeric"
     if member.shape and member.shape[0] != rows and not (held and member.shape[0] == rows - 1):
-        return f"has {member.shape[0]} rows where {time!r} has {rows}; all columns need equally many"
+        return (
+            f"has {member.shape[0]} rows where {time!r} has {rows}; all columns need equally many"
+        )
     return None
 
 

@@ -31,11 +31,17 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
         raise RecordingError(f"{path}: no such file")
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
-            raise RecordingError(f"{path}: a folder without metadata.yaml is no ROS 2 bag; name a file")
+            raise RecordingError(
+                f"{path}: a folder without metadata.yaml is no ROS 2 bag; name a file"
+            )
         return read_bag(path, spec)
-    reader = next((read for ending, read in READERS.items() if path.name.lower().endswith(ending)), None)
+    reader = next(
+        (read for ending, read in READERS.items() if path.name.lower().endswith(ending)), None
+    )
     if reader is None:
-        raise RecordingError(f"{path}: not a known kind of log; valid endings: {', '.join(READERS)}; or a bag's folder")
+        raise RecordingError(
+            f"{path}: not a known kind of log; valid endings: {', '.join(READERS)}; or a bag's folder"
+        )
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty")
     return reader(path, spec)
@@ -116,7 +122,9 @@ def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
                 )
             table = file.read(columns=wanted)
     except BROKEN as error:
-        raise RecordingError(f"{path}: not a readable Parquet file (damaged or truncated?): {said(error)}") from None
+        raise RecordingError(
+            f"{path}: not a readable Parquet file (damaged or truncated?): {said(error)}"
+        ) from None
     return _table(path, table, tuple(name for name in names if name not in wanted))
 
 
@@ -127,7 +135,9 @@ def _table(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
         name, column = table.column_names[0], table.column(0)
         table = table.remove_column(0)
         try:
-            whole = column.cast(pyarrow.float64(), safe=False) if not _is_text(column.type) else None
+            whole = (
+                column.cast(pyarrow.float64(), safe=False) if not _is_text(column.type) else None
+            )
         except (pyarrow.ArrowInvalid, pyarrow.ArrowNotImplementedError):
             whole = None
         if whole is None:

@@ -53,7 +53,9 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
     With several topics in the recording, `<topic>:position:<joint>`, rows of all merged by time. Raises RecordingError.
     """
     if spec.time_unit != "s":
-        raise RecordingError(f"{path}: recording.time_unit: the stamps of a bag are in seconds; leave it out")
+        raise RecordingError(
+            f"{path}: recording.time_unit: the stamps of a bag are in seconds; leave it out"
+        )
     rosbag2, typesys = _library(path, "rosbags.rosbag2"), _library(path, "rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     try:
@@ -63,9 +65,13 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
     except RecordingError:
         raise
     except Exception as error:  # what a damaged bag makes of a reader written for sound ones
-        raise RecordingError(f"{path}: not a readable ROS 2 bag (damaged or truncated?): {said(error)}") from None
+        raise RecordingError(
+            f"{path}: not a readable ROS 2 bag (damaged or truncated?): {said(error)}"
+        ) from None
     if not blocks:
-        raise RecordingError(f"{path}: topic {', '.join(c.topic for c in connections)} has no message")
+        raise RecordingError(
+            f"{path}: topic {', '.join(c.topic for c in connections)} has no message"
+        )
     return _merged(path, blocks, several=len(spec.topics) > 1)
 
 
@@ -73,7 +79,9 @@ def _library(path: Path, name: str) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise RecordingError(f"{path}: bags are read through the library rosbags; pip install 'mjfim[ros]'") from None
+        raise RecordingError(
+            f"{path}: bags are read through the library rosbags; pip install 'mjfim[ros]'"
+        ) from None
 
 
 def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]) -> list[Any]:
@@ -82,7 +90,9 @@ def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]
     held = sorted({c.topic for c in states})
     if not held:
         others = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in connections})) or "none"
-        raise RecordingError(f"{path}: no topic of {JOINT_STATE}, the only messages that are read; found: {others}")
+        raise RecordingError(
+            f"{path}: no topic of {JOINT_STATE}, the only messages that are read; found: {others}"
+        )
     for topic in topics:
         if topic not in held:
             raise RecordingError(f"{path}: recording.topics: {unknown('topic', topic, held)}")
@@ -101,14 +111,24 @@ def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict
         message = store.deserialize_cdr(raw, JOINT_STATE)
         where = f"{path}: topic {connection.topic!r}, message {number + 1}"
         joints = tuple(message.name)
-        layout = Layout(connection.topic, joints, tuple(k for k in KINDS if len(getattr(message, k))))
+        layout = Layout(
+            connection.topic, joints, tuple(k for k in KINDS if len(getattr(message, k)))
+        )
         if any(len(getattr(message, kind)) != len(joints) for kind in layout.kinds):
-            raise RecordingError(f"{where}: as many names as numbers are wanted ({len(joints)} names)")
+            raise RecordingError(
+                f"{where}: as many names as numbers are wanted ({len(joints)} names)"
+            )
         stamp = message.header.stamp.sec * NANO + message.header.stamp.nanosec or received
         before = last.get((connection.topic, frozenset(joints)))
         if before is not None and stamp <= before:
-            said = "has the stamp of the one before" if stamp == before else "has a stamp before the last one's"
-            raise RecordingError(f"{where}: {said} ({(stamp - before) / NANO:g} s); time must increase")
+            said = (
+                "has the stamp of the one before"
+                if stamp == before
+                else "has a stamp before the last one's"
+            )
+            raise RecordingError(
+                f"{where}: {said} ({(stamp - before) / NANO:g} s); time must increase"
+            )
         last[connection.topic, frozenset(joints)] = stamp
         block = blocks.get(layout)
         if block is None:
@@ -123,7 +143,9 @@ def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict
 
 def _merged(path: Path, blocks: dict[Layout, Block], several: bool) -> Table:
     """One row per stamp."""
-    stamps = np.unique(np.concatenate([np.frombuffer(b.stamps, dtype=np.int64) for b in blocks.values()]))
+    stamps = np.unique(
+        np.concatenate([np.frombuffer(b.stamps, dtype=np.int64) for b in blocks.values()])
+    )
     # whole nanoseconds first: since 1970 they are too many for a float64
     columns: dict[str, Array] = {"t": (stamps - stamps[0]).astype(np.float64) / NANO}
     for layout, block in blocks.items():

@@ -41,7 +41,9 @@ class Table:
             return self.columns[name]
         if name in self.faults:
             raise RecordingError(f"{self.source}: column {name!r} {self.faults[name]}")
-        raise RecordingError(f"{self.source}: column {name!r} is missing; found: {', '.join(self.names) or 'none'}")
+        raise RecordingError(
+            f"{self.source}: column {name!r} is missing; found: {', '.join(self.names) or 'none'}"
+        )
 
 
 def chosen(names: Iterable[str], spec: RecordingSpec) -> list[str]:
@@ -67,6 +69,8 @@ def refuse_bomb(path: Path, packed: int, unpacked: int) -> None:
 
 def said(error: Exception) -> str:
     """What a library says, in one line that is not too long."""
-    printable = "".join(c if c.isprintable() or c.isspace() else "?" for c in str(error))  # it may quote the file
+    printable = "".join(
+        c if c.isprintable() or c.isspace() else "?" for c in str(error)
+    )  # it may quote the file
     line = " ".join(printable.split()) or type(error).__name__
     return line if len(line) <= LONGEST else f"{line[:LONGEST]}..."

@@ -118,14 +118,21 @@ class Arena:
         if point.sight is None or point.point is None:
             return np.inf
         cost = self.exact.judged(point.point).cost if self.inside(point) else np.inf
-        self.keep(point.ctrl, cost, min(self.fence.shares(point.sight).values(), default=np.inf), name)
+        self.keep(
+            point.ctrl, cost, min(self.fence.shares(point.sight).values(), default=np.inf), name
+        )
         return cost
 
     def keep(self, control: Array, cost: float, share: float, name: str = "") -> None:
         """The same by its numbers."""
         best = self.attempt
         if cost < best.cost or (not np.isfinite(best.cost) and share > best.share):
-            best.control, best.cost, best.share, best.found_by = np.array(control), cost, share, name
+            best.control, best.cost, best.share, best.found_by = (
+                np.array(control),
+                cost,
+                share,
+                name,
+            )
 
     def largest(self, swing: Array, most: float = 1.0) -> float:
         """The largest scale found, up to most, at which the centre plus a swing: (N, nu) keeps all limits; 0 for none."""
@@ -158,7 +165,9 @@ class Arena:
                 continue
             trajectory, tapped = plant.trajectory(out.states[i], ctrl[i]), out.tapped[i]
             share = _share(replace(self.fence, clearance=None), trajectory, tapped)
-            if share >= 0.0 and self.fence.clearance is not None:  # distances take long, and are looked at last
+            if (
+                share >= 0.0 and self.fence.clearance is not None
+            ):  # distances take long, and are looked at last
                 share = _share(self.fence, trajectory, tapped)
             if share >= 0.0:
                 return i

@@ -64,7 +64,9 @@ def search(arena: Arena, kind: Callable[[Frame], Excitation]) -> None:
     best, cost, spread = np.zeros(0), np.inf, 0.3
     while True:
         arena.require()
-        z = rng.random(1 + excitation.numbers)  # the first one: how large, where weights decide that
+        z = rng.random(
+            1 + excitation.numbers
+        )  # the first one: how large, where weights decide that
         about = len(best) > 0 and rng.random() > STRAY
         if about:
             changed = rng.random(len(z)) < max(MUTATED, 2.0 / len(z))
@@ -99,7 +101,9 @@ class Shaper:
         e = setup.experiment
         fastest = min(e.limits.bandwidth or np.inf, 0.25 * e.rate, CYCLES / e.horizon)
         jumps = fence.rate is None and e.limits.bandwidth is None and e.boundary.start != "rest"
-        self.frame = Frame(setup.t, e.horizon, len(setup.controls), min(0.5 / e.horizon, fastest), fastest, jumps)
+        self.frame = Frame(
+            setup.t, e.horizon, len(setup.controls), min(0.5 / e.horizon, fastest), fastest, jumps
+        )
         self.weighted = bool(setup.control_weight.any() or setup.tracking.any()) or not arena.holds
         self.most = BOUNDED if np.isfinite(fence.control.lower).all() else LARGEST
         self.window = swell(setup)
@@ -109,7 +113,11 @@ class Shaper:
     def swing(self, wave: Array) -> Array:
         """(N, nu) what is added to the centre; at scale 1 as large as half of the controls' range."""
         windowed = self.window * wave * self.arena.fence.control.scale
-        return windowed if self.basis is None or self.fit is None else np.asarray(self.basis @ (self.fit @ windowed))
+        return (
+            windowed
+            if self.basis is None or self.fit is None
+            else np.asarray(self.basis @ (self.fit @ windowed))
+        )
 
 
 def _harmonics(count: int, optimise: Optimiser) -> Callable[[Arena], None]:

@@ -72,7 +72,9 @@ class Series:
         return self.mu == 0.0
 
 
-Optimiser = Callable[[Arena, Series, float, float], None]  # to a last mu, or until a share of the budget is used
+Optimiser = Callable[
+    [Arena, Series, float, float], None
+]  # to a last mu, or until a share of the budget is used
 
 
 def fourier(arena: Arena, harmonics: int) -> Iterator[Series]:
@@ -114,7 +116,12 @@ def _any(
     while True:
         frequency = float(np.exp(arena.rng.uniform(*np.log(ends))))
         basis = made(frequency)
-        swing = basis @ arena.rng.normal(size=(basis.shape[1], len(size))) * size / np.sqrt(basis.shape[1])
+        swing = (
+            basis
+            @ arena.rng.normal(size=(basis.shape[1], len(size)))
+            * size
+            / np.sqrt(basis.shape[1])
+        )
         yield started(arena, f"{frequency:.3g} Hz, at random", basis, swing)
 
 
@@ -170,10 +177,21 @@ def tournament(arena: Arena, entrants: Iterator[Series], count: int, optimise: O
 def own(arena: Arena, series: Series, last: float, limit: float) -> None:
     """Descend as designs do, within the series."""
     job, chase = arena.job, Chase(series.name)
-    left = (1.0 - arena.used) * job.seconds if limit >= 1.0 else np.inf  # else sharper barriers would come too early
+    left = (
+        (1.0 - arena.used) * job.seconds if limit >= 1.0 else np.inf
+    )  # else sharper barriers would come too early
     start = Start(series.name, series.control, series.basis)
     rungs = Rungs(first=series.mu, last=last)
-    task = Task(job.experiment, start, rungs, 100_000, left, job.combinations, job.added, threads=job.threads)
+    task = Task(
+        job.experiment,
+        start,
+        rungs,
+        100_000,
+        left,
+        job.combinations,
+        job.added,
+        threads=job.threads,
+    )
     for row in pursue(task, chase, arena.setup):
         series.mu = min(row.mu, series.mu)
         if chase.control is not None and chase.cost < series.cost:
@@ -208,7 +226,9 @@ class Descent:
 
     def __init__(self, arena: Arena, series: Series, base: DesignProblem, limit: float) -> None:
         self.arena, self.series, self.base, self.limit = arena, series, base, limit
-        self.ladder = Ladder(base, arena.fence, arena.centre, series.basis, regulator_for(arena.setup))
+        self.ladder = Ladder(
+            base, arena.fence, arena.centre, series.basis, regulator_for(arena.setup)
+        )
         self.K = np.zeros((len(series.basis), len(arena.centre), arena.setup.space.nx))
         self.s = np.zeros((series.basis.shape[1], len(arena.centre)))
 
@@ -222,7 +242,12 @@ class Descent:
                 last = mu <= rungs.last or not self.arena.holds
                 fence = self.arena.fence.tightened(held)
                 barrier = mu if self.arena.holds else 0.0
-                self._stage(InteriorProblem(self.base, fence, barrier, min(WIDEST, RELAXED * mu)), rungs, mu, last)
+                self._stage(
+                    InteriorProblem(self.base, fence, barrier, min(WIDEST, RELAXED * mu)),
+                    rungs,
+                    mu,
+                    last,
+                )
                 self._mend()
                 point = self._point(self.arena.looking)
                 if mu <= HOLDING and point.sight is not None:
@@ -250,11 +275,16 @@ class Descent:
         if point.sight is None:
             return
         factor = self._whitening(problem, point)
-        enough, patience = rungs.tolerance if last else rungs.settled * mu, rungs.patience * (2 if last else 1)
+        enough, patience = (
+            rungs.tolerance if last else rungs.settled * mu,
+            rungs.patience * (2 if last else 1),
+        )
         values, tried = [problem.value(point)], dict[bytes, float]()
 
         def value(y: Array) -> tuple[float, Array]:
-            found, slope = self._valued(problem, solve_triangular(factor.T, y).reshape(self.s.shape))
+            found, slope = self._valued(
+                problem, solve_triangular(factor.T, y).reshape(self.s.shape)
+            )
             tried[y.tobytes()] = found
             return found, solve_triangular(factor, slope, lower=True)
 
@@ -267,7 +297,14 @@ class Descent:
 
         method, options = SCIPY
         with suppress(Settled):
-            minimize(value, factor.T @ self.s.reshape(-1), jac=True, method=method, options=options, callback=accepted)
+            minimize(
+                value,
+                factor.T @ self.s.reshape(-1),
+                jac=True,
+                method=method,
+                options=options,
+                callback=accepted,
+            )
 
     def _valued(self, problem: InteriorProblem, s: Array) -> tuple[float, Array]:
         """Value and slope by the coefficients; every point that keeps the limits is offered."""
@@ -310,7 +347,9 @@ class Descent:
         return np.asarray(self.arena.centre + self.series.basis @ s)
 
     def _coefficients(self, control: Array) -> Array:
-        return np.asarray(np.linalg.lstsq(self.series.basis, control - self.arena.centre)[0], dtype=np.float64)
+        return np.asarray(
+            np.linalg.lstsq(self.series.basis, control - self.arena.centre)[0], dtype=np.float64
+        )
 
     def _point(self, problem: InteriorProblem) -> InteriorPoint:
         return problem.point(self._control(self.s))

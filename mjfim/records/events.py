@@ -1,0 +1,63 @@
+"""Events that long work reports while it runs. Every verb calls `callback(event)` with one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mjfim.records.design import HistoryRow
+
+
+@dataclass(frozen=True, kw_only=True)
+class DesignEvent:
+    """One iterate of a design.
+
+    Attributes:
+        start: Name of the start from which the iterate comes.
+        row: The iterate.
+    """
+
+    start: str
+    row: HistoryRow
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitEvent:
+    """One iterate of an estimation.
+
+    Attributes:
+        phase: What is fitted: "all data", or a part of the search for its starting point.
+        iteration: Number of the iterate in this phase.
+        cost: Half of the sum of squared whitened residuals.
+        step: Length of the last step [standard deviations].
+    """
+
+    phase: str
+    iteration: int
+    cost: float
+    step: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyEvent:
+    """Progress of a study that consists of several parts.
+
+    Attributes:
+        study: The verb: "compare", "monte_carlo", "campaign", "shortest_experiment", ...
+        part: Name of the part that is running.
+        index: Number of the part, from 0.
+        count: Number of parts; None where it is not known beforehand.
+        share: Share of this part that is done, 0 to 1.
+        message: One line about what was found so far; may be empty.
+    """
+
+    study: str
+    part: str
+    index: int
+    count: int | None
+    share: float
+    message: str = ""
+
+
+Event = DesignEvent | FitEvent | StudyEvent
+Callback = Callable[[Event], None]
