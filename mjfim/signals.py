@@ -10,7 +10,6 @@ from scipy.interpolate import BSpline
 from scipy.signal import chirp
 
 from mjfim.arrays import Array
-from mjfim.experiment.schema import Signal, by_name
 
 DEGREE = 3
 FAINT = 1e-5  # size of a combination of curves, over the largest
@@ -201,35 +200,6 @@ class Steps:
             :, None
         ]
         return np.asarray((1.0 - passed) * levels[place] + passed * levels[place + 1])
-
-
-SPREAD = 0.17  # frequency of an actuator over that of the one before, less 1
-
-
-def generate(signal: Signal, t: Array, names: tuple[str, ...], rest: Array) -> Array:
-    """(N, nu) from a `Signal` at times t: (N,) [s]; every actuator gets its own frequency so that they do not coincide.
-
-    rest: (nu,) offset where none is stated. Sines and chirps begin there, without a jolt.
-    """
-    amplitude = by_name("initial.control.amplitude", signal.amplitude, names, "actuator")
-    offset = np.array(rest)
-    if signal.offset is not None:
-        offset = by_name("initial.control.offset", signal.offset, names, "actuator")
-    shape = np.zeros((len(t), len(names)))
-    spread = 1.0 + SPREAD * np.arange(len(names))
-    if signal.kind == "sine":
-        shape = np.sin(2 * np.pi * signal.frequency * t[:, None] * spread)
-    elif signal.kind == "chirp":
-        end = signal.frequency_end or 5.0 * signal.frequency
-        sweeps = [chirp(t, signal.frequency * s, t[-1], end * s, phi=-90.0) for s in spread]
-        shape = np.stack(sweeps, axis=1)
-    elif signal.kind == "multisine":
-        shape = multisine(
-            t, len(names), signal.frequency, signal.harmonics, np.random.default_rng(signal.seed)
-        )
-    elif signal.kind == "constant":
-        shape = np.ones_like(shape)
-    return np.asarray(offset + amplitude * shape)
 
 
 def multisine(

@@ -36,11 +36,11 @@ import sys, time
 clock = time.perf_counter()
 from pathlib import Path
 import mjfim
-from mjfim.logs import read_recording
+from mjfim.recordings.read import read_recording
 from mjfim.experiment.system import Setup
 setup = Setup(mjfim.Experiment.from_file(sys.argv[1]))
 clock = time.perf_counter()
-read_recording(Path(sys.argv[2]), setup)
+read_recording(Path(sys.argv[2]), setup.channels)
 print(time.perf_counter() - clock)
 """
 

@@ -186,7 +186,7 @@ def run(experiment: Path, recordings: Sequence[Path], folder: Path) -> None:
     require_extra()
     check_folder(folder)
     setup = Setup(mjfim.Experiment.from_file(experiment))
-    read = [read_recording(path, setup) for path in recordings]
+    read = [read_recording(path, setup.channels) for path in recordings]
     exported = export(setup, read)
     estimate = mjfim.identify(setup, read)
     weighted, default = fitted(exported, weighted=True), fitted(exported, weighted=False)

@@ -29,7 +29,7 @@ def main() -> int:
 
     # The experiment file says what is unknown, where to start, and how noisy each output is.
     setup = Setup(mjfim.Experiment.from_file(args.experiment))
-    recordings = [read_recording(path, setup) for path in args.recordings]
+    recordings = [read_recording(path, setup.channels) for path in args.recordings]
 
     # Weighted least squares in MuJoCo over all recordings at once.
     estimate = mjfim.identify(setup, recordings)

@@ -99,7 +99,7 @@ class Bench:
     def __init__(self, experiment: Experiment, table: Path, conditions: Conditions) -> None:
         self.conditions = conditions
         self.stated = Setup(experiment, threads=1)
-        self.plan = read_playback(table, self.stated)
+        self.plan = read_playback(table, self.stated.channels)
         e, timestep = experiment, float(self.stated.model.opt.timestep)
         if abs(self.plan.t[-1] - e.horizon) > 0.5 * timestep:
             raise ExperimentError(

@@ -63,7 +63,7 @@ class Folder:
         """Copy recordings that are not here yet to the round that waits for them."""
         known = {path.read_bytes() for k in range(self.designed) for path in self.recordings(k + 1)}
         for file in files:
-            read_recording(file, self.setup)
+            read_recording(file, self.setup.channels)
         new = [file for file in dict.fromkeys(files) if file.read_bytes() not in known]
         waiting = self.recorded + 1
         if new and waiting > self.designed:
@@ -93,7 +93,9 @@ class Folder:
                 )
             trajectory = read_design(self.round(k) / "design.npz")["final"]
             check_fits(self.round(k) / "design.npz", trajectory, self.setup)
-            recordings = tuple(read_recording(path, self.setup) for path in self.recordings(k))
+            recordings = tuple(
+                read_recording(path, self.setup.channels) for path in self.recordings(k)
+            )
             yield Played(recordings, theta, np.where(np.isnan(std), np.inf, std), trajectory.ctrl)
 
     def leave_design(self, design: Design, number: int) -> None:

@@ -11,11 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from mjfim.errors import ExperimentError, RecordingError
+from mjfim.experiment.control_signal import generate
 from mjfim.experiment.schema import Experiment, Signal
 from mjfim.experiment.system import Setup
 from mjfim.recordings.control_table import read_control
 from mjfim.recordings.formats.read import read_table
-from mjfim.signals import generate, multisine
+from mjfim.signals import multisine
 
 Array = NDArray[np.float64]
 Read = Callable[..., Array]

@@ -35,7 +35,7 @@ def check(
 ) -> None:
     """Say what can be identified, how well, and what only in combination; before any fit."""
     setup = Setup(mjfim.Experiment.from_file(experiment), threads)
-    loaded = [read_recording(path, setup) for path in recordings or []]
+    loaded = [read_recording(path, setup.channels) for path in recordings or []]
     trajectory = None
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]

@@ -58,7 +58,8 @@ def identify(
     with progress() as bar:
         task = bar.add_task("reading", total=None)
         loaded, kept = (
-            [read_log(path, setup) for path in paths] for paths in (recordings, held_out or [])
+            [read_log(path, setup.channels) for path in paths]
+            for paths in (recordings, held_out or [])
         )
         if not as_json:
             out.print(report.looks_report([log.look for log in (*loaded, *kept)]))

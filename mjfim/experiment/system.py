@@ -16,6 +16,7 @@ from mjfim.excitation.limits import limits_of
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.prior_information import information_of
 from mjfim.excitation.robust import Pool
+from mjfim.experiment.control_signal import generate
 from mjfim.experiment.outputs import outputs_of, stride_of
 from mjfim.experiment.parameters import parameters_of
 from mjfim.experiment.schema import Experiment, Signal, by_name
@@ -37,9 +38,9 @@ from mjfim.model.variants import STATED, Level, Lifted, Mocap, Source
 from mjfim.plant.batch import state_space
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
+from mjfim.recordings.channels import Channels
 from mjfim.recordings.control_table import read_control
 from mjfim.records.trajectory import Trajectory
-from mjfim.signals import generate
 
 MAX_SAMPLES = 10_000_000
 HOLDS = 4  # Gauss-Newton steps towards a control that holds a state; one does where forces are linear in it
@@ -185,6 +186,18 @@ class Setup:
     def measurable(self) -> tuple[str, ...]:
         """Everything that a recording may hold column by column: state components and sensors."""
         return measurable(self.model)
+
+    @property
+    def channels(self) -> Channels:
+        """Signals that a log of this experiment can hold, and how to read them."""
+        return Channels(
+            model=self.model,
+            controls=self.controls,
+            outputs=self.outputs.names,
+            sigma=self.noise.sigma,
+            spec=self.experiment.recording,
+            source=self.experiment.source,
+        )
 
     def model_at(self, theta: Array, placed: bool = True) -> Any:
         """The user's model, everything on, with theta: (p,) written into it.

@@ -392,7 +392,7 @@ class _Identification:
         yield from (
             f"poor data in {Path(r.name).name}: {said}"
             for r in fit.recordings
-            for said in doubts(self.setup, r)
+            for said in doubts(self.setup.channels, r)
         )
 
 

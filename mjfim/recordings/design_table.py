@@ -7,17 +7,22 @@ from pathlib import Path
 import numpy as np
 
 from mjfim.errors import RecordingError
-from mjfim.experiment.system import Setup
 from mjfim.model.coordinates import gain_names, state_names
+from mjfim.recordings.channels import Channels
 from mjfim.recordings.formats.read import read_table
 from mjfim.records.playback import Playback
 
 
-def read_playback(path: Path, setup: Setup) -> Playback:
+def read_playback(path: Path, channels: Channels) -> Playback:
     """design.csv as it was written, at whatever rate. Raises RecordingError naming file and column."""
-    table, space = read_table(path), setup.space
-    controls = tuple(f"ctrl:{name}" for name in setup.controls)
-    wanted = ("t", *state_names(setup.model), *controls, *gain_names(setup.model, setup.controls))
+    table = read_table(path)
+    controls = tuple(f"ctrl:{name}" for name in channels.controls)
+    wanted = (
+        "t",
+        *state_names(channels.model),
+        *controls,
+        *gain_names(channels.model, channels.controls),
+    )
     missing = next((name for name in wanted if name not in table), None)
     if missing is not None:
         raise RecordingError(
@@ -27,7 +32,7 @@ def read_playback(path: Path, setup: Setup) -> Playback:
     if len(t) < 3:
         raise RecordingError(f"{path}: too few rows ({len(t)}); a playback needs at least 3")
     period = (t[-1] - t[0]) / (len(t) - 1)
-    timestep = float(setup.model.opt.timestep)
+    timestep = float(channels.model.opt.timestep)
     steps = round(period / timestep)
     if steps < 1 or not np.abs(
         t - np.arange(len(t)) * steps * timestep
@@ -37,9 +42,9 @@ def read_playback(path: Path, setup: Setup) -> Playback:
         )
     parts = []
     for names, rows in (
-        (state_names(setup.model), None),
+        (state_names(channels.model), None),
         (controls, -1),
-        (gain_names(setup.model, setup.controls), -1),
+        (gain_names(channels.model, channels.controls), -1),
     ):
         values = np.column_stack([table[name][:rows] for name in names])
         if not np.isfinite(values).all():
@@ -53,5 +58,5 @@ def read_playback(path: Path, setup: Setup) -> Playback:
         np.arange(len(t)) * (steps * timestep),
         state,
         ctrl,
-        gain.reshape(len(ctrl), len(controls), space.nx),
+        gain.reshape(len(ctrl), len(controls), -1),
     )

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.signal import medfilt
 
 from mjfim.arrays import Array
-from mjfim.experiment.system import Setup
 from mjfim.model.loading import coordinates
+from mjfim.recordings.channels import Channels
 from mjfim.records.recording import Recording
 
 ROWS = 200_000  # looked at
@@ -23,19 +23,19 @@ APART = 0.1  # of the way, by which positions and the integral of velocities may
 STRETCH = 0.2  # [s] over which they are compared
 
 
-def doubts(setup: Setup, recording: Recording) -> tuple[str, ...]:
+def doubts(channels: Channels, recording: Recording) -> tuple[str, ...]:
     """Sentences; none where nothing speaks against the data."""
     t = recording.t[:ROWS]
     return (
-        *_controls(setup, recording.ctrl[:ROWS]),
-        *_rough(setup, recording),
-        *_contradictions(setup, t, recording),
+        *_controls(channels, recording.ctrl[:ROWS]),
+        *_rough(channels, recording),
+        *_contradictions(channels, t, recording),
     )
 
 
-def _controls(setup: Setup, ctrl: Array) -> Iterator[str]:
-    model = setup.model
-    for i, name in enumerate(setup.controls):
+def _controls(channels: Channels, ctrl: Array) -> Iterator[str]:
+    model = channels.model
+    for i, name in enumerate(channels.controls):
         u = ctrl[:, i]
         if len(u) < 4 * RUN or not float(np.std(u)) > 0.0:
             continue
@@ -57,9 +57,9 @@ def _controls(setup: Setup, ctrl: Array) -> Iterator[str]:
             )
 
 
-def _rough(setup: Setup, recording: Recording) -> Iterator[str]:
+def _rough(channels: Channels, recording: Recording) -> Iterator[str]:
     """Columns that jump by more than the stated noise and by much of their motion."""
-    sigma = dict(zip(setup.outputs.names, setup.noise.sigma.tolist(), strict=True))
+    sigma = dict(zip(channels.outputs, channels.sigma.tolist(), strict=True))
     for i, name in enumerate(recording.outputs):
         column = recording.y[:ROWS, i]
         column = column[np.isfinite(column)]
@@ -73,10 +73,10 @@ def _rough(setup: Setup, recording: Recording) -> Iterator[str]:
             )
 
 
-def _contradictions(setup: Setup, t: Array, recording: Recording) -> Iterator[str]:
+def _contradictions(channels: Channels, t: Array, recording: Recording) -> Iterator[str]:
     """Positions that do not move as their velocities say."""
     names = recording.outputs
-    for c in coordinates(setup.model):
+    for c in coordinates(channels.model):
         pair = (f"qpos:{c.name}", f"qvel:{c.name}")
         if not all(name in names for name in pair):
             continue
@@ -88,7 +88,7 @@ def _contradictions(setup: Setup, t: Array, recording: Recording) -> Iterator[st
         dq, dv, lag = ways(at, q, v, STRETCH, len(at) // 4)
         size = float(np.std(dq))
         apart = float(np.std(dq - dv)) / size if size > 0.0 else 0.0
-        sigmas = dict(zip(setup.outputs.names, setup.noise.sigma.tolist(), strict=True))
+        sigmas = dict(zip(channels.outputs, channels.sigma.tolist(), strict=True))
         own = np.sqrt(2.0) * sigmas.get(pair[0], 0.0)
         summed = sigmas.get(pair[1], 0.0) * np.sqrt(lag) * float(np.median(np.diff(at)))
         if apart > APART and apart * size > NOISY * np.hypot(own, summed):

@@ -13,9 +13,9 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, unknown
-from mjfim.experiment.system import Setup
 from mjfim.model.coordinates import components
 from mjfim.recordings.angle_units import check_angles
+from mjfim.recordings.channels import Channels
 from mjfim.recordings.column_units import check_unit, converted, units_of
 from mjfim.recordings.formats.read import read_columns
 from mjfim.recordings.formats.table import Table
@@ -42,17 +42,17 @@ class Logged:
     look: Look
 
 
-def read_recording(path: Path, setup: Setup) -> Recording:
+def read_recording(path: Path, channels: Channels) -> Recording:
     """A recording from a log of any format. Raises RecordingError naming file and column."""
-    return read_log(path, setup).recording
+    return read_log(path, channels).recording
 
 
-def read_log(path: Path, setup: Setup) -> Logged:
+def read_log(path: Path, channels: Channels) -> Logged:
     """A recording and how its log looks. Raises RecordingError naming file and column."""
-    spec = setup.experiment.recording
-    check_spec(setup)
+    spec = channels.spec
+    check_spec(channels)
     table = read_columns(path, spec)
-    plan = _plan(table, setup)
+    plan = _plan(table, channels)
     t, rows = _window(table, spec)
     check_clock(f"{path}: column {spec.time!r}", t[rows], rows.start, spec.time_unit, spec.gap)
     columns = _columns(table, plan, t, rows, spec)
@@ -61,8 +61,8 @@ def read_log(path: Path, setup: Setup) -> Logged:
     for name in measured:
         check_measured(f"{path}: column {plan[name].column!r}", t, columns[name], spec.gap)
     stated = {name for name, source in plan.items() if source.unit is not None}
-    check_angles(str(path), setup.model, t, columns, stated)
-    ctrl = np.column_stack([columns[f"ctrl:{name}"][:-1] for name in setup.controls])
+    check_angles(str(path), channels.model, t, columns, stated)
+    ctrl = np.column_stack([columns[f"ctrl:{name}"][:-1] for name in channels.controls])
     y = np.column_stack([columns[name] for name in measured])
     summary = look(
         str(path), t, columns, {name: source.column for name, source in plan.items()}, dropped
@@ -70,49 +70,47 @@ def read_log(path: Path, setup: Setup) -> Logged:
     return Logged(Recording(t, ctrl, y, measured, str(path)), summary)
 
 
-def check_spec(setup: Setup) -> None:
+def check_spec(channels: Channels) -> None:
     """Raise ExperimentError where [recording.columns] has an unknown key or a unit that does not fit."""
-    where, units = f"{setup.experiment.source}: recording.columns", units_of(setup.model)
-    units.update({f"ctrl:{name}": "any" for name in setup.controls})
-    for name, source in setup.experiment.recording.sources.items():
+    where, units = f"{channels.source}: recording.columns", units_of(channels.model)
+    units.update({f"ctrl:{name}": "any" for name in channels.controls})
+    for name, source in channels.spec.sources.items():
         if name not in units:
             raise ExperimentError(f"{where}: {unknown('column', name, units)}")
         check_unit(f"{where}.{name}", source, units[name])
 
 
-def _plan(table: Table, setup: Setup) -> dict[str, ColumnSpec]:
+def _plan(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     """Source of every column of the recording: all controls, then what is measured.
 
     What the experiment does not name has mjfim's own name; measured columns only where it names none of them.
     """
-    stated, own = setup.experiment.recording.sources, _own(table, setup)
-    controls = [f"ctrl:{name}" for name in setup.controls]
+    stated, own = channels.spec.sources, _own(table, channels)
+    controls = [f"ctrl:{name}" for name in channels.controls]
     plan = {name: stated.get(name) or ColumnSpec(column=own.get(name, name)) for name in controls}
     for name in controls:
         table.column(plan[name].column)
     measured = {name: source for name, source in stated.items() if name not in plan}
     if not measured:
-        known = {*controls, *setup.measurable}
+        known = {*controls, *channels.measurable}
         for name in table.names:
             if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
                 raise RecordingError(
                     f"{table.source}: {unknown('column', name, ['t', *sorted(known)])}"
                 )
-        measured = {
-            name: ColumnSpec(column=own[name]) for name in setup.outputs.names if name in own
-        }
-    if not any(name in measured for name in setup.outputs.names):
-        taken = {setup.experiment.recording.time, *(s.column for s in plan.values())}
+        measured = {name: ColumnSpec(column=own[name]) for name in channels.outputs if name in own}
+    if not any(name in measured for name in channels.outputs):
+        taken = {channels.spec.time, *(s.column for s in plan.values())}
         strays = ", ".join(measured or [c for c in table.names if c not in taken]) or "none"
         raise RecordingError(
-            f"{table.source}: no measured column; {unknown('column', strays, setup.outputs.names)}"
+            f"{table.source}: no measured column; {unknown('column', strays, channels.outputs)}"
         )
     return {**plan, **measured}
 
 
-def _own(table: Table, setup: Setup) -> dict[str, str]:
+def _own(table: Table, channels: Channels) -> dict[str, str]:
     """Columns of the table by mjfim's names: also those of a bag, and the matrices of a design.npz."""
-    names, model = table.names, setup.model
+    names, model = table.names, channels.model
     found = {
         name.replace(kind, q, 1): name
         for kind, q in (("position:", "qpos:"), ("velocity:", "qvel:"))
@@ -123,9 +121,9 @@ def _own(table: Table, setup: Setup) -> dict[str, str]:
     wholes = {
         "qpos": state[: model.nq],
         "qvel": state[model.nq :],
-        "ctrl": [f"ctrl:{n}" for n in setup.controls],
+        "ctrl": [f"ctrl:{n}" for n in channels.controls],
     }
-    stated = setup.experiment.recording.sources
+    stated = channels.spec.sources
     if any(not name.startswith("ctrl:") for name in stated):
         del wholes["qpos"], wholes["qvel"]
     if all(name in stated for name in wholes["ctrl"]):

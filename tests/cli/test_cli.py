@@ -18,12 +18,12 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import mjfim
-from mjfim.recordings import read as logs
 from mjfim.cli import main as cli
 from mjfim.experiment.system import Setup
 from mjfim.output import archive, plots
 from mjfim.output import folders as results
 from mjfim.output import rerun as rerun_log
+from mjfim.recordings import read as logs
 
 MODELS = Path(__file__).parents[2] / "models"
 DESIGN = {
@@ -163,7 +163,7 @@ def test_design_json_is_the_file(home: Path, designed: Result) -> None:
 def test_simulate_leaves_a_recording(study: Path, recorded: Path, archived: Path) -> None:
     """The design's control, noise of the stated size about the true model's outputs."""
     setup = Setup(mjfim.Experiment.from_file(study))
-    recording = logs.read_recording(recorded, setup)
+    recording = logs.read_recording(recorded, setup.channels)
     curve = archive.read_design(archived)["final"]
     assert np.array_equal(recording.ctrl, curve.ctrl)
     noise = recording.y - np.hstack([curve.qpos, curve.qvel])

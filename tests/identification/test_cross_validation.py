@@ -107,19 +107,20 @@ def test_per_recording_belongs_to_nuisance(base: mjfim.Experiment) -> None:
 def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experiment) -> None:
     setup = Setup(base)
     good = recorded(setup, 0)
-    assert doubts(setup, good) == ()
+    assert doubts(setup.channels, good) == ()
     rng = np.random.default_rng(0)
     y = np.array(good.y)
     y[:, 3] += rng.normal(0.0, 2.0, len(y))
     noisy = Recording(
         good.t, good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape), y, good.outputs, "x"
     )
-    said = " ".join(doubts(setup, noisy))
+    said = " ".join(doubts(setup.channels, noisy))
     assert "jumps from row to row" in said and "qvel:hinge is rough" in said
     swung = recorded(setup, 0, 20.0)
-    assert doubts(setup, swung) == ()
+    assert doubts(setup.channels, swung) == ()
     y = np.array(swung.y)
     y[:, 3] *= 2.0
     assert any(
-        "part by" in s for s in doubts(setup, Recording(swung.t, swung.ctrl, y, swung.outputs, "x"))
+        "part by" in s
+        for s in doubts(setup.channels, Recording(swung.t, swung.ctrl, y, swung.outputs, "x"))
     )

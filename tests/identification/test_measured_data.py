@@ -68,7 +68,9 @@ def experiment(name: str, guess: dict[str, float] | None = None, **fit: object) 
 def identified(stated: mjfim.Experiment, files: list[Path], held_out: list[Path]) -> Estimate:
     """Read, fit, predict."""
     setup = Setup(stated)
-    fitted, kept = ([read_recording(path, setup) for path in paths] for paths in (files, held_out))
+    fitted, kept = (
+        [read_recording(path, setup.channels) for path in paths] for paths in (files, held_out)
+    )
     return mjfim.identify(setup, fitted, held_out=kept)
 
 
@@ -152,6 +154,8 @@ def test_servo_predicts_held_out_logs_as_well_as_published() -> None:
     mine = np.mean([p.identified.mae[0] for p in found.predictions])
     for published in (PUBLISHED_SERVO, HEAD_SERVO):
         setup = Setup(experiment("bam_xl330", published))
-        errors = mjfim.predict(setup, setup.theta, [read_recording(path, setup) for path in others])
+        errors = mjfim.predict(
+            setup, setup.theta, [read_recording(path, setup.channels) for path in others]
+        )
         assert mine < 1.05 * np.mean([e.mae[0] for e in errors])
     assert "coulomb" in found.sloppy

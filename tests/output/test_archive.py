@@ -16,12 +16,12 @@ import pytest
 from numpy.typing import NDArray
 
 import mjfim
-from mjfim.recordings import read as logs
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, RecordingError
 from mjfim.experiment.system import Setup
 from mjfim.output import archive
 from mjfim.output.mjcf.write import write_identified
+from mjfim.recordings import read as logs
 from mjfim.records.design import Design
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
@@ -436,7 +436,7 @@ def test_recording_round_trip(recording: Recording, setup: Setup, tmp_path: Path
     """Full precision; what was not measured stays empty."""
     path = tmp_path / "recording.csv"
     archive.write_recording(path, recording, setup)
-    again = logs.read_recording(path, setup)
+    again = logs.read_recording(path, setup.channels)
     assert np.array_equal(again.t, recording.t)
     assert np.array_equal(again.ctrl, recording.ctrl)
     assert np.array_equal(again.y, recording.y, equal_nan=True)
@@ -459,7 +459,7 @@ def test_extreme_numbers_survive(setup: Setup, tmp_path: Path) -> None:
     values = np.array([5e-324, 1e-300, 0.1 + 0.2, -1.7976931348623157e308])
     r = Recording(np.arange(4) * 0.01, values[:3, None], values[:, None], ("qpos:slide",))
     archive.write_recording(tmp_path / "r.csv", r, setup)
-    assert np.array_equal(logs.read_recording(tmp_path / "r.csv", setup).y, r.y)
+    assert np.array_equal(logs.read_recording(tmp_path / "r.csv", setup.channels).y, r.y)
 
 
 def test_foreign_recording(setup: Setup, tmp_path: Path) -> None:
@@ -468,7 +468,7 @@ def test_foreign_recording(setup: Setup, tmp_path: Path) -> None:
     path.write_text(
         "qpos:hinge,t,ctrl:force\n3.1,0,1\n3.2,0.01,2\n,0.02,3\n3.4,0.03,\n", encoding="utf-8"
     )
-    r = logs.read_recording(path, setup)
+    r = logs.read_recording(path, setup.channels)
     assert (r.outputs, r.ctrl.tolist()) == (("qpos:hinge",), [[1.0], [2.0], [3.0]])
     assert np.array_equal(r.y[:, 0], [3.1, 3.2, np.nan, 3.4], equal_nan=True)
 
@@ -494,7 +494,7 @@ def test_unusable_recordings(text: str, message: str, setup: Setup, tmp_path: Pa
     path = tmp_path / "lab.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(RecordingError, match=rf"lab\.csv: .*{message}"):
-        logs.read_recording(path, setup)
+        logs.read_recording(path, setup.channels)
 
 
 def test_misspelled_output_is_not_ignored(setup: Setup, tmp_path: Path) -> None:
@@ -504,7 +504,7 @@ def test_misspelled_output_is_not_ignored(setup: Setup, tmp_path: Path) -> None:
         "t,ctrl:force,qpos:slide,qpos:hing\n0,1,1,3\n0.01,1,1,3\n0.02,1,1,3\n", encoding="utf-8"
     )
     with pytest.raises(RecordingError, match=r"'qpos:hing'.*'qpos:hinge'"):
-        logs.read_recording(path, setup)
+        logs.read_recording(path, setup.channels)
 
 
 # ---- identified.xml

@@ -74,7 +74,7 @@ def read(tmp_path: Path) -> Read:
     def run(columns: Mapping[str, Any], /, bare: bool = False, **recording: Any) -> Logged:
         path = tmp_path / "lab.csv"
         write_table(path, dict(columns) if bare else {"t": T, **CTRL, **columns})
-        return read_log(path, setup_of(tmp_path, recording))
+        return read_log(path, setup_of(tmp_path, recording).channels)
 
     return run
 
@@ -512,7 +512,7 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     qpos, qvel, ctrl = (rng.standard_normal((n, k)) for n, k in ((M, 3), (M, 3), (M - 1, 2)))
     np.savez(tmp_path / "d.npz", t=T, qpos=qpos, qvel=qvel, ctrl=ctrl, gain=np.zeros((M - 1, 2, 6)))
-    r = read_recording(tmp_path / "d.npz", setup)
+    r = read_recording(tmp_path / "d.npz", setup.channels)
     assert np.array_equal(r.ctrl, ctrl)
     order = [f"{kind}:{joint}" for kind in ("qpos", "qvel") for joint in ("rail", "pin", "stop")]
     assert np.array_equal(
@@ -522,9 +522,9 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     with pytest.raises(
         RecordingError, match=r"'qpos' has 2 columns, the model 3: qpos:rail, qpos:pin, qpos:stop"
     ):
-        read_recording(tmp_path / "d.npz", setup)
+        read_recording(tmp_path / "d.npz", setup.channels)
     stated = setup_of(tmp_path, {"columns": {"qpos:pin": "qpos[1]"}})
-    assert np.array_equal(read_recording(tmp_path / "d.npz", stated).y[:, 0], qpos[:, 1])
+    assert np.array_equal(read_recording(tmp_path / "d.npz", stated.channels).y[:, 0], qpos[:, 1])
 
 
 def test_names_beside_matrices(tmp_path: Path) -> None:
@@ -537,7 +537,7 @@ def test_names_beside_matrices(tmp_path: Path) -> None:
         "gyro": np.column_stack([wave(), wave(2.0), wave(3.0)]),
     }
     np.savez(tmp_path / "r.npz", **arrays)
-    r = read_recording(tmp_path / "r.npz", setup)
+    r = read_recording(tmp_path / "r.npz", setup.channels)
     assert r.outputs == ("qpos:pin", "gyro[0]", "gyro[1]", "gyro[2]")
     assert np.array_equal(r.y[:, 3], wave(3.0))
     assert r.ctrl.shape == (M - 1, 2)
@@ -563,11 +563,11 @@ def test_bags_are_recordings(tmp_path: Path) -> None:
     with pytest.raises(
         RecordingError, match="column 'ctrl:push' is missing; found: t, position:pin"
     ):
-        read_recording(path, setup_of(tmp_path, {}))
+        read_recording(path, setup_of(tmp_path, {}).channels)
     spec = {
         "columns": {"ctrl:turn": "effort:pin", "ctrl:push": {"column": "effort:grip", "scale": 0.0}}
     }
-    r = read_recording(path, setup_of(tmp_path, spec))
+    r = read_recording(path, setup_of(tmp_path, spec).channels)
     assert r.outputs == ("qpos:pin", "qvel:pin")
     assert np.array_equal(r.y[:, 0], wave())
     assert np.allclose(r.t, T, rtol=0, atol=1e-12)
@@ -636,7 +636,7 @@ def test_logs_of_robots(pattern: str, tmp_path: Path) -> None:
     """They are read whole, and their velocities are the slopes of their positions."""
     files, setup = robot(pattern, tmp_path)
     for file in files:
-        logged = read_log(file, setup)
+        logged = read_log(file, setup.channels)
         r, look = logged.recording, logged.look
         assert look.rows == len(r.t) > 1000 and look.dropped == 0
         assert 150.0 < look.rate < 600.0 and 3.0 < look.duration < 21.0
@@ -655,13 +655,13 @@ def test_robots_in_degrees(pattern: str, kind: str, tmp_path: Path) -> None:
     files, setup = robot(pattern, tmp_path, columns=sources)
     for file in files:
         with pytest.raises(RecordingError, match=f"'{kind}:one' is probably in deg"):
-            read_log(file, setup)
+            read_log(file, setup.channels)
 
 
 def test_loads_of_a_servo(tmp_path: Path) -> None:
     """What the log holds as 65 thousand is a small negative load."""
     files, setup = robot("bam_xl330/raw/*.json", tmp_path)
-    loads = np.concatenate([read_recording(file, setup).ctrl[:, 0] for file in files])
+    loads = np.concatenate([read_recording(file, setup.channels).ctrl[:, 0] for file in files])
     assert loads.min() < -10.0 and loads.max() > 10.0
     assert np.abs(loads).max() < 500.0
     _, naive = robot(
@@ -669,4 +669,4 @@ def test_loads_of_a_servo(tmp_path: Path) -> None:
         tmp_path,
         columns={**ROBOTS["bam_xl330/raw/*.json"]["columns"], "ctrl:one": "load"},
     )
-    assert read_recording(files[0], naive).ctrl.max() > 65_000
+    assert read_recording(files[0], naive.channels).ctrl.max() > 65_000

@@ -257,7 +257,7 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     """All digits of states, controls and gains, whatever the rate."""
     setup = BUILD["body"](tmp_path, playback_rate=50.0)
     path, played = written(setup, tmp_path)
-    found = read_playback(path, BUILD["body"](tmp_path))
+    found = read_playback(path, BUILD["body"](tmp_path).channels)
     for name in ("t", "state", "ctrl", "gain"):
         np.testing.assert_array_equal(getattr(found, name), getattr(played, name))
     assert found.period == pytest.approx(0.02, rel=1e-12)
@@ -301,7 +301,7 @@ def test_a_damaged_table_is_refused(column: str, wrong: Any, words: str, tmp_pat
     path, _ = written(setup, tmp_path)
     change(path, **{column: None if wrong is None else wrong(table(path)[column])})
     with pytest.raises(RecordingError, match=words):
-        read_playback(path, setup)
+        read_playback(path, setup.channels)
 
 
 @pytest.fixture(scope="module")
