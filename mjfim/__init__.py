@@ -19,7 +19,7 @@ from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.monte_carlo import Study
+from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.campaign import sequential
@@ -35,10 +35,10 @@ __all__ = [
     "Estimate",
     "Experiment",
     "MjfimError",
+    "MonteCarloStudy",
     "Pool",
     "Recording",
     "Shortest",
-    "Study",
     "Trajectory",
     "check",
     "compare",

@@ -22,7 +22,7 @@ from rich.console import Console
 
 import mjfim
 from mjfim.parallel import cores
-from mjfim.records.comparison import Comparison, Row
+from mjfim.records.comparison import Comparison, MethodResult
 
 FEW, MANY = ("fourier5", "fourier5-mjfim"), ("fourier15-mjfim",)
 PITCH = 0.2  # [Hz] of the series that is among the design's starts
@@ -96,7 +96,7 @@ def run(arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: 
 def best(found: Comparison, methods: tuple[str, ...]) -> float:
     """Smallest worst relative sigma of some methods."""
 
-    def worth(row: Row) -> float:
+    def worth(row: MethodResult) -> float:
         return row.worst if row.sound else float("inf")
 
     return min((worth(row) for row in found.rows if row.method in methods), default=float("inf"))

@@ -25,7 +25,7 @@ from mjfim.output.archive import study_summary, write_design, write_json
 from mjfim.output.labels import Labels
 from mjfim.plant.plant import CENTRAL
 from mjfim.records.design import Design
-from mjfim.records.monte_carlo import Study
+from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.trajectory import Trajectory
 
 EXPERIMENT = Path(__file__).resolve().parents[1] / "models" / "cart_pendulum.toml"
@@ -141,7 +141,7 @@ def matrix_table(name: str, trials: int, covariance: Array, information: Array) 
     return table
 
 
-def efficiency_table(study: Study) -> Table:
+def efficiency_table(study: MonteCarloStudy) -> Table:
     """Observed variances against mjfim's own bound."""
     headings = ("trajectory", "parameter", "variance", "bound", "variance / bound", "failed")
     table = new_table(
@@ -162,7 +162,7 @@ def efficiency_table(study: Study) -> Table:
     return table
 
 
-def write_figures(folder: Path, setup: Setup, design: Design, study: Study) -> None:
+def write_figures(folder: Path, setup: Setup, design: Design, study: MonteCarloStudy) -> None:
     """Figures 2-6 and the tables as PNG, and the Rerun file."""
     names = Labels.of(setup)
     plots.save(plots.trajectories(design, names), folder / "figure_2.png")

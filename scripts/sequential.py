@@ -33,7 +33,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.output.archive import write_recording
 from mjfim.output.folders import check_folder
-from mjfim.records.campaign import Campaign, Outcome
+from mjfim.records.campaign import Campaign, CampaignStatus
 from mjfim.records.design import Design
 from mjfim.records.recording import Recording
 
@@ -107,13 +107,15 @@ def real(folder: Folder, rounds: int, files: Sequence[Path]) -> Campaign:
         folder.leave_design(design, number)
 
     if waits and not done:
-        return Campaign(folder.setup.parameters.names, wanted_of(folder.setup), (), Outcome.WAITING)
+        return Campaign(
+            folder.setup.parameters.names, wanted_of(folder.setup), (), CampaignStatus.WAITING
+        )
     limit = len(done) if waits else rounds
     campaign = mjfim.sequential(
         experiment, measure, limit, threads=threads, report=folder.report, done=done
     )
-    if waits and campaign.status is Outcome.EXHAUSTED and len(done) < rounds:
-        return replace(campaign, status=Outcome.WAITING)
+    if waits and campaign.status is CampaignStatus.EXHAUSTED and len(done) < rounds:
+        return replace(campaign, status=CampaignStatus.WAITING)
     return campaign
 
 
@@ -186,7 +188,7 @@ def main() -> int:
         told.print(f"sequential: interrupted; {args.output}/ holds the rounds that are complete")
         return 1
     say.print(table(campaign, folder.setup, truth))
-    if campaign.status is Outcome.WAITING:
+    if campaign.status is CampaignStatus.WAITING:
         waiting = folder.round(folder.designed)
         say.print(
             f"play {waiting}/design.csv, record, then repeat this call with --recordings FILE.csv",

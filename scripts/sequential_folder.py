@@ -20,7 +20,7 @@ from mjfim.output.mjcf.write import write_identified
 from mjfim.output.plots import style
 from mjfim.output.plots.style import save
 from mjfim.recordings.read import read_recording
-from mjfim.records.campaign import Campaign, Played, Round
+from mjfim.records.campaign import Campaign, EarlierRound, Round
 from mjfim.records.design import Design
 from mjfim.studies.redesign import restated
 
@@ -75,7 +75,7 @@ class Folder:
             name = "recording.csv" if len(new) == 1 else f"recording_{i + 1}.csv"
             shutil.copyfile(file, self.round(waiting) / name)
 
-    def done(self) -> Iterator[Played]:
+    def done(self) -> Iterator[EarlierRound]:
         """The rounds that are recorded."""
         names = self.setup.parameters.names
         for k in range(1, self.recorded + 1):
@@ -96,7 +96,9 @@ class Folder:
             recordings = tuple(
                 read_recording(path, self.setup.channels) for path in self.recordings(k)
             )
-            yield Played(recordings, theta, np.where(np.isnan(std), np.inf, std), trajectory.ctrl)
+            yield EarlierRound(
+                recordings, theta, np.where(np.isnan(std), np.inf, std), trajectory.ctrl
+            )
 
     def leave_design(self, design: Design, number: int) -> None:
         """What the robot needs."""

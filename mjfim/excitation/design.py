@@ -27,7 +27,7 @@ from mjfim.information.marginal import shared
 from mjfim.information.smoothness import roughness
 from mjfim.plant.active_constraints import saturated
 from mjfim.plant.plant import CENTRAL
-from mjfim.records.combinations import Group, listed
+from mjfim.records.combinations import ParameterGroup, join_names
 from mjfim.records.design import Design, HistoryRow, StartResult, Status
 
 Monitor = Callable[[HistoryRow], None]
@@ -337,9 +337,9 @@ def require_designable(setup: Setup, seen: Survey) -> None:
         )
 
 
-def _plainly(group: Group) -> str:
+def _plainly(group: ParameterGroup) -> str:
     """A group that is not excited here, though it has an effect elsewhere."""
-    return str(group) if group.combinations else listed(group.members)
+    return str(group) if group.combinations else join_names(group.members)
 
 
 def _parameters(names: Sequence[str]) -> str:

@@ -23,7 +23,7 @@ from mjfim.experiment.schema import Experiment, Signal
 from mjfim.experiment.system import Setup
 from mjfim.optimize.bracketing import Grid, bracket
 from mjfim.recordings.formats.read import read_table
-from mjfim.records.campaign import missed
+from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
 
 LONGER = 4.0  # times the stated horizon: how long an experiment may become
@@ -226,7 +226,7 @@ class _Hunt:
         far = (
             last.why
             if found is None
-            else f"it does not tell {missed(names, found.final.std, self.wanted)}"
+            else f"it does not tell {missed_targets(names, found.final.std, self.wanted)}"
         )
         raise OutOfReachError(
             f"{self.experiment.source}: even {last.horizon:g} s is not enough: {far}. Allow a longer experiment (`longest`, "

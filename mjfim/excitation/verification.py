@@ -13,7 +13,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import Fence, Sight, basis_of, fence_of
 from mjfim.experiment.system import Setup
 from mjfim.plant.batch import Engine
-from mjfim.records.design import Usage
+from mjfim.records.design import LimitUsage
 from mjfim.records.trajectory import Trajectory
 
 SAME = 1e-6  # deviation of a state, in its unit, up to which two simulations are the same
@@ -32,7 +32,7 @@ class Audit:
     shares: dict[str, float]
     deviation: float
     told: frozenset[str] = frozenset()
-    usage: tuple[Usage, ...] = ()
+    usage: tuple[LimitUsage, ...] = ()
 
     @property
     def kept(self) -> bool:
@@ -66,13 +66,13 @@ def audit(setup: Setup, trajectory: Trajectory) -> Audit:
         margins["clearance"] = distance - fence.least
         over = np.maximum(fence.clearance(positions, slopes=False).d.min(axis=1), 1e-9)
         t = np.arange(1, len(positions) + 1) * setup.dt / setup.substeps
-        usage.append(Usage("clearance", pair.name, t, fence.least / over))
+        usage.append(LimitUsage("clearance", pair.name, t, fence.least / over))
         shares["clearance"] = margins["clearance"] / fence.least
     deviation = float(np.abs(setup.space.minus(played.state, trajectory.state)).max())
     return Audit(margins, shares, deviation, frozenset(told), tuple(usage))
 
 
-def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[Usage]:
+def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
     """Of whatever has a range, within samples at every engine step."""
     N, substeps, w = sight.tapped.shape
     tapped, ctrl = sight.tapped.reshape(N * substeps, w), sight.trajectory.ctrl
@@ -80,7 +80,7 @@ def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[Usage]:
     for kind, name, share in zip(
         fence.kinds, fence.names, fence.shown.share(tapped).T, strict=True
     ):
-        yield Usage(kind, name, t, share)
+        yield LimitUsage(kind, name, t, share)
     bands = [("control", fence.control, ctrl, setup.t)]
     if fence.rate is not None:
         bands.append(
@@ -94,7 +94,7 @@ def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[Usage]:
     for kind, band, values, times in bands:
         for i, name in enumerate(setup.controls):
             if np.isfinite(band.lower[i]) or np.isfinite(band.upper[i]):
-                yield Usage(kind, name, times, band.share(values)[:, i])
+                yield LimitUsage(kind, name, times, band.share(values)[:, i])
 
 
 def _positions(setup: Setup, engine: Engine, played: Trajectory) -> Array:

@@ -15,7 +15,7 @@ from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import Null, grouped
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution
-from mjfim.records.combinations import Group
+from mjfim.records.combinations import ParameterGroup
 from mjfim.records.estimate import Uncertainty
 
 SLOPPY = 0.25  # half of an interval over the value, from which a parameter is hardly known
@@ -37,7 +37,7 @@ class Accuracy:
     sandwich: Array
     interval: Array
     between: Array
-    groups: tuple[Group, ...]
+    groups: tuple[ParameterGroup, ...]
     singular: bool
     lost: bool
     sloppy: tuple[tuple[str, str], ...]

@@ -16,7 +16,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
 from mjfim.optimize.levenberg_marquardt import Search, Unknowns, completed
-from mjfim.records.estimate import Errors, Prediction
+from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.recording import Recording
 
 FOLDS = 5  # at most
@@ -27,7 +27,7 @@ STEPS = 8  # Levenberg-Marquardt steps of a fit without a part, and of a start
 
 def predict(
     experiment: Experiment | Setup, theta: Array, recordings: Sequence[Recording]
-) -> tuple[Errors, ...]:
+) -> tuple[PredictionErrors, ...]:
     """Errors of a model at theta: (p,) on recordings; only what belongs to a recording alone is found from it.
 
     Raises RecordingError for unusable recordings.
@@ -102,7 +102,7 @@ def _judged(
     return Prediction(name, own, plain, held_out)
 
 
-def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> Errors:
+def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> PredictionErrors:
     """Errors at theta: (p,) of the values that the masks: (M, ny) of each track hold.
 
     Unknown starts are found from what else a piece measures, or from those values where they are all it has.
@@ -124,7 +124,7 @@ def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> E
     for j, error in enumerate([] if values is None else fit.masked(masks).errors(values)):
         if len(error):
             rms[j], mae[j] = np.sqrt(np.mean(error**2)), np.mean(np.abs(error))
-    return Errors(name, outputs, rms, mae)
+    return PredictionErrors(name, outputs, rms, mae)
 
 
 def _learned(fit: Fit, masks: Sequence[np.ndarray]) -> list[np.ndarray]:

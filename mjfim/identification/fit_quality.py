@@ -13,7 +13,7 @@ from mjfim.errors import SimulationDiverged
 from mjfim.identification.residual_tests import whiteness, worst_place
 from mjfim.identification.residuals import Fit
 from mjfim.optimize.levenberg_marquardt import Solution
-from mjfim.records.estimate import Place, Whiteness
+from mjfim.records.estimate import Whiteness, WorstResidual
 
 # root mean square of residuals over the deviation of what was measured, from which a motion is not explained
 HARDLY = 0.5
@@ -31,7 +31,7 @@ class Left:
     dof: int
     rms: dict[str, float]
     white: tuple[Whiteness, ...]
-    worst: Place | None
+    worst: WorstResidual | None
     unexplained: tuple[str, ...]
 
     def times(self, rows: int) -> list[float]:

@@ -40,7 +40,7 @@ from mjfim.optimize.levenberg_marquardt import (
 )
 from mjfim.plant.noise import Noise
 from mjfim.recordings.plausibility import doubts
-from mjfim.records.estimate import Estimate, Suspect
+from mjfim.records.estimate import Estimate, MissingTerm
 from mjfim.records.recording import Recording
 
 NEWTON = Search(iterations=50, tolerance=1e-5, damped=False)
@@ -334,7 +334,7 @@ class _Identification:
             self.interrupted = True
             return ()
 
-    def _missing(self, at: Unknowns) -> tuple[Suspect, ...]:
+    def _missing(self, at: Unknowns) -> tuple[MissingTerm, ...]:
         """Terms that the model lacks, from recordings, or of much data from pieces of them."""
         some = self._sample(self.fit)
         return suspects(some, self.fit.recordings, self._places, self._sampled(at))
@@ -351,7 +351,7 @@ class _Identification:
         rest: Left,
         known: Accuracy,
         why: Sequence[str],
-        missing: Sequence[Suspect],
+        missing: Sequence[MissingTerm],
         at_bound: tuple[str, ...],
         outside: bool,
     ) -> Iterator[str]:

@@ -19,7 +19,7 @@ from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
 from mjfim.model.loading import coordinates
 from mjfim.optimize.levenberg_marquardt import Unknowns
-from mjfim.records.estimate import Suspect
+from mjfim.records.estimate import MissingTerm
 from mjfim.records.recording import Recording
 
 LEVEL = 1e-3  # probability, over all candidates, from which one is named
@@ -43,7 +43,7 @@ class Candidate:
 
 def suspects(
     fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: Unknowns
-) -> tuple[Suspect, ...]:
+) -> tuple[MissingTerm, ...]:
     """Terms that would explain significant residuals, the strongest first; none where nothing does.
 
     fit: of some of the pieces that the recordings are cut into
@@ -94,7 +94,7 @@ def suspects(
         # more than all squares: the fit is too far from its minimum for a linear answer
         if not wrong and sigmas > norm.isf(0.5 * LEVEL / len(tested)) and WORTH < share < 1.0:
             named.append(
-                Suspect(
+                MissingTerm(
                     candidate.words,
                     candidate.path,
                     float(value),

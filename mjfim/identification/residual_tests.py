@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from scipy.stats import chi2 as chi2_distribution
 
 from mjfim.arrays import Array
-from mjfim.records.estimate import Place, Whiteness
+from mjfim.records.estimate import Whiteness, WorstResidual
 
 MISFIT = 1e-3  # probability below which residuals are not noise
 LARGER = 1.03  # residuals over the stated noise from which that matters
@@ -67,13 +67,13 @@ def _how(found: Whiteness) -> str:
 
 def worst_place(
     outputs: Sequence[str], names: Sequence[str], times: Sequence[Array], whitened: Sequence[Array]
-) -> Place | None:
+) -> WorstResidual | None:
     """The window, or run of neighbouring ones, where whitened residuals: (M, ny) per recording are largest.
 
     None where there are none. A run that does not stand out is widened to the whole recording.
     """
     total = sum(float(np.nansum(z**2)) for z in whitened)
-    best: Place | None = None
+    best: WorstResidual | None = None
     for name, t, z in zip(names, times, whitened, strict=True):
         for j, output in enumerate(outputs):
             seen = np.isfinite(z[:, j])
@@ -99,7 +99,7 @@ def worst_place(
             )
             inside = slice(first, last + 1)
             size = float(np.sqrt(squares[inside].sum() / max(counts[inside].sum(), 1)))
-            place = Place(
+            place = WorstResidual(
                 output,
                 name,
                 edges[first],

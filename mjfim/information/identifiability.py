@@ -14,8 +14,8 @@ from mjfim.experiment.system import Setup
 from mjfim.information.fisher import Information
 from mjfim.information.null_space import BLIND, COARSER, SURE, Null, grouped, invisible
 from mjfim.plant.plant import SENSITIVITY_STEP
-from mjfim.records.combinations import Group, rows_of
-from mjfim.records.design import Combined
+from mjfim.records.combinations import ParameterGroup, combination_matrix
+from mjfim.records.design import CombinationAccuracy
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 PROBES = 3
@@ -35,8 +35,8 @@ class Survey:
     names: tuple[str, ...]
     here: Null
     always: Null
-    groups_here: tuple[Group, ...]
-    groups_always: tuple[Group, ...]
+    groups_here: tuple[ParameterGroup, ...]
+    groups_always: tuple[ParameterGroup, ...]
 
     @property
     def basis(self) -> Array | None:
@@ -45,16 +45,17 @@ class Survey:
 
     def combined(
         self, information: Information, values: Array, before: Array, after: Array
-    ) -> tuple[Combined, ...]:
+    ) -> tuple[CombinationAccuracy, ...]:
         """The visible combinations of `groups_always`: words, value and standard deviations of two informations (p, p).
 
         values: (t,) of the wanted parameters
         """
-        rows = rows_of(self.groups_always, self.names)
+        rows = combination_matrix(self.groups_always, self.names)
         words = [str(c) for group in self.groups_always for c in group.combinations]
         stds = (information.spread(told, rows).tolist() for told in (before, after))
         return tuple(
-            Combined(*column) for column in zip(words, (rows @ values).tolist(), *stds, strict=True)
+            CombinationAccuracy(*column)
+            for column in zip(words, (rows @ values).tolist(), *stds, strict=True)
         )
 
 

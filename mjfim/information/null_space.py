@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.records.combinations import Combination, Group
+from mjfim.records.combinations import Combination, ParameterGroup
 
 COARSER = 4.0  # the second step, times the first
 SURE = 1e-4  # a normalised singular value above it needs no second look
@@ -123,7 +123,7 @@ def _range(A: Array) -> Array:
 
 def grouped(
     null: Null, names: Sequence[str], size: Array, units: Sequence[str]
-) -> tuple[Group, ...]:
+) -> tuple[ParameterGroup, ...]:
     """The invisible directions in the user's words: groups of parameters and the combinations that remain of them.
 
     names, size, units: of the t wanted parameters; sizes decide which coefficients are round-off. Parameters without any
@@ -160,8 +160,8 @@ def grouped(
                         (names[b], *(names[f] for f, _ in parts)), (1.0, *(c for _, c in parts))
                     )
                 )
-        groups.append(Group(tuple(names[m] for m in sorted(members)), tuple(rows)))
-    return (*groups, Group(tuple(none), ())) if none else tuple(groups)
+        groups.append(ParameterGroup(tuple(names[m] for m in sorted(members)), tuple(rows)))
+    return (*groups, ParameterGroup(tuple(none), ())) if none else tuple(groups)
 
 
 def _lumped(N: Array, units: Sequence[str]) -> np.ndarray:

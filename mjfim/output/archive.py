@@ -19,11 +19,11 @@ from mjfim.errors import RecordingError
 from mjfim.experiment.system import Setup
 from mjfim.output.playback import design_columns, playback_of, reference_columns
 from mjfim.records.check import Check
-from mjfim.records.combinations import Group
-from mjfim.records.comparison import Comparison, Row
+from mjfim.records.combinations import ParameterGroup
+from mjfim.records.comparison import Comparison, MethodResult
 from mjfim.records.design import Design, Evaluation
-from mjfim.records.estimate import Errors, Estimate, Prediction
-from mjfim.records.monte_carlo import Study
+from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
+from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
@@ -266,18 +266,18 @@ def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
     }
 
 
-def _errors(p: Prediction) -> list[tuple[str, Errors, Array]]:
+def _errors(p: Prediction) -> list[tuple[str, PredictionErrors, Array]]:
     """Names of errors, and where they are."""
     own, plain = p.identified, p.nominal
     pairs = [("rms", own, own.rms), ("mae", own, own.mae), ("nominal_rms", plain, plain.rms)]
     return [*pairs, ("nominal_mae", plain, plain.mae)]
 
 
-def _by_output(errors: Errors, values: Array) -> dict[str, float]:
+def _by_output(errors: PredictionErrors, values: Array) -> dict[str, float]:
     return dict(zip(errors.outputs, values.tolist(), strict=True))
 
 
-def study_summary(study: Study) -> dict[str, Any]:
+def study_summary(study: MonteCarloStudy) -> dict[str, Any]:
     """Contents of montecarlo.json."""
     summary: dict[str, Any] = {
         "parameters": list(study.parameters),
@@ -370,7 +370,7 @@ def comparison_summary(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _compared(row: Row) -> dict[str, Any]:
+def _compared(row: MethodResult) -> dict[str, Any]:
     return {
         "method": row.method,
         "title": row.title,
@@ -389,7 +389,7 @@ def _compared(row: Row) -> dict[str, Any]:
     }
 
 
-def _group(group: Group) -> dict[str, Any]:
+def _group(group: ParameterGroup) -> dict[str, Any]:
     return {
         "members": list(group.members),
         "identifiable": [

@@ -18,7 +18,7 @@ from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.monte_carlo import Study
+from mjfim.records.monte_carlo import MonteCarloStudy
 
 
 def recording_of(source: Path) -> Path:
@@ -124,7 +124,7 @@ def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
     return missing
 
 
-def leave_study(folder: Path, study: Study, setup: Setup) -> None:
+def leave_study(folder: Path, study: MonteCarloStudy, setup: Setup) -> None:
     """montecarlo.json, a histogram per parameter, the tables."""
     archive.write_json(folder / "montecarlo.json", archive.study_summary(study))
     labels = Labels.of(setup)

@@ -10,13 +10,13 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from mjfim.recordings.summary import Look
+from mjfim.recordings.summary import LogSummary
 from mjfim.records.check import Check
-from mjfim.records.combinations import Group as Combinations
-from mjfim.records.comparison import DESIGN, Comparison, Row
+from mjfim.records.combinations import ParameterGroup
+from mjfim.records.comparison import DESIGN, Comparison, MethodResult
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
-from mjfim.records.monte_carlo import Study
+from mjfim.records.monte_carlo import MonteCarloStudy
 
 FEW = 7  # parameters up to which each has a column
 BEST_CASE = "sigma is the Cramér-Rao bound: a best case, true if model and noise are right."
@@ -103,7 +103,7 @@ def estimate_report(estimate: Estimate, units: tuple[str, ...]) -> RenderableTyp
     return Group(table, *lines, *told_apart, Text(note, style="dim"), *_warnings(estimate.warnings))
 
 
-def looks_report(looks: Sequence[Look]) -> RenderableType:
+def looks_report(looks: Sequence[LogSummary]) -> RenderableType:
     """What was read: the clock of every log, then the range of its columns."""
     table = Table(title="What was read", title_justify="left")
     for heading in ("log", "rows", "time", "rate", "jitter", "longest gap", "left out"):
@@ -170,7 +170,7 @@ def _predictions(estimate: Estimate) -> Table:
     return table
 
 
-def study_report(study: Study, units: tuple[str, ...]) -> RenderableType:
+def study_report(study: MonteCarloStudy, units: tuple[str, ...]) -> RenderableType:
     """Observed scatter against the bound."""
     parts: list[RenderableType] = []
     for name, s in study.sets.items():
@@ -308,12 +308,12 @@ def _spreads(comparison: Comparison) -> Table:
     return table
 
 
-def _marked(comparison: Comparison, row: Row) -> str:
+def _marked(comparison: Comparison, row: MethodResult) -> str:
     """A method's title, the best one's with an arrow."""
     return ("▶ " if row is comparison.best else "  ") + escape(row.title)
 
 
-def _compared(comparison: Comparison, row: Row) -> list[str]:
+def _compared(comparison: Comparison, row: MethodResult) -> list[str]:
     """Cells of one method."""
     ours, (kind, share) = comparison.design, row.tightest
     against = (
@@ -339,18 +339,18 @@ def _number(value: float, digits: int) -> str:
     return "-" if np.isnan(value) else f"{value:.{digits}g}"
 
 
-def _remarks(row: Row) -> list[str]:
+def _remarks(row: MethodResult) -> list[str]:
     return [*([] if row.sound else [row.outcome.value]), *([row.note] if row.note else [])]
 
 
-def _style(comparison: Comparison, row: Row) -> str:
+def _style(comparison: Comparison, row: MethodResult) -> str:
     """The design stands out, so does what beats it; what may not be played steps back."""
     if not row.sound:
         return "dim"
     return "bold" if row.method == DESIGN else "yellow" if row in comparison.beating else ""
 
 
-def _lines(group: Combinations, check: Check) -> list[str]:
+def _lines(group: ParameterGroup, check: Check) -> list[str]:
     """A group of parameters: its members, then one combination a line, with its value and standard deviation."""
     if not group.combinations:
         return [f"  {group}"]

@@ -20,7 +20,7 @@ from mjfim.recordings.column_units import check_unit, converted, units_of
 from mjfim.recordings.formats.read import read_columns
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import ColumnSpec, RecordingSpec
-from mjfim.recordings.summary import Look, look
+from mjfim.recordings.summary import LogSummary, summarize
 from mjfim.recordings.validity import (
     SECONDS,
     check_clock,
@@ -39,7 +39,7 @@ class Logged:
     """A recording and how the log looked that it was read from."""
 
     recording: Recording
-    look: Look
+    look: LogSummary
 
 
 def read_recording(path: Path, channels: Channels) -> Recording:
@@ -64,7 +64,7 @@ def read_log(path: Path, channels: Channels) -> Logged:
     check_angles(str(path), channels.model, t, columns, stated)
     ctrl = np.column_stack([columns[f"ctrl:{name}"][:-1] for name in channels.controls])
     y = np.column_stack([columns[name] for name in measured])
-    summary = look(
+    summary = summarize(
         str(path), t, columns, {name: source.column for name, source in plan.items()}, dropped
     )
     return Logged(Recording(t, ctrl, y, measured, str(path)), summary)

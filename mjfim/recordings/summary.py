@@ -13,7 +13,7 @@ ROUNDING = 1e-12  # of the largest value: closer ones are one value, computed tw
 
 
 @dataclass(frozen=True)
-class ColumnLook:
+class ColumnSummary:
     """One column of a recording, in the model's unit.
 
     source: column of the log;  minimum, maximum: NaN where it is empty;  empty: share of the rows, 0 ... 1
@@ -29,7 +29,7 @@ class ColumnLook:
 
 
 @dataclass(frozen=True)
-class Look:
+class LogSummary:
     """One log as it was read.
 
     duration [s];  rate: [Hz] from the median step;  jitter_std, jitter_max: [s] of the steps about their median
@@ -44,17 +44,17 @@ class Look:
     jitter_max: float
     longest: float
     dropped: int
-    columns: tuple[ColumnLook, ...]
+    columns: tuple[ColumnSummary, ...]
 
 
-def look(
+def summarize(
     file: str, t: Array, columns: Mapping[str, Array], sources: Mapping[str, str], dropped: int
-) -> Look:
+) -> LogSummary:
     """t: (M,) [s], M > 1;  columns: (M,) each by name;  sources: what they are called in the log"""
     steps = np.diff(t)
     median = float(np.median(steps))
     off = steps - median
-    return Look(
+    return LogSummary(
         file,
         len(t),
         float(t[-1] - t[0]),
@@ -67,14 +67,14 @@ def look(
     )
 
 
-def _column(name: str, source: str, values: Array) -> ColumnLook:
+def _column(name: str, source: str, values: Array) -> ColumnSummary:
     there = np.sort(values[np.isfinite(values)])
     empty = 1.0 - len(there) / len(values)
     if not len(there):
-        return ColumnLook(name, source, float("nan"), float("nan"), empty, 0.0)
+        return ColumnSummary(name, source, float("nan"), float("nan"), empty, 0.0)
     apart = np.diff(there)
     apart = apart[apart > ROUNDING * np.abs(there[[0, -1]]).max()]
-    return ColumnLook(
+    return ColumnSummary(
         name,
         source,
         float(there[0]),

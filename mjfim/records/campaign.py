@@ -14,7 +14,7 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
 
 
-class Outcome(Enum):
+class CampaignStatus(Enum):
     """How a campaign ended; the value is a sentence for the user."""
 
     REACHED = "reached: every parameter is known as well as wanted"
@@ -26,7 +26,7 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Played:
+class EarlierRound:
     """Recordings that are there already: of an earlier session's round, or made without a design.
 
     theta: (p,) where the round was designed;  predicted: (p,) σ that was promised;  control: (N, nu) of the design
@@ -74,7 +74,7 @@ class Campaign:
     parameters: tuple[str, ...]
     wanted: Array
     rounds: tuple[Round, ...]
-    status: Outcome
+    status: CampaignStatus
     pending: Design | None = None
     warnings: tuple[str, ...] = ()
 
@@ -84,7 +84,7 @@ class Campaign:
     @property
     def reached(self) -> bool:
         """Every parameter is known as well as wanted, and nothing speaks against the fit."""
-        return self.status is Outcome.REACHED
+        return self.status is CampaignStatus.REACHED
 
     @property
     def estimate(self) -> Estimate | None:
@@ -105,13 +105,13 @@ class Campaign:
     def short(self) -> str:
         """Parameters that are not known as well as wanted, in words; empty where all are."""
         last = self.estimate
-        return "" if last is None else missed(self.parameters, last.std, self.wanted)
+        return "" if last is None else missed_targets(self.parameters, last.std, self.wanted)
 
     def __str__(self) -> str:
         return f"{self.status.value}{f': {self.short}' if self.short else ''}; {len(self.rounds)} rounds"
 
 
-def missed(names: Sequence[str], std: Array, wanted: Array) -> str:
+def missed_targets(names: Sequence[str], std: Array, wanted: Array) -> str:
     """The parameters that are not known as well as wanted, the worst first: `m (σ 0.012, wanted 0.01)`."""
     order = sorted(np.flatnonzero(~(std <= wanted)).tolist(), key=lambda j: -std[j] / wanted[j])
     return ", ".join(f"{names[j]} (σ {std[j]:.3g}, wanted {wanted[j]:.3g})" for j in order)

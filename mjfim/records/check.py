@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array, freeze
-from mjfim.records.combinations import Group
-from mjfim.records.design import Combined
+from mjfim.records.combinations import ParameterGroup
+from mjfim.records.design import CombinationAccuracy
 
-CONFOUNDED = 0.95
+CONFOUNDED_CORRELATION = 0.95
 
 
 @dataclass(frozen=True)
-class Row:
+class ParameterCheck:
     """One parameter. std: predicted standard deviation, infinite where it cannot be told alone;  relative: to its size
 
     size: its magnitude, of its value or, for components of vectors and tensors, of the whole
@@ -36,7 +36,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Pair:
+class ConfoundedPair:
     """Two parameters that the data hardly tell apart."""
 
     first: str
@@ -58,17 +58,17 @@ class Check:
 
     source: str
     horizon: float
-    rows: tuple[Row, ...]
+    rows: tuple[ParameterCheck, ...]
     wanted: tuple[str, ...]
     information: Array
     eigenvalues: Array
     correlation: Array
-    confounded: tuple[Pair, ...]
-    never: tuple[Group, ...]
-    not_here: tuple[Group, ...]
+    confounded: tuple[ConfoundedPair, ...]
+    never: tuple[ParameterGroup, ...]
+    not_here: tuple[ParameterGroup, ...]
     self_test: SelfTest
     verdict: tuple[str, ...]
-    combined: tuple[Combined, ...] = ()
+    combined: tuple[CombinationAccuracy, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "information", "eigenvalues", "correlation")
@@ -113,8 +113,8 @@ class Roughness:
         )
 
 
-RECURSION = 1e-3
-SLOPE = 1e-2
+RECURSION_TOLERANCE = 1e-3
+SLOPE_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True)
@@ -134,4 +134,8 @@ class SelfTest:
     @property
     def passed(self) -> bool:
         """True where all derivatives agree."""
-        return self.rough is None and not self.recursion > RECURSION and not self.slope > SLOPE
+        return (
+            self.rough is None
+            and not self.recursion > RECURSION_TOLERANCE
+            and not self.slope > SLOPE_TOLERANCE
+        )

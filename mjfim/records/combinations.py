@@ -24,7 +24,7 @@ class Combination:
         )
 
 
-def rows_of(groups: Sequence[Group], names: Sequence[str]) -> Array:
+def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -> Array:
     """(c, t) coefficients of all combinations of the groups, over the named parameters."""
     combinations = [c for group in groups for c in group.combinations]
     rows = np.zeros((len(combinations), len(names)))
@@ -35,14 +35,14 @@ def rows_of(groups: Sequence[Group], names: Sequence[str]) -> Array:
 
 
 @dataclass(frozen=True)
-class Group:
+class ParameterGroup:
     """Parameters that are visible only together: as `combinations`, fewer than members; none where all are invisible."""
 
     members: tuple[str, ...]
     combinations: tuple[Combination, ...]
 
     def __str__(self) -> str:
-        names = listed(self.members)
+        names = join_names(self.members)
         if not self.combinations:
             return f"{names}: no effect on anything that is measured"
         return f"{names} only as {', '.join(str(c) for c in self.combinations)}"
@@ -52,6 +52,6 @@ def _number(value: float) -> str:
     return "" if abs(value - 1.0) < 1e-6 else f"{value:.4g} "
 
 
-def listed(names: Sequence[str]) -> str:
+def join_names(names: Sequence[str]) -> str:
     """`a, b and c`."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

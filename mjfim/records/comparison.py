@@ -10,10 +10,10 @@ import numpy as np
 from mjfim.arrays import Array, freeze
 
 DESIGN = "design"
-TIE = 1e-3  # relative difference of J that is none
+TIE_TOLERANCE = 1e-3  # relative difference of J that is none
 
 
-class Outcome(Enum):
+class MethodOutcome(Enum):
     """How a method ended; the value is a verb phrase for the user."""
 
     INSIDE = "keeps all limits"
@@ -24,7 +24,7 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class MethodResult:
     """What a method found. The control is None, and numbers are NaN, where it has nothing to show.
 
     method, title: its key, its name;  control: (N, nu);  cost: J;  criterion: phi;  std: (p,) Cramer-Rao
@@ -36,7 +36,7 @@ class Row:
 
     method: str
     title: str
-    outcome: Outcome
+    outcome: MethodOutcome
     control: Array | None
     cost: float
     criterion: float
@@ -56,7 +56,7 @@ class Row:
     @property
     def sound(self) -> bool:
         """It may be played: inside all limits, and what it promises is no artefact of clamps."""
-        return self.outcome is Outcome.INSIDE
+        return self.outcome is MethodOutcome.INSIDE
 
     @property
     def tightest(self) -> tuple[str, float]:
@@ -80,7 +80,7 @@ class Comparison:
     units: tuple[str, ...]
     scale: Array
     nuisance: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[MethodResult, ...]
     seconds: float
     steps: float
     seed: int
@@ -96,23 +96,23 @@ class Comparison:
         return tuple(j for j, name in enumerate(self.parameters) if name not in self.nuisance)
 
     @property
-    def design(self) -> Row | None:
+    def design(self) -> MethodResult | None:
         """The design, if it was reached."""
         return next((row for row in self.rows if row.method == DESIGN), None)
 
     @property
-    def rival(self) -> Row | None:
+    def rival(self) -> MethodResult | None:
         """The best baseline that may be played."""
         others = (row for row in self.rows if row.method != DESIGN and row.sound)
         return min(others, key=lambda row: row.cost, default=None)
 
     @property
-    def best(self) -> Row | None:
+    def best(self) -> MethodResult | None:
         """The best of all that may be played."""
         return min((row for row in self.rows if row.sound), key=lambda row: row.cost, default=None)
 
     @property
-    def beating(self) -> tuple[Row, ...]:
+    def beating(self) -> tuple[MethodResult, ...]:
         """Baselines that are better than the design, the best first."""
         ours = self.design
         if ours is None:
@@ -120,11 +120,11 @@ class Comparison:
         better = [
             r
             for r in self.rows
-            if r.sound and r is not ours and (not ours.sound or self.gain(r, ours) > TIE)
+            if r.sound and r is not ours and (not ours.sound or self.gain(r, ours) > TIE_TOLERANCE)
         ]
         return tuple(sorted(better, key=lambda row: row.cost))
 
-    def gain(self, row: Row, other: Row) -> float:
+    def gain(self, row: MethodResult, other: MethodResult) -> float:
         """By what share of the other's J a row's is lower; of D-optimality, its geometric mean of variances."""
         if self.nats:
             return float(-np.expm1((row.cost - other.cost) / self.nats))
@@ -164,7 +164,7 @@ def _verdict(c: Comparison) -> str:
         )
         return f"The design is beaten by {told}: {sigmas}."
     won = c.gain(ours, rival)
-    if won <= TIE:
+    if won <= TIE_TOLERANCE:
         return f"The design is as good as the best baseline, {rival.title}: {sigmas}."
     return f"The design is the best: J {_percent(won)} lower than that of the best baseline, {rival.title}; {sigmas}."
 

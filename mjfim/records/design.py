@@ -93,7 +93,7 @@ class StartResult:
 
 
 @dataclass(frozen=True)
-class Combined:
+class CombinationAccuracy:
     """An identifiable combination of parameters that are not so alone: its words, value and standard deviations."""
 
     words: str
@@ -103,7 +103,7 @@ class Combined:
 
 
 @dataclass(frozen=True, eq=False)
-class Usage:
+class LimitUsage:
     """How much of a limit a trajectory uses. kind: of the limit;  name: of the joint, the actuator or the nearest pair
 
     t: (n,) [s];  share: (n,) -1 at the lower bound, 1 at the upper one; of a clearance, the least one over what there is
@@ -142,13 +142,13 @@ class Design:
     steps: int
     seconds: float
     limits: dict[str, float] = field(default_factory=dict)
-    usage: tuple[Usage, ...] = ()
+    usage: tuple[LimitUsage, ...] = ()
     warnings: tuple[str, ...] = ()
     found_by: str = "initial control"
     starts: tuple[StartResult, ...] = ()
     nuisance: tuple[str, ...] = ()
     combinations: tuple[str, ...] = ()
-    combined: tuple[Combined, ...] = ()
+    combined: tuple[CombinationAccuracy, ...] = ()
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     data: Array = field(default_factory=lambda: np.zeros((0, 0)))
 

@@ -56,10 +56,10 @@ class Estimate:
     sigma: dict[str, float] = field(default_factory=dict)
     reasons: tuple[str, ...] = ()
     whiteness: tuple[Whiteness, ...] = ()
-    worst: Place | None = None
+    worst: WorstResidual | None = None
     predictions: tuple[Prediction, ...] = ()
     sloppy: tuple[str, ...] = ()
-    suspects: tuple[Suspect, ...] = ()
+    suspects: tuple[MissingTerm, ...] = ()
     each: dict[str, tuple[float, ...]] = field(default_factory=dict)
     detail: Uncertainty | None = None
     motion: Trajectory | None = None
@@ -89,7 +89,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Place:
+class WorstResidual:
     """Where residuals are worst. begin, end: [s];  size: their root mean square in sigmas;  share: of all squares"""
 
     output: str
@@ -105,7 +105,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
+class PredictionErrors:
     """How far a model is from a recording. name: of it;  rms, mae: (ny,) root mean square and mean absolute errors
 
     NaN where nothing was measured or the model diverged.
@@ -128,8 +128,8 @@ class Prediction:
     """
 
     name: str
-    identified: Errors
-    nominal: Errors
+    identified: PredictionErrors
+    nominal: PredictionErrors
     held_out: bool
 
     @property
@@ -143,7 +143,7 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Suspect:
+class MissingTerm:
     """A term that would explain residuals. path: a parameter's target;  value: about how much of it there would be [unit]
 
     sigmas: its value over its standard deviation;  share: of all squared residuals that it explains

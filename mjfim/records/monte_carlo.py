@@ -8,7 +8,7 @@ from mjfim.arrays import Array, freeze
 
 
 @dataclass(frozen=True, eq=False)
-class TrialSet:
+class TrialStatistics:
     """Monte-Carlo estimates along one trajectory, against theory.
 
     estimates: (trials, p), NaN rows for failed trials;  mean: (p,);  covariance, crlb: (p, p)
@@ -31,7 +31,7 @@ class TrialSet:
 
 
 @dataclass(frozen=True, eq=False)
-class Study:
+class MonteCarloStudy:
     """Monte-Carlo studies of trajectories by name (`initial`, `final`).
 
     theta: (p,) the true values; information: (p, p) by the same names
@@ -40,7 +40,7 @@ class Study:
     parameters: tuple[str, ...]
     theta: Array
     measure_rate: float
-    sets: dict[str, TrialSet]
+    sets: dict[str, TrialStatistics]
     information: dict[str, Array]
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ from mjfim.excitation.target_accuracy import furthest, require_reachable, wanted
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.identification.identify import identify
-from mjfim.records.campaign import Campaign, Outcome, Played, Round
+from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
@@ -38,7 +38,7 @@ def sequential(
     monitor: Monitor | None = None,
     threads: int | None = None,
     report: Callable[[Round], None] | None = None,
-    done: Sequence[Played] = (),
+    done: Sequence[EarlierRound] = (),
     executor: Executor | None = None,
 ) -> Campaign:
     """Design, record and identify in turn until every parameter's `wanted` σ is reached, or the rounds are used up.
@@ -77,7 +77,7 @@ class _Loop:
         self.rounds: list[Round] = []
         self.pending: Design | None = None
 
-    def run(self, measure: Measure, count: int, done: Sequence[Played]) -> Campaign:
+    def run(self, measure: Measure, count: int, done: Sequence[EarlierRound]) -> Campaign:
         """The whole loop."""
         try:
             for played in done:
@@ -87,28 +87,30 @@ class _Loop:
                 if ended is not None:
                     return self._concluded(ended)
         except KeyboardInterrupt:
-            return self._concluded(Outcome.INTERRUPTED)
+            return self._concluded(CampaignStatus.INTERRUPTED)
         if not self._formally():
-            return self._concluded(Outcome.EXHAUSTED)
+            return self._concluded(CampaignStatus.EXHAUSTED)
         last = self.rounds[-1].estimate
         doubtful = last.misfit or any(_doubts(last, self.wanted))
-        return self._concluded(Outcome.DOUBTFUL if doubtful else Outcome.REACHED)
+        return self._concluded(CampaignStatus.DOUBTFUL if doubtful else CampaignStatus.REACHED)
 
-    def _play(self, measure: Measure) -> Outcome | None:
+    def _play(self, measure: Measure) -> CampaignStatus | None:
         """One round; says how the campaign ends where it does before the recording."""
         found, told = self._design()
         self.pending = found
         if found.status is Status.INTERRUPTED:
-            return Outcome.INTERRUPTED
+            return CampaignStatus.INTERRUPTED
         if found.status is Status.INFEASIBLE:
-            return Outcome.INFEASIBLE
+            return CampaignStatus.INFEASIBLE
         require_reachable(self.base, found, self.wanted)
         answer = measure(found, len(self.rounds) + 1)
         recordings = (answer,) if isinstance(answer, Recording) else tuple(answer or ())
         if not recordings:
-            return Outcome.WAITING
+            return CampaignStatus.WAITING
         self._record(
-            Played(recordings, found.theta, found.final.std, found.trajectory.ctrl), found, told
+            EarlierRound(recordings, found.theta, found.final.std, found.trajectory.ctrl),
+            found,
+            told,
         )
         self.pending = None
         return None
@@ -131,7 +133,7 @@ class _Loop:
             return redesigned(self.base, past, last.theta, self.monitor, self.executor), (told,)
 
     def _record(
-        self, played: Played, found: Design | None = None, told: tuple[str, ...] = ()
+        self, played: EarlierRound, found: Design | None = None, told: tuple[str, ...] = ()
     ) -> None:
         """Identify from all recordings and keep the round."""
         p, last = self.base.parameters, self.rounds[-1] if self.rounds else None
@@ -182,7 +184,7 @@ class _Loop:
         """Every wanted σ is reached."""
         return bool(self.rounds) and furthest(self.rounds[-1].attained, self.wanted)[0] <= 1.0
 
-    def _concluded(self, status: Outcome) -> Campaign:
+    def _concluded(self, status: CampaignStatus) -> Campaign:
         warnings = [f"round {r.number}: {sentence}" for r in self.rounds for sentence in r.warnings]
         names = self.base.parameters.names
         return Campaign(

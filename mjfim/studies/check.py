@@ -16,8 +16,14 @@ from mjfim.information.fisher import Information
 from mjfim.information.identifiability import Survey, survey, survey_rows
 from mjfim.information.marginal import shared
 from mjfim.plant.plant import CENTRAL
-from mjfim.records.check import CONFOUNDED, Check, Pair, Row, SelfTest
-from mjfim.records.combinations import Group, listed
+from mjfim.records.check import (
+    CONFOUNDED_CORRELATION,
+    Check,
+    ConfoundedPair,
+    ParameterCheck,
+    SelfTest,
+)
+from mjfim.records.combinations import ParameterGroup, join_names
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.derivative_test import self_test
@@ -118,7 +124,7 @@ def _concluded(
 
 def _rows(
     setup: Setup, information: Information, data: Array, std: Array, horizon: float
-) -> Iterator[Row]:
+) -> Iterator[ParameterCheck]:
     p = setup.parameters
     for j, parameter in enumerate(p.parameters):
         value = float(setup.theta[j])
@@ -129,7 +135,7 @@ def _rows(
         needed = (
             0 if parameter.nuisance else _repetitions(information, data, setup.prior, j, wanted)
         )
-        yield Row(
+        yield ParameterCheck(
             parameter.name,
             parameter.unit,
             value,
@@ -167,18 +173,18 @@ def _repetitions(
     return high
 
 
-def _pairs(names: Sequence[str], correlation: Array) -> Iterator[Pair]:
+def _pairs(names: Sequence[str], correlation: Array) -> Iterator[ConfoundedPair]:
     """Confounded pairs, the worst first."""
     found = [
-        Pair(names[i], names[j], float(correlation[i, j]))
+        ConfoundedPair(names[i], names[j], float(correlation[i, j]))
         for i in range(len(names))
         for j in range(i + 1, len(names))
-        if abs(correlation[i, j]) > CONFOUNDED
+        if abs(correlation[i, j]) > CONFOUNDED_CORRELATION
     ]
     yield from sorted(found, key=lambda pair: -abs(pair.correlation))
 
 
-def _brief(groups: Sequence[Group]) -> str:
+def _brief(groups: Sequence[ParameterGroup]) -> str:
     """Groups in words, or only how many where that would fill a page."""
     said = "; ".join(str(group) for group in groups)
     if len(said) <= LONGEST_LINE:
@@ -188,10 +194,10 @@ def _brief(groups: Sequence[Group]) -> str:
 
 
 def _verdict(
-    rows: Sequence[Row],
-    never: Sequence[Group],
-    not_here: Sequence[Group],
-    confounded: Sequence[Pair],
+    rows: Sequence[ParameterCheck],
+    never: Sequence[ParameterGroup],
+    not_here: Sequence[ParameterGroup],
+    confounded: Sequence[ConfoundedPair],
     tested: SelfTest,
     source: str,
 ) -> Iterator[str]:
@@ -212,7 +218,7 @@ def _verdict(
             "give it a prior, or measure something else; a design works on the combinations"
         )
     if settled:
-        yield f"told apart by priors only, not by data: {'; '.join(listed(group.members) for group in settled)}"
+        yield f"told apart by priors only, not by data: {'; '.join(join_names(group.members) for group in settled)}"
     if not_here:
         yield f"not visible from {source}, but another control would show: {_brief(not_here)}. Move those joints more"
     wanted = [row for row in rows if not row.nuisance]

@@ -20,7 +20,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.parallel import salvaged, workers_of
 from mjfim.plant.active_constraints import saturated
-from mjfim.records.comparison import DESIGN, Comparison, Outcome, Row
+from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import HistoryRow, Status
 from mjfim.studies.baselines.budget import Attempt, Job
 from mjfim.studies.baselines.methods import METHODS, perform
@@ -82,7 +82,7 @@ def compare(
         setup.added,
         threads,
     )
-    rows: list[Row] = []
+    rows: list[MethodResult] = []
     interrupted = False
     try:
         for i, method in enumerate(chosen):
@@ -164,7 +164,9 @@ def _tried(job: Job, executor: Executor | None, tell: Tell) -> Attempt:
     )
 
 
-def _designed(judge: Judge, job: Job, executor: Executor | None, tell: Tell) -> tuple[Row, bool]:
+def _designed(
+    judge: Judge, job: Job, executor: Executor | None, tell: Tell
+) -> tuple[MethodResult, bool]:
     """The design with the same budget, and whether the user interrupted it."""
     d = job.experiment.descent
     stated = job.experiment.replace(
@@ -224,23 +226,23 @@ class Judge:
         count = len(p.interest) if combinations is None else combinations.shape[1]
         self.nats = e.cost.information * count if e.cost.criterion == "D" else 0.0
 
-    def row(self, method: str, title: str, attempt: Attempt, note: str = "") -> Row:
+    def row(self, method: str, title: str, attempt: Attempt, note: str = "") -> MethodResult:
         """What an attempt is worth. A baseline's control that leaves the limits after all is shrunk until it does not."""
         if attempt.control is None:
             return self._nothing(method, title, attempt, note)
-        first: Row | None = None
+        first: MethodResult | None = None
         for share in (
             [1.0] if method == DESIGN or not np.isfinite(attempt.cost) else SHRUNK.tolist()
         ):
             control = self.setup.centre + share * (attempt.control - self.setup.centre)
             told = note if share == 1.0 else f"shrunk to {100.0 * share:.3g} %"
             found = self._looked(method, title, replace(attempt, control=control), told)
-            if found is not None and found.outcome is not Outcome.OUTSIDE:
+            if found is not None and found.outcome is not MethodOutcome.OUTSIDE:
                 return found
             first = first or found
         return first or self._nothing(method, title, attempt, note)
 
-    def _looked(self, method: str, title: str, attempt: Attempt, note: str) -> Row | None:
+    def _looked(self, method: str, title: str, attempt: Attempt, note: str) -> MethodResult | None:
         """None where the simulation diverges."""
         setup = self.setup
         point = None if attempt.control is None else fine_point(self.stage, attempt.control)
@@ -252,16 +254,16 @@ class Judge:
         ):
             return None
         found = audit(setup, point.trajectory)
-        outcome = Outcome.INSIDE if found.kept else Outcome.OUTSIDE
-        if outcome is Outcome.OUTSIDE and not np.isfinite(attempt.cost):
-            outcome = Outcome.NOTHING
+        outcome = MethodOutcome.INSIDE if found.kept else MethodOutcome.OUTSIDE
+        if outcome is MethodOutcome.OUTSIDE and not np.isfinite(attempt.cost):
+            outcome = MethodOutcome.NOTHING
         clamped = saturated(setup.model_at(setup.theta), point.trajectory)
-        if outcome is Outcome.INSIDE and clamped:
-            outcome, note = Outcome.CLAMPED, f"forcerange clamps {', '.join(clamped)}"
+        if outcome is MethodOutcome.INSIDE and clamped:
+            outcome, note = MethodOutcome.CLAMPED, f"forcerange clamps {', '.join(clamped)}"
         elif found.deviation > SAME:
             note = f"a clamp, stop or contact acts: deviates by {found.deviation:.2g}"
         smallest = float(point.criterion.eigenvalues[0])
-        return Row(
+        return MethodResult(
             method=method,
             title=title,
             outcome=outcome,
@@ -279,11 +281,11 @@ class Judge:
             note=note,
         )
 
-    def _nothing(self, method: str, title: str, attempt: Attempt, note: str) -> Row:
-        outcome = Outcome.NONE if attempt.control is None else Outcome.NOTHING
+    def _nothing(self, method: str, title: str, attempt: Attempt, note: str) -> MethodResult:
+        outcome = MethodOutcome.NONE if attempt.control is None else MethodOutcome.NOTHING
         blank = np.full(len(self.setup.parameters), np.nan)
         taken = (attempt.seconds, attempt.steps)
-        return Row(
+        return MethodResult(
             method,
             title,
             outcome,

@@ -23,7 +23,7 @@ from mjfim.experiment.system import Setup
 from mjfim.identification.identify import least_squares, newton_raphson
 from mjfim.identification.residuals import Fit
 from mjfim.information.identifiability import require_visible
-from mjfim.records.monte_carlo import Study, TrialSet
+from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
@@ -41,7 +41,7 @@ def monte_carlo(
     seed: int = 0,
     measure_rate: float | None = None,
     progress: Progress | None = None,
-) -> Study:
+) -> MonteCarloStudy:
     """Estimate the parameters from many noisy repetitions of one or several trajectories (name -> trajectory).
 
     Parameters are searched without bounds and priors: the study holds the data's information alone. Ctrl-C returns the
@@ -67,7 +67,7 @@ def monte_carlo(
     except KeyboardInterrupt:
         if not sets:
             raise
-    return Study(
+    return MonteCarloStudy(
         setup.parameters.names, setup.parameters.true, setup.measure_rate, sets, information
     )
 
@@ -132,7 +132,7 @@ def _trial_set(
     count: int,
     rng: np.random.Generator,
     tell: Callable[[float], None] | None,
-) -> tuple[TrialSet, Array]:
+) -> tuple[TrialStatistics, Array]:
     clock = time.perf_counter()
     y, G = _exact(setup, curve)
     J = setup.noise.rows(G)
@@ -223,12 +223,12 @@ def _gauss_newton(J: Array, r: Array) -> Array:
     return step
 
 
-def _statistics(estimates: Array, crlb: Array, seconds: float) -> TrialSet:
+def _statistics(estimates: Array, crlb: Array, seconds: float) -> TrialStatistics:
     good = estimates[np.isfinite(estimates).all(axis=1)]
     n, p = len(good), estimates.shape[1]
     if n < 2:
         blank = np.full(p, np.nan)
-        return TrialSet(
+        return TrialStatistics(
             estimates,
             blank,
             np.full((p, p), np.nan),
@@ -242,7 +242,7 @@ def _statistics(estimates: Array, crlb: Array, seconds: float) -> TrialSet:
     covariance = np.atleast_2d(np.cov(good, rowvar=False))
     efficiency = np.diag(crlb) / np.diag(covariance)
     interval = efficiency[:, None] * chi2_distribution.ppf([0.025, 0.975], n - 1) / (n - 1)
-    return TrialSet(
+    return TrialStatistics(
         estimates,
         good.mean(axis=0),
         covariance,

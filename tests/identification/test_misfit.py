@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from support.numerics import Array
 
 from mjfim.identification.residual_tests import coloured, larger, reasons, smaller, worst_place
-from mjfim.records.estimate import Place, Whiteness
+from mjfim.records.estimate import Whiteness, WorstResidual
 
 NAMES = ("angle", "speed", "force")
 
@@ -20,7 +20,7 @@ def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
     return times, [rng.standard_normal((len(t), 3)) for t in times]
 
 
-def place(times: list[Array], z: list[Array]) -> Place:
+def place(times: list[Array], z: list[Array]) -> WorstResidual:
     """The worst of the three recordings a, b, c."""
     found = worst_place(NAMES, "abc", times, z)
     assert found is not None
@@ -96,7 +96,7 @@ def test_short_recordings(count: int) -> None:
 
 def test_a_place_in_words() -> None:
     """What, when, where, how much."""
-    said = str(Place("angle", "run.csv", 1.25, 2.5, 7.93, 0.412))
+    said = str(WorstResidual("angle", "run.csv", 1.25, 2.5, 7.93, 0.412))
     assert said == "worst in angle, 1.25 to 2.5 s of run.csv: 7.9 sigmas, 41 % of all squares"
 
 

@@ -24,7 +24,7 @@ from mjfim.output.labels import Labels
 from mjfim.output.plots.style import INITIAL, OPTIMIZED, number, per, squared, with_error
 from mjfim.records.design import Design, Evaluation, HistoryRow, Status
 from mjfim.records.estimate import Estimate
-from mjfim.records.monte_carlo import Study, TrialSet
+from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
@@ -90,17 +90,21 @@ def make_design(dofs: int = 2, count: int = 3) -> Design:
     )
 
 
-def make_trials(theta: Array, std: float, failed: int, seed: int, trials: int = 200) -> TrialSet:
+def make_trials(
+    theta: Array, std: float, failed: int, seed: int, trials: int = 200
+) -> TrialStatistics:
     """Efficient estimates with the first `failed` rows NaN."""
     count = len(theta)
     estimates = theta + std * np.random.default_rng(seed).normal(size=(trials, count))
     estimates[:failed] = np.nan
     spread = np.diag(np.full(count, std**2))
     interval = np.tile([0.8, 1.2], (count, 1))
-    return TrialSet(estimates, theta, spread, spread, np.ones(count), interval, trials, failed)
+    return TrialStatistics(
+        estimates, theta, spread, spread, np.ones(count), interval, trials, failed
+    )
 
 
-def make_study(count: int = 3, failed: int = 5) -> Study:
+def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
     """Two sets, the second fifty times tighter."""
     theta = np.linspace(1.0, 2.0, count)
     sets = {
@@ -108,7 +112,7 @@ def make_study(count: int = 3, failed: int = 5) -> Study:
         "final": make_trials(theta, 0.004, failed, 1),
     }
     information = {name: np.diag(1.0 / np.diagonal(trials.crlb)) for name, trials in sets.items()}
-    return Study(tuple(f"p{j}" for j in range(count)), theta, 25.0, sets, information)
+    return MonteCarloStudy(tuple(f"p{j}" for j in range(count)), theta, 25.0, sets, information)
 
 
 def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estimate:

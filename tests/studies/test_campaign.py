@@ -22,7 +22,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDiverged, UnidentifiableError
 from mjfim.experiment.system import Setup
 from mjfim.identification.residual_tests import larger
-from mjfim.records.campaign import Campaign, Outcome, Played
+from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import restated
@@ -70,7 +70,7 @@ def truth() -> Setup:
 
 
 def test_it_ends_at_what_is_wanted_and_at_the_truth(campaign: Campaign, truth: Setup) -> None:
-    assert campaign.reached and campaign.status is Outcome.REACHED
+    assert campaign.reached and campaign.status is CampaignStatus.REACHED
     assert 2 <= len(campaign.rounds) <= 5, "one round would not test a redesign"
     last = campaign.estimate
     assert last is not None and (last.std <= 0.008).all()
@@ -174,7 +174,7 @@ def test_friction_that_the_model_has_not_is_not_silent(tmp_path: Path) -> None:
         easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=2
     )
     assert found.estimate is not None and found.estimate.misfit
-    assert found.status is Outcome.DOUBTFUL and not found.reached
+    assert found.status is CampaignStatus.DOUBTFUL and not found.reached
     assert any("misfit" in sentence for sentence in found.warnings)
 
 
@@ -186,7 +186,7 @@ def test_friction_too_weak_for_chi_squared_shows_in_successive_residuals(tmp_pat
     )
     assert found.estimate is not None and found.estimate.misfit
     assert not larger(found.estimate.chi2, found.estimate.dof)
-    assert found.status is Outcome.DOUBTFUL
+    assert found.status is CampaignStatus.DOUBTFUL
     assert any("follow one another" in sentence for sentence in found.warnings)
 
 
@@ -199,9 +199,12 @@ def test_a_round_that_tells_nothing_is_named(campaign: Campaign) -> None:
         ctrl=first.control[:2],
         y=first.recordings[0].y[:3],
     )
-    done = [Played(first.recordings, first.theta, first.predicted, first.control), Played((start,))]
+    done = [
+        EarlierRound(first.recordings, first.theta, first.predicted, first.control),
+        EarlierRound((start,)),
+    ]
     found = mjfim.sequential(STUDY, never, rounds=2, done=done)
-    assert found.status is Outcome.EXHAUSTED and not found.reached
+    assert found.status is CampaignStatus.EXHAUSTED and not found.reached
     assert any("round 2: no progress" in sentence for sentence in found.warnings)
     assert "wanted 0.008" in found.short and "wanted 0.008" in str(found)
 
@@ -212,8 +215,8 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     light = STUDY.replace(parameters={"m": {"true": 1.8}})
     second = mjfim.simulate(light, campaign.designs[1].trajectory, seed=1)
     done = [
-        Played(first.recordings, first.theta, first.predicted, first.control),
-        Played((second,)),
+        EarlierRound(first.recordings, first.theta, first.predicted, first.control),
+        EarlierRound((second,)),
     ]
     found = mjfim.sequential(STUDY, never, rounds=2, done=done)
     assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
@@ -222,9 +225,9 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
 def test_what_is_recorded_already_is_not_done_again(campaign: Campaign) -> None:
     """The next design of a campaign that is taken up again is the one that it would have had."""
     first = campaign.rounds[0]
-    done = [Played(first.recordings, first.theta, first.predicted, first.control)]
+    done = [EarlierRound(first.recordings, first.theta, first.predicted, first.control)]
     found = mjfim.sequential(STUDY, lambda design, number: None, done=done)
-    assert found.status is Outcome.WAITING and found.pending is not None
+    assert found.status is CampaignStatus.WAITING and found.pending is not None
     np.testing.assert_allclose(found.pending.trajectory.ctrl, campaign.rounds[1].control, atol=1e-6)
     np.testing.assert_allclose(found.pending.theta, campaign.rounds[1].theta, rtol=1e-9)
 
@@ -237,7 +240,9 @@ def test_interrupted_while_recording(campaign: Campaign) -> None:
 
     found = mjfim.sequential(STUDY, stop)
     assert (
-        found.status is Outcome.INTERRUPTED and len(found.rounds) == 1 and found.pending is not None
+        found.status is CampaignStatus.INTERRUPTED
+        and len(found.rounds) == 1
+        and found.pending is not None
     )
     np.testing.assert_allclose(
         found.rounds[0].estimate.theta, campaign.rounds[0].estimate.theta, rtol=1e-9
@@ -250,7 +255,9 @@ def test_nothing_is_played_that_leaves_the_limits(
     outside = replace(campaign.designs[0], status=Status.INFEASIBLE)
     monkeypatch.setattr(loop, "design", lambda *args, **kwargs: outside)
     found = mjfim.sequential(STUDY, never)
-    assert found.status is Outcome.INFEASIBLE and found.pending is outside and not found.rounds
+    assert (
+        found.status is CampaignStatus.INFEASIBLE and found.pending is outside and not found.rounds
+    )
 
 
 def test_without_a_design_at_the_estimate_the_last_place_serves(
@@ -265,7 +272,7 @@ def test_without_a_design_at_the_estimate_the_last_place_serves(
         return campaign.designs[1]
 
     monkeypatch.setattr(loop, "redesigned", fails_once)
-    done = [Played(first.recordings, first.theta, first.predicted, first.control)]
+    done = [EarlierRound(first.recordings, first.theta, first.predicted, first.control)]
     found = mjfim.sequential(STUDY, robot, rounds=2, done=done)
     np.testing.assert_array_equal(asked, [first.estimate.theta, first.theta])
     assert any("no design at the estimate" in w and "too fast" in w for w in found.warnings)
@@ -305,7 +312,7 @@ def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: Setup) -> 
         parameters={name: {"wanted": 1e-4} for name in "mlc"},
     )
     found = mjfim.sequential(limited, robot, rounds=2)
-    assert len(found.rounds) == 2 and found.status is Outcome.EXHAUSTED
+    assert len(found.rounds) == 2 and found.status is CampaignStatus.EXHAUSTED
     for design in found.designs:
         assert min(design.limits.values()) >= 0.0
     assert gained([r.control for r in found.rounds], truth) > 1.2

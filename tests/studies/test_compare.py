@@ -20,7 +20,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.verification import audit
 from mjfim.experiment.system import Setup
 from mjfim.output.plots.compare import compare_figure
-from mjfim.records.comparison import DESIGN, Comparison, Outcome, Row
+from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design, HistoryRow
 from mjfim.studies.baselines.budget import Attempt
 from mjfim.studies.compare import Glance, Judge, Meter, chosen_methods
@@ -37,10 +37,10 @@ def small() -> Comparison:
     return mjfim.compare(pendulum(), 60.0, 100_000, 1, ["chirp", "fourier5"])
 
 
-def row(method: str, cost: float, outcome: Outcome = Outcome.INSIDE) -> Row:
+def row(method: str, cost: float, outcome: MethodOutcome = MethodOutcome.INSIDE) -> MethodResult:
     """A made-up result."""
     std = np.full(2, np.sqrt(abs(cost)))
-    return Row(
+    return MethodResult(
         method,
         method,
         outcome,
@@ -57,7 +57,7 @@ def row(method: str, cost: float, outcome: Outcome = Outcome.INSIDE) -> Row:
     )
 
 
-def made(*rows: Row, nats: float = 0.0) -> Comparison:
+def made(*rows: MethodResult, nats: float = 0.0) -> Comparison:
     """A made-up comparison."""
     return Comparison(
         "e",
@@ -125,29 +125,29 @@ def test_a_control_that_leaks_is_shrunk_until_it_does_not() -> None:
     assert found.control is not None
     leaking = setup.centre + 1.15 * (found.control - setup.centre)
     r = Judge(setup, None).row("chirp", "chirp", Attempt(leaking, 1.0))
-    assert r.outcome is Outcome.INSIDE
+    assert r.outcome is MethodOutcome.INSIDE
     assert "shrunk to" in r.note
     assert min(r.margins.values()) >= 0.0
     far = Judge(setup, None).row("chirp", "chirp", Attempt(leaking, np.inf))
-    assert far.outcome is Outcome.NOTHING
+    assert far.outcome is MethodOutcome.NOTHING
     assert min(far.margins.values()) < 0.0
     assert not far.sound
     nothing = Judge(setup, None).row("chirp", "chirp", Attempt())
-    assert (nothing.outcome, nothing.control) == (Outcome.NONE, None)
+    assert (nothing.outcome, nothing.control) == (MethodOutcome.NONE, None)
 
 
 def test_the_designs_control_is_never_shrunk() -> None:
     setup, found = Setup(pendulum()), small().rows[2]
     assert found.control is not None
     r = Judge(setup, None).row(DESIGN, "design", Attempt(1.05 * found.control, 1.0))
-    assert r.outcome is Outcome.OUTSIDE
+    assert r.outcome is MethodOutcome.OUTSIDE
 
 
 def test_who_beats_whom() -> None:
     c = made(
         row("a", 2.0),
         row("b", 0.5),
-        row("c", 0.4, Outcome.OUTSIDE),
+        row("c", 0.4, MethodOutcome.OUTSIDE),
         row("d", 0.9995),
         row(DESIGN, 1.0),
     )
@@ -166,11 +166,13 @@ def test_who_beats_whom() -> None:
 
 
 def test_a_design_that_may_not_be_played_has_lost() -> None:
-    c = made(row("a", 2.0), row(DESIGN, 1.0, Outcome.OUTSIDE))
+    c = made(row("a", 2.0), row(DESIGN, 1.0, MethodOutcome.OUTSIDE))
     assert not c.ok
     assert [r.method for r in c.beating] == ["a"]
     assert "leaves a limit" in c.verdict[0]
-    assert not made(row("a", 2.0, Outcome.NOTHING), row(DESIGN, 1.0, Outcome.OUTSIDE)).ok
+    assert not made(
+        row("a", 2.0, MethodOutcome.NOTHING), row(DESIGN, 1.0, MethodOutcome.OUTSIDE)
+    ).ok
     assert not made(row("a", 2.0)).ok  # no design, no win
 
 
@@ -247,12 +249,19 @@ def test_the_picture_has_a_row_per_method() -> None:
     "rows",
     [
         (row("a", 1.0),),
-        (row("a", 1e-4), row("b", 1.0, Outcome.OUTSIDE), row(DESIGN, 0.5)),
-        (replace(row("a", 1.0, Outcome.NONE), control=None, worst=np.nan, std=np.full(2, np.nan)),),
+        (row("a", 1e-4), row("b", 1.0, MethodOutcome.OUTSIDE), row(DESIGN, 0.5)),
+        (
+            replace(
+                row("a", 1.0, MethodOutcome.NONE),
+                control=None,
+                worst=np.nan,
+                std=np.full(2, np.nan),
+            ),
+        ),
         (replace(row(DESIGN, 1.0), std=np.full(2, np.inf)),),
     ],
 )
-def test_the_picture_of_any_result_is_drawn(rows: tuple[Row, ...], tmp_path: Path) -> None:
+def test_the_picture_of_any_result_is_drawn(rows: tuple[MethodResult, ...], tmp_path: Path) -> None:
     compare_figure(made(*rows)).savefig(tmp_path / "x.png")
     assert imread(tmp_path / "x.png").std() > 0.0
 

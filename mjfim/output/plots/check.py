@@ -24,7 +24,7 @@ from mjfim.output.plots.style import (
     say,
     shorten,
 )
-from mjfim.records.check import CONFOUNDED, Check, Row
+from mjfim.records.check import CONFOUNDED_CORRELATION, Check, ParameterCheck
 
 READABLE = 14  # parameters up to which correlations are written into the cells
 
@@ -50,7 +50,7 @@ def check_figure(check: Check) -> Figure:
     return figure
 
 
-def _bars(axes: Axes, rows: list[Row]) -> None:
+def _bars(axes: Axes, rows: list[ParameterCheck]) -> None:
     std = np.array([row.relative for row in rows])
     wanted = np.array([row.wanted / row.size for row in rows])
     known = np.isfinite(std) & (std > 0.0)
@@ -111,7 +111,7 @@ def _heat(axes: Axes, check: Check) -> None:
                 continue
             if count <= READABLE:
                 strong = abs(value) > 0.6
-                weight = "bold" if abs(value) > CONFOUNDED else "normal"
+                weight = "bold" if abs(value) > CONFOUNDED_CORRELATION else "normal"
                 colour = "white" if strong else INK
                 axes.text(
                     j,
@@ -123,11 +123,11 @@ def _heat(axes: Axes, check: Check) -> None:
                     color=colour,
                     weight=weight,
                 )
-            elif abs(value) > CONFOUNDED:
+            elif abs(value) > CONFOUNDED_CORRELATION:
                 axes.plot(j, i, marker="o", color=INK, markersize=2.0)
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.7, pad=0.02)
     bar.set_label("correlation of the estimates", fontsize=NORMAL, color=INK)
     bar.ax.tick_params(labelsize=SMALL, color=MUTED)
     grey = "; grey: not alone" if np.isnan(matrix).any() else ""
-    marked = f"{'bold' if count <= READABLE else 'dots'}: |correlation| > {CONFOUNDED:g}, hardly told apart{grey}"
+    marked = f"{'bold' if count <= READABLE else 'dots'}: |correlation| > {CONFOUNDED_CORRELATION:g}, hardly told apart{grey}"
     axes.set_title(marked, fontsize=SMALL, color=MUTED)

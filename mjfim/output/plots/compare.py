@@ -25,7 +25,7 @@ from mjfim.output.plots.style import (
     say,
     shorten,
 )
-from mjfim.records.comparison import DESIGN, Comparison, Row
+from mjfim.records.comparison import DESIGN, Comparison, MethodResult
 
 READABLE = 12  # parameters up to which numbers are written into the cells
 SPAN = 3.0  # ratio at which the colours end
@@ -60,7 +60,7 @@ def compare_figure(comparison: Comparison) -> Figure:
     return figure
 
 
-def _colour(comparison: Comparison, row: Row) -> str:
+def _colour(comparison: Comparison, row: MethodResult) -> str:
     if row.method == DESIGN:
         return OPTIMIZED
     return OTHER if row in comparison.beating else INITIAL

@@ -35,14 +35,14 @@ from mjfim.output.plots.style import (
     two_lines,
 )
 from mjfim.records.estimate import Estimate
-from mjfim.records.monte_carlo import Study, TrialSet
+from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
 
 MAX_OUTPUTS = 12
 MAX_ROWS = 6000  # of a recording in a picture
 
 
-def finite_column(trials: TrialSet, index: int) -> Array:
+def finite_column(trials: TrialStatistics, index: int) -> Array:
     """Estimates of one parameter without the failed trials."""
     column = trials.estimates[:, index]
     return column[np.isfinite(column)]
@@ -74,7 +74,7 @@ def normal(x: Array, mean: float, std: float) -> Array:
     )
 
 
-def describe(trials: TrialSet, index: int, unit: str, hidden: int) -> str:
+def describe(trials: TrialStatistics, index: int, unit: str, hidden: int) -> str:
     """Variance, bound, efficiency and counts of one panel."""
     low, high = (number(float(v)) for v in trials.efficiency_interval[index])
     square = f" {squared(unit)}".rstrip()
@@ -88,7 +88,7 @@ def describe(trials: TrialSet, index: int, unit: str, hidden: int) -> str:
 
 
 def draw_panel(
-    axes: Axes, trials: TrialSet, index: int, theta: float, unit: str, style: tuple[str, str]
+    axes: Axes, trials: TrialStatistics, index: int, theta: float, unit: str, style: tuple[str, str]
 ) -> None:
     """Histogram of one trajectory on its own range, with true value and the normal curve of the bound."""
     name, colour = style
@@ -113,7 +113,7 @@ def draw_panel(
     axes.text(0.0, 1.02, note, transform=axes.transAxes, va="bottom", fontsize=SMALL, color=MUTED)
 
 
-def draw_overlay(axes: Axes, study: Study, index: int) -> None:
+def draw_overlay(axes: Axes, study: MonteCarloStudy, index: int) -> None:
     """All trajectories on one axis, each scaled to its own peak."""
     theta = float(study.theta[index])
     columns = {name: finite_column(trials, index) for name, trials in study.sets.items()}
@@ -140,7 +140,7 @@ def draw_overlay(axes: Axes, study: Study, index: int) -> None:
     axes.set_ylim(0.0, 1.08)
 
 
-def histogram(study: Study, index: int, labels: Labels) -> Figure:
+def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Figure:
     """Monte-Carlo estimates of parameter `index` along each trajectory (paper's figures 4 to 6)."""
     labels.check(parameters=len(study.theta))
     if not 0 <= index < len(study.theta):

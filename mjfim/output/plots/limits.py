@@ -18,7 +18,7 @@ from mjfim.output.plots.style import (
     number,
     shorten,
 )
-from mjfim.records.design import Design, Usage
+from mjfim.records.design import Design, LimitUsage
 
 KINDS = (
     "position",
@@ -72,7 +72,7 @@ def _said(kind: str, margin: float) -> str:
     return f"{kind.replace('_', ' ')}: {'kept by' if margin >= 0.0 else 'MISSED by'} {number(abs(margin))}"
 
 
-def draw_usage(axes: Axes, curves: list[Usage], one_sided: bool) -> None:
+def draw_usage(axes: Axes, curves: list[LimitUsage], one_sided: bool) -> None:
     """Curves between their bounds at -1 and 1; the closest ones strong and named."""
     order = sorted(curves, key=lambda u: -float(np.abs(u.share).max()))
     for rank, curve in enumerate(order):

@@ -30,7 +30,7 @@ from mjfim.output.plots.style import (
     shorten,
 )
 from mjfim.records.design import Design
-from mjfim.records.monte_carlo import Study
+from mjfim.records.monte_carlo import MonteCarloStudy
 
 ROW = 0.26  # [inch]
 GAP = 0.28  # between columns [inch]
@@ -212,7 +212,9 @@ def design_table(design: Design, labels: Labels) -> Figure:
     )
 
 
-def matrix_block(study: Study, labels: Labels, title: str, matrix: Callable[[str], Array]) -> Block:
+def matrix_block(
+    study: MonteCarloStudy, labels: Labels, title: str, matrix: Callable[[str], Array]
+) -> Block:
     """Upper triangle of a symmetric matrix per trajectory, side by side."""
     count = len(study.theta)
     short = [shorten(name, 16) for name in labels.parameters]
@@ -227,7 +229,7 @@ def matrix_block(study: Study, labels: Labels, title: str, matrix: Callable[[str
     return Block(title, header, tuple(tuple(row) for row in rows), tuple(groups))
 
 
-def variance_block(study: Study, labels: Labels) -> Block:
+def variance_block(study: MonteCarloStudy, labels: Labels) -> Block:
     """Variances only, one row per parameter: for studies with too many parameters to print matrices."""
     groups, rows = [], [[brief(labels.parameter(j))] for j in range(len(study.theta))]
     for k, (name, trials) in enumerate(study.sets.items()):
@@ -242,7 +244,7 @@ def variance_block(study: Study, labels: Labels) -> Block:
     return Block("Variances (diagonals)", header, tuple(tuple(row) for row in rows), tuple(groups))
 
 
-def efficiency_block(study: Study, labels: Labels) -> Block:
+def efficiency_block(study: MonteCarloStudy, labels: Labels) -> Block:
     """Cramer-Rao variance over observed variance, with its 95 % interval."""
     groups, rows = [], [[brief(labels.parameter(j))] for j in range(len(study.theta))]
     for k, (name, trials) in enumerate(study.sets.items()):
@@ -263,7 +265,7 @@ def efficiency_block(study: Study, labels: Labels) -> Block:
     )
 
 
-def study_table(study: Study, labels: Labels) -> Figure:
+def study_table(study: MonteCarloStudy, labels: Labels) -> Figure:
     """Monte-Carlo covariance, Fisher information, Cramer-Rao bound and efficiency (paper's tables II and III)."""
     labels.check(parameters=len(study.theta))
     notes = [
