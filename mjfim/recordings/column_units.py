@@ -1,6 +1,6 @@
 """What one column of a log becomes: counters and signs undone, units, scales, factors. Formula (1):
 
-value = (scale * unit * raw + offset) * product of `times`
+value = (scale * unit * raw + offset) * product of the columns `multiply_by`
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def converted(table: Table, spec: ColumnSpec) -> Array:
     value = raw if factor == 1.0 and spec.offset == 0.0 else factor * raw + spec.offset
     if spec.unwrap:
         value = _unwrapped(value, TURN)
-    for name in spec.times:
+    for name in spec.multiply_by:
         value = value * table.column(name)
     return np.asarray(value)
 

@@ -162,7 +162,7 @@ def _columns(
     """Converted columns in the window; controls held where they are empty, from before the window too."""
     columns = {}
     for name, source in plan.items():
-        for raw in (source.column, *source.times):
+        for raw in (source.column, *source.multiply_by):
             check_finite(f"{table.source}: column {raw!r}", table.column(raw)[rows], rows.start)
         values = converted(table, source)
         if name.startswith("ctrl:"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -12,19 +12,34 @@ Range = tuple[Annotated[float, Field(strict=True)], Annotated[float, Field(stric
 
 
 class Section(BaseModel):
-    """A table of the experiment file: immutable, no unknown keys."""
+    """A table of the experiment file: immutable, no unknown keys.
+
+    Attributes:
+        renamed_keys: Keys of earlier versions, each with the name that it has now.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    renamed_keys: ClassVar[dict[str, str]] = {}
+
 
 class ColumnSpec(Section):
-    """Where one column of a recording comes from: `(scale * unit * raw + offset) * times`.
+    """How one column of a recording is computed from the columns of a log.
 
-    column: of the log;  unit: of what the log holds, where it is not the model's (angles, times of angles);  scale, offset
-    signed: bits of an integer that the log holds as unsigned;  period: raw numbers after which a counter begins anew
-    unwrap: angles that jump by a whole turn are made continuous, once they are in rad
-    times: further columns or constants of the log that it is multiplied with, as they are
+    The value is `(scale * unit * raw + offset)` times the product of the columns in `multiply_by`.
+
+    Attributes:
+        column: Name of the log's column.
+        unit: Unit of the log's numbers, where it differs from the model's unit.
+        scale: Factor of the raw number.
+        offset: Added after the scaling [unit of the model].
+        signed: Number of bits of a signed integer that the log holds as an unsigned one.
+        period: Raw numbers after which a counter wraps around to its first value.
+        unwrap: Whether jumps of an angle by whole turns are removed, after the conversion to rad.
+        multiply_by: Further columns or constants of the log, by whose raw numbers the value is multiplied.
     """
+
+    renamed_keys = {"times": "multiply_by"}
 
     column: str
     unit: (
@@ -38,7 +53,7 @@ class ColumnSpec(Section):
     signed: Literal[8, 16, 32] | None = None
     period: Positive | None = None
     unwrap: bool = False
-    times: tuple[str, ...] = ()
+    multiply_by: tuple[str, ...] = ()
 
 
 class RecordingSpec(Section):

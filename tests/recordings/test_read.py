@@ -103,14 +103,29 @@ def test_own_columns(read: Read) -> None:
 
 
 def test_formula(read: Read) -> None:
-    """(scale unit raw + offset) times: by hand for every piece."""
+    """The formula (scale * unit * raw + offset) * factors, computed by hand."""
     on, kp = (T < 1.0).astype(float), np.full(M, 100.0)
     columns = {"a": wave(90.0), "on": on, "kp": kp}
-    spec = {"column": "a", "unit": "deg", "scale": -2.0, "offset": 0.5, "times": ["on", "kp"]}
+    spec = {"column": "a", "unit": "deg", "scale": -2.0, "offset": 0.5, "multiply_by": ["on", "kp"]}
     logged = read(columns, columns={"qpos:pin": spec})
     expected = (-2.0 * np.pi / 180.0 * wave(90.0) + 0.5) * on * 100.0
     assert np.allclose(column(logged, "qpos:pin"), expected, rtol=1e-14, atol=1e-12)
     assert logged.recording.outputs == ("qpos:pin",)
+
+
+def test_the_former_name_of_multiply_by_is_refused(tmp_path: Path) -> None:
+    """The message names the file and the key, and says how the key is called now."""
+    file = tmp_path / "study.toml"
+    file.write_text(
+        'model = "arm.xml"\nrate = 100.0\n[parameters.mass]\ntarget = "body/arm:mass"\n'
+        '[recording.columns]\n"ctrl:turn" = { column = "duty", times = ["enabled"] }\n',
+        encoding="utf-8",
+    )
+    with pytest.raises(ExperimentError) as refused:
+        Experiment.from_file(file)
+    assert str(refused.value) == (
+        f"{file}: recording.columns.ctrl:turn.times: this key is called 'multiply_by' now"
+    )
 
 
 @pytest.mark.parametrize(
@@ -387,7 +402,7 @@ def test_infinite_values(name: str, read: Read) -> None:
     """In the columns that are used, also as a factor."""
     columns = {"qpos:pin": wave(), **CTRL, "kp": np.full(M, 2.0)}
     columns[name] = np.where(np.arange(M) == 11, np.inf, columns[name])
-    source = {"column": "ctrl:turn", "times": ["kp"]}
+    source = {"column": "ctrl:turn", "multiply_by": ["kp"]}
     with pytest.raises(RecordingError, match=rf"column '{name}' is infinite in data row 12"):
         read(columns, columns={"ctrl:turn": source})
 
@@ -398,7 +413,7 @@ def test_columns_that_are_missing(read: Read) -> None:
         ("lost", "column 'lost' is missing; found: .*note"),
         ("note", "column 'note' is not numeric"),
     ):
-        for source in (name, {"column": "q", "times": [name]}):
+        for source in (name, {"column": "q", "multiply_by": [name]}):
             with pytest.raises(RecordingError, match=said):
                 read({"q": wave(), "note": np.array(["x"] * M)}, columns={"qpos:pin": source})
     with pytest.raises(RecordingError, match=r"column 'ctrl:push' is missing"):
@@ -600,7 +615,7 @@ ROBOTS: dict[str, dict[str, Any]] = {
                 "column": "load",
                 "signed": 16,
                 "scale": 1e-3,
-                "times": ["torque_enable", "kp"],
+                "multiply_by": ["torque_enable", "kp"],
             },
         },
     },

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pyarrow
+import pyarrow.csv
 import pyarrow.parquet
 
 from mjfim.arrays import Array

@@ -51,7 +51,7 @@ def chosen(names: Iterable[str], spec: RecordingSpec) -> list[str]:
     sources = spec.sources
     if all(key.startswith("ctrl:") for key in sources):
         return list(names)
-    wanted = {spec.time}.union(*({s.column, *s.times} for s in sources.values()))
+    wanted = {spec.time}.union(*({s.column, *s.multiply_by} for s in sources.values()))
     return [name for name in names if name in wanted or name.startswith("ctrl")]
 
 
