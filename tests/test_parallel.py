@@ -15,14 +15,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.test_cli import names, read, write_experiment
-from excitation.test_constrained import HARD, cart_inside
 
 import mjfim
 from mjfim import parallel as workers
 from mjfim.excitation import constrained as enclosed
 from mjfim.excitation.interior_point import Ladder, Rung
 from mjfim.records.design import HistoryRow, Status
+from tests.support.cli import names, read, write_experiment
+from tests.support.limits import HARD, cart_inside
 
 
 def identity() -> int:

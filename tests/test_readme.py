@@ -17,8 +17,8 @@ from mjfim.excitation.initial_controls import starts_of
 from mjfim.excitation.verification import require_inside
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 

@@ -17,11 +17,11 @@ from mjfim.experiment.system import Setup
 from mjfim.recordings.control_table import read_control
 from mjfim.recordings.formats.read import read_table
 from mjfim.signals import multisine
+from tests.support.paths import MODELS
 
 Array = NDArray[np.float64]
 Read = Callable[..., Array]
 
-MODELS = Path(__file__).parents[1] / "models"
 NAMES = ("left", "right")
 REST = np.zeros(2)
 T = np.arange(400) * 0.01

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.test_cli import MODELS, loads, names, read, run, write_experiment
 from matplotlib.image import imread
 
 import mjfim
 from mjfim.output.plots.check import check_figure
+from tests.support.cli import MODELS, loads, names, read, run, write_experiment
 
 
 @pytest.fixture(scope="module")

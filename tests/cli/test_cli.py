@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -15,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import mjfim
 from mjfim.cli import main as cli
@@ -24,79 +23,18 @@ from mjfim.output import archive, plots
 from mjfim.output import folders as results
 from mjfim.output import rerun as rerun_log
 from mjfim.recordings import read as logs
-
-MODELS = Path(__file__).parents[2] / "models"
-DESIGN = {
-    "design.json",
-    "design.npz",
-    "design.csv",
-    "reference.csv",
-    "design.rrd",
-    "trajectories.png",
-    "sensitivity_phase.png",
-    "convergence.png",
-    "standard_deviations.png",
-    "table_eigenvalues.png",
-}
-ESTIMATE = {"estimate.json", "identified.xml", "estimate.rrd"} | {
-    f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions")
-}
-STUDY = {
-    "montecarlo.json",
-    "histogram_m.png",
-    "histogram_l.png",
-    "histogram_c.png",
-    "table_covariance.png",
-}
-
-
-def run(*words: object) -> Result:
-    """`mjfim` in this process."""
-    return CliRunner().invoke(cli.app, [str(word) for word in words])
-
-
-def write_experiment(home: Path, **lines: str) -> Path:
-    """The paper's study, shortened to one second and easily content, with some lines exchanged by key.
-
-    start: the initial control
-    """
-    for file in ("cart_pendulum.xml", "cart_pendulum.csv"):
-        if not (home / file).exists():
-            shutil.copy(MODELS / file, home)
-    text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
-    for key, value in {
-        "horizon": "1.0",
-        "tolerance": "0.1",
-        "max_iterations": "40",
-        **lines,
-    }.items():
-        name, found = (
-            ("control", '"') if key == "start" else (key, "")
-        )  # the cost has a key `control` too
-        text, count = re.subn(
-            rf"^{name} = {found}.*$", f"{name} = {value}", text, flags=re.MULTILINE
-        )
-        if count != 1:
-            raise ValueError(f"{key} does not stand exactly once in the experiment file")
-    path = home / "study.toml"
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
-def loads(text: str) -> dict[str, Any]:
-    """A JSON object."""
-    found: dict[str, Any] = json.loads(text)
-    return found
-
-
-def read(path: Path) -> dict[str, Any]:
-    """A JSON file."""
-    return loads(path.read_text(encoding="utf-8"))
-
-
-def names(folder: Path) -> set[str]:
-    """Everything in a folder, hidden files too."""
-    return {path.name for path in folder.iterdir()}
+from tests.support.cli import (
+    DESIGN,
+    ESTIMATE,
+    STUDY,
+    loads,
+    misused,
+    names,
+    read,
+    run,
+    write_experiment,
+)
+from tests.support.paths import MODELS
 
 
 @pytest.fixture(scope="module")
@@ -352,17 +290,6 @@ def test_misfit(
 
 
 # ---- exit code 2: misuse
-
-
-def misused(result: Result, *fragments: str) -> None:
-    """One message on stderr, nothing on stdout, no traceback."""
-    assert isinstance(result.exception, SystemExit), repr(result.exception)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr.startswith("mjfim: ")
-    assert result.stderr.count("mjfim: ") == 1
-    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
-    assert "Traceback" not in result.stderr
-    assert [f for f in fragments if f not in result.stderr] == []
 
 
 BAD_LINES: dict[str, tuple[dict[str, str], list[str]]] = {

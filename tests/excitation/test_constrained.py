@@ -11,15 +11,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from excitation.test_constraints import ARM
-from support.numerics import (
-    CART_PARAMETERS,
-    CART_PENDULUM,
-    Array,
-    cart_setup,
-    make_setup,
-    relative_error,
-)
 
 import mjfim
 from mjfim.excitation import interior_point as ladder_module
@@ -34,8 +25,15 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.records.design import Design, HistoryRow, Status
 from mjfim.signals import spline_basis
-
-MODELS = Path(__file__).parents[2] / "models"
+from tests.support.limits import ARM, HARD, cart_inside
+from tests.support.numerics import (
+    CART_PARAMETERS,
+    CART_PENDULUM,
+    Array,
+    make_setup,
+    relative_error,
+)
+from tests.support.paths import MODELS
 
 
 def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -> dict[str, Array]:
@@ -122,23 +120,6 @@ def test_and_no_engine_step_leaves_them(paper: Design) -> None:
 
 
 # ---- ways to the inside
-
-HARD = {
-    "control": {"force": (-5.0, 5.0)},
-    "position": {"slide": (-0.3, 0.5)},
-    "velocity": {"hinge": 3.0},
-}
-
-
-def cart_inside(folder: Path, **tables: Any) -> Setup:
-    """The cart-pendulum for a second within limits, no weights."""
-    defaults: dict[str, Any] = {
-        "horizon": 1.0,
-        "cost": {"control": 0.0},
-        "limits": HARD,
-        "descent": {"max_iterations": 30},
-    }
-    return cart_setup(folder, **{**defaults, **tables})
 
 
 def assert_inside(setup: Setup, ctrl: Array) -> None:

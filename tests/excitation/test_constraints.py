@@ -9,37 +9,15 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from plant.test_substep_observations import floating_setup
-from support.numerics import Array, directional_check, make_setup
 
 from mjfim.excitation.constraints import END_WEIGHT, Sight, fence_of
 from mjfim.excitation.interior_point import InteriorProblem, seen
 from mjfim.experiment.system import Setup
 from mjfim.optimize.barrier import Band
 from mjfim.optimize.lq import TangentCurve
+from tests.support.limits import ARM, directions_of, floating_setup
+from tests.support.numerics import directional_check, make_setup
 
-# A planar arm of two torque-controlled servos over a floor, with a post in its way.
-ARM = """
-<mujoco model="arm">
-  <option timestep="0.002" integrator="implicitfast"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="2 2 0.1" pos="0 0 -0.42"/>
-    <geom name="post" type="sphere" size="0.05" pos="0.56 0 -0.3"/>
-    <body name="upper" pos="0 0 0">
-      <joint name="shoulder" axis="0 1 0" damping="0.3" armature="0.02"/>
-      <geom name="upper" type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.8"/>
-      <body name="fore" pos="0.3 0 0">
-        <joint name="elbow" axis="0 1 0" damping="0.2" armature="0.01"/>
-        <geom name="fore" type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.4"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position name="shoulder" joint="shoulder" kp="40" kv="1"/>
-    <general name="elbow" joint="elbow" gainprm="25" biastype="affine" biasprm="0 -25 -0.5"/>
-  </actuator>
-</mujoco>
-"""
 WIDE = {
     "position": 0.5,
     "velocity": 5.0,
@@ -91,17 +69,6 @@ def arm_setup(folder: Path, **tables: Any) -> Setup:
         },
     }
     return make_setup(ARM, folder, **{**defaults, **tables}).free()
-
-
-def directions_of(setup: Setup, count: int, seed: int = 0) -> Array:
-    """(count, N, nu) random changes of the control, smooth ones and rough ones."""
-    rng, t = np.random.default_rng(seed), setup.t[:, None] / setup.experiment.horizon
-    nu = setup.control.shape[1]
-    smooth = [
-        np.sin(2 * np.pi * rng.uniform(0.5, 3.0, nu) * t + rng.uniform(0, 6, nu))
-        for _ in range(count // 2)
-    ]
-    return np.array([*smooth, *rng.normal(size=(count - count // 2, *setup.control.shape))])
 
 
 def barrier_check(setup: Setup, delta: float, h: float = 2e-5) -> float:

@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.numerics import CART_PARAMETERS, cart_setup
 
 import mjfim
 from mjfim.errors import ExperimentError, ModelError, UnidentifiableError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.records.design import Status
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.numerics import CART_PARAMETERS, cart_setup
+from tests.support.paths import ROOT
 
 
 @pytest.fixture(scope="module")

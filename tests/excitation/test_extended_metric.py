@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.numerics import Array, Loop, body_setup, cart_setup, relative_error
 
 from mjfim.excitation.design import design
 from mjfim.excitation.objective import extend
@@ -20,6 +19,7 @@ from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.noise import Noise
 from mjfim.plant.plant import CENTRAL, Bilinear
 from mjfim.records.trajectory import Sensitivity
+from tests.support.numerics import Array, Loop, body_setup, cart_setup, relative_error
 
 TRACKING = {"tracking": {"slide": 0.3, "hinge": 0.1}, "control": 1e-2}
 SENSED = {"angle": 0.01, "acc": 0.3, "drive": 0.1}

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from excitation.test_constraints import ARM
-from support.numerics import make_setup
 
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.initial_controls import starts_of
 from mjfim.experiment.system import Setup
 from mjfim.signals import fourier_basis
+from tests.support.limits import ARM
+from tests.support.numerics import make_setup
 
 SWING = {
     "kind": "sine",

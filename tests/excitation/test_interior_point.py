@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from excitation.test_constraints import directions_of
-from support.numerics import Array, cart_setup, directional_check
 
 from mjfim.excitation.constraints import fence_of
 from mjfim.excitation.interior_point import DIVERGED_POINT, InteriorProblem, seen
 from mjfim.experiment.system import Setup
 from mjfim.optimize.projection_operator import Expansion
+from tests.support.limits import directions_of
+from tests.support.numerics import Array, cart_setup, directional_check
 
 LIMITS = {
     "control": {"force": (-5.0, 4.5)},

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.numerics import CART_PARAMETERS, cart_setup, relative_error
 
 import mjfim
 from mjfim.errors import ExperimentError, UnidentifiableError
 from mjfim.experiment.system import Setup
+from tests.support.numerics import CART_PARAMETERS, cart_setup, relative_error
 
 NEAR = {
     "qpos": (0.0, 3.0),

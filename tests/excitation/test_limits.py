@@ -7,7 +7,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import make_setup
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import Sight, fence_of
@@ -17,6 +16,7 @@ from mjfim.model.loading import control_names, coordinates
 from mjfim.output.labels import Labels
 from mjfim.plant.active_constraints import saturated
 from mjfim.records.trajectory import Trajectory
+from tests.support.numerics import make_setup
 
 # A ball joint first, so that addresses of positions, velocities and joints all differ.
 XML = """

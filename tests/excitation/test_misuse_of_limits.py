@@ -6,8 +6,6 @@ from pathlib import Path
 
 import mujoco
 import pytest
-from cli.test_cli import loads, misused, names, run, write_experiment
-from support.numerics import CART_PENDULUM, make_setup
 
 import mjfim
 from mjfim.errors import ExperimentError
@@ -15,6 +13,8 @@ from mjfim.excitation.limits import unwatched
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.output import folders as results
+from tests.support.cli import loads, misused, names, run, write_experiment
+from tests.support.numerics import CART_PENDULUM, make_setup
 
 MOTOR = (
     '<motor name="force" joint="slide"/>',

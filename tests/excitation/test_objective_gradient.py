@@ -13,7 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.numerics import (
+
+from mjfim.excitation.objective import Point
+from mjfim.excitation.unconstrained import Stage
+from mjfim.experiment.system import Setup
+from mjfim.optimize.lq import TangentCurve, regulator
+from mjfim.optimize.projection_operator import Expansion
+from mjfim.plant.plant import CENTRAL, FAST, Accuracy
+from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,
     Array,
@@ -24,13 +31,6 @@ from support.numerics import (
     make_setup,
     shared_model,
 )
-
-from mjfim.excitation.objective import Point
-from mjfim.excitation.unconstrained import Stage
-from mjfim.experiment.system import Setup
-from mjfim.optimize.lq import TangentCurve, regulator
-from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.plant import CENTRAL, FAST, Accuracy
 
 TRACKING = {
     "tracking": {"slide": 0.3, "hinge": 0.1},

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.numerics import Array, cart_setup
 
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.prior_information import information_of
 from mjfim.output import archive
+from tests.support.numerics import Array, cart_setup
 
 
 def information(seed: int, size: int) -> Array:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import norm
-from support.numerics import CART_PARAMETERS, Array, body_setup, cart_setup
 
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design
@@ -17,6 +16,7 @@ from mjfim.excitation.robust import Pool
 from mjfim.experiment.system import Setup
 from mjfim.model.parameter_samples import sampled
 from mjfim.model.parameters import Parameter, ParameterSet
+from tests.support.numerics import CART_PARAMETERS, Array, body_setup, cart_setup
 
 KINDS = {
     "mean": ("mean", False),

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.numerics import MODELS
 from typer.testing import CliRunner
 
 import mjfim
@@ -20,6 +19,7 @@ from mjfim.excitation.target_accuracy import furthest, wanted_of
 from mjfim.experiment.system import Setup
 from mjfim.optimize.bracketing import Grid, bracket
 from mjfim.records.design import HistoryRow
+from tests.support.paths import MODELS
 
 STUDY = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
     horizon=1.5,

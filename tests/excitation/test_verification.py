@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.numerics import CART_PENDULUM, make_setup
 
 from mjfim.excitation.constraints import fence_of
 from mjfim.excitation.verification import SAME, audit
 from mjfim.experiment.system import Setup
+from tests.support.numerics import CART_PENDULUM, make_setup
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
 SPRING = """

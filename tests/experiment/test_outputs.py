@@ -8,7 +8,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import FREE_BODY, Array, Loop, body_setup, cart_setup, make_setup
 
 from mjfim.errors import ExperimentError
 from mjfim.experiment.outputs import outputs_of
@@ -16,6 +15,8 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.model.coordinates import components, measurable
 from mjfim.model.loading import control_names, coordinates, joint_names
+from tests.support.numerics import FREE_BODY, Array, Loop, body_setup, cart_setup, make_setup
+from tests.support.paths import MODELS
 
 FREE = [f"qpos:float.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
 BALL = [f"qpos:ball.q{part}" for part in "wxyz"]
@@ -232,7 +233,7 @@ def test_correlated_outputs_alone_are_a_measurement(tmp_path: Path) -> None:
     """Where neither the experiment nor the MJCF states a sigma."""
     plain = {"outputs": ["qpos:slide", "qvel:hinge"], "covariance": [[0.04, 0.01], [0.01, 0.09]]}
     model = tmp_path / "silent.xml"
-    text = (Path(__file__).parents[2] / "models" / "cart_pendulum.xml").read_text(encoding="utf-8")
+    text = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
     model.write_text(text.replace('noise="0.05"', ""), encoding="utf-8")
     values: dict[str, Any] = {
         "model": str(model),

@@ -8,7 +8,13 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import (
+
+from mjfim.errors import ExperimentError, MjfimError, ModelError
+from mjfim.experiment.system import Setup
+from mjfim.model.inertia import CHARTS
+from mjfim.model.parameters import Parameter
+from mjfim.model.targets import inertial
+from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,
     body_setup,
@@ -16,12 +22,6 @@ from support.numerics import (
     filtered_setup,
     make_setup,
 )
-
-from mjfim.errors import ExperimentError, MjfimError, ModelError
-from mjfim.experiment.system import Setup
-from mjfim.model.inertia import CHARTS
-from mjfim.model.parameters import Parameter
-from mjfim.model.targets import inertial
 
 ARM = {"inertial": "arm"}
 

@@ -23,8 +23,7 @@ from mjfim.experiment.schema import (
     Signal,
 )
 from mjfim.experiment.system import Setup
-
-MODELS = Path(__file__).parents[2] / "models"
+from tests.support.paths import MODELS
 
 # All keys of the contract.
 CONTRACT = """

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.numerics import Array, body_setup, cart_setup
 
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import Setup
 from mjfim.identification.aligned_recording import Track, held, measured_trajectory, track_of
 from mjfim.plant.delay import Lag
 from mjfim.records.recording import Recording
+from tests.support.numerics import Array, body_setup, cart_setup
 
 DT = 0.01
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -12,8 +10,7 @@ from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
 from mjfim.recordings.plausibility import doubts
 from mjfim.records.recording import Recording
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.paths import ROOT
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -20,8 +18,7 @@ from mjfim.identification.residuals import Fit
 from mjfim.optimize.levenberg_marquardt import Progress
 from mjfim.records.recording import Recording
 from mjfim.studies.campaign import identified
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.paths import ROOT
 
 
 @pytest.fixture(scope="module")

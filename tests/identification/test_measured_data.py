@@ -14,17 +14,16 @@ import mjfim
 from mjfim.experiment.system import Setup
 from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
+from tests.support.paths import ROOT, SHARED_DATA
 
-ROOT = Path(__file__).resolve().parents[2]
-DATA = ROOT.parent / "shared" / "data"
 PENDULUM, DOUBLE, SERVO = (
-    DATA / "dfki_simple_pendulum",
-    DATA / "dfki_double_pendulum",
-    DATA / "bam_xl330" / "raw",
+    SHARED_DATA / "dfki_simple_pendulum",
+    SHARED_DATA / "dfki_double_pendulum",
+    SHARED_DATA / "bam_xl330" / "raw",
 )
 
 pytestmark = pytest.mark.skipif(
-    not DATA.is_dir(), reason="the measured recordings are not beside the repository"
+    not SHARED_DATA.is_dir(), reason="the measured recordings are not beside the repository"
 )
 
 # J, m c, viscous and Coulomb friction as published; atan(100 qd) levels off at pi/2

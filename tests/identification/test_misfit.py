@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.numerics import Array
 
 from mjfim.identification.residual_tests import coloured, larger, reasons, smaller, worst_place
 from mjfim.records.estimate import Whiteness, WorstResidual
+from tests.support.numerics import Array
 
 NAMES = ("angle", "speed", "force")
 

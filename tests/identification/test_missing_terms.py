@@ -10,8 +10,8 @@ import pytest
 import mjfim
 from mjfim.experiment.system import Setup
 from mjfim.records.recording import Recording
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics": 6}
 
 

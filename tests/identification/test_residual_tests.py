@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom, chi2
-from support.numerics import Array
 
 from mjfim.identification.residual_tests import LAGS, whiteness
 from mjfim.records.estimate import Whiteness
+from tests.support.numerics import Array
 
 N = 4000
 

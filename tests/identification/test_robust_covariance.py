@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
-from support.numerics import Array
 
 from mjfim.identification.robust_covariance import merge, together, uncertainty
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
+from tests.support.numerics import Array
 
 FINE = 8  # rows of a block
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.numerics import Array, body_setup, cart_setup
 
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import Setup
@@ -14,6 +13,7 @@ from mjfim.identification.aligned_recording import Track, track_of
 from mjfim.identification.identify import identify
 from mjfim.identification.segments import FEWEST, Piece, cut, groups, measured_starts, whole
 from mjfim.records.recording import Recording
+from tests.support.numerics import Array, body_setup, cart_setup
 
 HORIZON = 2.0
 

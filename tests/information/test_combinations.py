@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.numerics import make_setup, relative_error
 
 import mjfim
 from mjfim.errors import UnidentifiableError
 from mjfim.experiment.system import Setup
 from mjfim.output import archive
+from tests.support.numerics import make_setup, relative_error
 
 # A double pendulum whose first link holds a mass that no motion tells from the second one's.
 PENDULUM = """

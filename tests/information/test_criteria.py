@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from support.numerics import Array, richardson
 
 from mjfim.information.criteria import (
     CRITERIA,
@@ -15,6 +14,7 @@ from mjfim.information.criteria import (
     e_optimality,
     smooth_e_optimality,
 )
+from tests.support.numerics import Array, richardson
 
 CONTRAST = np.array([[1.0, 0.0], [-2.0, 0.0], [0.5, 1.0], [0.0, 3.0]])
 ALL: dict[str, Callable[[Array], Criterion]] = {

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.numerics import CART_PARAMETERS, cart_setup, relative_error, richardson
 
 from mjfim.errors import UnidentifiableError
 from mjfim.excitation.design import design
@@ -18,6 +17,7 @@ from mjfim.information.fisher import Information
 from mjfim.information.marginal import standard_deviations
 from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Sensitivity
+from tests.support.numerics import CART_PARAMETERS, cart_setup, relative_error, richardson
 
 SIGMA = np.array([0.1, 0.5, 2.0])
 

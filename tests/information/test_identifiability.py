@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.numerics import CART_PARAMETERS, Array, cart_setup, make_setup
 
 import mjfim.information.identifiability
 from mjfim.errors import SimulationDiverged, UnidentifiableError
@@ -15,6 +14,7 @@ from mjfim.excitation.design import design, require_designable
 from mjfim.excitation.initial_controls import probes
 from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import PROBES, Survey, require_visible, rows, survey
+from tests.support.numerics import CART_PARAMETERS, Array, cart_setup, make_setup
 
 PRODUCT = {
     "gear": {"target": "actuator/force:gear[0]"},

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.numerics import Array, make_setup
 
 from mjfim.excitation.evaluation import evaluate_trajectory
 from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import survey
 from mjfim.information.null_space import Null, grouped, invisible
+from tests.support.numerics import Array, make_setup
 
 SIZES = np.array([1e-6, 1e-3, 1.0, 1e3, 1e6])
 

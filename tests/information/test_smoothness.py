@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.numerics import Array, Loop, body_setup, cart_setup, filtered_setup, make_setup
 
 from mjfim.excitation.design import design
 from mjfim.experiment.system import Setup
 from mjfim.information.smoothness import TOLERANCE, disagreement, roughness
 from mjfim.records.check import Roughness
+from tests.support.numerics import Array, Loop, body_setup, cart_setup, filtered_setup, make_setup
 
 SLIDER = """
 <mujoco model="slider">

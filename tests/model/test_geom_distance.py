@@ -8,11 +8,11 @@ from itertools import combinations_with_replacement
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import Array, directional_check
 
 from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.model import geom_distance as clearance
 from mjfim.model.geom_distance import Clearance, Distances, pairs
+from tests.support.numerics import Array, directional_check
 
 ROCK = " ".join(f"{v:.3f}" for v in np.random.default_rng(5).normal(scale=0.1, size=60))
 ASSETS = f'<asset><mesh name="rock" vertex="{ROCK}"/><hfield name="hills" nrow="3" ncol="3" size="1 1 .2 .1"/></asset>'

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from cli.test_cli import DESIGN, MODELS, names, read, run
 
 import mjfim
 from mjfim.experiment.system import Setup
 from mjfim.output import folders as results
+from tests.support.cli import DESIGN, MODELS, names, read, run
 
 EXAMPLES = sorted(
     path.stem for path in MODELS.glob("*.toml") if not path.stem.startswith("cart_pendulum")

@@ -9,7 +9,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import Loop, make_setup
 
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.model.inertia import CHARTS
@@ -19,6 +18,7 @@ from mjfim.model.paths import KINDS, PATH, fields_of, names_of, resolve
 from mjfim.model.targets import RotationSlot, Slot, SpecSlot, inertial
 from mjfim.model.variants import Source
 from mjfim.output.mjcf.write import write_identified, write_spec
+from tests.support.numerics import Loop, make_setup
 
 # Two links with inertia from skewed geoms; a position servo; sensors that see sites and geoms.
 ARM = """

@@ -9,7 +9,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import make_setup
 
 import mjfim
 from mjfim.arrays import Array
@@ -19,6 +18,7 @@ from mjfim.model.variants import FREE, STATED
 from mjfim.plant.plant import DRAFT
 from mjfim.plant.plant import DRY as DRY_DIFFERENCES
 from mjfim.records.design import Status
+from tests.support.numerics import make_setup
 
 ARM = """
 <mujoco model="dry">

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.numerics import Array, relative_error
 
 from mjfim.optimize.barrier import Band, Hedge, relaxed
 from mjfim.optimize.lq import TangentCurve, Weights
+from tests.support.numerics import Array, relative_error
 
 INF = np.inf
 S = np.array([-3.0, -0.2, 0.0, 0.04, 0.0499, 0.0501, 0.06, 0.4, 1.0, 3.0])

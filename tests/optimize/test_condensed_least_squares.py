@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.linalg import lstsq
 from scipy.optimize import lsq_linear
-from support.numerics import Array
 
 from mjfim.optimize.condensed_least_squares import Condensed, Step
+from tests.support.numerics import Array
 
 
 @dataclass(frozen=True, eq=False)

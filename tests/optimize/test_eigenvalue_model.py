@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, logm
 from scipy.optimize import minimize
-from support.numerics import Array, cart_setup, relative_error
 
 from mjfim.excitation.constraints import fence_of
 from mjfim.experiment.system import Setup
 from mjfim.information.criteria import smooth_e_optimality
 from mjfim.optimize.eigenvalue_model import Spectral, coordinates, divided, matrix
+from tests.support.numerics import Array, cart_setup, relative_error
 
 VALUES = {"apart": [0.5, 0.85, 2.0], "meeting": [0.5, 0.5 + 5e-10, 0.525]}
 

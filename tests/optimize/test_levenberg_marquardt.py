@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from support.numerics import Array
 
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 from mjfim.optimize.levenberg_marquardt import Progress, Search, Solution, Unknowns, minimise
+from tests.support.numerics import Array
 
 Rows = Callable[[Array, Array], Array]
 FREE = np.inf

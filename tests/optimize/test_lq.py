@@ -9,19 +9,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from mjfim.optimize.lq import Recursion, Riccati, TangentCurve, Weights, descent, growth, regulator
-
-
-def random_system(
-    rng: np.random.Generator, N: int, nx: int, nu: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """A time-varying pair (A, B), mildly unstable."""
-    return np.eye(nx) + 0.2 * rng.normal(size=(N, nx, nx)), rng.normal(size=(N, nx, nu))
-
-
-def positive(rng: np.random.Generator, n: int) -> np.ndarray:
-    """A random symmetric positive definite weight that is not diagonal."""
-    root = rng.normal(size=(n, n))
-    return root @ root.T + 0.5 * np.eye(n)
+from tests.support.lq import positive, random_system, random_weights
 
 
 def dense_solution(A, B, a, b, Q, R, terminal) -> tuple[np.ndarray, np.ndarray]:
@@ -43,14 +31,6 @@ def dense_solution(A, B, a, b, Q, R, terminal) -> tuple[np.ndarray, np.ndarray]:
     solution = np.linalg.solve(KKT, np.concatenate([-g, np.zeros(nz)]))
     z = np.concatenate([np.zeros((1, nx)), solution[:nz].reshape(N, nx)])
     return z, solution[nz : nz + nv].reshape(N, nu)
-
-
-def random_weights(rng: np.random.Generator, N: int, nx: int, nu: int, steps: bool) -> Weights:
-    """Weights that vary over time and couple state and control, positive definite together; zero or positive on steps."""
-    both = [positive(rng, nx + nu) for _ in range(N)]
-    Q = np.array([*(form[:nx, :nx] for form in both), positive(rng, nx)])
-    S, R = np.array([form[nx:, :nx] for form in both]), np.array([form[nx:, nx:] for form in both])
-    return Weights(Q, S, R, rng.uniform(0.0, 5.0, (N + 1, nu)) * steps)
 
 
 def form(weights: Weights, z: np.ndarray, v: np.ndarray) -> float:

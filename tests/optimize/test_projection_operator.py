@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from support.numerics import Array, directional_check
 
 from mjfim.optimize.directions import LBFGS, MetricDescent
 from mjfim.optimize.lq import TangentCurve, growth
@@ -23,6 +22,7 @@ from mjfim.optimize.projection_operator import (
     optimize,
 )
 from mjfim.records.design import Status
+from tests.support.numerics import Array, directional_check
 
 DT, N = 0.05, 60
 START, GOAL = np.array([0.4, 0.0]), np.array([np.pi, 0.0])

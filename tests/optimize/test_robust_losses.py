@@ -7,9 +7,9 @@ from typing import Literal, get_args
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from support.numerics import Array, richardson
 
 from mjfim.optimize.robust_losses import Loss
+from tests.support.numerics import Array, richardson
 
 Kind = Literal["linear", "huber", "soft_l1", "cauchy"]
 KINDS = get_args(Kind)

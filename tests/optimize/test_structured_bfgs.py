@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from optimize.test_lq import random_system, random_weights
 from scipy.optimize import minimize
-from support.numerics import Array, cart_setup, relative_error
 
 from mjfim.optimize.barrier import Band, Hedge
 from mjfim.optimize.lq import Chart, Recursion, TangentCurve, Weights
 from mjfim.optimize.projection_operator import Armijo, Expansion, Regulator, optimize
 from mjfim.optimize.structured_bfgs import BasisMetric, Metric, StructuredBFGS
 from mjfim.records.design import Status
+from tests.support.lq import random_system, random_weights
+from tests.support.numerics import Array, cart_setup, relative_error
 
 N, NX, NU = 12, 3, 2
 

@@ -25,10 +25,10 @@ from mjfim.recordings import read as logs
 from mjfim.records.design import Design
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
+from tests.support.paths import MODELS
 
 Array = NDArray[np.float64]
 
-MODELS = Path(__file__).parents[2] / "models"
 N, NQ, NV, NU, P = 40, 2, 2, 1, 3
 
 

@@ -11,8 +11,6 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.numerics import MODELS, SHARED, make_setup, shared_model
-from support.shared_models import EXPERIMENTS
 
 import mjfim
 from mjfim.errors import ModelError
@@ -22,6 +20,9 @@ from mjfim.output.mjcf.actuators import SHORTCUTS
 from mjfim.output.mjcf.document import Sheet
 from mjfim.output.mjcf.write import COMPARED, NOT_DYNAMICS, write_identified
 from mjfim.output.mjcf.xml_edit import Markup
+from tests.support.numerics import make_setup, shared_model
+from tests.support.paths import MODELS, SHARED_MODELS
+from tests.support.shared_models import EXPERIMENTS
 
 PRECISE = 1e-12
 
@@ -617,7 +618,7 @@ def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_models_of_others(name: str, tmp_path: Path) -> None:
     shared_model(EXPERIMENTS[name]["model"])
-    setup = Setup(mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED, source=name))
+    setup = Setup(mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED_MODELS, source=name))
     theta = setup.parameters.guess * (
         1.0 + 0.03 * np.random.default_rng(1).uniform(-1.0, 1.0, len(setup.parameters))
     )

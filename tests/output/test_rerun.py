@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from tests.support.paths import ROOT, SHARED_MODELS
+
 pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
 
@@ -27,13 +29,11 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
-ROOT = Path(__file__).parents[2]
-SHARED = ROOT.parent / "shared" / "models"
 MODELS = {
     "cart": ROOT / "models" / "cart_pendulum.xml",
-    "acrobot": SHARED / "dmc_acrobot" / "acrobot.xml",
-    "panda": SHARED / "menagerie_panda" / "panda_nomesh.xml",
-    "panda without geoms": SHARED / "menagerie_panda" / "panda_nohand_nomesh.xml",
+    "acrobot": SHARED_MODELS / "dmc_acrobot" / "acrobot.xml",
+    "panda": SHARED_MODELS / "menagerie_panda" / "panda_nomesh.xml",
+    "panda without geoms": SHARED_MODELS / "menagerie_panda" / "panda_nohand_nomesh.xml",
 }
 
 ZOO = """

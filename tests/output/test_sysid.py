@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from mujoco import sysid
-from support.numerics import Array, body_setup, filtered_setup
 
 import mjfim
 from mjfim.errors import ExperimentError
@@ -24,8 +23,9 @@ from mjfim.identification.residuals import Fit
 from mjfim.output.archive import write_recording
 from mjfim.output.mjcf.write import same_dynamics
 from mjfim.records.recording import Recording
+from tests.support.numerics import Array, body_setup, filtered_setup
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 CART = ROOT / "models" / "cart_pendulum.toml"
 UNEQUAL = {"qpos:slide": 0.05, "qpos:hinge": 0.05, "qvel:slide": 0.005, "qvel:hinge": 0.005}
 installed = pytest.mark.skipif(

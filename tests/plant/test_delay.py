@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.numerics import Array, cart_setup, richardson
 
 from mjfim.plant.delay import Lag
+from tests.support.numerics import Array, cart_setup, richardson
 
 DT = 0.01
 T = np.arange(120) * DT

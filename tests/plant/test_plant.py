@@ -9,7 +9,17 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
-from support.numerics import (
+
+from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.experiment.system import Setup
+from mjfim.model.loading import compile_spec, load_spec, unconstrained
+from mjfim.model.mujoco_log import quiet
+from mjfim.model.variants import Source
+from mjfim.optimize.lq import Recursion, TangentCurve, regulator
+from mjfim.output.mjcf.write import write_spec
+from mjfim.plant.plant import CENTRAL, FAST
+from mjfim.records.trajectory import Linearization
+from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,
     Array,
@@ -21,16 +31,6 @@ from support.numerics import (
     relative_error,
     shared_model,
 )
-
-from mjfim.errors import ExperimentError, SimulationDiverged
-from mjfim.experiment.system import Setup
-from mjfim.model.loading import compile_spec, load_spec, unconstrained
-from mjfim.model.mujoco_log import quiet
-from mjfim.model.variants import Source
-from mjfim.optimize.lq import Recursion, TangentCurve, regulator
-from mjfim.output.mjcf.write import write_spec
-from mjfim.plant.plant import CENTRAL, FAST
-from mjfim.records.trajectory import Linearization
 
 SENSED = {"angle": 0.01, "rate": 0.05, "acc": 0.3, "drive": 0.1}
 SAMPLES = (0, 7, 23, 49)

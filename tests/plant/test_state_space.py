@@ -5,9 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import Loop
 
 from mjfim.plant.batch import state_space
+from tests.support.numerics import Loop
 
 EVERY_JOINT = """
 <mujoco>

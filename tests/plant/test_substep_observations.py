@@ -8,48 +8,14 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import Array, Loop, make_setup, relative_error
 
 from mjfim.excitation.constraints import fence_of, looked_at
 from mjfim.experiment.system import Setup
 from mjfim.plant.batch import Taps
 from mjfim.plant.plant import CENTRAL, DRAFT, FAST
+from tests.support.limits import FLOATING, floating_setup
+from tests.support.numerics import Array, Loop, relative_error
 
-# An arm of two servos on a hull that floats: addresses of positions, velocities, joints and actuators all differ. One
-# servo has an activation state, one a clamp that acts, one joint a clamp on what actuators may do to it.
-FLOATING = """
-<mujoco model="floating">
-  <option timestep="0.002" integrator="{integrator}" gravity="0 0 -1"><flag contact="disable"/></option>
-  <default><geom contype="0" conaffinity="0"/></default>
-  <worldbody>
-    <body name="hull" pos="0 0 1">
-      <freejoint name="float"/>
-      <geom type="box" size="0.2 0.1 0.1" mass="3"/>
-      <body name="upper" pos="0.2 0 0">
-        <joint name="shoulder" axis="0 1 0" damping="0.1" armature="0.01" actuatorfrcrange="-0.9 0.9"/>
-        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.5"/>
-        <body name="fore" pos="0.3 0 0">
-          <joint name="elbow" axis="0 0 1" damping="0.1" armature="0.005" range="-3 3" limited="false"/>
-          <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.3"/>
-          <site name="tip" pos="0.25 0 0"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor name="thrust" joint="float" gear="0 0 1 0 0 0"/>
-    <general name="shoulder" joint="shoulder" dyntype="filter" dynprm="0.03" gainprm="20" biastype="affine" biasprm="0 -20 -0.5"/>
-    <position name="elbow" joint="elbow" kp="12" kv="0.3" forcerange="-0.7 0.7"/>
-  </actuator>
-  <sensor><gyro name="gyro" site="tip"/></sensor>
-</mujoco>
-"""
-LIMITS = {
-    "position": {"elbow": (-2.0, 2.0), "shoulder": (-1.5, 2.5)},
-    "velocity": {"shoulder": 9.0},
-    "acceleration": 300.0,
-    "force": {"shoulder": 8.0, "thrust": 50.0},
-}
 # kinds, names in the order of the taps
 SHOWN = [
     ("position", "shoulder"),
@@ -62,33 +28,6 @@ SHOWN = [
     ("force", "elbow"),
     ("joint_force", "shoulder"),
 ]
-
-
-def floating_setup(folder: Path, integrator: str = "implicitfast", **tables: Any) -> Setup:
-    """The floating arm, swinging: 0.3 s of five engine steps per sample; every state is measured."""
-    tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
-    control = {
-        "kind": "sine",
-        "amplitude": {"thrust": 4.0, "shoulder": 0.6, "elbow": 0.5},
-        "offset": {"thrust": 3.0, "shoulder": 0.2, "elbow": 0.1},
-        "frequency": 2.0,
-    }
-    defaults: dict[str, Any] = {
-        "horizon": 0.3,
-        "parameters": {
-            "m": {"target": "body/fore:mass"},
-            "c": {"target": "joint/shoulder:damping"},
-        },
-        "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01, "qvel:elbow": 0.05},
-        "limits": LIMITS,
-        "initial": {
-            "qpos": (0.0, 0.0, 1.0, *tilt.tolist(), 0.4, -0.3),
-            "qvel": (0.1, 0.0, 0.2, 0.5, -0.4, 0.3, 1.0, -2.0),
-            "act": (0.1,),
-            "control": control,
-        },
-    }
-    return make_setup(FLOATING.format(integrator=integrator), folder, **{**defaults, **tables})
 
 
 def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:

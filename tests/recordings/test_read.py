@@ -15,11 +15,11 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.output.archive import write_table
 from mjfim.recordings.read import Logged, read_log, read_recording
+from tests.support.paths import SHARED_DATA
 
 Array = NDArray[np.float64]
 Read = Callable[..., Logged]
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
 ARM = """
 <mujoco>
   <option timestep="0.001"/>
@@ -561,8 +561,9 @@ def test_names_beside_matrices(tmp_path: Path) -> None:
 def test_bags_are_recordings(tmp_path: Path) -> None:
     """Positions and velocities by the joints' names; the control has to be named."""
     pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
-    from recordings.test_ros2_bag import EPOCH, State, write
     from rosbags.rosbag2 import StoragePlugin
+
+    from tests.support.ros2_bag import EPOCH, State, write
 
     states = [
         State(
@@ -636,9 +637,9 @@ ROBOTS: dict[str, dict[str, Any]] = {
 
 def robot(pattern: str, folder: Path, **changes: Any) -> tuple[list[Path], Setup]:
     """Logs of one of them and how they are read; skips where they are absent."""
-    files = sorted(DATA.glob(pattern))
+    files = sorted(SHARED_DATA.glob(pattern))
     if not files:
-        pytest.skip(f"no logs of robots at {DATA}")
+        pytest.skip(f"no logs of robots at {SHARED_DATA}")
     double = "double" in pattern
     model = ONE.format(
         inner=INNER if double else "", motor='<motor name="two" joint="two"/>' if double else ""

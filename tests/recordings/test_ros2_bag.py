@@ -5,8 +5,6 @@ from __future__ import annotations
 import builtins
 import importlib
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,55 +17,13 @@ from mjfim.recordings.spec import RecordingSpec
 
 pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
 
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import StoragePlugin
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-EPOCH = 1_700_000_000_123_456_789  # [ns]
+from tests.support.ros2_bag import EPOCH, State, write
+
 PERIOD = 2_000_000  # [ns]
 ALL = RecordingSpec()
 both = pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-
-
-@dataclass(frozen=True)
-class State:
-    """A message. stamp, received: [ns]"""
-
-    stamp: int
-    names: Sequence[str]
-    position: Sequence[float] = ()
-    velocity: Sequence[float] = ()
-    effort: Sequence[float] = ()
-    received: int | None = None
-
-
-def message(state: State) -> Any:
-    """As ROS has it."""
-    types = STORE.types
-    stamp = types["builtin_interfaces/msg/Time"](
-        sec=state.stamp // 10**9, nanosec=state.stamp % 10**9
-    )
-    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="base")
-    arrays = (np.array(v, dtype=np.float64) for v in (state.position, state.velocity, state.effort))
-    return types["sensor_msgs/msg/JointState"](header, list(state.names), *arrays)
-
-
-def write(path: Path, storage: Any, topics: dict[str, list[State]], text: bool = False) -> Path:
-    """A bag's folder; text: with a topic of another type."""
-    with Writer(path, version=9, storage_plugin=storage) as writer:
-        if text:
-            other = writer.add_connection("/log", "std_msgs/msg/String", typestore=STORE)
-            raw = STORE.serialize_cdr(
-                STORE.types["std_msgs/msg/String"](data="hello"), "std_msgs/msg/String"
-            )
-            writer.write(other, EPOCH, raw)
-        for topic, states in topics.items():
-            kind = "sensor_msgs/msg/JointState"
-            connection = writer.add_connection(topic, kind, typestore=STORE)
-            for state in states:
-                received = state.stamp + 500_000 if state.received is None else state.received
-                writer.write(connection, received, STORE.serialize_cdr(message(state), kind))
-    return path
 
 
 def swing(count: int = 20) -> list[State]:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -28,24 +26,11 @@ from mjfim.studies.baselines.parametric import (
     tournament,
 )
 from mjfim.studies.compare import _tried
+from tests.support.baselines import pendulum, played
+from tests.support.paths import MODELS
 
-MODELS = Path(__file__).parents[2] / "models"
 STEPS = 120_000
 FRAME = Frame(np.arange(500) * 0.01, 5.0, 2, 0.1, 5.0, jumps=True)
-
-
-def pendulum(bandwidth: float | None = None, **tables: Any) -> Experiment:
-    """Two seconds of the cart-pendulum, by its limits alone."""
-    hard = {
-        "horizon": 2.0,
-        "limits": {
-            "control": {"force": (-5.0, 5.0)},
-            "position": {"slide": (-0.5, 0.5)},
-            "bandwidth": bandwidth,
-        },
-        "cost": {"control": 0.0, "tracking": {}},
-    }
-    return Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**{**hard, **tables})
 
 
 def arm(**limits: Any) -> Experiment:
@@ -62,22 +47,6 @@ def arm(**limits: Any) -> Experiment:
 def found(method: str) -> Attempt:
     """What a method finds on the cart-pendulum with a small budget of steps."""
     return perform(Job(pendulum(), method, 60.0, STEPS, seed=1))
-
-
-def played(experiment: Experiment, control: Array) -> tuple[Array, Array, Array]:
-    """(n+1, nq), (n+1, nv) at every engine step and (n, nu) the controls, by a plain loop on the user's model."""
-    setup = Setup(experiment)
-    model = setup.model_at(setup.theta)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key(experiment.initial.keyframe).id)
-    qpos, qvel, ctrl = [data.qpos.copy()], [data.qvel.copy()], []
-    for u in np.repeat(control, setup.substeps, axis=0):
-        data.ctrl[:] = u
-        mujoco.mj_step(model, data)
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
-        ctrl.append(u)
-    return np.array(qpos), np.array(qvel), np.array(ctrl)
 
 
 # ---- shapes

@@ -15,7 +15,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.numerics import MODELS, cart_setup
 
 import mjfim
 from mjfim.arrays import Array
@@ -26,6 +25,8 @@ from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import restated
+from tests.support.numerics import cart_setup
+from tests.support.paths import MODELS
 
 SCRIPTS = MODELS.parent / "scripts"
 loop = importlib.import_module("mjfim.studies.campaign")  # `mjfim.sequential` is the function

@@ -6,15 +6,6 @@ import gzip
 
 import numpy as np
 import pytest
-from support.numerics import (
-    CART_PARAMETERS,
-    MODELS,
-    SHARED,
-    Array,
-    cart_setup,
-    make_setup,
-    relative_error,
-)
 
 import mjfim
 from mjfim.experiment.system import Setup
@@ -24,8 +15,10 @@ from mjfim.output import archive
 from mjfim.plant.plant import Plant
 from mjfim.records.recording import Recording
 from mjfim.studies.check import check
+from tests.support.numerics import CART_PARAMETERS, Array, cart_setup, make_setup, relative_error
+from tests.support.paths import MODELS, SHARED_DATA
 
-RECORDED = SHARED.parent / "data" / "dfki_double_pendulum"
+RECORDED = SHARED_DATA / "dfki_double_pendulum"
 PRODUCT = {
     "gear": {"target": "actuator/force:gear[0]"},
     "gain": {"target": "actuator/force:gainprm[0]"},

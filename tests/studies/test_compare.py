@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli.test_cli import loads, names, read, run, write_experiment
 from matplotlib.image import imread
-from studies.test_baselines import pendulum, played
 
 import mjfim
 from mjfim.errors import ExperimentError
@@ -24,6 +22,8 @@ from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodRe
 from mjfim.records.design import Design, HistoryRow
 from mjfim.studies.baselines.budget import Attempt
 from mjfim.studies.compare import Glance, Judge, Meter, chosen_methods
+from tests.support.baselines import pendulum, played
+from tests.support.cli import loads, names, read, run, write_experiment
 
 compare = importlib.import_module(
     "mjfim.studies.compare"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest, norm
@@ -16,8 +14,8 @@ from mjfim.experiment.system import Setup
 from mjfim.identification.identify import identify
 from mjfim.records.recording import Recording
 from mjfim.studies.monte_carlo import _statistics, monte_carlo
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 # Table III of the paper, diagonal, initial trajectory, 25 Hz
 PAPER_BOUND = np.array([1.04e-3, 2.26e-3, 4.57e-2])
 

@@ -16,7 +16,6 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.stats import binom
-from support.numerics import Array, body_setup, cart_setup, filtered_setup
 
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError
@@ -28,8 +27,9 @@ from mjfim.output import archive
 from mjfim.output.playback import design_columns, playback_of, reference_columns
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.playback import Playback
+from tests.support.numerics import Array, body_setup, cart_setup, filtered_setup
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).parents[2]
 FILTERED_FINE = {"rate": 50.0, "playback_rate": 100.0}  # of an engine at 200 Hz
 COARSE = {"rate": 25.0, "horizon": 0.8}  # of engines at 100 Hz
 BUILD: dict[str, Any] = {

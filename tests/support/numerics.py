@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
+from tests.support.paths import SHARED_MODELS
 
 Array = NDArray[np.float64]
 
-MODELS = Path(__file__).parents[2] / "models"
-SHARED = Path(__file__).parents[3] / "shared" / "models"
 
 # A pendulum on a cart, by one of the integrators; every joint free of limits, no contacts.
 CART_PENDULUM = """
@@ -113,7 +112,7 @@ FILTERED_PARAMETERS = {
 
 def shared_model(relative: str) -> Path:
     """Path of a model that others wrote; skips the test where it is absent."""
-    path = SHARED / relative
+    path = SHARED_MODELS / relative
     if not path.is_file():
         pytest.skip(f"the shared model {relative} is not here")
     return path

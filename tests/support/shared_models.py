@@ -1,6 +1,6 @@
 """Experiments for the models of others: name -> keyword arguments of `mjfim.Experiment`. Data only.
 
-Model paths are relative to ../shared/models beside the repository's root (`numerics.SHARED`).
+Model paths are relative to `paths.SHARED_MODELS`.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ from mjfim.experiment.system import Setup
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.plant import CENTRAL
 from mjfim.records.design import Status
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 EIGENVALUES = {
     "true": (0.87398028, 19.3587854, 38.1413276),
     "guess": (0.54702697, 18.1770570, 25.1244795),

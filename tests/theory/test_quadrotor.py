@@ -7,11 +7,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import MODELS, Loop
 
 import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import Setup
+from tests.support.numerics import Loop
+from tests.support.paths import MODELS
 
 TUMBLE = {
     "qpos": (0.0, 0.0, 2.0, 0.8, 0.4, -0.4, 0.2),

@@ -7,13 +7,14 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from support.numerics import SHARED, shared_model
-from support.shared_models import EXPERIMENTS
 
 import mjfim
 from mjfim.errors import ModelError
 from mjfim.model.loading import compile_spec, load_spec
 from mjfim.records.design import Status
+from tests.support.numerics import shared_model
+from tests.support.paths import SHARED_MODELS
+from tests.support.shared_models import EXPERIMENTS
 
 GAIN = 10.0
 
@@ -21,12 +22,12 @@ GAIN = 10.0
 def experiment(name: str) -> mjfim.Experiment:
     """The experiment of this name, beside its model; skips where that is absent."""
     shared_model(EXPERIMENTS[name]["model"])
-    return mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED, source=name)
+    return mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED_MODELS, source=name)
 
 
 def whole() -> list[Path]:
     """Every MJCF that stands alone: no parts that others include, none whose meshes were not copied."""
-    files = sorted(SHARED.glob("*/*.xml"))
+    files = sorted(SHARED_MODELS.glob("*/*.xml"))
     texts = [path.read_text(encoding="utf-8") for path in files]
     return [
         path
@@ -36,8 +37,8 @@ def whole() -> list[Path]:
 
 
 def test_every_shared_model_loads() -> None:
-    if not SHARED.is_dir():
-        pytest.skip(f"no shared models at {SHARED}")
+    if not SHARED_MODELS.is_dir():
+        pytest.skip(f"no shared models at {SHARED_MODELS}")
     loaded = set()
     for path in whole():
         if (
@@ -51,7 +52,7 @@ def test_every_shared_model_loads() -> None:
         mujoco.mj_step(model, data)
         assert np.isfinite(data.qpos).all()
         loaded.add(path.parent.name)
-    assert loaded == {folder.name for folder in SHARED.iterdir() if folder.is_dir()}
+    assert loaded == {folder.name for folder in SHARED_MODELS.iterdir() if folder.is_dir()}
 
 
 @pytest.mark.parametrize("name", list(EXPERIMENTS))

@@ -1,0 +1,47 @@
+"""An experiment under limits for the baselines, and an independent simulation of a control."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from tests.support.numerics import Array
+from tests.support.paths import MODELS
+
+
+def pendulum(bandwidth: float | None = None, **tables: Any) -> Experiment:
+    """The cart-pendulum over two seconds under hard limits, without weights; bandwidth in Hz."""
+    hard = {
+        "horizon": 2.0,
+        "limits": {
+            "control": {"force": (-5.0, 5.0)},
+            "position": {"slide": (-0.5, 0.5)},
+            "bandwidth": bandwidth,
+        },
+        "cost": {"control": 0.0, "tracking": {}},
+    }
+    return Experiment.from_file(MODELS / "cart_pendulum.toml").replace(**{**hard, **tables})
+
+
+def played(experiment: Experiment, control: Array) -> tuple[Array, Array, Array]:
+    """Simulate a control (N, nu) on the user's model by a plain loop around `mj_step`.
+
+    Returns:
+        Positions (n+1, nq), velocities (n+1, nv) and controls (n, nu) at all n engine steps.
+    """
+    setup = Setup(experiment)
+    model = setup.model_at(setup.theta)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key(experiment.initial.keyframe).id)
+    qpos, qvel, ctrl = [data.qpos.copy()], [data.qvel.copy()], []
+    for u in np.repeat(control, setup.substeps, axis=0):
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data)
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+        ctrl.append(u)
+    return np.array(qpos), np.array(qvel), np.array(ctrl)

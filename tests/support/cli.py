@@ -1,0 +1,104 @@
+"""Run the command line inside the test process, on a short study; check its files and its errors."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+from typer.testing import CliRunner, Result
+
+from mjfim.cli import main as cli
+from tests.support.paths import MODELS
+
+# Files that `mjfim design` writes.
+DESIGN = {
+    "design.json",
+    "design.npz",
+    "design.csv",
+    "reference.csv",
+    "design.rrd",
+    "trajectories.png",
+    "sensitivity_phase.png",
+    "convergence.png",
+    "standard_deviations.png",
+    "table_eigenvalues.png",
+}
+
+# Files that `mjfim identify` writes.
+ESTIMATE = {"estimate.json", "identified.xml", "estimate.rrd"} | {
+    f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions")
+}
+
+# Files that `mjfim montecarlo` writes for the cart-pendulum.
+STUDY = {
+    "montecarlo.json",
+    "histogram_m.png",
+    "histogram_l.png",
+    "histogram_c.png",
+    "table_covariance.png",
+}
+
+
+def run(*words: object) -> Result:
+    """Run `mjfim` with these words in this process."""
+    return CliRunner().invoke(cli.app, [str(word) for word in words])
+
+
+def write_experiment(home: Path, **lines: str) -> Path:
+    """Write the paper's study with a short horizon and a loose tolerance; return its experiment file.
+
+    Args:
+        home: Folder that receives the experiment, its model and its initial control.
+        **lines: New values of single keys of the experiment file; `start` is the initial control.
+
+    Raises:
+        ValueError: A key is missing in the experiment file or stands there more than once.
+    """
+    for file in ("cart_pendulum.xml", "cart_pendulum.csv"):
+        if not (home / file).exists():
+            shutil.copy(MODELS / file, home)
+
+    text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")
+    values = {"horizon": "1.0", "tolerance": "0.1", "max_iterations": "40", **lines}
+
+    for key, value in values.items():
+        # The cost also has a key `control`; only the initial control is a string.
+        name, quote = ("control", '"') if key == "start" else (key, "")
+        pattern = rf"^{name} = {quote}.*$"
+        text, count = re.subn(pattern, f"{name} = {value}", text, flags=re.MULTILINE)
+        if count != 1:
+            raise ValueError(f"{key} does not stand exactly once in the experiment file")
+
+    path = home / "study.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def loads(text: str) -> dict[str, Any]:
+    """Parse a JSON object."""
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds one object."""
+    return loads(path.read_text(encoding="utf-8"))
+
+
+def names(folder: Path) -> set[str]:
+    """Names of all entries of a folder, hidden files too."""
+    return {path.name for path in folder.iterdir()}
+
+
+def misused(result: Result, *fragments: str) -> None:
+    """Assert exit code 2 and one message of one line on stderr that contains all fragments, without a traceback."""
+    assert isinstance(result.exception, SystemExit), repr(result.exception)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith("mjfim: ")
+    assert result.stderr.count("mjfim: ") == 1
+    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    assert [f for f in fragments if f not in result.stderr] == []

@@ -1,0 +1,130 @@
+"""Models and setups that tests of hard limits share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjfim.experiment.system import Setup
+from tests.support.numerics import Array, cart_setup, make_setup
+
+# An arm of two servos on a floating hull: the addresses of positions, velocities, joints and actuators all differ.
+# One servo has an activation state, the other a limited force; one joint limits the force of its actuators.
+FLOATING = """
+<mujoco model="floating">
+  <option timestep="0.002" integrator="{integrator}" gravity="0 0 -1"><flag contact="disable"/></option>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="hull" pos="0 0 1">
+      <freejoint name="float"/>
+      <geom type="box" size="0.2 0.1 0.1" mass="3"/>
+      <body name="upper" pos="0.2 0 0">
+        <joint name="shoulder" axis="0 1 0" damping="0.1" armature="0.01" actuatorfrcrange="-0.9 0.9"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.5"/>
+        <body name="fore" pos="0.3 0 0">
+          <joint name="elbow" axis="0 0 1" damping="0.1" armature="0.005" range="-3 3" limited="false"/>
+          <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.3"/>
+          <site name="tip" pos="0.25 0 0"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="thrust" joint="float" gear="0 0 1 0 0 0"/>
+    <general name="shoulder" joint="shoulder" dyntype="filter" dynprm="0.03" gainprm="20" biastype="affine" biasprm="0 -20 -0.5"/>
+    <position name="elbow" joint="elbow" kp="12" kv="0.3" forcerange="-0.7 0.7"/>
+  </actuator>
+  <sensor><gyro name="gyro" site="tip"/></sensor>
+</mujoco>
+"""
+
+# Limits of several kinds for the floating arm.
+FLOATING_LIMITS = {
+    "position": {"elbow": (-2.0, 2.0), "shoulder": (-1.5, 2.5)},
+    "velocity": {"shoulder": 9.0},
+    "acceleration": 300.0,
+    "force": {"shoulder": 8.0, "thrust": 50.0},
+}
+
+
+def floating_setup(folder: Path, integrator: str = "implicitfast", **tables: Any) -> Setup:
+    """The floating arm, swinging: 0.3 s of five engine steps per sample; every state is measured."""
+    tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
+    control = {
+        "kind": "sine",
+        "amplitude": {"thrust": 4.0, "shoulder": 0.6, "elbow": 0.5},
+        "offset": {"thrust": 3.0, "shoulder": 0.2, "elbow": 0.1},
+        "frequency": 2.0,
+    }
+    defaults: dict[str, Any] = {
+        "horizon": 0.3,
+        "parameters": {
+            "m": {"target": "body/fore:mass"},
+            "c": {"target": "joint/shoulder:damping"},
+        },
+        "noise": {"qpos:shoulder": 0.01, "qpos:elbow": 0.01, "qvel:elbow": 0.05},
+        "limits": FLOATING_LIMITS,
+        "initial": {
+            "qpos": (0.0, 0.0, 1.0, *tilt.tolist(), 0.4, -0.3),
+            "qvel": (0.1, 0.0, 0.2, 0.5, -0.4, 0.3, 1.0, -2.0),
+            "act": (0.1,),
+            "control": control,
+        },
+    }
+    return make_setup(FLOATING.format(integrator=integrator), folder, **{**defaults, **tables})
+
+
+# A planar arm of two torque-controlled servos over a floor, with a post in its way.
+ARM = """
+<mujoco model="arm">
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 0.1" pos="0 0 -0.42"/>
+    <geom name="post" type="sphere" size="0.05" pos="0.56 0 -0.3"/>
+    <body name="upper" pos="0 0 0">
+      <joint name="shoulder" axis="0 1 0" damping="0.3" armature="0.02"/>
+      <geom name="upper" type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="0.8"/>
+      <body name="fore" pos="0.3 0 0">
+        <joint name="elbow" axis="0 1 0" damping="0.2" armature="0.01"/>
+        <geom name="fore" type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.4"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="shoulder" joint="shoulder" kp="40" kv="1"/>
+    <general name="elbow" joint="elbow" gainprm="25" biastype="affine" biasprm="0 -25 -0.5"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def directions_of(setup: Setup, count: int, seed: int = 0) -> Array:
+    """Random changes of the control, half of them smooth and half of them rough: (count, N, nu)."""
+    rng, t = np.random.default_rng(seed), setup.t[:, None] / setup.experiment.horizon
+    nu = setup.control.shape[1]
+    smooth = [
+        np.sin(2 * np.pi * rng.uniform(0.5, 3.0, nu) * t + rng.uniform(0, 6, nu))
+        for _ in range(count // 2)
+    ]
+    return np.array([*smooth, *rng.normal(size=(count - count // 2, *setup.control.shape))])
+
+
+# Limits that the cart-pendulum meets quickly.
+HARD = {
+    "control": {"force": (-5.0, 5.0)},
+    "position": {"slide": (-0.3, 0.5)},
+    "velocity": {"hinge": 3.0},
+}
+
+
+def cart_inside(folder: Path, **tables: Any) -> Setup:
+    """The cart-pendulum over one second under the limits `HARD`, without weights on control or state."""
+    defaults: dict[str, Any] = {
+        "horizon": 1.0,
+        "cost": {"control": 0.0},
+        "limits": HARD,
+        "descent": {"max_iterations": 30},
+    }
+    return cart_setup(folder, **{**defaults, **tables})

@@ -1,0 +1,29 @@
+"""Where the repository, its models and scripts, and the data of others beside it are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def _repository() -> Path:
+    """The nearest folder above this file that holds pyproject.toml."""
+    for folder in Path(__file__).resolve().parents:
+        if (folder / "pyproject.toml").is_file():
+            return folder
+
+    raise FileNotFoundError(f"no pyproject.toml in a folder above {__file__}")
+
+
+# The repository's top folder.
+ROOT = _repository()
+
+# The experiments and MuJoCo models that the package ships.
+MODELS = ROOT / "models"
+
+# The scripts that users copy.
+SCRIPTS = ROOT / "scripts"
+
+# Models and recordings of others; the folder lies beside the repository and may be absent.
+SHARED = ROOT.parent / "shared"
+SHARED_MODELS = SHARED / "models"
+SHARED_DATA = SHARED / "data"
