@@ -62,7 +62,7 @@ def identify(
             for paths in (recordings, held_out or [])
         )
         if not as_json:
-            out.print(report.looks_report([log.look for log in (*loaded, *kept)]))
+            out.print(report.log_report([log.summary for log in (*loaded, *kept)]))
 
         def tell(what: str, iterate: Progressed) -> None:
             text = f"{what}: iteration {iterate.iteration}, half of the squares {iterate.cost:.6g}, step {iterate.size:.2g} σ"

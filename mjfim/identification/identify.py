@@ -39,7 +39,7 @@ from mjfim.optimize.levenberg_marquardt import (
     minimise,
 )
 from mjfim.plant.noise import Noise
-from mjfim.recordings.plausibility import doubts
+from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import Estimate, MissingTerm
 from mjfim.records.recording import Recording
 
@@ -392,7 +392,7 @@ class _Identification:
         yield from (
             f"poor data in {Path(r.name).name}: {said}"
             for r in fit.recordings
-            for said in doubts(self.setup.channels, r)
+            for said in plausibility_remarks(self.setup.channels, r)
         )
 
 

@@ -103,32 +103,38 @@ def estimate_report(estimate: Estimate, units: tuple[str, ...]) -> RenderableTyp
     return Group(table, *lines, *told_apart, Text(note, style="dim"), *_warnings(estimate.warnings))
 
 
-def looks_report(looks: Sequence[LogSummary]) -> RenderableType:
+def log_report(summaries: Sequence[LogSummary]) -> RenderableType:
     """What was read: the clock of every log, then the range of its columns."""
     table = Table(title="What was read", title_justify="left")
     for heading in ("log", "rows", "time", "rate", "jitter", "longest gap", "left out"):
         table.add_column(heading, justify="left" if heading == "log" else "right")
-    for own in looks:
+    for summary in summaries:
         clock = (
-            f"{own.rate:.5g} Hz",
-            f"{1e3 * own.jitter_std:.2g} ms",
-            f"{1e3 * own.longest:.3g} ms",
+            f"{summary.rate:.5g} Hz",
+            f"{1e3 * summary.jitter_std:.2g} ms",
+            f"{1e3 * summary.longest_step:.3g} ms",
         )
-        left = f"{own.dropped:,} rows" if own.dropped else "-"
+        left = f"{summary.dropped:,} rows" if summary.dropped else "-"
         table.add_row(
-            escape(shortened(own.file, 34)), f"{own.rows:,}", f"{own.duration:.4g} s", *clock, left
+            escape(shortened(summary.file, 34)),
+            f"{summary.rows:,}",
+            f"{summary.duration:.4g} s",
+            *clock,
+            left,
         )
     ranges = Table(title="Range of its columns (all logs)", title_justify="left")
     for heading in ("column", "from", "least", "largest", "resolution", "empty"):
         ranges.add_column(heading, justify="left" if heading in ("column", "from") else "right")
-    for name in dict.fromkeys(column.name for own in looks for column in own.columns):
-        some = [column for own in looks for column in own.columns if column.name == name]
+    for name in dict.fromkeys(column.name for summary in summaries for column in summary.columns):
+        some = [
+            column for summary in summaries for column in summary.columns if column.name == name
+        ]
         low, high = (
             f([getattr(c, key) for c in some])
             for f, key in ((np.nanmin, "minimum"), (np.nanmax, "maximum"))
         )
         finest = min((c.resolution for c in some if c.resolution > 0.0), default=0.0)
-        empty = float(np.mean([c.empty for c in some]))
+        empty = float(np.mean([c.empty_share for c in some]))
         told = f"{100 * empty:.0f} %" if empty else "-"
         ranges.add_row(
             escape(name), escape(some[0].source), f"{low:.4g}", f"{high:.4g}", f"{finest:.2g}", told

@@ -23,7 +23,7 @@ APART = 0.1  # of the way, by which positions and the integral of velocities may
 STRETCH = 0.2  # [s] over which they are compared
 
 
-def doubts(channels: Channels, recording: Recording) -> tuple[str, ...]:
+def plausibility_remarks(channels: Channels, recording: Recording) -> tuple[str, ...]:
     """Sentences; none where nothing speaks against the data."""
     t = recording.t[:ROWS]
     return (

@@ -35,11 +35,11 @@ ROUNDING = 1e-9  # [s] by which a time may miss the window
 
 
 @dataclass(frozen=True, eq=False)
-class Logged:
+class Log:
     """A recording and how the log looked that it was read from."""
 
     recording: Recording
-    look: LogSummary
+    summary: LogSummary
 
 
 def read_recording(path: Path, channels: Channels) -> Recording:
@@ -47,7 +47,7 @@ def read_recording(path: Path, channels: Channels) -> Recording:
     return read_log(path, channels).recording
 
 
-def read_log(path: Path, channels: Channels) -> Logged:
+def read_log(path: Path, channels: Channels) -> Log:
     """A recording and how its log looks. Raises RecordingError naming file and column."""
     spec = channels.spec
     check_spec(channels)
@@ -67,7 +67,7 @@ def read_log(path: Path, channels: Channels) -> Logged:
     summary = summarize(
         str(path), t, columns, {name: source.column for name, source in plan.items()}, dropped
     )
-    return Logged(Recording(t, ctrl, y, measured, str(path)), summary)
+    return Log(Recording(t, ctrl, y, measured, str(path)), summary)
 
 
 def check_spec(channels: Channels) -> None:

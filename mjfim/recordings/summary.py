@@ -16,7 +16,7 @@ ROUNDING = 1e-12  # of the largest value: closer ones are one value, computed tw
 class ColumnSummary:
     """One column of a recording, in the model's unit.
 
-    source: column of the log;  minimum, maximum: NaN where it is empty;  empty: share of the rows, 0 ... 1
+    source: column of the log;  minimum, maximum: NaN where it is empty;  empty_share: share of the rows, 0 ... 1
     resolution: least difference between two values that differ, 0 where none do
     """
 
@@ -24,7 +24,7 @@ class ColumnSummary:
     source: str
     minimum: float
     maximum: float
-    empty: float
+    empty_share: float
     resolution: float
 
 
@@ -33,7 +33,7 @@ class LogSummary:
     """One log as it was read.
 
     duration [s];  rate: [Hz] from the median step;  jitter_std, jitter_max: [s] of the steps about their median
-    longest: [s] longest step;  dropped: rows outside the window
+    longest_step: [s] longest step;  dropped: rows outside the window
     """
 
     file: str
@@ -42,7 +42,7 @@ class LogSummary:
     rate: float
     jitter_std: float
     jitter_max: float
-    longest: float
+    longest_step: float
     dropped: int
     columns: tuple[ColumnSummary, ...]
 

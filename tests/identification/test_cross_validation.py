@@ -8,7 +8,7 @@ import pytest
 import mjfim
 from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
-from mjfim.recordings.plausibility import doubts
+from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.recording import Recording
 from tests.support.paths import ROOT
 
@@ -104,20 +104,22 @@ def test_per_recording_belongs_to_nuisance(base: mjfim.Experiment) -> None:
 def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experiment) -> None:
     setup = Setup(base)
     good = recorded(setup, 0)
-    assert doubts(setup.channels, good) == ()
+    assert plausibility_remarks(setup.channels, good) == ()
     rng = np.random.default_rng(0)
     y = np.array(good.y)
     y[:, 3] += rng.normal(0.0, 2.0, len(y))
     noisy = Recording(
         good.t, good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape), y, good.outputs, "x"
     )
-    said = " ".join(doubts(setup.channels, noisy))
+    said = " ".join(plausibility_remarks(setup.channels, noisy))
     assert "jumps from row to row" in said and "qvel:hinge is rough" in said
     swung = recorded(setup, 0, 20.0)
-    assert doubts(setup.channels, swung) == ()
+    assert plausibility_remarks(setup.channels, swung) == ()
     y = np.array(swung.y)
     y[:, 3] *= 2.0
     assert any(
         "part by" in s
-        for s in doubts(setup.channels, Recording(swung.t, swung.ctrl, y, swung.outputs, "x"))
+        for s in plausibility_remarks(
+            setup.channels, Recording(swung.t, swung.ctrl, y, swung.outputs, "x")
+        )
     )

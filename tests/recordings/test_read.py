@@ -14,11 +14,11 @@ from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.output.archive import write_table
-from mjfim.recordings.read import Logged, read_log, read_recording
+from mjfim.recordings.read import Log, read_log, read_recording
 from tests.support.paths import SHARED_DATA
 
 Array = NDArray[np.float64]
-Read = Callable[..., Logged]
+Read = Callable[..., Log]
 
 ARM = """
 <mujoco>
@@ -71,7 +71,7 @@ def setup_of(folder: Path, recording: Mapping[str, Any], model: str = ARM) -> Se
 def read(tmp_path: Path) -> Read:
     """Columns, written as CSV and read by a [recording] table; t and the controls are there unless stated otherwise."""
 
-    def run(columns: Mapping[str, Any], /, bare: bool = False, **recording: Any) -> Logged:
+    def run(columns: Mapping[str, Any], /, bare: bool = False, **recording: Any) -> Log:
         path = tmp_path / "lab.csv"
         write_table(path, dict(columns) if bare else {"t": T, **CTRL, **columns})
         return read_log(path, setup_of(tmp_path, recording).channels)
@@ -79,7 +79,7 @@ def read(tmp_path: Path) -> Read:
     return run
 
 
-def column(logged: Logged, name: str) -> Array:
+def column(logged: Log, name: str) -> Array:
     """Measured column by name."""
     return logged.recording.y[:, logged.recording.outputs.index(name)]
 
@@ -256,7 +256,7 @@ def test_window(read: Read) -> None:
     columns = {"qpos:pin": wave(), "ctrl:push": ctrl}
     logged = read({**columns, "t": T + 5.0}, window=(0.52, 1.0))
     r = logged.recording
-    assert (len(r.t), r.t[0], logged.look.dropped) == (97, 0.0, M - 97)
+    assert (len(r.t), r.t[0], logged.summary.dropped) == (97, 0.0, M - 97)
     assert np.allclose(r.t, T[:97], rtol=0, atol=1e-12)
     assert np.array_equal(column(logged, "qpos:pin"), wave()[104:201])
     assert r.ctrl[:4, 0].tolist() == [102.0, 105.0, 105.0, 105.0]
@@ -491,31 +491,31 @@ def test_speed_tells_degrees(read: Read) -> None:
 # ---- the summary
 
 
-def test_look(read: Read) -> None:
+def test_summary(read: Read) -> None:
     """Numbers that can be counted by hand."""
     t = np.array(T)
     t[100:] += 0.02
     q = np.round(wave(1.0, 3.0) / 0.01) * 0.01
     q[:40:4] = np.nan
-    look = read({"t": t, "q": q}, columns={"qpos:pin": "q"}, window=(0.0, 1.5)).look
-    assert (look.rows, look.dropped) == (297, M - 297)
-    assert look.rate == pytest.approx(200.0)
-    assert look.duration == pytest.approx(1.5)
-    assert (look.longest, look.jitter_max) == (pytest.approx(0.025), pytest.approx(0.02))
-    assert look.jitter_std == pytest.approx(0.02 * np.sqrt(1 / 296 - 1 / 296**2))
-    assert [c.name for c in look.columns] == ["ctrl:push", "ctrl:turn", "qpos:pin"]
-    pin = look.columns[2]
+    summary = read({"t": t, "q": q}, columns={"qpos:pin": "q"}, window=(0.0, 1.5)).summary
+    assert (summary.rows, summary.dropped) == (297, M - 297)
+    assert summary.rate == pytest.approx(200.0)
+    assert summary.duration == pytest.approx(1.5)
+    assert (summary.longest_step, summary.jitter_max) == (pytest.approx(0.025), pytest.approx(0.02))
+    assert summary.jitter_std == pytest.approx(0.02 * np.sqrt(1 / 296 - 1 / 296**2))
+    assert [c.name for c in summary.columns] == ["ctrl:push", "ctrl:turn", "qpos:pin"]
+    pin = summary.columns[2]
     assert (pin.source, pin.resolution) == ("q", pytest.approx(0.01))
     assert (pin.minimum, pin.maximum) == (np.nanmin(q[:297]), np.nanmax(q[:297]))
-    assert pin.empty == pytest.approx(10 / 297)
+    assert pin.empty_share == pytest.approx(10 / 297)
 
 
 def test_resolution_ignores_rounding(read: Read) -> None:
     """Equal angles stay equal after turns were undone, but for the last digits."""
     truth = np.rint(300 * np.sin(2 * T)) * (2 * np.pi / 100)
     wrapped = np.mod(truth, 2 * np.pi)
-    look = read({"q": wrapped}, columns={"qpos:pin": {"column": "q", "unwrap": True}}).look
-    assert look.columns[-1].resolution == pytest.approx(2 * np.pi / 100)
+    summary = read({"q": wrapped}, columns={"qpos:pin": {"column": "q", "unwrap": True}}).summary
+    assert summary.columns[-1].resolution == pytest.approx(2 * np.pi / 100)
 
 
 # ---- archives of arrays
@@ -653,9 +653,9 @@ def test_logs_of_robots(pattern: str, tmp_path: Path) -> None:
     files, setup = robot(pattern, tmp_path)
     for file in files:
         logged = read_log(file, setup.channels)
-        r, look = logged.recording, logged.look
-        assert look.rows == len(r.t) > 1000 and look.dropped == 0
-        assert 150.0 < look.rate < 600.0 and 3.0 < look.duration < 21.0
+        r, summary = logged.recording, logged.summary
+        assert summary.rows == len(r.t) > 1000 and summary.dropped == 0
+        assert 150.0 < summary.rate < 600.0 and 3.0 < summary.duration < 21.0
         assert np.isfinite(r.y).all() and np.isfinite(r.ctrl).all()
         q, v = (r.y[:, r.outputs.index(f"{kind}:one")] for kind in ("qpos", "qvel"))
         way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(r.t))])
