@@ -77,7 +77,7 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
     exact, smooth = Stage(setup, task.combinations).problem, smoothed(setup, task.combinations)
     fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
     basis = None if fine is None else independent(setup.averaged(fine))
-    regulate = replace(regulator_for(setup), calm=CALM if basis is None else np.inf)
+    regulate = replace(regulator_for(setup), feedback_threshold=CALM if basis is None else np.inf)
     fence = fence_of(setup).tightened(task.held)
     ladder = Ladder(smooth, fence, setup.centre, basis, regulate, task.rungs)
     control = setup.averaged(task.start.control)

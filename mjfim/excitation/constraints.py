@@ -13,7 +13,7 @@ from mjfim.excitation.limits import Limit
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.model.geom_distance import Clearance, pairs
-from mjfim.optimize.barrier import Band, Hedge
+from mjfim.optimize.barrier import BarrierExpansion, Bounds
 from mjfim.optimize.lq import Weights
 from mjfim.plant.batch import Taps
 from mjfim.plant.state_space import StateSpace
@@ -36,14 +36,14 @@ def _of(limits: tuple[Limit, ...], kind: str) -> list[Limit]:
     return [limit for limit in limits if limit.kind == kind]
 
 
-def _dense(limits: list[Limit], count: int) -> Band | None:
+def _dense(limits: list[Limit], count: int) -> Bounds | None:
     """Ranges of all controls, infinite where none is stated; None without any."""
     if not limits:
         return None
     lower, upper = np.full(count, -np.inf), np.full(count, np.inf)
     for limit in limits:
         lower[limit.index], upper[limit.index] = limit.lower, limit.upper
-    return Band.of(lower, upper)
+    return Bounds.from_range(lower, upper)
 
 
 def fence_of(setup: Setup, every: bool = False) -> Fence:
@@ -61,11 +61,13 @@ def fence_of(setup: Setup, every: bool = False) -> Fence:
     taps = Taps(
         q, v, a, f, j, looked_at(setup.substeps), float(setup.plant.engine.model.opt.timestep)
     )
-    shown = Band.of(
+    shown = Bounds.from_range(
         np.array([limit.lower for limit in flat]), np.array([limit.upper for limit in flat])
     )
     free = np.full(nu, np.inf)
-    control = _dense(_of(limits, "control"), nu) or Band(-free, free, _sizes(setup))
+    control = _dense(_of(limits, "control"), nu) or Bounds(
+        lower=-free, upper=free, scale=_sizes(setup)
+    )
     clearance, least = None, 0.0
     if e.limits.clearance is not None and (every or e.limits.enforce):
         least = e.limits.clearance
@@ -104,10 +106,10 @@ def _sizes(setup: Setup) -> Array:
     return np.where(size > 0.0, size, 1.0)
 
 
-def _end(setup: Setup) -> Band:
+def _end(setup: Setup) -> Bounds:
     b, nv, na = setup.experiment.boundary, setup.space.nv, setup.space.na
     width = np.concatenate([np.full(nv, b.position), np.full(nv, b.velocity), np.full(na, np.inf)])
-    return Band.of(-width, width)
+    return Bounds.from_range(-width, width)
 
 
 def basis_of(setup: Setup, t: Array) -> Array | None:
@@ -160,15 +162,15 @@ class Fence:
     space: StateSpace
     dt: float
     taps: Taps
-    shown: Band
+    shown: Bounds
     kinds: tuple[str, ...]
     names: tuple[str, ...]
-    control: Band
-    rate: Band | None = None
+    control: Bounds
+    rate: Bounds | None = None
     before: Array | None = None
     after: Array | None = None
     seam: bool = False
-    end: Band | None = None
+    end: Bounds | None = None
     target: Array | None = None
     clearance: Clearance | None = None
     least: float = 0.0
@@ -259,67 +261,77 @@ class Fence:
         """The barrier."""
         N, looked = len(sight.tapped), np.array(self.taps.substeps) - 1
         weight, ctrl = self._weight(N), sight.trajectory.ctrl
-        total = self.shown.wall(sight.tapped[:, looked], delta, weight / len(looked)).value
-        total += self.control.wall(ctrl, delta, weight).value
+        total = self.shown.barrier(sight.tapped[:, looked], delta, weight / len(looked)).value
+        total += self.control.barrier(ctrl, delta, weight).value
         if self.rate is not None:
-            total += self.rate.wall(self.rates(ctrl), delta, weight).value
+            total += self.rate.barrier(self.rates(ctrl), delta, weight).value
         if self.end is not None:
-            total += self.end.wall(self._ended(sight.trajectory), delta, END_WEIGHT).value
+            total += self.end.barrier(self._ended(sight.trajectory), delta, END_WEIGHT).value
         if sight.distances is not None:
-            total += self._near(sight.distances).wall(sight.distances, delta, weight).value
+            total += self._near(sight.distances).barrier(sight.distances, delta, weight).value
         return total
 
-    def _near(self, distances: Array) -> Band:
+    def _near(self, distances: Array) -> Bounds:
         """Distances between the least allowed one and where they are no longer looked at."""
         if self.clearance is None:
             raise ValueError("nothing is kept clear")
         m = distances.shape[1]
-        return Band(
-            np.full(m, self.least),
-            np.full(m, np.inf),
-            np.full(m, self.clearance.reach - self.least),
+        return Bounds(
+            lower=np.full(m, self.least),
+            upper=np.full(m, np.inf),
+            scale=np.full(m, self.clearance.reach - self.least),
         )
 
-    def expand(self, sight: Sight, rise: Array, delta: float) -> Hedge:
+    def expand(self, sight: Sight, rise: Array, delta: float) -> BarrierExpansion:
         """Expansion about a trajectory. rise: (N, looked-at substeps, w, nx+nu) derivative of what the taps show"""
         N, looked = len(sight.tapped), np.array(self.taps.substeps) - 1
         nx, ctrl = self.space.nx, sight.trajectory.ctrl
         nu, weight = ctrl.shape[1], self._weight(N)
-        wall = self.shown.wall(sight.tapped[:, looked], delta, weight / len(looked))
-        both = np.einsum("kswi,ksw->ki", rise, wall.slope)
+        barrier = self.shown.barrier(sight.tapped[:, looked], delta, weight / len(looked))
+        both = np.einsum("kswi,ksw->ki", rise, barrier.slope)
         flat = rise.reshape(N, -1, nx + nu)
-        H = np.swapaxes(flat * wall.bend.reshape(N, -1, 1), 1, 2) @ flat
+        H = np.swapaxes(flat * barrier.curvature.reshape(N, -1, 1), 1, 2) @ flat
         a, b, Q = np.zeros((N + 1, nx)), both[:, nx:], np.zeros((N + 1, nx, nx))
         a[:-1], Q[:-1], S, R = both[:, :nx], H[:, :nx, :nx], H[:, nx:, :nx], H[:, nx:, nx:].copy()
-        wall = self.control.wall(ctrl, delta, weight)
-        b = b + wall.slope
-        R[:, np.arange(nu), np.arange(nu)] += wall.bend
+        barrier = self.control.barrier(ctrl, delta, weight)
+        b = b + barrier.slope
+        R[:, np.arange(nu), np.arange(nu)] += barrier.curvature
         W = np.zeros((N + 1, nu))
         if self.rate is not None:
-            wall = self.rate.wall(self.rates(ctrl), delta, weight)
-            b += (wall.slope[:-1] - wall.slope[1:]) / self.dt
-            W = wall.bend / self.dt**2
+            barrier = self.rate.barrier(self.rates(ctrl), delta, weight)
+            b += (barrier.slope[:-1] - barrier.slope[1:]) / self.dt
+            W = barrier.curvature / self.dt**2
             if self.seam:
-                b[0] += wall.slope[-1] / self.dt
+                b[0] += barrier.slope[-1] / self.dt
             if self.before is None:
-                b[0] -= wall.slope[0] / self.dt
+                b[0] -= barrier.slope[0] / self.dt
                 W[0] = 0.0
             if self.after is None and not self.seam:
-                b[-1] += wall.slope[-1] / self.dt
+                b[-1] += barrier.slope[-1] / self.dt
                 W[-1] = 0.0
         if self.end is not None:
             ended = self._ended(sight.trajectory)
-            wall, moved = self.end.wall(ended, delta, END_WEIGHT), self.space.minus_slope(ended)
-            a[-1] += moved.T @ wall.slope
-            Q[-1] += moved.T @ (wall.bend[:, None] * moved)
+            barrier, moved = (
+                self.end.barrier(ended, delta, END_WEIGHT),
+                self.space.minus_slope(ended),
+            )
+            a[-1] += moved.T @ barrier.slope
+            Q[-1] += moved.T @ (barrier.curvature[:, None] * moved)
         if sight.distances is not None and sight.slopes is not None:
-            wall, nv = (
-                self._near(sight.distances).wall(sight.distances, delta, weight),
+            barrier, nv = (
+                self._near(sight.distances).barrier(sight.distances, delta, weight),
                 self.space.nv,
             )
-            a[1:, :nv] += np.einsum("km,kmi->ki", wall.slope, sight.slopes)
-            Q[1:, :nv, :nv] += np.swapaxes(sight.slopes * wall.bend[..., None], 1, 2) @ sight.slopes
+            a[1:, :nv] += np.einsum("km,kmi->ki", barrier.slope, sight.slopes)
+            Q[1:, :nv, :nv] += (
+                np.swapaxes(sight.slopes * barrier.curvature[..., None], 1, 2) @ sight.slopes
+            )
         step = np.full(nu, np.inf) if self.rate is None else self.rate.scale * self.dt
-        return Hedge(
-            a, b, Weights(Q, S, R, W), rise / self.shown.scale[:, None], self.control.scale, step
+        return BarrierExpansion(
+            a=a,
+            b=b,
+            weights=Weights(Q=Q, S=S, R=R, W=W),
+            observations=rise / self.shown.scale[:, None],
+            control_scale=self.control.scale,
+            control_step_scale=step,
         )

@@ -13,7 +13,7 @@ from mjfim.excitation.verification import SAME, Audit
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import survey
-from mjfim.optimize.lq import growth, regulator
+from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.plant.plant import CENTRAL
 from mjfim.records.check import Roughness
 from mjfim.records.design import Evaluation
@@ -50,7 +50,7 @@ def evaluate(stage: Stage, point: Point) -> Evaluation:
         min_eigenvalue=information.accumulated(point.sensitivity),
         criterion=point.criterion.value,
         cost=point.cost,
-        growth=growth(A),
+        growth=largest_amplification(A),
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.excitation.constraints import Fence, Sight
 from mjfim.excitation.objective import DIVERGED, DesignProblem, Point
-from mjfim.optimize.barrier import Hedge
+from mjfim.optimize.barrier import BarrierExpansion
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Armijo, Expansion, Iterate, Regulator, optimize
 from mjfim.optimize.structured_bfgs import StructuredBFGS
@@ -120,16 +120,24 @@ class InteriorProblem:
         sight = self.fence.sight(sight.trajectory, sight.tapped, slopes=True)
         if point.point is None:
             A, B, rise = self.base.plant.tapped(self.base.theta, sight.trajectory, self.fence.taps)
-            e = Expansion(A, B, np.zeros((len(A) + 1, A.shape[1])), np.zeros((len(A), B.shape[2])))
+            e = Expansion(
+                A=A, B=B, a=np.zeros((len(A) + 1, A.shape[1])), b=np.zeros((len(A), B.shape[2]))
+            )
         else:
             e, found = self.base.tapped(point.point, self.fence.taps)
             if found is None:
                 raise ValueError("an expansion along a criterion without directions")
             rise = found
         share = self._share(point)
-        hedge: Hedge = self.fence.expand(sight, rise, self.delta).times(self.mu)
+        barrier: BarrierExpansion = self.fence.expand(sight, rise, self.delta).scaled(self.mu)
         return Expansion(
-            e.A, e.B, e.a / share + hedge.a, e.b / share + hedge.b, None, hedge, e.spectral
+            A=e.A,
+            B=e.B,
+            a=e.a / share + barrier.a,
+            b=e.b / share + barrier.b,
+            extended=None,
+            barrier=barrier,
+            eigenvalue_model=e.eigenvalue_model,
         )
 
     def project(

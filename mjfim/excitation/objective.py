@@ -41,7 +41,7 @@ def extend(full: Bilinear, a: Array, b: Array, a_psi: Array) -> Expansion:
         A[:, block, :nx] = mixed[:, :, :nx]
         B[:, block] = mixed[:, :, nx:]
     stacked = np.swapaxes(a_psi, 1, 2).reshape(N + 1, nx * p)
-    return Expansion(A, B, np.concatenate([a, stacked], axis=1), np.array(b))
+    return Expansion(A=A, B=B, a=np.concatenate([a, stacked], axis=1), b=np.array(b))
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ class DesignProblem:
             ):
                 own, a_own, b_own = self._slope(theta, other)
                 open_loop = np.zeros((len(b_own), b_own.shape[1], a_own.shape[1]))
-                b += weight * Expansion(own.A, own.B, a_own, b_own).gradient(open_loop)
+                b += weight * Expansion(A=own.A, B=own.B, a=a_own, b=b_own).gradient(open_loop)
         a_running, b_running = self.running.gradient(trajectory)
         extended = None
         if self.extended:
@@ -203,7 +203,13 @@ class DesignProblem:
             a_psi, a_h, b_h = self.information.partials(criterion, sensitivity, full)
             extended = extend(full, a_running + a_h, b_running + b_h, a_psi)
         return Expansion(
-            bilinear.A, bilinear.B, a + a_running, b + b_running, extended, None, spectral
+            A=bilinear.A,
+            B=bilinear.B,
+            a=a + a_running,
+            b=b + b_running,
+            extended=extended,
+            barrier=None,
+            eigenvalue_model=spectral,
         ), bilinear.taps
 
     def _slope(

@@ -82,7 +82,7 @@ CALM = 10.0
 def regulator_for(setup: Setup) -> Regulator:
     """Unit weights on state and control along the trajectory; no feedback where the plant is calm without."""
     Q, R = np.eye(setup.space.nx) * setup.dt, np.eye(len(setup.controls)) * setup.dt
-    return Regulator(Q, R, Q / setup.dt, calm=CALM)
+    return Regulator(Q=Q, R=R, terminal=Q / setup.dt, feedback_threshold=CALM)
 
 
 AUTO = 4  # how many times longer the samples of a coarse level are, where the experiment leaves it open

@@ -78,7 +78,7 @@ def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
     tapped, ctrl = sight.tapped.reshape(N * substeps, w), sight.trajectory.ctrl
     t = np.arange(1, len(tapped) + 1) * setup.dt / setup.substeps
     for kind, name, share in zip(
-        fence.kinds, fence.names, fence.shown.share(tapped).T, strict=True
+        fence.kinds, fence.names, fence.shown.relative_position(tapped).T, strict=True
     ):
         yield LimitUsage(kind, name, t, share)
     bands = [("control", fence.control, ctrl, setup.t)]
@@ -94,7 +94,7 @@ def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
     for kind, band, values, times in bands:
         for i, name in enumerate(setup.controls):
             if np.isfinite(band.lower[i]) or np.isfinite(band.upper[i]):
-                yield LimitUsage(kind, name, times, band.share(values)[:, i])
+                yield LimitUsage(kind, name, times, band.relative_position(values)[:, i])
 
 
 def _positions(setup: Setup, engine: Engine, played: Trajectory) -> Array:

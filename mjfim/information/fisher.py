@@ -27,8 +27,8 @@ from mjfim.information.criteria import (
     smooth_e_optimality,
 )
 from mjfim.information.marginal import standard_deviations
-from mjfim.optimize.eigenvalue_model import Spectral, divided
-from mjfim.optimize.lq import Recursion
+from mjfim.optimize.eigenvalue_model import EigenvalueModel, divided_log_differences
+from mjfim.optimize.lq import LinearRecursion
 from mjfim.plant.noise import Noise
 from mjfim.plant.plant import Bilinear
 from mjfim.records.trajectory import Sensitivity
@@ -209,7 +209,7 @@ class Information:
 
     def spectral(
         self, criterion: Criterion, sensitivity: Sensitivity, bilinear: Bilinear, cost: float
-    ) -> Spectral:
+    ) -> EigenvalueModel:
         """Model of log J about a point of the smooth E-criterion, from the very derivatives that its gradient takes.
 
         With `V = 2 Sigma^-1 G w_i` the change of `w_i' I w_j` is half of what V_i makes of dG w_j and V_j of dG w_i.
@@ -217,7 +217,7 @@ class Information:
         rays = self._rays(criterion, sensitivity) / criterion.weights[:, None, None]
         backs, nx, r = self._back(rays, bilinear), bilinear.A.shape[1], len(rays)
         values = criterion.eigenvalues[:r]
-        turn = divided(values)
+        turn = divided_log_differences(values)
         rows = []
         for i in range(r):
             for j in range(i, r):
@@ -226,13 +226,17 @@ class Information:
                     both = (both + self._through(backs, j, i, criterion, bilinear)) / np.sqrt(2.0)
                 rows.append(turn[i, j] * both)
         slopes = np.stack(rows)
-        return Spectral(
-            values, criterion.power, criterion.value / cost, slopes[..., :nx], slopes[:, :-1, nx:]
+        return EigenvalueModel(
+            eigenvalues=values,
+            power=criterion.power,
+            weight=criterion.value / cost,
+            a=slopes[..., :nx],
+            b=slopes[:, :-1, nx:],
         )
 
     def _back(self, rays: Array, bilinear: Bilinear) -> list[tuple[Array, Array, Array]]:
         """Each ray, as the outputs themselves see it, and its costate."""
-        recursion, backs = Recursion(bilinear.A), []
+        recursion, backs = LinearRecursion(bilinear.A), []
         for v in rays:
             own = v if bilinear.lag is None else bilinear.lag.apply_transposed(v)
             backs.append((v, own, recursion.adjoint(np.einsum("kyx,ky->kx", bilinear.C, own))))

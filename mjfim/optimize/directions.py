@@ -55,7 +55,7 @@ class ExtendedMetricDescent:
                 "the problem must provide extended expansions for a metric with weight on psi"
             )
         zeta = descent(e.A, e.B, e.a, e.b, self.Q, self.R, self.terminal)
-        return TangentCurve(zeta.z[:, :nx], zeta.v)
+        return TangentCurve(z=zeta.z[:, :nx], v=zeta.v)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
         """Nothing is learnt."""

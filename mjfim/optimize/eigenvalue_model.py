@@ -23,17 +23,17 @@ SQUARE = np.sqrt(2.0)
 STEPS, SOLVED = 50, 1e-10
 
 
-@dataclass(frozen=True, eq=False)
-class Spectral:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EigenvalueModel:
     """The model about a point, in m = r (r + 1) / 2 coordinates of B.
 
-    values: (r,) eigenvalues, ascending;  power: q;  share: of the criterion in the cost
+    eigenvalues: (r,), ascending;  power: q;  weight: of the criterion in the cost
     a: (m, N+1, nx), b: (m, N, nu) slopes of the coordinates, those of `B_ii` and of `sqrt(2) B_ij` for i < j
     """
 
-    values: Array
+    eigenvalues: Array
     power: float
-    share: float
+    weight: float
     a: Array
     b: Array
 
@@ -46,14 +46,16 @@ class Spectral:
         return self._weigh(d)[0] - self._weigh(np.zeros_like(d))[0]
 
     def _weigh(self, d: Array) -> tuple[float, Array]:
-        q, logs = self.power, np.log(self.values / self.values[0])
-        moved, vectors = np.linalg.eigh(np.diag(logs) + matrix(d, len(logs)))
+        q, logs = self.power, np.log(self.eigenvalues / self.eigenvalues[0])
+        moved, vectors = np.linalg.eigh(np.diag(logs) + symmetric_matrix(d, len(logs)))
         weights = np.exp(-q * (moved - moved[0]))
         total = weights.sum()
         P = (vectors * (weights / total)) @ vectors.T
-        return self.share * float(np.log(total) / q - moved[0]), -self.share * coordinates(P)
+        return self.weight * float(
+            np.log(total) / q - moved[0]
+        ), -self.weight * symmetric_coordinates(P)
 
-    def settle(self, d0: Array, spread: Array) -> Array:
+    def minimising_gradient(self, d0: Array, spread: Array) -> Array:
         """The gradient w at the minimum of `h(d) + 1/2 (d - d0)' spread^-1 (d - d0)`: there `d = d0 - spread w`.
 
         Newton's method in `d = d0 + L y`, `L L' = spread`. spread: (m, m), positive semidefinite
@@ -88,7 +90,7 @@ class Spectral:
         )
 
 
-def matrix(d: Array, r: int) -> Array:
+def symmetric_matrix(d: Array, r: int) -> Array:
     """(r, r) symmetric matrix of coordinates (m,)."""
     full = np.zeros((r, r))
     rows, columns = np.triu_indices(r)
@@ -98,13 +100,13 @@ def matrix(d: Array, r: int) -> Array:
     return full
 
 
-def coordinates(full: Array) -> Array:
+def symmetric_coordinates(full: Array) -> Array:
     """(m,) coordinates of a symmetric matrix (r, r), such that their scalar product is that of matrices."""
     rows, columns = np.triu_indices(len(full))
     return np.asarray(full[rows, columns] * np.where(rows == columns, 1.0, SQUARE))
 
 
-def divided(values: Array) -> Array:
+def divided_log_differences(values: Array) -> Array:
     """(r, r) divided differences of the logarithm: what turns a change of I into one of log I."""
     ratio = values[:, None] / values
     near = np.abs(ratio - 1.0) < 1e-6

@@ -16,7 +16,7 @@ from mjfim.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Recursion:
+class LinearRecursion:
     """The linear recursion `z_{k+1} = A_k z_k + c_k`, z_0 given, and its adjoint, for one A: (N, n, n)."""
 
     A: Array
@@ -54,13 +54,13 @@ class Recursion:
         return np.asarray(solution).reshape(rhs.shape)
 
 
-def growth(A: Array) -> float:
+def largest_amplification(A: Array) -> float:
     """Largest amplification of a unit deviation, from the start to any sample or from any sample to the end.
 
     A: (N, nx, nx)
     """
     N, nx, _ = A.shape
-    recursion, zero = Recursion(A), np.zeros((N, nx))
+    recursion, zero = LinearRecursion(A), np.zeros((N, nx))
     unit = np.eye(nx)
     onward = np.stack([recursion.forward(e, zero) for e in unit], axis=2)
     back = np.stack([recursion.adjoint(np.concatenate([zero, e[None]])) for e in unit], axis=1)
@@ -96,7 +96,7 @@ def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
     return K
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TangentCurve:
     """A tangent vector zeta = (z, v) of the trajectory manifold. z: (N+1, nx), v: (N, nu)."""
 
@@ -104,7 +104,7 @@ class TangentCurve:
     v: Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Weights:
     """A quadratic form on tangent curves, `sum z'Qz + 2 v'Sz + v'Rv`, and one on the steps of the control.
 
@@ -117,21 +117,28 @@ class Weights:
     R: Array
     W: Array
 
-    def plus(self, other: Weights, share: float = 1.0) -> Weights:
-        """The sum of this form and a share of another."""
+    def plus(self, other: Weights, factor: float = 1.0) -> Weights:
+        """Sum of this form and a multiple of another one.
+
+        Args:
+            other: The form to add.
+            factor: Number with which the other form is multiplied.
+
+        Returns:
+            The sum; neither form is changed.
+        """
         return Weights(
-            *(mine + share * theirs for mine, theirs in zip(self._parts, other._parts, strict=True))
+            Q=self.Q + factor * other.Q,
+            S=self.S + factor * other.S,
+            R=self.R + factor * other.R,
+            W=self.W + factor * other.W,
         )
 
-    def times(self, share: float) -> Weights:
-        """A share of this form."""
-        return Weights(*(share * mine for mine in self._parts))
+    def scaled(self, factor: float) -> Weights:
+        """This form multiplied by a number."""
+        return Weights(Q=factor * self.Q, S=factor * self.S, R=factor * self.R, W=factor * self.W)
 
-    @property
-    def _parts(self) -> tuple[Array, Array, Array, Array]:
-        return self.Q, self.S, self.R, self.W
-
-    def force(self, zeta: TangentCurve) -> tuple[Array, Array]:
+    def half_gradient(self, zeta: TangentCurve) -> tuple[Array, Array]:
         """(N+1, nx) and (N, nu): half the derivative of the form, so that `<zeta, other> = a.z + b.v`."""
         z, v = zeta.z, zeta.v
         a = np.einsum("kij,kj->ki", self.Q, z)
@@ -151,16 +158,16 @@ def descent(
     """
     N, nx, nu = B.shape
     held = Weights(
-        np.stack([*[Q] * N, terminal]),
-        np.zeros((N, nu, nx)),
-        np.stack([R] * N),
-        np.zeros((N + 1, nu)),
+        Q=np.stack([*[Q] * N, terminal]),
+        S=np.zeros((N, nu, nx)),
+        R=np.stack([R] * N),
+        W=np.zeros((N + 1, nu)),
     )
-    return Riccati.of(A, B, held).descent(a, b)
+    return RiccatiSolution.solve(A, B, held).descent(a, b)
 
 
 @dataclass(frozen=True, eq=False)
-class Riccati:
+class RiccatiSolution:
     """The same problem under weights that vary over time, couple state and control, and hold the control's steps down.
 
     Factored once for any number of costs: only banded systems are left. With weights on the steps, the state of the
@@ -170,12 +177,12 @@ class Riccati:
 
     K: Array
     inverse: Array
-    closed: Recursion
+    closed: LinearRecursion
     drive: Array
     nx: int
 
     @staticmethod
-    def of(A: Array, B: Array, weights: Weights) -> Riccati:
+    def solve(A: Array, B: Array, weights: Weights) -> RiccatiSolution:
         """Solve the Riccati equations. Raises LinAlgError where the form is not positive on the controls."""
         N, nx, nu = B.shape
         Q, S, R = weights.Q, weights.S, weights.R
@@ -197,7 +204,7 @@ class Riccati:
             K[k], inverse[k] = both[:, :-nu], both[:, -nu:]
             P = Q[k] + A[k].T @ P @ (A[k] - B[k] @ K[k]) - S[k].T @ K[k]
             P = 0.5 * (P + P.T)
-        return Riccati(K, inverse, Recursion(A - B @ K), B, nx)
+        return RiccatiSolution(K, inverse, LinearRecursion(A - B @ K), B, nx)
 
     def descent(self, a: Array, b: Array) -> TangentCurve:
         """The minimiser for the cost `sum a'z + b'v`. a: (N+1, nx);  b: (N, nu)"""
@@ -211,11 +218,11 @@ class Riccati:
         z = self.closed.forward(
             np.zeros(wide.shape[1]), -np.einsum("kiu,ku->ki", self.drive, ahead)
         )
-        return TangentCurve(z[:, : self.nx], -np.einsum("kui,ki->ku", self.K, z[:-1]) - ahead)
+        return TangentCurve(z=z[:, : self.nx], v=-np.einsum("kui,ki->ku", self.K, z[:-1]) - ahead)
 
 
-@dataclass(frozen=True, eq=False)
-class Chart:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CurveCoordinates:
     """Tangent curves in the coordinate `c = u + K x`, in which the projection is affine. A, B of the trajectory; K: gain"""
 
     A: Array
@@ -223,8 +230,8 @@ class Chart:
     K: Array
 
     @cached_property
-    def _closed(self) -> Recursion:
-        return Recursion(self.A - self.B @ self.K)
+    def _closed(self) -> LinearRecursion:
+        return LinearRecursion(self.A - self.B @ self.K)
 
     def gradient(self, a: Array, b: Array) -> Array:
         """(N, nu) derivative by the coordinate of a cost `sum a'z + b'v`."""
@@ -236,4 +243,4 @@ class Chart:
     def lift(self, c: Array) -> TangentCurve:
         """Tangent vector whose coordinate moves by c: (N, nu)."""
         z = self._closed.forward(np.zeros(self.A.shape[1]), np.einsum("kiu,ku->ki", self.B, c))
-        return TangentCurve(z, c - np.einsum("kui,ki->ku", self.K, z[:-1]))
+        return TangentCurve(z=z, v=c - np.einsum("kui,ki->ku", self.K, z[:-1]))

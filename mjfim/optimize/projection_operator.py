@@ -13,23 +13,23 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.optimize.barrier import Hedge
-from mjfim.optimize.eigenvalue_model import Spectral
-from mjfim.optimize.lq import Chart, TangentCurve, growth, regulator
+from mjfim.optimize.barrier import BarrierExpansion
+from mjfim.optimize.eigenvalue_model import EigenvalueModel
+from mjfim.optimize.lq import CurveCoordinates, TangentCurve, largest_amplification, regulator
 from mjfim.records.design import Status
 
 P = TypeVar("P")
 ROUND_OFF = 1e-12  # relative; a promised decrease below it says nothing
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Expansion:
     """First-order model of the cost on the tangent space, `DJ.zeta = sum a'z + b'v` with `z_{k+1} = A z_k + B v_k`.
 
     A: (N, nx, nx);  B: (N, nx, nu);  a: (N+1, nx) [1 / x-unit];  b: (N, nu) [1 / u-unit]
     extended: the same with psi among the states (nx (1+p) of them), where a metric with weight on psi wants it
-    hedge: the share of hard limits in a and b, with its Gauss-Newton Hessian
-    spectral: model of the cost's logarithm where a and b are of that, better than linear
+    barrier: the share of hard limits in a and b, with its Gauss-Newton Hessian
+    eigenvalue_model: model of the cost's logarithm where a and b are of that, better than linear
     """
 
     A: Array
@@ -37,8 +37,8 @@ class Expansion:
     a: Array
     b: Array
     extended: Expansion | None = None
-    hedge: Hedge | None = None
-    spectral: Spectral | None = None
+    barrier: BarrierExpansion | None = None
+    eigenvalue_model: EigenvalueModel | None = None
 
     def slope(self, zeta: TangentCurve) -> float:
         """DJ.zeta."""
@@ -46,11 +46,11 @@ class Expansion:
 
     def gradient(self, K: Array) -> Array:
         """(N, nu) derivative of the cost by the curve coordinate `c = u + K x`, i.e. through the projection."""
-        return Chart(self.A, self.B, K).gradient(self.a, self.b)
+        return CurveCoordinates(A=self.A, B=self.B, K=K).gradient(self.a, self.b)
 
     def lift(self, K: Array, c: Array) -> TangentCurve:
         """Tangent vector whose curve coordinate moves by c: (N, nu)."""
-        return Chart(self.A, self.B, K).lift(c)
+        return CurveCoordinates(A=self.A, B=self.B, K=K).lift(c)
 
 
 class Problem(Protocol[P]):
@@ -97,7 +97,7 @@ class Direction(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Armijo:
     """Backtracking to `J(gamma) <= J(0) + sigma gamma DJ.zeta`.
 
@@ -130,13 +130,15 @@ class Armijo:
             new = problem.value(trial)
             if new <= value + self.sigma * gamma * slope:
                 return trial, gamma
-            bend = new - value - gamma * slope
-            shorter = -0.5 * slope * gamma**2 / bend if np.isfinite(new) and bend > 0.0 else 0.0
+            curvature = new - value - gamma * slope
+            shorter = (
+                -0.5 * slope * gamma**2 / curvature if np.isfinite(new) and curvature > 0.0 else 0.0
+            )
             gamma = float(np.clip(shorter, 0.1 * gamma, self.beta * gamma))
         return None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Iterate(Generic[P]):
     """One iterate of Algorithm 1. slope: |DJ.zeta| at this point; gamma: the step that led here; status: set on the last."""
 
@@ -148,22 +150,25 @@ class Iterate(Generic[P]):
     status: Status | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Regulator:
     """How K is made: weights Q, R, terminal (times dt) of the LQR along the trajectory, renewed every `period` iterates.
 
-    calm: where no deviation grows more than this along the open-loop trajectory, K is zero: P needs no feedback there
+    feedback_threshold: K is zero where no deviation grows more than this along the open-loop trajectory
     """
 
     Q: Array
     R: Array
     terminal: Array
     period: int = 10
-    calm: float = 0.0
+    feedback_threshold: float = 0.0
 
     def gain(self, expansion: Expansion) -> Array:
         """K: (N, nu, nx) about the expansion's trajectory."""
-        if self.calm and growth(expansion.A) <= self.calm:
+        if (
+            self.feedback_threshold
+            and largest_amplification(expansion.A) <= self.feedback_threshold
+        ):
             N, nx, nu = expansion.B.shape
             return np.zeros((N, nu, nx))
         return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
@@ -189,14 +194,28 @@ def optimize(
         if abs(slope) <= tolerance * size:
             better = problem.refine(point)
             if better is None:
-                yield Iterate(index, point, value, abs(slope), gamma, Status.CONVERGED)
+                yield Iterate(
+                    index=index,
+                    point=point,
+                    value=value,
+                    slope=abs(slope),
+                    gamma=gamma,
+                    status=Status.CONVERGED,
+                )
                 return
             point, expansion = better, problem.expand(better)
             continue
         if index >= max_iterations:
-            yield Iterate(index, point, value, abs(slope), gamma, Status.MAX_ITERATIONS)
+            yield Iterate(
+                index=index,
+                point=point,
+                value=value,
+                slope=abs(slope),
+                gamma=gamma,
+                status=Status.MAX_ITERATIONS,
+            )
             return
-        yield Iterate(index, point, value, abs(slope), gamma)
+        yield Iterate(index=index, point=point, value=value, slope=abs(slope), gamma=gamma)
         first = min(
             1.0, -2.0 * size / slope
         )  # a step that promises to lose more than twice J is too long to try
@@ -208,7 +227,14 @@ def optimize(
                 continue
             if direction.reset():
                 continue
-            yield Iterate(index, point, value, abs(slope), gamma, Status.STALLED)
+            yield Iterate(
+                index=index,
+                point=point,
+                value=value,
+                slope=abs(slope),
+                gamma=gamma,
+                status=Status.STALLED,
+            )
             return
         old, (point, gamma) = point, found
         expansion = problem.expand(point)

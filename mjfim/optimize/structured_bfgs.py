@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from mjfim.arrays import Array
-from mjfim.optimize.barrier import Hedge
-from mjfim.optimize.lq import Chart, Riccati, TangentCurve, Weights
+from mjfim.optimize.barrier import BarrierExpansion
+from mjfim.optimize.lq import CurveCoordinates, RiccatiSolution, TangentCurve, Weights
 from mjfim.optimize.projection_operator import Expansion
 
 BENT = 1e-8  # relative curvature of a pair that still counts
@@ -34,19 +34,19 @@ TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
-class Metric:
+class CurveMetric:
     """The quadratic form of the barrier's Gauss-Newton Hessian and a ridge, on what the control may do: anything."""
 
-    chart: Chart
+    chart: CurveCoordinates
     weights: Weights
 
     @cached_property
-    def _factored(self) -> Riccati:
-        return Riccati.of(self.chart.A, self.chart.B, self.weights)
+    def _factored(self) -> RiccatiSolution:
+        return RiccatiSolution.solve(self.chart.A, self.chart.B, self.weights)
 
     def apply(self, s: Array) -> Array:
         """The form's gradient at s: (N, nu)."""
-        return self.chart.gradient(*self.weights.force(self.chart.lift(s)))
+        return self.chart.gradient(*self.weights.half_gradient(self.chart.lift(s)))
 
     def solve(self, g: Array) -> Array:
         """What apply undoes, by the Riccati equations."""
@@ -135,18 +135,18 @@ class Local:
     """
 
     expansion: Expansion
-    chart: Chart
+    chart: CurveCoordinates
     weights: Weights
     gradient: Array
     cost: Array
     slopes: Array
     basis: Array | None
 
-    def metric(self, damping: float) -> Metric | BasisMetric:
+    def metric(self, damping: float) -> CurveMetric | BasisMetric:
         """Of the weights, and a multiple of even ones."""
-        even = _hedge(self.expansion).even
+        even = _barrier(self.expansion).uniform_weights
         if self.basis is None:
-            return Metric(
+            return CurveMetric(
                 self.chart, self.weights.plus(even, damping) if damping > 0.0 else self.weights
             )
         form, spread = self._forms
@@ -158,11 +158,11 @@ class Local:
         if self.basis is None:
             raise ValueError("no basis, no coefficients")
         curves = Curves.of(self.expansion, self.basis)
-        return curves.form(self.weights), curves.form(_hedge(self.expansion).even)
+        return curves.form(self.weights), curves.form(_barrier(self.expansion).uniform_weights)
 
     def modelled(self, s: Array) -> Array:
         """Gradient of the cost that the model expects after a step s, over that at its start."""
-        model = self.expansion.spectral
+        model = self.expansion.eigenvalue_model
         if model is None:
             return np.zeros_like(s)
         d = np.tensordot(self.slopes, s, axes=s.ndim)
@@ -176,7 +176,7 @@ class StructuredBFGS:
     """BFGS of what remains of the cost, on top of the barrier's Gauss-Newton Hessian and the model of the criterion.
 
     Both are exact at every point; pairs hold the remainder alone, so what was learnt outlives a sharper barrier.
-    Steps that go too far are damped by `Hedge.even` (Levenberg & Marquardt): that shortens what nothing holds, and leaves
+    Steps that go too far are damped by `uniform_weights` (Levenberg & Marquardt): it shortens what nothing holds, and leaves
     the way back inside as it is.
     ridge: (nu,) weight of the control at every sample;  basis: (N, M) what controls may do, or None
     reach: largest move of anything limited in one step, over half of its range;  damping: of the step to come
@@ -193,22 +193,22 @@ class StructuredBFGS:
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
         """zeta by the two-loop recursion and the model, damped until it does not move too far."""
-        here, hedge = self._local(expansion, K), _hedge(expansion)
+        here, barrier = self._local(expansion, K), _barrier(expansion)
         for left in reversed(range(TRIES)):
             step = self._step(here)
             zeta = here.chart.lift(step if self.basis is None else self.basis @ step)
-            far = hedge.motion(zeta) / self.reach
+            far = barrier.largest_relative_move(zeta) / self.reach
             if far <= 1.0 or left == 0:
                 break
             self.damping = max(self.damping, LEAST) * float(np.clip(AIM * far, *RAISED))
         move = 1.0 / max(far, 1.0)
-        self._told = TangentCurve(move * zeta.z, move * zeta.v)
+        self._told = TangentCurve(z=move * zeta.z, v=move * zeta.v)
         return self._told
 
     def _step(self, here: Local) -> Array:
         """The model's minimum, in the coordinates."""
         undo = self._inverse(here.metric(self.damping))
-        model = here.expansion.spectral
+        model = here.expansion.eigenvalue_model
         if model is None:
             return -undo(here.gradient)
         m = len(here.slopes)
@@ -217,10 +217,10 @@ class StructuredBFGS:
         moves = np.stack([undo(slope) for slope in here.slopes])
         flat = here.slopes.reshape(m, -1)
         spread = flat @ moves.reshape(m, -1).T
-        w = model.settle(flat @ away.reshape(-1), 0.5 * (spread + spread.T))
+        w = model.minimising_gradient(flat @ away.reshape(-1), 0.5 * (spread + spread.T))
         return np.asarray(away - np.tensordot(w, moves, axes=1))
 
-    def _inverse(self, metric: Metric | BasisMetric) -> Callable[[Array], Array]:
+    def _inverse(self, metric: CurveMetric | BasisMetric) -> Callable[[Array], Array]:
         """What undoes the Hessian of metric and pairs: BFGS, the two-loop recursion."""
         used = []
         for pair in self._pairs:
@@ -248,7 +248,7 @@ class StructuredBFGS:
             return
         gamma = float(np.vdot(told.v, moved.v)) / max(float(np.vdot(told.v, told.v)), TINY)
         if gamma > CUT:
-            far = _hedge(before.expansion).motion(told) / self.reach
+            far = _barrier(before.expansion).largest_relative_move(told) / self.reach
             self.damping = (
                 self.damping * float(np.clip(AIM * far, *LOWERED)) if self.damping > LEAST else 0.0
             )
@@ -275,12 +275,14 @@ class StructuredBFGS:
             or self._last.expansion is not expansion
             or self._last.chart.K is not K
         ):
-            hedge, w = _hedge(expansion), _hedge(expansion).weights
-            weights = Weights(w.Q, w.S, w.R + np.diag(self.ridge), w.W)
-            chart = Chart(expansion.A, expansion.B, K)
-            forms = [(expansion.a, expansion.b), (expansion.a - hedge.a, expansion.b - hedge.b)]
-            if expansion.spectral is not None:
-                forms += list(zip(expansion.spectral.a, expansion.spectral.b, strict=True))
+            barrier, w = _barrier(expansion), _barrier(expansion).weights
+            weights = Weights(Q=w.Q, S=w.S, R=w.R + np.diag(self.ridge), W=w.W)
+            chart = CurveCoordinates(A=expansion.A, B=expansion.B, K=K)
+            forms = [(expansion.a, expansion.b), (expansion.a - barrier.a, expansion.b - barrier.b)]
+            if expansion.eigenvalue_model is not None:
+                forms += list(
+                    zip(expansion.eigenvalue_model.a, expansion.eigenvalue_model.b, strict=True)
+                )
             found = [chart.gradient(a, b) for a, b in forms]
             if self.basis is not None:
                 found = [self.basis.T @ g for g in found]
@@ -289,7 +291,7 @@ class StructuredBFGS:
         return self._last
 
 
-def _hedge(expansion: Expansion) -> Hedge:
-    if expansion.hedge is None:
+def _barrier(expansion: Expansion) -> BarrierExpansion:
+    if expansion.barrier is None:
         raise ValueError("a direction under hard limits needs their expansion")
-    return expansion.hedge
+    return expansion.barrier

@@ -329,7 +329,7 @@ class Plant:
 
     def difference(self, new: Trajectory, old: Trajectory) -> TangentCurve:
         """(x_new - x_old, u_new - u_old) in the tangent space."""
-        return TangentCurve(self.space.minus(new.state, old.state), new.ctrl - old.ctrl)
+        return TangentCurve(z=self.space.minus(new.state, old.state), v=new.ctrl - old.ctrl)
 
     def steps_of(self, trajectory: Trajectory) -> Array:
         """(nx+nu,) magnitudes to which difference steps are relative, at least 1 for states."""

@@ -13,7 +13,7 @@ from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.system import Setup
 from mjfim.information.smoothness import roughness, visible_columns
 from mjfim.optimize.directions import LBFGS
-from mjfim.optimize.lq import Recursion, TangentCurve
+from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.active_constraints import first_active
 from mjfim.records.check import SelfTest
@@ -52,7 +52,7 @@ def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivi
     except SimulationDiverged:
         return np.inf
     psi = sensitivity.psi
-    recursion = Recursion(line.A)
+    recursion = LinearRecursion(line.A)
     own = np.stack(
         [recursion.forward(psi[0, :, j], line.E[..., j]) for j in range(psi.shape[2])], axis=2
     )
@@ -77,7 +77,7 @@ def slope_error(setup: Setup, problem: DesignProblem, point: Point) -> float:
     )
     if relative == 0.0:
         return 0.0
-    unit = TangentCurve(zeta.z / relative, zeta.v / relative)
+    unit = TangentCurve(z=zeta.z / relative, v=zeta.v / relative)
     return min(_slope_error(problem, point, expansion, unit, K, step) for step in (1e-3, 1e-4))
 
 

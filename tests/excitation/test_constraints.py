@@ -13,7 +13,7 @@ import pytest
 from mjfim.excitation.constraints import END_WEIGHT, Sight, fence_of
 from mjfim.excitation.interior_point import InteriorProblem, seen
 from mjfim.experiment.system import Setup
-from mjfim.optimize.barrier import Band
+from mjfim.optimize.barrier import Bounds
 from mjfim.optimize.lq import TangentCurve
 from tests.support.limits import ARM, directions_of, floating_setup
 from tests.support.numerics import directional_check, make_setup
@@ -125,8 +125,8 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     problem = InteriorProblem(setup.problem, fence, 1.0, delta, costs=False)
     point = problem.point(setup.control)
     expansion = problem.expand(point)
-    assert expansion.hedge is not None
-    w, rng = expansion.hedge.weights, np.random.default_rng(4)
+    assert expansion.barrier is not None
+    w, rng = expansion.barrier.weights, np.random.default_rng(4)
     for k in range(setup.samples):
         form = np.block([[w.Q[k], w.S[k].T], [w.S[k], w.R[k]]])
         values = np.linalg.eigvalsh(0.5 * (form + form.T))
@@ -144,12 +144,12 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     assert sight.distances is not None and sight.slopes is not None and fence.rate is not None
     assert fence.clearance is not None
     m, least = sight.distances.shape[1], np.full(sight.distances.shape[1], 0.03)
-    near = Band(least, np.full(m, np.inf), fence.clearance.reach - least)
+    near = Bounds(lower=least, upper=np.full(m, np.inf), scale=fence.clearance.reach - least)
     bends = [
-        fence.shown.wall(sight.tapped[:, looked], delta, 1.0 / N / len(looked)).bend,
-        fence.control.wall(ctrl, delta, 1.0 / N).bend,
-        fence.rate.wall(fence.rates(ctrl), delta, 1.0 / N).bend,
-        near.wall(sight.distances, delta, 1.0 / N).bend,
+        fence.shown.barrier(sight.tapped[:, looked], delta, 1.0 / N / len(looked)).curvature,
+        fence.control.barrier(ctrl, delta, 1.0 / N).curvature,
+        fence.rate.barrier(fence.rates(ctrl), delta, 1.0 / N).curvature,
+        near.barrier(sight.distances, delta, 1.0 / N).curvature,
     ]
     for way in rng.normal(size=(3, *ctrl.shape)):
         way[0] = 0.0  # with a seam the metric leaves the move of the first control out
@@ -164,10 +164,12 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         if fence.end is not None and fence.target is not None:
             ended = setup.space.minus(sight.trajectory.state[-1], fence.target)
             wanted.append(
-                float(np.sum(fence.end.wall(ended, delta, END_WEIGHT).bend * zeta.z[-1] ** 2))
+                float(
+                    np.sum(fence.end.barrier(ended, delta, END_WEIGHT).curvature * zeta.z[-1] ** 2)
+                )
             )
         assert min(wanted) > 1e-6 * sum(wanted)
-        a, b = w.force(zeta)
+        a, b = w.half_gradient(zeta)
         assert float(np.sum(a * zeta.z) + np.sum(b * zeta.v)) == pytest.approx(
             sum(wanted), rel=1e-9
         )
@@ -177,9 +179,11 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         fence, shown=replace(fence.shown, lower=-endless, upper=endless), clearance=None, end=None
     )
     problem = InteriorProblem(setup.problem, narrow, 1.0, delta, costs=False)
-    hedge = problem.expand(problem.point(ctrl)).hedge
-    assert hedge is not None
-    _, b = hedge.weights.force(TangentCurve(np.zeros((N + 1, setup.space.nx)), 1e-5 * way))
+    barrier = problem.expand(problem.point(ctrl)).barrier
+    assert barrier is not None
+    _, b = barrier.weights.half_gradient(
+        TangentCurve(z=np.zeros((N + 1, setup.space.nx)), v=1e-5 * way)
+    )
     here, up, down = (problem.point(ctrl + s * way).barrier for s in (0.0, 1e-5, -1e-5))
     assert float(np.sum(b * 1e-5 * way)) == pytest.approx(up + down - 2 * here, rel=1e-3)
 
@@ -190,7 +194,7 @@ def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> Non
     fence = fence_of(setup)
     problem = InteriorProblem(setup.problem, fence, 1.0, 0.1, costs=False)
     expansion = problem.expand(problem.point(setup.control))
-    assert expansion.hedge is not None
+    assert expansion.barrier is not None
     for way in 1e-4 * directions_of(setup, 4, seed=2):
         zeta = expansion.lift(np.zeros((setup.samples, 2, setup.space.nx)), way)
         up, down = (seen(problem.point(setup.control + s * way)).tapped for s in (1.0, -1.0))
@@ -198,7 +202,7 @@ def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> Non
             :, np.array(fence.taps.substeps) - 1
         ].max()
         wanted = max(moved, np.abs(way / fence.control.scale).max())
-        assert expansion.hedge.motion(zeta) == pytest.approx(wanted, rel=1e-3)
+        assert expansion.barrier.largest_relative_move(zeta) == pytest.approx(wanted, rel=1e-3)
 
 
 def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> None:

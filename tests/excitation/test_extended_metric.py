@@ -14,7 +14,7 @@ from mjfim.excitation.unconstrained import Stage, direction_for
 from mjfim.experiment.system import Setup
 from mjfim.information.fisher import Information
 from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
-from mjfim.optimize.lq import Recursion, TangentCurve
+from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.noise import Noise
 from mjfim.plant.plant import CENTRAL, Bilinear
@@ -103,18 +103,22 @@ def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None
     a_psi, a_h, b_h = made.partials(found, S, unit)
     wide = extend(unit, a_h, b_h, a_psi)
     v = rng.normal(size=(N, nu))
-    z = Recursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
-    full = Recursion(wide.A).forward(np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v))
+    z = LinearRecursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
+    full = LinearRecursion(wide.A).forward(
+        np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v)
+    )
     reduced, slope = (
-        Expansion(A, B, a, b).slope(TangentCurve(z, v)),
-        wide.slope(TangentCurve(full, v)),
+        Expansion(A=A, B=B, a=a, b=b).slope(TangentCurve(z=z, v=v)),
+        wide.slope(TangentCurve(z=full, v=v)),
     )
     assert slope == pytest.approx(reduced, rel=1e-10)
     R, Q = np.eye(nu), np.diag([1.0, 2.0, 0.0])
-    plain = MetricDescent(Q, R, Q)(Expansion(A, B, a, b), np.zeros((N, nu, nx)))
+    plain = MetricDescent(Q, R, Q)(Expansion(A=A, B=B, a=a, b=b), np.zeros((N, nu, nx)))
     wide_Q = np.zeros((nx * (1 + p), nx * (1 + p)))
     wide_Q[:nx, :nx] = Q
-    same = extended_direction(Expansion(A, B, a, b, wide), np.zeros((N, nu, nx)), wide_Q, R, wide_Q)
+    same = extended_direction(
+        Expansion(A=A, B=B, a=a, b=b, extended=wide), np.zeros((N, nu, nx)), wide_Q, R, wide_Q
+    )
     assert relative_error(same.v, plain.v) < 1e-10
 
 
@@ -125,18 +129,18 @@ def test_extended_slope_is_the_reduced_slope(case: str, tmp_path) -> None:
     wide = e.extended
     for _ in range(3):
         v = rng.normal(size=setup.control.shape)
-        z = Recursion(e.A).forward(np.zeros(e.A.shape[1]), np.einsum("kij,kj->ki", e.B, v))
-        full = Recursion(wide.A).forward(
+        z = LinearRecursion(e.A).forward(np.zeros(e.A.shape[1]), np.einsum("kij,kj->ki", e.B, v))
+        full = LinearRecursion(wide.A).forward(
             np.zeros(wide.A.shape[1]), np.einsum("kij,kj->ki", wide.B, v)
         )
         np.testing.assert_allclose(full[:, : z.shape[1]], z, rtol=1e-5, atol=1e-5 * np.abs(z).max())
-        assert wide.slope(TangentCurve(full, v)) == pytest.approx(
-            e.slope(TangentCurve(z, v)), rel=1e-4
+        assert wide.slope(TangentCurve(z=full, v=v)) == pytest.approx(
+            e.slope(TangentCurve(z=z, v=v)), rel=1e-4
         )
         partial = np.zeros_like(full)
         partial[:, : z.shape[1]] = z
-        assert wide.slope(TangentCurve(partial, v)) != pytest.approx(
-            e.slope(TangentCurve(z, v)), rel=0.1
+        assert wide.slope(TangentCurve(z=partial, v=v)) != pytest.approx(
+            e.slope(TangentCurve(z=z, v=v)), rel=0.1
         )
 
 
@@ -147,7 +151,9 @@ def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_t
     setup = CASES[case](tmp_path)
     wide, nx, p = expanded(setup).extended, setup.space.nx, len(setup.theta)
     v, h = np.cos(9.0 * setup.t)[:, None] * np.ones(setup.plant.nu), 1e-2
-    full = Recursion(wide.A).forward(np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v))
+    full = LinearRecursion(wide.A).forward(
+        np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v)
+    )
     up, down = (setup.plant.simulate(setup.theta, setup.control + s * h * v) for s in (1, -1))
     psi = [setup.plant.sensitivity(setup.theta, curve).psi for curve in (up, down)]
     change = np.swapaxes(psi[0] - psi[1], 1, 2).reshape(setup.samples + 1, p, nx) / (2 * h)

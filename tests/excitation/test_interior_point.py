@@ -66,13 +66,15 @@ def test_its_slope_is_that_of_simulated_controls(name: str, tmp_path: Path) -> N
     point = problem.point(setup.control)
     expansion = problem.expand(point)
     assert check(setup, problem, expansion) < 5e-3
-    bare, hedge = replace(problem, mu=0.0), expansion.hedge
-    assert hedge is not None
-    alone = Expansion(expansion.A, expansion.B, expansion.a - hedge.a, expansion.b - hedge.b)
+    bare, barrier = replace(problem, mu=0.0), expansion.barrier
+    assert barrier is not None
+    alone = Expansion(
+        A=expansion.A, B=expansion.B, a=expansion.a - barrier.a, b=expansion.b - barrier.b
+    )
     assert check(setup, bare, alone) < 5e-3
-    twice = replace(problem, mu=0.4, delta=0.05).expand(point).hedge
+    twice = replace(problem, mu=0.4, delta=0.05).expand(point).barrier
     assert twice is not None
-    np.testing.assert_allclose(twice.b, 2.0 * hedge.b, rtol=1e-12)
+    np.testing.assert_allclose(twice.b, 2.0 * barrier.b, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", COSTS)
@@ -130,8 +132,8 @@ def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
     assert inward.value(point) == point.barrier == problem.point(setup.control).barrier
     assert inward.size(point) == max(1.0, abs(point.barrier))
     expansion = inward.expand(point)
-    assert expansion.hedge is not None
-    np.testing.assert_array_equal(expansion.a, expansion.hedge.a)
+    assert expansion.barrier is not None
+    np.testing.assert_array_equal(expansion.a, expansion.barrier.a)
     assert check(setup, inward, expansion) < 2e-3
     assert inward.again(point) is point
 

@@ -274,7 +274,7 @@ def test_leaving_out_what_psi_does_to_the_information_would_be_rejected(tmp_path
     point, expansion = expansion_of(setup, CENTRAL)
     K = np.zeros((setup.samples, 1, 4))
     a, b = setup.problem.running.gradient(setup.initial)
-    wrong = Expansion(expansion.A, expansion.B, a, b)
+    wrong = Expansion(A=expansion.A, B=expansion.B, a=a, b=b)
     c = directions(setup, expansion.gradient(K))[0]
     zeta = expansion.lift(K, c)
 

@@ -1,11 +1,11 @@
-"""The relaxed barrier: twice differentiable, defined outside, by hand on bands of every kind; the moves that a hedge sees."""
+"""The relaxed barrier: twice differentiable, defined outside, by hand on bands of every kind; the moves that a barrier sees."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from mjfim.optimize.barrier import Band, Hedge, relaxed
+from mjfim.optimize.barrier import BarrierExpansion, Bounds, relaxed_log_barrier
 from mjfim.optimize.lq import TangentCurve, Weights
 from tests.support.numerics import Array, relative_error
 
@@ -17,33 +17,38 @@ S = np.array([-3.0, -0.2, 0.0, 0.04, 0.0499, 0.0501, 0.06, 0.4, 1.0, 3.0])
 def test_the_barrier_is_twice_continuous_where_it_relaxes(delta: float) -> None:
     """Value, slope and curvature from both sides; further inside the curvature falls, outside it does not."""
     h = 1e-9
-    below, above = (relaxed(np.array([delta * (1.0 + sign * h)]), delta) for sign in (-1.0, 1.0))
+    below, above = (
+        relaxed_log_barrier(np.array([delta * (1.0 + sign * h)]), delta) for sign in (-1.0, 1.0)
+    )
     for order, (left, right) in enumerate(zip(below, above, strict=True)):
         np.testing.assert_allclose(left * delta**order, right * delta**order, rtol=0, atol=1e-7)
-    bend = [relaxed(np.array([delta * (1.0 + s)]), delta)[2][0] * delta**2 for s in (-0.1, 0.1)]
-    assert bend == pytest.approx([1.0, 1.1**-2])
+    curvature = [
+        relaxed_log_barrier(np.array([delta * (1.0 + s)]), delta)[2][0] * delta**2
+        for s in (-0.1, 0.1)
+    ]
+    assert curvature == pytest.approx([1.0, 1.1**-2])
 
 
 @pytest.mark.parametrize("delta", [0.05, 0.3])
 def test_its_derivatives_are_its_slopes_on_either_side(delta: float) -> None:
     h = 1e-6
-    value, slope, bend = relaxed(S, delta)
-    up, down = relaxed(S + h, delta), relaxed(S - h, delta)
+    value, slope, curvature = relaxed_log_barrier(S, delta)
+    up, down = relaxed_log_barrier(S + h, delta), relaxed_log_barrier(S - h, delta)
     assert relative_error(slope, (up[0] - down[0]) / (2 * h)) < 1e-8
     smooth = np.abs(S - delta) > 2 * h
-    assert relative_error(bend[smooth], ((up[1] - down[1]) / (2 * h))[smooth]) < 1e-7
+    assert relative_error(curvature[smooth], ((up[1] - down[1]) / (2 * h))[smooth]) < 1e-7
     assert np.isfinite(value).all()
-    assert (slope < 0.0).all() and (bend > 0.0).all()
+    assert (slope < 0.0).all() and (curvature > 0.0).all()
 
 
 def test_inside_it_is_the_logarithm_and_outside_it_rises_without_end() -> None:
     inside = np.array([0.2, 0.7, 1.0, 2.5])
-    np.testing.assert_array_equal(relaxed(inside, 0.1)[0], -np.log(inside))
-    outside = relaxed(np.array([-1e6, -10.0, -1.0, 0.0, 0.1]), 0.1)[0]
+    np.testing.assert_array_equal(relaxed_log_barrier(inside, 0.1)[0], -np.log(inside))
+    outside = relaxed_log_barrier(np.array([-1e6, -10.0, -1.0, 0.0, 0.1]), 0.1)[0]
     assert (np.diff(outside) < 0.0).all()
     assert np.isfinite(outside).all()
     # at the bound itself: 1/2 (4 - 1) - log delta
-    assert relaxed(np.array([0.0]), 0.1)[0][0] == pytest.approx(1.5 - np.log(0.1))
+    assert relaxed_log_barrier(np.array([0.0]), 0.1)[0][0] == pytest.approx(1.5 - np.log(0.1))
 
 
 LOWER = np.array([-1.0, -INF, 2.0, -INF, -0.5, -INF])
@@ -52,17 +57,19 @@ UPPER = np.array([3.0, 0.5, INF, INF, INF, -40.0])
 
 def test_a_band_is_scaled_by_half_of_its_range_or_by_its_only_bound() -> None:
     """At least 1 where the bound alone says nothing about the size; 1 where there is none."""
-    np.testing.assert_array_equal(Band.of(LOWER, UPPER).scale, [2.0, 1.0, 2.0, 1.0, 1.0, 40.0])
+    np.testing.assert_array_equal(
+        Bounds.from_range(LOWER, UPPER).scale, [2.0, 1.0, 2.0, 1.0, 1.0, 40.0]
+    )
 
 
 def test_margins_are_distances_to_the_nearer_bound() -> None:
     r = np.array([[2.5, 0.4, 2.0, 1e9, 7.0, -41.0], [-1.5, 0.6, 1.0, -1e9, -0.5, -39.0]])
     expected = [[0.5, 0.1, 0.0, INF, 7.5, 1.0], [-0.5, -0.1, -1.0, INF, 0.0, -1.0]]
-    np.testing.assert_allclose(Band.of(LOWER, UPPER).margin(r), expected, atol=1e-12)
+    np.testing.assert_allclose(Bounds.from_range(LOWER, UPPER).margin(r), expected, atol=1e-12)
 
 
 def test_a_tightened_band_has_both_bounds_moved_inwards_and_its_scale_kept() -> None:
-    band = Band.of(LOWER, UPPER)
+    band = Bounds.from_range(LOWER, UPPER)
     shares = np.array([0.1, 0.2, 0.5, 0.3, 0.0, 0.01])
     inner = band.tightened(shares)
     np.testing.assert_allclose(inner.lower, [-0.8, -INF, 3.0, -INF, -0.5, -INF])
@@ -73,7 +80,7 @@ def test_a_tightened_band_has_both_bounds_moved_inwards_and_its_scale_kept() -> 
 @pytest.mark.parametrize("delta", [0.1, 1e-3])
 def test_a_wall_is_the_sum_of_the_barriers_of_its_bounds(delta: float) -> None:
     """Of both where there are two; its derivatives by every number, inside and outside, are differences of it."""
-    band, weight = Band.of(LOWER, UPPER), 0.25
+    band, weight = Bounds.from_range(LOWER, UPPER), 0.25
     r = np.array([[2.4, 0.2, 2.7, 5.0, 0.3, -60.0], [3.3, 0.8, 1.1, -5.0, -0.9, -35.0]])
 
     def value(numbers: Array) -> float:
@@ -82,27 +89,30 @@ def test_a_wall_is_the_sum_of_the_barriers_of_its_bounds(delta: float) -> None:
             zip(band.lower, band.upper, band.scale, strict=True)
         ):
             for s in ((numbers[:, i] - low) / scale, (high - numbers[:, i]) / scale):
-                total += weight * float(np.sum(relaxed(s[np.isfinite(s)], delta)[0]))
+                total += weight * float(np.sum(relaxed_log_barrier(s[np.isfinite(s)], delta)[0]))
         return total
 
-    wall = band.wall(r, delta, weight)
-    assert wall.value == pytest.approx(value(r), rel=1e-12)
-    assert (wall.slope[:, 3] == 0.0).all() and (wall.bend[:, 3] == 0.0).all()  # free
+    barrier = band.barrier(r, delta, weight)
+    assert barrier.value == pytest.approx(value(r), rel=1e-12)
+    assert (barrier.slope[:, 3] == 0.0).all() and (barrier.curvature[:, 3] == 0.0).all()  # free
     h = 1e-5
     for k, i in np.ndindex(*r.shape):
         e = np.zeros_like(r)
         e[k, i] = h
-        size = max(abs(wall.slope[k, i]), 1.0)
-        assert wall.slope[k, i] == pytest.approx(
+        size = max(abs(barrier.slope[k, i]), 1.0)
+        assert barrier.slope[k, i] == pytest.approx(
             (value(r + e) - value(r - e)) / (2 * h), abs=1e-6 * size
         )
-        up, down = band.wall(r + e, delta, weight).slope, band.wall(r - e, delta, weight).slope
-        np.testing.assert_allclose((up - down)[k, i] / (2 * h), wall.bend[k, i], rtol=1e-4)
+        up, down = (
+            band.barrier(r + e, delta, weight).slope,
+            band.barrier(r - e, delta, weight).slope,
+        )
+        np.testing.assert_allclose((up - down)[k, i] / (2 * h), barrier.curvature[k, i], rtol=1e-4)
 
 
 def test_the_middle_of_a_range_costs_nothing_and_the_gradient_leads_there() -> None:
-    band = Band.of(np.array([-1.0]), np.array([3.0]))
-    middle, right, outside = (band.wall(np.array([[r]]), 0.1, 1.0) for r in (1.0, 2.0, 3.5))
+    band = Bounds.from_range(np.array([-1.0]), np.array([3.0]))
+    middle, right, outside = (band.barrier(np.array([[r]]), 0.1, 1.0) for r in (1.0, 2.0, 3.5))
     assert (middle.value, float(middle.slope[0, 0])) == (0.0, 0.0)
     assert right.slope[0, 0] > 0.0
     assert outside.slope[0, 0] > right.slope[0, 0]
@@ -110,28 +120,42 @@ def test_the_middle_of_a_range_costs_nothing_and_the_gradient_leads_there() -> N
 
 def test_a_hedge_tells_the_largest_move_of_anything_over_its_range() -> None:
     N, nx, nu = 4, 2, 1
-    taps = np.zeros((N, 1, 2, nx + nu))
-    taps[2, 0, 1] = [0.0, 3.0, 1.0]  # what is shown there moves by 3 z_1 + v over its scale
+    observations = np.zeros((N, 1, 2, nx + nu))
+    observations[2, 0, 1] = [0.0, 3.0, 1.0]  # what is shown there moves by 3 z_1 + v over its scale
     free = Weights(
-        np.zeros((N + 1, nx, nx)),
-        np.zeros((N, nu, nx)),
-        np.zeros((N, nu, nu)),
-        np.zeros((N + 1, nu)),
+        Q=np.zeros((N + 1, nx, nx)),
+        S=np.zeros((N, nu, nx)),
+        R=np.zeros((N, nu, nu)),
+        W=np.zeros((N + 1, nu)),
     )
-    hedge = Hedge(
-        np.zeros((N + 1, nx)), np.zeros((N, nu)), free, taps, np.array([8.0]), np.array([np.inf])
+    barrier = BarrierExpansion(
+        a=np.zeros((N + 1, nx)),
+        b=np.zeros((N, nu)),
+        weights=free,
+        observations=observations,
+        control_scale=np.array([8.0]),
+        control_step_scale=np.array([np.inf]),
     )
     z, v = np.zeros((N + 1, nx)), np.zeros((N, nu))
     v[0] = -2.0
-    assert hedge.motion(TangentCurve(z, v)) == pytest.approx(0.25)  # the control alone
+    assert barrier.largest_relative_move(TangentCurve(z=z, v=v)) == pytest.approx(
+        0.25
+    )  # the control alone
     z[2], v[2] = [9.0, -0.4], 0.1
-    assert hedge.motion(TangentCurve(z, v)) == pytest.approx(1.1)
+    assert barrier.largest_relative_move(TangentCurve(z=z, v=v)) == pytest.approx(1.1)
     a, b, twice = (
-        hedge.a + 1.0,
-        hedge.b + 2.0,
-        Weights(free.Q + 1.0, free.S + 2.0, free.R + 3.0, free.W + 4.0),
+        barrier.a + 1.0,
+        barrier.b + 2.0,
+        Weights(Q=free.Q + 1.0, S=free.S + 2.0, R=free.R + 3.0, W=free.W + 4.0),
     )
-    double = Hedge(a, b, twice, taps, hedge.control, hedge.step).times(2.0)
+    double = BarrierExpansion(
+        a=a,
+        b=b,
+        weights=twice,
+        observations=observations,
+        control_scale=barrier.control_scale,
+        control_step_scale=barrier.control_step_scale,
+    ).scaled(2.0)
     found = [
         double.a,
         double.b,
@@ -141,4 +165,4 @@ def test_a_hedge_tells_the_largest_move_of_anything_over_its_range() -> None:
         double.weights.W,
     ]
     assert [float(array.flat[0]) for array in found] == [2.0, 4.0, 2.0, 4.0, 6.0, 8.0]
-    np.testing.assert_array_equal(double.taps, taps)  # ranges, not weights
+    np.testing.assert_array_equal(double.observations, observations)  # ranges, not weights

@@ -13,25 +13,36 @@ from scipy.optimize import minimize
 from mjfim.excitation.constraints import fence_of
 from mjfim.experiment.system import Setup
 from mjfim.information.criteria import smooth_e_optimality
-from mjfim.optimize.eigenvalue_model import Spectral, coordinates, divided, matrix
+from mjfim.optimize.eigenvalue_model import (
+    EigenvalueModel,
+    divided_log_differences,
+    symmetric_coordinates,
+    symmetric_matrix,
+)
 from tests.support.numerics import Array, cart_setup, relative_error
 
 VALUES = {"apart": [0.5, 0.85, 2.0], "meeting": [0.5, 0.5 + 5e-10, 0.525]}
 
 
-def model_of(values: list[float], power: float = 12.0, share: float = 0.6) -> Spectral:
+def model_of(values: list[float], power: float = 12.0, share: float = 0.6) -> EigenvalueModel:
     """A model without slopes."""
     m = len(values) * (len(values) + 1) // 2
-    return Spectral(np.array(values), power, share, np.zeros((m, 2, 1)), np.zeros((m, 1, 1)))
+    return EigenvalueModel(
+        eigenvalues=np.array(values),
+        power=power,
+        weight=share,
+        a=np.zeros((m, 2, 1)),
+        b=np.zeros((m, 1, 1)),
+    )
 
 
 def test_coordinates_keep_scalar_products() -> None:
     rng = np.random.default_rng(0)
     for r in (1, 2, 4):
         d, e = rng.normal(size=(2, r * (r + 1) // 2))
-        np.testing.assert_allclose(coordinates(matrix(d, r)), d)
-        np.testing.assert_array_equal(matrix(d, r), matrix(d, r).T)
-        assert np.sum(matrix(d, r) * matrix(e, r)) == pytest.approx(d @ e)
+        np.testing.assert_allclose(symmetric_coordinates(symmetric_matrix(d, r)), d)
+        np.testing.assert_array_equal(symmetric_matrix(d, r), symmetric_matrix(d, r).T)
+        assert np.sum(symmetric_matrix(d, r) * symmetric_matrix(e, r)) == pytest.approx(d @ e)
 
 
 @pytest.mark.parametrize("values", VALUES)
@@ -40,8 +51,8 @@ def test_the_model_is_the_criterion_of_moved_information(values: str) -> None:
     rng, model = np.random.default_rng(1), model_of(VALUES[values])
 
     def wanted(d: Array) -> float:
-        moved = np.diag(np.log(model.values)) + matrix(d, 3)
-        return model.share * float(
+        moved = np.diag(np.log(model.eigenvalues)) + symmetric_matrix(d, 3)
+        return model.weight * float(
             np.log(smooth_e_optimality(np.asarray(expm(moved)), model.power).value)
         )
 
@@ -74,7 +85,7 @@ def test_the_settled_gradient_belongs_to_the_minimum_of_the_proximal_problem(val
         def cost(y: Array, root: Array = root, d0: Array = d0) -> float:
             return model.value(d0 + root @ y) + 0.5 * float(y @ y)
 
-        w = model.settle(d0, spread)
+        w = model.minimising_gradient(d0, spread)
         best = minimize(cost, np.zeros(rank), method="BFGS", options={"gtol": 1e-10})
         np.testing.assert_allclose(d0 - spread @ w, d0 + root @ best.x, rtol=0, atol=1e-5)
 
@@ -84,7 +95,9 @@ def test_divided_differences_turn_a_change_into_one_of_the_logarithm() -> None:
     change = rng.normal(size=(3, 3))
     change = 1e-6 * (change + change.T)
     slope = (logm(np.diag(values) + change) - logm(np.diag(values) - change)) / 2.0
-    np.testing.assert_allclose(divided(values) * change, slope, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(
+        divided_log_differences(values) * change, slope, rtol=1e-5, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("information", ["plain", "nuisance", "delay and sensors"])
@@ -107,9 +120,9 @@ def test_slopes_are_those_of_the_logarithm_of_simulated_information(
     problem = replace(problem, information=replace(problem.information, power=3.0, faint=0.0))
     point = problem.point(setup.initial)
     expansion, _ = problem.tapped(point, fence_of(setup).taps)
-    model = expansion.spectral
+    model = expansion.eigenvalue_model
     assert model is not None and point.information is not None
-    assert len(model.values) == 3
+    assert len(model.eigenvalues) == 3
     reduced, _ = problem.information.reduced(point.information)
     vectors = np.linalg.eigh(reduced)[1]
 
@@ -117,7 +130,7 @@ def test_slopes_are_those_of_the_logarithm_of_simulated_information(
         moved = problem.point(setup.plant.simulate(setup.theta, ctrl))
         assert moved.information is not None
         inside, _ = problem.information.reduced(moved.information)
-        return coordinates(np.real(vectors.T @ logm(inside) @ vectors))
+        return symmetric_coordinates(np.real(vectors.T @ logm(inside) @ vectors))
 
     rng, open_loop = np.random.default_rng(5), np.zeros((setup.samples, 1, 4))
     for _ in range(3):
@@ -139,7 +152,7 @@ def test_other_criteria_and_plain_expansions_have_no_model(tmp_path: Path) -> No
     setup = cart_setup(tmp_path, limits={"control": {"force": (-9.0, 9.0)}}).free()
     point = setup.problem.point(setup.initial)
     assert (
-        setup.problem.tapped(point, fence_of(setup).taps)[0].spectral is None
+        setup.problem.tapped(point, fence_of(setup).taps)[0].eigenvalue_model is None
     )  # 1 / lambda_min itself
     smooth = replace(setup.problem, information=replace(setup.problem.information, power=40.0))
-    assert smooth.expand(smooth.judged(point)).spectral is None
+    assert smooth.expand(smooth.judged(point)).eigenvalue_model is None

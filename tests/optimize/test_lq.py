@@ -1,4 +1,4 @@
-"""Linear recursions, regulator and descent against plain loops, SciPy's Riccati solver and a dense KKT system."""
+"""Linear recursions, regulator and descent against plain loops, SciPy's RiccatiSolution solver and a dense KKT system."""
 
 from __future__ import annotations
 
@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from mjfim.optimize.lq import Recursion, Riccati, TangentCurve, Weights, descent, growth, regulator
+from mjfim.optimize.lq import (
+    LinearRecursion,
+    RiccatiSolution,
+    TangentCurve,
+    Weights,
+    descent,
+    largest_amplification,
+    regulator,
+)
 from tests.support.lq import positive, random_system, random_weights
 
 
@@ -54,7 +62,7 @@ def test_forward_recursion_is_the_plain_loop(sizes: tuple[int, int]) -> None:
     for k in range(N):
         z.append(A[k] @ z[-1] + c[k])
     np.testing.assert_allclose(
-        Recursion(A).forward(z0, c), z, rtol=1e-12, atol=1e-12 * np.abs(z).max()
+        LinearRecursion(A).forward(z0, c), z, rtol=1e-12, atol=1e-12 * np.abs(z).max()
     )
 
 
@@ -67,14 +75,14 @@ def test_adjoint_recursion_is_the_plain_loop(sizes: tuple[int, int]) -> None:
     for k in range(N - 1, -1, -1):
         costate.insert(0, A[k].T @ costate[0] + a[k])
     np.testing.assert_allclose(
-        Recursion(A).adjoint(a), costate, rtol=1e-12, atol=1e-12 * np.abs(costate).max()
+        LinearRecursion(A).adjoint(a), costate, rtol=1e-12, atol=1e-12 * np.abs(costate).max()
     )
 
 
 def test_adjoint_is_the_transpose_of_forward() -> None:
     rng = np.random.default_rng(3)
     A, c, a = rng.normal(size=(12, 3, 3)) * 0.7, rng.normal(size=(12, 3)), rng.normal(size=(13, 3))
-    z0, recursion = rng.normal(size=3), Recursion(A)
+    z0, recursion = rng.normal(size=3), LinearRecursion(A)
     costate = recursion.adjoint(a)
     left = np.sum(a * recursion.forward(z0, c))
     assert left == pytest.approx(np.sum(costate[1:] * c) + costate[0] @ z0, rel=1e-12)
@@ -83,7 +91,7 @@ def test_adjoint_is_the_transpose_of_forward() -> None:
 def test_recursions_leave_their_inputs_alone_and_can_be_reused() -> None:
     rng = np.random.default_rng(4)
     A, c, a = rng.normal(size=(5, 2, 2)), rng.normal(size=(5, 2)), rng.normal(size=(6, 2))
-    kept, recursion = [v.copy() for v in (A, c, a)], Recursion(A)
+    kept, recursion = [v.copy() for v in (A, c, a)], LinearRecursion(A)
     first = recursion.forward(np.ones(2), c)
     recursion.adjoint(a)
     np.testing.assert_array_equal(recursion.forward(np.ones(2), c), first)
@@ -92,7 +100,7 @@ def test_recursions_leave_their_inputs_alone_and_can_be_reused() -> None:
 
 
 def test_recursion_overflows_to_infinity_without_a_warning() -> None:
-    z = Recursion(np.full((400, 1, 1), 10.0)).forward(np.ones(1), np.zeros((400, 1)))
+    z = LinearRecursion(np.full((400, 1, 1), 10.0)).forward(np.ones(1), np.zeros((400, 1)))
     assert np.isinf(z[-1, 0])
 
 
@@ -130,11 +138,11 @@ def test_regulator_gain_minimises_its_cost_over_a_finite_time_varying_horizon() 
     K, z0 = regulator(A, B, Q, R, terminal), rng.normal(size=3)
 
     def cost(v: np.ndarray) -> float:
-        z = Recursion(A).forward(z0, np.einsum("kij,kj->ki", B, v))
+        z = LinearRecursion(A).forward(z0, np.einsum("kij,kj->ki", B, v))
         running = np.einsum("ki,ij,kj->", z[:-1], Q, z[:-1]) + np.einsum("ki,ij,kj->", v, R, v)
         return float(running + z[-1] @ terminal @ z[-1])
 
-    z = Recursion(A - B @ K).forward(z0, np.zeros((9, 3)))
+    z = LinearRecursion(A - B @ K).forward(z0, np.zeros((9, 3)))
     best = -np.einsum("kui,ki->ku", K, z[:-1])
     for _ in range(20):
         step = 1e-3 * rng.normal(size=best.shape)
@@ -190,7 +198,7 @@ def test_weighted_descent_solves_the_dense_normal_equations(
     )
 
     def response(v: np.ndarray) -> np.ndarray:
-        return Recursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
+        return LinearRecursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))
 
     def cost(v: np.ndarray) -> tuple[float, float]:
         z = response(v)
@@ -201,7 +209,7 @@ def test_weighted_descent_solves_the_dense_normal_equations(
     pairs = np.array([[cost(e + f)[1] for f in units] for e in units])
     H = 0.5 * (pairs - diagonal[:, None] - diagonal)  # by polarisation
     best = -np.linalg.solve(H, g).reshape(N, nu)
-    zeta = Riccati.of(A, B, weights).descent(a, b)
+    zeta = RiccatiSolution.solve(A, B, weights).descent(a, b)
     np.testing.assert_allclose(zeta.v, best, rtol=0, atol=1e-8 * np.abs(best).max())
     np.testing.assert_allclose(
         zeta.z, response(best), rtol=0, atol=1e-8 * max(np.abs(zeta.z).max(), 1.0)
@@ -209,9 +217,9 @@ def test_weighted_descent_solves_the_dense_normal_equations(
     # every weight is seen
     for name in ("S", "W") if steps else ("S",):
         other = Weights(**{**weights.__dict__, name: 0.5 * getattr(weights, name)})
-        assert np.abs(Riccati.of(A, B, other).descent(a, b).v - best).max() > 1e-4 * np.abs(
-            best
-        ).max() or (
+        assert np.abs(
+            RiccatiSolution.solve(A, B, other).descent(a, b).v - best
+        ).max() > 1e-4 * np.abs(best).max() or (
             name == "S" and N == 1  # z_0 = 0
         )
 
@@ -221,7 +229,7 @@ def test_force_is_half_the_derivative_of_the_form() -> None:
     N, nx, nu = 9, 3, 2
     weights = random_weights(rng, N, nx, nu, steps=True)
     z, v, dz, dv = (rng.normal(size=s) for s in ((N + 1, nx), (N, nu), (N + 1, nx), (N, nu)))
-    a, b = weights.force(TangentCurve(z, v))
+    a, b = weights.half_gradient(TangentCurve(z=z, v=v))
     slope = (
         0.5 * (form(weights, z + dz, v + dv) - form(weights, z - dz, v - dv)) / 2.0
     )  # a quadratic: exact
@@ -242,7 +250,7 @@ def test_descent_is_feasible_optimal_and_goes_down_by_its_own_metric() -> None:
         )
 
     zeta = descent(A, B, a, b, Q, R, terminal)
-    recursion = Recursion(A)
+    recursion = LinearRecursion(A)
     np.testing.assert_allclose(
         zeta.z,
         recursion.forward(np.zeros(3), np.einsum("kij,kj->ki", B, zeta.v)),
@@ -278,7 +286,7 @@ def test_arrays_that_do_not_fit_together_are_refused(wrong: str) -> None:
 
 @pytest.mark.parametrize(("rows", "rhs"), [(3, "c"), (5, "c"), (4, "a"), (6, "a")])
 def test_recursion_refuses_arrays_of_the_wrong_length(rows: int, rhs: str) -> None:
-    recursion, wrong = Recursion(np.ones((4, 2, 2))), np.ones((rows, 2))
+    recursion, wrong = LinearRecursion(np.ones((4, 2, 2))), np.ones((rows, 2))
     solve = recursion.adjoint if rhs == "a" else partial(recursion.forward, np.ones(2))
     with pytest.raises(ValueError, match="needs"):
         solve(wrong)
@@ -291,6 +299,6 @@ def test_growth_is_the_largest_amplification_from_the_start_or_to_the_end() -> N
     for step in A:
         product = step @ product
         largest = max(largest, np.linalg.norm(product, 2))
-    assert growth(A) == pytest.approx(largest)
+    assert largest_amplification(A) == pytest.approx(largest)
     late = np.concatenate([0.01 * A, 3.0 * A])  # forgets the start, then explodes
-    assert growth(late) == pytest.approx(3.3**12)
+    assert largest_amplification(late) == pytest.approx(3.3**12)

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import minimize
 
 from mjfim.optimize.directions import LBFGS, MetricDescent
-from mjfim.optimize.lq import TangentCurve, growth
+from mjfim.optimize.lq import TangentCurve, largest_amplification
 from mjfim.optimize.projection_operator import (
     Armijo,
     Direction,
@@ -96,7 +96,7 @@ class Pendulum:
         A, B = (np.array(m) for m in zip(*(jacobians(x) for x in point.x[:-1]), strict=True))
         a = DT * (point.x - GOAL) @ Q
         a[0], a[N] = 0.0, TERMINAL @ (point.x[N] - GOAL)
-        return Expansion(A, B, self.sign * a, self.sign * DT * point.u @ R)
+        return Expansion(A=A, B=B, a=self.sign * a, b=self.sign * DT * point.u @ R)
 
     def project(self, point: Curve, zeta: TangentCurve, gamma: float, K: Array) -> Curve:
         """The projection operator, sample by sample."""
@@ -110,7 +110,7 @@ class Pendulum:
 
     def difference(self, new: Curve, old: Curve) -> TangentCurve:
         """On a vector space."""
-        return TangentCurve(new.x - old.x, new.u - old.u)
+        return TangentCurve(z=new.x - old.x, v=new.u - old.u)
 
     def refine(self, point: Curve) -> Curve | None:
         """Nothing to refine, unless asked for."""
@@ -126,7 +126,7 @@ def start(problem: Pendulum) -> Curve:
 
 
 METRIC = MetricDescent(Q * DT, R * DT, TERMINAL)
-REGULATOR = Regulator(np.eye(2) * DT, np.eye(1) * DT, np.eye(2))
+REGULATOR = Regulator(Q=np.eye(2) * DT, R=np.eye(1) * DT, terminal=np.eye(2))
 
 
 def run(problem: Any, direction: Direction, **changes: Any) -> list[Iterate[Curve]]:
@@ -197,7 +197,7 @@ def test_the_expansion_of_this_problem_is_exact(method: str) -> None:
     K = REGULATOR.gain(expansion)
     zeta = DIRECTIONS[method]()(expansion, K)
     size = 1e-2 / np.abs(zeta.v).max()
-    short = TangentCurve(size * zeta.z, size * zeta.v)
+    short = TangentCurve(z=size * zeta.z, v=size * zeta.v)
 
     def J(t: float) -> float:
         return problem.value(problem.project(point, short, t, K))
@@ -261,7 +261,7 @@ class Upwards:
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
         zeta = METRIC(expansion, K)
-        return TangentCurve(-zeta.z, -zeta.v)
+        return TangentCurve(z=-zeta.z, v=-zeta.v)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
         """Nothing is learnt."""
@@ -285,7 +285,7 @@ def searched(
     expansion = problem.expand(point)
     K = REGULATOR.gain(expansion)
     zeta = METRIC(expansion, K)
-    zeta = TangentCurve(factor * zeta.z, factor * zeta.v)
+    zeta = TangentCurve(z=factor * zeta.z, v=factor * zeta.v)
     slope = expansion.slope(zeta)
     return armijo.search(problem, point, zeta, slope, K, first), problem.value(point), slope
 
@@ -316,7 +316,7 @@ def test_armijo_rejects_small_decrease_that_is_not_sufficient() -> None:
 
     problem = Flat()
     origin = start(problem)
-    zeta = TangentCurve(np.zeros((N + 1, 2)), np.ones((N, 1)))
+    zeta = TangentCurve(z=np.zeros((N + 1, 2)), v=np.ones((N, 1)))
     K = np.zeros((N, 1, 2))
     assert Armijo(sigma=1e-2).search(problem, origin, zeta, -1.0, K) is None
     assert Armijo(sigma=1e-4).search(problem, origin, zeta, -1.0, K) is not None
@@ -328,7 +328,7 @@ def test_armijo_gives_up_on_an_ascent_direction_that_claims_to_descend() -> None
     expansion = problem.expand(point)
     K = REGULATOR.gain(expansion)
     zeta = METRIC(expansion, K)
-    up = TangentCurve(-zeta.z, -zeta.v)
+    up = TangentCurve(z=-zeta.z, v=-zeta.v)
     before = len(problem.values)
     assert Armijo(trials=12).search(problem, point, up, expansion.slope(zeta), K) is None
     assert len(problem.values) - before == 13  # the start and every trial
@@ -340,7 +340,7 @@ def test_armijo_does_not_accept_a_step_too_short_to_change_the_cost() -> None:
     expansion = problem.expand(point)
     K = REGULATOR.gain(expansion)
     zeta = METRIC(expansion, K)
-    up = TangentCurve(-zeta.z, -zeta.v)
+    up = TangentCurve(z=-zeta.z, v=-zeta.v)
     found = Armijo(trials=100).search(problem, point, up, expansion.slope(zeta), K)
     assert found is None or problem.value(found[0]) < problem.value(point)
 
@@ -489,12 +489,12 @@ def test_lbfgs_carried_to_a_finer_grid_keeps_its_curvature_and_its_direction() -
         assert np.sum(new.s * new.y) == pytest.approx(np.sum(old.s * old.y), rel=1e-12)
         assert new.curvature == pytest.approx(old.curvature, rel=1e-12)
     g = np.cos(np.arange(N))[:, None]
-    still = Expansion(np.zeros((N, 1, 1)), np.zeros((N, 1, 1)), np.zeros((N + 1, 1)), g)
+    still = Expansion(A=np.zeros((N, 1, 1)), B=np.zeros((N, 1, 1)), a=np.zeros((N + 1, 1)), b=g)
     dense = Expansion(
-        np.zeros((4 * N, 1, 1)),
-        np.zeros((4 * N, 1, 1)),
-        np.zeros((4 * N + 1, 1)),
-        np.repeat(g, 4, axis=0) / 4,
+        A=np.zeros((4 * N, 1, 1)),
+        B=np.zeros((4 * N, 1, 1)),
+        a=np.zeros((4 * N + 1, 1)),
+        b=np.repeat(g, 4, axis=0) / 4,
     )
     coarse = direction(still, np.zeros((N, 1, 1))).v
     np.testing.assert_allclose(
@@ -505,8 +505,9 @@ def test_lbfgs_carried_to_a_finer_grid_keeps_its_curvature_and_its_direction() -
 
 def test_feedback_only_where_the_plant_is_not_calm() -> None:
     expansion = Pendulum().expand(start(Pendulum()))
-    amplification = growth(expansion.A)
-    assert not replace(REGULATOR, calm=1.01 * amplification).gain(expansion).any()
+    amplification = largest_amplification(expansion.A)
+    assert not replace(REGULATOR, feedback_threshold=1.01 * amplification).gain(expansion).any()
     np.testing.assert_array_equal(
-        replace(REGULATOR, calm=0.99 * amplification).gain(expansion), REGULATOR.gain(expansion)
+        replace(REGULATOR, feedback_threshold=0.99 * amplification).gain(expansion),
+        REGULATOR.gain(expansion),
     )

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from mjfim.optimize.barrier import Band, Hedge
-from mjfim.optimize.lq import Chart, Recursion, TangentCurve, Weights
+from mjfim.optimize.barrier import BarrierExpansion, Bounds
+from mjfim.optimize.lq import CurveCoordinates, LinearRecursion, TangentCurve, Weights
 from mjfim.optimize.projection_operator import Armijo, Expansion, Regulator, optimize
-from mjfim.optimize.structured_bfgs import BasisMetric, Metric, StructuredBFGS
+from mjfim.optimize.structured_bfgs import BasisMetric, CurveMetric, StructuredBFGS
 from mjfim.records.design import Status
 from tests.support.lq import random_system, random_weights
 from tests.support.numerics import Array, cart_setup, relative_error
@@ -24,11 +24,11 @@ N, NX, NU = 12, 3, 2
 def random_expansion(rng: np.random.Generator) -> tuple[Expansion, Weights]:
     """An expansion with every weight."""
     A, B = random_system(rng, N, NX, NU)
-    expansion = Expansion(A, B, rng.normal(size=(N + 1, NX)), rng.normal(size=(N, NU)))
+    expansion = Expansion(A=A, B=B, a=rng.normal(size=(N + 1, NX)), b=rng.normal(size=(N, NU)))
     return expansion, random_weights(rng, N, NX, NU, steps=True)
 
 
-def dense(metric: Metric) -> Array:
+def dense(metric: CurveMetric) -> Array:
     """(N*nu, N*nu) matrix of a metric: what it makes of each unit step."""
     units = np.eye(N * NU).reshape(-1, N, NU)
     return np.stack([metric.apply(e).reshape(-1) for e in units], axis=1)
@@ -39,7 +39,7 @@ def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: b
     rng = np.random.default_rng(1)
     expansion, weights = random_expansion(rng)
     K = feedback * 0.3 * rng.normal(size=(N, NU, NX))
-    metric = Metric(Chart(expansion.A, expansion.B, K), weights)
+    metric = CurveMetric(CurveCoordinates(A=expansion.A, B=expansion.B, K=K), weights)
     H = dense(metric)
     np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(H)[0] > 0.0
@@ -50,7 +50,7 @@ def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: b
     # its own form on the curve that a step makes
     s = rng.normal(size=(N, NU))
     zeta = expansion.lift(K, s)
-    a, b = weights.force(zeta)
+    a, b = weights.half_gradient(zeta)
     assert np.vdot(s, metric.apply(s)) == pytest.approx(
         np.sum(a * zeta.z) + np.sum(b * zeta.v), rel=1e-10
     )
@@ -59,7 +59,9 @@ def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: b
 def test_on_an_identity_basis_both_metrics_agree() -> None:
     rng = np.random.default_rng(2)
     expansion, weights = random_expansion(rng)
-    free = Metric(Chart(expansion.A, expansion.B, np.zeros((N, NU, NX))), weights)
+    free = CurveMetric(
+        CurveCoordinates(A=expansion.A, B=expansion.B, K=np.zeros((N, NU, NX))), weights
+    )
     based = BasisMetric.of(expansion, weights, np.eye(N))
     for _ in range(3):
         s = rng.normal(size=(N, NU))
@@ -77,7 +79,11 @@ def test_on_fewer_curves_the_metric_is_the_projected_one() -> None:
     wide = np.einsum("km,uw->kumw", basis, np.eye(NU)).reshape(N * NU, -1)
     H = (
         wide.T
-        @ dense(Metric(Chart(expansion.A, expansion.B, np.zeros((N, NU, NX))), weights))
+        @ dense(
+            CurveMetric(
+                CurveCoordinates(A=expansion.A, B=expansion.B, K=np.zeros((N, NU, NX))), weights
+            )
+        )
         @ wide
     )
     based = BasisMetric.of(expansion, weights, basis)
@@ -115,9 +121,9 @@ class Toy:
 
     wanted = np.array([3.0, 0.0, -1.0])
     start = np.array([0.2, 0.0, 0.1])
-    shown = Band.of(np.array([-1.0]), np.array([1.0]))
-    control = Band.of(np.full(NU, -0.6), np.array([0.6, np.inf]))
-    rate = Band.of(np.full(NU, -0.4), np.full(NU, 0.4))
+    shown = Bounds.from_range(np.array([-1.0]), np.array([1.0]))
+    control = Bounds.from_range(np.full(NU, -0.6), np.array([0.6, np.inf]))
+    rate = Bounds.from_range(np.full(NU, -0.4), np.full(NU, 0.4))
 
     @property
     def delta(self) -> float:
@@ -127,7 +133,7 @@ class Toy:
     def point(self, u: Array) -> ToyPoint:
         """The curve of a control."""
         A, B = self.plant
-        return ToyPoint(u, Recursion(A).forward(self.start, np.einsum("kij,kj->ki", B, u)))
+        return ToyPoint(u, LinearRecursion(A).forward(self.start, np.einsum("kij,kj->ki", B, u)))
 
     def value(self, point: ToyPoint) -> float:
         """Cost and barrier."""
@@ -137,15 +143,15 @@ class Toy:
         )  # a little that is not quadratic
         if not self.mu:
             return float(cost)
-        walls = (
-            self.shown.wall(point.x[1:, :1], self.delta, 1.0).value
-            + self.control.wall(point.u, self.delta, 1.0).value
+        barriers = (
+            self.shown.barrier(point.x[1:, :1], self.delta, 1.0).value
+            + self.control.barrier(point.u, self.delta, 1.0).value
         )
         if self.steps:
-            walls += self.rate.wall(
+            barriers += self.rate.barrier(
                 np.diff(point.u, axis=0, prepend=0.0, append=0.0), self.delta, 1.0
             ).value
-        return float(cost + self.mu * walls)
+        return float(cost + self.mu * barriers)
 
     def size(self, point: ToyPoint) -> float:
         """Of a change."""
@@ -159,30 +165,32 @@ class Toy:
         a[1:, 2] += 4e-3 * x[1:, 2] * u[:, 1] ** 2
         b[:, 1] += 4e-3 * x[1:, 2] ** 2 * u[:, 1]
         if not self.mu:
-            return Expansion(A, B, a, b)
+            return Expansion(A=A, B=B, a=a, b=b)
         shown, held = (
-            self.shown.wall(x[1:, :1], self.delta, self.mu),
-            self.control.wall(u, self.delta, self.mu),
+            self.shown.barrier(x[1:, :1], self.delta, self.mu),
+            self.control.barrier(u, self.delta, self.mu),
         )
         Q, R, W = np.zeros((N + 1, NX, NX)), np.zeros((N, NU, NU)), np.zeros((N + 1, NU))
-        Q[1:, 0, 0], R[:, range(NU), range(NU)] = shown.bend[:, 0], held.bend
-        wall_a, wall_b = np.zeros_like(a), held.slope.copy()
-        wall_a[1:, 0] = shown.slope[:, 0]
+        Q[1:, 0, 0], R[:, range(NU), range(NU)] = shown.curvature[:, 0], held.curvature
+        barrier_a, barrier_b = np.zeros_like(a), held.slope.copy()
+        barrier_a[1:, 0] = shown.slope[:, 0]
         if self.steps:
-            wall = self.rate.wall(np.diff(u, axis=0, prepend=0.0, append=0.0), self.delta, self.mu)
-            wall_b += wall.slope[:-1] - wall.slope[1:]
-            W = wall.bend
-        taps = np.zeros((N, 1, 1, NX + NU))
-        taps[:, 0, 0, :NX], taps[:, 0, 0, NX:] = A[:, 0], B[:, 0]
-        hedge = Hedge(
-            wall_a,
-            wall_b,
-            Weights(Q, np.zeros((N, NU, NX)), R, W),
-            taps,
-            self.control.scale,
-            self.rate.scale,
+            derivatives = self.rate.barrier(
+                np.diff(u, axis=0, prepend=0.0, append=0.0), self.delta, self.mu
+            )
+            barrier_b += derivatives.slope[:-1] - derivatives.slope[1:]
+            W = derivatives.curvature
+        observations = np.zeros((N, 1, 1, NX + NU))
+        observations[:, 0, 0, :NX], observations[:, 0, 0, NX:] = A[:, 0], B[:, 0]
+        barrier = BarrierExpansion(
+            a=barrier_a,
+            b=barrier_b,
+            weights=Weights(Q=Q, S=np.zeros((N, NU, NX)), R=R, W=W),
+            observations=observations,
+            control_scale=self.control.scale,
+            control_step_scale=self.rate.scale,
         )
-        return Expansion(A, B, a + wall_a, b + wall_b, None, hedge)
+        return Expansion(A=A, B=B, a=a + barrier_a, b=b + barrier_b, extended=None, barrier=barrier)
 
     def project(self, point: ToyPoint, zeta: TangentCurve, gamma: float, K: Array) -> ToyPoint:
         """The plant is linear: with feedback or without, a tangent curve is a move of the control."""
@@ -190,15 +198,15 @@ class Toy:
 
     def difference(self, new: ToyPoint, old: ToyPoint) -> TangentCurve:
         """Linear."""
-        return TangentCurve(new.x - old.x, new.u - old.u)
+        return TangentCurve(z=new.x - old.x, v=new.u - old.u)
 
     def refine(self, point: ToyPoint) -> ToyPoint | None:
         """It is exact."""
         return None
 
 
-CALM = Regulator(np.eye(NX), np.eye(NU), np.eye(NX), calm=np.inf)
-FED_BACK = Regulator(np.eye(NX), np.eye(NU), np.eye(NX))
+CALM = Regulator(Q=np.eye(NX), R=np.eye(NU), terminal=np.eye(NX), feedback_threshold=np.inf)
+FED_BACK = Regulator(Q=np.eye(NX), R=np.eye(NU), terminal=np.eye(NX))
 
 
 @pytest.mark.parametrize("mu", [1e-1, 1e-3])
@@ -264,16 +272,16 @@ def test_what_was_learnt_outlives_a_sharper_barrier() -> None:
 def test_no_step_moves_anything_limited_too_far() -> None:
     toy = Toy(1e-4)
     e = toy.expand(toy.point(np.zeros((N, NU))))
-    assert e.hedge is not None
+    assert e.barrier is not None
     K = np.zeros((N, NU, NX))
     long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(e, K)
     short = StructuredBFGS(np.full(NU, 1e-6), reach=0.25)(e, K)
-    assert e.hedge.motion(long) > 1.0
-    assert 0.05 < e.hedge.motion(short) <= 0.25
+    assert e.barrier.largest_relative_move(long) > 1.0
+    assert 0.05 < e.barrier.largest_relative_move(short) <= 0.25
     assert e.slope(short) < 0.0
-    tiny = Expansion(e.A, e.B, 1e-9 * e.a, 1e-9 * e.b, None, e.hedge)
+    tiny = Expansion(A=e.A, B=e.B, a=1e-9 * e.a, b=1e-9 * e.b, extended=None, barrier=e.barrier)
     assert (
-        e.hedge.motion(StructuredBFGS(np.full(NU, 1.0))(tiny, K)) < 1e-6
+        e.barrier.largest_relative_move(StructuredBFGS(np.full(NU, 1.0))(tiny, K)) < 1e-6
     )  # a short step stays as it is
 
 
@@ -282,16 +290,16 @@ def test_damping_shortens_what_nothing_holds_and_leaves_the_way_back_inside() ->
     toy, outside = Toy(1e-4), np.zeros((N, NU))
     outside[3, 0] = toy.control.upper[0] + 0.2 * toy.control.scale[0]
     e = toy.expand(toy.point(outside))
-    assert e.hedge is not None
+    assert e.barrier is not None
     a = e.a + 50.0 * np.random.default_rng(2).normal(size=e.a.shape) * np.array([0.0, 1.0, 1.0])
     pulled, K = replace(e, a=a), np.zeros((N, NU, NX))
     long = StructuredBFGS(np.full(NU, 1e-6), reach=1e9)(pulled, K)
-    far = e.hedge.motion(long) / 0.25
+    far = e.barrier.largest_relative_move(long) / 0.25
     assert far > 10.0
     direction = StructuredBFGS(np.full(NU, 1e-6), reach=0.25)
     damped = direction(pulled, K)
     assert direction.damping > 0.0
-    assert e.hedge.motion(damped) <= 0.25 + 1e-12
+    assert e.barrier.largest_relative_move(damped) <= 0.25 + 1e-12
     assert pulled.slope(damped) < 0.0
     assert damped.v[3, 0] < 2.0 * long.v[3, 0] / far < 0.0
 

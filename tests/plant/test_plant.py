@@ -15,7 +15,7 @@ from mjfim.experiment.system import Setup
 from mjfim.model.loading import compile_spec, load_spec, unconstrained
 from mjfim.model.mujoco_log import quiet
 from mjfim.model.variants import Source
-from mjfim.optimize.lq import Recursion, TangentCurve, regulator
+from mjfim.optimize.lq import LinearRecursion, TangentCurve, regulator
 from mjfim.output.mjcf.write import write_spec
 from mjfim.plant.plant import CENTRAL, FAST
 from mjfim.records.trajectory import Linearization
@@ -211,7 +211,10 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
     assert (scale > 0).all()
     assert np.abs((S.psi[-1] - psi) / scale).max() < tolerance
     every = np.stack(
-        [Recursion(L.A).forward(np.zeros(setup.space.nx), L.E[:, :, j]) for j in range(len(scale))],
+        [
+            LinearRecursion(L.A).forward(np.zeros(setup.space.nx), L.E[:, :, j])
+            for j in range(len(scale))
+        ],
         axis=2,
     )
     assert np.abs((S.psi - every) / scale).max() < tolerance
@@ -321,8 +324,10 @@ def tangent(setup: Setup, K: Array, size: float = 1.0) -> TangentCurve:
     """A smooth tangent vector along the initial trajectory."""
     L, t = linear(setup), setup.t[:, None]
     c = size * np.sin(7.0 * t + 1.0 + np.arange(setup.plant.nu))
-    z = Recursion(L.A - L.B @ K).forward(np.zeros(setup.space.nx), np.einsum("kiu,ku->ki", L.B, c))
-    return TangentCurve(z, c - np.einsum("kui,ki->ku", K, z[:-1]))
+    z = LinearRecursion(L.A - L.B @ K).forward(
+        np.zeros(setup.space.nx), np.einsum("kiu,ku->ki", L.B, c)
+    )
+    return TangentCurve(z=z, v=c - np.einsum("kui,ki->ku", K, z[:-1]))
 
 
 STILL = pytest.mark.parametrize(
@@ -338,7 +343,7 @@ def test_projecting_a_trajectory_onto_itself_changes_nothing(
     setup = make(tmp_path)
     K = gain(setup) * (not open_loop)
     still = TangentCurve(
-        np.zeros((setup.samples + 1, setup.space.nx)), np.zeros((setup.samples, setup.plant.nu))
+        z=np.zeros((setup.samples + 1, setup.space.nx)), v=np.zeros((setup.samples, setup.plant.nu))
     )
     same = setup.plant.project(setup.theta, setup.initial, still, 1.0, K)
     np.testing.assert_allclose(same.state, setup.initial.state, rtol=0, atol=1e-12)
@@ -404,7 +409,7 @@ def test_feedback_holds_an_upright_pendulum_that_open_loop_loses(tmp_path) -> No
     )
     K, kick = gain(setup), np.zeros((setup.samples, 1))
     kick[:20] = 0.5
-    zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), kick)
+    zeta = TangentCurve(z=np.zeros((setup.samples + 1, 4)), v=kick)
     lost = setup.plant.project(setup.theta, setup.initial, zeta, 1.0, 0.0 * K)
     held = setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K)
     assert np.abs(lost.qpos[:, 1]).max() > 2.0
@@ -416,7 +421,7 @@ def test_a_control_that_diverges_is_an_outcome_without_noise(tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     setup = cart_setup(tmp_path)
     before, K = sorted(p.name for p in tmp_path.iterdir()), gain(setup)
-    wild = TangentCurve(np.zeros((setup.samples + 1, 4)), np.full((setup.samples, 1), 9e9))
+    wild = TangentCurve(z=np.zeros((setup.samples + 1, 4)), v=np.full((setup.samples, 1), 9e9))
     assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, 0.0 * K) is None
     assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, K) is None
     with pytest.raises(SimulationDiverged, match="diverges"):
@@ -436,7 +441,7 @@ def test_a_control_that_mujoco_would_silently_replace_by_zero_is_not_simulated(
     setup = cart_setup(tmp_path)
     K, wild = gain(setup) * (not open_loop), np.zeros((setup.samples, 1))
     wild[20] = bad
-    zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), wild)
+    zeta = TangentCurve(z=np.zeros((setup.samples + 1, 4)), v=wild)
     assert setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K) is None
 
 
@@ -453,7 +458,7 @@ def test_an_acceleration_that_makes_mujoco_reset_is_noticed_at_any_sample(
     setup = make_setup(light, tmp_path, parameters=CART_PARAMETERS, noise={"state": 0.1})
     K, wild = gain(setup) * (not open_loop), np.zeros((setup.samples, 1))
     wild[sample] = 9e9
-    zeta = TangentCurve(np.zeros((setup.samples + 1, 4)), wild)
+    zeta = TangentCurve(z=np.zeros((setup.samples + 1, 4)), v=wild)
     assert setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K) is None
 
 
@@ -554,7 +559,7 @@ def test_every_mj_step_is_counted(tmp_path) -> None:
         N * n + 1
     )  # one more for the sensors of the last sample
     count = engine.steps
-    zero = TangentCurve(np.zeros((N + 1, 3)), np.zeros((N, 1)))
+    zero = TangentCurve(z=np.zeros((N + 1, 3)), v=np.zeros((N, 1)))
     setup.plant.project(setup.theta, curve, zero, 1.0, np.ones((N, 1, 3)))
     assert engine.steps - count == N * n
 
@@ -657,7 +662,7 @@ def test_the_start_enters_the_sensitivity_as_its_own_initial_value(tmp_path) -> 
     start = np.eye(4)[:, [1, 2]]  # (dq, dv): the hinge's angle, the slide's speed
     np.testing.assert_allclose(S.psi[0][:, 3:], start, rtol=0, atol=1e-9)
     for j in (0, 1):
-        alone = Recursion(L.A).forward(start[:, j], np.zeros((setup.samples, 4)))
+        alone = LinearRecursion(L.A).forward(start[:, j], np.zeros((setup.samples, 4)))
         assert relative_error(S.psi[..., 3 + j], alone) < 1e-6
         assert relative_error(S.G[..., 3 + j], np.einsum("kyx,kx->ky", L.C, alone)) < 1e-6
 

@@ -29,4 +29,4 @@ def random_weights(rng: np.random.Generator, N: int, nx: int, nu: int, steps: bo
     both = [positive(rng, nx + nu) for _ in range(N)]
     Q = np.array([*(form[:nx, :nx] for form in both), positive(rng, nx)])
     S, R = np.array([form[nx:, :nx] for form in both]), np.array([form[nx:, nx:] for form in both])
-    return Weights(Q, S, R, rng.uniform(0.0, 5.0, (N + 1, nu)) * steps)
+    return Weights(Q=Q, S=S, R=R, W=rng.uniform(0.0, 5.0, (N + 1, nu)) * steps)

@@ -60,7 +60,7 @@ def test_gradient_of_the_information_term() -> None:
         setup.theta, setup.initial, point.sensitivity.psi, point.criterion.directions, CENTRAL
     )
     a, b = setup.information.gradient(point.criterion, point.sensitivity, bilinear)
-    gradient = Expansion(bilinear.A, bilinear.B, a, b).gradient(np.zeros((400, 1, 4)))[:, 0]
+    gradient = Expansion(A=bilinear.A, B=bilinear.B, a=a, b=b).gradient(np.zeros((400, 1, 4)))[:, 0]
     assert np.linalg.norm(gradient) == pytest.approx(1.4318943623, rel=1e-4)
     np.testing.assert_allclose(
         gradient[[0, 100, 250]], [0.1734982191, 0.0586059128, 0.0474071683], rtol=1e-4

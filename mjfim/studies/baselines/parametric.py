@@ -334,13 +334,15 @@ class Descent:
     def _whitening(self, problem: InteriorProblem, point: InteriorPoint) -> Array:
         """Lower Cholesky factor of the barrier's Gauss-Newton Hessian and a ridge on the coefficients."""
         setup, e = self.arena.setup, problem.expand(point)
-        if e.hedge is None:
+        if e.barrier is None:
             raise ValueError("nothing to whiten with")
-        N, w = len(self.series.basis), e.hedge.weights
+        N, w = len(self.series.basis), e.barrier.weights
         ridge = RIDGE / N / self.arena.fence.control.scale**2
         if problem.costs and point.point is not None and point.point.cost > 0.0:
             ridge = ridge + setup.control_weight * setup.dt / point.point.cost
-        H = BasisMetric.of(e, Weights(w.Q, w.S, w.R + np.diag(ridge), w.W), self.series.basis).H
+        H = BasisMetric.of(
+            e, Weights(Q=w.Q, S=w.S, R=w.R + np.diag(ridge), W=w.W), self.series.basis
+        ).H
         return np.asarray(cholesky(H + 1e-12 * np.trace(H) * np.eye(len(H)), lower=True))
 
     def _control(self, s: Array) -> Array:
