@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.experiment.control_signal import generate
-from mjfim.experiment.schema import Experiment, Signal
+from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
+from mjfim.experiment.system_tables import Signal
 from mjfim.recordings.control_table import read_control
 from mjfim.recordings.formats.read import read_table
 from mjfim.signals import multisine

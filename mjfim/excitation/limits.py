@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
-from mjfim.experiment.schema import Limits
+from mjfim.experiment.task_tables import Limits
 from mjfim.model.loading import Coordinate, actuator_names
 
 Range = tuple[float, float]

@@ -19,8 +19,9 @@ from mjfim.errors import ExperimentError, MjfimError
 from mjfim.excitation.design import Monitor, design
 from mjfim.excitation.target_accuracy import furthest, require_reachable, wanted_of
 from mjfim.excitation.unconstrained import AUTO, COARSEST
-from mjfim.experiment.schema import Experiment, Signal
+from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
+from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import Grid, bracket
 from mjfim.recordings.formats.read import read_table
 from mjfim.records.campaign import missed_targets

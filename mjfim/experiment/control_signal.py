@@ -6,7 +6,8 @@ import numpy as np
 from scipy.signal import chirp
 
 from mjfim.arrays import Array
-from mjfim.experiment.schema import Signal, by_name
+from mjfim.experiment.schema import by_name
+from mjfim.experiment.system_tables import Signal
 from mjfim.signals import multisine
 
 # Each actuator's frequency exceeds that of the one before by this share of the first frequency.

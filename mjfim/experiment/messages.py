@@ -71,8 +71,11 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
 
         return unknown("key", keys[-1], valid_keys(parent, hidden))
 
-    alike = [f for f in faults if f["type"] == fault["type"] or f is faults[0]]
-    messages = [f["msg"].removeprefix("Value error, ") for f in alike]
+    # Where no branch has the right type, all of them are offered; else only the faults of the chosen kind.
+    only_types = fault is faults[0]
+    shown_faults = [f for f in faults if only_types or f["type"] == fault["type"]]
+    messages = [f["msg"].removeprefix("Value error, ") for f in shown_faults]
+
     given = fault.get("input")
     shown = f" (got {given!r})" if isinstance(given, (str, int, float, bool)) else ""
 
@@ -119,11 +122,16 @@ def _branches(annotation: Any) -> list[Any]:
 
 
 def _chosen(branches: list[Any], tag: str) -> Any:
-    """The branch of a union that pydantic calls `tag`: the name of a table, or `dict[...]`, `tuple[...]`."""
+    """Find the branch of a union by the name that pydantic gives it; None where there is none.
+
+    pydantic writes `Table` for a table, `function-after[_check(), Table]` for a table with a validator, and `dict[...]` or
+    `tuple[...]` for a container.
+    """
     for branch in branches:
         container = get_origin(branch) or branch
         name = getattr(container, "__name__", "")
-        if tag == name or tag.startswith(f"{name}["):
+
+        if tag == name or tag.startswith(f"{name}[") or tag.endswith(f", {name}]"):
             return branch
 
     return None

@@ -9,7 +9,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
-from mjfim.experiment.schema import Correlated, Experiment, NoiseSpec
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system_tables import Correlated, NoiseSpec
 from mjfim.model.coordinates import Component, _labels, components, measurable
 from mjfim.model.paths import names_of
 from mjfim.plant.noise import Noise

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
-from mjfim.experiment.schema import Experiment, ParameterSpec
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system_tables import ParameterSpec
 from mjfim.model.inertia import CHARTS
 from mjfim.model.parameters import Parameter, Target
 from mjfim.model.paths import OBJECTS, joint_width, names_of, resolve

@@ -19,7 +19,8 @@ from mjfim.excitation.robust import Pool
 from mjfim.experiment.control_signal import generate
 from mjfim.experiment.outputs import outputs_of, stride_of
 from mjfim.experiment.parameters import parameters_of
-from mjfim.experiment.schema import Experiment, Signal, by_name
+from mjfim.experiment.schema import Experiment, by_name
+from mjfim.experiment.system_tables import Signal
 from mjfim.information.fisher import Information
 from mjfim.model.coordinates import measurable
 from mjfim.model.loading import (

@@ -27,50 +27,68 @@ class ColumnSpec(Section):
     """How one column of a recording is computed from the columns of a log.
 
     The value is `(scale * unit * raw + offset)` times the product of the columns in `multiply_by`.
-
-    Attributes:
-        column: Name of the log's column.
-        unit: Unit of the log's numbers, where it differs from the model's unit.
-        scale: Factor of the raw number.
-        offset: Added after the scaling [unit of the model].
-        signed: Number of bits of a signed integer that the log holds as an unsigned one.
-        period: Raw numbers after which a counter wraps around to its first value.
-        unwrap: Whether jumps of an angle by whole turns are removed, after the conversion to rad.
-        multiply_by: Further columns or constants of the log, by whose raw numbers the value is multiplied.
     """
 
     renamed_keys = {"times": "multiply_by"}
 
-    column: str
+    column: str = Field(description="Name of the column in the log.")
     unit: (
         Literal[
             "rad", "deg", "rev", "rad/s", "deg/s", "rev/s", "rpm", "m", "cm", "mm", "m/s", "mm/s"
         ]
         | None
-    ) = None
-    scale: Finite = 1.0
-    offset: Finite = 0.0
-    signed: Literal[8, 16, 32] | None = None
-    period: Positive | None = None
-    unwrap: bool = False
-    multiply_by: tuple[str, ...] = ()
+    ) = Field(default=None, description="Unit of the column in the log. Default: the model's unit.")
+    scale: Finite = Field(default=1.0, description="Factor of the raw numbers.")
+    offset: Finite = Field(
+        default=0.0, description="Constant that is added after scaling [unit of the model]."
+    )
+    signed: Literal[8, 16, 32] | None = Field(
+        default=None,
+        description="Number of bits of a signed integer that the log holds as an unsigned one. Default: the log's "
+        "numbers already have a sign.",
+    )
+    period: Positive | None = Field(
+        default=None,
+        description="Raw number after which a counter begins again at 0; its jumps are removed. Default: no counter.",
+    )
+    unwrap: bool = Field(
+        default=False, description="Jumps of an angle by a whole turn are removed."
+    )
+    multiply_by: tuple[str, ...] = Field(
+        default=(),
+        description="Further columns or constants of the log by which the value is multiplied.",
+    )
 
 
 class RecordingSpec(Section):
-    """How a robot's log becomes a recording. Without it a log has the columns of mjfim's own CSV.
+    """How the log of a robot becomes a recording. Without this table a log has the columns of mjfim's own CSV files."""
 
-    time: column of the stamps, in time_unit;  records: where the list of records is in a JSON file (`a.b`)
-    topics: of the bag, where it holds several of joint states;  window: [s] after the first row that is used
-    gap: [s] longest hole, in time or in a column, that is bridged;  columns: of the recording by name
-    """
-
-    time: str = "t"
-    time_unit: Literal["s", "ms", "us", "ns"] = "s"
-    records: str | None = None
-    topics: tuple[str, ...] = ()
-    window: Range | None = None
-    gap: Positive = 0.1
-    columns: dict[str, str | ColumnSpec] = {}
+    time: str = Field(default="t", description="Column of the time stamps.")
+    time_unit: Literal["s", "ms", "us", "ns"] = Field(
+        default="s", description="Unit of the time stamps."
+    )
+    records: str | None = Field(
+        default=None,
+        description="Place of the list of records inside a JSON file, keys joined by dots, such as `data.entries`. Default: the "
+        "only list of records that the file holds.",
+    )
+    topics: tuple[str, ...] = Field(
+        default=(),
+        description="Topics of the joint states of a ROS bag. Default: the only such topic in the bag.",
+    )
+    window: Range | None = Field(
+        default=None,
+        description="First and last time that are used, after the first row [s]. Default: all rows.",
+    )
+    gap: Positive = Field(
+        default=0.1,
+        description="Longest gap in the time stamps or in a column that is accepted [s].",
+    )
+    columns: dict[str, str | ColumnSpec] = Field(
+        default={},
+        description="Sources of the columns of the recording, by `ctrl:<actuator>`, `qpos:<joint>`, `qvel:<joint>` or sensor: "
+        "the name of a column of the log, or a table. Default: columns with these very names.",
+    )
 
     @model_validator(mode="after")
     def _forward(self) -> RecordingSpec:
@@ -80,7 +98,8 @@ class RecordingSpec(Section):
 
     @property
     def sources(self) -> dict[str, ColumnSpec]:
-        """The columns, however they were written."""
+        """Sources of the columns as tables, whether the file gives a name or a table."""
         return {
-            k: ColumnSpec(column=v) if isinstance(v, str) else v for k, v in self.columns.items()
+            name: ColumnSpec(column=source) if isinstance(source, str) else source
+            for name, source in self.columns.items()
         }

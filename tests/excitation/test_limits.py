@@ -11,7 +11,7 @@ import pytest
 from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import Sight, fence_of
 from mjfim.excitation.limits import Limit, limits_of
-from mjfim.experiment.schema import Limits
+from mjfim.experiment.task_tables import Limits
 from mjfim.model.loading import control_names, coordinates
 from mjfim.output.labels import Labels
 from mjfim.plant.active_constraints import saturated

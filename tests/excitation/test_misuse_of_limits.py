@@ -89,7 +89,7 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     ),
     "end of nothing": (
         '[boundary]\nkeyframe = "hanging"',
-        ['boundary: keyframe says where a design with end = "rest" comes to rest'],
+        ['boundary: keyframe needs end = "rest"'],
         [],
     ),
     "unknown way to end": (

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
-from mjfim.experiment.schema import (
-    Correlated,
-    Cost,
-    Descent,
-    Experiment,
-    Limits,
-    NoiseSpec,
-    Nuisance,
-    Robust,
-    Signal,
-)
+from mjfim.experiment.schema import Experiment, json_schema
 from mjfim.experiment.system import Setup
+from mjfim.experiment.system_tables import Correlated, NoiseSpec, Nuisance, Signal
+from mjfim.experiment.task_tables import Cost, Descent, Limits, Robust
+from mjfim.recordings.spec import Section
 from tests.support.paths import MODELS
 
 # All keys of the contract.
@@ -255,7 +249,7 @@ seed = 5
 
 
 def test_extended_contract_parses_and_resolves(resolve: Callable[[str], Setup]) -> None:
-    """Each table arrives with the values that were written, and the numbers where they act."""
+    """Each table keeps the values of the file, and the system uses them."""
     setup = resolve(EXTENDED)
     e = setup.experiment
     assert e.noise["hinge_angle"] == NoiseSpec(sigma=(0.01,)) and e.noise["slide_position"] == 0.02
@@ -978,6 +972,40 @@ def test_misuse_is_not_accepted(name: str, resolve: Callable[[str], Setup]) -> N
     with pytest.raises(MjfimError) as caught:
         resolve(text)
     assert [f for f in fragments if f not in str(caught.value)] == []
+
+
+def described_tables(annotation: Any) -> set[type[Section]]:
+    """Every table of the experiment file that a type holds, at any depth."""
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        members = [field.annotation for field in annotation.model_fields.values()]
+        return {annotation}.union(*(described_tables(member) for member in members))
+
+    return set().union(*(described_tables(member) for member in get_args(annotation)))
+
+
+def test_every_key_has_a_description() -> None:
+    """Each description is a sentence in plain text, for the reference page and the editors."""
+    tables = described_tables(Experiment)
+
+    assert len(tables) == 16
+    for table in tables:
+        for key, field in table.model_fields.items():
+            assert field.description, f"{table.__name__}.{key}"
+            assert field.description.endswith("."), f"{table.__name__}.{key}"
+
+
+def test_json_schema_states_the_keys_of_a_file() -> None:
+    """The schema is JSON, describes the tables and leaves out what only Python can state."""
+    schema = json.loads(json.dumps(json_schema()))
+
+    keys = set(schema["properties"])
+    assert keys == {key for key, field in Experiment.model_fields.items() if not field.exclude}
+    assert schema["required"] == ["model", "rate", "parameters"]
+
+    parameter_keys = schema["$defs"]["ParameterSpec"]["properties"]
+    assert "target" in parameter_keys
+    assert "function" not in parameter_keys
+    assert schema["additionalProperties"] is False
 
 
 @pytest.mark.parametrize("values", [{}, {"parameters": {}}, {"model": 3}])

@@ -1,0 +1,289 @@
+"""Tables of the experiment file about the system: initial state, unknown parameters and measurement noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, SkipValidation, model_validator
+from pydantic.json_schema import SkipJsonSchema
+
+from mjfim.recordings.spec import Finite, Positive, Range, Section
+
+Matrix = tuple[tuple[Finite, ...], ...]
+PriorOrUnknown = Positive | Literal[True]
+
+
+class Signal(Section):
+    """A generated control signal.
+
+    Each further actuator gets a frequency that is 17 % higher than that of the actuator before, so that the
+    movements differ. Sines and chirps begin at the offset.
+    """
+
+    kind: Literal["constant", "sine", "chirp", "multisine"] = Field(
+        description="Waveform. A chirp sweeps its frequency linearly; a multisine is a sum of harmonics with random phases."
+    )
+    amplitude: Finite | dict[str, Finite] = Field(
+        default=1.0,
+        description="Amplitude [actuator unit], one number for all actuators or a table by actuator name.",
+    )
+    offset: Finite | dict[str, Finite] | None = Field(
+        default=None,
+        description="Constant that is added [actuator unit], one number or a table by actuator name. "
+        "Default: the control of the initial keyframe, 0 without a keyframe.",
+    )
+    frequency: Positive = Field(
+        default=0.5,
+        description="Frequency of a sine, first frequency of a chirp, base frequency of a multisine [Hz].",
+    )
+    frequency_end: Positive | None = Field(
+        default=None,
+        description="Last frequency of a chirp [Hz]. Default: five times `frequency`.",
+    )
+    harmonics: int = Field(default=5, ge=1, description="Number of harmonics of a multisine.")
+    seed: int = Field(
+        default=0, ge=0, description="Seed of the random phases and weights of a multisine."
+    )
+
+
+class Initial(Section):
+    """Initial state of the experiment, and the control from which a design starts."""
+
+    keyframe: str | None = Field(
+        default=None,
+        description="Name of a keyframe of the MJCF that gives the initial state and the resting control. "
+        "Not together with `qpos`, `qvel` or `act`.",
+    )
+    qpos: tuple[Finite, ...] | None = Field(
+        default=None,
+        description="Initial positions, nq numbers [m, rad, quaternions as w x y z]. Default: the model's reference positions.",
+    )
+    qvel: tuple[Finite, ...] | None = Field(
+        default=None, description="Initial velocities, nv numbers [m/s or rad/s]. Default: 0."
+    )
+    act: tuple[Finite, ...] | None = Field(
+        default=None, description="Initial actuator activations, na numbers. Default: 0."
+    )
+    control: str | Signal | None = Field(
+        default=None,
+        description="Control from which a design starts: a table file with the column `t` [s] and one column per actuator, "
+        "or a generated signal. Identification does not need it.",
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Initial:
+        if self.keyframe is not None and (self.qpos or self.qvel or self.act):
+            raise ValueError("give either keyframe or qpos/qvel/act, not both")
+        return self
+
+
+class TargetSpec(Section):
+    """One number inside the model, which is set to `scale * parameter + offset`."""
+
+    path: str = Field(
+        description="Parameter path, `kind/name:field[index]` with MuJoCo's field names, for example `body/bob:pos[2]`."
+    )
+    scale: Finite = Field(default=1.0, description="Factor of the parameter; not 0.")
+    offset: Finite = Field(
+        default=0.0, description="Constant that is added [unit of the number inside the model]."
+    )
+
+    @model_validator(mode="after")
+    def _moves(self) -> TargetSpec:
+        if self.scale == 0.0:
+            raise ValueError("a target with scale 0 never changes")
+        return self
+
+
+class ParameterSpec(Section):
+    """One unknown parameter, or with `inertial` the ten inertial parameters of one body."""
+
+    target: str | None = Field(
+        default=None,
+        description="Path of the number inside the model that this parameter sets, for example `joint/hinge:damping`.",
+    )
+    targets: tuple[TargetSpec, ...] = Field(
+        default=(),
+        description="Several numbers inside the model that this one parameter sets, each by its scale and offset.",
+    )
+    function: SkipJsonSchema[SkipValidation[Callable[[Any, float], None]] | None] = Field(
+        default=None,
+        description="Function `f(spec, value)` that edits an MjSpec. In Python only; it needs a `guess`.",
+    )
+    inertial: str | None = Field(
+        default=None,
+        description="Name of a body whose mass, centre of mass and inertia are all unknown: ten parameters, "
+        "named `<this name>.<coordinate>`.",
+    )
+    coordinates: Literal["logcholesky", "barycentric"] | None = Field(
+        default=None,
+        description="Coordinates of `inertial`: log-Cholesky, which is physical for every value, or barycentric, "
+        "in which the dynamics are linear. Default: `logcholesky`.",
+    )
+    guess: Finite | None = Field(
+        default=None,
+        description="Value at which the design is made and from which the fit starts [parameter unit]. "
+        "Default: the value in the model.",
+    )
+    true: Finite | None = Field(
+        default=None,
+        description="Value that `simulate` and `montecarlo` use for the robot [parameter unit]. Default: the guess.",
+    )
+    bounds: Range | None = Field(
+        default=None,
+        description="Lower and upper bound of the estimate [parameter unit]. Default: unbounded.",
+    )
+    scale: Positive | Literal["guess"] | None = Field(
+        default=None,
+        description='Unit in which the criterion measures the error: a number [parameter unit], or "guess" for the size of the '
+        "guess. 1.0 means absolute errors, as in the paper. Default: the guess or the natural size of the quantity, "
+        "whichever is larger.",
+    )
+    prior: Positive | None = Field(
+        default=None,
+        description="Standard deviation with which the guess is known before the experiment [parameter unit; for `inertial` "
+        "relative to the natural size of each coordinate]. Default: no prior knowledge.",
+    )
+    unit: str = Field(
+        default="",
+        description="Unit that is shown in tables and pictures. Default: that of the first target.",
+    )
+    nuisance: bool = Field(
+        default=False,
+        description="The parameter is unknown and is fitted, but the design spends no effort on it.",
+    )
+    per_recording: bool = Field(
+        default=False,
+        description="Each recording has a value of this parameter of its own. Needs `nuisance = true`.",
+    )
+    wanted: Positive | None = Field(
+        default=None,
+        description="Standard deviation that is aimed at [parameter unit], for `check`, `design --shortest` and campaigns.",
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ParameterSpec:
+        self._require_one_source()
+        self._require_keys_of_inertial()
+
+        if self.per_recording and not self.nuisance:
+            raise ValueError(
+                "per_recording needs nuisance = true: other parameters have one value in all recordings"
+            )
+        if self.bounds is not None:
+            self._require_inside(*self.bounds)
+
+        return self
+
+    def _require_one_source(self) -> None:
+        """Raise ValueError unless exactly one key says what the parameter changes in the model."""
+        sources = (
+            self.target is not None,
+            bool(self.targets),
+            self.function is not None,
+            self.inertial is not None,
+        )
+
+        if sum(sources) != 1:
+            raise ValueError(
+                "give exactly one of target and targets, or inertial (in Python also function)"
+            )
+        if self.function is not None and (not callable(self.function) or self.guess is None):
+            raise ValueError("function must be callable, f(spec, value), and needs a guess")
+
+    def _require_keys_of_inertial(self) -> None:
+        """Raise ValueError for keys of a single parameter beside `inertial`, and for keys of `inertial` without it."""
+        if self.inertial is None:
+            if self.coordinates is not None:
+                raise ValueError("coordinates belongs to inertial")
+            return
+
+        single = [
+            key for key in ("guess", "true", "bounds", "wanted") if getattr(self, key) is not None
+        ]
+        if self.unit:
+            single.append("unit")
+        if self.scale not in (None, "guess"):
+            single.append("scale")
+
+        if single:
+            raise ValueError(
+                f"inertial stands for ten parameters; {', '.join(single)} would fit only one"
+            )
+
+    def _require_inside(self, low: float, high: float) -> None:
+        """Raise ValueError where the bounds are inverted, or the guess or the true value is outside them."""
+        if not low < high:
+            raise ValueError(f"bounds are inverted: [{low}, {high}] needs lower < upper")
+
+        for key, value in (("guess", self.guess), ("true", self.true)):
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"{key} {value} is outside bounds [{low}, {high}]")
+
+    @property
+    def all_targets(self) -> tuple[TargetSpec, ...]:
+        """Targets of the parameter, whether the file says `target` or `targets`."""
+        if self.targets:
+            return self.targets
+        if self.target is None:
+            return ()
+        return (TargetSpec(path=self.target),)
+
+
+class NoiseSpec(Section):
+    """Noise of one output, or of the components of one sensor."""
+
+    sigma: Positive | tuple[Positive, ...] | None = Field(
+        default=None,
+        description="Standard deviation [output unit], one number or one per component. Either this or `covariance`.",
+    )
+    covariance: Matrix | None = Field(
+        default=None,
+        description="Covariance matrix of the components [output unit squared], as a list of rows.",
+    )
+    rate: Positive | None = Field(
+        default=None,
+        description="Rate at which this output is measured [Hz]; it divides `rate`. Default: `measure_rate`.",
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> NoiseSpec:
+        if (self.sigma is None) == (self.covariance is None):
+            raise ValueError("give exactly one of sigma and covariance")
+        return self
+
+
+class Correlated(Section):
+    """Covariance of several outputs whose noise is correlated. It replaces their standard deviations."""
+
+    outputs: Annotated[tuple[str, ...], Field(min_length=2)] = Field(
+        description="Names of the outputs, in the order of the matrix."
+    )
+    covariance: Matrix = Field(
+        description="Covariance matrix [product of the output units], as a list of rows."
+    )
+
+
+class Nuisance(Section):
+    """Unknowns that every experiment has but nobody asks for.
+
+    Each value is the standard deviation with which zero is known beforehand, or `true` where nothing is known.
+    """
+
+    initial: PriorOrUnknown | dict[str, PriorOrUnknown] | None = Field(
+        default=None,
+        description="Deviation of the initial state [m, rad, m/s or rad/s]: one value for all of qpos and qvel, or a table by "
+        "coordinate, `qpos:<joint>` and `qvel:<joint>`. Default: the initial state is known.",
+    )
+    bias: PriorOrUnknown | dict[str, PriorOrUnknown] | None = Field(
+        default=None,
+        description="Constant bias of the outputs [output unit]: one value for all of them or a table by output. Default: none.",
+    )
+    delay: PriorOrUnknown | None = Field(
+        default=None, description="Time by which all outputs lag [s]. Default: none."
+    )
+    per_recording: bool = Field(
+        default=False,
+        description="Each recording has a bias and a delay of its own, as it always has its own initial state.",
+    )
