@@ -1,0 +1,110 @@
+"""Nothing in the package executes or unpickles what a file holds, and importing it loads no plotting library."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+
+import pytest
+
+from tests.support.paths import ROOT
+
+# Every source file of the package.
+SOURCES = sorted((ROOT / "mjfim").rglob("*.py"))
+
+# Modules whose readers can execute code that a file holds.
+PICKLING_MODULES = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"}
+
+# Built-in functions that execute text.
+EXECUTING_FUNCTIONS = {"eval", "exec", "__import__"}
+
+# Libraries that only drawing and the command line need; they take seconds to import.
+HEAVY_LIBRARIES = {"matplotlib", "rerun", "rich", "typer"}
+
+
+def unsafe_code(source: str) -> list[str]:
+    """Uses of pickling modules, of functions that execute text and of pickles in NumPy files, with line numbers."""
+    found = []
+
+    for node in ast.walk(ast.parse(source)):
+        names: set[str] = set()
+
+        if isinstance(node, ast.Import):
+            names = {alias.name.split(".")[0] for alias in node.names} & PICKLING_MODULES
+        elif isinstance(node, ast.ImportFrom):
+            names = {(node.module or "").split(".")[0]} & PICKLING_MODULES
+        elif isinstance(node, ast.Name):
+            names = {node.id} & EXECUTING_FUNCTIONS
+        elif isinstance(node, ast.keyword) and node.arg == "allow_pickle":
+            # Only the literal False refuses pickles for certain.
+            refused = isinstance(node.value, ast.Constant) and node.value.value is False
+            names = set() if refused else {"allow_pickle"}
+
+        line = node.value.lineno if isinstance(node, ast.keyword) else getattr(node, "lineno", 0)
+        found += [f"line {line}: {name}" for name in sorted(names)]
+
+    return found
+
+
+def heavy_libraries_after(code: str) -> set[str]:
+    """Heavy libraries that are loaded in a new Python process after it has run this code."""
+    script = f"{code}\nimport sys\nprint(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return HEAVY_LIBRARIES & set(done.stdout.split())
+
+
+def test_nothing_unpickles_or_evaluates() -> None:
+    """Experiments, recordings and archives come from others: they are data, never code."""
+    found = {
+        str(path.relative_to(ROOT)): unsafe_code(path.read_text(encoding="utf-8"))
+        for path in SOURCES
+    }
+
+    assert len(found) > 10
+    assert {name: uses for name, uses in found.items() if uses} == {}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "eval('1')",
+        "exec('x = 1')",
+        "f = eval",
+        "__import__('os')",
+        "import pickle",
+        "import os, joblib.memory",
+        "from pickle import loads",
+        "def f():\n    from dill.source import getsource",
+        "import numpy as np\nnp.load('x', allow_pickle=True)",
+        "np.load('x', allow_pickle=flag)",
+    ],
+)
+def test_unsafe_code_is_found(source: str) -> None:
+    """Each of these sources holds one unsafe use."""
+    assert len(unsafe_code(source)) == 1
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "np.load('x', allow_pickle=False)",
+        "import re\nre.compile('x')",
+        "from mjfim.arrays import Array",
+    ],
+)
+def test_safe_code_is_accepted(source: str) -> None:
+    """A refused pickle and ordinary imports are not reported."""
+    assert unsafe_code(source) == []
+
+
+def test_importing_the_package_stays_light() -> None:
+    """`import mjfim` loads no library that only figures and the command line need."""
+    assert heavy_libraries_after("import mjfim") == set()
+
+
+def test_heavy_libraries_are_found() -> None:
+    """Code that imports a heavy library, here through a module of the package, is noticed."""
+    assert "matplotlib" in heavy_libraries_after("import mjfim.output.plots")
