@@ -74,6 +74,7 @@ def test_what_has_ended_is_salvaged_in_order_and_the_rest_is_left(
     assert workers.workers_of(ThreadPoolExecutor(3)) == 3
 
 
+@pytest.mark.slow
 def test_interrupted_among_workers_a_design_keeps_what_they_found(tmp_path: Path) -> None:
     """SIGINT while two of hundreds of starts are under way."""
     setup = cart_inside(tmp_path, horizon=2.0, descent={"starts": 400, "max_iterations": 100_000})
@@ -103,6 +104,7 @@ def test_interrupted_by_what_watches_it_keeps_the_others_too(tmp_path: Path) -> 
     assert design.final.cost < design.initial.cost
 
 
+@pytest.mark.slow
 def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
     tmp_path: Path,
 ) -> None:

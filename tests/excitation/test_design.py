@@ -69,6 +69,7 @@ def test_saturation_is_said(experiment: Experiment, tmp_path: Path) -> None:
     assert not any("forcerange" in sentence for sentence in mjfim.design(experiment).warnings)
 
 
+@pytest.mark.slow
 def test_instability_is_said(experiment: Experiment) -> None:
     # D-optimality with this little effort balances the pendulum upright, where every sensitivity explodes
     wild = mjfim.design(experiment.replace(cost={"criterion": "D"}, descent={"max_iterations": 60}))

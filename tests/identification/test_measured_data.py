@@ -75,8 +75,10 @@ def identified(stated: mjfim.Experiment, files: list[Path], held_out: list[Path]
 
 @pytest.mark.parametrize(
     ("fitted", "held_out"),
-    [("dircol", "energy_shaping"), ("energy_shaping", "dircol")],
-    ids=["dircol", "energy"],
+    [
+        pytest.param("dircol", "energy_shaping", id="dircol"),
+        pytest.param("energy_shaping", "dircol", id="energy", marks=pytest.mark.slow),
+    ],
 )
 def test_pendulum_predicts_the_other_file_far_better_than_published(
     fitted: str, held_out: str
@@ -103,6 +105,7 @@ def test_pendulum_predicts_the_other_file_far_better_than_published(
     assert found.misfit
 
 
+@pytest.mark.slow
 def test_the_two_files_agree_within_honest_intervals() -> None:
     files = [PENDULUM / f"{name}_measured.csv" for name in ("dircol", "energy_shaping")]
     one, two = (
@@ -115,6 +118,7 @@ def test_the_two_files_agree_within_honest_intervals() -> None:
         ), name
 
 
+@pytest.mark.slow
 def test_poor_data_are_named() -> None:
     poor = identified(
         experiment("dfki_simple_pendulum", bootstrap=0), [PENDULUM / "sysid_measured.csv"], []
@@ -129,6 +133,7 @@ def test_poor_data_are_named() -> None:
     assert not any(s.startswith("poor data") for s in good.warnings)
 
 
+@pytest.mark.slow
 def test_double_pendulum_in_base_parameters_and_its_held_out_file() -> None:
     files = [DOUBLE / f"A0_0{i}.csv.gz" for i in range(3)]
     stated = experiment("dfki_double_pendulum", bootstrap=300, max_iterations=10)
@@ -144,6 +149,7 @@ def test_double_pendulum_in_base_parameters_and_its_held_out_file() -> None:
     assert sum(p.ratio < 0.95 for p in found.predictions) >= 2
 
 
+@pytest.mark.slow
 def test_servo_predicts_held_out_logs_as_well_as_published() -> None:
     """Two logs at each gain of the firmware; mean absolute errors of whole rollouts."""
     stem = "2026-01-15_10h"

@@ -69,6 +69,7 @@ def test_a_bias_and_a_lag_are_told(tmp_path: Path) -> None:
     assert "output:delay" in [s.path for s in lagging.suspects]
 
 
+@pytest.mark.slow
 def test_a_right_model_lacks_nothing() -> None:
     setup = Setup(stated())
     found = [

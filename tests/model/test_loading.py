@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,11 +25,16 @@ ROUGH = {
 TOGETHER = {"double_pendulum", "ball_pendulum"}  # not every parameter can be told alone
 
 
+def slow_except(*fast: str) -> list[Any]:
+    """All examples as parameters of a test, marked as slow but for those named."""
+    return [pytest.param(name, marks=[] if name in fast else pytest.mark.slow) for name in EXAMPLES]
+
+
 def test_every_model_has_an_experiment() -> None:
     assert {path.stem for path in MODELS.glob("*.xml")} == {*EXAMPLES, "cart_pendulum"}
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("name", slow_except("double_pendulum", "four_bar"))
 def test_check_says_what_the_example_is_about(name: str, tmp_path: Path) -> None:
     result = run("check", MODELS / f"{name}.toml", "-o", tmp_path / "out")
     assert result.exit_code in (0, 1), result.output
@@ -44,7 +50,7 @@ def test_check_says_what_the_example_is_about(name: str, tmp_path: Path) -> None
     assert told["not_excited"] == []
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("name", slow_except("four_bar"))
 def test_a_short_design_improves_and_leaves_everything(name: str, tmp_path: Path) -> None:
     setup = Setup(
         mjfim.Experiment.from_file(MODELS / f"{name}.toml").replace(descent={"max_iterations": 3})

@@ -30,6 +30,7 @@ def design(experiment: Experiment) -> mjfim.Design:
     return mjfim.design(experiment)
 
 
+@pytest.mark.slow
 def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Design) -> None:
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     study = monte_carlo(experiment, curves, trials=1500, seed=0, measure_rate=25.0)

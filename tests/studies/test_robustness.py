@@ -447,6 +447,7 @@ def judged(
     return verdict.judge(bench, [bench.run(number) for number in range(runs)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("feedback", [False, True])
 def test_intervals_hold_the_truth(
     robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path], feedback: bool
@@ -463,6 +464,7 @@ def test_intervals_hold_the_truth(
     assert found.fit == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["noise", "delay"])
 def test_the_check_can_fail(
     robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path], fault: str
@@ -478,6 +480,7 @@ def test_the_check_can_fail(
     assert found.misfits > 0.9 * FEW
 
 
+@pytest.mark.slow
 def test_limits_that_the_plan_uses_up_are_missed(
     robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path]
 ) -> None:

@@ -78,6 +78,7 @@ def test_reaches_the_best_known_cost(case: str, starts: int) -> None:
     assert design.found_by in {start.name for start in design.starts}
 
 
+@pytest.mark.slow
 def test_the_shipped_guess_experiment_reports_every_start() -> None:
     design = mjfim.design(Experiment.from_file(ROOT / "models" / "cart_pendulum_guess.toml"))
     assert design.final.cost <= 1.000001 * CASES["e"][3]
@@ -87,17 +88,20 @@ def test_the_shipped_guess_experiment_reports_every_start() -> None:
     )  # the second optimum is seen too
 
 
+@pytest.mark.slow
 def test_metric_descent_of_the_paper_reaches_the_same_optimum() -> None:
     design = mjfim.design(experiment("c", method="metric"))
     assert design.final.cost <= 1.000001 * CASES["c"][3]
 
 
+@pytest.mark.slow
 def test_weight_on_psi_in_the_metric_reaches_the_same_optimum() -> None:
     design = mjfim.design(experiment("a", method="metric", psi_weight=1e-6, tolerance=1e-3))
     assert design.status is Status.CONVERGED
     assert design.final.cost <= 1.02 * CASES["a"][3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coarse", [1, 4])
 def test_half_the_sample_period_changes_neither_cost_nor_iteration_count(
     coarse: int, tmp_path: Path

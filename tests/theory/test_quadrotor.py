@@ -88,6 +88,7 @@ def test_psi_of_a_tumbling_flight_is_that_of_re_simulation(name: str) -> None:
     ).max() > 1e-6  # an error of 1e-5 would be seen
 
 
+@pytest.mark.slow
 def test_the_shipped_experiment_is_identifiable_and_designs() -> None:
     experiment = mjfim.Experiment.from_file(MODELS / "quadrotor.toml")
     looked = mjfim.check(experiment)

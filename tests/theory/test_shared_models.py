@@ -62,7 +62,17 @@ def test_every_experiment_starts(name: str) -> None:
     assert not start.combinations
 
 
-@pytest.mark.parametrize("name", ["cartpole", "acrobot", "furuta", "so_arm100", "panda"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cartpole",
+        "panda",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("acrobot", "furuta", "so_arm100")
+        ),
+    ],
+)
 def test_design_knows_ten_times_more_than_the_chirp(name: str) -> None:
     design = mjfim.design(experiment(name))
     gain = design.final.eigenvalues[0] / design.initial.eigenvalues[0]
