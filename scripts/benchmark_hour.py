@@ -83,7 +83,9 @@ def played(setup: Setup, seconds: float, seed: int) -> Recording:
         states.append(out.states[0, 1:])
     y = setup.plant.outputs(np.concatenate(states), None)
     y += setup.noise.sample(len(y), rng)
-    return Recording(np.arange(len(y)) / rate, ctrl, y, setup.outputs.names, "hour")
+    return Recording(
+        t=np.arange(len(y)) / rate, ctrl=ctrl, y=y, outputs=setup.outputs.names, name="hour"
+    )
 
 
 def bare(setup: Setup, samples: int) -> float:

@@ -355,7 +355,11 @@ class Bench:
         y[setup.noise.measured(last - 1) == 0.0] = np.nan
         t = np.arange(last, dtype=np.float64) * self.timestep
         recording = Recording(
-            t, np.repeat(sent, self.every, axis=0), y, setup.outputs.names, "robot"
+            t=t,
+            ctrl=np.repeat(sent, self.every, axis=0),
+            y=y,
+            outputs=setup.outputs.names,
+            name="robot",
         )
         margins = self._margins(
             out.tapped[0, :, 0], sent, before, out.states[0][:, : setup.space.nq], feedback

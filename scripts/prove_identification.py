@@ -92,7 +92,7 @@ def robot(
         + p.bias(len(setup.outputs)) @ theta
         + rng.normal(0.0, SIGMA, (N + 1, len(setup.outputs)))
     )
-    return theta, Recording(ticks, control, y, setup.outputs.names, "robot")
+    return theta, Recording(t=ticks, ctrl=control, y=y, outputs=setup.outputs.names, name="robot")
 
 
 def stepped(

@@ -108,7 +108,10 @@ def real(folder: Folder, rounds: int, files: Sequence[Path]) -> Campaign:
 
     if waits and not done:
         return Campaign(
-            folder.setup.parameters.names, wanted_of(folder.setup), (), CampaignStatus.WAITING
+            parameters=folder.setup.parameters.names,
+            wanted=wanted_of(folder.setup),
+            rounds=(),
+            status=CampaignStatus.WAITING,
         )
     limit = len(done) if waits else rounds
     campaign = mjfim.sequential(

@@ -97,7 +97,10 @@ class Folder:
                 read_recording(path, self.setup.channels) for path in self.recordings(k)
             )
             yield EarlierRound(
-                recordings, theta, np.where(np.isnan(std), np.inf, std), trajectory.ctrl
+                recordings=recordings,
+                theta=theta,
+                predicted=np.where(np.isnan(std), np.inf, std),
+                control=trajectory.ctrl,
             )
 
     def leave_design(self, design: Design, number: int) -> None:

@@ -141,7 +141,17 @@ def _row(rung: Rung, point: Point | None, rate: float, fence: Fence) -> HistoryR
     cost, i = (np.inf if point is None else point.cost), rung.iterate
     margin = min(fence.shares(seen(i.point)).values(), default=np.nan)
     return HistoryRow(
-        i.index, cost, value, smallest, i.slope, i.gamma, 0.0, 0, rate, rung.mu, margin
+        iteration=i.index,
+        cost=cost,
+        criterion=value,
+        min_eigenvalue=smallest,
+        slope=i.slope,
+        gamma=i.gamma,
+        seconds=0.0,
+        steps=0,
+        rate=rate,
+        mu=rung.mu,
+        margin=margin,
     )
 
 

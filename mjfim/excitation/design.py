@@ -276,7 +276,12 @@ def _conclude(
         warnings=tuple(warnings_of(final, found, setup, clamped, rough)),
         found_by=best.name,
         starts=tuple(
-            StartResult(r.name, r.cost, r.status, r.history[-1].iteration if r.history else 0)
+            StartResult(
+                name=r.name,
+                cost=r.cost,
+                status=r.status,
+                iterations=r.history[-1].iteration if r.history else 0,
+            )
             for r in runs
         ),
         nuisance=tuple(p.name for p in setup.parameters.parameters if p.nuisance),

@@ -265,13 +265,13 @@ def _row(iterate: Iterate[Point], done: int, rate: float) -> HistoryRow:
         (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
     )
     return HistoryRow(
-        done + iterate.index,
-        iterate.value,
-        value,
-        smallest,
-        iterate.slope,
-        iterate.gamma,
-        0.0,
-        0,
-        rate,
+        iteration=done + iterate.index,
+        cost=iterate.value,
+        criterion=value,
+        min_eigenvalue=smallest,
+        slope=iterate.slope,
+        gamma=iterate.gamma,
+        seconds=0.0,
+        steps=0,
+        rate=rate,
     )

@@ -66,7 +66,7 @@ def audit(setup: Setup, trajectory: Trajectory) -> Audit:
         margins["clearance"] = distance - fence.least
         over = np.maximum(fence.clearance(positions, slopes=False).d.min(axis=1), 1e-9)
         t = np.arange(1, len(positions) + 1) * setup.dt / setup.substeps
-        usage.append(LimitUsage("clearance", pair.name, t, fence.least / over))
+        usage.append(LimitUsage(kind="clearance", name=pair.name, t=t, share=fence.least / over))
         shares["clearance"] = margins["clearance"] / fence.least
     deviation = float(np.abs(setup.space.minus(played.state, trajectory.state)).max())
     return Audit(margins, shares, deviation, frozenset(told), tuple(usage))
@@ -80,7 +80,7 @@ def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
     for kind, name, share in zip(
         fence.kinds, fence.names, fence.shown.relative_position(tapped).T, strict=True
     ):
-        yield LimitUsage(kind, name, t, share)
+        yield LimitUsage(kind=kind, name=name, t=t, share=share)
     bands = [("control", fence.control, ctrl, setup.t)]
     if fence.rate is not None:
         bands.append(
@@ -94,7 +94,9 @@ def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
     for kind, band, values, times in bands:
         for i, name in enumerate(setup.controls):
             if np.isfinite(band.lower[i]) or np.isfinite(band.upper[i]):
-                yield LimitUsage(kind, name, times, band.relative_position(values)[:, i])
+                yield LimitUsage(
+                    kind=kind, name=name, t=times, share=band.relative_position(values)[:, i]
+                )
 
 
 def _positions(setup: Setup, engine: Engine, played: Trajectory) -> Array:

@@ -27,9 +27,9 @@ def simulate(
     measured[0] = 1.0
     noisy[measured == 0.0] = np.nan
     return Recording(
-        np.arange(len(noisy), dtype=np.float64) * setup.dt,
-        trajectory.ctrl,
-        noisy,
-        setup.outputs.names,
-        "simulated",
+        t=np.arange(len(noisy), dtype=np.float64) * setup.dt,
+        ctrl=trajectory.ctrl,
+        y=noisy,
+        outputs=setup.outputs.names,
+        name="simulated",
     )

@@ -160,9 +160,9 @@ def measured_trajectory(setup: Setup, recording: Recording) -> Trajectory | None
         )
     n = len(qpos)
     return Trajectory(
-        recording.t,
-        qpos,
-        np.zeros((n, setup.model.nv)),
-        np.zeros((n, setup.model.na)),
-        recording.ctrl,
+        t=recording.t,
+        qpos=qpos,
+        qvel=np.zeros((n, setup.model.nv)),
+        act=np.zeros((n, setup.model.na)),
+        ctrl=recording.ctrl,
     )

@@ -99,7 +99,7 @@ def _judged(
     if len(fit.tracks) == 1 and not held_out:
         name = f"last {100 * REST:.0f} % of {name}"
     own, plain = (_errors(fit, value, masks, name) for value in (theta, nominal))
-    return Prediction(name, own, plain, held_out)
+    return Prediction(name=name, identified=own, nominal=plain, held_out=held_out)
 
 
 def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> PredictionErrors:
@@ -124,7 +124,7 @@ def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> P
     for j, error in enumerate([] if values is None else fit.masked(masks).errors(values)):
         if len(error):
             rms[j], mae[j] = np.sqrt(np.mean(error**2)), np.mean(np.abs(error))
-    return PredictionErrors(name, outputs, rms, mae)
+    return PredictionErrors(name=name, outputs=outputs, rms=rms, mae=mae)
 
 
 def _learned(fit: Fit, masks: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -343,7 +343,9 @@ class _Identification:
         """A recording in the order of the outputs, as it was fitted."""
         track = self.fit.tracks[i]
         held = self.fit.recordings[i].ctrl[: len(track.t) - 1]
-        return Recording(track.t, held, track.y, self.setup.outputs.names, track.name)
+        return Recording(
+            t=track.t, ctrl=held, y=track.y, outputs=self.setup.outputs.names, name=track.name
+        )
 
     def _sentences(
         self,

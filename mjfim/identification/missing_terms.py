@@ -95,12 +95,12 @@ def suspects(
         if not wrong and sigmas > norm.isf(0.5 * LEVEL / len(tested)) and WORTH < share < 1.0:
             named.append(
                 MissingTerm(
-                    candidate.words,
-                    candidate.path,
-                    float(value),
-                    candidate.unit,
-                    float(sigmas),
-                    float(share),
+                    words=candidate.words,
+                    path=candidate.path,
+                    value=float(value),
+                    unit=candidate.unit,
+                    sigmas=float(sigmas),
+                    share=float(share),
                 )
             )
     return tuple(sorted(named, key=lambda s: -s.sigmas)[:LISTED])

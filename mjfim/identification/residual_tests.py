@@ -100,12 +100,12 @@ def worst_place(
             inside = slice(first, last + 1)
             size = float(np.sqrt(squares[inside].sum() / max(counts[inside].sum(), 1)))
             place = WorstResidual(
-                output,
-                name,
-                edges[first],
-                edges[last + 1],
-                size,
-                float(squares[inside].sum() / max(total, 1e-300)),
+                output=output,
+                recording=name,
+                begin=edges[first],
+                end=edges[last + 1],
+                size=size,
+                share=float(squares[inside].sum() / max(total, 1e-300)),
             )
             if best is None or place.size > best.size:
                 best = place
@@ -135,7 +135,15 @@ def whiteness(output: str, parts: Sequence[Array]) -> Whiteness:
     count = sum(len(part) for part in series)
     square = sum(float(part @ part) for part in series)
     if count < 2 * FEWEST or not square > 0.0:
-        return Whiteness(output, count, square / max(count, 1), 0.0, 1.0, 1.0, 1.0)
+        return Whiteness(
+            output=output,
+            count=count,
+            variance=square / max(count, 1),
+            correlation=0.0,
+            p=1.0,
+            inflation=1.0,
+            time=1.0,
+        )
     lags = min(LAGS, count // 5)
     rho = _autocorrelation(series, max(lags, _reach(series)))
     statistic = (
@@ -148,7 +156,13 @@ def whiteness(output: str, parts: Sequence[Array]) -> Whiteness:
     inflation = max((ratio for ratio, _ in ratios), default=1.0)
     p = min(min(chances) * len(chances), 1.0)
     return Whiteness(
-        output, count, square / count, float(rho[1]), p, max(inflation, 1.0), _integrated(rho)
+        output=output,
+        count=count,
+        variance=square / count,
+        correlation=float(rho[1]),
+        p=p,
+        inflation=max(inflation, 1.0),
+        time=_integrated(rho),
     )
 
 

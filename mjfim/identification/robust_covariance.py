@@ -70,7 +70,13 @@ def uncertainty(
         tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, 0.5 + LEVEL / 2.0], axis=0)
         low, high = np.minimum(low, theta + tails[0]), np.maximum(high, theta + tails[1])
     return Uncertainty(
-        sandwich, np.column_stack([low, high]), between, apart, each, count, theta + replicates
+        sandwich=sandwich,
+        interval=np.column_stack([low, high]),
+        between=between,
+        apart=apart,
+        each=each,
+        blocks=count,
+        draws=theta + replicates,
     )
 
 

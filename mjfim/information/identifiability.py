@@ -52,10 +52,14 @@ class Survey:
         """
         rows = combination_matrix(self.groups_always, self.names)
         words = [str(c) for group in self.groups_always for c in group.combinations]
-        stds = (information.spread(told, rows).tolist() for told in (before, after))
+        combined_values = (rows @ values).tolist()
+        std_before = information.spread(before, rows).tolist()
+        std_after = information.spread(after, rows).tolist()
+
+        columns = zip(words, combined_values, std_before, std_after, strict=True)
         return tuple(
-            CombinationAccuracy(*column)
-            for column in zip(words, (rows @ values).tolist(), *stds, strict=True)
+            CombinationAccuracy(words=name, value=value, std_initial=initial, std_final=final)
+            for name, value, initial, final in columns
         )
 
 

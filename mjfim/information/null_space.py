@@ -157,11 +157,18 @@ def grouped(
                 ]
                 rows.append(
                     Combination(
-                        (names[b], *(names[f] for f, _ in parts)), (1.0, *(c for _, c in parts))
+                        members=(names[b], *(names[f] for f, _ in parts)),
+                        coefficients=(1.0, *(c for _, c in parts)),
                     )
                 )
-        groups.append(ParameterGroup(tuple(names[m] for m in sorted(members)), tuple(rows)))
-    return (*groups, ParameterGroup(tuple(none), ())) if none else tuple(groups)
+        groups.append(
+            ParameterGroup(
+                members=tuple(names[m] for m in sorted(members)), combinations=tuple(rows)
+            )
+        )
+    return (
+        (*groups, ParameterGroup(members=tuple(none), combinations=())) if none else tuple(groups)
+    )
 
 
 def _lumped(N: Array, units: Sequence[str]) -> np.ndarray:

@@ -37,7 +37,9 @@ def roughness(
     names = setup.parameters.names
     if fine is None or coarse is None:
         causes = tuple(_active(setup.model_at(theta), trajectory, range(trajectory.samples)))
-        return Roughness(np.inf, ", ".join(names), 0, 0.0, causes)
+        return Roughness(
+            error=np.inf, parameter=", ".join(names), sample=0, time=0.0, causes=causes
+        )
     G = setup.noise.whiten(fine.G)
     kept = np.flatnonzero(visible_columns(setup, G))
     if not len(kept):
@@ -57,7 +59,11 @@ def roughness(
     near = range(max(first - 2, 0), min(first + 1, trajectory.samples))
     causes = tuple(_active(setup.model_at(theta), trajectory, near))
     return Roughness(
-        float(error[:, worst].max()), names[kept[worst]], first, float(trajectory.t[first]), causes
+        error=float(error[:, worst].max()),
+        parameter=names[kept[worst]],
+        sample=first,
+        time=float(trajectory.t[first]),
+        causes=causes,
     )
 
 

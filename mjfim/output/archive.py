@@ -86,7 +86,12 @@ def design_summary(design: Design) -> dict[str, Any]:
         "nuisance": list(design.nuisance),
         "combinations": list(design.combinations),
         "combined": [
-            {"words": c.words, "value": c.value, "std_initial": c.initial, "std_final": c.final}
+            {
+                "words": c.words,
+                "value": c.value,
+                "std_initial": c.std_initial,
+                "std_final": c.std_final,
+            }
             for c in design.combined
         ],
         "prior": design.prior,
@@ -189,7 +194,7 @@ def _trajectory(path: Path, prefix: str, arrays: Mapping[str, Array]) -> Traject
             raise RecordingError(
                 f"{path}: array '{prefix}{key}' has shape {array.shape}, wanted {shape}"
             )
-    return Trajectory(*(arrays[prefix + key] for key in ARRAYS[:5]))
+    return Trajectory(**{key: arrays[prefix + key] for key in ARRAYS[:5]})
 
 
 def write_control(path: Path, control: Array, setup: Setup) -> None:
@@ -331,7 +336,9 @@ def check_summary(check: Check) -> dict[str, Any]:
             {"a": p.first, "b": p.second, "correlation": p.correlation} for p in check.confounded
         ],
         "combinations": [_group(g) for g in check.never],
-        "combined": [{"words": c.words, "value": c.value, "std": c.final} for c in check.combined],
+        "combined": [
+            {"words": c.words, "value": c.value, "std": c.std_final} for c in check.combined
+        ],
         "not_excited": [_group(g) for g in check.not_here],
         "self_test": {
             "passed": check.self_test.passed,

@@ -31,7 +31,7 @@ def playback_of(setup: Setup, trajectory: Trajectory, gain: Array) -> Playback:
     if not out.finite[0]:
         raise SimulationDiverged("the designed control diverges when it is simulated again")
     t = np.arange(len(held) + 1, dtype=np.float64) * (setup.dt / rows)
-    return Playback(t, out.states[0], held, np.repeat(gain, rows, axis=0))
+    return Playback(t=t, state=out.states[0], ctrl=held, gain=np.repeat(gain, rows, axis=0))
 
 
 def design_columns(playback: Playback, setup: Setup) -> dict[str, Array]:
@@ -56,7 +56,7 @@ def reference_columns(playback: Playback, setup: Setup) -> dict[str, Array]:
     """
     held = np.concatenate([playback.ctrl, playback.ctrl[-1:]])
     qpos, qvel, act = setup.space.split(playback.state)
-    rows = Trajectory(playback.t, qpos, qvel, act, held)
+    rows = Trajectory(t=playback.t, qpos=qpos, qvel=qvel, act=act, ctrl=held)
     qacc, force = np.empty_like(qvel), np.empty_like(qvel)
     for k, data in forwarded(setup.model_at(setup.theta), rows, range(len(held))):
         qacc[k], force[k] = data.qacc, data.qfrc_actuator

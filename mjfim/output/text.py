@@ -38,14 +38,14 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
         shown = [f"{std:.3g}" if np.isfinite(std) else "not alone" for std in (before, after)]
         table.add_row(_named(name, unit), f"{value:.4g}", *shown, relative, _ratio(before, after))
     for c in design.combined:
-        relative = f"{100 * c.final / abs(c.value):.2g} %" if c.value else "-"
-        stds = (f"{c.initial:.3g}", f"{c.final:.3g}")
+        relative = f"{100 * c.std_final / abs(c.value):.2g} %" if c.value else "-"
+        stds = (f"{c.std_initial:.3g}", f"{c.std_final:.3g}")
         table.add_row(
             escape(c.words),
             f"{c.value:.4g}",
             *stds,
             relative,
-            _ratio(c.initial, c.final),
+            _ratio(c.std_initial, c.std_final),
             style="cyan",
         )
     last = design.history[-1] if design.history else None
@@ -360,7 +360,7 @@ def _lines(group: ParameterGroup, check: Check) -> list[str]:
     """A group of parameters: its members, then one combination a line, with its value and standard deviation."""
     if not group.combinations:
         return [f"  {group}"]
-    known = {c.words: f" = {c.value:.4g} ± {c.final:.2g}" for c in check.combined}
+    known = {c.words: f" = {c.value:.4g} ± {c.std_final:.2g}" for c in check.combined}
     return [
         f"  {', '.join(group.members)} only as",
         *(f"    {c}{known.get(str(c), '')}" for c in group.combinations),

@@ -167,7 +167,13 @@ class Plant:
     def trajectory(self, states: Array, ctrl: Array) -> Trajectory:
         """Record from states: (N+1, ns) and ctrl: (N, nu)."""
         qpos, qvel, act = self.space.split(states)
-        return Trajectory(np.arange(len(states), dtype=np.float64) * self.dt, qpos, qvel, act, ctrl)
+        return Trajectory(
+            t=np.arange(len(states), dtype=np.float64) * self.dt,
+            qpos=qpos,
+            qvel=qvel,
+            act=act,
+            ctrl=ctrl,
+        )
 
     def simulate(self, theta: Array, ctrl: Array) -> Trajectory:
         """Open-loop trajectory from the start under ctrl: (N, nu). Raises SimulationDiverged."""
@@ -403,7 +409,7 @@ class Plant:
         if lag is not None:
             G = lag.apply(G) + lag.rate(y)[..., None] * self.parameters.delay
             y = lag.apply(y)
-        return y, Sensitivity(psi, G)
+        return y, Sensitivity(psi=psi, G=G)
 
     def linearize(
         self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
@@ -418,7 +424,7 @@ class Plant:
             self.outputs.tangent(states, np.zeros((p, len(states), self.space.nx)), hp), 0, 2
         )
         H = H + self._bias
-        return Linearization(A, B, E, C, D, H)
+        return Linearization(A=A, B=B, E=E, C=C, D=D, H=H)
 
     def one_step(
         self, theta: Array, trajectory: Trajectory, samples: np.ndarray, step: float

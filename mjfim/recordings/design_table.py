@@ -55,8 +55,8 @@ def read_playback(path: Path, channels: Channels) -> Playback:
         parts.append(values)
     state, ctrl, gain = parts
     return Playback(
-        np.arange(len(t)) * (steps * timestep),
-        state,
-        ctrl,
-        gain.reshape(len(ctrl), len(controls), -1),
+        t=np.arange(len(t)) * (steps * timestep),
+        state=state,
+        ctrl=ctrl,
+        gain=gain.reshape(len(ctrl), len(controls), -1),
     )

@@ -67,7 +67,7 @@ def read_log(path: Path, channels: Channels) -> Log:
     summary = summarize(
         str(path), t, columns, {name: source.column for name, source in plan.items()}, dropped
     )
-    return Log(Recording(t, ctrl, y, measured, str(path)), summary)
+    return Log(Recording(t=t, ctrl=ctrl, y=y, outputs=measured, name=str(path)), summary)
 
 
 def check_spec(channels: Channels) -> None:

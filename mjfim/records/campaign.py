@@ -25,7 +25,7 @@ class CampaignStatus(Enum):
     INTERRUPTED = "interrupted by the user; the rounds so far are complete"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class EarlierRound:
     """Recordings that are there already: of an earlier session's round, or made without a design.
 
@@ -38,7 +38,7 @@ class EarlierRound:
     control: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Round:
     """One round. number: from 1;  theta: (p,) where it was designed;  control: (N, nu) of the design
 
@@ -64,7 +64,7 @@ class Round:
         return self.estimate.std
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Campaign:
     """All rounds. wanted: (p,) σ aimed at, infinite where none is
 

@@ -13,7 +13,7 @@ from mjfim.records.design import CombinationAccuracy
 CONFOUNDED_CORRELATION = 0.95
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ParameterCheck:
     """One parameter. std: predicted standard deviation, infinite where it cannot be told alone;  relative: to its size
 
@@ -35,7 +35,7 @@ class ParameterCheck:
     seconds: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ConfoundedPair:
     """Two parameters that the data hardly tell apart."""
 
@@ -44,7 +44,7 @@ class ConfoundedPair:
     correlation: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Check:
     """What can be identified.
 
@@ -88,7 +88,7 @@ class Check:
         return self.self_test.passed and apart and not self.not_here and reached
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Roughness:
     """Disagreement of dy/dtheta by two difference steps.
 
@@ -117,7 +117,7 @@ RECURSION_TOLERANCE = 1e-3
 SLOPE_TOLERANCE = 1e-2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SelfTest:
     """Relative errors; infinite where a perturbed motion diverges, NaN where the criterion itself is infinite.
 

@@ -10,7 +10,7 @@ import numpy as np
 from mjfim.arrays import Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Combination:
     """A visible combination `sum_i coefficients_i * parameter_i`, its first member with coefficient 1."""
 
@@ -34,7 +34,7 @@ def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -
     return rows
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ParameterGroup:
     """Parameters that are visible only together: as `combinations`, fewer than members; none where all are invisible."""
 

@@ -23,7 +23,7 @@ class MethodOutcome(Enum):
     NONE = "had no time for a single try"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MethodResult:
     """What a method found. The control is None, and numbers are NaN, where it has nothing to show.
 
@@ -64,7 +64,7 @@ class MethodResult:
         return min(self.shares.items(), key=lambda item: item[1], default=("", np.inf))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Comparison:
     """Methods side by side, each with the same budget, in the order in which they ran.
 

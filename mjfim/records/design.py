@@ -11,7 +11,7 @@ from mjfim.arrays import Array, freeze
 from mjfim.records.trajectory import Trajectory
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Evaluation:
     """A trajectory and what it tells about the parameters.
 
@@ -61,7 +61,7 @@ class Status(Enum):
         return self in (Status.CONVERGED, Status.SMOOTHED)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class HistoryRow:
     """One iterate of a design: cost J, criterion phi, smallest eigenvalue, slope |DJ.zeta|, step length gamma.
 
@@ -82,7 +82,7 @@ class HistoryRow:
     margin: float = float("nan")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StartResult:
     """One start of a multi-start design: its name, the cost it reached, how it ended."""
 
@@ -92,17 +92,17 @@ class StartResult:
     iterations: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CombinationAccuracy:
     """An identifiable combination of parameters that are not so alone: its words, value and standard deviations."""
 
     words: str
     value: float
-    initial: float
-    final: float
+    std_initial: float
+    std_final: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class LimitUsage:
     """How much of a limit a trajectory uses. kind: of the limit;  name: of the joint, the actuator or the nearest pair
 
@@ -118,7 +118,7 @@ class LimitUsage:
         freeze(self, "t", "share")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Design:
     """Result of `mjfim.design`: the designed trajectory beside the one it started from.
 

@@ -11,7 +11,7 @@ from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Estimate:
     """Parameters from recordings.
 
@@ -88,7 +88,7 @@ class Estimate:
         freeze(self, *names)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class WorstResidual:
     """Where residuals are worst. begin, end: [s];  size: their root mean square in sigmas;  share: of all squares"""
 
@@ -104,7 +104,7 @@ class WorstResidual:
         return f"worst in {self.output}, {when}: {self.size:.2g} sigmas, {100 * self.share:.0f} % of all squares"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PredictionErrors:
     """How far a model is from a recording. name: of it;  rms, mae: (ny,) root mean square and mean absolute errors
 
@@ -120,7 +120,7 @@ class PredictionErrors:
         freeze(self, "rms", "mae")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Prediction:
     """How well something that was not fitted is predicted, by the identified and by the nominal model.
 
@@ -142,7 +142,7 @@ class Prediction:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MissingTerm:
     """A term that would explain residuals. path: a parameter's target;  value: about how much of it there would be [unit]
 
@@ -162,7 +162,7 @@ class MissingTerm:
         return f'{self.words}, {told}; to find it out: target = "{self.path}"'
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Uncertainty:
     """Of the c common unknowns.
 
@@ -181,7 +181,7 @@ class Uncertainty:
     draws: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Whiteness:
     """Of one output's whitened residuals. count: of them;  variance: their mean square;  correlation: of one with the next
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from mjfim.arrays import Array, freeze
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TrialStatistics:
     """Monte-Carlo estimates along one trajectory, against theory.
 
@@ -30,7 +30,7 @@ class TrialStatistics:
         freeze(self, "estimates", "mean", "covariance", "crlb", "efficiency", "efficiency_interval")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MonteCarloStudy:
     """Monte-Carlo studies of trajectories by name (`initial`, `final`).
 

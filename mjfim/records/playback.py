@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from mjfim.arrays import Array, freeze
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Playback:
     """A design at the controller's rate, M rows and the end.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from mjfim.arrays import Array, freeze
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
     """Measured (or simulated) outputs under a known control, at the times at which they were logged.
 

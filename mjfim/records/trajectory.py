@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.arrays import Array, freeze
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Trajectory:
     """A feasible curve (x, u) of the plant: `x_{k+1} = F(x_k, u_k, theta)`.
 
@@ -49,7 +49,7 @@ class Trajectory:
         return np.concatenate([self.qpos, self.qvel, self.act], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Linearization:
     """First derivatives along a trajectory, in the tangent space of the state.
 
@@ -68,7 +68,7 @@ class Linearization:
         freeze(self, "A", "B", "E", "C", "D", "H")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Sensitivity:
     """What the parameters do to a trajectory at fixed control.
 

@@ -108,7 +108,12 @@ class _Loop:
         if not recordings:
             return CampaignStatus.WAITING
         self._record(
-            EarlierRound(recordings, found.theta, found.final.std, found.trajectory.ctrl),
+            EarlierRound(
+                recordings=recordings,
+                theta=found.theta,
+                predicted=found.final.std,
+                control=found.trajectory.ctrl,
+            ),
             found,
             told,
         )
@@ -188,7 +193,12 @@ class _Loop:
         warnings = [f"round {r.number}: {sentence}" for r in self.rounds for sentence in r.warnings]
         names = self.base.parameters.names
         return Campaign(
-            names, self.wanted, tuple(self.rounds), status, self.pending, tuple(warnings)
+            parameters=names,
+            wanted=self.wanted,
+            rounds=tuple(self.rounds),
+            status=status,
+            pending=self.pending,
+            warnings=tuple(warnings),
         )
 
 

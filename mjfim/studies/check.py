@@ -106,19 +106,19 @@ def _concluded(
     verdict = tuple(_verdict(rows, never, not_here, confounded, tested, source))
     combined = () if not_here else seen.combined(information, setup.theta[p.interest], total, total)
     return Check(
-        source,
-        horizon,
-        rows,
-        seen.names,
-        total,
-        eigenvalues,
-        correlation,
-        confounded,
-        never,
-        not_here,
-        tested,
-        verdict,
-        combined,
+        source=source,
+        horizon=horizon,
+        rows=rows,
+        wanted=seen.names,
+        information=total,
+        eigenvalues=eigenvalues,
+        correlation=correlation,
+        confounded=confounded,
+        never=never,
+        not_here=not_here,
+        self_test=tested,
+        verdict=verdict,
+        combined=combined,
     )
 
 
@@ -136,17 +136,17 @@ def _rows(
             0 if parameter.nuisance else _repetitions(information, data, setup.prior, j, wanted)
         )
         yield ParameterCheck(
-            parameter.name,
-            parameter.unit,
-            value,
-            parameter.nuisance,
-            size,
-            float(std[j]),
-            float(std[j] / size),
-            wanted,
-            stated,
-            needed,
-            needed * horizon,
+            name=parameter.name,
+            unit=parameter.unit,
+            value=value,
+            nuisance=parameter.nuisance,
+            size=size,
+            std=float(std[j]),
+            relative=float(std[j] / size),
+            wanted=wanted,
+            stated=stated,
+            repetitions=needed,
+            seconds=needed * horizon,
         )
 
 
@@ -176,7 +176,7 @@ def _repetitions(
 def _pairs(names: Sequence[str], correlation: Array) -> Iterator[ConfoundedPair]:
     """Confounded pairs, the worst first."""
     found = [
-        ConfoundedPair(names[i], names[j], float(correlation[i, j]))
+        ConfoundedPair(first=names[i], second=names[j], correlation=float(correlation[i, j]))
         for i in range(len(names))
         for j in range(i + 1, len(names))
         if abs(correlation[i, j]) > CONFOUNDED_CORRELATION

@@ -284,20 +284,19 @@ class Judge:
     def _nothing(self, method: str, title: str, attempt: Attempt, note: str) -> MethodResult:
         outcome = MethodOutcome.NONE if attempt.control is None else MethodOutcome.NOTHING
         blank = np.full(len(self.setup.parameters), np.nan)
-        taken = (attempt.seconds, attempt.steps)
         return MethodResult(
-            method,
-            title,
-            outcome,
-            None,
-            np.nan,
-            np.nan,
-            blank,
-            np.nan,
-            np.nan,
-            *taken,
-            {},
-            {},
-            "",
-            note,
+            method=method,
+            title=title,
+            outcome=outcome,
+            control=None,
+            cost=np.nan,
+            criterion=np.nan,
+            std=blank,
+            smallest=np.nan,
+            worst=np.nan,
+            seconds=attempt.seconds,
+            steps=attempt.steps,
+            margins={},
+            shares={},
+            note=note,
         )

@@ -26,9 +26,9 @@ def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
     if trajectory is None or point.sensitivity is None:
         raise SimulationDiverged("the trajectory diverges when the parameters move a little")
     found = SelfTest(
-        roughness(setup, setup.theta, trajectory, point.sensitivity),
-        recursion_error(setup, trajectory, point.sensitivity),
-        slope_error(setup, problem, point),
+        rough=roughness(setup, setup.theta, trajectory, point.sensitivity),
+        recursion=recursion_error(setup, trajectory, point.sensitivity),
+        slope=slope_error(setup, problem, point),
     )
     if found.passed or found.rough is not None:
         return found

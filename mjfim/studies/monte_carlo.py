@@ -68,7 +68,11 @@ def monte_carlo(
         if not sets:
             raise
     return MonteCarloStudy(
-        setup.parameters.names, setup.parameters.true, setup.measure_rate, sets, information
+        parameters=setup.parameters.names,
+        theta=setup.parameters.true,
+        measure_rate=setup.measure_rate,
+        sets=sets,
+        information=information,
     )
 
 
@@ -108,11 +112,11 @@ class Trials:
         y[mask] = measured
         y = np.where(mask, y @ noise.factor.T, np.nan)
         return Recording(
-            np.arange(len(y), dtype=np.float64) * self.setup.dt,
-            self.ctrl,
-            y,
-            self.setup.outputs.names,
-            "trial",
+            t=np.arange(len(y), dtype=np.float64) * self.setup.dt,
+            ctrl=self.ctrl,
+            y=y,
+            outputs=self.setup.outputs.names,
+            name="trial",
         )
 
     def jacobian(self, theta: Array, predicted: Array, relative: float = 1e-6) -> Array:
@@ -229,27 +233,27 @@ def _statistics(estimates: Array, crlb: Array, seconds: float) -> TrialStatistic
     if n < 2:
         blank = np.full(p, np.nan)
         return TrialStatistics(
-            estimates,
-            blank,
-            np.full((p, p), np.nan),
-            crlb,
-            blank,
-            np.full((p, 2), np.nan),
-            len(estimates),
-            len(estimates) - n,
-            seconds,
+            estimates=estimates,
+            mean=blank,
+            covariance=np.full((p, p), np.nan),
+            crlb=crlb,
+            efficiency=blank,
+            efficiency_interval=np.full((p, 2), np.nan),
+            trials=len(estimates),
+            failed=len(estimates) - n,
+            seconds=seconds,
         )
     covariance = np.atleast_2d(np.cov(good, rowvar=False))
     efficiency = np.diag(crlb) / np.diag(covariance)
     interval = efficiency[:, None] * chi2_distribution.ppf([0.025, 0.975], n - 1) / (n - 1)
     return TrialStatistics(
-        estimates,
-        good.mean(axis=0),
-        covariance,
-        crlb,
-        efficiency,
-        interval,
-        len(estimates),
-        len(estimates) - n,
-        seconds,
+        estimates=estimates,
+        mean=good.mean(axis=0),
+        covariance=covariance,
+        crlb=crlb,
+        efficiency=efficiency,
+        efficiency_interval=interval,
+        trials=len(estimates),
+        failed=len(estimates) - n,
+        seconds=seconds,
     )

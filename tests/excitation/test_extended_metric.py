@@ -94,7 +94,7 @@ def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None
     unit = Bilinear(
         A, B, C, D, rng.normal(size=(p, N, nx + nu, nx)), rng.normal(size=(p, N + 1, nx + nu, ny))
     )
-    S = Sensitivity(rng.normal(size=(N + 1, nx, p)), rng.normal(size=(N + 1, ny, p)))
+    S = Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, ny, p)))
     noise = Noise.independent([0.3, 2.0])
     made = Information(noise, 20.0, np.array([1.0, 0.5, 3.0]), np.zeros((p, p)), criterion)
     found = made.evaluate(made.matrix(S))

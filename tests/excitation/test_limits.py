@@ -58,7 +58,11 @@ def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajecto
     for name, (index, values) in columns.items():
         arrays[name][:, index] = values
     return Trajectory(
-        np.arange(3) * 0.1, arrays["qpos"], arrays["qvel"], np.zeros((3, 0)), arrays["ctrl"]
+        t=np.arange(3) * 0.1,
+        qpos=arrays["qpos"],
+        qvel=arrays["qvel"],
+        act=np.zeros((3, 0)),
+        ctrl=arrays["ctrl"],
     )
 
 
@@ -280,11 +284,11 @@ def test_clamped_forces_are_found_beside_actuators_with_several(
 ) -> None:
     model = mujoco.MjModel.from_xml_string(SERVOED)
     still = Trajectory(
-        np.arange(3) * 0.1,
-        np.tile(model.qpos0, (3, 1)),
-        np.zeros((3, 4)),
-        np.zeros((3, 0)),
-        np.array([ctrl] * 2),
+        t=np.arange(3) * 0.1,
+        qpos=np.tile(model.qpos0, (3, 1)),
+        qvel=np.zeros((3, 4)),
+        act=np.zeros((3, 0)),
+        ctrl=np.array([ctrl] * 2),
     )
     assert saturated(model, still) == names
 

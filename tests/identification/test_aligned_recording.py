@@ -177,7 +177,10 @@ def test_quaternions_get_the_sign_of_the_model(body: Setup) -> None:
         columns = [names.index(f"qpos:{joint}.q{a}") for a in "wxyz"]
         flipped[:, columns] *= rng.choice([-1.0, 1.0], (len(y), 1))
         flipped[10:20, columns] = np.nan
-    track = track_of(body, Recording(np.arange(len(y)) * body.dt, ctrl, flipped, names, "x.csv"))
+    track = track_of(
+        body,
+        Recording(t=np.arange(len(y)) * body.dt, ctrl=ctrl, y=flipped, outputs=names, name="x.csv"),
+    )
     seen = np.isfinite(flipped)
     np.testing.assert_array_equal(track.y[seen], y[seen])
     assert np.isnan(track.y[~seen]).all()
@@ -189,7 +192,10 @@ def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
     y = some.plant.measure(some.parameters.guess[None], some.control)[0][0]
     assert (np.ptp(np.sign(y), axis=0) == 2.0).any(), "nothing crosses zero"
     track = track_of(
-        some, Recording(np.arange(len(y)) * some.dt, some.control, y, some.outputs.names)
+        some,
+        Recording(
+            t=np.arange(len(y)) * some.dt, ctrl=some.control, y=y, outputs=some.outputs.names
+        ),
     )
     np.testing.assert_array_equal(track.y, y)
 

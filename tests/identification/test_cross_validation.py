@@ -45,7 +45,11 @@ def test_without_held_out_recordings_each_is_predicted_by_the_others(
     setup = Setup(base)
     recordings = [recorded(setup, seed) for seed in range(3)]
     spoilt = Recording(
-        recordings[2].t, recordings[2].ctrl, recordings[2].y + 0.2, recordings[2].outputs, "spoilt"
+        t=recordings[2].t,
+        ctrl=recordings[2].ctrl,
+        y=recordings[2].y + 0.2,
+        outputs=recordings[2].outputs,
+        name="spoilt",
     )
     found = mjfim.identify(setup, [*recordings[:2], spoilt])
     assert [p.name for p in found.predictions] == ["simulated", "simulated", "spoilt"]
@@ -61,7 +65,7 @@ def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
     late = np.array(recording.y)
     late[320:] += 1.0
     (prediction,) = mjfim.identify(
-        setup, [Recording(recording.t, recording.ctrl, late, recording.outputs)]
+        setup, [Recording(t=recording.t, ctrl=recording.ctrl, y=late, outputs=recording.outputs)]
     ).predictions
     assert prediction.name.startswith("last 25 %")
     np.testing.assert_allclose(
@@ -77,7 +81,9 @@ def test_every_recording_has_its_own_bias(base: mjfim.Experiment) -> None:
     for seed, bias in enumerate(biases):
         clean = recorded(plain, seed)
         shift = bias * (np.arange(4) == clean.outputs.index("qpos:hinge"))
-        recordings.append(Recording(clean.t, clean.ctrl, clean.y + shift, clean.outputs))
+        recordings.append(
+            Recording(t=clean.t, ctrl=clean.ctrl, y=clean.y + shift, outputs=clean.outputs)
+        )
     found = mjfim.identify(setup, recordings)
     np.testing.assert_allclose(found.each["bias qpos:hinge"], biases, atol=0.02)
     j = found.parameters.index("bias qpos:hinge")
@@ -109,7 +115,11 @@ def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experime
     y = np.array(good.y)
     y[:, 3] += rng.normal(0.0, 2.0, len(y))
     noisy = Recording(
-        good.t, good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape), y, good.outputs, "x"
+        t=good.t,
+        ctrl=good.ctrl + rng.normal(0.0, 20.0, good.ctrl.shape),
+        y=y,
+        outputs=good.outputs,
+        name="x",
     )
     said = " ".join(plausibility_remarks(setup.channels, noisy))
     assert "jumps from row to row" in said and "qvel:hinge is rough" in said
@@ -120,6 +130,7 @@ def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experime
     assert any(
         "part by" in s
         for s in plausibility_remarks(
-            setup.channels, Recording(swung.t, swung.ctrl, y, swung.outputs, "x")
+            setup.channels,
+            Recording(t=swung.t, ctrl=swung.ctrl, y=y, outputs=swung.outputs, name="x"),
         )
     )

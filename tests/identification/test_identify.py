@@ -38,7 +38,7 @@ def recording(setup: Setup, design: mjfim.Design) -> Recording:
 
 def noiseless(setup: Setup, recording: Recording) -> Recording:
     y, _ = setup.plant.measure(setup.parameters.true[None], recording.ctrl)
-    return Recording(recording.t, recording.ctrl, y[0], recording.outputs)
+    return Recording(t=recording.t, ctrl=recording.ctrl, y=y[0], outputs=recording.outputs)
 
 
 @pytest.mark.parametrize("method", ["least_squares", "newton"])
@@ -101,7 +101,9 @@ def test_chi_square_and_misfit(setup: Setup, recording: Recording) -> None:
     assert not right.misfit
     drag = np.array(recording.y)
     drag[:, 0] += 0.1 * np.sin(3 * recording.t)  # a structured error that no parameter explains
-    wrong = identify(setup, [Recording(recording.t, recording.ctrl, drag, recording.outputs)])
+    wrong = identify(
+        setup, [Recording(t=recording.t, ctrl=recording.ctrl, y=drag, outputs=recording.outputs)]
+    )
     assert wrong.misfit
     assert any("not accuracy" in sentence for sentence in wrong.warnings)
 
@@ -145,7 +147,9 @@ def test_recording_with_fewer_outputs_and_gaps_still_fits(
 ) -> None:
     y = np.array(recording.y[:, :2])
     y[50:80, 1] = np.nan
-    estimate = identify(setup, [Recording(recording.t, recording.ctrl, y, recording.outputs[:2])])
+    estimate = identify(
+        setup, [Recording(t=recording.t, ctrl=recording.ctrl, y=y, outputs=recording.outputs[:2])]
+    )
     assert estimate.dof == 2 * 400 - 30 - 3
     assert np.all(np.abs(estimate.theta - setup.parameters.true) < 5 * estimate.std)
 
@@ -153,15 +157,15 @@ def test_recording_with_fewer_outputs_and_gaps_still_fits(
 def test_unusable_recordings_are_named(setup: Setup, recording: Recording) -> None:
     t, ctrl, y, names = recording.t, recording.ctrl, recording.y, recording.outputs
     with pytest.raises(RecordingError, match="too few rows"):
-        track_of(setup, Recording(t[:2], ctrl[:1], y[:2], names, "x.csv"))
+        track_of(setup, Recording(t=t[:2], ctrl=ctrl[:1], y=y[:2], outputs=names, name="x.csv"))
     with pytest.raises(RecordingError, match=r"x\.csv.*does not increase in data row 2"):
-        track_of(setup, Recording(-t, ctrl, y, names, "x.csv"))
+        track_of(setup, Recording(t=-t, ctrl=ctrl, y=y, outputs=names, name="x.csv"))
     bad = np.array(ctrl)
     bad[7] = np.nan
     with pytest.raises(RecordingError, match="data row 8"):
-        track_of(setup, Recording(t, bad, y, names, "x.csv"))
+        track_of(setup, Recording(t=t, ctrl=bad, y=y, outputs=names, name="x.csv"))
     with pytest.raises(RecordingError, match="qpos:slide"):
-        track_of(setup, Recording(t, ctrl, y, ("a", "b", "c", "d"), "x.csv"))
+        track_of(setup, Recording(t=t, ctrl=ctrl, y=y, outputs=("a", "b", "c", "d"), name="x.csv"))
     with pytest.raises(RecordingError, match="at least one"):
         identify(setup, [])
 
@@ -296,7 +300,10 @@ def test_a_robust_fit_judges_the_size_of_its_residuals(
     assert not any("overstated" in sentence for sentence in right.warnings)
     truth = noiseless(setup, recording).y
     loud = Recording(
-        recording.t, recording.ctrl, truth + 3.0 * (recording.y - truth), recording.outputs
+        t=recording.t,
+        ctrl=recording.ctrl,
+        y=truth + 3.0 * (recording.y - truth),
+        outputs=recording.outputs,
     )
     assert any("x the stated noise" in reason for reason in identify(robust, [loud]).reasons)
 

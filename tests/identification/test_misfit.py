@@ -96,7 +96,11 @@ def test_short_recordings(count: int) -> None:
 
 def test_a_place_in_words() -> None:
     """What, when, where, how much."""
-    said = str(WorstResidual("angle", "run.csv", 1.25, 2.5, 7.93, 0.412))
+    said = str(
+        WorstResidual(
+            output="angle", recording="run.csv", begin=1.25, end=2.5, size=7.93, share=0.412
+        )
+    )
     assert said == "worst in angle, 1.25 to 2.5 s of run.csv: 7.9 sigmas, 41 % of all squares"
 
 
@@ -108,7 +112,15 @@ def seen(
     time: float = 1.0,
     correlation: float = 0.3,
 ) -> Whiteness:
-    return Whiteness(output, 1000, variance, correlation, p, inflation, time)
+    return Whiteness(
+        output=output,
+        count=1000,
+        variance=variance,
+        correlation=correlation,
+        p=p,
+        inflation=inflation,
+        time=time,
+    )
 
 
 def test_larger_and_smaller_need_probability_and_size() -> None:

@@ -61,10 +61,14 @@ def test_a_bias_and_a_lag_are_told(tmp_path: Path) -> None:
     clean = mjfim.simulate(setup, setup.initial, seed=1)
     off = np.array(clean.y)
     off[:, 3] += 0.03
-    biased = mjfim.identify(setup, [Recording(clean.t, clean.ctrl, off, clean.outputs)])
+    biased = mjfim.identify(
+        setup, [Recording(t=clean.t, ctrl=clean.ctrl, y=off, outputs=clean.outputs)]
+    )
     assert biased.suspects[0].path == "output/qvel:hinge:bias"
     assert biased.suspects[0].value == pytest.approx(0.03, rel=0.4)
-    late = Recording(clean.t[2:] - clean.t[2], clean.ctrl[2:], clean.y[:-2], clean.outputs)
+    late = Recording(
+        t=clean.t[2:] - clean.t[2], ctrl=clean.ctrl[2:], y=clean.y[:-2], outputs=clean.outputs
+    )
     lagging = mjfim.identify(setup, [late])
     assert "output:delay" in [s.path for s in lagging.suspects]
 

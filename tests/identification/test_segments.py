@@ -51,7 +51,11 @@ def track(
     return track_of(
         setup,
         Recording(
-            rows * setup.dt, ctrl, y[np.ix_(rows, np.arange(y.shape[1])[kept])], names, "x.csv"
+            t=rows * setup.dt,
+            ctrl=ctrl,
+            y=y[np.ix_(rows, np.arange(y.shape[1])[kept])],
+            outputs=names,
+            name="x.csv",
         ),
     )
 
@@ -76,7 +80,11 @@ def test_every_row_is_in_one_piece(setup: Setup, length: float | None, lead: flo
     some = np.sort(rng.choice(len(y), 120, replace=False))
     some[0] = 0
     off = Recording(
-        np.sort(rng.uniform(0, 1.7, 90)), np.zeros((89, 1)), y[:90], setup.outputs.names, "off.csv"
+        t=np.sort(rng.uniform(0, 1.7, 90)),
+        ctrl=np.zeros((89, 1)),
+        y=y[:90],
+        outputs=setup.outputs.names,
+        name="off.csv",
     )
     tracks = [track(setup), track(setup, rows=some), track_of(setup, off)]
     assert [t.even for t in tracks] == [True, True, False]
@@ -223,7 +231,12 @@ def test_a_start_that_nothing_shows_does_no_harm(
     theta, y = 1.1 * blind.parameters.guess, truth(blind)
     y = y + 0.01 * np.random.default_rng(0).standard_normal(y.shape)
     found = identify(
-        blind, [Recording(np.arange(len(y)) * blind.dt, blind.control, y, names, "x.csv")]
+        blind,
+        [
+            Recording(
+                t=np.arange(len(y)) * blind.dt, ctrl=blind.control, y=y, outputs=names, name="x.csv"
+            )
+        ],
     )
     assert found.success, found.status
     assert not found.misfit, found.reasons

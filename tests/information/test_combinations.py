@@ -124,7 +124,7 @@ def test_criterion_c_refuses_what_cannot_be_identified(tmp_path) -> None:
     design = mjfim.design(pendulum(tmp_path, cost=visible))
     known = {c.words.split()[0]: c for c in design.combined}
     assert design.final.criterion == pytest.approx(
-        known["I1"].final ** 2 * 100.0, rel=1e-6
+        known["I1"].std_final ** 2 * 100.0, rel=1e-6
     )  # per second, 100 Hz
 
 
@@ -157,7 +157,9 @@ def test_starts_are_each_recordings_own_for_check_as_for_identify(tmp_path) -> N
 def test_a_quaternion_sensor_may_come_with_either_sign(tmp_path) -> None:
     setup = pendulum(tmp_path, noise={"tip": 0.005}, parameters={"d": PARAMETERS["d"]})
     recording = mjfim.simulate(setup, setup.initial, seed=1)
-    turned = mjfim.Recording(recording.t, recording.ctrl, -recording.y, recording.outputs, "turned")
+    turned = mjfim.Recording(
+        t=recording.t, ctrl=recording.ctrl, y=-recording.y, outputs=recording.outputs, name="turned"
+    )
     right, other = (mjfim.identify(setup, [r]) for r in (recording, turned))
     np.testing.assert_allclose(other.theta, right.theta, rtol=1e-6)
     assert not other.misfit

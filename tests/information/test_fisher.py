@@ -25,7 +25,7 @@ SIGMA = np.array([0.1, 0.5, 2.0])
 def random_sensitivity(seed: int, N: int = 12, p: int = 4, nx: int = 5) -> Sensitivity:
     """Any psi and G."""
     rng = np.random.default_rng(seed)
-    return Sensitivity(rng.normal(size=(N + 1, nx, p)), rng.normal(size=(N + 1, 3, p)))
+    return Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, 3, p)))
 
 
 def information(stride: int = 1, criterion: str = "E", **changes) -> Information:
@@ -60,10 +60,13 @@ def test_information_leaves_out_the_known_start() -> None:
     G = np.array(S.G)
     G[0] += 100.0
     np.testing.assert_array_equal(
-        information().matrix(Sensitivity(S.psi, G)), information().matrix(S)
+        information().matrix(Sensitivity(psi=S.psi, G=G)), information().matrix(S)
     )
     G[1] += 100.0
-    assert np.abs(information().matrix(Sensitivity(S.psi, G)) - information().matrix(S)).max() > 1.0
+    assert (
+        np.abs(information().matrix(Sensitivity(psi=S.psi, G=G)) - information().matrix(S)).max()
+        > 1.0
+    )
 
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])
@@ -291,7 +294,7 @@ def test_accumulated_smallest_eigenvalue_is_monotone_and_ends_at_the_whole() -> 
         assert (np.diff(series) >= -1e-12 * series[-1]).all()
         assert series[0] == 0.0
         assert series[-1] == pytest.approx(made.evaluate(made.matrix(S)).eigenvalues[0], rel=1e-10)
-        half = replace(made, prior=np.zeros((4, 4))).matrix(Sensitivity(S.psi[:7], S.G[:7]))
+        half = replace(made, prior=np.zeros((4, 4))).matrix(Sensitivity(psi=S.psi[:7], G=S.G[:7]))
         assert series[6] == pytest.approx(
             np.linalg.eigvalsh(made.scaled(half))[0], rel=1e-9, abs=1e-12
         )

@@ -142,7 +142,13 @@ def test_a_force_that_just_meets_its_range_is_named(
 
 def test_the_sentence_says_parameter_sample_time_and_cause() -> None:
     said = str(
-        Roughness(0.2345, "mass", 17, 0.17, ("contact floor - ball", "dry friction of rail"))
+        Roughness(
+            error=0.2345,
+            parameter="mass",
+            sample=17,
+            time=0.17,
+            causes=("contact floor - ball", "dry friction of rail"),
+        )
     )
     for part in (
         "23 %",
@@ -152,7 +158,7 @@ def test_the_sentence_says_parameter_sample_time_and_cause() -> None:
         "contact floor - ball, dry friction of rail",
     ):
         assert part in said
-    lost = str(Roughness(np.inf, "mass", 0, 0.0, ()))
+    lost = str(Roughness(error=np.inf, parameter="mass", sample=0, time=0.0, causes=()))
     assert "without bound" in lost
     assert "chaotic" in lost
 

@@ -342,13 +342,21 @@ def test_designs_of_other_experiments_are_refused(folder: Path, setup: Setup) ->
     """Another model, another rate."""
     path, curve = folder / "design.npz", archive.read_design(folder / "design.npz")["final"]
     archive.check_fits(path, curve, setup)
-    wide = Trajectory(curve.t, np.zeros((N + 1, 3)), np.zeros((N + 1, 3)), curve.act, curve.ctrl)
+    wide = Trajectory(
+        t=curve.t,
+        qpos=np.zeros((N + 1, 3)),
+        qvel=np.zeros((N + 1, 3)),
+        act=curve.act,
+        ctrl=curve.ctrl,
+    )
     with pytest.raises(
         RecordingError,
         match=r"design\.npz: made for \(nq, nv, nu\) = \(3, 3, 1\), .* has \(2, 2, 1\)",
     ):
         archive.check_fits(path, wide, setup)
-    slow = Trajectory(2 * curve.t, curve.qpos, curve.qvel, curve.act, curve.ctrl)
+    slow = Trajectory(
+        t=2 * curve.t, qpos=curve.qpos, qvel=curve.qvel, act=curve.act, ctrl=curve.ctrl
+    )
     with pytest.raises(
         RecordingError, match=r"design\.npz: sampled at 50 Hz, the experiment at 100 Hz"
     ):
@@ -457,7 +465,9 @@ def test_recording_columns(recording: Recording, setup: Setup, tmp_path: Path) -
 def test_extreme_numbers_survive(setup: Setup, tmp_path: Path) -> None:
     """From the smallest to the largest magnitudes."""
     values = np.array([5e-324, 1e-300, 0.1 + 0.2, -1.7976931348623157e308])
-    r = Recording(np.arange(4) * 0.01, values[:3, None], values[:, None], ("qpos:slide",))
+    r = Recording(
+        t=np.arange(4) * 0.01, ctrl=values[:3, None], y=values[:, None], outputs=("qpos:slide",)
+    )
     archive.write_recording(tmp_path / "r.csv", r, setup)
     assert np.array_equal(logs.read_recording(tmp_path / "r.csv", setup.channels).y, r.y)
 

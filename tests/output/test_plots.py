@@ -50,7 +50,9 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
     t = np.asarray(np.linspace(0.0, 2.0, 51), dtype=np.float64)
     waves = size * np.sin(np.outer(t, 1.0 + np.arange(dofs)))
     control = np.asarray(size * np.cos(t[:-1, None]), dtype=np.float64)
-    curve = Trajectory(t, waves, np.gradient(waves, t, axis=0), np.zeros((51, 0)), control)
+    curve = Trajectory(
+        t=t, qpos=waves, qvel=np.gradient(waves, t, axis=0), act=np.zeros((51, 0)), ctrl=control
+    )
     psi = size * np.sin(np.multiply.outer(t, 1.0 + np.arange(2 * dofs * count))).reshape(
         51, 2 * dofs, count
     )
@@ -59,22 +61,31 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
     smallest = np.asarray(size**2 * t / 2.0, dtype=np.float64)
     criterion = 1.0 / size**2
     return Evaluation(
-        curve,
-        np.zeros((50, 1, 2 * dofs)),
-        psi,
-        np.diag(std**-2),
-        eigenvalues,
-        std,
-        smallest,
-        criterion,
-        criterion + 0.01,
+        trajectory=curve,
+        gain=np.zeros((50, 1, 2 * dofs)),
+        sensitivity=psi,
+        information=np.diag(std**-2),
+        eigenvalues=eigenvalues,
+        std=std,
+        min_eigenvalue=smallest,
+        criterion=criterion,
+        cost=criterion + 0.01,
     )
 
 
 def make_design(dofs: int = 2, count: int = 3) -> Design:
     """Ten iterations from a small to a large motion."""
     rows = tuple(
-        HistoryRow(i, 2.0**-i, 2.0**-i, 2.0**i, -(4.0**-i), 1.0, 0.1 * i, 100 * i)
+        HistoryRow(
+            iteration=i,
+            cost=2.0**-i,
+            criterion=2.0**-i,
+            min_eigenvalue=2.0**i,
+            slope=-(4.0**-i),
+            gamma=1.0,
+            seconds=0.1 * i,
+            steps=100 * i,
+        )
         for i in range(10)
     )
     return Design(
@@ -100,7 +111,14 @@ def make_trials(
     spread = np.diag(np.full(count, std**2))
     interval = np.tile([0.8, 1.2], (count, 1))
     return TrialStatistics(
-        estimates, theta, spread, spread, np.ones(count), interval, trials, failed
+        estimates=estimates,
+        mean=theta,
+        covariance=spread,
+        crlb=spread,
+        efficiency=np.ones(count),
+        efficiency_interval=interval,
+        trials=trials,
+        failed=failed,
     )
 
 
@@ -112,7 +130,13 @@ def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
         "final": make_trials(theta, 0.004, failed, 1),
     }
     information = {name: np.diag(1.0 / np.diagonal(trials.crlb)) for name, trials in sets.items()}
-    return MonteCarloStudy(tuple(f"p{j}" for j in range(count)), theta, 25.0, sets, information)
+    return MonteCarloStudy(
+        parameters=tuple(f"p{j}" for j in range(count)),
+        theta=theta,
+        measure_rate=25.0,
+        sets=sets,
+        information=information,
+    )
 
 
 def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estimate:
@@ -122,7 +146,11 @@ def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estima
     measured = predicted + 0.05 * np.random.default_rng(2).normal(size=predicted.shape)
     measured[10:20, 0] = np.nan
     recording = Recording(
-        t, np.zeros((50, 1)), measured, tuple(f"qpos:joint_{i}" for i in range(dofs)), "swing"
+        t=t,
+        ctrl=np.zeros((50, 1)),
+        y=measured,
+        outputs=tuple(f"qpos:joint_{i}" for i in range(dofs)),
+        name="swing",
     )
     theta = np.linspace(1.0, 2.0, count)
     return Estimate(

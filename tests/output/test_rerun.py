@@ -85,7 +85,7 @@ def simulated(model: mujoco.MjModel, amplitude: float, samples: int = 40) -> Tra
         mujoco.mj_step(model, data)
         rows.append((data.qpos.copy(), data.qvel.copy(), data.act.copy()))
     qpos, qvel, act = (np.array(column) for column in zip(*rows, strict=True))
-    return Trajectory(t, qpos, qvel, act, ctrl)
+    return Trajectory(t=t, qpos=qpos, qvel=qvel, act=act, ctrl=ctrl)
 
 
 def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Evaluation:
@@ -108,7 +108,17 @@ def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Eva
 def designed(model: mujoco.MjModel) -> Design:
     """A hand-made design: a gentle and a vigorous control, three iterations."""
     history = tuple(
-        HistoryRow(k, 2.0 / 4**k, 1.0, 4.0**k, 0.1**k, 0.5, 0.1 * k, 100 * k) for k in range(3)
+        HistoryRow(
+            iteration=k,
+            cost=2.0 / 4**k,
+            criterion=1.0,
+            min_eigenvalue=4.0**k,
+            slope=0.1**k,
+            gamma=0.5,
+            seconds=0.1 * k,
+            steps=100 * k,
+        )
+        for k in range(3)
     )
     return Design(
         status=Status.MAX_ITERATIONS,
@@ -124,8 +134,8 @@ def designed(model: mujoco.MjModel) -> Design:
         warnings=("the two parameters are nearly confounded",),
         found_by="multisine 2",
         starts=(
-            StartResult("initial", 9.0, Status.STALLED, 5),
-            StartResult("multisine 2", 0.125, Status.CONVERGED, 3),
+            StartResult(name="initial", cost=9.0, status=Status.STALLED, iterations=5),
+            StartResult(name="multisine 2", cost=0.125, status=Status.CONVERGED, iterations=3),
         ),
     )
 
@@ -137,7 +147,8 @@ def estimated(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
     y = predicted + 0.01
     y[3, 0] = np.nan
     recordings = tuple(
-        Recording(trajectory.t, trajectory.ctrl, y, outputs, f"run {k}") for k in range(2)
+        Recording(t=trajectory.t, ctrl=trajectory.ctrl, y=y, outputs=outputs, name=f"run {k}")
+        for k in range(2)
     )
     return Estimate(
         parameters=("mass", "gear/ratio"),
@@ -512,7 +523,19 @@ class TestLabels:
         np.testing.assert_array_equal(out[0, :3], qpos[0, :3])
 
     def test_costs_that_change_sign_are_not_put_on_a_logarithm(self) -> None:
-        rows = [HistoryRow(k, 1.0 - k, 0.0, 1.0, 0.0, float("nan"), 0.0, 0) for k in range(3)]
+        rows = [
+            HistoryRow(
+                iteration=k,
+                cost=1.0 - k,
+                criterion=0.0,
+                min_eigenvalue=1.0,
+                slope=0.0,
+                gamma=float("nan"),
+                seconds=0.0,
+                steps=0,
+            )
+            for k in range(3)
+        ]
         series = history_series(rows)
         assert list(series["cost"][1]) == [1.0, 0.0, -1.0]
         assert len(series["slope"][0]) == 0

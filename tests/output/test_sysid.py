@@ -50,7 +50,9 @@ def noiseless(setup: Setup, theta: Array | None = None) -> Recording:
     """Of the initial control, at the true values."""
     values = setup.parameters.true if theta is None else theta
     y, _ = setup.plant.measure(values[None], setup.control)
-    return Recording(np.arange(len(y[0])) * setup.dt, setup.control, y[0], setup.outputs.names)
+    return Recording(
+        t=np.arange(len(y[0])) * setup.dt, ctrl=setup.control, y=y[0], outputs=setup.outputs.names
+    )
 
 
 def residual(exported: Any, theta: Array, weighted: bool) -> Array:
@@ -179,7 +181,7 @@ def test_times_off_the_grid_are_read_between_the_steps(script: ModuleType) -> No
     t = fine.t[rows] + rng.uniform(-2e-3, 2e-3, 300)
     t[0] = 0.0
     y = np.column_stack([np.interp(t, fine.t, column) for column in fine.y.T])
-    recording = Recording(t, fine.ctrl[rows[:-1]], y, fine.outputs)
+    recording = Recording(t=t, ctrl=fine.ctrl[rows[:-1]], y=y, outputs=fine.outputs)
     exported, fit = script.export(setup, [recording]), Fit(setup, [recording])
     wanted = fit.dense(fit.begin(setup.parameters.true))
     assert wanted is not None

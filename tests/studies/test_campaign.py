@@ -201,8 +201,13 @@ def test_a_round_that_tells_nothing_is_named(campaign: Campaign) -> None:
         y=first.recordings[0].y[:3],
     )
     done = [
-        EarlierRound(first.recordings, first.theta, first.predicted, first.control),
-        EarlierRound((start,)),
+        EarlierRound(
+            recordings=first.recordings,
+            theta=first.theta,
+            predicted=first.predicted,
+            control=first.control,
+        ),
+        EarlierRound(recordings=(start,)),
     ]
     found = mjfim.sequential(STUDY, never, rounds=2, done=done)
     assert found.status is CampaignStatus.EXHAUSTED and not found.reached
@@ -216,8 +221,13 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     light = STUDY.replace(parameters={"m": {"true": 1.8}})
     second = mjfim.simulate(light, campaign.designs[1].trajectory, seed=1)
     done = [
-        EarlierRound(first.recordings, first.theta, first.predicted, first.control),
-        EarlierRound((second,)),
+        EarlierRound(
+            recordings=first.recordings,
+            theta=first.theta,
+            predicted=first.predicted,
+            control=first.control,
+        ),
+        EarlierRound(recordings=(second,)),
     ]
     found = mjfim.sequential(STUDY, never, rounds=2, done=done)
     assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
@@ -226,7 +236,14 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
 def test_what_is_recorded_already_is_not_done_again(campaign: Campaign) -> None:
     """The next design of a campaign that is taken up again is the one that it would have had."""
     first = campaign.rounds[0]
-    done = [EarlierRound(first.recordings, first.theta, first.predicted, first.control)]
+    done = [
+        EarlierRound(
+            recordings=first.recordings,
+            theta=first.theta,
+            predicted=first.predicted,
+            control=first.control,
+        )
+    ]
     found = mjfim.sequential(STUDY, lambda design, number: None, done=done)
     assert found.status is CampaignStatus.WAITING and found.pending is not None
     np.testing.assert_allclose(found.pending.trajectory.ctrl, campaign.rounds[1].control, atol=1e-6)
@@ -273,7 +290,14 @@ def test_without_a_design_at_the_estimate_the_last_place_serves(
         return campaign.designs[1]
 
     monkeypatch.setattr(loop, "redesigned", fails_once)
-    done = [EarlierRound(first.recordings, first.theta, first.predicted, first.control)]
+    done = [
+        EarlierRound(
+            recordings=first.recordings,
+            theta=first.theta,
+            predicted=first.predicted,
+            control=first.control,
+        )
+    ]
     found = mjfim.sequential(STUDY, robot, rounds=2, done=done)
     np.testing.assert_array_equal(asked, [first.estimate.theta, first.theta])
     assert any("no design at the estimate" in w and "too fast" in w for w in found.warnings)

@@ -129,7 +129,7 @@ def test_recordings_add_up_and_missing_values_do_not_count(tmp_path) -> None:
     whole = mjfim.simulate(setup, setup.initial, seed=1)
     thinned = np.array(whole.y)
     thinned[::2] = np.nan
-    part = Recording(whole.t, whole.ctrl, thinned, whole.outputs, "half")
+    part = Recording(t=whole.t, ctrl=whole.ctrl, y=thinned, outputs=whole.outputs, name="half")
     two = check(setup, [whole, part])
     fit = Fit(setup, [whole, part], data_only=True)
     J = fit.dense(fit.begin(setup.theta)).J
@@ -231,7 +231,9 @@ def test_recordings_of_the_real_double_pendulum_tell_the_same() -> None:
     names = ("shoulder_angle", "elbow_angle", "shoulder_velocity", "elbow_velocity")
     y = np.column_stack([picked[n] for n in ("pos_meas1", "pos_meas2", "vel_meas1", "vel_meas2")])
     ctrl = np.column_stack([picked["tau_meas1"], picked["tau_meas2"]])[:-1]
-    recording = Recording(np.arange(count) / experiment.rate, ctrl, y, names, file.name)
+    recording = Recording(
+        t=np.arange(count) / experiment.rate, ctrl=ctrl, y=y, outputs=names, name=file.name
+    )
     combinations = double_pendulum_groups(check(setup, [recording]))
     assert combinations["m1r1"]["m2"] == pytest.approx(0.3, rel=1e-3)
     assert combinations["I1"]["m2"] == pytest.approx(0.09, rel=1e-3)

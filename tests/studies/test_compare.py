@@ -41,37 +41,37 @@ def row(method: str, cost: float, outcome: MethodOutcome = MethodOutcome.INSIDE)
     """A made-up result."""
     std = np.full(2, np.sqrt(abs(cost)))
     return MethodResult(
-        method,
-        method,
-        outcome,
-        np.zeros((4, 1)),
-        cost,
-        cost,
-        std,
-        1.0 / cost,
-        std[0],
-        1.0,
-        10,
-        {},
-        {},
+        method=method,
+        title=method,
+        outcome=outcome,
+        control=np.zeros((4, 1)),
+        cost=cost,
+        criterion=cost,
+        std=std,
+        smallest=1.0 / cost,
+        worst=std[0],
+        seconds=1.0,
+        steps=10,
+        margins={},
+        shares={},
     )
 
 
 def made(*rows: MethodResult, nats: float = 0.0) -> Comparison:
     """A made-up comparison."""
     return Comparison(
-        "e",
-        "D" if nats else "E",
-        nats,
-        ("a", "b"),
-        ("", ""),
-        np.ones(2),
-        (),
-        rows,
-        1.0,
-        np.inf,
-        0,
-        False,
+        source="e",
+        criterion="D" if nats else "E",
+        nats=nats,
+        parameters=("a", "b"),
+        units=("", ""),
+        scale=np.ones(2),
+        nuisance=(),
+        rows=rows,
+        seconds=1.0,
+        steps=np.inf,
+        seed=0,
+        weighted=False,
     )
 
 
@@ -197,7 +197,16 @@ def test_a_design_is_stopped_at_its_steps() -> None:
     meter = Meter(job, lambda used, cost: told.append(used))
 
     def iterate(steps: int) -> HistoryRow:
-        return HistoryRow(0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, steps)
+        return HistoryRow(
+            iteration=0,
+            cost=1.0,
+            criterion=1.0,
+            min_eigenvalue=1.0,
+            slope=1.0,
+            gamma=1.0,
+            seconds=0.0,
+            steps=steps,
+        )
 
     meter(iterate(400))
     meter(iterate(300))  # another task

@@ -59,7 +59,9 @@ def test_each_trial_is_its_own_least_squares_estimate(
     for i in range(5):
         y = np.full((401, 4), np.nan)
         y[rows] = exact[0, rows] + 0.05 * noise[i]
-        alone = identify(setup, [Recording(np.arange(401) * 0.01, ctrl, y, setup.outputs.names)])
+        alone = identify(
+            setup, [Recording(t=np.arange(401) * 0.01, ctrl=ctrl, y=y, outputs=setup.outputs.names)]
+        )
         np.testing.assert_array_less(
             np.abs(study.sets["initial"].estimates[i] - alone.theta), 0.01 * std
         )
@@ -163,7 +165,8 @@ def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estim
         z[mask] = white[i]
         y = np.where(mask, exact[0] + z @ setup.noise.factor.T, np.nan)
         alone = identify(
-            unprejudiced, [Recording(np.arange(401) * 0.01, curve.ctrl, y, setup.outputs.names)]
+            unprejudiced,
+            [Recording(t=np.arange(401) * 0.01, ctrl=curve.ctrl, y=y, outputs=setup.outputs.names)],
         )
         np.testing.assert_array_less(
             np.abs(study.sets["final"].estimates[i] - alone.theta), 0.01 * std

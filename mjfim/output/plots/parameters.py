@@ -123,8 +123,8 @@ def std_bars(design: Design, labels: Labels) -> Figure:
         *(shorten(c.words) for c in design.combined),
     ]
     values = np.array([*design.theta[shown], *(c.value for c in design.combined)])
-    before = np.array([*design.initial.std[shown], *(c.initial for c in design.combined)])
-    after = np.array([*design.final.std[shown], *(c.final for c in design.combined)])
+    before = np.array([*design.initial.std[shown], *(c.std_initial for c in design.combined)])
+    after = np.array([*design.final.std[shown], *(c.std_final for c in design.combined)])
     count = len(names)
     figure = new_figure(9.0, 1.7 + (0.5 if count <= ROOMY else 0.3) * count)
     axes = figure.subplots()

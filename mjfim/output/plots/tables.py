@@ -186,11 +186,17 @@ def bound_block(design: Design, labels: Labels) -> Block:
             )
         for c in design.combined:
             relative = [
-                percent(abs(std / c.value)) if c.value else "–" for std in (c.initial, c.final)
+                percent(abs(std / c.value)) if c.value else "–"
+                for std in (c.std_initial, c.std_final)
             ]
-            stds = (number(c.initial), relative[0], number(c.final), relative[1])
+            stds = (number(c.std_initial), relative[0], number(c.std_final), relative[1])
             rows.append(
-                (shorten(c.words), number(c.value, 4), *stds, f"{number(c.initial / c.final)}×")
+                (
+                    shorten(c.words),
+                    number(c.value, 4),
+                    *stds,
+                    f"{number(c.std_initial / c.std_final)}×",
+                )
             )
     return Block(
         "Cramér–Rao standard deviation",

@@ -214,7 +214,11 @@ def _thin(trajectory: Trajectory) -> Trajectory:
     rows = thinned(len(trajectory.t), MOST)
     ctrl = trajectory.ctrl[rows[:-1]]
     return Trajectory(
-        trajectory.t[rows], trajectory.qpos[rows], trajectory.qvel[rows], trajectory.act[rows], ctrl
+        t=trajectory.t[rows],
+        qpos=trajectory.qpos[rows],
+        qvel=trajectory.qvel[rows],
+        act=trajectory.act[rows],
+        ctrl=ctrl,
     )
 
 
