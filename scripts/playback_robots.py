@@ -27,7 +27,7 @@ from mjfim.excitation.limits import Limit
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.information.marginal import standard_deviations
-from mjfim.model.loading import joint_names
+from mjfim.model.coordinates import joint_names
 from mjfim.model.paths import joint_width
 from mjfim.plant.batch import Engine
 from mjfim.recordings.design_table import read_playback
@@ -175,9 +175,9 @@ class Bench:
         reach = np.where(known > 0.0, np.minimum(wrong * size, known), wrong * size)
         for attempt in range(DRAWS):
             off = rng.choice([-1.0, 1.0], len(p)) * reach * 0.9 ** (attempt // len(p))
-            theta = np.where(p.in_model, p.guess + off, known * rng.standard_normal(len(p)))
+            theta = np.where(p.changes_model, p.guess + off, known * rng.standard_normal(len(p)))
             theta = self._with_delay(np.clip(theta, p.lower, p.upper))
-            if not p.impossible(self.setup.plant.source, theta):
+            if not p.unphysical_bodies(self.setup.plant.source, theta):
                 return theta
         raise ExperimentError(
             f"{wrong:.0%} wrong parameters make bodies that cannot exist; try less"
@@ -186,7 +186,9 @@ class Bench:
     def _with_delay(self, theta: Array) -> Array:
         """theta with the true delay."""
         return np.asarray(
-            np.where(self.setup.parameters.delay != 0.0, self.late * self.timestep, theta)
+            np.where(
+                self.setup.parameters.delay_derivative != 0.0, self.late * self.timestep, theta
+            )
         )
 
     def _command(self, state: Array, row: int, feedback: bool) -> Array:
@@ -305,7 +307,7 @@ class Bench:
         """
         setup, na = self.setup, self.setup.space.na
         setup.plant.nominal_start[len(start) - na :] = start[len(start) - na :]
-        matrix = setup.parameters.start(setup.space.nx)
+        matrix = setup.parameters.initial_state_derivative(setup.space.nx)
         used = matrix.any(axis=0)
         deviation = setup.space.minus(start, setup.plant.nominal_start)
         theta[used] = np.linalg.lstsq(matrix[:, used], deviation)[0]
@@ -318,7 +320,11 @@ class Bench:
         p = self.setup.parameters
         starts = [
             p.guess,
-            *(np.where(p.delay != 0.0, lag, p.guess) for lag in LAGS if p.delay.any()),
+            *(
+                np.where(p.delay_derivative != 0.0, lag, p.guess)
+                for lag in LAGS
+                if p.delay_derivative.any()
+            ),
         ]
         for start in starts:
             try:
@@ -339,7 +345,7 @@ class Bench:
         model = setup.model_at(theta)
         start = self._start(model, theta, feedback)
         before = self._before(start, feedback)
-        noise = noise + setup.parameters.bias(len(setup.outputs)) @ theta
+        noise = noise + setup.parameters.bias_derivative(len(setup.outputs)) @ theta
         sent = self._sent(model, start, before, noise, feedback)
         applied = np.concatenate(
             [np.tile(before, (self.late, 1)), np.repeat(sent, self.every, axis=0)]

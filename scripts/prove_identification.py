@@ -89,7 +89,7 @@ def robot(
     read = np.clip(np.rint((ticks - LATE) / STEP).astype(int), 0, len(states) - 1)
     y = (
         states[read]
-        + p.bias(len(setup.outputs)) @ theta
+        + p.bias_derivative(len(setup.outputs)) @ theta
         + rng.normal(0.0, SIGMA, (N + 1, len(setup.outputs)))
     )
     return theta, Recording(t=ticks, ctrl=control, y=y, outputs=setup.outputs.names, name="robot")

@@ -164,7 +164,7 @@ def efficiency_table(study: MonteCarloStudy) -> Table:
 
 def write_figures(folder: Path, setup: Setup, design: Design, study: MonteCarloStudy) -> None:
     """Figures 2-6 and the tables as PNG, and the Rerun file."""
-    names = Labels.of(setup)
+    names = Labels.of_system(setup)
     plots.save(plots.trajectories(design, names), folder / "figure_2.png")
     plots.save(plots.sensitivity_phase(design, names), folder / "figure_3.png")
     for figure, parameter in ((4, "c"), (5, "m"), (6, "l")):

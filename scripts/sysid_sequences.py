@@ -16,7 +16,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, ModelError
 from mjfim.experiment.system import Setup
 from mjfim.identification.aligned_recording import Track, track_of
-from mjfim.model.mujoco_log import quiet
+from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.paths import INERTIAL_FIELDS, PATH, SERVO
 from mjfim.model.spec_writer import settle
 from mjfim.output.mjcf.write import same_dynamics, write_spec
@@ -45,7 +45,7 @@ def hushed() -> Iterator[None]:
     before = logger.level
     logger.setLevel(logging.ERROR)
     try:
-        with quiet():
+        with silence_mujoco_log():
             yield
     finally:
         logger.setLevel(before)
@@ -145,8 +145,8 @@ def parameters_of(setup: Setup) -> Any:
 
         return write
 
-    lower = np.where(np.isfinite(p.lower), p.lower, p.guess - REACH * p.step)
-    upper = np.where(np.isfinite(p.upper), p.upper, p.guess + REACH * p.step)
+    lower = np.where(np.isfinite(p.lower), p.lower, p.guess - REACH * p.magnitude)
+    upper = np.where(np.isfinite(p.upper), p.upper, p.guess + REACH * p.magnitude)
     found = sysid.ParameterDict()
     for j, name in enumerate(p.names):
         found.add(sysid.Parameter(name, p.guess[j], lower[j], upper[j], modifier=modifier(j)))
@@ -156,8 +156,8 @@ def parameters_of(setup: Setup) -> Any:
 def _require_alike(setup: Setup) -> None:
     """Raise ExperimentError where sysid could not fit the same problem."""
     e, p = setup.experiment, setup.parameters
-    if p.outside.any():
-        name = p.names[int(np.argmax(p.outside))]
+    if p.outside_model.any():
+        name = p.names[int(np.argmax(p.outside_model))]
         raise ExperimentError(
             f"{e.source}: {name}: sysid fits numbers of the model only; take starts, biases, delays out"
         )
@@ -170,7 +170,7 @@ def _require_alike(setup: Setup) -> None:
 def _require_followed(setup: Setup, parameters: Any, spec: Any) -> None:
     """Make sure that the compile of moved parameters is the model that mjfim simulates. Raises ModelError."""
     p, moved = setup.parameters, parameters.copy()
-    theta = np.clip(p.guess + PROBE * p.step, p.lower, p.upper)
+    theta = np.clip(p.guess + PROBE * p.magnitude, p.lower, p.upper)
     moved.update_from_vector(theta)
     for settled in (False, True):
         if settled:

@@ -46,7 +46,9 @@ def replay(
         named = archive.read_design(source)
         for trajectory in named.values():
             archive.check_fits(source, trajectory, setup)
-        rerun_log.log_trajectories(target, setup.model_at(setup.theta), named, Labels.of(setup))
+        rerun_log.log_trajectories(
+            target, setup.model_at(setup.theta), named, Labels.of_system(setup)
+        )
     else:
         found = recording_of(source)
         if save is not None:

@@ -12,7 +12,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.limits import Limit
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
-from mjfim.model.geom_distance import Clearance, pairs
+from mjfim.model.geom_distance import GeomDistances, find_geom_pairs
 from mjfim.optimize.barrier import BarrierExpansion, Bounds
 from mjfim.optimize.lq import Weights
 from mjfim.plant.batch import Taps
@@ -91,11 +91,13 @@ def fence_of(setup: Setup, every: bool = False) -> Fence:
     )
 
 
-def _kept_clear(setup: Setup, reach: float) -> Clearance:
+def _kept_clear(setup: Setup, reach: float) -> GeomDistances:
     """Distances of all pairs that are not ignored. Raises ExperimentError where there are none, or unknown bodies."""
     try:
-        near = pairs(setup.model, [frozenset(pair) for pair in setup.experiment.limits.ignored])
-        return Clearance(setup.model_at(setup.theta), near, reach)
+        near = find_geom_pairs(
+            setup.model, [frozenset(pair) for pair in setup.experiment.limits.ignored]
+        )
+        return GeomDistances(setup.model_at(setup.theta), near, reach)
     except ExperimentError as error:
         raise ExperimentError(f"limits.{error}") from None
 
@@ -172,7 +174,7 @@ class Fence:
     seam: bool = False
     end: Bounds | None = None
     target: Array | None = None
-    clearance: Clearance | None = None
+    clearance: GeomDistances | None = None
     least: float = 0.0
 
     def tightened(self, shares: Mapping[str, float]) -> Fence:

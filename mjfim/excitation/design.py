@@ -296,7 +296,7 @@ def _conclude(
         data=shared(
             information.visible(final.information - setup.prior),
             setup.parameters.prior_information,
-            setup.parameters.private,
+            setup.parameters.recording_specific,
         ),
     )
 

@@ -73,5 +73,5 @@ def _data(setup: Setup) -> Array:
     return shared(
         information.visible(point.information - setup.information.prior),
         p.prior_information,
-        p.private,
+        p.recording_specific,
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.task_tables import Limits
-from mjfim.model.loading import Coordinate, actuator_names
+from mjfim.model.coordinates import ScalarJoint, actuator_names
 
 Range = tuple[float, float]
 JOINTS = (
@@ -50,7 +50,7 @@ class Limit:
 
 
 def limits_of(
-    model: Any, coordinates: tuple[Coordinate, ...], controls: tuple[str, ...], stated: Limits
+    model: Any, coordinates: tuple[ScalarJoint, ...], controls: tuple[str, ...], stated: Limits
 ) -> tuple[Limit, ...]:
     """All limits. Raises ExperimentError for unknown names, inverted ranges and ranges that exclude the MJCF's."""
     joints = {c.name: c for c in coordinates}
@@ -120,7 +120,7 @@ def _rows(
     return rows
 
 
-def _position(model: Any, coordinates: tuple[Coordinate, ...]) -> dict[str, Range]:
+def _position(model: Any, coordinates: tuple[ScalarJoint, ...]) -> dict[str, Range]:
     return {
         c.name: tuple(model.jnt_range[c.joint]) for c in coordinates if model.jnt_limited[c.joint]
     }
@@ -142,7 +142,7 @@ def _force(model: Any, scalar: Mapping[str, int]) -> dict[str, Range]:
     }
 
 
-def _joint_force(model: Any, joints: Mapping[str, Coordinate]) -> dict[str, Range]:
+def _joint_force(model: Any, joints: Mapping[str, ScalarJoint]) -> dict[str, Range]:
     limited = {name: c.joint for name, c in joints.items() if model.jnt_actfrclimited[c.joint]}
     return {name: tuple(model.jnt_actfrcrange[j]) for name, j in limited.items()}
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.experiment.parameters import START
+from mjfim.experiment.parameters import INITIAL_STATE_PREFIX
 from mjfim.information.marginal import marginal
 
 
@@ -23,7 +23,7 @@ def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
     total = np.zeros((len(names), len(names)))
     for path in paths:
         theirs, matrix, prior = _read(path)
-        common = [n for n in names if n in theirs and not n.startswith(START)]
+        common = [n for n in names if n in theirs and not n.startswith(INITIAL_STATE_PREFIX)]
         if not common:
             raise ExperimentError(
                 f"earlier: {path}: it knows {', '.join(theirs)}, but none of the parameters {', '.join(names)}"

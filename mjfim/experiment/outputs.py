@@ -11,18 +11,23 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Correlated, NoiseSpec
-from mjfim.model.coordinates import Component, _labels, components, measurable
+from mjfim.model.coordinates import (
+    StateComponent,
+    measurable_columns,
+    sensor_columns,
+    state_components,
+)
 from mjfim.model.paths import names_of
 from mjfim.plant.noise import Noise
 from mjfim.plant.outputs import Output, OutputMap
 from mjfim.plant.state_space import StateSpace
 
 
-def outputs_of(
+def resolve_outputs(
     experiment: Experiment, model: Any, space: StateSpace, stride: int
 ) -> tuple[OutputMap, Noise]:
     """Outputs and their noise. stride: of measure_rate. Raises ExperimentError naming the key."""
-    everything = {c.name: c for c in components(model)}
+    everything = {c.name: c for c in state_components(model)}
     sensors = names_of(model, "sensor")
     matches = _matches(everything, model, sensors)
     stated = dict(experiment.noise) or _from_mjcf(
@@ -31,7 +36,7 @@ def outputs_of(
     for key in stated:
         if key not in matches:
             raise ExperimentError(f"noise: {unknown('sensor', key, list(matches))}")
-    order = [*everything, *(label for s in sensors for label in _labels(model, s))]
+    order = [*everything, *(label for s in sensors for label in sensor_columns(model, s))]
     covariance, strides, chosen = (
         np.zeros((len(order), len(order))),
         np.full(len(order), stride),
@@ -67,7 +72,7 @@ def outputs_of(
     addresses = {
         label: int(model.sensor(s).adr[0]) + i
         for s in sensors
-        for i, label in enumerate(_labels(model, s))
+        for i, label in enumerate(sensor_columns(model, s))
     }
     sigma = np.sqrt(np.diag(covariance))
     made = []
@@ -81,7 +86,7 @@ def outputs_of(
 
 
 def _matches(
-    everything: Mapping[str, Component], model: Any, sensors: list[str]
+    everything: Mapping[str, StateComponent], model: Any, sensors: list[str]
 ) -> dict[str, list[str]]:
     """Outputs that each key of the noise table stands for."""
     found: dict[str, list[str]] = {"state": list(everything)}
@@ -90,7 +95,7 @@ def _matches(
         for key in c.keys:
             found.setdefault(key, []).append(c.name)
     for sensor in sensors:
-        found.setdefault(sensor, _labels(model, sensor))
+        found.setdefault(sensor, sensor_columns(model, sensor))
     return found
 
 
@@ -100,7 +105,7 @@ def _from_mjcf(model: Any, sensors: list[str], required: bool) -> dict[str, Any]
     if required and not stated:
         raise ExperimentError(
             "noise: nothing is measured: give `state`, or sensors by name, or `noise` in the MJCF; valid: "
-            + ", ".join(["state", *measurable(model)])
+            + ", ".join(["state", *measurable_columns(model)])
         )
     return stated
 
@@ -171,6 +176,6 @@ def _stride(key: str, rate: float, wanted: float) -> int:
     return stride
 
 
-def stride_of(experiment: Experiment) -> int:
+def measurement_stride(experiment: Experiment) -> int:
     """Samples from one measurement to the next at measure_rate."""
     return _stride("measure_rate", experiment.rate, experiment.measure_rate or experiment.rate)

@@ -11,13 +11,13 @@ import numpy as np
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import ParameterSpec
-from mjfim.model.inertia import CHARTS
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.parameters import Parameter, Target
 from mjfim.model.paths import OBJECTS, joint_width, names_of, resolve
 from mjfim.model.targets import inertial
 from mjfim.model.units import unit_of
 
-START = "initial "  # how names of the nuisance table's deviations of the start begin
+INITIAL_STATE_PREFIX = "initial "  # how names of the nuisance table's deviations of the start begin
 BARYCENTRIC = (
     "mass",
     *(f"firstmoment[{i}]" for i in range(3)),
@@ -25,7 +25,9 @@ BARYCENTRIC = (
 )
 
 
-def parameters_of(experiment: Experiment, model: Any, outputs: Sequence[str]) -> list[Parameter]:
+def resolve_parameters(
+    experiment: Experiment, model: Any, outputs: Sequence[str]
+) -> list[Parameter]:
     """All parameters in the order of theta: those of the file, then the nuisance table's.
 
     outputs: names of the measured columns. Raises ExperimentError naming the key.
@@ -109,7 +111,7 @@ def _inertial(name: str, spec: ParameterSpec, model: Any) -> Iterator[Parameter]
     if not float(model.body_mass[body]) > 0.0:
         raise ExperimentError(f"parameters.{name}.inertial: body {spec.inertial!r} has no mass")
     coordinates = spec.coordinates or "logcholesky"
-    chart, now = CHARTS[coordinates], inertial(model, body)
+    chart, now = INERTIA_PARAMETRISATIONS[coordinates], inertial(model, body)
     try:
         values, sizes = chart.of(now), chart.size(now)
     except ValueError as error:
@@ -150,7 +152,13 @@ def _nuisance(experiment: Experiment, model: Any, outputs: Sequence[str]) -> Ite
             f"nuisance.initial: {nameless} joints have no name: give them one in the MJCF, or state deviations by name"
         )
     for label, prior in _by_name("nuisance.initial", stated.initial, list(starts)):
-        yield _unwanted(f"{START}{label}", starts[label], prior, unit_of(model, starts[label]), 1.0)
+        yield _unwanted(
+            f"{INITIAL_STATE_PREFIX}{label}",
+            starts[label],
+            prior,
+            unit_of(model, starts[label]),
+            1.0,
+        )
     for label, prior in _by_name("nuisance.bias", stated.bias, outputs):
         yield _unwanted(
             f"bias {label}", f"output/{label}:bias", prior, "", 1.0, stated.per_recording

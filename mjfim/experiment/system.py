@@ -17,24 +17,17 @@ from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.prior_information import information_of
 from mjfim.excitation.robust import Pool
 from mjfim.experiment.control_signal import generate
-from mjfim.experiment.outputs import outputs_of, stride_of
-from mjfim.experiment.parameters import parameters_of
+from mjfim.experiment.outputs import measurement_stride, resolve_outputs
+from mjfim.experiment.parameters import resolve_parameters
 from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system_tables import Signal
 from mjfim.information.fisher import Information
-from mjfim.model.coordinates import measurable
-from mjfim.model.loading import (
-    compile_spec,
-    control_names,
-    coordinates,
-    decoration,
-    joint_names,
-    load_spec,
-)
-from mjfim.model.parameter_samples import sampled
+from mjfim.model.coordinates import control_names, joint_names, measurable_columns, scalar_joints
+from mjfim.model.loading import compile_spec, decoration, load_spec
+from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import ParameterSet, moved_bodies
 from mjfim.model.paths import joint_width
-from mjfim.model.smooth_friction import is_dry, speeds_of
+from mjfim.model.smooth_friction import has_dry_friction, smoothing_speeds_of
 from mjfim.model.variants import STATED, Level, Lifted, Mocap, Source
 from mjfim.plant.batch import state_space
 from mjfim.plant.plant import Plant
@@ -90,11 +83,11 @@ class Setup:
             raise ModelError(
                 f"{self.model_path}: {what} keep a state that mjfim does not see; take them out of the model"
             )
-        self.coordinates = coordinates(self.model)
+        self.coordinates = scalar_joints(self.model)
         self.controls = control_names(self.model)
         self.substeps = self._substeps()
         self.playback_steps = self._playback_steps()
-        measured_every = stride_of(e)
+        measured_every = measurement_stride(e)
         self.stride = measured_every if self.coarsen == 1 else 1
         self.samples = self._samples() // self.coarsen
         if self.stride > self.samples:
@@ -108,12 +101,14 @@ class Setup:
             )
         self.substeps //= self.stretch
         self.t = np.arange(self.samples, dtype=np.float64) * self.dt
-        self.outputs, noise = outputs_of(e, self.model, state_space(self.model), measured_every)
+        self.outputs, noise = resolve_outputs(
+            e, self.model, state_space(self.model), measured_every
+        )
         self.noise = noise if self.coarsen == 1 else noise.every_sample(measured_every)
         self._mocap = Mocap.of(self.model, self._keyframe())
         self.limits = limits_of(self.model, self.coordinates, self.controls, e.limits)
         self.parameters = ParameterSet.build(
-            parameters_of(e, self.model, self.outputs.names),
+            resolve_parameters(e, self.model, self.outputs.names),
             self.model,
             self.outputs.names,
             decoration(self.spec, self.model),
@@ -186,7 +181,7 @@ class Setup:
     @property
     def measurable(self) -> tuple[str, ...]:
         """Everything that a recording may hold column by column: state components and sensors."""
-        return measurable(self.model)
+        return measurable_columns(self.model)
 
     @property
     def channels(self) -> Channels:
@@ -389,7 +384,11 @@ class Setup:
     def _source(
         self, sensors: bool, friction: bool, coarsen: int, lifted: Lifted | None = None
     ) -> Source:
-        moved = None if self.parameters.compiled.any() else moved_bodies(self.parameters.parameters)
+        moved = (
+            None
+            if self.parameters.needs_compile.any()
+            else moved_bodies(self.parameters.parameters)
+        )
         return Source(
             self.spec, self.model_path, moved, sensors, friction, coarsen, self._mocap, lifted
         )
@@ -431,7 +430,7 @@ class Setup:
         """Raise where the guess or the true values make a body that cannot exist."""
         p = self.parameters
         for key, theta in (("guess", p.guess), ("true", p.true)):
-            for columns, fault in p.impossible(source, theta):
+            for columns, fault in p.unphysical_bodies(source, theta):
                 makers = dict.fromkeys(
                     p.parameters[j].group or f"{p.parameters[j].name}.{key}" for j in columns
                 )
@@ -443,12 +442,12 @@ class Setup:
             return sorted(
                 {
                     j
-                    for columns, _ in self.parameters.impossible(self.plant.source, theta)
+                    for columns, _ in self.parameters.unphysical_bodies(self.plant.source, theta)
                     for j in columns
                 }
             )
         except ModelError:
-            return np.flatnonzero(self.parameters.compiled).tolist()
+            return np.flatnonzero(self.parameters.needs_compile).tolist()
 
     def _keyframe(self) -> Any:
         """The initial keyframe, or None."""
@@ -532,7 +531,9 @@ class Setup:
             raise ExperimentError(
                 "robust: descent.psi_weight belongs to a design at one parameter value"
             )
-        thetas = sampled(self.parameters, self.theta, robust.samples, robust.seed, self.impossible)
+        thetas = sample_parameters(
+            self.parameters, self.theta, robust.samples, robust.seed, self.impossible
+        )
         return Pool(thetas, robust.over, self.experiment.cost.criterion == "D")
 
     def _calibrate(self) -> None:
@@ -571,13 +572,13 @@ class Setup:
     def _slow(self) -> tuple[float, ...]:
         """Speeds at which dry friction turns viscous for derivatives; empty where there is none."""
         model = self.model_at(self.theta)
-        if not is_dry(model):
+        if not has_dry_friction(model):
             return ()
         fastest = np.abs(self.initial.qvel).max(axis=0)
         for limit in self.limits:
             if limit.kind == "velocity":
                 fastest[limit.index] = limit.scale
-        return speeds_of(model, fastest)
+        return smoothing_speeds_of(model, fastest)
 
     def _at(self, **changes: Any) -> Setup:
         return Setup(

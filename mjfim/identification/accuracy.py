@@ -49,7 +49,7 @@ def accuracy(fit: Fit, solution: Solution, null: Null, times: Sequence[float]) -
     """Of a solution. null: what no recording shows;  times: rows over which the residuals of each output hang together"""
     p, theta = fit.setup.parameters, fit.theta(solution.unknowns)
     covariance, std = _formal(fit, solution)
-    groups = grouped(null, p.names, p.step, [q.unit for q in p.parameters])
+    groups = grouped(null, p.names, p.magnitude, [q.unit for q in p.parameters])
     lumped = np.isin(p.names, [name for group in groups for name in group.members])
     std = np.where(lumped, np.inf, std)
     covariance = np.where(np.logical_or.outer(lumped, lumped), np.inf, covariance)
@@ -150,7 +150,7 @@ def _sloppy(
     spread = np.sqrt(np.maximum(np.where(told, np.diag(covariance), 1.0), 1e-300))
     for j in p.interest:
         half = 0.5 * float(interval[j, 1] - interval[j, 0])
-        size = max(abs(float(theta[j])), 1e-3 * float(p.step[j]))
+        size = max(abs(float(theta[j])), 1e-3 * float(p.magnitude[j]))
         if not np.isfinite(half) or half <= SLOPPY * size:
             continue
         together = np.where(told, covariance[j], 0.0) / (spread * spread[j])

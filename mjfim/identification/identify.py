@@ -27,7 +27,7 @@ from mjfim.identification.missing_terms import suspects
 from mjfim.identification.residual_tests import reasons, smaller
 from mjfim.identification.residuals import LARGE, Fit
 from mjfim.information.null_space import Null, invisible
-from mjfim.model.parameter_samples import sampled
+from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import (
     INTERRUPTED,
@@ -153,7 +153,7 @@ class _Identification:
         )
         weight = np.sqrt(np.diag(np.diag(p.prior_information)))
         J, error = np.concatenate([J, weight]), np.concatenate([error, np.zeros_like(weight)])
-        return invisible(J, error, p.step, p.scale, np.arange(len(p)), np.zeros_like(weight))
+        return invisible(J, error, p.magnitude, p.scale, np.arange(len(p)), np.zeros_like(weight))
 
     def _sample(self, fit: Fit) -> Fit:
         """Of the pieces that are quick to look at."""
@@ -242,7 +242,7 @@ class _Identification:
             return np.zeros((0, len(self.theta0)))
         setup = self.setup
         seed = setup.experiment.fit.seed
-        return sampled(setup.parameters, self.theta0, count, seed, setup.impossible)[1:]
+        return sample_parameters(setup.parameters, self.theta0, count, seed, setup.impossible)[1:]
 
     def _settled(self, begin: Unknowns) -> Solution:
         """The minimum, with sigmas that agree with the residuals where they are to be estimated."""
@@ -285,7 +285,7 @@ class _Identification:
         predictions = self._afterwards(lambda: predicted(fit, at, self.held_out))
         why = reasons(rest.chi2, rest.dof, self.stated, rest.white, missing)
         known = accuracy(fit, solution, null, rest.times(sum(len(t.t) for t in fit.tracks)))
-        near = 1e-6 * p.step
+        near = 1e-6 * p.magnitude
         outside = bool(((theta < p.lower - near) | (theta > p.upper + near)).any())
         touch = np.minimum(theta - p.lower, p.upper - theta) < near
         at_bound = tuple(name for name, hit in zip(p.names, touch, strict=True) if hit)

@@ -17,7 +17,7 @@ from scipy.stats import norm
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
-from mjfim.model.loading import coordinates
+from mjfim.model.coordinates import scalar_joints
 from mjfim.optimize.levenberg_marquardt import Unknowns
 from mjfim.records.estimate import MissingTerm
 from mjfim.records.recording import Recording
@@ -110,7 +110,7 @@ def _candidates(setup: Setup, measured: bool) -> Iterator[Candidate]:
     """Everything that the experiment does not already seek."""
     sought = {t.path.removesuffix("[0]") for p in setup.parameters.parameters for t in p.targets}
     model: Any = setup.model
-    for c in coordinates(model):
+    for c in scalar_joints(model):
         force, inertia = ("N", "kg") if c.unit == "m" else ("N m", "kg m²")
         dof = c.v
         for field, words, unit, now in (
@@ -128,5 +128,5 @@ def _candidates(setup: Setup, measured: bool) -> Iterator[Candidate]:
         path = f"output/{output.name}:bias"
         if path not in sought:
             yield Candidate(f"bias of {output.name}", path, output.unit, False, 0.0, 0.0)
-    if not measured and not setup.parameters.delay.any():  # a lag would move the pieces
+    if not measured and not setup.parameters.delay_derivative.any():  # a lag would move the pieces
         yield Candidate("a lag of everything that is measured", "output:delay", "s", True, 0.0, 0.0)

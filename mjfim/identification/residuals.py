@@ -83,7 +83,7 @@ class Fit:
             self.free = np.eye(setup.space.nx)
             self.pieces = cut(setup, self.tracks, fit.segments, self._lead())
         else:
-            self.free = p.start(setup.space.nx)[:, p.deviations]
+            self.free = p.initial_state_derivative(setup.space.nx)[:, p.initial_deviations]
             self.pieces = whole(self.tracks, setup.plant.nominal_start)
         self.masks = [self._used(i) for i in range(len(self.tracks))]
         if not any(mask.any() for mask in self.masks):
@@ -94,7 +94,7 @@ class Fit:
 
     def _require_free(self) -> None:
         """Raises ExperimentError where deviations of the stated start are asked for though it is measured."""
-        starts = self.setup.parameters.start(self.setup.space.nx).any(axis=0)
+        starts = self.setup.parameters.initial_state_derivative(self.setup.space.nx).any(axis=0)
         if starts.any():
             name = self.setup.parameters.names[int(np.argmax(starts))]
             raise ExperimentError(
@@ -107,7 +107,7 @@ class Fit:
         p = self.setup.parameters
         reach = np.array([DELAYED * (q.prior or q.scale) for q in p.parameters])
         latest = np.minimum(p.guess + reach, np.where(np.isfinite(p.upper), p.upper, np.inf))
-        return max(float(p.delay @ latest), 0.0) if p.delay.any() else 0.0
+        return max(float(p.delay_derivative @ latest), 0.0) if p.delay_derivative.any() else 0.0
 
     def _used(self, i: int) -> np.ndarray:
         """(M, ny) measured values of a track; what is measured at a stated start tells nothing."""
@@ -221,7 +221,7 @@ class Fit:
 
     def pin(self, theta0: Array, null: Null) -> None:
         """Hold what no recording shows at its start, to one size of each parameter. null: of all p parameters"""
-        size = self.setup.parameters.step
+        size = self.setup.parameters.magnitude
         self.pins = np.linalg.qr(null.directions / size[:, None])[0].T / size
         self.pinned_at = np.array(theta0)
 
@@ -464,7 +464,7 @@ class Fit:
             return space.plus(self.pieces[piece].start, self.free @ at.starts[piece])
         theta = np.array(at.theta)
         theta[self.layout.private] = at.starts[piece]
-        return space.plus(self.pieces[piece].start, p.start(space.nx) @ theta)
+        return space.plus(self.pieces[piece].start, p.initial_state_derivative(space.nx) @ theta)
 
     def _control(self, piece: int, longest: int) -> Array:
         """(longest, nu) from the piece's begin; held where the track is over."""
@@ -476,7 +476,7 @@ class Fit:
         """What a response says of the rows of one piece that fall into its stretch; None where none does."""
         own, p = self.pieces[piece], self.setup.parameters
         track = self.tracks[own.track]
-        late = float(p.delay @ theta) / track.dt
+        late = float(p.delay_derivative @ theta) / track.dt
         wanted = track.t[own.rows] / track.dt - own.begin - late
         n = response.y.shape[1] - 1
         inside = np.clip(wanted, 0.0, own.samples)
@@ -486,7 +486,7 @@ class Fit:
             return None
         rows = np.flatnonzero(hit) + own.rows.start
         values = (response.y[place], response.common, response.private)
-        if track.even and not p.delay.any():
+        if track.even and not p.delay_derivative.any():
             at_samples = np.rint(wanted[hit]).astype(int) - response.first
             y, common, private = (
                 None if v is None else (v if i == 0 else v[place])[at_samples]
@@ -498,8 +498,8 @@ class Fit:
                 None if v is None else lag.apply(v if i == 0 else v[place])
                 for i, v in enumerate(values)
             )
-            if common is not None and p.delay.any():
-                common = common + lag.rate(response.y[place])[..., None] * p.delay
+            if common is not None and p.delay_derivative.any():
+                common = common + lag.rate(response.y[place])[..., None] * p.delay_derivative
         if y is None:
             raise ValueError("a response without outputs")
         return Rows(piece, rows, y, common, private)

@@ -36,12 +36,12 @@ class Layout:
     def of(parameters: ParameterSet, recordings: int, free: bool, bounded: bool) -> Layout:
         """free: starts are measured;  bounded: False: without bounds"""
         p = parameters
-        own = p.private & ~p.deviations
-        shared, each = np.flatnonzero(~p.private), np.flatnonzero(own)
+        own = p.recording_specific & ~p.initial_deviations
+        shared, each = np.flatnonzero(~p.recording_specific), np.flatnonzero(own)
         places = np.concatenate([shared, np.tile(each, recordings)])
         lower, upper = p.lower[places], p.upper[places]
         found = Layout(
-            p, shared, each, np.flatnonzero(p.deviations), recordings, lower, upper, free
+            p, shared, each, np.flatnonzero(p.initial_deviations), recordings, lower, upper, free
         )
         return found if bounded else found.unbounded()
 

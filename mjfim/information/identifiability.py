@@ -111,7 +111,7 @@ def _local(setup: Setup, trajectories: Sequence[Trajectory]) -> Array | None:
     Such a direction moves nothing, whatever is measured. None: there is no parameter inside the model.
     """
     p = setup.parameters
-    inside = p.interest[p.in_model[p.interest]]
+    inside = p.interest[p.changes_model[p.interest]]
     if not len(inside):
         return None
     unseen = np.zeros_like(setup.prior)
@@ -121,7 +121,9 @@ def _local(setup: Setup, trajectories: Sequence[Trajectory]) -> Array | None:
         if found is None:
             return None
         J, error = (each[:, inside] for each in found)
-        null = invisible(J, error, p.step[inside], p.scale[inside], np.arange(len(inside)), unseen)
+        null = invisible(
+            J, error, p.magnitude[inside], p.scale[inside], np.arange(len(inside)), unseen
+        )
         if not null.count:
             break
     out = np.zeros((len(p.interest), null.count))
@@ -152,7 +154,7 @@ def _stepped(
 def _words(setup: Setup, here: Null, always: Null) -> Survey:
     p = setup.parameters
     names = tuple(p.names[j] for j in p.interest)
-    size, units = p.step[p.interest], [p.parameters[j].unit for j in p.interest]
+    size, units = p.magnitude[p.interest], [p.parameters[j].unit for j in p.interest]
     return Survey(
         names, here, always, grouped(here, names, size, units), grouped(always, names, size, units)
     )
@@ -165,7 +167,13 @@ def _null(
     before = _rows_of(setup.earlier)
     error = None if errors is None else np.concatenate([*errors, ROUND_OFF * np.abs(before)])
     return invisible(
-        np.concatenate([*stack, before]), error, p.step, p.scale, p.interest, setup.prior, known
+        np.concatenate([*stack, before]),
+        error,
+        p.magnitude,
+        p.scale,
+        p.interest,
+        setup.prior,
+        known,
     )
 
 
@@ -181,14 +189,14 @@ def _unseen_before(setup: Setup, directions: Array) -> Array:
     if not setup.earlier.any() or not directions.shape[1]:
         return directions
     unit = directions / np.linalg.norm(
-        directions / setup.parameters.step[setup.parameters.interest][:, None], axis=0
+        directions / setup.parameters.magnitude[setup.parameters.interest][:, None], axis=0
     )
     before = _rows_of(setup.earlier)
     effect = before[:, setup.parameters.interest] @ unit
     _, values, V = np.linalg.svd(
         np.concatenate([effect, np.zeros((unit.shape[1], unit.shape[1]))]), full_matrices=False
     )
-    strongest = np.linalg.norm(before * setup.parameters.step, 2)
+    strongest = np.linalg.norm(before * setup.parameters.magnitude, 2)
     return np.asarray(unit @ V[values <= max(BLIND, FAINTEST * strongest)].T)
 
 
@@ -202,9 +210,9 @@ def _pair(setup: Setup, trajectory: Trajectory, fine: Sensitivity) -> tuple[Arra
 def require_visible(setup: Setup, J: Array) -> None:
     """Raise UnidentifiableError where a wanted parameter cannot be told from data with these rows of G. J: (n, p)"""
     p = setup.parameters
-    null = invisible(J, None, p.step, p.scale, np.arange(len(p)), setup.prior)
+    null = invisible(J, None, p.magnitude, p.scale, np.arange(len(p)), setup.prior)
     if null.count:
         said = "; ".join(
-            str(g) for g in grouped(null, p.names, p.step, [q.unit for q in p.parameters])
+            str(g) for g in grouped(null, p.names, p.magnitude, [q.unit for q in p.parameters])
         )
         raise UnidentifiableError(f"this trajectory does not show every parameter: {said}")

@@ -32,7 +32,7 @@ def roughness(
     """The worst disagreement along a trajectory, or None where it is below `TOLERANCE`. fine: by the first step, if known"""
     plant = setup.plant
     fine = plant.sensitivity(theta, trajectory) if fine is None else fine
-    longer = np.maximum(LONGER * setup.parameters.step / plant.span, LEAST)
+    longer = np.maximum(LONGER * setup.parameters.magnitude / plant.span, LEAST)
     coarse = plant.sensitivity(theta, trajectory, longer * SENSITIVITY_STEP)
     names = setup.parameters.names
     if fine is None or coarse is None:
@@ -69,5 +69,5 @@ def roughness(
 
 def visible_columns(setup: Setup, G: Array) -> np.ndarray:
     """(p,) True where a parameter has an effect that stands out of round-off. G: (N+1, ny, p), whitened"""
-    length = np.linalg.norm(G, axis=(0, 1)) * setup.parameters.step
+    length = np.linalg.norm(G, axis=(0, 1)) * setup.parameters.magnitude
     return np.asarray((length > BLIND) & (length > FAINT * length.max(initial=0.0)))

@@ -8,7 +8,6 @@ from typing import Any
 
 import mujoco
 
-from mjfim.model.loading import actuator_names, joint_names
 from mjfim.model.paths import names_of
 
 JOINT_DOFS = {
@@ -35,6 +34,64 @@ SENSOR_UNITS = {
 
 
 QUATERNION = (".qw", ".qx", ".qy", ".qz")
+
+
+@dataclass(frozen=True)
+class ScalarJoint:
+    """A scalar joint: its name, unit and place. joint: id;  q: qpos address;  v: dof address."""
+
+    name: str
+    unit: str
+    joint: int
+    q: int
+    v: int
+
+
+def scalar_joints(model: Any) -> tuple[ScalarJoint, ...]:
+    """All slide and hinge joints, in order."""
+    found, names = [], joint_names(model)
+    for j in range(model.njnt):
+        if int(model.jnt_type[j]) in (
+            int(mujoco.mjtJoint.mjJNT_SLIDE),
+            int(mujoco.mjtJoint.mjJNT_HINGE),
+        ):
+            unit = "m" if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
+            found.append(
+                ScalarJoint(names[j], unit, j, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
+            )
+    return tuple(found)
+
+
+def joint_names(model: Any) -> tuple[str, ...]:
+    """njnt names; unnamed joints are called by their number."""
+    return _names(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt, "joint")
+
+
+def actuator_names(model: Any) -> tuple[str, ...]:
+    """nactuator names; unnamed actuators are called by their number."""
+    return _names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nactuator, "actuator")
+
+
+def _names(model: Any, kind: Any, count: int, fallback: str) -> tuple[str, ...]:
+    """Names of all objects of a kind, no two alike: a number that another one is called by gets underscores."""
+    given = [mujoco.mj_id2name(model, kind, i) for i in range(count)]
+    taken = {name for name in given if name}
+    for i in range(count):
+        if not given[i]:
+            name = f"{fallback}{i}"
+            while name in taken:
+                name += "_"
+            given[i] = name
+    return tuple(given)
+
+
+def control_names(model: Any) -> tuple[str, ...]:
+    """nu names; an actuator with several controls gets one name per control."""
+    names: list[str] = []
+    for i, name in enumerate(actuator_names(model)):
+        count = int(model.actuator_ctrlnum[i])
+        names += [name] if count == 1 else [f"{name}[{c}]" for c in range(count)]
+    return tuple(names)
 
 
 def _coordinates(model: mujoco.MjModel) -> tuple[str, ...]:
@@ -110,12 +167,12 @@ def activation_names(model: Any) -> tuple[str, ...]:
 
 def state_names(model: Any) -> tuple[str, ...]:
     """Columns of the state: `qpos:<joint>`, `qvel:<joint>` (with parts for ball and free joints), `act:<actuator>`."""
-    return (*(c.name for c in components(model)), *activation_names(model))
+    return (*(c.name for c in state_components(model)), *activation_names(model))
 
 
 def tangent_names(model: Any) -> tuple[str, ...]:
     """nx components of a deviation from the plan: as the state's columns, but `.rx`, `.ry`, `.rz` [rad] for rotations."""
-    velocities = [c.name for c in components(model) if c.state >= model.nq]
+    velocities = [c.name for c in state_components(model) if c.state >= model.nq]
     positions = [name.replace("qvel:", "qpos:", 1) for name in velocities]
     return (*positions, *velocities, *activation_names(model))
 
@@ -126,7 +183,7 @@ def gain_names(model: Any, controls: Sequence[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Component:
+class StateComponent:
     """One number of qpos or qvel that can be measured and recorded.
 
     name: its column, `qpos:<joint>` or `qpos:<joint>.<part>`;  keys: names of wholes that it belongs to
@@ -142,7 +199,7 @@ class Component:
     share: float = 1.0
 
 
-def components(model: Any) -> tuple[Component, ...]:
+def state_components(model: Any) -> tuple[StateComponent, ...]:
     """All of qpos, then all of qvel."""
     positions, velocities = [], []
     for j, name in enumerate(joint_names(model)):
@@ -154,29 +211,37 @@ def components(model: Any) -> tuple[Component, ...]:
         qpos, qvel = f"qpos:{name}", f"qvel:{name}"
         if kind in (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)):
             unit = "m" if kind == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
-            positions.append(Component(qpos, (), q, unit))
-            velocities.append(Component(qvel, (), v, f"{unit}/s"))
+            positions.append(StateComponent(qpos, (), q, unit))
+            velocities.append(StateComponent(qvel, (), v, f"{unit}/s"))
             continue
         if kind == int(mujoco.mjtJoint.mjJNT_FREE):
             for i, axis in enumerate("xyz"):
-                positions.append(Component(f"{qpos}.{axis}", (f"{qpos}.pos", qpos), q + i, "m"))
-                velocities.append(Component(f"{qvel}.{axis}", (f"{qvel}.pos", qvel), v + i, "m/s"))
+                positions.append(
+                    StateComponent(f"{qpos}.{axis}", (f"{qpos}.pos", qpos), q + i, "m")
+                )
+                velocities.append(
+                    StateComponent(f"{qvel}.{axis}", (f"{qvel}.pos", qvel), v + i, "m/s")
+                )
             q, v = q + 3, v + 3
         for i, axis in enumerate("wxyz"):
-            positions.append(Component(f"{qpos}.q{axis}", (f"{qpos}.rot", qpos), q + i, "", 0.5))
+            positions.append(
+                StateComponent(f"{qpos}.q{axis}", (f"{qpos}.rot", qpos), q + i, "", 0.5)
+            )
         for i, axis in enumerate("xyz"):
-            velocities.append(Component(f"{qvel}.r{axis}", (f"{qvel}.rot", qvel), v + i, "rad/s"))
+            velocities.append(
+                StateComponent(f"{qvel}.r{axis}", (f"{qvel}.rot", qvel), v + i, "rad/s")
+            )
     return (*positions, *velocities)
 
 
-def measurable(model: Any) -> tuple[str, ...]:
+def measurable_columns(model: Any) -> tuple[str, ...]:
     """Everything that a recording may hold column by column: state components and sensors."""
     return (
-        *(c.name for c in components(model)),
-        *(label for s in names_of(model, "sensor") for label in _labels(model, s)),
+        *(c.name for c in state_components(model)),
+        *(label for s in names_of(model, "sensor") for label in sensor_columns(model, s)),
     )
 
 
-def _labels(model: Any, sensor: str) -> list[str]:
+def sensor_columns(model: Any, sensor: str) -> list[str]:
     width = int(model.sensor(sensor).dim[0])
     return [sensor] if width == 1 else [f"{sensor}[{i}]" for i in range(width)]

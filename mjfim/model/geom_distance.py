@@ -55,7 +55,7 @@ BLOCK = 1 << 18  # bounds at a time
 
 
 @dataclass(frozen=True)
-class Pair:
+class GeomPair:
     """Two geoms that can come near each other. first, second: ids, the one that cannot move comes second."""
 
     first: int
@@ -64,7 +64,7 @@ class Pair:
 
 
 @dataclass(frozen=True, eq=False)
-class Distances:
+class SignedDistances:
     """Signed distances. d: (n, m) [m], negative in penetration, at most reach;  slope: (n, m, nv) d(d)/dq, or None.
 
     q: tangent of qpos as in `mj_integratePos`;  the slope is zero where d is reach
@@ -75,7 +75,7 @@ class Distances:
     slope: Array | None
 
 
-def pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Pair, ...]:
+def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[GeomPair, ...]:
     """All pairs of geoms that move relative to each other and that MuJoCo would let collide, contacts enabled or not.
 
     As MuJoCo selects: no geoms of bodies welded together, of parent and child (unless the parent is fixed in the
@@ -124,7 +124,7 @@ def pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[Pair, ...]:
                     f"clearance: {label} is a {REFUSED[int(model.geom_type[g])]}, to which MuJoCo knows no reliable distance; "
                     f"ignore the bodies {bodies[body[first]]!r} and {bodies[body[second]]!r}, or use boxes or meshes"
                 )
-        found.append(Pair(first, second, " - ".join(labels)))
+        found.append(GeomPair(first, second, " - ".join(labels)))
     return tuple(found)
 
 
@@ -155,7 +155,7 @@ def _geom_name(model: Any, geom: int, body: str) -> str:
     return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"{body} geom {geom}"
 
 
-class Clearance:
+class GeomDistances:
     """Distances between chosen pairs of geoms.
 
     model: copied, mocap bodies stay where it puts them
@@ -165,7 +165,7 @@ class Clearance:
     """
 
     def __init__(
-        self, model: Any, chosen: Sequence[Pair], reach: float, grouped: bool = True
+        self, model: Any, chosen: Sequence[GeomPair], reach: float, grouped: bool = True
     ) -> None:
         if not chosen:
             raise ExperimentError(
@@ -220,18 +220,18 @@ class Clearance:
             for p, c, taken in zip(self.pairs, cored, self._taken, strict=True)
         ]
 
-    def __call__(self, qpos: Array, slopes: bool) -> Distances:
+    def __call__(self, qpos: Array, slopes: bool) -> SignedDistances:
         """Distances of every column at every configuration, qpos: (n, nq); with their slopes or without."""
         rows = max(BLOCK // len(self.pairs), 1)
         blocks = [
             self._block(qpos[k : k + rows], slopes) for k in range(0, max(len(qpos), 1), rows)
         ]
         d = np.concatenate([b.d for b in blocks])
-        return Distances(
+        return SignedDistances(
             d, np.concatenate([b.slope for b in blocks if b.slope is not None]) if slopes else None
         )
 
-    def nearest(self, qpos: Array) -> tuple[float, int, Pair]:
+    def nearest(self, qpos: Array) -> tuple[float, int, GeomPair]:
         """Smallest distance [m] at any configuration however far, its row and its geoms. qpos: (n, nq), n > 0, finite."""
         bad = np.flatnonzero(~np.isfinite(qpos).all(axis=1))
         if bad.size:
@@ -256,7 +256,7 @@ class Clearance:
                 best, row, pair = distance, int(k), self.pairs[p]
         return best, row, pair
 
-    def _block(self, qpos: Array, slopes: bool) -> Distances:
+    def _block(self, qpos: Array, slopes: bool) -> SignedDistances:
         finite = np.asarray(np.isfinite(qpos).all(axis=1))
         places, frames, screws = self._poses(
             np.where(finite[:, None], qpos, self._model.qpos0), slopes
@@ -270,7 +270,7 @@ class Clearance:
         every[~finite] = np.nan
         d = np.minimum.reduceat(every, self._starts, axis=1)
         if screws is None:
-            return Distances(d, None)
+            return SignedDistances(d, None)
 
         k, p = np.nonzero(near & self._exact)
         normals = self._normals(rows, which, found, segments, places, frames)
@@ -282,7 +282,7 @@ class Clearance:
         lines = np.zeros((*d.shape, 6))
         lines[rows[least], column[least], :3] = np.cross(points[least], normals[least])
         lines[rows[least], column[least], 3:] = normals[least]
-        return Distances(d, (lines @ screws.transpose(0, 2, 1)) * self._sign)
+        return SignedDistances(d, (lines @ screws.transpose(0, 2, 1)) * self._sign)
 
     def _poses(self, qpos: Array, slopes: bool) -> tuple[Array, Array, Array | None]:
         """Positions (n, ngeom, 3) [m] and frames (n, ngeom, 3, 3) of geoms; screws (n, nv, 6) of dofs about the origin.

@@ -26,7 +26,7 @@ PAIRS = (
 )  # xx yy zz xy xz yz, MJCF's order of fullinertia
 
 
-ROWS, COLUMNS = np.array(PAIRS).T
+INERTIA_ROWS, INERTIA_COLUMNS = np.array(PAIRS).T
 
 
 DEGENERATE = 1e-9
@@ -67,7 +67,7 @@ class Inertial:
 
 def central(body: Inertial) -> Array:
     """(10,) mass, centre of mass, fullinertia about it."""
-    return np.concatenate([[body.mass], body.com, body.inertia[ROWS, COLUMNS]])
+    return np.concatenate([[body.mass], body.com, body.inertia[INERTIA_ROWS, INERTIA_COLUMNS]])
 
 
 def from_central(v: Array) -> Inertial:
@@ -80,7 +80,7 @@ def barycentric(body: Inertial) -> Array:
     about = body.inertia + body.mass * (
         body.com @ body.com * np.eye(3) - np.outer(body.com, body.com)
     )
-    return np.concatenate([[body.mass], body.mass * body.com, about[ROWS, COLUMNS]])
+    return np.concatenate([[body.mass], body.mass * body.com, about[INERTIA_ROWS, INERTIA_COLUMNS]])
 
 
 def from_barycentric(v: Array) -> Inertial:
@@ -115,12 +115,12 @@ def from_logcholesky(v: Array) -> Inertial:
 
 def _symmetric(v: Array) -> Array:
     out = np.empty((3, 3))
-    out[ROWS, COLUMNS] = out[COLUMNS, ROWS] = v
+    out[INERTIA_ROWS, INERTIA_COLUMNS] = out[INERTIA_COLUMNS, INERTIA_ROWS] = v
     return out
 
 
 @dataclass(frozen=True)
-class Chart:
+class InertiaParametrisation:
     """Ten coordinates of a body's inertia: their names and units, and the way there and back."""
 
     names: tuple[str, ...]
@@ -136,20 +136,20 @@ class Chart:
 
 
 TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")
-CHARTS = {
-    "central": Chart(
+INERTIA_PARAMETRISATIONS = {
+    "central": InertiaParametrisation(
         ("mass", "cx", "cy", "cz", *(f"I{t}" for t in TENSOR)),
         ("kg", "m", "m", "m", *["kg m²"] * 6),
         central,
         from_central,
     ),
-    "barycentric": Chart(
+    "barycentric": InertiaParametrisation(
         ("mass", "mx", "my", "mz", *(f"J{t}" for t in TENSOR)),
         ("kg", "kg m", "kg m", "kg m", *["kg m²"] * 6),
         barycentric,
         from_barycentric,
     ),
-    "logcholesky": Chart(
+    "logcholesky": InertiaParametrisation(
         ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3"),
         ("", "", "", "", "m", "m", "m", "m", "m", "m"),
         logcholesky,

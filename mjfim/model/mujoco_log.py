@@ -16,7 +16,7 @@ _blocks: list[
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def silence_mujoco_log() -> Iterator[None]:
     """No MuJoCo message inside the block; the settings from before it come back after it, after the last one of threads."""
     with _lock:
         before, config = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()

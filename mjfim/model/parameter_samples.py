@@ -16,7 +16,7 @@ HALVINGS = 20  # of a sample's distance from the guess, until its bodies can exi
 SAME_SIGN = 0.05  # least share of a scalar's value that a normal sample keeps
 
 
-def sampled(
+def sample_parameters(
     parameters: ParameterSet,
     theta: Array,
     count: int,
@@ -32,7 +32,7 @@ def sampled(
 
     impossible: indices of the parameters that make bodies which cannot exist; nobody looks where it is left out
     """
-    p, outside = len(parameters), parameters.outside
+    p, outside = len(parameters), parameters.outside_model
     stated = [
         q.prior is not None or bool(np.isfinite(q.bounds).all()) for q in parameters.parameters
     ]

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as record_field
 from functools import cached_property
 from typing import Any
 
@@ -18,19 +19,19 @@ from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.model.inertia import CHARTS
-from mjfim.model.mujoco_log import quiet
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
+from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.paths import INERTIAL_FIELDS, PATH, resolve
 from mjfim.model.spec_writer import write_element
 from mjfim.model.targets import (
-    AnySlot,
-    BiasSlot,
-    DelaySlot,
-    InertiaSlot,
-    RotationSlot,
-    Slot,
-    SpecSlot,
-    StartSlot,
+    InertiaField,
+    InitialStateField,
+    ModelField,
+    OutputBiasField,
+    OutputDelayField,
+    RotationField,
+    SpecField,
+    TargetField,
     inertial,
 )
 from mjfim.model.variants import Mocap, Source
@@ -38,7 +39,7 @@ from mjfim.model.variants import Mocap, Source
 INERTIAL = {"pos", "ipos", "inertia", "mass", "rot", *INERTIAL_FIELDS}
 Function = Callable[[Any, float], None]
 ROUNDED = 1e-6  # relative: by how much moments of a plate or rod, typed with few digits, may miss what a body can have
-OUTSIDE = (StartSlot, BiasSlot, DelaySlot)  # of the model
+OUTSIDE = (InitialStateField, OutputBiasField, OutputDelayField)  # of the model
 
 
 @dataclass(frozen=True)
@@ -97,10 +98,10 @@ class ParameterSet:
     """
 
     parameters: tuple[Parameter, ...]
-    slots: tuple[tuple[AnySlot, ...], ...]
-    nominal: dict[tuple[str, int], Array] = field(default_factory=dict)
+    fields: tuple[tuple[TargetField, ...], ...]
+    nominal: dict[tuple[str, int], Array] = record_field(default_factory=dict)
     mocap: Mocap | None = None
-    _cache: dict[str, Any] = field(default_factory=dict, repr=False)
+    _cache: dict[str, Any] = record_field(default_factory=dict, repr=False)
 
     @staticmethod
     def build(
@@ -111,40 +112,44 @@ class ParameterSet:
         mocap: Mocap | None = None,
     ) -> ParameterSet:
         """Resolve every target (`paths.resolve`). Raises ExperimentError naming the parameter and the path."""
-        slots: list[tuple[AnySlot, ...]] = []
+        fields: list[tuple[TargetField, ...]] = []
         for parameter in parameters:
             try:
-                slots.append(
+                fields.append(
                     tuple(resolve(model, t.path, outputs, decoration) for t in parameter.targets)
                 )
             except ExperimentError as error:
                 raise ExperimentError(f"parameters.{parameter.name}: {error}") from None
-        slots = _in_charts(parameters, slots)
-        owner: dict[AnySlot, str] = {}
+        fields = _in_charts(parameters, fields)
+        owner: dict[TargetField, str] = {}
         written: dict[tuple[str, int, int], str] = {}
-        for parameter, row in zip(parameters, slots, strict=True):
-            for target, slot in zip(parameter.targets, row, strict=True):
-                numbers = slot.numbers if isinstance(slot, Slot) else set()
-                other = owner.get(slot) or next((written[n] for n in numbers if n in written), None)
+        for parameter, row in zip(parameters, fields, strict=True):
+            for target, field in zip(parameter.targets, row, strict=True):
+                numbers = field.numbers if isinstance(field, ModelField) else set()
+                other = owner.get(field) or next(
+                    (written[n] for n in numbers if n in written), None
+                )
                 if other is not None:
                     taken = f"target {target.path!r} already belongs to parameters.{other}"
                     raise ExperimentError(
                         f"parameters.{parameter.name}: {taken}; one number takes one parameter"
                     )
-                _movable(model, parameter, slot, mocap)
-                owner[slot] = parameter.name
+                _movable(model, parameter, field, mocap)
+                owner[field] = parameter.name
                 written |= dict.fromkeys(numbers, parameter.name)
         nominal: dict[tuple[str, int], Array] = {}
-        for slot, name in owner.items():
-            if isinstance(slot, InertiaSlot):
+        for field, name in owner.items():
+            if isinstance(field, InertiaField):
                 try:
-                    slot.read(model)
+                    field.read(model)
                 except ExperimentError as error:
                     raise ExperimentError(f"parameters.{name}: {error}") from None
-                nominal[slot.chart, slot.body] = CHARTS[slot.chart].of(inertial(model, slot.body))
-            elif isinstance(slot, RotationSlot):
-                nominal[slot.array, slot.row] = np.array(getattr(model, slot.array)[slot.row])
-        return ParameterSet(tuple(parameters), tuple(slots), nominal, mocap)
+                nominal[field.chart, field.body] = INERTIA_PARAMETRISATIONS[field.chart].of(
+                    inertial(model, field.body)
+                )
+            elif isinstance(field, RotationField):
+                nominal[field.array, field.row] = np.array(getattr(model, field.array)[field.row])
+        return ParameterSet(tuple(parameters), tuple(fields), nominal, mocap)
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -183,7 +188,7 @@ class ParameterSet:
         return self._column(lambda p: p.scale)
 
     @cached_property
-    def step(self) -> Array:
+    def magnitude(self) -> Array:
         """(p,) magnitude to which finite-difference steps are relative."""
         return self._column(lambda p: p.size or abs(p.guess) or p.scale)
 
@@ -197,34 +202,40 @@ class ParameterSet:
         """Indices of the parameters that are wanted, i.e. no nuisance."""
         return np.array([j for j, p in enumerate(self.parameters) if not p.nuisance], dtype=np.intp)
 
-    def _linear(self, rows: int, pick: Callable[[AnySlot], int | None]) -> Array:
+    def _linear(self, rows: int, pick: Callable[[TargetField], int | None]) -> Array:
         """(rows, p) matrix of targets that act linearly outside the model."""
         matrix = np.zeros((rows, len(self)))
-        for j, (parameter, slots) in enumerate(zip(self.parameters, self.slots, strict=True)):
-            for target, slot in zip(parameter.targets, slots, strict=True):
-                row = pick(slot)
+        for j, (parameter, fields) in enumerate(zip(self.parameters, self.fields, strict=True)):
+            for target, field in zip(parameter.targets, fields, strict=True):
+                row = pick(field)
                 if row is not None:
                     matrix[row, j] += target.scale
         return matrix
 
-    def start(self, nx: int) -> Array:
+    def initial_state_derivative(self, nx: int) -> Array:
         """(nx, p) derivative of the initial state."""
-        return self._linear(nx, lambda slot: slot.tangent if isinstance(slot, StartSlot) else None)
-
-    def bias(self, ny: int) -> Array:
-        """(ny, p) derivative of every output by constant biases."""
-        return self._linear(ny, lambda slot: slot.output if isinstance(slot, BiasSlot) else None)
-
-    @cached_property
-    def delay(self) -> Array:
-        """(p,) derivative of the time by which outputs lag."""
-        return np.asarray(
-            self._linear(1, lambda slot: 0 if isinstance(slot, DelaySlot) else None)[0]
+        return self._linear(
+            nx, lambda field: field.tangent if isinstance(field, InitialStateField) else None
         )
 
-    def _any(self, kind: Callable[[AnySlot], bool]) -> np.ndarray:
-        """(p,) True where a parameter has a slot of a kind."""
-        return np.array([any(kind(slot) for slot in slots) for slots in self.slots], dtype=bool)
+    def bias_derivative(self, ny: int) -> Array:
+        """(ny, p) derivative of every output by constant biases."""
+        return self._linear(
+            ny, lambda field: field.output if isinstance(field, OutputBiasField) else None
+        )
+
+    @cached_property
+    def delay_derivative(self) -> Array:
+        """(p,) derivative of the time by which outputs lag."""
+        return np.asarray(
+            self._linear(1, lambda field: 0 if isinstance(field, OutputDelayField) else None)[0]
+        )
+
+    def _any(self, kind: Callable[[TargetField], bool]) -> np.ndarray:
+        """(p,) True where a parameter has a field of a kind."""
+        return np.array(
+            [any(kind(field) for field in fields) for fields in self.fields], dtype=bool
+        )
 
     @property
     def _functions(self) -> np.ndarray:
@@ -232,37 +243,40 @@ class ParameterSet:
         return np.array([p.function is not None for p in self.parameters], dtype=bool)
 
     @cached_property
-    def outside(self) -> np.ndarray:
+    def outside_model(self) -> np.ndarray:
         """(p,) True where a parameter concerns the start or the measurement."""
-        return self._any(lambda slot: isinstance(slot, OUTSIDE))
+        return self._any(lambda field: isinstance(field, OUTSIDE))
 
     @cached_property
-    def deviations(self) -> np.ndarray:
+    def initial_deviations(self) -> np.ndarray:
         """(p,) True for nuisance deviations of the start."""
         nuisance = np.array([p.nuisance for p in self.parameters], dtype=bool)
-        return np.asarray(nuisance & self._any(lambda slot: isinstance(slot, StartSlot)))
+        return np.asarray(nuisance & self._any(lambda field: isinstance(field, InitialStateField)))
 
     @cached_property
-    def private(self) -> np.ndarray:
+    def recording_specific(self) -> np.ndarray:
         """(p,) True for deviations of the start and what else every experiment and recording has its own value of."""
         return np.asarray(
-            self.deviations | np.array([p.per_recording for p in self.parameters], dtype=bool)
+            self.initial_deviations
+            | np.array([p.per_recording for p in self.parameters], dtype=bool)
         )
 
     @cached_property
-    def in_model(self) -> np.ndarray:
+    def changes_model(self) -> np.ndarray:
         """(p,) True where a parameter changes the model."""
-        return np.asarray(self._functions | self._any(lambda slot: not isinstance(slot, OUTSIDE)))
+        return np.asarray(self._functions | self._any(lambda field: not isinstance(field, OUTSIDE)))
 
     @cached_property
-    def moving(self) -> np.ndarray:
+    def changes_motion(self) -> np.ndarray:
         """(p,) True where a parameter changes the motion: through the model or the start."""
-        return np.asarray(self.in_model | self._any(lambda slot: isinstance(slot, StartSlot)))
+        return np.asarray(
+            self.changes_model | self._any(lambda field: isinstance(field, InitialStateField))
+        )
 
     @cached_property
-    def compiled(self) -> np.ndarray:
+    def needs_compile(self) -> np.ndarray:
         """(p,) True where a change needs a compile."""
-        return np.asarray(self._functions | self._any(lambda slot: isinstance(slot, SpecSlot)))
+        return np.asarray(self._functions | self._any(lambda field: isinstance(field, SpecField)))
 
     def write(self, model: Any, theta: Array) -> None:
         """Write theta: (p,) into a model that the caller owns, in place, then recompute MuJoCo's derived constants.
@@ -273,7 +287,7 @@ class ParameterSet:
             self.mocap.put(model, self.mocap.compiled)
         whole = self._write_numbers(model, theta)
         for (kind, row), values in whole.items():
-            if kind in CHARTS:
+            if kind in INERTIA_PARAMETRISATIONS:
                 _write_inertia(model, row, kind, values)
             else:
                 turned = Rotation.from_quat(
@@ -282,7 +296,7 @@ class ParameterSet:
                 getattr(model, kind)[row] = turned.as_quat(scalar_first=True)
                 if kind == "site_quat":
                     model.site_sameframe[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-        with quiet():
+        with silence_mujoco_log():
             mujoco.mj_setConst(model, self._scratch(model))
         if self.mocap is not None:
             self.mocap.put(model, self.mocap.start)
@@ -290,35 +304,39 @@ class ParameterSet:
     def _write_numbers(self, model: Any, theta: Array) -> dict[tuple[str, int], Array]:
         """Write what is a number of its own; returns coordinates of inertias and orientations, by (chart or array, row)."""
         whole: dict[tuple[str, int], Array] = {}
-        for parameter, slots, value in zip(self.parameters, self.slots, theta, strict=True):
-            for target, slot in zip(parameter.targets, slots, strict=True):
+        for parameter, fields, value in zip(self.parameters, self.fields, theta, strict=True):
+            for target, field in zip(parameter.targets, fields, strict=True):
                 number = target.scale * float(value) + target.offset
-                if isinstance(slot, Slot):
-                    slot.write(model, number)
-                elif isinstance(slot, InertiaSlot):
-                    key = (slot.chart, slot.body)
-                    whole.setdefault(key, np.array(self.nominal[key]))[slot.component] = number
-                elif isinstance(slot, RotationSlot):
-                    whole.setdefault((slot.array, slot.row), np.zeros(3))[slot.component] = number
+                if isinstance(field, ModelField):
+                    field.write(model, number)
+                elif isinstance(field, InertiaField):
+                    key = (field.chart, field.body)
+                    whole.setdefault(key, np.array(self.nominal[key]))[field.component] = number
+                elif isinstance(field, RotationField):
+                    whole.setdefault((field.array, field.row), np.zeros(3))[field.component] = (
+                        number
+                    )
         return whole
 
-    def impossible(self, base: Source | Any, theta: Array) -> list[tuple[tuple[int, ...], str]]:
+    def unphysical_bodies(
+        self, base: Source | Any, theta: Array
+    ) -> list[tuple[tuple[int, ...], str]]:
         """Bodies whose inertia at theta: (p,) none can have: indices of the parameters that make it, and the fault in words.
 
         Raises ModelError where MuJoCo refuses to compile the values.
         """
         makers: dict[int, list[int]] = {}
-        for j, slots in enumerate(self.slots):
-            for slot in slots:
-                if isinstance(slot, InertiaSlot):
-                    makers.setdefault(slot.body, []).append(j)
-                elif isinstance(slot, Slot) and slot.array in ("body_mass", "body_inertia"):
-                    makers.setdefault(slot.rows[0], []).append(j)
+        for j, fields in enumerate(self.fields):
+            for field in fields:
+                if isinstance(field, InertiaField):
+                    makers.setdefault(field.body, []).append(j)
+                elif isinstance(field, ModelField) and field.array in ("body_mass", "body_inertia"):
+                    makers.setdefault(field.rows[0], []).append(j)
         own = copy.copy(self.base(base, theta))
         charted = {
             row: (kind, v)
             for (kind, row), v in self._write_numbers(own, theta).items()
-            if kind in CHARTS
+            if kind in INERTIA_PARAMETRISATIONS
         }
         found = []
         for body, columns in makers.items():
@@ -348,14 +366,15 @@ class ParameterSet:
         """The model into which theta is written in place: compiled anew where theta needs it, then kept."""
         if not isinstance(source, Source):
             return source
-        if not self.compiled.any():
+        if not self.needs_compile.any():
             return source.model
         return source.edited(
-            np.asarray(theta)[self.compiled].tobytes(), lambda spec: self._edit(spec, source, theta)
+            np.asarray(theta)[self.needs_compile].tobytes(),
+            lambda spec: self._edit(spec, source, theta),
         )
 
     def _edit(self, spec: Any, source: Source, theta: Array) -> None:
-        for j in np.flatnonzero(self.compiled):
+        for j in np.flatnonzero(self.needs_compile):
             parameter = self.parameters[j]
             if parameter.function is not None:
                 try:
@@ -364,8 +383,8 @@ class ParameterSet:
                     raise ExperimentError(
                         f"parameters.{parameter.name}: its function failed: {error}"
                     ) from error
-            for target, slot in zip(parameter.targets, self.slots[j], strict=True):
-                if isinstance(slot, SpecSlot):
+            for target, field in zip(parameter.targets, self.fields[j], strict=True):
+                if isinstance(field, SpecField):
                     number = target.scale * float(theta[j]) + target.offset
                     write_element(spec, source.model, source.model, target.path, number)
 
@@ -389,7 +408,7 @@ def _fault(model: Any, body: int, chart: str, values: Array | None) -> str:
     if not mass >= least:
         return f"mass {mass:g} kg; it must be > 0"
     if values is not None:
-        moments = np.linalg.eigvalsh(CHARTS[chart].back(values).inertia)
+        moments = np.linalg.eigvalsh(INERTIA_PARAMETRISATIONS[chart].back(values).inertia)
         missing = float(moments[2] - moments[0] - moments[1])
     if moments[0] >= least and missing <= ROUNDED * moments[2]:
         return ""
@@ -400,12 +419,12 @@ def _fault(model: Any, body: int, chart: str, values: Array | None) -> str:
     return f"principal moments of inertia {listed} kg m²; {wanted}"
 
 
-def _movable(model: Any, parameter: Parameter, slot: AnySlot, mocap: Mocap | None) -> None:
+def _movable(model: Any, parameter: Parameter, field: TargetField, mocap: Mocap | None) -> None:
     """Raise where a keyframe says where the mocap body is that a parameter moves."""
-    if isinstance(slot, RotationSlot):
-        array, row = slot.array, slot.row
-    elif isinstance(slot, Slot):
-        array, row = slot.array, slot.rows[0]
+    if isinstance(field, RotationField):
+        array, row = field.array, field.row
+    elif isinstance(field, ModelField):
+        array, row = field.array, field.rows[0]
     else:
         return
     if mocap is not None and array in ("body_pos", "body_quat") and row in mocap.bodies:
@@ -417,8 +436,8 @@ def _movable(model: Any, parameter: Parameter, slot: AnySlot, mocap: Mocap | Non
 
 
 def _write_inertia(model: Any, body: int, chart: str, values: Array) -> None:
-    """Set what the chart covers: the central one leaves mass and centre of mass to their own slots."""
-    new = CHARTS[chart].back(values)
+    """Set what the chart covers: the central one leaves mass and centre of mass to their own fields."""
+    new = INERTIA_PARAMETRISATIONS[chart].back(values)
     moments, quaternion = new.axes()
     model.body_inertia[body], model.body_iquat[body] = moments, quaternion
     if chart != "central":
@@ -427,34 +446,38 @@ def _write_inertia(model: Any, body: int, chart: str, values: Array) -> None:
 
 
 def _in_charts(
-    parameters: Sequence[Parameter], slots: list[tuple[AnySlot, ...]]
-) -> list[tuple[AnySlot, ...]]:
+    parameters: Sequence[Parameter], fields: list[tuple[TargetField, ...]]
+) -> list[tuple[TargetField, ...]]:
     """Give every body one chart: `mass` beside first moments is the barycentric mass. Raises where charts would mix."""
     charts: dict[int, set[str]] = {}
     plain: dict[int, set[str]] = {}
-    for row in slots:
-        for slot in row:
-            if isinstance(slot, InertiaSlot):
-                charts.setdefault(slot.body, set()).add(slot.chart)
-            elif isinstance(slot, Slot) and slot.array in (
+    for row in fields:
+        for field in row:
+            if isinstance(field, InertiaField):
+                charts.setdefault(field.body, set()).add(field.chart)
+            elif isinstance(field, ModelField) and field.array in (
                 "body_mass",
                 "body_ipos",
                 "body_inertia",
             ):
-                plain.setdefault(slot.rows[0], set()).add(slot.array)
+                plain.setdefault(field.rows[0], set()).add(field.array)
     allowed = {
         "central": {"body_mass", "body_ipos"},
         "barycentric": {"body_mass"},
         "logcholesky": set[str](),
     }
 
-    def settled(parameter: Parameter, slot: AnySlot) -> AnySlot:
-        """The slot in the chart of its body."""
-        body = slot.rows[0] if isinstance(slot, Slot) and slot.array.startswith("body_") else None
-        body = slot.body if isinstance(slot, InertiaSlot) else body
+    def settled(parameter: Parameter, field: TargetField) -> TargetField:
+        """The field in the chart of its body."""
+        body = (
+            field.rows[0]
+            if isinstance(field, ModelField) and field.array.startswith("body_")
+            else None
+        )
+        body = field.body if isinstance(field, InertiaField) else body
         own = charts.get(-1 if body is None else body, set())
         if body is None or not own:
-            return slot
+            return field
         chart = next(iter(own))
         if len(own) > 1 or plain.get(body, set()) - allowed[chart]:
             mixed = sorted({*own, *(a.removeprefix("body_") for a in plain.get(body, set()))})
@@ -463,8 +486,8 @@ def _in_charts(
                 f"({', '.join(mixed)}); valid together: mass, ipos and inertia; mass, ipos and fullinertia; mass, firstmoment "
                 "and origininertia; logcholesky alone"
             )
-        if isinstance(slot, Slot) and slot.array == "body_mass" and chart == "barycentric":
-            return InertiaSlot(body, "barycentric", 0)
-        return slot
+        if isinstance(field, ModelField) and field.array == "body_mass" and chart == "barycentric":
+            return InertiaField(body, "barycentric", 0)
+        return field
 
-    return [tuple(settled(p, s) for s in row) for p, row in zip(parameters, slots, strict=True)]
+    return [tuple(settled(p, s) for s in row) for p, row in zip(parameters, fields, strict=True)]

@@ -11,14 +11,14 @@ import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
 from mjfim.model.targets import (
-    AnySlot,
-    BiasSlot,
-    DelaySlot,
-    InertiaSlot,
-    RotationSlot,
-    Slot,
-    SpecSlot,
-    StartSlot,
+    InertiaField,
+    InitialStateField,
+    ModelField,
+    OutputBiasField,
+    OutputDelayField,
+    RotationField,
+    SpecField,
+    TargetField,
 )
 
 PATH = re.compile(r"^(?P<kind>\w+)(?:/(?P<name>.+))?:(?P<field>\w+)(?:\[(?P<index>\d+)\])?$")
@@ -113,7 +113,7 @@ KINDS = (*FIELDS, "initial", "output")
 
 def resolve(
     model: Any, path: str, outputs: Sequence[str] = (), decoration: Collection[str] = frozenset()
-) -> AnySlot:
+) -> TargetField:
     """What a path leads to. Raises ExperimentError listing the valid kinds, names, fields or indices.
 
     outputs: names of the measured columns, which `output/name:bias` may name
@@ -132,7 +132,9 @@ def resolve(
         )
     if kind == "option":
         width = np.size(getattr(model.opt, FIELDS[kind][field]))
-        return Slot(FIELDS[kind][field], (_checked(path, index, width),), None, in_options=True)
+        return ModelField(
+            FIELDS[kind][field], (_checked(path, index, width),), None, in_options=True
+        )
     if kind == "output":
         return _output(path, name, field, outputs)
     if kind == "initial":
@@ -146,9 +148,9 @@ def resolve(
         chart, first, width = INERTIAL_FIELDS[field]
         if not float(model.body_mass[ident]) > 0.0:
             raise ExperimentError(f"in parameter path {path!r}: body {name!r} has no mass")
-        return InertiaSlot(ident, chart, first + _checked(path, index, width))
+        return InertiaField(ident, chart, first + _checked(path, index, width))
     if field == "rot":
-        return RotationSlot(f"{kind}_quat", ident, _checked(path, index, 3))
+        return RotationField(f"{kind}_quat", ident, _checked(path, index, 3))
     if field in COMPILED.get(kind, ()):
         index = _checked(path, index, 3 if field in ("size", "pos") else 1)
         if field == "size" and int(model.geom_dataid[ident]) >= 0:
@@ -157,7 +159,9 @@ def resolve(
             )
         plain = field in ("size", "pos") and name in decoration
         return (
-            Slot(f"geom_{field}", (ident,), index) if plain else SpecSlot(kind, name, field, index)
+            ModelField(f"geom_{field}", (ident,), index)
+            if plain
+            else SpecField(kind, name, field, index)
         )
     if field in SERVO and kind == "actuator":
         return _servo(model, path, ident, field)
@@ -170,20 +174,20 @@ def _nameless(model: Any, kind: str) -> str:
     return f"; {nameless} more have no name: give them one in the MJCF" if nameless else ""
 
 
-def _plain(model: Any, path: str, kind: str, field: str, ident: int, index: int) -> Slot:
+def _plain(model: Any, path: str, kind: str, field: str, ident: int, index: int) -> ModelField:
     array = FIELDS[kind][field]
     holder = getattr(model, array)
     column = _checked(path, index, holder.shape[1]) if holder.ndim == 2 else None
     if holder.ndim == 1:
         _checked(path, index, 1)
     if field == "springlength" and not path.endswith("]") and holder[ident, 0] == holder[ident, 1]:
-        return Slot(
+        return ModelField(
             array, (ident,), 0, also=((array, ident, 1, 1.0),)
         )  # a rest length, not a range
-    return Slot(array, _rows(model, array, ident, path), column)
+    return ModelField(array, _rows(model, array, ident, path), column)
 
 
-def _servo(model: Any, path: str, ident: int, field: str) -> Slot:
+def _servo(model: Any, path: str, ident: int, field: str) -> ModelField:
     """Gain of a position or velocity servo together with its bias: kp moves gainprm[0] and biasprm[1], kv biasprm[2]."""
     gain, bias = float(model.actuator_gainprm[ident, 0]), model.actuator_biasprm[ident]
     kinds = (int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_SO3))
@@ -191,36 +195,40 @@ def _servo(model: Any, path: str, ident: int, field: str) -> Slot:
     if int(model.actuator_gaintype[ident]) == int(
         mujoco.mjtGain.mjGAIN_PID
     ):  # its own gain is the integral one
-        return Slot("actuator_biasprm", (ident,), {"kp": 1, "kv": 2}[field], factor=-1.0)
+        return ModelField("actuator_biasprm", (ident,), {"kp": 1, "kv": 2}[field], factor=-1.0)
     if affine and field == "kp" and gain != 0.0 and bias[1] == -gain:
-        return Slot("actuator_gainprm", (ident,), 0, also=(("actuator_biasprm", ident, 1, -1.0),))
+        return ModelField(
+            "actuator_gainprm", (ident,), 0, also=(("actuator_biasprm", ident, 1, -1.0),)
+        )
     if (
         affine and field == "kv" and gain != 0.0 and bias[1] == 0.0 and bias[2] == -gain
     ):  # a velocity servo
-        return Slot("actuator_gainprm", (ident,), 0, also=(("actuator_biasprm", ident, 2, -1.0),))
+        return ModelField(
+            "actuator_gainprm", (ident,), 0, also=(("actuator_biasprm", ident, 2, -1.0),)
+        )
     if affine and field == "kv" and bias[1] == -gain:
-        return Slot("actuator_biasprm", (ident,), 2, factor=-1.0)
+        return ModelField("actuator_biasprm", (ident,), 2, factor=-1.0)
     raise ExperimentError(
         f"in parameter path {path!r}: the actuator is no {'position' if field == 'kp' else 'position or velocity'} servo; "
         "use gainprm[i] and biasprm[i]"
     )
 
 
-def _output(path: str, name: str, field: str, outputs: Sequence[str]) -> AnySlot:
+def _output(path: str, name: str, field: str, outputs: Sequence[str]) -> TargetField:
     if field == "delay":
         if name:
             raise ExperimentError(
                 f"in parameter path {path!r}: one delay lags all outputs; write 'output:delay'"
             )
-        return DelaySlot()
+        return OutputDelayField()
     if name not in outputs:
         raise ExperimentError(
             f"in parameter path {path!r}: {unknown('output', name, list(outputs))}"
         )
-    return BiasSlot(list(outputs).index(name))
+    return OutputBiasField(list(outputs).index(name))
 
 
-def _initial(model: Any, path: str, name: str, field: str, index: int) -> AnySlot:
+def _initial(model: Any, path: str, name: str, field: str, index: int) -> TargetField:
     """Place of a start component in the tangent space (dq, dv, da)."""
     if field == "act":
         ident = mujoco.mj_name2id(model, OBJECTS["actuator"], name)
@@ -234,7 +242,7 @@ def _initial(model: Any, path: str, name: str, field: str, index: int) -> AnySlo
             raise ExperimentError(
                 f"in parameter path {path!r}: {unknown('actuator with a state', name, stateful)}"
             )
-        return StartSlot(
+        return InitialStateField(
             2 * model.nv + int(model.actuator_actadr[ident]) + _checked(path, index, count)
         )
     ident = mujoco.mj_name2id(model, OBJECTS["joint"], name)
@@ -243,7 +251,7 @@ def _initial(model: Any, path: str, name: str, field: str, index: int) -> AnySlo
             f"in parameter path {path!r}: {unknown('joint', name, names_of(model, 'joint'))}"
         )
     dof = int(model.jnt_dofadr[ident]) + _checked(path, index, joint_width(model, ident))
-    return StartSlot(dof + (model.nv if field == "qvel" else 0))
+    return InitialStateField(dof + (model.nv if field == "qvel" else 0))
 
 
 def joint_width(model: Any, joint: int) -> int:

@@ -13,27 +13,29 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-SLOW = 0.02  # s over the fastest speed
+SMOOTHING_SPEED_FRACTION = 0.02  # s over the fastest speed
 SOFT = 1e-3  # impedance of the softened constraint: it answers velocities, not accelerations
 
 
-def is_dry(model: Any) -> bool:
+def has_dry_friction(model: Any) -> bool:
     """Whether any joint or tendon has dry friction."""
     return bool(model.dof_frictionloss.any() or model.tendon_frictionloss.any())
 
 
-def speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
+def smoothing_speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
     """s of every degree of freedom, then of every tendon, no less than the speed at which the engine's own friction sticks.
 
     fastest: (nv,) speeds of the degrees of freedom
     """
     own = np.concatenate([_sticking(*rows) for rows in _frictions(model)])
     return tuple(
-        np.maximum(own, np.concatenate([SLOW * fastest, np.zeros(model.ntendon)])).tolist()
+        np.maximum(
+            own, np.concatenate([SMOOTHING_SPEED_FRACTION * fastest, np.zeros(model.ntendon)])
+        ).tolist()
     )
 
 
-def soften(model: Any, speeds: tuple[float, ...]) -> None:
+def smooth_dry_friction(model: Any, speeds: tuple[float, ...]) -> None:
     """Write the softened law into a model that the caller owns, for the friction that it has, in place."""
     rest = np.asarray(speeds)
     for loss, weight, impedance, reference in _frictions(model):

@@ -1,8 +1,8 @@
 """What a parameter path leads to: a number inside a model, of the start, or of the measurement.
 
-A number of an MjModel array (`Slot`), a coordinate of a body's inertia (`InertiaSlot`), of an orientation
-(`RotationSlot`), something that only a compile can follow (`SpecSlot`), the start (`StartSlot`) or the measurement itself
-(`BiasSlot`, `DelaySlot`).
+A number of an MjModel array (`ModelField`), a coordinate of a body's inertia (`InertiaField`), of an orientation
+(`RotationField`), something that only a compile can follow (`SpecField`), the initial state (`InitialStateField`) or the
+measurement itself (`OutputBiasField`, `OutputDelayField`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError
-from mjfim.model.inertia import CHARTS, Inertial
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, Inertial
 
 SAME_FRAME = {
     "body_ipos": "body_sameframe",
@@ -24,7 +24,7 @@ SAME_FRAME = {
 
 
 @dataclass(frozen=True)
-class Slot:
+class ModelField:
     """One number of an MjModel array: its rows, and the column (None for one-dimensional arrays).
 
     factor: the number is `factor * value`
@@ -81,7 +81,7 @@ class Slot:
 
 
 @dataclass(frozen=True)
-class InertiaSlot:
+class InertiaField:
     """One coordinate of a body's inertia in a chart. Written together with its sisters (`ParameterSet.write`)."""
 
     body: int
@@ -91,7 +91,9 @@ class InertiaSlot:
     def read(self, model: Any) -> float:
         """Current value. Raises ExperimentError where the chart does not cover the body."""
         try:
-            return float(CHARTS[self.chart].of(inertial(model, self.body))[self.component])
+            return float(
+                INERTIA_PARAMETRISATIONS[self.chart].of(inertial(model, self.body))[self.component]
+            )
         except ValueError as error:
             name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, self.body)
             raise ExperimentError(
@@ -100,7 +102,9 @@ class InertiaSlot:
 
     def size(self, model: Any) -> float:
         """Magnitude that a change is compared with."""
-        return float(CHARTS[self.chart].size(inertial(model, self.body))[self.component])
+        return float(
+            INERTIA_PARAMETRISATIONS[self.chart].size(inertial(model, self.body))[self.component]
+        )
 
 
 class FromOrigin:
@@ -118,7 +122,7 @@ class FromOrigin:
 
 
 @dataclass(frozen=True)
-class RotationSlot(FromOrigin):
+class RotationField(FromOrigin):
     """One component of a rotation vector [rad] by which a body or site is turned from its compiled orientation."""
 
     natural: ClassVar[float] = 1.0
@@ -128,7 +132,7 @@ class RotationSlot(FromOrigin):
 
 
 @dataclass(frozen=True)
-class SpecSlot:
+class SpecField:
     """A number of the MJCF from which the compiler derives others: it must compile anew."""
 
     kind: str
@@ -151,7 +155,7 @@ class SpecSlot:
 
 
 @dataclass(frozen=True)
-class StartSlot(FromOrigin):
+class InitialStateField(FromOrigin):
     """Deviation of one component of the initial state, by its place in the tangent space."""
 
     natural: ClassVar[float] = 1.0
@@ -159,7 +163,7 @@ class StartSlot(FromOrigin):
 
 
 @dataclass(frozen=True)
-class BiasSlot(FromOrigin):
+class OutputBiasField(FromOrigin):
     """Constant bias of one measured output."""
 
     natural: ClassVar[float] = 1.0
@@ -167,13 +171,21 @@ class BiasSlot(FromOrigin):
 
 
 @dataclass(frozen=True)
-class DelaySlot(FromOrigin):
+class OutputDelayField(FromOrigin):
     """Time by which all outputs lag [s]."""
 
     natural: ClassVar[float] = 0.01
 
 
-AnySlot = Slot | InertiaSlot | RotationSlot | SpecSlot | StartSlot | BiasSlot | DelaySlot
+TargetField = (
+    ModelField
+    | InertiaField
+    | RotationField
+    | SpecField
+    | InitialStateField
+    | OutputBiasField
+    | OutputDelayField
+)
 
 
 def inertial(model: Any, body: int) -> Inertial:

@@ -6,7 +6,7 @@ from typing import Any
 
 import mujoco
 
-from mjfim.model.inertia import CHARTS
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.paths import INERTIAL_FIELDS, OBJECTS, PATH
 
 UNITS = {
@@ -47,7 +47,7 @@ def unit_of(model: Any, path: str) -> str:
     )
     if field in INERTIAL_FIELDS:
         chart, first, _ = INERTIAL_FIELDS[field]
-        return CHARTS[chart].units[first + index]
+        return INERTIA_PARAMETRISATIONS[chart].units[first + index]
     if kind == "initial":
         ident = mujoco.mj_name2id(model, OBJECTS["joint"], name)
         if field == "act" or ident < 0:

@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError
 from mjfim.model.loading import compile_spec, unconstrained
-from mjfim.model.smooth_friction import soften
+from mjfim.model.smooth_friction import smooth_dry_friction
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class Source:
     def settle(self, model: Any) -> Any:
         """A model of this source after parameters were written into it: what rests on them is written anew, in place."""
         if self.soft:
-            soften(model, self.soft)
+            smooth_dry_friction(model, self.soft)
         return model
 
     def _compile(self, spec: Any) -> Any:

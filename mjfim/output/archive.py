@@ -17,7 +17,7 @@ from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import Setup
-from mjfim.output.playback import design_columns, playback_of, reference_columns
+from mjfim.output.playback import design_columns, reference_columns, simulate_playback
 from mjfim.records.check import Check
 from mjfim.records.combinations import ParameterGroup
 from mjfim.records.comparison import Comparison, MethodResult
@@ -112,7 +112,7 @@ def _evaluation(e: Evaluation) -> dict[str, Any]:
 
 def write_design(folder: Path, design: Design, setup: Setup) -> None:
     """design.json, design.npz, design.csv and reference.csv."""
-    played = playback_of(setup, design.trajectory, design.final.gain)
+    played = simulate_playback(setup, design.trajectory, design.final.gain)
     arrays: dict[str, Array] = {}
     for prefix, e in (("", design.final), ("initial_", design.initial)):
         own = {

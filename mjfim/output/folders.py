@@ -66,7 +66,7 @@ def check_file(path: Path) -> None:
 def leave_design(folder: Path, design: Design, setup: Setup) -> None:
     """design.json, design.npz, design.csv, design.rrd and pictures."""
     archive.write_design(folder, design, setup)
-    labels = Labels.of(setup)
+    labels = Labels.of_system(setup)
     for name, figure in (
         ("trajectories", plots.trajectories(design, labels)),
         ("sensitivity_phase", plots.sensitivity_phase(design, labels)),
@@ -105,7 +105,7 @@ def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
         missing += [said] if said else []
     except ModelError as error:
         missing.append(str(error))
-    labels = Labels.of(setup)
+    labels = Labels.of_system(setup)
     for i in range(len(estimate.recordings)):
         name = "fit.png" if len(estimate.recordings) == 1 else f"fit_{i + 1}.png"
         plots.save(plots.fit(estimate, i, labels, list(estimate.sigma.values())), folder / name)
@@ -127,7 +127,7 @@ def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
 def leave_study(folder: Path, study: MonteCarloStudy, setup: Setup) -> None:
     """montecarlo.json, a histogram per parameter, the tables."""
     archive.write_json(folder / "montecarlo.json", archive.study_summary(study))
-    labels = Labels.of(setup)
+    labels = Labels.of_system(setup)
     for i, name in enumerate(study.parameters):
         safe = re.sub(r"[^\w.-]", "_", name)
         plots.save(plots.histogram(study, i, labels), folder / f"histogram_{safe}.png")

@@ -63,7 +63,7 @@ class Labels:
         )
 
     @classmethod
-    def of(cls, setup: Setup) -> Labels:
+    def of_system(cls, setup: Setup) -> Labels:
         """Names of an experiment: its model's, its parameters' and its outputs'."""
         base = cls.of_model(setup.model)
         outputs = {name: output_label(setup.model, name) for name in setup.outputs.names}

@@ -12,14 +12,14 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDiverged
 from mjfim.experiment.system import Setup
-from mjfim.model.coordinates import components, gain_names, state_names
+from mjfim.model.coordinates import gain_names, state_components, state_names
 from mjfim.plant.active_constraints import forwarded
 from mjfim.plant.batch import Engine
 from mjfim.records.playback import Playback
 from mjfim.records.trajectory import Trajectory
 
 
-def playback_of(setup: Setup, trajectory: Trajectory, gain: Array) -> Playback:
+def simulate_playback(setup: Setup, trajectory: Trajectory, gain: Array) -> Playback:
     """A designed trajectory at `playback_rate`, simulated again at the design's theta. gain: (N, nu, nx)
 
     Raises SimulationDiverged where it cannot be simulated.
@@ -60,7 +60,7 @@ def reference_columns(playback: Playback, setup: Setup) -> dict[str, Array]:
     qacc, force = np.empty_like(qvel), np.empty_like(qvel)
     for k, data in forwarded(setup.model_at(setup.theta), rows, range(len(held))):
         qacc[k], force[k] = data.qacc, data.qfrc_actuator
-    names = [c.name for c in components(setup.model)]
+    names = [c.name for c in state_components(setup.model)]
     dofs = [name.removeprefix("qvel:") for name in names[setup.space.nq :]]
     return {
         "t": playback.t,

@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjfim.model.loading import actuator_names, joint_names
+from mjfim.model.coordinates import actuator_names, joint_names
 from mjfim.records.trajectory import Trajectory
 
 CLAMPED = 1e-12  # relative distance from its bound at which a force counts as clamped

@@ -11,7 +11,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 from mjfim.arrays import Array
-from mjfim.model.mujoco_log import quiet
+from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.parallel import cores
 from mjfim.plant.state_space import StateSpace
 
@@ -205,7 +205,7 @@ class Engine:
             batch.bind("sensordata")
         for name in () if taps is None else taps.fields:
             batch.bind(name)
-        with quiet():
+        with silence_mujoco_log():
             for stop in sorted({*looks, *((1,) if self.sensors else ()), self.substeps}):
                 if stop - done > 1 and stop in looks:
                     batch.step(ids, nstep=stop - done - 1)
@@ -248,7 +248,7 @@ class Engine:
             held, record = np.concatenate([held, held[:, -1:]], axis=1), (RECORD, "sensordata")
         if taps is not None:
             record = (*record, *taps.fields)
-        with quiet():
+        with silence_mujoco_log():
             out = batch.rollout(held.shape[1], np.ascontiguousarray(held), record=record, ids=ids)
         self.steps += count * held.shape[1]
         last = N * self.substeps
@@ -295,7 +295,7 @@ class Engine:
         states, used = np.empty((N + 1, reference.shape[1])), np.empty_like(mu)
         states[0] = reference[0]
         ctrl, qpos, qvel, act = data.ctrl, data.qpos, data.qvel, data.act
-        with np.errstate(over="ignore", invalid="ignore"), quiet():
+        with np.errstate(over="ignore", invalid="ignore"), silence_mujoco_log():
             for now, q, v, a, alpha, u, open_loop, gain in zip(
                 states, *space.split(states[1:]), reference, used, mu, K, strict=False
             ):

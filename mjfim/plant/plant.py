@@ -112,8 +112,8 @@ class Plant:
         self.nominal_start = np.array(start, dtype=np.float64)
         self.nu = int(source.model.nu)
         self.dt = substeps * float(source.model.opt.timestep)
-        self._start_matrix = parameters.start(self.space.nx)
-        self._bias = parameters.bias(len(outputs))
+        self._start_matrix = parameters.initial_state_derivative(self.space.nx)
+        self._bias = parameters.bias_derivative(len(outputs))
         self._reach = np.ones(len(parameters))
         self._models: dict[bytes, Any] = {}
         self._pool: list[Any] = []
@@ -126,7 +126,7 @@ class Plant:
         size = np.concatenate(
             [self.steps_of(trajectory)[: self.space.nx], np.ones(len(self.outputs))]
         )
-        both = np.concatenate([found.psi, found.G], axis=1) * self.parameters.step
+        both = np.concatenate([found.psi, found.G], axis=1) * self.parameters.magnitude
         effect = (np.abs(both).max(axis=0) / size[:, None]).max(axis=0)
         self._reach = np.clip(FAINT / np.maximum(effect, 1e-300), 1.0, LONGEST)
 
@@ -143,7 +143,7 @@ class Plant:
     @property
     def span(self) -> Array:
         """(p,) change of each parameter that moves the trajectory noticeably; differences are relative to it."""
-        return np.asarray(self.parameters.step * self._reach)
+        return np.asarray(self.parameters.magnitude * self._reach)
 
     def start(self, theta: Array) -> Array:
         """(..., ns) initial states at theta: (..., p)."""
@@ -151,9 +151,9 @@ class Plant:
 
     def lag(self, theta: Array, samples: int) -> Lag | None:
         """The lag of the outputs at theta: (p,) over N+1 samples; None where nothing delays."""
-        if not self.parameters.delay.any():
+        if not self.parameters.delay_derivative.any():
             return None
-        return Lag.of(samples, float(self.parameters.delay @ theta), self.dt)
+        return Lag.of(samples, float(self.parameters.delay_derivative @ theta), self.dt)
 
     def model(self, theta: Array) -> Any:
         """The model at theta: (p,); kept for the few values in use."""
@@ -192,7 +192,7 @@ class Plant:
         models, sound = self._many(theta)
         out = self.engine.rollout(models, self.start(theta), held)
         y = self.outputs(out.states, out.sensors) + (theta @ self._bias.T)[:, None]
-        if self.parameters.delay.any():
+        if self.parameters.delay_derivative.any():
             lags = (self.lag(row, y.shape[1]) for row in theta)
             y = np.stack(
                 [own if lag is None else lag.apply(own) for lag, own in zip(lags, y, strict=True)]
@@ -201,7 +201,7 @@ class Plant:
 
     def _many(self, theta: Array) -> tuple[list[Any], np.ndarray]:
         """A reusable pool of models, one per row of theta, and which of them could be compiled."""
-        if self.parameters.compiled.any():
+        if self.parameters.needs_compile.any():
             return self._compiled(theta)
         sound = np.ones(len(theta), dtype=bool)
         while len(self._pool) < len(theta):
@@ -254,7 +254,11 @@ class Plant:
         central: two-sided differences;  chunk: numbers that the states of a stretch may take
         sought: (p,) parameters by which to differentiate, None: all; biases are for nothing. Outputs are without delay
         """
-        wanted = self.parameters.moving if sought is None else self.parameters.moving & sought
+        wanted = (
+            self.parameters.changes_motion
+            if sought is None
+            else self.parameters.changes_motion & sought
+        )
         moving = np.flatnonzero(wanted & (free is not None))
         k, p, N = 0 if free is None else free.shape[1], len(theta), ctrl.shape[1]
         h = (step * self.span)[moving]
@@ -378,7 +382,7 @@ class Plant:
 
         states: (N+1, ns) at theta where they are known already; else, and where sensors lag, one more rollout
         """
-        moving = np.flatnonzero(self.parameters.moving)
+        moving = np.flatnonzero(self.parameters.changes_motion)
         m, p, N = len(moving), len(theta), len(ctrl)
         lag = self.lag(theta, N + 1)
         own = states is None or (lag is not None and self.outputs.needs_sensors)
@@ -407,7 +411,7 @@ class Plant:
         G += self._bias
         y = self.outputs(here, sensors) + self._bias @ theta
         if lag is not None:
-            G = lag.apply(G) + lag.rate(y)[..., None] * self.parameters.delay
+            G = lag.apply(G) + lag.rate(y)[..., None] * self.parameters.delay_derivative
             y = lag.apply(y)
         return y, Sensitivity(psi=psi, G=G)
 
@@ -438,7 +442,7 @@ class Plant:
         parts = [_finite(dx) / (self.dt * self.steps_of(trajectory)[: self.space.nx])]
         if ds is not None:
             dy = self.outputs.tangent(states, np.zeros_like(dx), ds)
-            size = np.abs(dy * self.parameters.step[:, None, None]).max(axis=(0, 1))
+            size = np.abs(dy * self.parameters.magnitude[:, None, None]).max(axis=(0, 1))
             parts.append(dy / np.where(size > 0.0, size, 1.0))
         return np.concatenate([part.reshape(p, -1) for part in parts], axis=1).T
 
@@ -606,7 +610,7 @@ class Plant:
             F_mixed,
             second,
             self.lag(theta, len(states)),
-            self.parameters.delay,
+            self.parameters.delay_derivative,
             tapped,
         )
 
@@ -658,11 +662,13 @@ class Plant:
         F_mixed = np.moveaxis(np.array(mixed)[:, :, :-1], 1, 2)
         lag = self.lag(theta, len(states))
         parts = (AB[..., :nx], AB[..., nx:], CD[..., :nx], CD[..., nx:], F_mixed, second)
-        return Bilinear(*parts, lag, self.parameters.delay, tapped)
+        return Bilinear(*parts, lag, self.parameters.delay_derivative, tapped)
 
     def _epsilon(self, accuracy: Accuracy, push: Array, w: Array) -> float:
         """Step along (psi w, w): relative to the larger of its two parts."""
-        inside = np.where(self.parameters.in_model, np.abs(w / self.span), 0.0).max(initial=0.0)
+        inside = np.where(self.parameters.changes_model, np.abs(w / self.span), 0.0).max(
+            initial=0.0
+        )
         return float(accuracy.epsilon / max(np.abs(push).max(initial=0.0), inside, 1e-300))
 
 

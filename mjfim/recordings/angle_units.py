@@ -10,7 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
-from mjfim.model.loading import joint_names
+from mjfim.model.coordinates import joint_names
 from mjfim.recordings.plausibility import ways
 
 DEGREES = 180.0 / np.pi

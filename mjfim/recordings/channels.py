@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mjfim.arrays import Array
-from mjfim.model.coordinates import measurable
+from mjfim.model.coordinates import measurable_columns
 from mjfim.recordings.spec import RecordingSpec
 
 
@@ -38,4 +38,4 @@ class Channels:
     @property
     def measurable(self) -> tuple[str, ...]:
         """Column names of everything that can be measured: components of the state, and sensors."""
-        return measurable(self.model)
+        return measurable_columns(self.model)

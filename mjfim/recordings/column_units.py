@@ -12,7 +12,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, unknown
-from mjfim.model.coordinates import components
+from mjfim.model.coordinates import state_components
 from mjfim.model.paths import names_of
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import ColumnSpec
@@ -51,7 +51,7 @@ OPEN = (
 
 def units_of(model: Any) -> dict[str, str]:
     """The model's unit of everything that can be measured by column: rad, rad/s, m, m/s; `any` or `none` of them."""
-    units = {c.name: c.unit or "none" for c in components(model)}
+    units = {c.name: c.unit or "none" for c in state_components(model)}
     for name in names_of(model, "sensor"):
         sensor = model.sensor(name)
         kind = mujoco.mjtSensor(int(sensor.type[0]))

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import medfilt
 
 from mjfim.arrays import Array
-from mjfim.model.loading import coordinates
+from mjfim.model.coordinates import scalar_joints
 from mjfim.recordings.channels import Channels
 from mjfim.records.recording import Recording
 
@@ -76,7 +76,7 @@ def _rough(channels: Channels, recording: Recording) -> Iterator[str]:
 def _contradictions(channels: Channels, t: Array, recording: Recording) -> Iterator[str]:
     """Positions that do not move as their velocities say."""
     names = recording.outputs
-    for c in coordinates(channels.model):
+    for c in scalar_joints(channels.model):
         pair = (f"qpos:{c.name}", f"qvel:{c.name}")
         if not all(name in names for name in pair):
             continue

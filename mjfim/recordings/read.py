@@ -13,7 +13,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, unknown
-from mjfim.model.coordinates import components
+from mjfim.model.coordinates import state_components
 from mjfim.recordings.angle_units import check_angles
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.column_units import check_unit, converted, units_of
@@ -117,7 +117,7 @@ def _own(table: Table, channels: Channels) -> dict[str, str]:
         for name in names
         if name.startswith(kind)
     }
-    state = [c.name for c in components(model)]
+    state = [c.name for c in state_components(model)]
     wholes = {
         "qpos": state[: model.nq],
         "qvel": state[model.nq :],

@@ -75,7 +75,7 @@ def check(
     tested = self_test(setup, judged, judged.judged(point))
     p = setup.parameters
     common = sum(
-        (shared(each, p.prior_information, p.private) for each in tells),
+        (shared(each, p.prior_information, p.recording_specific) for each in tells),
         start=np.zeros_like(setup.prior),
     )
     return _concluded(setup, seen, common, horizon, source, tested)
@@ -129,7 +129,7 @@ def _rows(
     for j, parameter in enumerate(p.parameters):
         value = float(setup.theta[j])
         plain = parameter.size == abs(parameter.guess) and value != 0.0
-        size = abs(value) if plain else float(p.step[j])
+        size = abs(value) if plain else float(p.magnitude[j])
         stated = parameter.wanted is not None
         wanted = parameter.wanted or DEFAULT_WANTED * size
         needed = (

@@ -121,7 +121,7 @@ class Trials:
 
     def jacobian(self, theta: Array, predicted: Array, relative: float = 1e-6) -> Array:
         """(m, n, p) by one-sided differences about predictions already made."""
-        steps = relative * self.setup.parameters.step
+        steps = relative * self.setup.parameters.magnitude
         columns = []
         for j, h in enumerate(steps):
             moved = np.array(theta)
@@ -169,7 +169,7 @@ def _shared(setup: Setup, trials: Trials) -> Shared:
     """Fit of the mean measurement from the guess, with its Jacobian and the Jacobian's derivative."""
     fit = Fit(setup, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
     theta = newton_raphson(fit, setup.parameters.guess).unknowns.theta
-    h = 1e-3 * setup.parameters.step
+    h = 1e-3 * setup.parameters.magnitude
 
     def jacobian(at: Array) -> Array:
         predicted = setup.plant.predict(at, trials.ctrl)

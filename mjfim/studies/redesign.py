@@ -129,7 +129,7 @@ def restated(
 
 def _moved(base: Setup, j: int, theta: Array | None, estimate: Estimate | None) -> dict[str, Any]:
     """Keys of a parameter that a redesign states anew."""
-    own, size = base.parameters.parameters[j], float(base.parameters.step[j])
+    own, size = base.parameters.parameters[j], float(base.parameters.magnitude[j])
     low, high = own.bounds
     if theta is None:
         return {"guess": own.guess, "scale": own.scale}
@@ -148,4 +148,4 @@ def _moved(base: Setup, j: int, theta: Array | None, estimate: Estimate | None) 
 def _shown(base: Setup, members: Sequence[int], estimate: Estimate) -> bool:
     """Whether the recordings show every one of some parameters: to move one by its size moves them by more than the noise."""
     at = np.asarray(members)
-    return bool((np.diag(estimate.data)[at] * base.parameters.step[at] ** 2 > 1.0).all())
+    return bool((np.diag(estimate.data)[at] * base.parameters.magnitude[at] ** 2 > 1.0).all())

@@ -12,7 +12,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import Sight, fence_of
 from mjfim.excitation.limits import Limit, limits_of
 from mjfim.experiment.task_tables import Limits
-from mjfim.model.loading import control_names, coordinates
+from mjfim.model.coordinates import control_names, scalar_joints
 from mjfim.output.labels import Labels
 from mjfim.plant.active_constraints import saturated
 from mjfim.records.trajectory import Trajectory
@@ -45,7 +45,7 @@ def model() -> mujoco.MjModel:
 
 def limits(model: mujoco.MjModel, **tables: object) -> tuple[Limit, ...]:
     """Limits of the model with tables of the file."""
-    return limits_of(model, coordinates(model), control_names(model), Limits(**tables))
+    return limits_of(model, scalar_joints(model), control_names(model), Limits(**tables))
 
 
 def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajectory:

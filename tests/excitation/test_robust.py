@@ -14,7 +14,7 @@ from mjfim.excitation.design import design
 from mjfim.excitation.evaluation import evaluate_trajectory
 from mjfim.excitation.robust import Pool
 from mjfim.experiment.system import Setup
-from mjfim.model.parameter_samples import sampled
+from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import Parameter, ParameterSet
 from tests.support.numerics import CART_PARAMETERS, Array, body_setup, cart_setup
 
@@ -90,7 +90,7 @@ def test_samples_fill_bounds_evenly_and_begin_with_the_guess() -> None:
         {"bounds": (1.0, 3.0), "guess": 2.5}, {"bounds": (-1e6, 1e6)}, {"guess": 7.0}
     )
     theta = np.array([2.5, 0.0, 7.0])
-    drawn = sampled(parameters, theta, 21, seed=3)
+    drawn = sample_parameters(parameters, theta, 21, seed=3)
     assert drawn.shape == (21, 3)
     np.testing.assert_array_equal(drawn[0], theta)
     np.testing.assert_array_equal(drawn[:, 2], 7.0)  # neither prior nor bounds: it stays
@@ -105,7 +105,7 @@ def test_samples_of_a_prior_are_normal_and_keep_within_bounds_and_reason() -> No
         {"prior": 0.5, "guess": 2.0}, {"prior": 1.0, "bounds": (-0.2, np.inf)}, {"prior": 1e3}
     )
     theta = np.array([2.0, 0.0, 0.0])
-    drawn = sampled(parameters, theta, 2001, seed=0)[1:]
+    drawn = sample_parameters(parameters, theta, 2001, seed=0)[1:]
     z = (drawn - theta) / [0.5, 1.0, 1e3]
     assert np.abs(z).max() == 2.5
     assert drawn[:, 1].min() == -0.2
@@ -117,16 +117,18 @@ def test_samples_of_a_prior_are_normal_and_keep_within_bounds_and_reason() -> No
 
 def test_the_seed_decides_the_samples() -> None:
     parameters = unknowns({"bounds": (0.0, 1.0)}, {"prior": 1.0})
-    a, b, c = (sampled(parameters, np.zeros(2), 5, seed) for seed in (1, 1, 2))
+    a, b, c = (sample_parameters(parameters, np.zeros(2), 5, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(a, b)
     assert not np.array_equal(a, c)
-    np.testing.assert_array_equal(sampled(parameters, np.zeros(2), 1, 0), np.zeros((1, 2)))
+    np.testing.assert_array_equal(
+        sample_parameters(parameters, np.zeros(2), 1, 0), np.zeros((1, 2))
+    )
 
 
 def test_parameters_without_prior_and_bounds_cannot_be_sampled(tmp_path) -> None:
     for half in ({}, {"bounds": (0.0, np.inf)}):
         with pytest.raises(ExperimentError, match="prior or bounds"):
-            sampled(unknowns(half), np.zeros(1), 3, 0)
+            sample_parameters(unknowns(half), np.zeros(1), 3, 0)
     with pytest.raises(ExperimentError, match="robust: no parameter has"):
         cart_setup(tmp_path, robust={"samples": 3})
     with pytest.raises(ExperimentError, match="samples"):
@@ -201,7 +203,7 @@ def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
     assert made.final.cost < 0.9 * crossed[0].cost
     assert plain.final.cost < 0.9 * crossed[1].cost
     # samples that neither has seen profit as well
-    fresh = sampled(robust.parameters, robust.theta, 9, seed=7)[1:]
+    fresh = sample_parameters(robust.parameters, robust.theta, 9, seed=7)[1:]
     ours, theirs = (phis(nominal, d.trajectory.ctrl, fresh) for d in (made, plain))
     assert pooled(ours) < 0.9 * pooled(theirs)
 
@@ -212,9 +214,11 @@ def test_samples_are_halved_until_their_bodies_can_exist() -> None:
     )
     theta, free = (
         np.ones(2),
-        sampled(unknowns({"bounds": (0.0, 8.0)}, {"bounds": (0.0, 8.0)}), np.ones(2), 9, 0),
+        sample_parameters(
+            unknowns({"bounds": (0.0, 8.0)}, {"bounds": (0.0, 8.0)}), np.ones(2), 9, 0
+        ),
     )
-    drawn = sampled(parameters, theta, 9, 0, lambda row: [0] if row[0] > 2.0 else [])
+    drawn = sample_parameters(parameters, theta, 9, 0, lambda row: [0] if row[0] > 2.0 else [])
     np.testing.assert_array_equal(drawn[:, 1], free[:, 1])
     assert (free[:, 0] > 2.0).sum() >= 4
     times = np.log2((free[1:, 0] - 1.0) / (drawn[1:, 0] - 1.0))
@@ -223,7 +227,9 @@ def test_samples_are_halved_until_their_bodies_can_exist() -> None:
     )
     assert (drawn[:, 0] <= 2.0).all()
     # where no halving helps they end at the guess, even those that are never right
-    np.testing.assert_array_equal(sampled(parameters, theta, 3, 0, lambda row: [0, 1]), 1.0)
+    np.testing.assert_array_equal(
+        sample_parameters(parameters, theta, 3, 0, lambda row: [0, 1]), 1.0
+    )
 
 
 def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
@@ -235,6 +241,6 @@ def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     )
     assert (moments > 0.0).all()
     assert (2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)).all()
-    free = sampled(setup.parameters, setup.theta, 8, 0)
-    assert any(setup.parameters.impossible(setup.plant.source, theta) for theta in free)
+    free = sample_parameters(setup.parameters, setup.theta, 8, 0)
+    assert any(setup.parameters.unphysical_bodies(setup.plant.source, theta) for theta in free)
     assert len(np.unique(setup.pool.thetas, axis=0)) == 8

@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError
-from mjfim.experiment.outputs import outputs_of
+from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
-from mjfim.model.coordinates import components, measurable
-from mjfim.model.loading import control_names, coordinates, joint_names
+from mjfim.model.coordinates import (
+    control_names,
+    joint_names,
+    measurable_columns,
+    scalar_joints,
+    state_components,
+)
 from tests.support.numerics import FREE_BODY, Array, Loop, body_setup, cart_setup, make_setup
 from tests.support.paths import MODELS
 
@@ -57,7 +62,7 @@ def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
         "tip[1]",
         "tip[2]",
     ]
-    assert list(measurable(setup.model)) == [*FREE, *BALL, *RATES, *sensors]
+    assert list(measurable_columns(setup.model)) == [*FREE, *BALL, *RATES, *sensors]
 
 
 def test_parts_of_a_joint_go_by_one_name(tmp_path: Path) -> None:
@@ -123,7 +128,7 @@ def test_unnamed_joints_are_called_by_their_number(tmp_path: Path) -> None:
     xml = xml.replace('<motor name="twist" joint="ball" gear="0.2 0.1 0.3"/>', "")
     model = mujoco.MjModel.from_xml_string(xml)
     assert joint_names(model) == ("joint0", "joint1")
-    assert [c.name for c in components(model)][6:9] == [
+    assert [c.name for c in state_components(model)][6:9] == [
         "qpos:joint0.qz",
         "qpos:joint1.qw",
         "qpos:joint1.qx",
@@ -135,7 +140,7 @@ def test_an_unnamed_joint_does_not_take_the_name_of_another(tmp_path: Path) -> N
       </body></body></worldbody><actuator><motor joint="joint0"/><motor name="actuator0" joint="joint0"/></actuator></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
     assert joint_names(model) == ("joint0_", "joint0")
-    assert [c.name for c in coordinates(model)] == ["joint0_", "joint0"]
+    assert [c.name for c in scalar_joints(model)] == ["joint0_", "joint0"]
     assert control_names(model) == ("actuator0_", "actuator0")
     parameters = {"d": {"target": "joint/joint0:damping", "guess": 0.1}}
     setup = make_setup(xml, tmp_path, parameters=parameters, noise={"state": 0.1})
@@ -412,7 +417,7 @@ def test_a_model_without_joints_has_no_state_to_measure(tmp_path: Path) -> None:
         noise={"state": 0.1},
     )
     with pytest.raises(ExperimentError, match=r"noise\.state: the model has no joint to measure"):
-        outputs_of(experiment, model, None, 1)
+        resolve_outputs(experiment, model, None, 1)
 
 
 def test_sensors_read_by_the_plant_are_those_of_mujoco(tmp_path: Path) -> None:

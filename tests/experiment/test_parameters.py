@@ -11,7 +11,7 @@ import pytest
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError
 from mjfim.experiment.system import Setup
-from mjfim.model.inertia import CHARTS
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.parameters import Parameter
 from mjfim.model.targets import inertial
 from tests.support.numerics import (
@@ -41,7 +41,7 @@ def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path
             "d": {"target": "joint/ball:damping"},
         },
     )
-    chart = CHARTS[coordinates or "logcholesky"]
+    chart = INERTIA_PARAMETRISATIONS[coordinates or "logcholesky"]
     body = setup.model.body("arm").id
     assert setup.parameters.names == (*(f"arm.{n}" for n in chart.names), "d")
     ten = setup.parameters.parameters[:10]
@@ -50,7 +50,7 @@ def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path
     )
     np.testing.assert_array_equal([p.scale for p in ten], chart.size(inertial(setup.model, body)))
     np.testing.assert_array_equal(
-        setup.parameters.step[:10], chart.size(inertial(setup.model, body))
+        setup.parameters.magnitude[:10], chart.size(inertial(setup.model, body))
     )
     assert tuple(p.unit for p in ten) == chart.units
     assert {p.group for p in ten} == {"arm"} and setup.parameters.parameters[10].group == ""
@@ -68,7 +68,7 @@ def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path
 def test_the_ten_are_written_together(coordinates: str, tmp_path: Path) -> None:
     """Another body's numbers: the model then holds that body."""
     setup = body_setup(tmp_path, parameters={"arm": {**ARM, "coordinates": coordinates}})
-    chart, arm = CHARTS[coordinates], setup.model.body("arm").id
+    chart, arm = INERTIA_PARAMETRISATIONS[coordinates], setup.model.body("arm").id
     rng = np.random.default_rng(0)
     theta = setup.parameters.guess + 0.05 * setup.parameters.scale * rng.standard_normal(10)
     wanted, found = chart.back(theta), inertial(setup.model_at(theta), arm)
@@ -84,7 +84,7 @@ def test_priors_of_an_inertial_are_relative_to_the_size_of_each(tmp_path: Path) 
         "d": {"target": "joint/ball:damping"},
     }
     parameters = named(body_setup(tmp_path, parameters=table))
-    for name in CHARTS["barycentric"].names:
+    for name in INERTIA_PARAMETRISATIONS["barycentric"].names:
         p = parameters[f"arm.{name}"]
         assert p.prior == pytest.approx(0.1 * p.scale)
         assert p.nuisance
@@ -244,7 +244,7 @@ def test_places_are_compared_with_the_size_of_the_body(tmp_path: Path) -> None:
     setup = body_setup(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]"}})
     radius = inertial(setup.model, setup.model.body("arm").id).radius
     assert setup.parameters.guess.tolist() == [0.0]
-    assert setup.parameters.scale.tolist() == setup.parameters.step.tolist() == [radius]
+    assert setup.parameters.scale.tolist() == setup.parameters.magnitude.tolist() == [radius]
     with pytest.raises(ExperimentError, match=r"parameters\.y\.scale"):
         body_setup(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]", "scale": "guess"}})
     turned = {"y": {"targets": [{"path": "body/arm:ipos[2]", "scale": -2.0, "offset": 1.0}]}}
@@ -279,7 +279,7 @@ def test_starts_of_all_components(tmp_path: Path) -> None:
     assert all(p.nuisance and p.prior == 0.02 and p.guess == 0.0 for p in found[1:])
     assert [p.unit for p in found[1:8]] == ["m", "m", "m", "rad", "rad", "rad", "rad"]
     assert setup.parameters.interest.tolist() == [0]
-    np.testing.assert_array_equal(setup.parameters.start(18)[:, 1:], np.eye(18))
+    np.testing.assert_array_equal(setup.parameters.initial_state_derivative(18)[:, 1:], np.eye(18))
     np.testing.assert_allclose(np.diag(setup.parameters.prior_information)[1:], 2500.0)
 
 
@@ -313,7 +313,7 @@ def test_biases_of_all_outputs(tmp_path: Path) -> None:
         "bias acc[1]",
         "bias acc[2]",
     )
-    np.testing.assert_array_equal(setup.parameters.bias(4)[:, 3:], np.eye(4))
+    np.testing.assert_array_equal(setup.parameters.bias_derivative(4)[:, 3:], np.eye(4))
     y, _ = setup.plant.measure(np.array([setup.theta, setup.theta + np.eye(7)[4]]), setup.control)
     np.testing.assert_allclose(
         y[1] - y[0], np.broadcast_to([0.0, 1.0, 0.0, 0.0], (51, 4)), rtol=0, atol=1e-12
@@ -387,7 +387,7 @@ def test_activations_are_starts_by_path(tmp_path: Path) -> None:
     setup = filtered_setup(
         tmp_path, parameters={"a": {"target": "initial/servo:act", "scale": 0.5}}
     )
-    assert setup.parameters.start(3).tolist() == [[0.0], [0.0], [1.0]]
+    assert setup.parameters.initial_state_derivative(3).tolist() == [[0.0], [0.0], [1.0]]
     assert setup.plant.start(np.array([0.3]))[2] == pytest.approx(0.5)
 
 
@@ -407,9 +407,9 @@ def test_a_function_edits_what_no_path_can(tmp_path: Path) -> None:
         tmp_path, parameters={"l": {"function": lengthen, "guess": 0.7, "unit": "m"}}
     )
     second = cart_setup(tmp_path, parameters={"l": {"targets": targets, "guess": 0.7}})
-    assert first.parameters.compiled.tolist() == [True] and second.parameters.compiled.tolist() == [
-        False
-    ]
+    assert first.parameters.needs_compile.tolist() == [
+        True
+    ] and second.parameters.needs_compile.tolist() == [False]
     np.testing.assert_allclose(first.initial.state, second.initial.state, rtol=0, atol=1e-12)
     found = [s.plant.sensitivity(s.theta, s.initial).G for s in (first, second)]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-7, atol=1e-7)

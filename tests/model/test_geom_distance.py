@@ -1,4 +1,4 @@
-"""Clearance: which geoms count, distances against MuJoCo and by hand, slopes against differences, nothing near is lost."""
+"""Geom distances: which geoms count, distances against MuJoCo and by hand, slopes against differences, nothing near is lost."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.model import geom_distance as clearance
-from mjfim.model.geom_distance import Clearance, Distances, pairs
+from mjfim.model.geom_distance import GeomDistances, SignedDistances, find_geom_pairs
 from tests.support.numerics import Array, directional_check
 
 ROCK = " ".join(f"{v:.3f}" for v in np.random.default_rng(5).normal(scale=0.1, size=60))
@@ -86,7 +86,7 @@ def scattered(model: mujoco.MjModel, count: int, spread: float, seed: int = 0) -
     )
 
 
-def asked(model: mujoco.MjModel, chosen: Clearance, qpos: Array, limit: float) -> Array:
+def asked(model: mujoco.MjModel, chosen: GeomDistances, qpos: Array, limit: float) -> Array:
     """Distances by `mj_geomDistance` for every pair at every configuration, nothing left out: (n, p)."""
     data, out = mujoco.MjData(model), np.empty((len(qpos), len(chosen.pairs)))
     for k, now in enumerate(qpos):
@@ -99,13 +99,16 @@ def asked(model: mujoco.MjModel, chosen: Clearance, qpos: Array, limit: float) -
     return out
 
 
-def between(model: mujoco.MjModel, reach: float, grouped: bool = False) -> Clearance:
-    """Clearance of all pairs of a model."""
-    return Clearance(model, pairs(model, ()), reach, grouped)
+def between(model: mujoco.MjModel, reach: float, grouped: bool = False) -> GeomDistances:
+    """Distances of all pairs of a model."""
+    return GeomDistances(model, find_geom_pairs(model, ()), reach, grouped)
 
 
 def slope_errors(
-    model: mujoco.MjModel, measured: Callable[[Array], Distances], qpos: Array, h: float = 2e-4
+    model: mujoco.MjModel,
+    measured: Callable[[Array], SignedDistances],
+    qpos: Array,
+    h: float = 2e-4,
 ) -> Array:
     """Largest error of slopes of the first column against differences along every dof, of each configuration: (n,)."""
     slope = measured(qpos).slope
@@ -152,7 +155,7 @@ def test_pairs_are_those_that_mujoco_lets_collide(flag: str) -> None:
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
     contacts = {frozenset(map(int, geoms)) for geoms in data.contact.geom}
-    found = pairs(model, ())
+    found = find_geom_pairs(model, ())
     assert {frozenset((p.first, p.second)) for p in found} == contacts
     assert len(found) == len(contacts)
     names = {p.name for p in found}
@@ -167,7 +170,7 @@ def test_pairs_are_found_where_contacts_are_off() -> None:
         mujoco.MjModel.from_xml_string(CROWD.format(flag=f'contact="{x}"'))
         for x in ("disable", "enable")
     )
-    assert pairs(off, ()) == pairs(on, ())
+    assert find_geom_pairs(off, ()) == find_geom_pairs(on, ())
 
 
 def test_what_no_joint_moves_has_no_pairs_with_itself() -> None:
@@ -180,15 +183,18 @@ def test_what_no_joint_moves_has_no_pairs_with_itself() -> None:
         </worldbody></mujoco>
         """
     )
-    assert [p.name for p in pairs(model, ())] == ["r - wall", "r - m geom 1"]
+    assert [p.name for p in find_geom_pairs(model, ())] == ["r - wall", "r - m geom 1"]
 
 
 def test_ignored_bodies_are_left_out() -> None:
     """All geoms of both, whichever comes first; the world has its name."""
     model = mujoco.MjModel.from_xml_string(ARMS)
-    every = {p.name for p in pairs(model, ())}
+    every = {p.name for p in find_geom_pairs(model, ())}
     left = {
-        p.name for p in pairs(model, {frozenset(("world", "wrist")), frozenset(("wrist", "hand"))})
+        p.name
+        for p in find_geom_pairs(
+            model, {frozenset(("world", "wrist")), frozenset(("wrist", "hand"))}
+        )
     }
     assert every - left == {
         "wrist geom 3 - floor",
@@ -212,7 +218,7 @@ def test_ignored_bodies_are_left_out() -> None:
 def test_misuse_of_ignored(ignored: tuple[str, ...], message: str) -> None:
     """Fault and what would be right."""
     with pytest.raises(ExperimentError, match=message):
-        pairs(mujoco.MjModel.from_xml_string(ARMS), {frozenset(ignored)})
+        find_geom_pairs(mujoco.MjModel.from_xml_string(ARMS), {frozenset(ignored)})
 
 
 def test_height_fields_are_refused_unless_ignored() -> None:
@@ -227,15 +233,15 @@ def test_height_fields_are_refused_unless_ignored() -> None:
         ExperimentError,
         match=r"hills is a height field, .* ignore the bodies 'b' and 'world', or use",
     ):
-        pairs(model, ())
-    assert pairs(model, {frozenset(("b", "world"))}) == ()
+        find_geom_pairs(model, ())
+    assert find_geom_pairs(model, {frozenset(("b", "world"))}) == ()
 
 
 def test_misuse_of_clearance() -> None:
     """Nothing to keep apart is no clearance."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     with pytest.raises(ExperimentError, match="no two geoms can come near each other"):
-        Clearance(model, (), 0.1)
+        GeomDistances(model, (), 0.1)
     with pytest.raises(ExperimentError, match="reach 0 m; needs a positive, finite distance"):
         between(model, 0.0)
     with pytest.raises(ExperimentError, match="reach inf m"):
@@ -380,7 +386,7 @@ def test_the_check_of_slopes_can_fail() -> None:
 
     def wrong(change: Callable[[Array], Array]) -> float:
         return slope_errors(
-            model, lambda q: Distances(chosen(q, True).d, change(chosen(q, True).slope)), qpos
+            model, lambda q: SignedDistances(chosen(q, True).d, change(chosen(q, True).slope)), qpos
         ).min()
 
     assert wrong(lambda s: s) < 1e-6
@@ -471,8 +477,8 @@ def test_columns_are_pairs_of_bodies() -> None:
 def test_nearest_is_the_smallest_of_all(spread: float) -> None:
     """Near and farther than reach, its row and geoms with it."""
     model = mujoco.MjModel.from_xml_string(ARMS)
-    stone = [p for p in pairs(model, ()) if "stone" in p.name and "floor" not in p.name]
-    chosen, qpos = Clearance(model, stone, 0.01), scattered(model, 40, spread)
+    stone = [p for p in find_geom_pairs(model, ()) if "stone" in p.name and "floor" not in p.name]
+    chosen, qpos = GeomDistances(model, stone, 0.01), scattered(model, 40, spread)
     if spread > 1.0:
         qpos = qpos[(chosen(qpos, False).d == 0.01).all(axis=1)]
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-10, 200

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mjfim.model.inertia import (
-    CHARTS,
+    INERTIA_PARAMETRISATIONS,
     PAIRS,
     Inertial,
     barycentric,
@@ -90,17 +90,19 @@ def dynamics(body: Inertial) -> Array:
     return np.concatenate([M.ravel(), data.qfrc_bias, data.energy])
 
 
-@pytest.mark.parametrize("chart", CHARTS)
+@pytest.mark.parametrize("chart", INERTIA_PARAMETRISATIONS)
 def test_there_and_back(chart: str) -> None:
     """Ten numbers are the body, and the body is ten numbers."""
     for body in solids(20, 0):
-        v = CHARTS[chart].of(body)
-        again = CHARTS[chart].back(v)
+        v = INERTIA_PARAMETRISATIONS[chart].of(body)
+        again = INERTIA_PARAMETRISATIONS[chart].back(v)
         assert v.shape == (10,)
         assert again.mass == pytest.approx(body.mass, rel=1e-12)
         np.testing.assert_allclose(again.com, body.com, rtol=1e-11, atol=1e-13)
         np.testing.assert_allclose(again.inertia, body.inertia, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(CHARTS[chart].of(again), v, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(
+            INERTIA_PARAMETRISATIONS[chart].of(again), v, rtol=1e-9, atol=1e-11
+        )
 
 
 def test_principal_axes_are_mujocos() -> None:
@@ -141,7 +143,7 @@ def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
     first, second = solids(2, 3)
     ends = dynamics(first), dynamics(second)
     errors = {}
-    for name, chart in CHARTS.items():
+    for name, chart in INERTIA_PARAMETRISATIONS.items():
         mixed = dynamics(chart.back(0.4 * chart.of(first) + 0.6 * chart.of(second)))
         errors[name] = np.abs(mixed - (0.4 * ends[0] + 0.6 * ends[1])).max() / np.abs(mixed).max()
     assert errors["barycentric"] < 1e-12
@@ -167,7 +169,7 @@ def test_log_cholesky_is_physical_for_every_vector() -> None:
         assert body.mass > 0.0 and moments[2] > 0.0 and moments[1] + moments[2] > moments[0]
         assert compiled(body).body("tip").mass[0] == pytest.approx(body.mass)
         try:
-            compiled(CHARTS["central"].back(np.append(abs(v[0]), v[1:])))
+            compiled(INERTIA_PARAMETRISATIONS["central"].back(np.append(abs(v[0]), v[1:])))
         except ValueError:
             failed += 1
     assert failed > 90
@@ -211,7 +213,7 @@ def test_points_rods_and_plates_have_no_log_cholesky(moments: tuple[float, ...])
     with pytest.raises(ValueError, match=r"a point, a rod or a plate"):
         logcholesky(body)
     for chart in ("central", "barycentric"):
-        assert np.isfinite(CHARTS[chart].of(body)).all()
+        assert np.isfinite(INERTIA_PARAMETRISATIONS[chart].of(body)).all()
     thick = Inertial.principal(
         2.0, np.array([0.1, 0.2, 0.3]), np.array([0.3 * (1 - 1e-6), 0.2, 0.1]), turned
     )
@@ -226,7 +228,7 @@ def test_magnitudes_follow_the_units() -> None:
     kilo, centi = 1000.0, 100.0
     other = Inertial(kilo * body.mass, centi * body.com, kilo * centi**2 * body.inertia)
     factor = {"kg": kilo, "kg m": kilo * centi, "kg m²": kilo * centi**2, "m": centi, "": 1.0}
-    for chart in CHARTS.values():
+    for chart in INERTIA_PARAMETRISATIONS.values():
         assert len(chart.names) == len(set(chart.names)) == len(chart.units) == 10
         np.testing.assert_allclose(
             chart.size(other), chart.size(body) * [factor[u] for u in chart.units], rtol=1e-12

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, MjfimError
-from mjfim.model.inertia import CHARTS
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.loading import decoration
 from mjfim.model.parameters import Parameter, ParameterSet, Target, moved_bodies
 from mjfim.model.paths import KINDS, PATH, fields_of, names_of, resolve
-from mjfim.model.targets import RotationSlot, Slot, SpecSlot, inertial
+from mjfim.model.targets import ModelField, RotationField, SpecField, inertial
 from mjfim.model.variants import Source
 from mjfim.output.mjcf.write import write_identified, write_spec
 from tests.support.numerics import Loop, make_setup
@@ -362,16 +362,16 @@ def test_charts_and_rotations_written_in_place_equal_a_compile_of_what_they_mean
     parameters = [one(path)]
     spec, base = compiled(xml, parameters)
     resolved = ParameterSet.build(parameters, base)
-    slot = resolved.slots[0][0]
+    field = resolved.fields[0][0]
     value, change = (
-        slot.read(base),
-        0.01 * slot.size(base) * (-1.0 if "firstmoment" in path else 1.0),
+        field.read(base),
+        0.01 * field.size(base) * (-1.0 if "firstmoment" in path else 1.0),
     )
     other = spec.copy()
     written_by_hand(other, base, path, change)
     own, again = resolved.model(base, np.array([value + change])), other.compile()
     written = (
-        CHARTS[slot.chart].of(inertial(own, slot.body))[slot.component]
+        INERTIA_PARAMETRISATIONS[field.chart].of(inertial(own, field.body))[field.component]
         if "rot" not in path
         else value + change
     )
@@ -427,10 +427,10 @@ def test_charts_of_simple_bodies_are_written_with_the_right_dynamics() -> None:
     ):
         spec, base = compiled(SIMPLE, [one(path)])
         resolved = ParameterSet.build([one(path)], base)
-        slot, other = resolved.slots[0][0], spec.copy()
-        change = 0.05 * slot.size(base)
+        field, other = resolved.fields[0][0], spec.copy()
+        change = 0.05 * field.size(base)
         written_by_hand(other, base, path, change)
-        own = resolved.model(base, np.array([slot.read(base) + change]))
+        own = resolved.model(base, np.array([field.read(base) + change]))
         np.testing.assert_allclose(
             rollout(own, 100), rollout(other.compile(), 100), rtol=1e-9, atol=1e-9
         )
@@ -447,8 +447,8 @@ def test_geoms_that_matter_are_compiled_anew(
     parameters = [one(path)]
     spec, base = compiled(xml, parameters)
     resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
-    assert isinstance(resolved.slots[0][0], SpecSlot)
-    assert resolved.compiled.tolist() == resolved.in_model.tolist() == [True]
+    assert isinstance(resolved.fields[0][0], SpecField)
+    assert resolved.needs_compile.tolist() == resolved.changes_model.tolist() == [True]
     source = Source(
         spec, Path("model.xml"), [b.name for b in spec.bodies[1:]], sensors=True, friction=True
     )
@@ -510,9 +510,9 @@ def test_decoration_is_what_neither_collides_nor_weighs() -> None:
         ),
     ):
         spec, base = compiled(xml, [])
-        slot = resolve(base, "geom/skin:size[2]", decoration=decoration(spec, base))
-        assert isinstance(slot, Slot if drawn else SpecSlot)
-        assert slot.read(base) == 0.3
+        field = resolve(base, "geom/skin:size[2]", decoration=decoration(spec, base))
+        assert isinstance(field, ModelField if drawn else SpecField)
+        assert field.read(base) == 0.3
     spec, base = compiled(ARM, [])
     assert decoration(spec, base) == frozenset()
     spec, base = compiled(
@@ -581,7 +581,7 @@ def test_a_mesh_moves_from_where_it_compiles_to() -> None:
     spec, base = compiled(MESHED, parameters)
     source = Source(spec, Path("model.xml"), ["a", "b"], sensors=True, friction=True)
     resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
-    now = resolved.slots[0][0].read(base)
+    now = resolved.fields[0][0].read(base)
     assert abs(now - 0.2) > 0.01, "no offset: a weak test"
     np.testing.assert_allclose(
         resolved.model(source, np.array([now])).geom_pos, base.geom_pos, rtol=0, atol=1e-14
@@ -634,9 +634,9 @@ def test_servo_gains_mean_what_mjcf_means_by_them(kind: str, written: str, path:
         compiled(ARM.replace(servo, written.format(gain)), []) for gain in ("10", "7.25")
     )
     resolved = ParameterSet.build([one(path)], base)
-    assert resolved.slots[0][0].read(base) == 10.0
+    assert resolved.fields[0][0].read(base) == 10.0
     own = resolved.model(base, np.array([7.25]))
-    assert resolved.slots[0][0].read(own) == 7.25
+    assert resolved.fields[0][0].read(own) == 7.25
     np.testing.assert_array_equal(own.actuator_gainprm, again.actuator_gainprm)
     np.testing.assert_array_equal(own.actuator_biasprm, again.actuator_biasprm)
     np.testing.assert_array_equal(rollout(own), rollout(again))
@@ -683,7 +683,7 @@ def test_servos_with_several_controls_have_gains_too(written: str, path: str) ->
         mujoco.MjModel.from_xml_string(BALL.format(written.format(gain))) for gain in ("2", "3.5")
     )
     resolved = ParameterSet.build([one(path)], base)
-    assert resolved.slots[0][0].read(base) == 2.0
+    assert resolved.fields[0][0].read(base) == 2.0
     mine, theirs = arrays(resolved.model(base, np.array([3.5]))), arrays(again)
     assert [n for n in theirs if not np.array_equal(mine[n], theirs[n])] == []
 
@@ -691,7 +691,7 @@ def test_servos_with_several_controls_have_gains_too(written: str, path: str) ->
 def test_gears_are_counted_by_force_outputs() -> None:
     base = mujoco.MjModel.from_xml_string(BALL.format('<orientation name="s" joint="j" kp="2"/>'))
     resolved = ParameterSet.build([one("actuator/m:gear")], base)
-    assert resolved.slots[0][0].read(base) == 1.5
+    assert resolved.fields[0][0].read(base) == 1.5
     np.testing.assert_array_equal(
         resolved.model(base, np.array([7.0])).actuator_gear[:, 0], [1.0, 1.0, 1.0, 7.0]
     )
@@ -725,7 +725,7 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
     np.testing.assert_allclose(
         rollout(own, 100), rollout(spec.compile(), 100), rtol=1e-9, atol=1e-9
     )
-    assert all(isinstance(s, RotationSlot) for row in resolved.slots for s in row)
+    assert all(isinstance(s, RotationField) for row in resolved.fields for s in row)
     again = resolved.model(base, np.zeros(3))  # nothing of the first value is left
     np.testing.assert_allclose(rollout(again, 100), rollout(base, 100), rtol=1e-9, atol=1e-9)
 
@@ -766,10 +766,10 @@ def test_coordinates_of_one_body_that_do_not_go_together_are_refused(
 def test_mass_beside_first_moments_keeps_them() -> None:
     """The barycentric mass: m c and the inertia about the origin stay while the mass changes; alone, the centre stays."""
     _, base = compiled(SOLID, [one("body/a:mass")])
-    before = CHARTS["barycentric"].of(inertial(base, base.body("a").id))
+    before = INERTIA_PARAMETRISATIONS["barycentric"].of(inertial(base, base.body("a").id))
     parameters = [one("body/a:mass"), Parameter("h", (Target("body/a:firstmoment[2]"),), 1.0)]
     own = ParameterSet.build(parameters, base).model(base, np.array([1.5, before[3] + 0.02]))
-    after = CHARTS["barycentric"].of(inertial(own, own.body("a").id))
+    after = INERTIA_PARAMETRISATIONS["barycentric"].of(inertial(own, own.body("a").id))
     wanted = np.array(before)
     wanted[0], wanted[3] = 1.5, before[3] + 0.02
     np.testing.assert_allclose(after, wanted, rtol=1e-12, atol=1e-15)
@@ -801,20 +801,22 @@ def test_outputs_and_starts_are_no_part_of_the_model() -> None:
     resolved = ParameterSet.build(parameters, base, outputs=("a", "b"))
     start = np.zeros((4, 5))
     start[3, 0], start[0, 1] = 2.0, -1.0
-    np.testing.assert_array_equal(resolved.start(4), start)
-    np.testing.assert_array_equal(resolved.bias(2), [[0.0] * 5, [0.0, 0.0, 0.5, 0.0, 0.0]])
-    np.testing.assert_array_equal(resolved.delay, [0.0, 0.0, 0.0, 3.0, 0.0])
-    assert resolved.in_model.tolist() == [False] * 4 + [True]
-    assert resolved.moving.tolist() == [True, True, False, False, True]
-    assert not resolved.compiled.any()
+    np.testing.assert_array_equal(resolved.initial_state_derivative(4), start)
+    np.testing.assert_array_equal(
+        resolved.bias_derivative(2), [[0.0] * 5, [0.0, 0.0, 0.5, 0.0, 0.0]]
+    )
+    np.testing.assert_array_equal(resolved.delay_derivative, [0.0, 0.0, 0.0, 3.0, 0.0])
+    assert resolved.changes_model.tolist() == [False] * 4 + [True]
+    assert resolved.changes_motion.tolist() == [True, True, False, False, True]
+    assert not resolved.needs_compile.any()
     own = resolved.model(base, np.array([9.0, 9.0, 9.0, 9.0, base.body("a").mass[0]]))
     np.testing.assert_array_equal(rollout(own, 20), rollout(base, 20))
 
 
 def test_comparison_would_notice_a_write_without_mj_setConst() -> None:
     _, base = compiled(ARM, [one("body/b:mass")])
-    own, slot = copy.copy(base), resolve(base, "body/b:mass")
-    slot.write(own, 2.0)
+    own, field = copy.copy(base), resolve(base, "body/b:mass")
+    field.write(own, 2.0)
     _, _, again = both_ways(ARM, "body/b:mass", 2.0)
     assert not np.array_equal(own.dof_M0, again.dof_M0)
 
@@ -930,8 +932,8 @@ def test_an_index_left_out_means_zero() -> None:
 
 def test_names_may_hold_slashes_and_spaces() -> None:
     _, base = compiled(ARM.replace('"b"', '"left arm/b"'), [])
-    slot = resolve(base, "body/left arm/b:pos[2]")
-    assert slot.read(base) == 0.5
+    field = resolve(base, "body/left arm/b:pos[2]")
+    assert field.read(base) == 0.5
     assert moved_bodies([one("body/left arm/b:pos[2]")]) == {"left arm/b"}
 
 
@@ -1029,7 +1031,7 @@ def test_difference_steps_and_priors_follow_guess_and_scale() -> None:
         "zero", (Target("joint/j:damping"),), guess=0.0, scale=0.2, true=0.4, bounds=(0.0, 1.0)
     )
     resolved = ParameterSet.build([large, zero], base)
-    np.testing.assert_array_equal(resolved.step, [3.0, 0.2])
+    np.testing.assert_array_equal(resolved.magnitude, [3.0, 0.2])
     np.testing.assert_allclose(resolved.prior_information, np.diag([100.0, 0.0]), rtol=1e-14)
     np.testing.assert_array_equal(resolved.true, [-3.0, 0.4])
     assert (resolved.names, resolved.lower[0], resolved.upper[1]) == (

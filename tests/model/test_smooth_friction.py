@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.model.smooth_friction import is_dry, soften, speeds_of
+from mjfim.model.smooth_friction import has_dry_friction, smooth_dry_friction, smoothing_speeds_of
 
 SLIDER = """
 <mujoco>
@@ -39,7 +39,7 @@ def friction(model: Any, speed: float, push: float = 0.0) -> list[float]:
 @pytest.mark.parametrize("push", [0.0, 3.0])
 def test_softened_friction_is_viscous_up_to_its_speed_and_constant_beyond(push: float) -> None:
     model = model_of(0.5, 0.8)
-    soften(model, (0.05, 0.0, 0.1))
+    smooth_dry_friction(model, (0.05, 0.0, 0.1))
     for speed in (-1.0, -0.2, -0.05, -0.03, 0.0, 0.01, 0.049, 0.07, 3.0):
         found = friction(model, speed, push)
         wanted = [-0.5 * np.clip(speed / 0.05, -1.0, 1.0), -0.8 * np.clip(speed / 0.1, -1.0, 1.0)]
@@ -52,14 +52,14 @@ def test_it_scales_with_the_frictionloss_where_that_changes_the_law_is_written_a
     for loss in (0.5, 0.6):
         model = model_of(0.5)
         model.dof_frictionloss[0] = loss
-        soften(model, (0.05, 0.0, 0.0))
+        smooth_dry_friction(model, (0.05, 0.0, 0.0))
         forces.append(friction(model, 0.02)[0])
     assert (forces[1] - forces[0]) / 0.1 == pytest.approx(-0.4, rel=0.02)
 
 
 def test_joints_without_friction_or_speed_stay_as_they_are() -> None:
     model, plain = model_of(0.5), model_of(0.5)
-    soften(model, (0.0, 0.05, 0.05))
+    smooth_dry_friction(model, (0.0, 0.05, 0.05))
     np.testing.assert_array_equal(model.dof_solref, plain.dof_solref)
     np.testing.assert_array_equal(model.tendon_solref_fri, plain.tendon_solref_fri)
     assert friction(model, 0.3) == friction(plain, 0.3)
@@ -67,15 +67,17 @@ def test_joints_without_friction_or_speed_stay_as_they_are() -> None:
 
 def test_speeds_are_a_share_of_the_fastest_but_no_less_than_where_the_engine_sticks() -> None:
     model = model_of(0.5, 0.8)
-    speeds = speeds_of(model, np.array([10.0, 0.0]))
+    speeds = smoothing_speeds_of(model, np.array([10.0, 0.0]))
     assert speeds[0] == pytest.approx(0.2)
     assert speeds[1] == 0.0
-    slow = speeds_of(model, np.zeros(2))
+    slow = smoothing_speeds_of(model, np.zeros(2))
     damping = 2.0 / (0.95 * 0.02)  # of the default solref and solimp
     assert slow[0] == pytest.approx(0.5 / 0.4 / damping, rel=1e-3)
     assert slow[2] == pytest.approx(0.8 / 2.0 / damping, rel=1e-3)
     model.dof_solref[0] = [-100.0, -50.0]  # given as stiffness and damping
-    assert speeds_of(model, np.zeros(2))[0] == pytest.approx(0.5 / 0.4 / (50.0 / 0.95), rel=1e-3)
+    assert smoothing_speeds_of(model, np.zeros(2))[0] == pytest.approx(
+        0.5 / 0.4 / (50.0 / 0.95), rel=1e-3
+    )
     data, sticks = mujoco.MjData(model_of(0.5)), model_of(0.5)
     data.qvel[0] = 0.5 * slow[0]
     mujoco.mj_forward(sticks, data)
@@ -83,6 +85,6 @@ def test_speeds_are_a_share_of_the_fastest_but_no_less_than_where_the_engine_sti
 
 
 def test_what_is_dry() -> None:
-    assert is_dry(model_of(0.1))
-    assert is_dry(model_of(0.0, 0.1))
-    assert not is_dry(model_of(0.0))
+    assert has_dry_friction(model_of(0.1))
+    assert has_dry_friction(model_of(0.0, 0.1))
+    assert not has_dry_friction(model_of(0.0))

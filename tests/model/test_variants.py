@@ -13,7 +13,7 @@ import pytest
 import mjfim
 from mjfim.arrays import Array
 from mjfim.experiment.system import Setup
-from mjfim.model.smooth_friction import SLOW
+from mjfim.model.smooth_friction import SMOOTHING_SPEED_FRACTION
 from mjfim.model.variants import FREE, STATED
 from mjfim.plant.plant import DRAFT
 from mjfim.plant.plant import DRY as DRY_DIFFERENCES
@@ -73,8 +73,8 @@ def test_only_dry_plants_have_speeds_at_which_friction_turns_viscous(tmp_path: P
     }
     setup = arm(tmp_path / "a", limits=limits).free()
     fastest = np.abs(setup.initial.qvel[:, 0]).max()
-    assert setup.level.soft[1] == pytest.approx(SLOW * 20.0)
-    assert setup.level.soft[0] >= SLOW * fastest
+    assert setup.level.soft[1] == pytest.approx(SMOOTHING_SPEED_FRACTION * 20.0)
+    assert setup.level.soft[0] >= SMOOTHING_SPEED_FRACTION * fastest
     assert setup.plant.draft is DRY_DIFFERENCES
     assert not setup.plant.source.soft
     assert setup.plant.smooth.source.soft

@@ -154,7 +154,7 @@ def test_sysid_gets_the_same_model_data_and_weights(
     """Whitened residuals away from the guess, and what the MjSpec compiles to there."""
     setup, recording = CASES[case](tmp_path)
     exported, p = script.export(setup, [recording]), setup.parameters
-    theta = np.clip(p.guess + 0.02 * p.step * np.cos(np.arange(len(p))), p.lower, p.upper)
+    theta = np.clip(p.guess + 0.02 * p.magnitude * np.cos(np.arange(len(p))), p.lower, p.upper)
     moved = exported.parameters.copy()
     moved.update_from_vector(theta)
     before = exported.sequences.spec.to_xml()

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.experiment.system import Setup
 from mjfim.model.loading import compile_spec, load_spec, unconstrained
-from mjfim.model.mujoco_log import quiet
+from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.variants import Source
 from mjfim.optimize.lq import LinearRecursion, TangentCurve, regulator
 from mjfim.output.mjcf.write import write_spec
@@ -474,7 +474,7 @@ def test_linearising_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_p
 def test_quiet_blocks_may_overlap_in_threads() -> None:
     """Quiet until the last one is left, and as it was after that."""
     before = mujoco.MjLogConfig.get()
-    first, second = quiet(), quiet()
+    first, second = silence_mujoco_log(), silence_mujoco_log()
     for block in (first, second):
         block.__enter__()
     for block in (first, second):
@@ -734,7 +734,7 @@ def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
 def test_faint_parameters_get_longer_differences_and_others_keep_theirs(tmp_path) -> None:
     faint = {"tiny": {"target": "body/bob:inertia[1]"}, **CART_PARAMETERS}
     setup = cart_setup(tmp_path, parameters=faint)
-    relative = setup.plant.span / setup.parameters.step
+    relative = setup.plant.span / setup.parameters.magnitude
     assert relative[0] > 5.0
     assert (relative >= 1.0).all() and (relative <= 100.0).all()
     np.testing.assert_array_equal(relative[1:3], 1.0)
@@ -755,13 +755,13 @@ def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> Non
     )
     assert relative_error(states, L.E[picked]) < 1e-6
     sensors = found[3 * nx :].reshape(3, ny, p)
-    H = L.H[picked] * setup.parameters.step
+    H = L.H[picked] * setup.parameters.magnitude
     size = np.abs(H).max(axis=(0, 2))
     moving = size > 1e-6
     assert moving.sum() >= 3
     assert (
         relative_error(
-            sensors[:, moving] * setup.parameters.step,
+            sensors[:, moving] * setup.parameters.magnitude,
             (H / np.where(moving, size, 1.0)[:, None])[:, moving],
         )
         < 1e-5

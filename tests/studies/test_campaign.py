@@ -141,11 +141,11 @@ def test_a_whole_inertia_moves_where_the_recordings_show_it(tmp_path: Path) -> N
     }
     base = cart_setup(tmp_path, parameters=tables)
     p = base.parameters
-    theta = p.guess + 0.01 * p.step
+    theta = p.guess + 0.01 * p.magnitude
     estimate = mjfim.identify(
         cart_setup(tmp_path), [mjfim.simulate(cart_setup(tmp_path), cart_setup(tmp_path).initial)]
     )
-    shown = replace(estimate, data=np.diag(1e4 / p.step**2), std=0.01 * p.step)
+    shown = replace(estimate, data=np.diag(1e4 / p.magnitude**2), std=0.01 * p.magnitude)
     moved = Setup(restated(base, theta, shown))
     assert moved.parameters.names == p.names
     np.testing.assert_allclose(moved.theta, theta)

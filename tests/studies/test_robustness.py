@@ -24,7 +24,7 @@ from mjfim.experiment.system import Setup
 from mjfim.model.coordinates import tangent_names
 from mjfim.optimize.lq import regulator
 from mjfim.output import archive
-from mjfim.output.playback import design_columns, playback_of, reference_columns
+from mjfim.output.playback import design_columns, reference_columns, simulate_playback
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.playback import Playback
 from tests.support.numerics import Array, body_setup, cart_setup, filtered_setup
@@ -56,7 +56,7 @@ def table(path: Path) -> dict[str, Array]:
 
 def written(setup: Setup, folder: Path) -> tuple[Path, Playback]:
     """design.csv of the initial trajectory, with gains."""
-    played = playback_of(setup, setup.initial, gains(setup))
+    played = simulate_playback(setup, setup.initial, gains(setup))
     archive.write_table(folder / "design.csv", design_columns(played, setup))
     return folder / "design.csv", played
 
@@ -95,7 +95,7 @@ def test_rows_at_samples_are_the_design(kind: str, tmp_path: Path) -> None:
     """However fast the controller, every sample of the design stands there to the last bit."""
     setup = BUILD[kind](tmp_path, playback_rate=FINE[kind])
     stride = round(FINE[kind] / setup.experiment.rate)
-    played = playback_of(setup, setup.initial, gains(setup))
+    played = simulate_playback(setup, setup.initial, gains(setup))
     assert stride > 1
     np.testing.assert_array_equal(played.state[::stride], setup.initial.state)
     for first in range(stride):
@@ -196,7 +196,7 @@ def test_gain_columns_name_what_they_act_on(tmp_path: Path) -> None:
 def test_reference_is_what_mujoco_says(kind: str, tmp_path: Path) -> None:
     """Accelerations and joint forces are those of mj_forward at each row, not differences; no field is empty."""
     setup = BUILD[kind](tmp_path, playback_rate=FINE[kind])
-    played = playback_of(setup, setup.initial, gains(setup))
+    played = simulate_playback(setup, setup.initial, gains(setup))
     archive.write_table(tmp_path / "reference.csv", reference_columns(played, setup))
     rows = table(tmp_path / "reference.csv")
     assert all(np.isfinite(values).all() for values in rows.values())

@@ -11,7 +11,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ModelError
 from mjfim.model.parameters import ParameterSet, Target
 from mjfim.model.paths import OBJECTS, PATH
-from mjfim.model.targets import AnySlot, InertiaSlot, RotationSlot, Slot, SpecSlot
+from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TargetField
 from mjfim.output.mjcf.actuators import ARRAYS, wordings
 from mjfim.output.mjcf.document import Sheet, close, digits
 from mjfim.output.mjcf.inertials import weigh
@@ -53,14 +53,14 @@ class Retouch:
         """Say theta: (p,), with which the wanted model was made. Called once."""
         weighed: dict[str, bool] = {}
         for parameter, slots, value in zip(
-            parameters.parameters, parameters.slots, theta, strict=True
+            parameters.parameters, parameters.fields, theta, strict=True
         ):
             if parameter.function is not None:
                 raise ModelError(f"parameters.{parameter.name} is a Python function of the MjSpec")
             for target, slot in zip(parameter.targets, slots, strict=True):
                 kind, name, field = _parts(target)
-                if isinstance(slot, InertiaSlot) or (kind == "body" and field in MASS):
-                    weighed[name] = weighed.get(name, False) or isinstance(slot, InertiaSlot)
+                if isinstance(slot, InertiaField) or (kind == "body" and field in MASS):
+                    weighed[name] = weighed.get(name, False) or isinstance(slot, InertiaField)
                 else:
                     self._target(
                         kind, name, field, slot, target.scale * float(value) + target.offset
@@ -94,12 +94,12 @@ class Retouch:
                         raise ModelError(
                             f"MuJoCo derives the {field} of a {kind} anew that has no name"
                         )
-                    self._number(kind, name, field, Slot(array, (int(row),), None))
+                    self._number(kind, name, field, ModelField(array, (int(row),), None))
                     stated.append(f"{kind} {name!r}")
         return list(dict.fromkeys(stated))
 
-    def _target(self, kind: str, name: str, field: str, slot: AnySlot, value: float) -> None:
-        if isinstance(slot, SpecSlot) and field in (
+    def _target(self, kind: str, name: str, field: str, slot: TargetField, value: float) -> None:
+        if isinstance(slot, SpecField) and field in (
             "mass",
             "density",
         ):  # the compiled model no longer has them
@@ -108,12 +108,12 @@ class Retouch:
                 self.sheet.numbers(self.sheet.place("geom", name), field, old, value)
         elif kind == "geom" and field in ("pos", "size"):
             self._extent(name)
-        elif isinstance(slot, RotationSlot):
+        elif isinstance(slot, RotationField):
             self._turn(kind, name)
-        elif isinstance(slot, Slot):
+        elif isinstance(slot, ModelField):
             self._number(kind, name, field, slot)
 
-    def _number(self, kind: str, name: str, field: str, slot: Slot) -> None:
+    def _number(self, kind: str, name: str, field: str, slot: ModelField) -> None:
         """A number that the MJCF has under the name of the path's field, or an actuator's gain."""
         if slot.array.removeprefix("actuator_") in ARRAYS:
             self._gain(name)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
-from mjfim.model.inertia import COLUMNS, ROWS
+from mjfim.model.inertia import INERTIA_COLUMNS, INERTIA_ROWS
 from mjfim.model.targets import inertial
 from mjfim.output.mjcf.document import ORIENTATIONS, Sheet, close, digits
 
@@ -57,7 +57,7 @@ def _turn(sheet: Sheet, own: int, b: int, old: Any, wanted: Any, charted: bool) 
     R = Rotation.from_quat(old.body_iquat[b], scalar_first=True).as_matrix()
     before, after = inertial(old, b).inertia, inertial(wanted, b).inertia
     inside, size = R.T @ after @ R, 10.0 * float(np.trace(before))
-    products = np.abs(inside[ROWS[3:], COLUMNS[3:]]).max()
+    products = np.abs(inside[INERTIA_ROWS[3:], INERTIA_COLUMNS[3:]]).max()
     full = sheet.attribute(own, "fullinertia") is not None
     if (charted and _watched(old, b)) or (full and not charted):
         words = _principal(wanted, b)
@@ -70,7 +70,9 @@ def _turn(sheet: Sheet, own: int, b: int, old: Any, wanted: Any, charted: bool) 
     elif not full and products <= SLIGHT * np.trace(after):
         sheet.numbers(own, "diaginertia", old.body_inertia[b], np.diag(inside), 3, size)
     else:
-        sheet.numbers(own, "fullinertia", before[ROWS, COLUMNS], _rounded(after), 6, size)
+        sheet.numbers(
+            own, "fullinertia", before[INERTIA_ROWS, INERTIA_COLUMNS], _rounded(after), 6, size
+        )
 
 
 def _matrix(inertia: Array) -> dict[str, str]:
@@ -83,7 +85,7 @@ def _rounded(inertia: Array) -> Array:
     These errors are about 1e-16 of the trace and depend on the processor's linear algebra kernel, so that 0.013 would be
     written as 0.01299999999999999 on some machines.
     """
-    entries = inertia[ROWS, COLUMNS]
+    entries = inertia[INERTIA_ROWS, INERTIA_COLUMNS]
     trace = float(np.trace(inertia))
     if trace <= 0.0:  # a body without inertia has nothing to round
         return np.asarray(entries)
