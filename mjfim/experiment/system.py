@@ -538,7 +538,7 @@ class Setup:
 
     def _calibrate(self) -> None:
         try:
-            self.plant.calibrate(self.theta, self.initial)
+            self.plant = self.plant.calibrated(self.theta, self.initial)
         except SimulationDiverged:
             return  # whoever needs the initial trajectory will say so
 

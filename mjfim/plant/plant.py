@@ -118,17 +118,32 @@ class Plant:
         self._models: dict[bytes, Any] = {}
         self._pool: list[Any] = []
 
-    def calibrate(self, theta: Array, trajectory: Trajectory) -> None:
-        """Lengthen the differences of parameters that hardly move this trajectory, so that they stand out of round-off."""
+    def calibrated(self, theta: Array, trajectory: Trajectory) -> Plant:
+        """A plant whose difference steps stand out of the round-off of a trajectory; engine and caches are shared.
+
+        Args:
+            theta: (p,) parameters of the trajectory [theta-unit].
+            trajectory: Trajectory on which the effect of every parameter is measured.
+
+        Returns:
+            The plant with longer difference steps for parameters that hardly move this trajectory, or the plant itself
+            if a perturbed rollout diverges.
+        """
         found = self.sensitivity(theta, trajectory)
         if found is None:
-            return
+            return self
+
         size = np.concatenate(
             [self.steps_of(trajectory)[: self.space.nx], np.ones(len(self.outputs))]
         )
         both = np.concatenate([found.psi, found.G], axis=1) * self.parameters.magnitude
         effect = (np.abs(both).max(axis=0) / size[:, None]).max(axis=0)
-        self._reach = np.clip(FAINT / np.maximum(effect, 1e-300), 1.0, LONGEST)
+
+        other = copy.copy(self)
+        other._reach = np.clip(FAINT / np.maximum(effect, 1e-300), 1.0, LONGEST)
+        if self.smooth is self:
+            other.smooth = other
+        return other
 
     @property
     def steps(self) -> int:
