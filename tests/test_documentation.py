@@ -1,0 +1,193 @@
+"""The code that README.md and docs/ show: Python, commands and experiment files run; links point to files.
+
+A block that cannot run here carries the comment `<!-- not run: reason -->` on a line above it. Python blocks stand
+alone. Commands of one file run one after another in one folder that holds a copy of models/. A TOML block with the key
+`model` is an experiment beside models/; the TOML blocks after it extend it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mjfim
+from tests.support.markdown import CodeBlock, code_blocks, linked_files
+from tests.support.paths import MODELS, ROOT
+
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+# Experiment that TOML blocks extend in a file that states no complete experiment before them.
+DEFAULT_EXPERIMENT = MODELS / "cart_pendulum.toml"
+
+
+def runnable(path: Path, language: str) -> list[CodeBlock]:
+    """Blocks of one language of a file that are not marked as `not run`."""
+    blocks = [block for block in code_blocks(path) if block.language == language]
+    return [block for block in blocks if not block.skip_reason]
+
+
+def commands(block: CodeBlock) -> list[tuple[str, int]]:
+    """Commands of a shell block with their exit codes, which a comment `exits with 1` behind a command states."""
+    lines = block.text.replace("\\\n", " ").splitlines()
+    found = []
+
+    for line in lines:
+        if line.strip() and not line.lstrip().startswith("#"):
+            stated = re.search(r"#.*\bexits with (\d+)", line)
+            found.append((line, int(stated[1]) if stated else 0))
+
+    return found
+
+
+def experiments(path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """The experiment of every TOML block of a file: the block alone, or the experiment before it extended by the block."""
+    whole = tomllib.loads(DEFAULT_EXPERIMENT.read_text(encoding="utf-8"))
+    found = []
+
+    for block in runnable(path, "toml"):
+        tables = tomllib.loads(block.text)
+        if "model" in tables:
+            whole = tables
+        found.append((block.name, merged(whole, tables)))
+
+    return found
+
+
+def merged(whole: dict[str, Any], tables: dict[str, Any]) -> dict[str, Any]:
+    """Tables of an experiment, their entries replaced by those of other tables."""
+    result = dict(whole)
+
+    for key, value in tables.items():
+        if isinstance(value, dict):
+            result[key] = {**whole.get(key, {}), **value}
+        else:
+            result[key] = value
+
+    return result
+
+
+def run(command: list[str], folder: Path, code: int = 0) -> None:
+    """Run a command with this package and this Python first; assert its exit code. Warnings are errors.
+
+    Args:
+        command: Program and arguments.
+        folder: Working directory; its subfolder `bin` receives `mjfim` and `python`.
+        code: Expected exit code.
+    """
+    programs = folder / "bin"
+    programs.mkdir(exist_ok=True)
+
+    for name, words in (("python", ""), ("mjfim", "-m mjfim ")):
+        script = programs / name
+        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" {words}"$@"\n', encoding="utf-8")
+        script.chmod(0o755)
+
+    environment = {
+        **os.environ,
+        "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+        "PYTHONWARNINGS": "error",
+    }
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, env=environment, check=False
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A folder with copies of models/ and scripts/, where results may be written."""
+    for name in ("models", "scripts"):
+        shutil.copytree(ROOT / name, tmp_path / name)
+    return tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "block",
+    [block for path in DOCUMENTS for block in runnable(path, "python")],
+    ids=lambda block: block.name,
+)
+def test_python_blocks_run(block: CodeBlock, checkout: Path) -> None:
+    run([sys.executable, "-c", block.text], checkout)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "path", [path for path in DOCUMENTS if runnable(path, "sh")], ids=lambda path: path.name
+)
+def test_shell_blocks_run(path: Path, checkout: Path) -> None:
+    for block in runnable(path, "sh"):
+        for line, code in commands(block):
+            run(["bash", "-c", line], checkout, code)
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [pytest.param(tables, id=name) for path in DOCUMENTS for name, tables in experiments(path)],
+)
+def test_toml_blocks_are_experiments(tables: dict[str, Any]) -> None:
+    """The experiment resolves on its model, and its initial trajectory has a finite cost."""
+    stated = mjfim.Experiment(**tables, directory=MODELS)
+    design = mjfim.design(stated.replace(descent={"max_iterations": 0, "starts": 1}))
+    assert design.initial.cost < float("inf")
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_links_point_to_files(path: Path) -> None:
+    assert [target for target in linked_files(path) if not target.exists()] == []
+
+
+# ---- the checks themselves, on small documents
+
+DOCUMENT = """# Title
+```python
+print(1)
+```
+
+<!-- not run: needs a robot -->
+
+```sh
+play
+```
+```sh
+mjfim check gone.toml \\
+  -o out  # exits with 2
+# a comment
+false
+```
+[file](gone.md), [page](https://example.org), [place](#title), ![picture](README.md#top)
+"""
+
+
+def test_blocks_are_found_with_their_lines_and_skipped_by_the_comment(tmp_path: Path) -> None:
+    path = tmp_path / "README.md"
+    path.write_text(DOCUMENT, encoding="utf-8")
+
+    found = [(block.language, block.line, block.skip_reason) for block in code_blocks(path)]
+    assert found == [("python", 2, ""), ("sh", 8, "needs a robot"), ("sh", 11, "")]
+
+    (block,) = runnable(path, "sh")
+    assert [code for _, code in commands(block)] == [2, 0]
+    assert [target.name for target in linked_files(path)] == ["gone.md", "README.md"]
+
+
+def test_a_block_that_is_not_closed_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "README.md"
+    path.write_text("text\n```python\nprint(1)\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="block of line 2 is not closed"):
+        code_blocks(path)
+
+
+def test_a_failing_block_is_noticed(tmp_path: Path) -> None:
+    run(["bash", "-c", "false"], tmp_path, code=1)
+    with pytest.raises(AssertionError, match="ZeroDivisionError"):
+        run(["bash", "-c", "python -c '1 / 0'"], tmp_path)
