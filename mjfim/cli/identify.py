@@ -22,11 +22,11 @@ from mjfim.cli.common import (
 )
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import Setup
-from mjfim.optimize.levenberg_marquardt import Progress as Progressed
 from mjfim.output import archive
 from mjfim.output import text as report
 from mjfim.output.folders import check_folder
 from mjfim.recordings.read import read_log
+from mjfim.records.events import FitEvent
 
 
 @verb
@@ -64,10 +64,13 @@ def identify(
         if not as_json:
             out.print(report.log_report([log.summary for log in (*loaded, *kept)]))
 
-        def tell(what: str, iterate: Progressed) -> None:
-            text = f"{what}: iteration {iterate.iteration}, half of the squares {iterate.cost:.6g}, step {iterate.size:.2g} σ"
+        def show(event: FitEvent) -> None:
+            text = (
+                f"{event.phase}: iteration {event.iteration}, half of the squares {event.cost:.6g}, "
+                f"step {event.step:.2g} σ"
+            )
             bar.update(task, description=text)
-            if not errors.is_terminal and iterate.iteration % 5 == 0:
+            if not errors.is_terminal and event.iteration % 5 == 0:
                 errors.print(text, markup=False)
 
         result = mjfim.identify(
@@ -75,7 +78,7 @@ def identify(
             [log.recording for log in loaded],
             "newton" if method == "newton" else "least_squares",
             held_out=[log.recording for log in kept],
-            tell=tell,
+            callback=show,
         )
     with writing(output) as results:
         for sentence in results.leave_estimate(output, result, setup):

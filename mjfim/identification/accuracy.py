@@ -87,7 +87,7 @@ def _formal(fit: Fit, solution: Solution) -> tuple[Array, Array]:
     if n and not fit.measured:
         R = condensed.triangles[0, :n, :n]
         free = np.linalg.matrix_rank(R) == n and not singular
-        C = condensed.eliminated[0]
+        C = condensed.private_response[0]
         alone = np.linalg.inv(R.T @ R) + C @ whole @ C.T if free else np.full((n, n), np.inf)
         cross = (C @ whole)[:, first] if free else np.full((n, len(first)), np.inf)
         covariance[np.ix_(private, private)] = alone
@@ -108,7 +108,7 @@ def _honest(fit: Fit, solution: Solution, times: Sequence[float]) -> Uncertainty
     if spec.blocks is not None:
         length = spec.blocks * total / sum(float(t.t[-1]) for t in fit.tracks)
     rng = np.random.default_rng(spec.seed)
-    place = fit.place(solution.unknowns)
+    place = fit.common_values(solution.unknowns)
     return uncertainty(solution.condensed, place, recording, rows, length, spec.bootstrap, rng)
 
 
@@ -134,7 +134,7 @@ def _spread(
 def _data(fit: Fit, condensed: Condensed) -> Array:
     """(p, p) information of the recordings alone about what they share, everything else marginalised."""
     p, layout = fit.setup.parameters, fit.layout
-    H, places = condensed.information(outer=False), layout.places
+    H, places = condensed.information(with_common_rows=False), layout.places
     kept, out = np.arange(len(layout.shared)), np.zeros((len(p), len(p)))
     prior = p.prior_information[np.ix_(places, places)] * np.eye(len(places))
     out[np.ix_(layout.shared, layout.shared)] = marginal(H, prior, kept)

@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array, thinned
+from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
-from mjfim.optimize.levenberg_marquardt import Search, Unknowns, completed
+from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.recording import Recording
 
@@ -40,34 +41,42 @@ def predict(
     )
 
 
-def predicted(fit: Fit, at: Unknowns, held_out: Fit | None) -> tuple[Prediction, ...]:
-    """Of held-out recordings; without any, of recordings in turn, or of the last quarter of a single one."""
+def predicted(
+    fit: Fit, at: UnknownValues, held_out: Fit | None, budget: Budget | None = None
+) -> tuple[Prediction, ...]:
+    """Of held-out recordings; without any, of recordings in turn, or of the last quarter of a single one.
+
+    Where the budget is exhausted, parts that were not predicted by then are missing.
+    """
+    budget = Budget() if budget is None else budget
     nominal = fit.setup.parameters.guess
     if held_out is not None:
         masks = held_out.masks
         return tuple(
-            _judged(held_out, at.theta, nominal, _alone(masks, i), (i,), True)
+            _judged(held_out, at.theta, nominal, _alone(masks, i), (i,), True, budget)
             for i in range(len(masks))
+            if budget.exhausted is None
         )
-    return tuple(_folds(fit, at, nominal))
+    return tuple(_folds(fit, at, nominal, budget))
 
 
-def _folds(fit: Fit, at: Unknowns, nominal: Array) -> Iterator[Prediction]:
+def _folds(fit: Fit, at: UnknownValues, nominal: Array, budget: Budget) -> Iterator[Prediction]:
     """What the rest says of each part; of much data, pieces all over it."""
     if fit.samples > MANY and len(fit.pieces) > 1:
         places = thinned(len(fit.pieces), max(MANY * len(fit.pieces) // fit.samples, 2))
-        fit, at = fit.part(places), replace(at, starts=at.starts[places])
+        fit, at = fit.part(places), replace(at, private=at.private[places])
     for names, masks in _parts(fit):
         rest = fit.masked([~mask for mask in masks])
         some = rest.occupied
         if not len(some):
             continue
-        begin = replace(at, starts=at.starts[some])
-        found = completed(
-            rest.part(some), begin, Search(iterations=STEPS, tolerance=1e-2, fresh=False)
-        )
+        begin = replace(at, private=at.private[some])
+        settings = SearchSettings(max_iterations=STEPS, tolerance=1e-2, relinearise_at_end=False)
+        found = minimise(rest.part(some), begin, settings, budget)
+        if budget.exhausted is not None:
+            return
         if found is not None:
-            yield _judged(fit, found.unknowns.theta, nominal, masks, names, False)
+            yield _judged(fit, found.unknowns.theta, nominal, masks, names, False, budget)
 
 
 def _parts(fit: Fit) -> Iterator[tuple[tuple[int, ...], list[np.ndarray]]]:
@@ -94,15 +103,18 @@ def _judged(
     masks: Sequence[np.ndarray],
     tracks: Sequence[int],
     held_out: bool,
+    budget: Budget,
 ) -> Prediction:
     name = ", ".join(fit.tracks[i].name for i in tracks)
     if len(fit.tracks) == 1 and not held_out:
         name = f"last {100 * REST:.0f} % of {name}"
-    own, plain = (_errors(fit, value, masks, name) for value in (theta, nominal))
+    own, plain = (_errors(fit, value, masks, name, budget) for value in (theta, nominal))
     return Prediction(name=name, identified=own, nominal=plain, held_out=held_out)
 
 
-def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> PredictionErrors:
+def _errors(
+    fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str, budget: Budget | None = None
+) -> PredictionErrors:
     """Errors at theta: (p,) of the values that the masks: (M, ny) of each track hold.
 
     Unknown starts are found from what else a piece measures, or from those values where they are all it has.
@@ -112,11 +124,11 @@ def _errors(fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str) -> P
     if fit.size > len(fit.layout.shared):
         # a nuisance start of the fitted recordings says nothing of this one's
         starts = (
-            np.zeros_like(now.starts) if fit.measured else np.tile(nominal, (len(fit.pieces), 1))
+            np.zeros_like(now.private) if fit.measured else np.tile(nominal, (len(fit.pieces), 1))
         )
-        search = Search(STEPS, 1e-2, fresh=False)
-        found = completed(
-            fit.masked(_learned(fit, masks)).frozen(), replace(now, starts=starts), search
+        search = SearchSettings(max_iterations=STEPS, tolerance=1e-2, relinearise_at_end=False)
+        found = minimise(
+            fit.masked(_learned(fit, masks)).frozen(), replace(now, private=starts), search, budget
         )
         now = now if found is None else found.unknowns
     values, outputs = fit.predicted(now), fit.setup.outputs.names

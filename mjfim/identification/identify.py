@@ -17,6 +17,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array, thinned
+from mjfim.budget import Budget, stop_on_interrupt
 from mjfim.errors import ExperimentError, SimulationDiverged, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
@@ -30,20 +31,19 @@ from mjfim.information.null_space import Null, invisible
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import (
-    INTERRUPTED,
-    Progress,
-    Search,
+    IterationReport,
+    SearchSettings,
     Solution,
-    Unknowns,
-    completed,
+    UnknownValues,
     minimise,
 )
 from mjfim.plant.noise import Noise
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.estimate import Estimate, MissingTerm
+from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
 
-NEWTON = Search(iterations=50, tolerance=1e-5, damped=False)
+NEWTON = SearchSettings(max_iterations=50, tolerance=1e-5, damped=False)
 SETTLED = 0.01  # relative change of a sigma that is estimated, below which it is
 ROUNDS = 10  # of estimating sigmas
 FLOOR = 1e-3  # of the stated sigma, below which an estimated one does not fall
@@ -53,7 +53,7 @@ BRIEF = 8  # iterations of a further start, before the best goes on
 SAMPLE = 40_000  # samples of a part of the data on which a search over much of it begins
 FAR = 4.0  # prior standard deviations from the guess that are worth a word
 Method = Literal["least_squares", "newton"]
-Tell = Callable[[str, Progress], None]
+Callback = Callable[[FitEvent], None]
 Found = TypeVar("Found")
 
 
@@ -63,13 +63,13 @@ def identify(
     method: Method = "least_squares",
     start: Array | None = None,
     held_out: Sequence[Recording] = (),
-    tell: Tell | None = None,
+    callback: Callback | None = None,
 ) -> Estimate:
     """Estimate the parameters from recordings, starting at the guess (or `start`: (p,)), as the table `fit` says.
 
     The stated std is formal: it is accuracy only if the model and the noise are right; `misfit` says when they are not, and
     `interval` is honest where residuals follow one another.
-    held_out: recordings that are predicted, not fitted;  tell: called with every iterate, and what it belongs to
+    held_out: recordings that are predicted, not fitted;  callback: called with every iterate (`FitEvent`)
     Ctrl-C ends the search with the best so far. Raises RecordingError for unusable recordings, SimulationDiverged where the
     model diverges at the start.
     """
@@ -86,26 +86,28 @@ def identify(
     with threadpool_limits(
         1, user_api="blas"
     ):  # small matrices: threads of BLAS only wait for each other
-        return _Identification(setup, recordings, method, theta0, held_out, tell).run()
+        return _Identification(setup, recordings, method, theta0, held_out, callback).run()
 
 
-def least_squares(fit: Fit, start: Array, search: Search | None = None) -> Solution:
+def least_squares(
+    fit: Fit, start: Array, search: SearchSettings | None = None, budget: Budget | None = None
+) -> Solution:
     """Levenberg-Marquardt inside the bounds from theta: (p,). Raises SimulationDiverged where that diverges.
 
-    Half a search is none: Ctrl-C is raised anew.
+    `interrupted` of the solution is True where the budget's token stopped the search.
     """
-    found = completed(fit, fit.begin(start), search or Search())
+    found = minimise(fit, fit.begin(start), search or SearchSettings(), budget)
     if found is None:
         raise SimulationDiverged("the simulation diverges at the start of the fit")
     return found
 
 
-def newton_raphson(fit: Fit, start: Array) -> Solution:
+def newton_raphson(fit: Fit, start: Array, budget: Budget | None = None) -> Solution:
     """The paper's iterator `theta - (J'J)^-1 J'r`, its step halved while the residual would grow. Bounds are not used.
 
     Stops when a step is below 1e-5 standard deviations. Raises SimulationDiverged where the start diverges.
     """
-    return least_squares(fit.unbounded(), start, NEWTON)
+    return least_squares(fit.unbounded(), start, NEWTON, budget)
 
 
 class _Identification:
@@ -118,10 +120,11 @@ class _Identification:
         method: Method,
         theta0: Array,
         held_out: Sequence[Recording],
-        tell: Tell | None,
+        callback: Callback | None,
     ) -> None:
         self.clock, self.steps = time.perf_counter(), setup.plant.steps
-        self.setup, self.method, self.theta0, self.tell = setup, method, theta0, tell
+        self.setup, self.method, self.theta0, self.callback = setup, method, theta0, callback
+        self.budget = Budget()
         fit = Fit(setup, recordings)
         self.fit = fit.unbounded() if method == "newton" else fit
         self.held_out = Fit(setup, held_out) if held_out else None
@@ -133,7 +136,12 @@ class _Identification:
             )
 
     def run(self) -> Estimate:
-        """From the start to the report."""
+        """From the start to the report; Ctrl-C ends the search with the best so far."""
+        with stop_on_interrupt() as stop:
+            self.budget = Budget(stop=stop)
+            return self._run()
+
+    def _run(self) -> Estimate:
         fit, setup = self.fit, self.setup
         begin = fit.begin(self.theta0)
         if not np.isfinite(self._sample(fit).cost(self._sampled(begin))):
@@ -166,46 +174,60 @@ class _Identification:
         quick = fit.samples <= SAMPLE or count == 1
         return thinned(count, count if quick else max(int(SAMPLE * count / fit.samples), 1))
 
-    def _sampled(self, at: Unknowns) -> Unknowns:
-        return replace(at, starts=at.starts[self._places])
+    def _sampled(self, at: UnknownValues) -> UnknownValues:
+        return replace(at, private=at.private[self._places])
 
     @property
-    def _search(self) -> Search:
+    def _search(self) -> SearchSettings:
         """What the user stated; much data is not linearised more often than is needed."""
         if self.method == "newton":
             return NEWTON
-        search = Search(iterations=self.setup.experiment.fit.max_iterations, tolerance=CLOSE)
+        search = SearchSettings(
+            max_iterations=self.setup.experiment.fit.max_iterations, tolerance=CLOSE
+        )
         if self.fit.samples * 2 * len(self.setup.parameters) >= LARGE * 10:
-            return replace(search, tolerance=1e-2, fresh=False)
+            return replace(search, tolerance=1e-2, relinearise_at_end=False)
         return search
 
-    def _told(self, what: str) -> Callable[[Progress], None] | None:
-        tell = self.tell
-        return None if tell is None else (lambda progress: tell(what, progress))
+    def _reported(self, phase: str) -> Callable[[IterationReport], None] | None:
+        """Callback of the optimiser that reports its iterations as events of a phase."""
+        callback = self.callback
+        if callback is None:
+            return None
 
-    def _minimise(self, fit: Fit, at: Unknowns, search: Search, what: str) -> Solution:
-        if self.interrupted:  # where all stands by now, for the report
-            search = replace(search, iterations=0)
-        found = minimise(fit, at, search, self._told(what))
-        if found is not None and (found.interrupted or self.interrupted):
-            self.interrupted = True
-            return replace(found, interrupted=True, success=False, status=INTERRUPTED)
+        def report(done: IterationReport) -> None:
+            callback(
+                FitEvent(
+                    phase=phase, iteration=done.iteration, cost=done.cost, step=done.step_length
+                )
+            )
+
+        return report
+
+    def _minimise(
+        self, fit: Fit, at: UnknownValues, search: SearchSettings, phase: str
+    ) -> Solution:
+        """Solution of a search. Raises SimulationDiverged where its start diverges."""
+        found = minimise(fit, at, search, self.budget, self._reported(phase))
         if found is None:
             raise SimulationDiverged(
-                f"the simulation diverges next to the start of the fit ({what})"
+                f"the simulation diverges next to the start of the fit ({phase})"
             )
+        self.interrupted = self.interrupted or found.interrupted
         return found
 
-    def _placed(self, fit: Fit, begin: Unknowns, iterations: int) -> Unknowns:
+    def _placed(self, fit: Fit, begin: UnknownValues, iterations: int) -> UnknownValues:
         """Starts that the data show roughly, at their best for theta as it is: far from it, theta would follow their errors."""
         if not fit.measured or self.interrupted:
             return begin
-        search = Search(iterations=iterations, tolerance=0.1, fresh=False)
-        found = minimise(fit.frozen(), begin, search, self._told("where pieces start"))
+        search = SearchSettings(max_iterations=iterations, tolerance=0.1, relinearise_at_end=False)
+        found = minimise(
+            fit.frozen(), begin, search, self.budget, self._reported("where pieces start")
+        )
         self.interrupted = found is not None and found.interrupted
         return begin if found is None else found.unknowns
 
-    def _best(self, begin: Unknowns) -> Unknowns:
+    def _best(self, begin: UnknownValues) -> UnknownValues:
         """Where the search over all data begins: the best end of short searches from several starts, on some of the data."""
         some, count = self._sample(self.fit), self.setup.experiment.fit.starts
         whole = len(some.pieces) == len(self.fit.pieces)
@@ -213,17 +235,19 @@ class _Identification:
         if whole and count == 1:
             return placed
         found = [
-            self._minimise(some, placed, replace(self._search, fresh=False), "some of the data")
+            self._minimise(
+                some, placed, replace(self._search, relinearise_at_end=False), "some of the data"
+            )
         ]
         for k, theta in enumerate([] if self.interrupted else self._thetas(count)):
-            search = Search(iterations=BRIEF, tolerance=1e-2, fresh=False)
-            try:
-                other = minimise(
-                    some, some.begin(theta), search, self._told(f"start {k + 2} of {count}")
-                )
-            except KeyboardInterrupt:  # before its first iterate
-                self.interrupted = True
-                break
+            search = SearchSettings(max_iterations=BRIEF, tolerance=1e-2, relinearise_at_end=False)
+            other = minimise(
+                some,
+                some.begin(theta),
+                search,
+                self.budget,
+                self._reported(f"start {k + 2} of {count}"),
+            )
             if other is not None:
                 found.append(other)
                 self.interrupted = other.interrupted
@@ -232,9 +256,9 @@ class _Identification:
         best = min(found, key=lambda s: s.cost).unknowns
         if whole:
             return best
-        starts = np.array(begin.starts)
-        starts[self._places] = best.starts
-        return self._placed(self.fit, replace(best, starts=starts), NUDGES)
+        starts = np.array(begin.private)
+        starts[self._places] = best.private
+        return self._placed(self.fit, replace(best, private=starts), NUDGES)
 
     def _thetas(self, count: int) -> Array:
         """(count - 1, p) random starts."""
@@ -244,7 +268,7 @@ class _Identification:
         seed = setup.experiment.fit.seed
         return sample_parameters(setup.parameters, self.theta0, count, seed, setup.impossible)[1:]
 
-    def _settled(self, begin: Unknowns) -> Solution:
+    def _settled(self, begin: UnknownValues) -> Solution:
         """The minimum, with sigmas that agree with the residuals where they are to be estimated."""
         solution = self._minimise(self.fit, begin, self._search, "all data")
         for _ in range(0 if self.stated else ROUNDS):
@@ -261,7 +285,7 @@ class _Identification:
                 break
         return solution
 
-    def _sigma(self, at: Unknowns) -> Array:
+    def _sigma(self, at: UnknownValues) -> Array:
         """(ny,) of the residuals; with a robust loss from their median, which outliers hardly move."""
         fit, robust = self.fit, self.setup.experiment.fit.loss != "linear"
         values = fit.predicted(at)
@@ -282,7 +306,7 @@ class _Identification:
         setup, fit, at = self.setup, self.fit, solution.unknowns
         p, theta, rest = setup.parameters, fit.theta(at), left(fit, solution)
         missing = self._afterwards(lambda: () if rest.unexplained else self._missing(at))
-        predictions = self._afterwards(lambda: predicted(fit, at, self.held_out))
+        predictions = self._afterwards(lambda: predicted(fit, at, self.held_out, self.budget))
         why = reasons(rest.chi2, rest.dof, self.stated, rest.white, missing)
         known = accuracy(fit, solution, null, rest.times(sum(len(t.t) for t in fit.tracks)))
         near = 1e-6 * p.magnitude
@@ -316,7 +340,10 @@ class _Identification:
             whiteness=rest.white,
             sloppy=tuple(name for name, _ in known.sloppy),
             suspects=missing,
-            each={p.names[j]: tuple(at.own[:, i].tolist()) for i, j in enumerate(fit.layout.own)},
+            each={
+                p.names[j]: tuple(at.per_recording[:, i].tolist())
+                for i, j in enumerate(fit.layout.own)
+            },
             worst=rest.worst if why else None,
             predictions=predictions,
             detail=known.detail,
@@ -327,14 +354,12 @@ class _Identification:
         )
 
     def _afterwards(self, work: Callable[[], tuple[Found, ...]]) -> tuple[Found, ...]:
-        """What the work says of the estimate; Ctrl-C ends it without costing the estimate."""
-        try:
-            return () if self.interrupted else work()
-        except KeyboardInterrupt:
-            self.interrupted = True
-            return ()
+        """Result of work after the estimate; empty, without costing the estimate, where somebody asked to stop."""
+        found = () if self.interrupted else work()
+        self.interrupted = self.interrupted or self.budget.stop.requested
+        return () if self.interrupted else found
 
-    def _missing(self, at: Unknowns) -> tuple[MissingTerm, ...]:
+    def _missing(self, at: UnknownValues) -> tuple[MissingTerm, ...]:
         """Terms that the model lacks, from recordings, or of much data from pieces of them."""
         some = self._sample(self.fit)
         return suspects(some, self.fit.recordings, self._places, self._sampled(at))

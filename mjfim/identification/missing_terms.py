@@ -18,7 +18,7 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
 from mjfim.model.coordinates import scalar_joints
-from mjfim.optimize.levenberg_marquardt import Unknowns
+from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.estimate import MissingTerm
 from mjfim.records.recording import Recording
 
@@ -42,7 +42,7 @@ class Candidate:
 
 
 def suspects(
-    fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: Unknowns
+    fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: UnknownValues
 ) -> tuple[MissingTerm, ...]:
     """Terms that would explain significant residuals, the strongest first; none where nothing does.
 
@@ -66,7 +66,7 @@ def suspects(
     found = other.condense(replace(at, theta=theta))
     if found is None:
         return ()
-    J = np.concatenate([found.profile(), found.outer])
+    J = np.concatenate([found.reduced_rows(), found.common_rows])
     unit = np.maximum(np.linalg.norm(J[:, :-1], axis=0), 1e-300)
     J[:, :-1] /= unit
     H, g = J[:, :-1].T @ J[:, :-1], J[:, :-1].T @ J[:, -1]

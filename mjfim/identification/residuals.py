@@ -21,7 +21,7 @@ from mjfim.identification.segments import cut, groups, whole
 from mjfim.identification.unknowns import Layout
 from mjfim.information.null_space import COARSER, Null
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
-from mjfim.optimize.levenberg_marquardt import Unknowns
+from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import Loss
 from mjfim.plant.delay import Lag
 from mjfim.plant.noise import Noise
@@ -59,7 +59,7 @@ class Rows:
 
 
 class Fit:
-    """Residuals of an experiment against recordings, as functions of the unknowns (`levenberg.Problem`).
+    """Residuals of an experiment against recordings, as functions of the unknowns (`levenberg_marquardt.Problem`).
 
     The common unknowns are theta without the private deviations of a start; every piece has its own of those. Pieces that
     start where the data say have all of the state as private unknowns.
@@ -158,19 +158,19 @@ class Fit:
         """(c,) bounds of the common unknowns."""
         return self.layout.upper
 
-    def begin(self, theta: Array) -> Unknowns:
+    def begin(self, theta: Array) -> UnknownValues:
         """Unknowns at theta: (p,), every piece starting as stated or measured."""
         return self.layout.begin(theta, len(self.pieces), self.free.shape[1])
 
-    def place(self, at: Unknowns) -> Array:
+    def common_values(self, at: UnknownValues) -> Array:
         """(c,) values of the common unknowns."""
-        return self.layout.place(at)
+        return self.layout.common_values(at)
 
-    def moved(self, at: Unknowns, step: Step, length: float) -> Unknowns:
+    def moved(self, at: UnknownValues, step: Step, length: float) -> UnknownValues:
         """The unknowns after a part of a step, inside the bounds to the last digit."""
         return self.layout.moved(at, step, length)
 
-    def theta(self, at: Unknowns) -> Array:
+    def theta(self, at: UnknownValues) -> Array:
         """(p,) with what is the first recording's."""
         return self.layout.theta(at)
 
@@ -227,7 +227,7 @@ class Fit:
 
     # what is computed
 
-    def predicted(self, at: Unknowns) -> list[Array] | None:
+    def predicted(self, at: UnknownValues) -> list[Array] | None:
         """(M, ny) of every track at its measured times, NaN outside of all pieces; None where a simulation diverges."""
         found = [np.full(track.y.shape, np.nan) for track in self.tracks]
         for rows in self._rows(at, derivatives=False):
@@ -244,7 +244,7 @@ class Fit:
             for j in range(len(self.setup.outputs))
         ]
 
-    def motion(self, at: Unknowns, track: int) -> Trajectory | None:
+    def motion(self, at: UnknownValues, track: int) -> Trajectory | None:
         """The fitted motion of one track on its grid, jumps between pieces and all; None where it diverges."""
         plant, whole, theta = (
             self.setup.plant,
@@ -267,7 +267,7 @@ class Fit:
             states[gap] = states[np.flatnonzero(~gap)[0]] if not gap.all() else plant.nominal_start
         return plant.trajectory(states, whole.ctrl)
 
-    def cost(self, at: Unknowns) -> float:
+    def cost(self, at: UnknownValues) -> float:
         """Half of the loss and the priors; infinite where a simulation diverges."""
         total = 0.0
         for rows in self._rows(at, derivatives=False):
@@ -278,7 +278,7 @@ class Fit:
         inner = self._inner(at)[:, :, -1]
         return 0.5 * (total + float(further @ further) + float(np.sum(inner**2)))
 
-    def condense(self, at: Unknowns) -> Condensed | None:
+    def condense(self, at: UnknownValues) -> Condensed | None:
         """Linearised about the unknowns; None where a perturbed simulation diverges."""
         m = self.free.shape[1] + self.layout.columns + 1
         blocks = np.zeros((int(self._offsets[-1]), m, m))
@@ -292,9 +292,14 @@ class Fit:
             for first, last in pairwise(edges):
                 own = np.concatenate([blocks[index[first]], stacked[first:last]])
                 blocks[index[first]] = triangle(own)
-        return Condensed(blocks, owners, self._inner(at), self._outer(at))
+        return Condensed(
+            blocks=blocks,
+            segment_of_block=owners,
+            private_rows=self._inner(at),
+            common_rows=self._outer(at),
+        )
 
-    def dense(self, at: Unknowns) -> Residuals | None:
+    def dense(self, at: UnknownValues) -> Residuals | None:
         """All rows, data first, and the derivative by the common unknowns, then by each piece's own. For small problems."""
         n, c = self.free.shape[1], self.layout.columns
         r, J = [], []
@@ -317,7 +322,7 @@ class Fit:
             J.append(wide)
         return Residuals(np.concatenate(r), np.concatenate(J))
 
-    def sensed(self, at: Unknowns) -> list[tuple[Array, Array]]:
+    def sensed(self, at: UnknownValues) -> list[tuple[Array, Array]]:
         """Whitened rows of G: (n, p) along each piece, and their change with a longer difference step; condensed, (2p, p).
 
         Of pieces whose whole start is free, what that leaves of them. Raises SimulationDiverged.
@@ -373,7 +378,7 @@ class Fit:
         index = np.broadcast_to((first + share)[:, None], mask.shape)[mask]
         return index, r, self.noise.whiten_present(G, mask)
 
-    def _outer(self, at: Unknowns) -> Array:
+    def _outer(self, at: UnknownValues) -> Array:
         """(l, c+1) rows of priors and pins on the common unknowns."""
         rows = self.layout.priors(at)
         pins = np.column_stack(
@@ -388,21 +393,21 @@ class Fit:
         """True where pins do not touch private unknowns."""
         return not self.pins[:, self.layout.private].any()
 
-    def _inner(self, at: Unknowns) -> Array:
+    def _inner(self, at: UnknownValues) -> Array:
         """(P, k, m) rows of priors on the private unknowns; pins that touch them belong to the first piece."""
         n, c, p = self.free.shape[1], self.layout.columns, self.setup.parameters
         private = self.layout.private
         if self.measured:
             rows = np.zeros((len(self.pieces), n, n + c + 1))
             rows[:, np.arange(n), np.arange(n)] = 1.0 / WIDE
-            rows[:, :, -1] = at.starts / WIDE
+            rows[:, :, -1] = at.private / WIDE
             return rows
         if not n:
             return np.zeros((len(self.pieces), 0, n + c + 1))
         weight = np.sqrt(np.diag(p.prior_information))[private] * (not self.data_only)
         rows = np.zeros((len(self.pieces), n + len(self.pins) * (not self._apart), n + c + 1))
         rows[:, np.arange(n), np.arange(n)] = weight
-        rows[:, :n, -1] = weight * (at.starts - p.guess[private])
+        rows[:, :n, -1] = weight * (at.private - p.guess[private])
         if not self._apart:
             rows[0, n:, :n], rows[0, n:, n:-1] = (
                 self.pins[:, private],
@@ -413,7 +418,7 @@ class Fit:
 
     def _rows(
         self,
-        at: Unknowns,
+        at: UnknownValues,
         derivatives: bool,
         central: bool | None = None,
         step: float = SENSITIVITY_STEP,
@@ -457,13 +462,13 @@ class Fit:
             for batch in groups([self.pieces[i] for i in mine], most):
                 yield track, [mine[k] for k in batch]
 
-    def _start(self, at: Unknowns, piece: int) -> Array:
+    def _start(self, at: UnknownValues, piece: int) -> Array:
         """(ns,) where a piece starts."""
         space, p = self.setup.space, self.setup.parameters
         if self.measured:
-            return space.plus(self.pieces[piece].start, self.free @ at.starts[piece])
+            return space.plus(self.pieces[piece].start, self.free @ at.private[piece])
         theta = np.array(at.theta)
-        theta[self.layout.private] = at.starts[piece]
+        theta[self.layout.private] = at.private[piece]
         return space.plus(self.pieces[piece].start, p.initial_state_derivative(space.nx) @ theta)
 
     def _control(self, piece: int, longest: int) -> Array:

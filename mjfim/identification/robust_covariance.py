@@ -43,12 +43,12 @@ def uncertainty(
     """
     merged = merge(recording, rows, together)
     count = int(merged.max(initial=-1)) + 1
-    c = condensed.common
+    c = condensed.common_count
     scores, grams = np.zeros((count, c)), np.zeros((count, c, c))
-    np.add.at(scores, merged, condensed.scores)
-    np.add.at(grams, merged, condensed.grams)
-    known = condensed.known
-    prior = np.concatenate([condensed.outer, known.reshape(-1, c + 1)])[:, :-1]
+    np.add.at(scores, merged, condensed.block_scores)
+    np.add.at(grams, merged, condensed.block_information)
+    known = condensed.reduced_private_rows
+    prior = np.concatenate([condensed.common_rows, known.reshape(-1, c + 1)])[:, :-1]
     H = grams.sum(axis=0) + prior.T @ prior
     inverse = _inverse(H)
     about = scores - scores.mean(axis=0)
@@ -57,8 +57,8 @@ def uncertainty(
     formal = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     replicates = _bootstrap(scores, grams, prior, draws, rng)
     kept = merged_owner(recording, merged, count)
-    owners = np.zeros(condensed.pieces, dtype=int)
-    owners[condensed.piece] = recording
+    owners = np.zeros(condensed.segment_count, dtype=int)
+    owners[condensed.segment_of_block] = recording
     each, between, apart = _recordings(
         theta, scores, grams, kept, [known[owners == k] for k in range(kept.max() + 1)]
     )

@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import Step
-from mjfim.optimize.levenberg_marquardt import Unknowns
+from mjfim.optimize.levenberg_marquardt import UnknownValues
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,36 +78,42 @@ class Layout:
         mask[self.places] = True
         return mask
 
-    def begin(self, theta: Array, pieces: int, width: int) -> Unknowns:
+    def begin(self, theta: Array, pieces: int, width: int) -> UnknownValues:
         """At theta: (p,), every one of some pieces with a start of some width as stated or measured."""
         theta = np.array(theta, dtype=np.float64)
         start = np.zeros(width) if self.free else theta[self.private]
-        return Unknowns(
-            theta, np.tile(start, (pieces, 1)), np.tile(theta[self.own], (self.recordings, 1))
+        return UnknownValues(
+            theta=theta,
+            private=np.tile(start, (pieces, 1)),
+            per_recording=np.tile(theta[self.own], (self.recordings, 1)),
         )
 
-    def place(self, at: Unknowns) -> Array:
+    def common_values(self, at: UnknownValues) -> Array:
         """(c,) values of the common unknowns."""
-        return np.concatenate([at.theta[self.shared], at.own.ravel()])
+        return np.concatenate([at.theta[self.shared], at.per_recording.ravel()])
 
-    def moved(self, at: Unknowns, step: Step, length: float) -> Unknowns:
+    def moved(self, at: UnknownValues, step: Step, length: float) -> UnknownValues:
         """The unknowns after a part of a step, inside the bounds to the last digit."""
-        values = np.clip(self.place(at) + length * step.common, self.lower, self.upper)
+        values = np.clip(self.common_values(at) + length * step.common, self.lower, self.upper)
         theta, s = np.array(at.theta), len(self.shared)
         theta[self.shared] = values[:s]
-        return Unknowns(theta, at.starts + length * step.private, values[s:].reshape(at.own.shape))
+        return UnknownValues(
+            theta=theta,
+            private=at.private + length * step.private,
+            per_recording=values[s:].reshape(at.per_recording.shape),
+        )
 
-    def of_recording(self, at: Unknowns, recording: int) -> Array:
+    def of_recording(self, at: UnknownValues, recording: int) -> Array:
         """(p,) theta of one recording, its start deviations left as they stand in theta."""
         theta = np.array(at.theta)
-        theta[self.own] = at.own[recording]
+        theta[self.own] = at.per_recording[recording]
         return theta
 
-    def theta(self, at: Unknowns) -> Array:
+    def theta(self, at: UnknownValues) -> Array:
         """(p,) with what is the first recording's."""
         theta = self.of_recording(at, 0)
         if not self.free and len(self.private):
-            theta[self.private] = at.starts[0]
+            theta[self.private] = at.private[0]
         return theta
 
     def spread(self, G: Array, recording: int) -> Array:
@@ -118,11 +124,11 @@ class Layout:
         out[..., s + recording * e : s + (recording + 1) * e] = G[..., self.own]
         return out
 
-    def priors(self, at: Unknowns) -> Array:
+    def priors(self, at: UnknownValues) -> Array:
         """(l, c+1) rows of the stated priors."""
         places = self.places
         weight = np.sqrt(np.diag(self.parameters.prior_information))[places]
         rows = np.column_stack(
-            [np.diag(weight), weight * (self.place(at) - self.parameters.guess[places])]
+            [np.diag(weight), weight * (self.common_values(at) - self.parameters.guess[places])]
         )
         return np.asarray(rows[weight > 0.0])

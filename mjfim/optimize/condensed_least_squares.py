@@ -1,7 +1,8 @@
-"""Least squares over many pieces whose starts are their own unknowns, without ever holding all rows.
+"""Least squares over many segments with private unknowns, condensed so that all rows are never held at once.
 
-The whitened rows `[J_private, J_common, r]` of each block of data are brought to a triangle that has the same inner products
-(QR); private unknowns are eliminated piece by piece. What is left is exact linear algebra of the size of the common unknowns.
+The whitened rows `[J_private, J_common, r]` of each block of data are reduced to a triangle with the same inner products (QR
+decomposition). The private unknowns are then eliminated segment by segment. The remaining problem is exact linear algebra of the
+size of the common unknowns.
 """
 
 from __future__ import annotations
@@ -14,220 +15,341 @@ from scipy.optimize import lsq_linear
 
 from mjfim.arrays import Array
 
-BATCH = 128  # rows of a pass of a tall QR decomposition
-TALL = 512  # rows from which it goes in passes
-MOST_EXCHANGES = 20  # of active bounds for every unknown; one for each, scipy's choice, may end short of the minimum
+# Rows of one batch in the first pass of a tall QR decomposition; a batch stays in the cache.
+QR_BATCH_ROWS = 128
+
+# Number of rows above which a QR decomposition takes two passes.
+TALL_ROWS = 512
+
+# Exchanges of active bounds per unknown in a bounded least-squares problem. SciPy's default of one exchange per unknown may end
+# before the minimum is reached.
+MAX_EXCHANGES_PER_UNKNOWN = 20
+
+# Smallest column norm or scale; protects divisions by zero.
+SMALLEST_NORM = 1e-300
+
+# Smallest damping of the private unknowns, relative to their scale. It keeps the elimination regular where a segment does not
+# determine its private unknowns.
+MIN_PRIVATE_DAMPING = 1e-12
+
+# Singular values below this share of the largest one are dropped from the pseudo-inverse of the private triangles.
+PRIVATE_RANK_TOLERANCE = 1e-12
+
+# Singular values of the scaled private columns below this value do not count towards the rank.
+PRIVATE_RANK_COUNT_TOLERANCE = 1e-8
+
+# Eigenvalues of the scaled information of the common unknowns below this value do not count towards the rank.
+COMMON_RANK_COUNT_TOLERANCE = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Step:
-    """A step of the unknowns. common: (c,);  private: (P, n);  gain: by how much half of the linearised squares falls
+    """Step of all unknowns.
 
-    size: standard deviations that the common unknowns move;  each: root mean square of those of the private ones
+    Attributes:
+        common: (c,) step of the common unknowns.
+        private: (P, n) steps of the private unknowns of each segment.
+        predicted_decrease: Decrease of half of the squares according to the linearisation.
+        common_length: Length of the step of the common unknowns [standard deviations].
+        private_length: Root mean square length of the steps of the private unknowns [standard deviations].
     """
 
     common: Array
     private: Array
-    gain: float
-    size: float
-    each: float
+    predicted_decrease: float
+    common_length: float
+    private_length: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Condensed:
-    """Linearised residuals of P pieces in B blocks. n private unknowns a piece, c common ones, m = n + c + 1.
+    """Linearised residuals of P segments in B blocks; every segment has n private unknowns, all share c common ones.
 
-    blocks: (B, m, m) rows `[J_private, J_common, r]` of each block, condensed;  piece: (B,) to which each belongs
-    inner: (P, k, m) further rows of each piece's private unknowns, e.g. priors;  outer: (l, c+1) of the common ones
+    The number of columns is m = n + c + 1: private unknowns, common unknowns, residual.
+
+    Attributes:
+        blocks: (B, m, m) rows `[J_private, J_common, r]` of each block, condensed to a triangle.
+        segment_of_block: (B,) number of the segment to which each block belongs.
+        private_rows: (P, k, m) further rows of each segment, e.g. priors on its private unknowns.
+        common_rows: (l, c+1) further rows `[J_common, r]`, e.g. priors on the common unknowns.
     """
 
     blocks: Array
-    piece: np.ndarray
-    inner: Array
-    outer: Array
+    segment_of_block: np.ndarray
+    private_rows: Array
+    common_rows: Array
 
     @property
-    def pieces(self) -> int:
-        """P."""
-        return len(self.inner)
+    def segment_count(self) -> int:
+        """Number of segments P."""
+        return len(self.private_rows)
 
     @property
-    def common(self) -> int:
-        """c."""
-        return int(self.outer.shape[1] - 1)
+    def common_count(self) -> int:
+        """Number of common unknowns c."""
+        return int(self.common_rows.shape[1] - 1)
 
     @property
-    def private(self) -> int:
-        """n."""
-        return int(self.blocks.shape[1] - self.common - 1)
+    def private_count(self) -> int:
+        """Number of private unknowns of a segment n."""
+        return int(self.blocks.shape[1] - self.common_count - 1)
 
     @cached_property
     def triangles(self) -> Array:
-        """(P, m, m), one for each piece."""
+        """(P, m, m) triangle of all rows of each segment."""
         m = self.blocks.shape[1]
-        counts = np.bincount(self.piece, minlength=self.pieces)
-        stacked = np.zeros((self.pieces, max(int(counts.max(initial=0)), 1), m, m))
-        order = np.argsort(self.piece, kind="stable")
-        slot = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-        stacked[self.piece[order], slot] = self.blocks[order]
-        rows = np.concatenate([stacked.reshape(self.pieces, -1, m), self.inner], axis=1)
-        return triangle(rows)
+        counts = np.bincount(self.segment_of_block, minlength=self.segment_count)
+        most = max(int(counts.max(initial=0)), 1)
+
+        # Blocks sorted by segment, and the place of each one among the blocks of its segment.
+        order = np.argsort(self.segment_of_block, kind="stable")
+        first = np.cumsum(counts) - counts
+        place = np.arange(len(order)) - np.repeat(first, counts)
+
+        stacked = np.zeros((self.segment_count, most, m, m))
+        stacked[self.segment_of_block[order], place] = self.blocks[order]
+
+        rows = stacked.reshape(self.segment_count, -1, m)
+        return triangle(np.concatenate([rows, self.private_rows], axis=1))
 
     @cached_property
-    def eliminated(self) -> Array:
-        """(P, n, c) change of each piece's private unknowns with the common ones where they follow them."""
-        return np.asarray(-self._inverse @ self.triangles[:, : self.private, self.private : -1])
+    def private_response(self) -> Array:
+        """(P, n, c) derivative of each segment's optimal private unknowns by the common unknowns."""
+        n = self.private_count
+        return np.asarray(-self._private_inverse @ self.triangles[:, :n, n:-1])
 
     @cached_property
-    def _inverse(self) -> Array:
-        """(P, n, n) pseudo-inverse of the private triangles, whatever the units of the unknowns."""
-        n = self.private
-        unit = np.maximum(self.lengths[:n], 1e-300)
-        return np.asarray(
-            np.linalg.pinv(self.triangles[:, :n, :n] / unit, rcond=1e-12) / unit[:, None]
-        )
+    def _private_inverse(self) -> Array:
+        """(P, n, n) pseudo-inverse of the private triangles, independent of the units of the unknowns."""
+        n = self.private_count
+        norms = np.maximum(self.column_norms[:n], SMALLEST_NORM)
+        scaled = self.triangles[:, :n, :n] / norms
 
-    def profile(self) -> Array:
-        """(k, c+1) rows of the common unknowns once the private ones follow them, `outer` left out."""
-        R, n = self.triangles, self.private
+        inverse = np.linalg.pinv(scaled, rcond=PRIVATE_RANK_TOLERANCE)
+        return np.asarray(inverse / norms[:, None])
+
+    def reduced_rows(self) -> Array:
+        """Rows of the common unknowns after elimination of the private ones, without the `common_rows`.
+
+        Returns:
+            (k, c+1) rows `[J_common, r]`.
+        """
+        R = self.triangles
+        n = self.private_count
         if not n:
             return np.asarray(R.reshape(-1, R.shape[2]))
-        rows = R[:, :n, :n] @ self.eliminated + R[:, :n, n:-1]
-        # what the least-squares private step leaves of r, should a piece not determine its start
-        own = R[:, :n, -1:] - R[:, :n, :n] @ (self._inverse @ R[:, :n, -1:])
-        left = np.concatenate([np.concatenate([rows, own], axis=2), R[:, n:, n:]], axis=1)
-        return np.asarray(left.reshape(-1, left.shape[2]))
+
+        # Rows that a segment without full rank leaves over: the least-squares step of its private unknowns does not cancel them.
+        private = R[:, :n, :n]
+        residual = R[:, :n, -1:]
+        remaining_jacobian = private @ self.private_response + R[:, :n, n:-1]
+        remaining_residual = residual - private @ (self._private_inverse @ residual)
+        remaining = np.concatenate([remaining_jacobian, remaining_residual], axis=2)
+
+        rows = np.concatenate([remaining, R[:, n:, n:]], axis=1)
+        return np.asarray(rows.reshape(-1, rows.shape[2]))
 
     @property
     def rank(self) -> int:
-        """Number of unknowns that the rows determine."""
-        n, R = self.private, self.triangles
-        length = np.maximum(np.linalg.norm(R[:, :, :n], axis=1, keepdims=True), 1e-300)
-        own = int(np.linalg.matrix_rank(R[:, :, :n] / length, tol=1e-8).sum()) if n else 0
-        H = self.information()
-        unit = np.sqrt(np.maximum(np.diag(H), 1e-300))
-        return own + (
-            int(np.linalg.matrix_rank(H / np.outer(unit, unit), tol=1e-12, hermitian=True))
-            if len(H)
-            else 0
-        )
+        """Number of unknowns, private and common, that the rows determine."""
+        n = self.private_count
+        private_rank = 0
+        if n:
+            columns = self.triangles[:, :, :n]
+            norms = np.linalg.norm(columns, axis=1, keepdims=True)
+            scaled = columns / np.maximum(norms, SMALLEST_NORM)
+            ranks = np.linalg.matrix_rank(scaled, tol=PRIVATE_RANK_COUNT_TOLERANCE)
+            private_rank = int(ranks.sum())
 
-    def information(self, outer: bool = True) -> Array:
-        """(c, c) of the common unknowns, the private ones marginalised; outer: with the rows of `outer`."""
-        J = self.profile()[:, :-1]
-        J = np.concatenate([J, self.outer[:, :-1]]) if outer else J
+        common_rank = 0
+        H = self.information()
+        if len(H):
+            unit = np.sqrt(np.maximum(np.diag(H), SMALLEST_NORM))
+            scaled = H / np.outer(unit, unit)
+            common_rank = int(
+                np.linalg.matrix_rank(scaled, tol=COMMON_RANK_COUNT_TOLERANCE, hermitian=True)
+            )
+
+        return private_rank + common_rank
+
+    def information(self, with_common_rows: bool = True) -> Array:
+        """Information about the common unknowns, the private ones marginalised.
+
+        Args:
+            with_common_rows: Whether to include the `common_rows`, i.e. the priors.
+
+        Returns:
+            (c, c) Gauss-Newton Hessian `J'J`.
+        """
+        J = self.reduced_rows()[:, :-1]
+        if with_common_rows:
+            J = np.concatenate([J, self.common_rows[:, :-1]])
+
         return np.asarray(J.T @ J)
 
     @cached_property
-    def lengths(self) -> Array:
-        """(n+c,) root of the mean square, and norm, of the columns: private, then common."""
-        R = self.triangles[:, :, :-1]
-        squares = np.sum(R**2, axis=1)
-        own = np.sqrt(squares[:, : self.private].mean(axis=0))
-        rest = np.sqrt(
-            squares[:, self.private :].sum(axis=0) + np.sum(self.outer[:, :-1] ** 2, axis=0)
-        )
-        return np.asarray(np.concatenate([own, rest]))
+    def column_norms(self) -> Array:
+        """(n+c,) norms of the Jacobian's columns: root mean square over segments for private ones, then the common ones."""
+        squares = np.sum(self.triangles[:, :, :-1] ** 2, axis=1)
+        n = self.private_count
+
+        private = squares[:, :n].mean(axis=0)
+        common = squares[:, n:].sum(axis=0) + np.sum(self.common_rows[:, :-1] ** 2, axis=0)
+        return np.asarray(np.concatenate([np.sqrt(private), np.sqrt(common)]))
 
     def step(self, damping: float, scale: Array, lower: Array, upper: Array) -> Step:
-        """The Levenberg-Marquardt step: `min |J d + r|^2 + damping |scale d|^2` with lower <= d_common <= upper.
+        """Levenberg-Marquardt step: minimiser of `|J d + r|^2 + damping |scale d|^2` with bounds on the common unknowns.
 
-        scale: (n+c,);  lower, upper: (c,)
+        Args:
+            damping: Damping factor, 0 for a Gauss-Newton step.
+            scale: (n+c,) scale of every unknown, usually the column norms.
+            lower: (c,) lower bounds of the step of the common unknowns, at most 0.
+            upper: (c,) upper bounds of the step of the common unknowns, at least 0.
+
+        Returns:
+            The step with its predicted decrease.
         """
-        n, c = self.private, self.common
-        R = np.array(self.triangles)
+        n = self.private_count
+        c = self.common_count
         weight = np.sqrt(damping) * scale
-        if n:
-            damp = np.zeros((self.pieces, n, R.shape[2]))
-            damp[:, np.arange(n), np.arange(n)] = np.maximum(
-                weight[:n], 1e-12 * np.maximum(scale[:n], 1e-300)
-            )
-            R = triangle(np.concatenate([R, damp], axis=1))
-        rows = R[:, n:, n:].reshape(-1, c + 1)
-        extra = np.concatenate([np.diag(weight[n:]), np.zeros((c, 1))], axis=1)
-        rows = triangle(np.concatenate([rows, self.outer, extra]))
-        d = _bounded(rows[:, :-1], -rows[:, -1], lower, upper)
-        own: Array = np.zeros((self.pieces, n))
-        if n:
-            rhs = R[:, :n, -1] + R[:, :n, n:-1] @ d
-            own = np.asarray(-np.linalg.solve(R[:, :n, :n], rhs[..., None])[..., 0])
-        return self._judged(d, own)
 
-    def _judged(self, d: Array, own: Array) -> Step:
-        moves = np.concatenate([own, np.broadcast_to(d, (self.pieces, len(d)))], axis=1)
+        # Eliminate the private unknowns: a triangle of all rows and of their damping.
+        R = np.array(self.triangles)
+        if n:
+            least = MIN_PRIVATE_DAMPING * np.maximum(scale[:n], SMALLEST_NORM)
+            damping_rows = np.zeros((self.segment_count, n, R.shape[2]))
+            damping_rows[:, np.arange(n), np.arange(n)] = np.maximum(weight[:n], least)
+            R = triangle(np.concatenate([R, damping_rows], axis=1))
+
+        # Bounded problem in the common unknowns alone.
+        segment_rows = R[:, n:, n:].reshape(-1, c + 1)
+        damping_rows = np.concatenate([np.diag(weight[n:]), np.zeros((c, 1))], axis=1)
+        rows = triangle(np.concatenate([segment_rows, self.common_rows, damping_rows]))
+        common = _bounded_least_squares(rows[:, :-1], -rows[:, -1], lower, upper)
+
+        # The private unknowns follow by substitution.
+        private: Array = np.zeros((self.segment_count, n))
+        if n:
+            rhs = R[:, :n, -1] + R[:, :n, n:-1] @ common
+            private = np.asarray(-np.linalg.solve(R[:, :n, :n], rhs[..., None])[..., 0])
+
+        return self._evaluated(common, private)
+
+    def _evaluated(self, common: Array, private: Array) -> Step:
+        """A step with its lengths and the decrease that the linearisation predicts, damping left out."""
         R = self.triangles
+        n = self.private_count
+        residual = R[:, :, -1]
+        common_residual = self.common_rows[:, -1]
+
+        # Change of all residuals along the step.
+        everywhere = np.broadcast_to(common, (self.segment_count, len(common)))
+        moves = np.concatenate([private, everywhere], axis=1)
         change = (R[:, :, :-1] @ moves[..., None])[..., 0]
-        outer = self.outer[:, :-1] @ d
-        gain = -float(np.sum(change * (R[:, :, -1] + 0.5 * change)))
-        gain -= float(outer @ (self.outer[:, -1] + 0.5 * outer))
-        size = float(np.sqrt(d @ self.information() @ d)) if len(d) else 0.0
-        n = self.private
-        each = (R[:, :, :n] @ own[..., None])[..., 0]
+        common_change = self.common_rows[:, :-1] @ common
+
+        decrease = -float(np.sum(change * (residual + 0.5 * change)))
+        decrease -= float(common_change @ (common_residual + 0.5 * common_change))
+
+        # Lengths in standard deviations.
+        common_length = 0.0
+        if len(common):
+            common_length = float(np.sqrt(common @ self.information() @ common))
+
+        private_length = 0.0
+        if n:
+            private_change = (R[:, :, :n] @ private[..., None])[..., 0]
+            private_length = float(np.sqrt(np.mean(private_change**2) * R.shape[1] / n))
+
         return Step(
-            d,
-            own,
-            gain,
-            size,
-            float(np.sqrt(np.mean(each**2) * R.shape[1] / max(n, 1))) if n else 0.0,
+            common=common,
+            private=private,
+            predicted_decrease=decrease,
+            common_length=common_length,
+            private_length=private_length,
         )
 
     @cached_property
-    def scores(self) -> Array:
-        """(B, c) gradient of half of the squares by the common unknowns, block by block, the private ones following."""
-        J, r = self._following
+    def block_scores(self) -> Array:
+        """(B, c) gradient of half of each block's squares by the common unknowns, with the private ones following."""
+        J, r = self._reduced_blocks
         return np.asarray((np.swapaxes(J, 1, 2) @ r)[..., 0])
 
     @cached_property
-    def grams(self) -> Array:
-        """(B, c, c) information of each block about the common unknowns, the private ones following."""
-        J, _ = self._following
+    def block_information(self) -> Array:
+        """(B, c, c) information of each block about the common unknowns, with the private ones following."""
+        J, _ = self._reduced_blocks
         return np.asarray(np.swapaxes(J, 1, 2) @ J)
 
     @property
-    def known(self) -> Array:
-        """(P, k, c+1) rows of `inner` by the common unknowns, the private ones following."""
-        n = self.private
-        J = self.inner[:, :, n:-1] + self.inner[:, :, :n] @ self.eliminated
-        return np.concatenate([J, self.inner[:, :, -1:]], axis=2)
+    def reduced_private_rows(self) -> Array:
+        """(P, k, c+1) the `private_rows` as rows of the common unknowns, with the private ones following."""
+        n = self.private_count
+        follow = self.private_rows[:, :, :n] @ self.private_response
+        J = self.private_rows[:, :, n:-1] + follow
+        return np.concatenate([J, self.private_rows[:, :, -1:]], axis=2)
 
     @property
-    def _following(self) -> tuple[Array, Array]:
-        n = self.private
-        J = self.blocks[:, :, n:-1] + self.blocks[:, :, :n] @ self.eliminated[self.piece]
+    def _reduced_blocks(self) -> tuple[Array, Array]:
+        """(B, m, c) Jacobian of each block by the common unknowns, the private ones following, and (B, m, 1) residuals."""
+        n = self.private_count
+        follow = self.blocks[:, :, :n] @ self.private_response[self.segment_of_block]
+        J = self.blocks[:, :, n:-1] + follow
         return J, self.blocks[:, :, -1:]
 
 
 def triangle(rows: Array) -> Array:
-    """R of the QR decomposition of (..., k, m) rows: m rows with the same inner products (fewer where k < m).
+    """Triangular factor R of the QR decomposition: few rows with the same inner products.
 
-    Tall ones go in two passes, the first over batches that stay in the cache.
+    Args:
+        rows: (..., k, m) rows; two-dimensional tall ones take two passes, the first over batches that stay in the cache.
+
+    Returns:
+        (..., min(k, m), m) factor R.
     """
     k, m = rows.shape[-2:]
-    if rows.ndim == 2 and k > TALL:
-        whole = k // BATCH * BATCH
-        firsts = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, BATCH, m), mode="r"))
-        return triangle(np.concatenate([firsts.reshape(-1, m), rows[whole:]]))
+    if rows.ndim == 2 and k > TALL_ROWS:
+        whole = k // QR_BATCH_ROWS * QR_BATCH_ROWS
+        batches = rows[:whole].reshape(-1, QR_BATCH_ROWS, m)
+        first_pass = np.asarray(np.linalg.qr(batches, mode="r"))
+        return triangle(np.concatenate([first_pass.reshape(-1, m), rows[whole:]]))
+
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def _bounded(A: Array, b: Array, lower: Array, upper: Array) -> Array:
-    """`min |A d - b|` within bounds that hold 0; A need not have full rank."""
-    unit = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-    d = np.linalg.lstsq(A / unit, b)[0] / unit
+def _bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Array:
+    """(c,) minimiser of `|A d - b|` between bounds that contain 0; A need not have full rank."""
+    norms = np.maximum(np.linalg.norm(A, axis=0), SMALLEST_NORM)
+
+    # The unbounded minimum is the answer where it lies inside.
+    d = np.linalg.lstsq(A / norms, b)[0] / norms
     if (d >= lower).all() and (d <= upper).all():
         return np.asarray(d)
-    low, high = np.minimum(lower, 0.0), np.maximum(upper, 0.0)
-    thin = high - low <= 0.0  # at both bounds: lsq_linear wants room
-    out = np.zeros(len(d))
-    if thin.all():
-        return out
-    A, unit = A[:, ~thin] / unit[~thin], unit[~thin]
-    box = (low[~thin] * unit, high[~thin] * unit)
-    solved = lsq_linear(A, b, box, method="bvls", tol=1e-14, max_iter=MOST_EXCHANGES * len(unit))
-    # An unknown that the solver holds at a bound lies exactly there, whatever rounding the scaling by `unit` leaves.
-    within = np.clip(solved.x / unit, low[~thin], high[~thin])
-    within = np.where(solved.active_mask < 0, low[~thin], within)
-    within = np.where(solved.active_mask > 0, high[~thin], within)
 
-    out[~thin] = within
-    return out
+    # Unknowns whose bounds coincide stay where they are: lsq_linear needs room between its bounds.
+    low = np.minimum(lower, 0.0)
+    high = np.maximum(upper, 0.0)
+    fixed = high - low <= 0.0
+    d = np.zeros(len(d))
+    if fixed.all():
+        return d
+
+    low = low[~fixed]
+    high = high[~fixed]
+    norms = norms[~fixed]
+    solved = lsq_linear(
+        A[:, ~fixed] / norms,
+        b,
+        (low * norms, high * norms),
+        method="bvls",
+        tol=1e-14,
+        max_iter=MAX_EXCHANGES_PER_UNKNOWN * len(norms),
+    )
+
+    # An unknown that the solver holds at a bound lies exactly there, whatever rounding the scaling by the norms leaves.
+    inside = np.clip(solved.x / norms, low, high)
+    inside = np.where(solved.active_mask < 0, low, inside)
+    inside = np.where(solved.active_mask > 0, high, inside)
+
+    d[~fixed] = inside
+    return d

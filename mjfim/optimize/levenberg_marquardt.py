@@ -1,7 +1,7 @@
-"""Levenberg-Marquardt within bounds on condensed least squares, and the undamped Gauss-Newton of the paper.
+"""Levenberg-Marquardt within bounds on condensed least squares, and the undamped Gauss-Newton method of the paper.
 
-Knows a protocol, no MuJoCo. The damping follows the ratio of gained to promised reduction (Nielsen 1999); bounds hold in every
-step, which is solved as a bounded linear problem.
+The module knows arrays and one protocol, not MuJoCo. The damping follows the ratio of the actual to the predicted decrease of
+the cost (Nielsen 1999). Bounds hold in every step, because each step is solved as a bounded linear least-squares problem.
 """
 
 from __future__ import annotations
@@ -13,69 +13,125 @@ from typing import Protocol
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget, StopReason
 from mjfim.optimize.condensed_least_squares import Condensed, Step
 
-FIRST = 1e-3  # damping over the columns' own squares
-HARDLY = 1e-6  # damping at which a step says how far the minimum seems to be
-MOST = 1e12
-STILL = (
-    1e-6,
-    1e-2,
-)  # fall of the cost that is none, over the cost and itself; 1e-2 is a seventh of a standard deviation
+# Damping of the first step, relative to the squared column norms of the Jacobian.
+INITIAL_DAMPING = 1e-3
+
+# Damping of the step that predicts how far away the minimum is; nearly none.
+WEAK_DAMPING = 1e-6
+
+# Damping above which the search gives up: no step lowers the cost.
+MAX_DAMPING = 1e12
+
+# Damping never falls below this value, so that it can still grow by multiplication.
+MIN_DAMPING = 1e-15
+
+# Smallest damping from which it grows after a rejected step.
+MIN_RAISED_DAMPING = 1e-12
+
+# Ratio of the actual to the predicted decrease below which a step is rejected.
+MIN_DECREASE_RATIO = 1e-4
+
+# Ratio of the actual to the predicted decrease beyond which it no longer changes the damping.
+MAX_DECREASE_RATIO = 10.0
+
+# Decrease of the cost, relative to the cost, below which an iteration counts as stagnant.
+RELATIVE_STAGNATION = 1e-6
+
+# Decrease of the cost below which an iteration counts as stagnant; about a seventh of a standard deviation, squared.
+ABSOLUTE_STAGNATION = 1e-2
+
+# Share of the predicted decrease below which an iteration counts as stagnant.
+PREDICTED_STAGNATION = 0.1
+
+# Number of consecutive stagnant iterations after which the search ends.
+MAX_STAGNANT_ITERATIONS = 3
+
+# Length of a step [standard deviations] that the roughness of a simulation can explain: a step of this length that is predicted
+# but not found does not speak against convergence.
+SHORT_STEP = 0.3
+
+# A predicted step may exceed the step that was taken by this factor and still count as taken completely.
+COMPLETE_STEP = 1.1
+
+# Private unknowns count as converged when their steps are below this multiple of the tolerance.
+PRIVATE_TOLERANCE = 10.0
+
+# Fraction of a Gauss-Newton step below which halving it further is useless.
+MIN_FRACTION = 1e-8
 
 
-INTERRUPTED = "interrupted by the user; the best estimate so far"
-PATIENCE = 3  # times in turn that it may be none
-FRACTION = 0.3  # standard deviations; a step that short, promised but not found, is the roughness of the simulation
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UnknownValues:
+    """Values of all unknowns of a fit.
 
-
-@dataclass(frozen=True, eq=False)
-class Unknowns:
-    """theta: (p,) what is common, the rest unused;  starts: (P, n) of the pieces;  own: (K, e) of the recordings"""
+    Attributes:
+        theta: (p,) parameters that all recordings share; entries that are private or per recording are unused.
+        private: (P, n) private unknowns of each segment, e.g. its initial state.
+        per_recording: (K, e) parameters that each recording has for itself.
+    """
 
     theta: Array
-    starts: Array
-    own: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    private: Array
+    per_recording: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 class Problem(Protocol):
-    """Half of the squares as a function of unknowns."""
+    """Least-squares cost, half of the sum of squares, as a function of the unknowns."""
 
     @property
     def lower(self) -> Array:
-        """(c,) bounds of the common unknowns."""
+        """(c,) lower bounds of the common unknowns, -inf without a bound."""
 
     @property
     def upper(self) -> Array:
-        """(c,) bounds of the common unknowns."""
+        """(c,) upper bounds of the common unknowns, inf without a bound."""
 
-    def cost(self, at: Unknowns) -> float:
-        """Half of the loss and the priors; infinite where a simulation diverges."""
+    def cost(self, at: UnknownValues) -> float:
+        """Half of the loss of the residuals and of the squared priors; infinite where a simulation diverges."""
 
-    def condense(self, at: Unknowns) -> Condensed | None:
-        """Linearised, None where a perturbed simulation diverges."""
+    def condense(self, at: UnknownValues) -> Condensed | None:
+        """Linearisation of the residuals about the unknowns; None where a perturbed simulation diverges."""
 
-    def moved(self, at: Unknowns, step: Step, length: float) -> Unknowns:
-        """The unknowns after a part of a step."""
+    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
+        """The unknowns after a fraction of a step, inside the bounds."""
 
-    def place(self, at: Unknowns) -> Array:
+    def common_values(self, at: UnknownValues) -> Array:
         """(c,) values of the common unknowns."""
 
 
-@dataclass(frozen=True)
-class Progress:
-    """One iterate. cost: half of the squares;  size: standard deviations that the last step moved the common unknowns"""
+@dataclass(frozen=True, kw_only=True)
+class IterationReport:
+    """One accepted iteration, for callbacks.
+
+    Attributes:
+        iteration: Number of the iteration, from 1.
+        cost: Half of the sum of squared whitened residuals and priors.
+        step_length: Length of the step of the common unknowns [standard deviations].
+    """
 
     iteration: int
     cost: float
-    size: float
+    step_length: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
-    """Where the search ended. condensed: at the unknowns, or a step of less than the tolerance before them"""
+    """Result of a search.
 
-    unknowns: Unknowns
+    Attributes:
+        unknowns: Best values that were found.
+        condensed: Linearisation at the unknowns, or less than one tolerance away from them.
+        cost: Cost at the unknowns.
+        iterations: Number of iterations that were begun.
+        success: True where the search converged.
+        status: Sentence that says why the search ended.
+        interrupted: True where somebody asked the search to stop.
+    """
+
+    unknowns: UnknownValues
     condensed: Condensed
     cost: float
     iterations: int
@@ -84,150 +140,325 @@ class Solution:
     interrupted: bool = False
 
 
-@dataclass(frozen=True)
-class Search:
-    """How to search. tolerance: standard deviations, a step below which is the last;  damped: False: Gauss-Newton, no bounds
+@dataclass(frozen=True, kw_only=True)
+class SearchSettings:
+    """Settings of a search.
 
-    fresh: linearise once more at the end
+    Attributes:
+        max_iterations: Largest number of iterations.
+        tolerance: Length of a step [standard deviations] below which the search has converged.
+        damped: True for Levenberg-Marquardt inside the bounds, False for Gauss-Newton without bounds.
+        relinearise_at_end: Whether to linearise once more at the solution. False saves one linearisation and lets the search
+            end when the next step is predicted to be below the tolerance.
     """
 
-    iterations: int = 60
+    max_iterations: int = 60
     tolerance: float = 1e-4
     damped: bool = True
-    fresh: bool = True
+    relinearise_at_end: bool = True
+
+
+Callback = Callable[[IterationReport], None]
 
 
 def minimise(
     problem: Problem,
-    start: Unknowns,
-    search: Search,
-    tell: Callable[[Progress], None] | None = None,
+    start: UnknownValues,
+    settings: SearchSettings,
+    budget: Budget | None = None,
+    callback: Callback | None = None,
 ) -> Solution | None:
-    """From a start to a local minimum; None where the start, or its neighbourhood, diverges. Ctrl-C returns the best so far."""
-    now, cost = start, problem.cost(start)
-    linear = problem.condense(now) if np.isfinite(cost) else None
-    if linear is None:
+    """Search for a local minimum of the cost from an initial guess.
+
+    The budget is asked before every trial step and before every linearisation. When it is exhausted, the best values so far
+    are returned; nothing is raised.
+
+    Args:
+        problem: Cost and linearisation.
+        start: Initial guess.
+        settings: Tolerance, number of iterations and kind of step.
+        budget: Time and stop token; default: no limit.
+        callback: Called after every accepted iteration.
+
+    Returns:
+        The solution, or None where the initial guess or its neighbourhood diverges.
+    """
+    cost = problem.cost(start)
+    condensed = problem.condense(start) if np.isfinite(cost) else None
+    if condensed is None:
         return None
-    loop = _Loop(problem, search, tell)
-    try:
-        return loop.run(now, cost, linear)
-    except KeyboardInterrupt:
-        if loop.best is None:
-            raise
-        return loop.ended(INTERRUPTED, False, interrupted=True)
+
+    search = _Search(problem, settings, Budget() if budget is None else budget, callback)
+    return search.run(start, cost, condensed)
 
 
-def completed(problem: Problem, start: Unknowns, search: Search) -> Solution | None:
-    """The same where half a search is none: Ctrl-C is raised anew."""
-    found = minimise(problem, start, search)
-    if found is not None and found.interrupted:
-        raise KeyboardInterrupt
-    return found
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Trial:
+    """A step and the point to which it leads.
+
+    Attributes:
+        step: The complete step.
+        unknowns: Values after the fraction of the step.
+        cost: Cost at these values.
+        fraction: Fraction of the step that was taken.
+        ratio: Actual decrease of the cost over the predicted one.
+    """
+
+    step: Step
+    unknowns: UnknownValues
+    cost: float
+    fraction: float
+    ratio: float
 
 
-class _Loop:
+class _Search:
+    """State of one search: the current point, its linearisation and the damping."""
+
+    unknowns: UnknownValues
+    cost: float
+    condensed: Condensed
+    scale: Array
+
     def __init__(
-        self, problem: Problem, search: Search, tell: Callable[[Progress], None] | None
+        self,
+        problem: Problem,
+        settings: SearchSettings,
+        budget: Budget,
+        callback: Callback | None,
     ) -> None:
-        self.problem, self.search, self.tell = problem, search, tell
-        self.best: tuple[Unknowns, Condensed, float] | None = None
-        self.count = 0
+        self.problem = problem
+        self.settings = settings
+        self.budget = budget
+        self.callback = callback
 
-    def run(self, now: Unknowns, cost: float, linear: Condensed) -> Solution:
-        """All iterations."""
-        damping, growth = (FIRST if self.search.damped else 0.0), 2.0
-        scale, before, still = linear.lengths, np.inf, 0
-        self.best = (now, linear, cost)
-        for k in range(1, self.search.iterations + 1):
-            self.count = k
-            scale = np.maximum(scale, linear.lengths)
-            while True:
-                step = self._step(now, linear, damping, scale)
-                trial, found, length = self._try(now, step, cost)
-                ratio = min((cost - found) / max(step.gain, 1e-300), 10.0)
-                if found <= cost and (ratio > 1e-4 or self._small(step)):
-                    break
-                if self._small(step) or damping > MOST or not self.search.damped:
-                    return self._stuck(self._promised(now, linear, scale))
-                damping, growth = max(damping, 1e-12) * growth, 2.0 * growth
-            promised = self._promised(now, linear, scale)
-            last = (
-                length == 1.0 and damping <= FIRST and self._small(step) and self._small(promised)
-            )
-            hardly = cost - found <= min(STILL[0] * cost, STILL[1], 0.1 * promised.gain)
-            still = still + 1 if hardly else 0
-            if still == PATIENCE:
-                self.best = (trial, linear, found)
-                return self._stuck(promised)
-            if not self.search.fresh and length == 1.0:
-                last = last or self._nearly(promised, step, before)
-            before = step.size
-            now, cost = trial, found
-            self.best = (now, linear, cost)
-            if self.tell is not None:
-                self.tell(Progress(self.count, cost, step.size))
-            if last:
-                return self._concluded(now, cost, linear)
-            if self.search.damped:
-                damping, growth = (
-                    max(damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3), 1e-15),
-                    2.0,
-                )
-            fresh = self.problem.condense(now)
-            if fresh is None:
-                return self.ended("stopped: the simulation diverges next to the estimate", False)
-            linear = fresh
-            self.best = (now, linear, cost)
-        return self.ended(f"not converged in {self.search.iterations} iterations", False)
+        self.iteration = 0
+        self.damping = INITIAL_DAMPING if settings.damped else 0.0
+        self.damping_growth = 2.0
+        self.stagnant_iterations = 0
+        self.previous_length = np.inf
 
-    def _step(self, now: Unknowns, linear: Condensed, damping: float, scale: Array) -> Step:
-        room = np.full(linear.common, np.inf)
-        lower, upper = -room, room
-        if self.search.damped:
-            place = self.problem.place(now)
-            lower, upper = self.problem.lower - place, self.problem.upper - place
-        return linear.step(damping, scale, lower, upper)
+    def run(self, start: UnknownValues, cost: float, condensed: Condensed) -> Solution:
+        """Iterate from a point with its cost and linearisation until the search ends."""
+        self.unknowns = start
+        self.cost = cost
+        self.condensed = condensed
+        self.scale = condensed.column_norms
 
-    def _promised(self, now: Unknowns, linear: Condensed, scale: Array) -> Step:
-        """A step that damping does not shorten: any step is short where it does."""
-        return self._step(now, linear, HARDLY if self.search.damped else 0.0, scale)
+        while self.iteration < self.settings.max_iterations:
+            ended = self._iterate()
+            if ended is not None:
+                return ended
 
-    def _try(self, now: Unknowns, step: Step, cost: float) -> tuple[Unknowns, float, float]:
-        """The unknowns after the step, halved while it raises the cost where nothing else shortens it."""
-        length = 1.0
-        while True:
-            trial = self.problem.moved(now, step, length)
-            found = self.problem.cost(trial)
-            if self.search.damped or found <= cost or length < 1e-8 or self._small(step):
-                return trial, found, length
-            length *= 0.5
-
-    def _small(self, step: Step) -> bool:
-        return step.size < self.search.tolerance and step.each < 10 * self.search.tolerance
-
-    def _nearly(self, promised: Step, step: Step, before: float) -> bool:
-        """Gauss-Newton steps shrink quadratically: a fraction of a deviation now, less than the tolerance next."""
-        coming = step.size * (step.size / before) ** 2 if before > 0.0 else np.inf
-        whole = promised.size < 1.1 * step.size and promised.each < FRACTION
-        return whole and step.size < FRACTION and coming < self.search.tolerance
-
-    def _stuck(self, step: Step) -> Solution:
-        """No step helps: where the one promised is short, that is the end."""
-        if step.size < FRACTION and step.each < FRACTION:
-            return self.ended("converged: the residual stopped falling", True)
-        return self.ended(
-            "stopped: no step lowers the residual any more, though the linearised model promises one",
-            False,
+        return self._solution(
+            f"not converged in {self.settings.max_iterations} iterations", success=False
         )
 
-    def _concluded(self, now: Unknowns, cost: float, linear: Condensed) -> Solution:
-        fresh = self.problem.condense(now) if self.search.fresh else None
-        self.best = (now, fresh or linear, cost)
-        return self.ended("converged: the step vanished", True)
+    def _iterate(self) -> Solution | None:
+        """Take one step and linearise at its end; return the solution where the search ends."""
+        if (reason := self.budget.exhausted) is not None:
+            return self._stopped(reason)
 
-    def ended(self, status: str, success: bool, interrupted: bool = False) -> Solution:
-        """The best so far."""
-        if self.best is None:
-            raise ValueError("nothing was found yet")
-        unknowns, condensed, cost = self.best
-        return Solution(unknowns, condensed, cost, self.count, success, status, interrupted)
+        # Marquardt's scaling: column norms never shrink, so that the damping does not forget a column.
+        self.iteration += 1
+        self.scale = np.maximum(self.scale, self.condensed.column_norms)
+
+        trial = self._accepted_trial()
+        if isinstance(trial, Solution):
+            return trial
+
+        # The search ends where the cost no longer falls, whatever the linearisation predicts.
+        predicted = self._predicted_step()
+        if self._stagnates(trial, predicted):
+            self.unknowns = trial.unknowns
+            self.cost = trial.cost
+            return self._without_progress(predicted)
+
+        converged = self._converged(trial, predicted)
+        self.previous_length = trial.step.common_length
+        self.unknowns = trial.unknowns
+        self.cost = trial.cost
+        self._report(trial.step)
+
+        if converged:
+            return self._finished()
+
+        self._relax_damping(trial.ratio)
+        return self._linearise()
+
+    def _accepted_trial(self) -> _Trial | Solution:
+        """Raise the damping until a step lowers the cost; a solution where none does or the budget is exhausted."""
+        while True:
+            trial = self._trial()
+
+            # A step below the tolerance may miss the predicted decrease: round-off of the simulation hides it.
+            small = self._is_small(trial.step)
+            if trial.cost <= self.cost and (trial.ratio > MIN_DECREASE_RATIO or small):
+                return trial
+
+            if small or self.damping > MAX_DAMPING or not self.settings.damped:
+                return self._without_progress(self._predicted_step())
+
+            self.damping = max(self.damping, MIN_RAISED_DAMPING) * self.damping_growth
+            self.damping_growth *= 2.0
+
+            if (reason := self.budget.exhausted) is not None:
+                return self._stopped(reason)
+
+    def _trial(self) -> _Trial:
+        """Evaluate a step with the current damping; without damping, halve it while it raises the cost."""
+        step = self._step(self.damping)
+        fraction = 1.0
+
+        while True:
+            unknowns = self.problem.moved(self.unknowns, step, fraction)
+            cost = self.problem.cost(unknowns)
+
+            useless = fraction < MIN_FRACTION or self._is_small(step)
+            if self.settings.damped or cost <= self.cost or useless:
+                break
+            fraction *= 0.5
+
+        ratio = (self.cost - cost) / max(step.predicted_decrease, 1e-300)
+        return _Trial(
+            step=step,
+            unknowns=unknowns,
+            cost=cost,
+            fraction=fraction,
+            ratio=min(ratio, MAX_DECREASE_RATIO),
+        )
+
+    def _step(self, damping: float) -> Step:
+        """Minimiser of the damped linearised cost, within the bounds where the search is damped."""
+        if self.settings.damped:
+            values = self.problem.common_values(self.unknowns)
+            lower = self.problem.lower - values
+            upper = self.problem.upper - values
+        else:
+            upper = np.full(self.condensed.common_count, np.inf)
+            lower = -upper
+
+        return self.condensed.step(damping, self.scale, lower, upper)
+
+    def _predicted_step(self) -> Step:
+        """Step to the minimum of the linearised cost. Damped steps are short everywhere and do not show how far it is."""
+        return self._step(WEAK_DAMPING if self.settings.damped else 0.0)
+
+    def _is_small(self, step: Step) -> bool:
+        """Whether a step is below the tolerance."""
+        tolerance = self.settings.tolerance
+        return (
+            step.common_length < tolerance and step.private_length < PRIVATE_TOLERANCE * tolerance
+        )
+
+    def _stagnates(self, trial: _Trial, predicted: Step) -> bool:
+        """Count consecutive iterations that hardly lower the cost; True when there were too many."""
+        negligible = min(
+            RELATIVE_STAGNATION * self.cost,
+            ABSOLUTE_STAGNATION,
+            PREDICTED_STAGNATION * predicted.predicted_decrease,
+        )
+        if self.cost - trial.cost <= negligible:
+            self.stagnant_iterations += 1
+        else:
+            self.stagnant_iterations = 0
+
+        return self.stagnant_iterations == MAX_STAGNANT_ITERATIONS
+
+    def _converged(self, trial: _Trial, predicted: Step) -> bool:
+        """Whether the step that was taken is the last one."""
+        if trial.fraction != 1.0:
+            return False
+
+        # A short step proves convergence only where damping did not shorten it.
+        if (
+            self.damping <= INITIAL_DAMPING
+            and self._is_small(trial.step)
+            and self._is_small(predicted)
+        ):
+            return True
+
+        return not self.settings.relinearise_at_end and self._next_step_is_small(
+            trial.step, predicted
+        )
+
+    def _next_step_is_small(self, step: Step, predicted: Step) -> bool:
+        """Whether the next step will be below the tolerance: Gauss-Newton steps shrink quadratically near the minimum."""
+        length = step.common_length
+        next_length = np.inf
+        if self.previous_length > 0.0:
+            next_length = length * (length / self.previous_length) ** 2
+
+        complete = (
+            predicted.common_length < COMPLETE_STEP * length
+            and predicted.private_length < SHORT_STEP
+        )
+        return complete and length < SHORT_STEP and next_length < self.settings.tolerance
+
+    def _report(self, step: Step) -> None:
+        """Call the callback."""
+        if self.callback is not None:
+            self.callback(
+                IterationReport(
+                    iteration=self.iteration, cost=self.cost, step_length=step.common_length
+                )
+            )
+
+    def _relax_damping(self, ratio: float) -> None:
+        """Lower or raise the damping by the ratio of actual to predicted decrease (Nielsen 1999, eq. 2.5)."""
+        if not self.settings.damped:
+            return
+
+        factor = max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
+        self.damping = max(self.damping * factor, MIN_DAMPING)
+        self.damping_growth = 2.0
+
+    def _linearise(self) -> Solution | None:
+        """Linearise at the current point; a solution where that is impossible or the budget is exhausted."""
+        if (reason := self.budget.exhausted) is not None:
+            return self._stopped(reason)
+
+        condensed = self.problem.condense(self.unknowns)
+        if condensed is None:
+            return self._solution(
+                "stopped: the simulation diverges next to the estimate", success=False
+            )
+
+        self.condensed = condensed
+        return None
+
+    def _finished(self) -> Solution:
+        """Solution after the last step, linearised there where the settings ask for it."""
+        if self.settings.relinearise_at_end:
+            self.condensed = self.problem.condense(self.unknowns) or self.condensed
+
+        return self._solution("converged: the step vanished", success=True)
+
+    def _without_progress(self, predicted: Step) -> Solution:
+        """Solution where no step lowers the cost: converged if the predicted step is short."""
+        if predicted.common_length < SHORT_STEP and predicted.private_length < SHORT_STEP:
+            return self._solution("converged: the residual stopped falling", success=True)
+
+        return self._solution(
+            "stopped: no step lowers the residual any more, though the linearised model predicts one",
+            success=False,
+        )
+
+    def _stopped(self, reason: StopReason) -> Solution:
+        """Best values so far, where the budget is exhausted."""
+        return self._solution(
+            f"{reason.value}; the best estimate so far",
+            success=False,
+            interrupted=reason is StopReason.REQUESTED,
+        )
+
+    def _solution(self, status: str, success: bool, interrupted: bool = False) -> Solution:
+        """The current point as a solution."""
+        return Solution(
+            unknowns=self.unknowns,
+            condensed=self.condensed,
+            cost=self.cost,
+            iterations=self.iteration,
+            success=success,
+            status=status,
+            interrupted=interrupted,
+        )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -15,7 +17,7 @@ from mjfim.experiment.system import Setup
 from mjfim.identification.aligned_recording import track_of
 from mjfim.identification.identify import identify, least_squares, newton_raphson
 from mjfim.identification.residuals import Fit
-from mjfim.optimize.levenberg_marquardt import Progress
+from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
 from mjfim.studies.campaign import identified
 from tests.support.paths import ROOT
@@ -196,12 +198,12 @@ def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
     """Ctrl-C in the second iteration."""
     costs: list[float] = []
 
-    def tell(what: str, iterate: Progress) -> None:
-        costs.append(iterate.cost)
+    def show(event: FitEvent) -> None:
+        costs.append(event.cost)
         if len(costs) == 2:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
 
-    found = identify(setup, [recording], tell=tell)
+    found = identify(setup, [recording], callback=show)
     assert found.interrupted and not found.success
     assert found.status.startswith("interrupted")
     assert found.chi2 == pytest.approx(2.0 * min(costs), rel=1e-9)
@@ -209,7 +211,7 @@ def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
 
 
 @pytest.mark.parametrize(
-    "place", ["identify.suspects", "cross_validation.completed", "cross_validation._errors"]
+    "place", ["identify.suspects", "cross_validation.minimise", "cross_validation._errors"]
 )
 def test_interrupted_after_the_search_the_estimate_stays(
     setup: Setup, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
@@ -217,8 +219,12 @@ def test_interrupted_after_the_search_the_estimate_stays(
     """Ctrl-C while terms are looked for that the model lacks, or while the rest is predicted."""
     whole = identify(setup, [recording])
 
+    pressed: list[bool] = []
+
     def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
+        if not pressed:
+            pressed.append(True)
+            signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(f"mjfim.identification.{place}", interrupt)
     found = identify(setup, [recording])
@@ -238,7 +244,7 @@ def test_half_a_search_is_no_answer(
     def interrupt(self: Fit, at: object) -> object:
         count[0] += 1
         if count[0] == 3:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
         return condense(self, at)
 
     monkeypatch.setattr(Fit, "condense", interrupt)
@@ -260,12 +266,12 @@ def test_interrupted_where_a_further_start_begins(setup: Setup, recording: Recor
     """The starts before it stay; none comes after it."""
     several, seen = Setup(setup.experiment.replace(fit={"starts": 6})), list[str]()
 
-    def tell(what: str, iterate: Progress) -> None:
-        seen.append(what)
-        if what.startswith("start 3"):
-            raise KeyboardInterrupt
+    def show(event: FitEvent) -> None:
+        seen.append(event.phase)
+        if event.phase.startswith("start 3"):
+            signal.raise_signal(signal.SIGINT)
 
-    found = identify(several, [recording], tell=tell)
+    found = identify(several, [recording], callback=show)
     assert found.interrupted
     assert not any(what.startswith("start 4") or what == "all data" for what in seen)
     np.testing.assert_allclose(found.theta, identify(setup, [recording]).theta, rtol=1e-3)
@@ -277,12 +283,12 @@ def test_interrupted_before_the_last_search_nothing_more_is_searched(
     pieces = Setup(setup.experiment.replace(fit={"segments": 1.0}))
     seen: list[str] = []
 
-    def tell(what: str, iterate: Progress) -> None:
-        seen.append(what)
-        if what == "where pieces start":
-            raise KeyboardInterrupt
+    def show(event: FitEvent) -> None:
+        seen.append(event.phase)
+        if event.phase == "where pieces start":
+            signal.raise_signal(signal.SIGINT)
 
-    found = identify(pieces, [recording], tell=tell)
+    found = identify(pieces, [recording], callback=show)
     assert found.interrupted and not found.success
     assert set(seen) == {"where pieces start"}
     np.testing.assert_array_equal(found.theta, setup.parameters.guess)

@@ -47,15 +47,26 @@ class Linear:
         known = (
             np.column_stack([np.eye(c), theta])[: c * bool(np.isfinite(self.prior))] / self.prior
         )
-        return theta, Condensed(blocks, owner, np.zeros((K, 0, n + c + 1)), known)
+        return theta, Condensed(
+            blocks=blocks,
+            segment_of_block=owner,
+            private_rows=np.zeros((K, 0, n + c + 1)),
+            common_rows=known,
+        )
 
     def judged(self, y: Array, length: float, draws: int = 0) -> tuple[Array, Array, Uncertainty]:
         """Estimate, its formal deviations and what is said of it."""
         theta, condensed = self.fitted(y)
-        rows = np.full(len(condensed.piece), float(FINE))
+        rows = np.full(len(condensed.segment_of_block), float(FINE))
         formal = np.sqrt(np.diag(np.linalg.inv(condensed.information())))
         said = uncertainty(
-            condensed, theta, condensed.piece, rows, length, draws, np.random.default_rng(0)
+            condensed,
+            theta,
+            condensed.segment_of_block,
+            rows,
+            length,
+            draws,
+            np.random.default_rng(0),
         )
         return theta, formal, said
 
@@ -226,10 +237,13 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
     theta, condensed = Linear(X).fitted(y)
     wide = np.append(unit, 1.0)
     other = Condensed(
-        condensed.blocks * wide, condensed.piece, condensed.inner * wide, condensed.outer * wide
+        blocks=condensed.blocks * wide,
+        segment_of_block=condensed.segment_of_block,
+        private_rows=condensed.private_rows * wide,
+        common_rows=condensed.common_rows * wide,
     )
-    rows = np.full(len(condensed.piece), float(FINE))
-    two = uncertainty(other, theta / unit, other.piece, rows, 36.0, 50, np.random.default_rng(0))
+    rows = np.full(len(condensed.segment_of_block), float(FINE))
+    two = uncertainty(other, theta / unit, other.segment_of_block, rows, 36.0, 50, np.random.default_rng(0))
     np.testing.assert_allclose(two.sandwich * unit, one.sandwich, rtol=1e-6)
     np.testing.assert_allclose(two.interval * unit[:, None], one.interval, rtol=1e-6)
     np.testing.assert_allclose(two.each * unit, one.each, rtol=1e-6)

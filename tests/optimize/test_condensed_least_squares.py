@@ -83,7 +83,12 @@ def problem(
         inside[:, :, n - 1] = 0.0
         for block in blocks:
             block[:, n - 1] = 0.0
-    condensed = Condensed(np.stack([condense(b) for b in blocks]), owner, inside, outside)
+    condensed = Condensed(
+        blocks=np.stack([condense(b) for b in blocks]),
+        segment_of_block=owner,
+        private_rows=inside,
+        common_rows=outside,
+    )
     every = [spread(b[:, :-1], i, P, n) for b, i in zip(blocks, owner, strict=True)]
     every += [spread(own[:, :-1], i, P, n) for i, own in enumerate(inside)]
     J = np.concatenate([*every, np.pad(outside[:, :-1], ((0, 0), (P * n, 0)))])
@@ -118,11 +123,11 @@ def test_a_step_is_that_of_the_full_stacked_problem(
         step = dense.condensed.step(damping, scale, np.full(dense.c, -FREE), np.full(dense.c, FREE))
         unit = np.linalg.norm(rows, axis=0)
         close(np.concatenate([step.private.ravel(), step.common]) * unit, wanted * unit)
-        assert step.gain == pytest.approx(
+        assert step.predicted_decrease == pytest.approx(
             0.5 * float(dense.r @ dense.r) - dense.halves(step), rel=1e-8
         )
-        assert dense.condensed.pieces == dense.P
-        assert (dense.condensed.private, dense.condensed.common) == (dense.n, dense.c)
+        assert dense.condensed.segment_count == dense.P
+        assert (dense.condensed.private_count, dense.condensed.common_count) == (dense.n, dense.c)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -182,10 +187,10 @@ def test_many_bounds_are_sorted_out() -> None:
         lower = -rng.uniform(0, 2, c) * (rng.random(c) < 0.7)
         upper = rng.uniform(0, 2, c) * (rng.random(c) < 0.7)
         condensed = Condensed(
-            np.column_stack([A, -b])[None],
-            np.zeros(1, int),
-            np.zeros((1, 0, c + 1)),
-            np.zeros((0, c + 1)),
+            blocks=np.column_stack([A, -b])[None],
+            segment_of_block=np.zeros(1, int),
+            private_rows=np.zeros((1, 0, c + 1)),
+            common_rows=np.zeros((0, c + 1)),
         )
         d = condensed.step(0.0, np.ones(c), lower, upper).common
         slope = A.T @ (A @ d - b) / (np.abs(A).sum(axis=0) * np.linalg.norm(b))
@@ -207,7 +212,7 @@ def test_a_common_unknown_that_cannot_move_stays() -> None:
     still = dense.condensed.step(0.0, np.ones(5), none, none)
     close(still.private.ravel(), lstsq(dense.starts, -dense.r)[0])
     assert not still.common.any()
-    assert still.size == 0.0
+    assert still.common_length == 0.0
 
 
 @pytest.mark.parametrize("lame", [False, True])
@@ -223,15 +228,15 @@ def test_what_is_left_of_the_private_unknowns(shape: tuple[int, int, int], lame:
         follow = -(inverse / unit[:, None]) @ dense.shared
         left = dense.shared + dense.starts @ follow
         close(C.information(), left.T @ left)
-        outer = C.outer[:, :-1]
-        close(C.information(outer=False), left.T @ left - outer.T @ outer, rtol=1e-6)
-        rows = np.concatenate([C.profile(), C.outer])
+        outer = C.common_rows[:, :-1]
+        close(C.information(with_common_rows=False), left.T @ left - outer.T @ outer, rtol=1e-6)
+        rows = np.concatenate([C.reduced_rows(), C.common_rows])
         rest = dense.r - dense.starts @ (inverse / unit[:, None]) @ dense.r
         both = np.column_stack([left, rest])
         close(rows.T @ rows, both.T @ both)
         rank = np.linalg.matrix_rank(dense.starts / unit) if n else 0
         if rank == P * n:
-            close(C.eliminated, follow.reshape(P, n, c), rtol=1e-6)
+            close(C.private_response, follow.reshape(P, n, c), rtol=1e-6)
 
 
 def test_lengths_are_those_of_the_columns() -> None:
@@ -239,7 +244,7 @@ def test_lengths_are_those_of_the_columns() -> None:
     dense = problem(1)
     norms = np.linalg.norm(dense.J, axis=0)
     own = np.sqrt(np.mean(norms[: dense.P * dense.n].reshape(dense.P, dense.n) ** 2, axis=0))
-    close(dense.condensed.lengths, np.concatenate([own, norms[dense.P * dense.n :]]))
+    close(dense.condensed.column_norms, np.concatenate([own, norms[dense.P * dense.n :]]))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -251,21 +256,30 @@ def test_scores_and_grams_of_the_blocks_sum_to_gradient_and_information(
         dense = problem(seed, *shape, inner=shape[1] + 1)
         C, n = dense.condensed, dense.n
         for b, rows in enumerate(dense.blocks):
-            J = rows[:, n:-1] + rows[:, :n] @ C.eliminated[C.piece[b]]
-            scale = np.abs(C.scores).max()
-            np.testing.assert_allclose(C.scores[b], J.T @ rows[:, -1], rtol=1e-7, atol=1e-9 * scale)
+            J = rows[:, n:-1] + rows[:, :n] @ C.private_response[C.segment_of_block[b]]
+            scale = np.abs(C.block_scores).max()
             np.testing.assert_allclose(
-                C.grams[b], J.T @ J, rtol=1e-7, atol=1e-9 * np.abs(C.grams).max()
+                C.block_scores[b], J.T @ rows[:, -1], rtol=1e-7, atol=1e-9 * scale
             )
-        known = np.concatenate([C.known.reshape(-1, dense.c + 1), C.outer])
-        gradient = C.scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
+            np.testing.assert_allclose(
+                C.block_information[b],
+                J.T @ J,
+                rtol=1e-7,
+                atol=1e-9 * np.abs(C.block_information).max(),
+            )
+        known = np.concatenate([C.reduced_private_rows.reshape(-1, dense.c + 1), C.common_rows])
+        gradient = C.block_scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
         fitted = dense.starts @ np.linalg.lstsq(dense.starts, -dense.r)[0] if n else 0.0
         wanted = dense.shared.T @ (dense.r + fitted)
         if n:
             basis = np.linalg.qr(dense.starts)[0]
             wanted = (dense.shared - basis @ (basis.T @ dense.shared)).T @ dense.r
         close(gradient, wanted, rtol=1e-6)
-        close(C.grams.sum(axis=0) + known[:, :-1].T @ known[:, :-1], C.information(), rtol=1e-6)
+        close(
+            C.block_information.sum(axis=0) + known[:, :-1].T @ known[:, :-1],
+            C.information(),
+            rtol=1e-6,
+        )
 
 
 def test_the_gradient_is_the_slope_of_the_squares_with_the_private_unknowns_following() -> None:
@@ -278,8 +292,8 @@ def test_the_gradient_is_the_slope_of_the_squares_with_the_private_unknowns_foll
         left = r - dense.starts @ np.linalg.lstsq(dense.starts, r)[0]
         return 0.5 * float(left @ left)
 
-    known = np.concatenate([C.known.reshape(-1, dense.c + 1), C.outer])
-    gradient = C.scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
+    known = np.concatenate([C.reduced_private_rows.reshape(-1, dense.c + 1), C.common_rows])
+    gradient = C.block_scores.sum(axis=0) + known[:, :-1].T @ known[:, -1]
     for j in range(dense.c):
         e = np.eye(dense.c)[j] * 1e-3 / np.linalg.norm(dense.shared[:, j])
         assert gradient[j] == pytest.approx((half(e) - half(-e)) / (2 * e[j]), rel=1e-5)
@@ -290,7 +304,7 @@ def test_pieces_that_do_not_tell_their_start_do_not_break_the_step(damping: floa
     """One private unknown is in no row at all; one piece has fewer rows than unknowns."""
     for seed in range(5):
         dense = problem(seed, P=3, n=3, c=2, inner=0, outer=3, lame=True)
-        scale = np.maximum(dense.condensed.lengths, 0.0)
+        scale = np.maximum(dense.condensed.column_norms, 0.0)
         step = dense.condensed.step(damping, scale, np.full(2, -FREE), np.full(2, FREE))
         assert np.isfinite(step.private).all()
         assert np.abs(step.private[:, 2]).max() == 0.0
@@ -306,9 +320,9 @@ def test_only_private_unknowns() -> None:
     none = np.zeros(0)
     step = dense.condensed.step(0.0, np.ones(2), none, none)
     close(step.private.ravel(), lstsq(dense.J, -dense.r)[0])
-    assert step.size == 0.0
+    assert step.common_length == 0.0
     assert dense.condensed.information().shape == (0, 0)
-    assert dense.condensed.scores.shape == (len(dense.blocks), 0)
+    assert dense.condensed.block_scores.shape == (len(dense.blocks), 0)
 
 
 def test_size_and_each_are_standard_deviations() -> None:
@@ -318,9 +332,9 @@ def test_size_and_each_are_standard_deviations() -> None:
     step = C.step(0.0, np.ones(5), np.full(3, -FREE), np.full(3, FREE))
     basis = np.linalg.qr(dense.starts)[0]
     left = dense.shared - basis @ (basis.T @ dense.shared)
-    assert step.size == pytest.approx(float(np.linalg.norm(left @ step.common)), rel=1e-8)
+    assert step.common_length == pytest.approx(float(np.linalg.norm(left @ step.common)), rel=1e-8)
     squares = np.linalg.norm(dense.starts @ step.private.ravel()) ** 2
-    assert step.each == pytest.approx(np.sqrt(squares / step.private.size), rel=1e-8)
+    assert step.private_length == pytest.approx(np.sqrt(squares / step.private.size), rel=1e-8)
 
 
 def test_units_of_the_unknowns_do_not_matter() -> None:
@@ -328,12 +342,17 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
     dense = problem(9, inner=3, outer=4)
     unit = np.array([1e6, 1e-4, 1e-5, 1.0, 1e5, 1.0])
     C = dense.condensed
-    other = Condensed(C.blocks * unit, C.piece, C.inner * unit, C.outer * unit[2:])
+    other = Condensed(
+        blocks=C.blocks * unit,
+        segment_of_block=C.segment_of_block,
+        private_rows=C.private_rows * unit,
+        common_rows=C.common_rows * unit[2:],
+    )
     for lower in (-FREE, -0.01):
         bound = np.full(3, lower)
-        one = C.step(1e-4, C.lengths, bound, -bound)
-        two = other.step(1e-4, other.lengths, bound / unit[2:-1], -bound / unit[2:-1])
+        one = C.step(1e-4, C.column_norms, bound, -bound)
+        two = other.step(1e-4, other.column_norms, bound / unit[2:-1], -bound / unit[2:-1])
         close(two.common * unit[2:-1], one.common, rtol=1e-6)
         close(two.private * unit[:2], one.private, rtol=1e-6)
-        assert two.size == pytest.approx(one.size, rel=1e-6)
+        assert two.common_length == pytest.approx(one.common_length, rel=1e-6)
     close(other.information(), C.information() * np.outer(unit[2:-1], unit[2:-1]), rtol=1e-6)

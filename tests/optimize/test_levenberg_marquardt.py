@@ -9,13 +9,20 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from mjfim.budget import Budget, StopToken
 from mjfim.optimize.condensed_least_squares import Condensed, Step
-from mjfim.optimize.levenberg_marquardt import Progress, Search, Solution, Unknowns, minimise
+from mjfim.optimize.levenberg_marquardt import (
+    IterationReport,
+    SearchSettings,
+    Solution,
+    UnknownValues,
+    minimise,
+)
 from tests.support.numerics import Array
 
 Rows = Callable[[Array, Array], Array]
 FREE = np.inf
-SHARP = Search(iterations=200, tolerance=1e-9)
+SHARP = SearchSettings(max_iterations=200, tolerance=1e-9)
 
 
 @dataclass(eq=False)
@@ -30,24 +37,25 @@ class Analytic:
     upper: Array
     spoil: Callable[[Array], Array] = np.asarray
     stop: int | None = None
-    seen: list[Unknowns] = field(default_factory=list)
+    token: StopToken = field(default_factory=StopToken)
+    seen: list[UnknownValues] = field(default_factory=list)
 
-    def residuals(self, at: Unknowns) -> list[Array]:
-        return [rows(at.theta, own) for rows, own in zip(self.pieces, at.starts, strict=True)]
+    def residuals(self, at: UnknownValues) -> list[Array]:
+        return [rows(at.theta, own) for rows, own in zip(self.pieces, at.private, strict=True)]
 
-    def cost(self, at: Unknowns) -> float:
+    def cost(self, at: UnknownValues) -> float:
         self.seen.append(at)
         if self.stop is not None and len(self.seen) >= self.stop:
-            raise KeyboardInterrupt
+            self.token.request()
         with np.errstate(all="ignore"):
             half = 0.5 * sum(float(r @ r) for r in self.residuals(at))
         return half if np.isfinite(half) else np.inf
 
-    def condense(self, at: Unknowns) -> Condensed | None:
-        n, c = at.starts.shape[1], len(at.theta)
+    def condense(self, at: UnknownValues) -> Condensed | None:
+        n, c = at.private.shape[1], len(at.theta)
         blocks = np.zeros((len(self.pieces), n + c + 1, n + c + 1))
         for i, (rows, r) in enumerate(zip(self.pieces, self.residuals(at), strict=True)):
-            both = np.concatenate([at.starts[i], at.theta]).astype(complex)
+            both = np.concatenate([at.private[i], at.theta]).astype(complex)
             J = np.stack(
                 [rows(*_split(both + 1e-30j * e, n)).imag / 1e-30 for e in np.eye(n + c)], axis=1
             )
@@ -57,14 +65,17 @@ class Analytic:
             return None
         owners = np.arange(len(self.pieces))
         return Condensed(
-            blocks, owners, np.zeros((len(owners), 0, n + c + 1)), np.zeros((0, c + 1))
+            blocks=blocks,
+            segment_of_block=owners,
+            private_rows=np.zeros((len(owners), 0, n + c + 1)),
+            common_rows=np.zeros((0, c + 1)),
         )
 
-    def moved(self, at: Unknowns, step: Step, length: float) -> Unknowns:
+    def moved(self, at: UnknownValues, step: Step, length: float) -> UnknownValues:
         theta = np.clip(at.theta + length * step.common, self.lower, self.upper)
-        return Unknowns(theta, at.starts + length * step.private)
+        return UnknownValues(theta=theta, private=at.private + length * step.private)
 
-    def place(self, at: Unknowns) -> Array:
+    def common_values(self, at: UnknownValues) -> Array:
         return at.theta
 
 
@@ -80,25 +91,25 @@ def problem(
     return Analytic(pieces, np.array(lower), top, **more)  # type: ignore[arg-type]
 
 
-def reference(p: Analytic, start: Unknowns) -> tuple[Array, Array, float]:
+def reference(p: Analytic, start: UnknownValues) -> tuple[Array, Array, float]:
     """theta, starts and half of the squares by scipy, all unknowns in one vector."""
-    c, shape = len(start.theta), start.starts.shape
+    c, shape = len(start.theta), start.private.shape
 
     def f(z: Array) -> Array:
-        return np.concatenate(p.residuals(Unknowns(z[:c], z[c:].reshape(shape))))
+        return np.concatenate(p.residuals(UnknownValues(theta=z[:c], private=z[c:].reshape(shape))))
 
-    none = np.full(start.starts.size, FREE)
+    none = np.full(start.private.size, FREE)
     bounds = (np.concatenate([p.lower, -none]), np.concatenate([p.upper, none]))
-    z0 = np.concatenate([start.theta, start.starts.ravel()])
+    z0 = np.concatenate([start.theta, start.private.ravel()])
     found = least_squares(
         f, z0, "cs", bounds, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=5000
     )
     return found.x[:c], found.x[c:].reshape(shape), float(found.cost)
 
 
-def solved(p: Analytic, start: Unknowns, search: Search = SHARP) -> Solution:
+def solved(p: Analytic, start: UnknownValues, search: SearchSettings = SHARP) -> Solution:
     """What `minimise` finds."""
-    found = minimise(p, start, search)
+    found = minimise(p, start, search, Budget(stop=p.token))
     assert found is not None
     return found
 
@@ -137,19 +148,19 @@ def peak(theta: Array, own: Array) -> Array:
     return (theta[0] * np.exp(-((x - theta[1]) ** 2) / (2 * theta[2] ** 2)) - y) / 0.05
 
 
-def alone(*theta: float) -> Unknowns:
+def alone(*theta: float) -> UnknownValues:
     """A start without private unknowns."""
-    return Unknowns(np.array(theta), np.zeros((1, 0)))
+    return UnknownValues(theta=np.array(theta), private=np.zeros((1, 0)))
 
 
 CASES = {
     "decays": (
         lambda: problem(*decays(), lower=[0.0, -5.0]),
-        Unknowns(np.array([0.3, 0.0]), np.ones((3, 1))),
+        UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1))),
     ),
     "bounded decays": (
         lambda: problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0]),
-        Unknowns(np.array([0.3, 1.0]), np.ones((3, 1))),
+        UnknownValues(theta=np.array([0.3, 1.0]), private=np.ones((3, 1))),
     ),
     "valley": (lambda: problem(rosenbrock, lower=[-5.0, -5.0], upper=[5.0, 5.0]), alone(-1.2, 1.0)),
     "walled valley": (
@@ -177,14 +188,14 @@ def test_the_minimum_is_that_of_scipy(name: str) -> None:
     """Within bounds that no evaluated point leaves; the cost falls from iterate to iterate."""
     build, start = CASES[name]
     p = build()
-    told: list[Progress] = []
-    found = minimise(p, start, SHARP, told.append)
+    told: list[IterationReport] = []
+    found = minimise(p, start, SHARP, callback=told.append)
     assert found is not None
     theta, starts, cost = reference(build(), start)
     assert found.success, found.status
     assert found.cost <= cost * (1 + 1e-9) + 1e-12
     np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(found.unknowns.starts, starts, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(found.unknowns.private, starts, rtol=1e-6, atol=1e-8)
     assert len(p.seen) > 3
     for at in p.seen:
         assert (at.theta >= p.lower).all()
@@ -199,16 +210,18 @@ def test_the_minimum_is_that_of_scipy(name: str) -> None:
 def test_gauss_newton_goes_where_damped_steps_go_and_ignores_bounds() -> None:
     """Undamped from nearby; steps that would raise the cost are halved."""
     p = problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0])
-    start = Unknowns(np.array([1.0, 0.4]), np.ones((3, 1)))
+    start = UnknownValues(theta=np.array([1.0, 0.4]), private=np.ones((3, 1)))
     p.lower, p.upper = np.full(2, -FREE), np.full(2, FREE)
-    found = solved(p, start, Search(iterations=50, tolerance=1e-9, damped=False))
+    found = solved(p, start, SearchSettings(max_iterations=50, tolerance=1e-9, damped=False))
     theta, starts, _ = reference(p, start)
     assert found.success
     np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-6)
-    np.testing.assert_allclose(found.unknowns.starts, starts, rtol=1e-6)
+    np.testing.assert_allclose(found.unknowns.private, starts, rtol=1e-6)
     assert found.unknowns.theta[0] > 1.2
     valley = problem(rosenbrock, lower=[-FREE, -FREE])
-    through = solved(valley, alone(-1.2, 1.0), Search(iterations=100, tolerance=1e-9, damped=False))
+    through = solved(
+        valley, alone(-1.2, 1.0), SearchSettings(max_iterations=100, tolerance=1e-9, damped=False)
+    )
     np.testing.assert_allclose(through.unknowns.theta, 1.0, rtol=1e-6)
     lengths = {
         np.abs(a.theta - b.theta).max() for a, b in zip(valley.seen[1:], valley.seen, strict=False)
@@ -232,7 +245,9 @@ def test_places_that_diverge_are_survived() -> None:
     assert found.success
     assert found.unknowns.theta[0] == pytest.approx(0.25, rel=1e-6)
     newton = problem(cliff, lower=[-10.0])
-    undamped = solved(newton, alone(3.0), Search(iterations=60, tolerance=1e-9, damped=False))
+    undamped = solved(
+        newton, alone(3.0), SearchSettings(max_iterations=60, tolerance=1e-9, damped=False)
+    )
     assert any(at.theta[0] < 0.2 for at in newton.seen)
     assert undamped.unknowns.theta[0] == pytest.approx(0.25, rel=1e-6)
     assert minimise(p, alone(0.1), SHARP) is None
@@ -255,7 +270,7 @@ def test_a_neighbourhood_that_diverges_is_said() -> None:
     """Where the linearisation fails after a step, the best is returned, with the linearisation before."""
 
     class Once(Analytic):
-        def condense(self, at: Unknowns) -> Condensed | None:
+        def condense(self, at: UnknownValues) -> Condensed | None:
             return super().condense(at) if at.theta[0] == -1.2 else None
 
     p = Once((rosenbrock,), np.full(2, -5.0), np.full(2, 5.0))
@@ -277,7 +292,7 @@ def test_a_wrong_jacobian_is_noticed(damped: bool, fault: str) -> None:
         "noise": lambda J: rng.standard_normal(J.shape) * np.linalg.norm(J, axis=0),
     }
     p = problem(peak, lower=[0.0, -3.0, 0.1], upper=[10.0, 3.0, 5.0], spoil=spoils[fault])
-    found = solved(p, alone(1.0, -0.5, 1.5), Search(damped=damped))
+    found = solved(p, alone(1.0, -0.5, 1.5), SearchSettings(damped=damped))
     assert found.cost > 1.05 * reference(p, alone(1.0, -0.5, 1.5))[2], (
         "it is at the minimum in spite of all"
     )
@@ -294,7 +309,9 @@ def test_the_noise_of_a_simulation_does_not_hinder_convergence() -> None:
             return peak(theta, own) * (1.0 + 1e-7 * ripple)
 
         found = solved(
-            problem(rough, lower=[0.0, -3.0, 0.1]), alone(1.0, -0.5, 1.5), Search(tolerance=1e-6)
+            problem(rough, lower=[0.0, -3.0, 0.1]),
+            alone(1.0, -0.5, 1.5),
+            SearchSettings(tolerance=1e-6),
         )
         theta, _, cost = reference(problem(peak, lower=[0.0, -3.0, 0.1]), alone(2.0, 0.4, 0.7))
         assert found.success, found.status
@@ -308,7 +325,7 @@ def test_a_start_at_the_minimum_ends_at_once() -> None:
     assert exact.success
     assert exact.iterations == 1
     theta, _, _ = reference(problem(peak, lower=[0.0, -3.0, 0.1]), alone(1.0, -0.5, 1.5))
-    again = solved(problem(peak, lower=[0.0, -3.0, 0.1]), alone(*theta), Search())
+    again = solved(problem(peak, lower=[0.0, -3.0, 0.1]), alone(*theta), SearchSettings())
     assert again.success
     assert again.iterations <= 2
     np.testing.assert_allclose(again.unknowns.theta, theta, rtol=1e-6)
@@ -322,48 +339,64 @@ def test_a_flat_valley_is_not_mistaken_for_its_end() -> None:
             total, apart = theta[0] + theta[1], theta[0] - theta[1]
             return np.array([total - 2.0, thin * apart - 10.0])
 
-        found = solved(problem(rows, lower=[-FREE, -FREE]), alone(1.0, 1.0), Search())
+        found = solved(problem(rows, lower=[-FREE, -FREE]), alone(1.0, 1.0), SearchSettings())
         assert found.success, found.status
         np.testing.assert_allclose(
             thin * (found.unknowns.theta @ [1.0, -1.0]), 10.0, rtol=0, atol=0.02
         )
 
 
-@pytest.mark.parametrize("stop", [2, 3, 7])
-def test_an_interrupt_returns_the_best_so_far(stop: int) -> None:
-    """Whenever it comes after the start; before, it is passed on."""
+@pytest.mark.parametrize("stop", [1, 2, 3, 7])
+def test_a_requested_stop_returns_the_best_so_far(stop: int) -> None:
+    """The token is set during the evaluation with this number; no further point is evaluated."""
     p = problem(rosenbrock, lower=[-5.0, -5.0], stop=stop)
     found = solved(p, alone(-1.2, 1.0))
     assert found.interrupted
     assert not found.success
     assert "interrupted" in found.status
-    p.stop = None
-    costs = [p.cost(at) for at in p.seen[: stop - 1]]
+    assert len(p.seen) == stop
+    costs = [p.cost(at) for at in list(p.seen)]
     assert found.cost == min(costs)
     assert p.cost(found.unknowns) == found.cost
 
 
-def test_an_interrupt_by_the_listener_keeps_what_was_told() -> None:
-    """Ctrl-C often comes while progress is shown."""
-
-    def tell(progress: Progress) -> None:
-        if progress.iteration == 3:
-            costs.append(progress.cost)
-            raise KeyboardInterrupt
-
+def test_a_stop_requested_by_the_callback_keeps_the_reported_iteration() -> None:
+    stop = StopToken()
     costs: list[float] = []
-    found = minimise(problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0), SHARP, tell)
+
+    def callback(report: IterationReport) -> None:
+        if report.iteration == 3:
+            costs.append(report.cost)
+            stop.request()
+
+    found = minimise(
+        problem(rosenbrock, lower=[-5.0, -5.0]),
+        alone(-1.2, 1.0),
+        SHARP,
+        Budget(stop=stop),
+        callback,
+    )
     assert found is not None
     assert found.interrupted
     assert found.cost == costs[0]
-    with pytest.raises(KeyboardInterrupt):
-        minimise(problem(rosenbrock, lower=[-5.0, -5.0], stop=1), alone(-1.2, 1.0), SHARP)
+
+
+def test_an_exhausted_time_is_not_an_interruption() -> None:
+    """The first point is returned with the reason, and nothing is raised."""
+    found = minimise(
+        problem(rosenbrock, lower=[-5.0, -5.0]), alone(-1.2, 1.0), SHARP, Budget(seconds=0.0)
+    )
+    assert found is not None
+    assert not found.interrupted
+    assert not found.success
+    assert found.iterations == 0
+    assert "the time is used up" in found.status
 
 
 def test_the_limit_of_iterations_is_kept_and_said() -> None:
     """And the cost of what is returned is that of its unknowns."""
     p = problem(rosenbrock, lower=[-5.0, -5.0])
-    found = solved(p, alone(-1.2, 1.0), Search(iterations=3))
+    found = solved(p, alone(-1.2, 1.0), SearchSettings(max_iterations=3))
     assert found.iterations == 3
     assert not found.success
     assert "not converged in 3 iterations" in found.status
@@ -372,13 +405,13 @@ def test_the_limit_of_iterations_is_kept_and_said() -> None:
 
 def test_the_last_linearisation_is_at_the_solution() -> None:
     """Unless that was not wanted; then it is the one before."""
-    start = Unknowns(np.array([0.3, 0.0]), np.ones((3, 1)))
+    start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
     p = problem(*decays(), lower=[0.0, -5.0])
-    found = solved(p, start, Search())
+    found = solved(p, start, SearchSettings())
     fresh = p.condense(found.unknowns)
     assert fresh is not None
     np.testing.assert_array_equal(found.condensed.blocks, fresh.blocks)
-    saved = solved(p, start, Search(fresh=False))
+    saved = solved(p, start, SearchSettings(relinearise_at_end=False))
     np.testing.assert_allclose(saved.unknowns.theta, found.unknowns.theta, rtol=1e-5)
     assert saved.cost == p.cost(saved.unknowns)
     assert not np.array_equal(saved.condensed.blocks, fresh.blocks)
