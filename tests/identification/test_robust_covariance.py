@@ -243,7 +243,9 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
         common_rows=condensed.common_rows * wide,
     )
     rows = np.full(len(condensed.segment_of_block), float(FINE))
-    two = uncertainty(other, theta / unit, other.segment_of_block, rows, 36.0, 50, np.random.default_rng(0))
+    two = uncertainty(
+        other, theta / unit, other.segment_of_block, rows, 36.0, 50, np.random.default_rng(0)
+    )
     np.testing.assert_allclose(two.sandwich * unit, one.sandwich, rtol=1e-6)
     np.testing.assert_allclose(two.interval * unit[:, None], one.interval, rtol=1e-6)
     np.testing.assert_allclose(two.each * unit, one.each, rtol=1e-6)
