@@ -1,1 +1,1 @@
-"""Logs of any format as recordings in SI units, with doubts about them."""
+"""Logs of any format as recordings in SI units, with remarks about the quality of their data."""

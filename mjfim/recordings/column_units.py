@@ -1,6 +1,10 @@
-"""What one column of a log becomes: counters and signs undone, units, scales, factors. Formula (1):
+"""Conversion of a log's column to the model's unit.
 
-value = (scale * unit * raw + offset) * product of the columns `multiply_by`
+A column of the recording is, with the symbols of `ColumnSpec`:
+
+    value = (scale * unit * raw + offset) * product of the columns `multiply_by`          (1)
+
+where raw numbers are first freed of missing signs and counter wraps, and values of jumps by whole turns.
 """
 
 from __future__ import annotations
@@ -17,7 +21,10 @@ from mjfim.model.paths import names_of
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import ColumnSpec
 
+# One turn [rad].
 TURN = 2.0 * np.pi
+
+# Factors from the units that a log may have to the model's unit, by the model's unit.
 FACTORS = {
     "rad": {"rad": 1.0, "deg": TURN / 360.0, "rev": TURN},
     "rad/s": {"rad/s": 1.0, "deg/s": TURN / 360.0, "rev/s": TURN, "rpm": TURN / 60.0},
@@ -25,9 +32,11 @@ FACTORS = {
     "m/s": {"m/s": 1.0, "mm/s": 1e-3},
 }
 
+# Factor to the model's unit of every unit that a log may have.
+UNIT_FACTORS = {unit: factor for table in FACTORS.values() for unit, factor in table.items()}
 
-EVERY = {unit: factor for table in FACTORS.values() for unit, factor in table.items()}
-SENSORS = {
+# Unit of the sensors whose type determines it.
+SENSOR_UNITS = {
     mujoco.mjtSensor.mjSENS_GYRO: "rad/s",
     mujoco.mjtSensor.mjSENS_BALLANGVEL: "rad/s",
     mujoco.mjtSensor.mjSENS_FRAMEANGVEL: "rad/s",
@@ -41,8 +50,8 @@ SENSORS = {
     mujoco.mjtSensor.mjSENS_TENDONPOS: "m",
 }
 
-
-OPEN = (
+# Sensors that may measure an angle as well as a length: any unit is accepted.
+SENSORS_OF_ANY_UNIT = (
     mujoco.mjtSensor.mjSENS_ACTUATORPOS,
     mujoco.mjtSensor.mjSENS_ACTUATORVEL,
     mujoco.mjtSensor.mjSENS_USER,
@@ -50,46 +59,86 @@ OPEN = (
 
 
 def units_of(model: Any) -> dict[str, str]:
-    """The model's unit of everything that can be measured by column: rad, rad/s, m, m/s; `any` or `none` of them."""
-    units = {c.name: c.unit or "none" for c in state_components(model)}
+    """Find the model's unit of everything that can be measured.
+
+    Args:
+        model: The compiled MuJoCo model.
+
+    Returns:
+        By column name `rad`, `rad/s`, `m` or `m/s`; `any` where each of them is possible, `none` where no unit
+        can be stated.
+    """
+    units = {component.name: component.unit or "none" for component in state_components(model)}
+
     for name in names_of(model, "sensor"):
         sensor = model.sensor(name)
-        kind = mujoco.mjtSensor(int(sensor.type[0]))
-        unit = "any" if kind in OPEN else SENSORS.get(kind, "none")
-        if kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL):
-            slide = int(model.jnt_type[int(sensor.objid[0])]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
-            unit = ("m" if slide else "rad") + (
-                "" if kind == mujoco.mjtSensor.mjSENS_JOINTPOS else "/s"
-            )
         width = int(sensor.dim[0])
-        units.update(
-            dict.fromkeys([name] if width == 1 else [f"{name}[{i}]" for i in range(width)], unit)
-        )
+        columns = [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
+        units.update(dict.fromkeys(columns, _sensor_unit(model, sensor)))
+
     return units
 
 
+def _sensor_unit(model: Any, sensor: Any) -> str:
+    """Unit of a sensor, with the values of `units_of`."""
+    kind = mujoco.mjtSensor(int(sensor.type[0]))
+
+    if kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL):
+        joint_type = int(model.jnt_type[int(sensor.objid[0])])
+        unit = "m" if joint_type == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
+        return unit if kind == mujoco.mjtSensor.mjSENS_JOINTPOS else f"{unit}/s"
+
+    if kind in SENSORS_OF_ANY_UNIT:
+        return "any"
+    return SENSOR_UNITS.get(kind, "none")
+
+
 def check_unit(where: str, spec: ColumnSpec, unit: str) -> None:
-    """Raise ExperimentError where a column's unit is not one of what it stands for. unit: the model's, as in `units_of`"""
-    fitting = list(EVERY) if unit == "any" else list(FACTORS.get(unit, {}))
-    if spec.unit is not None and spec.unit not in fitting:
+    """Refuse a stated unit that does not fit the quantity that a column measures.
+
+    Args:
+        where: File and key, for messages.
+        spec: The stated rule.
+        unit: Unit of the model, with the values of `units_of`.
+
+    Raises:
+        ExperimentError: The unit does not fit, or something other than an angle is unwrapped.
+    """
+    valid = list(UNIT_FACTORS) if unit == "any" else list(FACTORS.get(unit, {}))
+    if spec.unit is not None and spec.unit not in valid:
         raise ExperimentError(
-            f"{where}.unit: {unknown('unit', spec.unit, fitting)}; for others there is scale"
+            f"{where}.unit: {unknown('unit', spec.unit, valid)}; use scale for any other unit"
         )
+
     if spec.unwrap and unit not in ("rad", "any"):
         raise ExperimentError(
-            f"{where}.unwrap: only angles jump by whole turns; a counter has a period"
+            f"{where}.unwrap: only angles jump by whole turns; use period for a counter"
         )
 
 
-def converted(table: Table, spec: ColumnSpec) -> Array:
-    """(M,) by formula (1). Raises RecordingError where a column is missing, or has numbers that cannot be."""
+def convert(table: Table, spec: ColumnSpec) -> Array:
+    """Compute one column of a recording by equation (1).
+
+    Args:
+        table: The log.
+        spec: The rule of the column.
+
+    Returns:
+        (M,) values in the model's unit, NaN where empty.
+
+    Raises:
+        RecordingError: A column of the log is missing, or holds numbers that the rule excludes.
+    """
     raw = table.column(spec.column)
     if spec.signed is not None:
         raw = _signed(table, spec.column, raw, spec.signed)
     if spec.period is not None:
         raw = _unwrapped(raw, spec.period)
-    factor = spec.scale * (1.0 if spec.unit is None else EVERY[spec.unit])
+
+    # Without a conversion the values keep all their bits, and infinite ones stay infinite.
+    factor = spec.scale * (1.0 if spec.unit is None else UNIT_FACTORS[spec.unit])
     value = raw if factor == 1.0 and spec.offset == 0.0 else factor * raw + spec.offset
+
     if spec.unwrap:
         value = _unwrapped(value, TURN)
     for name in spec.multiply_by:
@@ -98,20 +147,23 @@ def converted(table: Table, spec: ColumnSpec) -> Array:
 
 
 def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
-    """Two's complement of whole numbers; those that have their sign already keep it."""
+    """(M,) signed integers from their two's complement (M,); numbers that are negative already stay."""
     half = 2.0 ** (bits - 1)
-    wrong = np.isfinite(raw) & ((raw < -half) | (raw >= 2.0 * half) | (raw != np.rint(raw)))
-    if wrong.any():
-        row = int(np.argmax(wrong))
+
+    outside = (raw < -half) | (raw >= 2.0 * half)
+    invalid = np.isfinite(raw) & (outside | (raw != np.rint(raw)))
+    if invalid.any():
+        row = int(np.argmax(invalid))
         raise RecordingError(
             f"{table.source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is no integer of {bits} bits"
         )
+
     return np.asarray(np.where(raw >= half, raw - 2.0 * half, raw))
 
 
 def _unwrapped(raw: Array, period: float) -> Array:
-    """Without jumps of more than half a period, over holes too."""
-    there = np.isfinite(raw)
-    whole = np.array(raw)
-    whole[there] = np.unwrap(raw[there], period=period)
-    return whole
+    """(M,) numbers without jumps of more than half a period, also across empty rows."""
+    present = np.isfinite(raw)
+    unwrapped = np.array(raw)
+    unwrapped[present] = np.unwrap(raw[present], period=period)
+    return unwrapped

@@ -1,7 +1,8 @@
-"""Read a control from a table."""
+"""Controls of an experiment from a table of a file."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,51 +11,94 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError, unknown
 from mjfim.recordings.formats.read import read_table
 
-OF_DESIGN = ("qpos:", "qvel:", "act:", "gain:")  # what a design.csv holds beside t and the control
+# Prefixes of the columns that a design.csv has beside the time and the controls.
+DESIGN_PREFIXES = ("qpos:", "qvel:", "act:", "gain:")
+
+# A time stamp may be rounded by this share of the sample period.
+STAMP_TOLERANCE = 1e-6
+
+# Tolerance of the first and last time of a table [s].
+TIME_TOLERANCE = 1e-9
 
 
 def read_control(
     path: Path, t: Array, dt: float, names: tuple[str, ...], repeat: bool = False
 ) -> Array:
-    """(N, nu) control at times t: (N,), held between rows. Columns: t and each actuator's name (`ctrl:` optional).
+    """Read a control that is held from each row of a table to the next one.
 
-    repeat: where the table ends early, it begins again
+    Args:
+        path: CSV file with the columns `t` [s] and, for each actuator, its name or `ctrl:<name>`; also a design.csv.
+        t: (N,) sample times [s].
+        dt: Sample period [s].
+        names: nu names of the actuators.
+        repeat: Whether a table that ends before the last sample starts again.
+
+    Returns:
+        (N, nu) control at the sample times [control unit].
+
+    Raises:
+        RecordingError: A column is missing or unknown, a number is missing, the times do not increase, or the table
+            does not cover the sample times.
     """
     columns = read_table(path)
+    stamps, values = _columns_of_control(path, columns, names)
+    _check_values(path, stamps, values)
+
+    # The last row is held for the typical period of the table.
+    period = float(np.median(np.diff(stamps)))
+    end = stamps[-1] + period
+
+    if repeat:
+        t = stamps[0] + np.mod(t - t[0] + STAMP_TOLERANCE * dt, end - stamps[0])
+    elif stamps[0] > t[0] + TIME_TOLERANCE or end < t[-1] + dt - TIME_TOLERANCE:
+        raise RecordingError(
+            f"{path}: too few rows: the table covers t = {stamps[0]:g} ... {end:g} s with {len(stamps)} rows, "
+            f"the experiment needs 0 ... {t[-1] + dt:g} s ({len(t)} samples)"
+        )
+
+    row = np.searchsorted(stamps, t + STAMP_TOLERANCE * dt, side="right") - 1
+    return np.asarray(values[np.clip(row, 0, len(stamps) - 1)])
+
+
+def _columns_of_control(
+    path: Path, columns: Mapping[str, Array], names: tuple[str, ...]
+) -> tuple[Array, Array]:
+    """Times: (M,) and controls: (M, nu) of a table whose columns are those of a control or of a design."""
     if "t" not in columns:
         raise RecordingError(f"{path}: column 't' is missing; found: {', '.join(columns)}")
-    chosen = []
-    for name in names:
-        key = name if name in columns else f"ctrl:{name}"
+
+    keys = [name if name in columns else f"ctrl:{name}" for name in names]
+    for name, key in zip(names, keys, strict=True):
         if key not in columns:
             raise RecordingError(
-                f"{path}: no column for actuator {name!r}; wanted columns: t, {', '.join(names)}; found: {', '.join(columns)}"
+                f"{path}: no column for actuator {name!r}; expected columns: t, {', '.join(names)}; "
+                f"found: {', '.join(columns)}"
             )
-        chosen.append(columns[key])
-    stamps, values = columns["t"], np.column_stack(chosen)
-    if "ctrl:" + names[0] in columns:  # a design: its last row has no control
+
+    known = {"t", *names, *(f"ctrl:{name}" for name in names)}
+    for column in columns:
+        if column not in known and not column.startswith(DESIGN_PREFIXES):
+            raise RecordingError(f"{path}: {unknown('column', column, ['t', *names])}")
+
+    stamps, values = columns["t"], np.column_stack([columns[key] for key in keys])
+
+    # The last row of a design is the final state, which has no control.
+    if f"ctrl:{names[0]}" in columns:
         while len(values) and np.isnan(values[-1]).all():
             stamps, values = stamps[:-1], values[:-1]
-    known = {"t", *names, *(f"ctrl:{n}" for n in names)}
-    strays = [c for c in columns if c not in known and not c.startswith(OF_DESIGN)]
-    if strays:
-        raise RecordingError(f"{path}: {unknown('column', strays[0], ['t', *names])}")
-    if not np.isfinite(values).all() or not np.isfinite(stamps).all():
-        bad = int(np.argmax(~np.isfinite(np.column_stack([stamps, values])).all(axis=1)))
+    return stamps, values
+
+
+def _check_values(path: Path, stamps: Array, values: Array) -> None:
+    """Refuse times: (M,) that do not increase, and numbers that are not finite. values: (M, nu)."""
+    finite = np.isfinite(stamps) & np.isfinite(values).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite)) + 1
         raise RecordingError(
-            f"{path}: NaN or infinite value in data row {bad + 1}; every row must be finite"
+            f"{path}: NaN or infinite value in data row {row}; every row must be finite"
         )
+
     if len(stamps) < 2 or np.any(np.diff(stamps) <= 0):
         raise RecordingError(
             f"{path}: column 't' must increase from row to row and have at least two rows"
         )
-    period = float(np.median(np.diff(stamps)))
-    if repeat:
-        t = stamps[0] + np.mod(t - t[0] + 1e-6 * dt, stamps[-1] + period - stamps[0])
-    elif stamps[0] > t[0] + 1e-9 or stamps[-1] + period < t[-1] + dt - 1e-9:
-        raise RecordingError(
-            f"{path}: too few rows: the table covers t = {stamps[0]:g} ... {stamps[-1] + period:g} s with {len(stamps)} rows, "
-            f"the experiment needs 0 ... {t[-1] + dt:g} s ({len(t)} samples)"
-        )
-    row = np.clip(np.searchsorted(stamps, t + 1e-6 * dt, side="right") - 1, 0, len(stamps) - 1)
-    return np.asarray(values[row])

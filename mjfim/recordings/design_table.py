@@ -1,62 +1,87 @@
-"""Read the design.csv that a robot plays."""
+"""The design.csv that a controller plays on a robot."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.model.coordinates import gain_names, state_names
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.formats.read import read_table
 from mjfim.records.playback import Playback
 
+# Smallest number of rows of a playback.
+MIN_ROWS = 3
+
+# Largest deviation of a time stamp from the grid of timesteps, as a share of a timestep, per row.
+STAMP_TOLERANCE = 1e-6
+
 
 def read_playback(path: Path, channels: Channels) -> Playback:
-    """design.csv as it was written, at whatever rate. Raises RecordingError naming file and column."""
+    """Read a design.csv at the rate at which it was written.
+
+    Args:
+        path: The file.
+        channels: The signals of the experiment for which it was written.
+
+    Returns:
+        States, controls and gains of every row.
+
+    Raises:
+        RecordingError: A column or a number is missing, or the times are not equally spaced.
+    """
     table = read_table(path)
-    controls = tuple(f"ctrl:{name}" for name in channels.controls)
-    wanted = (
-        "t",
-        *state_names(channels.model),
-        *controls,
-        *gain_names(channels.model, channels.controls),
+    states = state_names(channels.model)
+    controls = channels.control_columns
+    gains = gain_names(channels.model, channels.controls)
+
+    for name in ("t", *states, *controls, *gains):
+        if name not in table:
+            raise RecordingError(
+                f"{path}: column {name!r} is missing; it is no design.csv of this model"
+            )
+
+    # The last row is the final state, which has neither control nor gain.
+    t = _grid(path, table["t"], float(channels.model.opt.timestep))
+    state = _stacked(path, table, states, len(t))
+    ctrl = _stacked(path, table, controls, len(t) - 1)
+    gain = _stacked(path, table, gains, len(t) - 1)
+
+    return Playback(
+        t=t, state=state, ctrl=ctrl, gain=gain.reshape(len(ctrl), len(controls), -1)
     )
-    missing = next((name for name in wanted if name not in table), None)
-    if missing is not None:
+
+
+def _grid(path: Path, t: Array, timestep: float) -> Array:
+    """(M+1,) times of a table, free of rounding: multiples of a whole number of timesteps [s]."""
+    if len(t) < MIN_ROWS:
         raise RecordingError(
-            f"{path}: column {missing!r} is missing; it is no design.csv of this model"
+            f"{path}: too few rows ({len(t)}); a playback needs at least {MIN_ROWS}"
         )
-    t = table["t"]
-    if len(t) < 3:
-        raise RecordingError(f"{path}: too few rows ({len(t)}); a playback needs at least 3")
+
     period = (t[-1] - t[0]) / (len(t) - 1)
-    timestep = float(channels.model.opt.timestep)
     steps = round(period / timestep)
-    if steps < 1 or not np.abs(
-        t - np.arange(len(t)) * steps * timestep
-    ).max() <= 1e-6 * timestep * len(t):
+    grid = np.arange(len(t)) * (steps * timestep)
+
+    # The comparison is negated so that NaN is refused, too.
+    if steps < 1 or not np.abs(t - grid).max() <= STAMP_TOLERANCE * timestep * len(t):
         raise RecordingError(
             f"{path}: column 't' does not go from 0 in equal periods of whole timesteps ({timestep:g} s)"
         )
-    parts = []
-    for names, rows in (
-        (state_names(channels.model), None),
-        (controls, -1),
-        (gain_names(channels.model, channels.controls), -1),
-    ):
-        values = np.column_stack([table[name][:rows] for name in names])
-        if not np.isfinite(values).all():
-            row, column = np.argwhere(~np.isfinite(values))[0]
-            raise RecordingError(
-                f"{path}: column {names[column]!r} has no number in data row {row + 1}"
-            )
-        parts.append(values)
-    state, ctrl, gain = parts
-    return Playback(
-        t=np.arange(len(t)) * (steps * timestep),
-        state=state,
-        ctrl=ctrl,
-        gain=gain.reshape(len(ctrl), len(controls), -1),
-    )
+    return np.asarray(grid)
+
+
+def _stacked(path: Path, table: Mapping[str, Array], names: Sequence[str], rows: int) -> Array:
+    """(rows, len(names)) numbers of some columns, all of which must be finite."""
+    values = np.column_stack([table[name][:rows] for name in names])
+
+    if not np.isfinite(values).all():
+        row, column = np.argwhere(~np.isfinite(values))[0]
+        raise RecordingError(
+            f"{path}: column {names[column]!r} has no number in data row {row + 1}"
+        )
+    return values

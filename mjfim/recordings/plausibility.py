@@ -1,4 +1,4 @@
-"""What speaks against the data themselves, before any fit: roughness, spikes, columns that contradict each other."""
+"""Remarks about the quality of measured data before any fit: noise, spikes, and columns that contradict each other."""
 
 from __future__ import annotations
 
@@ -12,106 +12,205 @@ from mjfim.model.coordinates import scalar_joints
 from mjfim.recordings.channels import Channels
 from mjfim.records.recording import Recording
 
-ROWS = 200_000  # looked at
-RUN = 7  # rows of the running median
-ROUGH = 0.1  # share of a measured column's variance that a running median takes away
-NOISY = 3.0  # stated sigmas that the rough part has at least
-JUMPY = 0.5  # the same of a control, which may jump by intent
-ALIKE = 0.5  # correlation of a control with the row before, below which it jumps
-OUTSIDE = 1e-3  # share of rows with a control out of its range
-APART = 0.1  # of the way, by which positions and the integral of velocities may part
-STRETCH = 0.2  # [s] over which they are compared
+# Only the first rows of a long recording are inspected.
+MAX_ROWS = 200_000
+
+# Width of the running median that separates a smooth motion from noise and spikes [rows].
+MEDIAN_ROWS = 7
+
+# Shortest column that is inspected [rows].
+MIN_ROWS = 4 * MEDIAN_ROWS
+
+# A measured column is rough if the running median removes more than this share of its variance.
+MAX_ROUGH_SHARE = 0.1
+
+# A deviation counts only if it exceeds this number of stated standard deviations of the noise.
+SIGNIFICANT_SIGMAS = 3.0
+
+# A control jumps if the running median removes more than this share of its variance; controls may jump by intent.
+MAX_ROUGH_CONTROL_SHARE = 0.5
+
+# A control that jumps by intent is still correlated with the row before; below this correlation it looks like noise.
+MIN_CONTROL_CORRELATION = 0.5
+
+# Share of the rows in which a control may be outside its range.
+MAX_SHARE_OUTSIDE_RANGE = 1e-3
+
+# Tolerance of that range, as a share of its width.
+RANGE_TOLERANCE = 1e-6
+
+# A position and the integral of its velocity contradict each other if their displacements differ by more than this
+# share of the displacements' standard deviation.
+MAX_DISAGREEMENT = 0.1
+
+# Time over which displacements are compared [s].
+COMPARISON_TIME = 0.2
 
 
 def plausibility_remarks(channels: Channels, recording: Recording) -> tuple[str, ...]:
-    """Sentences; none where nothing speaks against the data."""
-    t = recording.t[:ROWS]
+    """Describe everything that makes the data of a recording implausible.
+
+    Args:
+        channels: Names, ranges and noise of the recording's columns.
+        recording: The measured data.
+
+    Returns:
+        One sentence per remark; none where the data are plausible.
+    """
     return (
-        *_controls(channels, recording.ctrl[:ROWS]),
-        *_rough(channels, recording),
-        *_contradictions(channels, t, recording),
+        *_control_remarks(channels, recording.ctrl[:MAX_ROWS]),
+        *_roughness_remarks(channels, recording),
+        *_contradiction_remarks(channels, recording),
     )
 
 
-def _controls(channels: Channels, ctrl: Array) -> Iterator[str]:
+def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
+    """Remarks about controls outside their range, and controls that look like noise. ctrl: (M-1, nu)."""
     model = channels.model
+
     for i, name in enumerate(channels.controls):
         u = ctrl[:, i]
-        if len(u) < 4 * RUN or not float(np.std(u)) > 0.0:
+        if not _moves(u):
             continue
+
+        # The ranges are in the order of the controls only where every actuator has one control.
         if model.nactuator == model.nu and model.actuator_ctrllimited[i]:
-            low, high = model.actuator_ctrlrange[i]
-            slack = 1e-6 * (high - low)
-            share = float(np.mean((u < low - slack) | (u > high + slack)))
-            if share > OUTSIDE:
-                yield (
-                    f"control {name!r} is outside its ctrlrange [{low:g}, {high:g}] in {100 * share:.2g} % of the rows (it goes "
-                    f"from {u.min():.3g} to {u.max():.3g}); the simulation clamps it there"
-                )
-        rough, echo = _share(u), _echo(u)
-        if rough > JUMPY and echo < ALIKE:
+            yield from _range_remarks(name, u, model.actuator_ctrlrange[i])
+
+        rough, correlation = _rough_share(u), _lag_one_correlation(u)
+        if rough > MAX_ROUGH_CONTROL_SHARE and correlation < MIN_CONTROL_CORRELATION:
             yield (
-                f"control {name!r} jumps from row to row ({100 * rough:.0f} % of its variance lies within {RUN} rows, "
-                f"correlation with the row before {echo:.2f}): where it was measured rather than commanded, its noise acts as a "
-                "force that was never there, and parameters come out wrong"
+                f"control {name!r} jumps from row to row ({100 * rough:.0f} % of its variance lies within {MEDIAN_ROWS} rows, "
+                f"correlation with the previous row {correlation:.2f}): if it was measured rather than commanded, its noise "
+                "acts as a force that never existed, and the estimates are biased"
             )
 
 
-def _rough(channels: Channels, recording: Recording) -> Iterator[str]:
-    """Columns that jump by more than the stated noise and by much of their motion."""
-    sigma = dict(zip(channels.outputs, channels.sigma.tolist(), strict=True))
+def _range_remarks(name: str, u: Array, limits: Array) -> Iterator[str]:
+    """Remark about a control u: (M-1,) that leaves its range, limits: (2,)."""
+    low, high = limits
+    tolerance = RANGE_TOLERANCE * (high - low)
+    outside = (u < low - tolerance) | (u > high + tolerance)
+
+    share = float(np.mean(outside))
+    if share > MAX_SHARE_OUTSIDE_RANGE:
+        yield (
+            f"control {name!r} is outside its ctrlrange [{low:g}, {high:g}] in {100 * share:.2g} % of the rows (it ranges "
+            f"from {u.min():.3g} to {u.max():.3g}); the simulation clamps it to the range"
+        )
+
+
+def _roughness_remarks(channels: Channels, recording: Recording) -> Iterator[str]:
+    """Remarks about outputs that jump by more than the stated noise and by much of their motion."""
+    sigma = _sigma_by_name(channels)
+
     for i, name in enumerate(recording.outputs):
-        column = recording.y[:ROWS, i]
-        column = column[np.isfinite(column)]
-        if len(column) < 4 * RUN or not float(np.std(column)) > 0.0:
+        y = recording.y[:MAX_ROWS, i]
+        y = y[np.isfinite(y)]
+        if not _moves(y):
             continue
-        share = _share(column)
-        if share > ROUGH and np.sqrt(share * np.var(column)) > NOISY * sigma.get(name, 0.0):
+
+        share = _rough_share(y)
+        rough_std = np.sqrt(share * np.var(y))
+        if share > MAX_ROUGH_SHARE and rough_std > SIGNIFICANT_SIGMAS * sigma.get(name, 0.0):
             yield (
-                f"{name} is rough: {100 * share:.0f} % of its variance lies within {RUN} rows, which no smooth motion does; "
-                "its noise, spikes or steps hide what the robot did"
+                f"{name} is rough: {100 * share:.0f} % of its variance lies within {MEDIAN_ROWS} rows, which is impossible "
+                "for a smooth motion; noise, spikes or steps hide the motion of the robot"
             )
 
 
-def _contradictions(channels: Channels, t: Array, recording: Recording) -> Iterator[str]:
-    """Positions that do not move as their velocities say."""
-    names = recording.outputs
-    for c in scalar_joints(channels.model):
-        pair = (f"qpos:{c.name}", f"qvel:{c.name}")
-        if not all(name in names for name in pair):
+def _contradiction_remarks(channels: Channels, recording: Recording) -> Iterator[str]:
+    """Remarks about joints whose position does not follow the integral of their velocity."""
+    t = recording.t[:MAX_ROWS]
+    columns = {name: recording.y[:MAX_ROWS, i] for i, name in enumerate(recording.outputs)}
+    sigma = _sigma_by_name(channels)
+
+    for joint in scalar_joints(channels.model):
+        position, velocity = f"qpos:{joint.name}", f"qvel:{joint.name}"
+        if position not in columns or velocity not in columns:
             continue
-        q, v = (recording.y[:ROWS, names.index(name)] for name in pair)
+
+        q, v = columns[position], columns[velocity]
         both = np.isfinite(q) & np.isfinite(v)
-        if both.sum() < 4 * RUN:
+        if both.sum() < MIN_ROWS:
             continue
-        at, q, v = t[both], q[both], v[both]
-        dq, dv, lag = ways(at, q, v, STRETCH, len(at) // 4)
-        size = float(np.std(dq))
-        apart = float(np.std(dq - dv)) / size if size > 0.0 else 0.0
-        sigmas = dict(zip(channels.outputs, channels.sigma.tolist(), strict=True))
-        own = np.sqrt(2.0) * sigmas.get(pair[0], 0.0)
-        summed = sigmas.get(pair[1], 0.0) * np.sqrt(lag) * float(np.median(np.diff(at)))
-        if apart > APART and apart * size > NOISY * np.hypot(own, summed):
-            yield f"{pair[0]} and the integral of {pair[1]} part by {100 * apart:.0f} % of the way: one of them is wrong, or late"
+
+        disagreement, expected = _disagreement(
+            t[both], q[both], v[both], sigma.get(position, 0.0), sigma.get(velocity, 0.0)
+        )
+        if disagreement > max(MAX_DISAGREEMENT, SIGNIFICANT_SIGMAS * expected):
+            yield (
+                f"{position} and the integral of {velocity} differ by {100 * disagreement:.0f} % of the motion: "
+                "one of them is wrong or delayed"
+            )
 
 
-def _share(x: Array) -> float:
-    """Share of the variance that a running median takes away."""
-    return float(np.var(x - medfilt(x, RUN)) / np.var(x))
+def _disagreement(
+    t: Array, q: Array, v: Array, sigma_q: float, sigma_v: float
+) -> tuple[float, float]:
+    """Difference between the displacements of a position and of its integrated velocity.
+
+    Args:
+        t: (M,) times [s].
+        q: (M,) positions.
+        v: (M,) velocities.
+        sigma_q: Standard deviation of the positions' noise.
+        sigma_v: Standard deviation of the velocities' noise.
+
+    Returns:
+        Standard deviation of the difference and the one expected from the noise, both relative to the standard
+        deviation of the displacement; 0 and 0 where nothing moves.
+    """
+    dq, dv, lag = displacements(t, q, v, COMPARISON_TIME, len(t) // 4)
+    size = float(np.std(dq))
+    if size == 0.0:
+        return 0.0, 0.0
+
+    difference_noise = np.sqrt(2.0) * sigma_q
+    integral_noise = sigma_v * np.sqrt(lag) * float(np.median(np.diff(t)))
+    return float(np.std(dq - dv)) / size, float(np.hypot(difference_noise, integral_noise)) / size
 
 
-def _echo(x: Array) -> float:
-    """Correlation of a value with the one before."""
-    d = x - x.mean()
-    return float(d[1:] @ d[:-1] / (d @ d))
+def displacements(
+    t: Array, q: Array, v: Array, duration: float, max_lag: int
+) -> tuple[Array, Array, int]:
+    """Compare a position with the integral of a velocity over stretches of a fixed number of rows.
 
+    Args:
+        t: (M,) times [s].
+        q: (M,) positions without NaN.
+        v: (M,) velocities without NaN.
+        duration: Approximate length of a stretch [s].
+        max_lag: Largest length of a stretch [rows].
 
-def ways(t: Array, q: Array, v: Array, stretch: float, most: int) -> tuple[Array, Array, int]:
-    """Differences of q and of the integral of v over a stretch [s] of at most so many rows, and how many it is.
-
-    t, q, v: (M,) without NaN
+    Returns:
+        (M-lag,) differences of the position, (M-lag,) integrals of the velocity by the trapezoidal rule, and lag,
+        the length of a stretch [rows].
     """
     steps = np.diff(t)
-    lag = int(np.clip(round(stretch / float(np.median(steps))), 1, most))
-    way = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * steps)])
-    return q[lag:] - q[:-lag], way[lag:] - way[:-lag], lag
+    lag = int(np.clip(round(duration / float(np.median(steps))), 1, max_lag))
+
+    means = 0.5 * (v[1:] + v[:-1])
+    integral = np.concatenate([[0.0], np.cumsum(means * steps)])
+    return q[lag:] - q[:-lag], integral[lag:] - integral[:-lag], lag
+
+
+def _sigma_by_name(channels: Channels) -> dict[str, float]:
+    """Standard deviation of the noise by name of the output."""
+    return dict(zip(channels.outputs, channels.sigma.tolist(), strict=True))
+
+
+def _moves(x: Array) -> bool:
+    """Whether a column x: (M,) is long enough to be inspected, and not constant."""
+    return len(x) >= MIN_ROWS and float(np.std(x)) > 0.0
+
+
+def _rough_share(x: Array) -> float:
+    """Share of the variance of x: (M,) that a running median removes."""
+    return float(np.var(x - medfilt(x, MEDIAN_ROWS)) / np.var(x))
+
+
+def _lag_one_correlation(x: Array) -> float:
+    """Correlation of x: (M,) with its previous row."""
+    d = x - x.mean()
+    return float(d[1:] @ d[:-1] / (d @ d))

@@ -1,6 +1,6 @@
-"""A robot's log as a recording: the experiment's `[recording]` table applied to the columns of a file.
+"""Recordings from logs: the experiment's `[recording]` table applied to the columns of a file.
 
-Times stay the log's own and nothing is interpolated; only controls are held over rows where they are empty.
+The times are those of the log, and nothing is interpolated; only controls are held over rows in which they are empty.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mjfim.errors import ExperimentError, RecordingError, unknown
 from mjfim.model.coordinates import state_components
 from mjfim.recordings.angle_units import check_angles
 from mjfim.recordings.channels import Channels
-from mjfim.recordings.column_units import check_unit, converted, units_of
+from mjfim.recordings.column_units import check_unit, convert, units_of
 from mjfim.recordings.formats.read import read_columns
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import ColumnSpec, RecordingSpec
@@ -27,128 +27,198 @@ from mjfim.recordings.validity import (
     check_finite,
     check_held,
     check_measured,
-    held,
+    hold_last_value,
 )
 from mjfim.records.recording import Recording
 
-ROUNDING = 1e-9  # [s] by which a time may miss the window
+# Time by which a row may miss the window [s].
+WINDOW_TOLERANCE = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Log:
-    """A recording and how the log looked that it was read from."""
+    """A recording, and a summary of the log from which it was read.
+
+    Attributes:
+        recording: The measured data in SI units.
+        summary: Clock and columns of the log.
+    """
 
     recording: Recording
     summary: LogSummary
 
 
 def read_recording(path: Path, channels: Channels) -> Recording:
-    """A recording from a log of any format. Raises RecordingError naming file and column."""
+    """Read a recording from a log of any format.
+
+    Args:
+        path: The log: a file, or the folder of a ROS 2 bag.
+        channels: The signals of the experiment, and how to read them.
+
+    Returns:
+        The recording, in SI units.
+
+    Raises:
+        ExperimentError: The `[recording]` table does not fit the model.
+        RecordingError: The log cannot be used; the message names file and column.
+    """
     return read_log(path, channels).recording
 
 
 def read_log(path: Path, channels: Channels) -> Log:
-    """A recording and how its log looks. Raises RecordingError naming file and column."""
-    spec = channels.spec
+    """Read a recording from a log of any format, and summarize the log.
+
+    Args:
+        path: The log: a file, or the folder of a ROS 2 bag.
+        channels: The signals of the experiment, and how to read them.
+
+    Returns:
+        The recording, in SI units, and the summary.
+
+    Raises:
+        ExperimentError: The `[recording]` table does not fit the model.
+        RecordingError: The log cannot be used; the message names file and column.
+    """
     check_spec(channels)
+    spec = channels.spec
+
     table = read_columns(path, spec)
-    plan = _plan(table, channels)
-    t, rows = _window(table, spec)
-    check_clock(f"{path}: column {spec.time!r}", t[rows], rows.start, spec.time_unit, spec.gap)
-    columns = _columns(table, plan, t, rows, spec)
-    dropped, t = len(t) - len(t[rows]), t[rows] - t[rows.start]
-    measured = tuple(name for name in plan if not name.startswith("ctrl:"))
+    sources = _sources(table, channels)
+    measured = tuple(name for name in sources if name not in channels.control_columns)
+
+    stamps, rows = _window(table, spec)
+    check_clock(f"{path}: column {spec.time!r}", stamps[rows], rows.start, spec.time_unit, spec.gap)
+    columns = _columns(table, sources, stamps, rows, spec)
+
+    # The recording begins at time 0.
+    t = stamps[rows] - stamps[rows.start]
     for name in measured:
-        check_measured(f"{path}: column {plan[name].column!r}", t, columns[name], spec.gap)
-    stated = {name for name, source in plan.items() if source.unit is not None}
+        check_measured(f"{path}: column {sources[name].column!r}", t, columns[name], spec.gap)
+    stated = {name for name, source in sources.items() if source.unit is not None}
     check_angles(str(path), channels.model, t, columns, stated)
-    ctrl = np.column_stack([columns[f"ctrl:{name}"][:-1] for name in channels.controls])
+
+    # The last row has no control: it would be held beyond the recording.
+    ctrl = np.column_stack([columns[name][:-1] for name in channels.control_columns])
     y = np.column_stack([columns[name] for name in measured])
-    summary = summarize(
-        str(path), t, columns, {name: source.column for name, source in plan.items()}, dropped
+    column_names = {name: source.column for name, source in sources.items()}
+
+    return Log(
+        recording=Recording(t=t, ctrl=ctrl, y=y, outputs=measured, name=str(path)),
+        summary=summarize(str(path), t, columns, column_names, dropped=len(stamps) - len(t)),
     )
-    return Log(Recording(t=t, ctrl=ctrl, y=y, outputs=measured, name=str(path)), summary)
 
 
 def check_spec(channels: Channels) -> None:
-    """Raise ExperimentError where [recording.columns] has an unknown key or a unit that does not fit."""
-    where, units = f"{channels.source}: recording.columns", units_of(channels.model)
-    units.update({f"ctrl:{name}": "any" for name in channels.controls})
+    """Check the `[recording]` table against the model.
+
+    Args:
+        channels: The signals of the experiment, and how to read them.
+
+    Raises:
+        ExperimentError: A column has an unknown name, or a unit that does not fit it.
+    """
+    where = f"{channels.source}: recording.columns"
+    units = units_of(channels.model)
+    units.update(dict.fromkeys(channels.control_columns, "any"))
+
     for name, source in channels.spec.sources.items():
         if name not in units:
             raise ExperimentError(f"{where}: {unknown('column', name, units)}")
         check_unit(f"{where}.{name}", source, units[name])
 
 
-def _plan(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
-    """Source of every column of the recording: all controls, then what is measured.
+def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
+    """Rule of every column of the recording: first of all controls, then of the measured columns.
 
-    What the experiment does not name has mjfim's own name; measured columns only where it names none of them.
+    A control without a stated rule is read under its default name; measured columns are read under their default names
+    only where the experiment file states none of them.
     """
-    stated, own = channels.spec.sources, _own(table, channels)
-    controls = [f"ctrl:{name}" for name in channels.controls]
-    plan = {name: stated.get(name) or ColumnSpec(column=own.get(name, name)) for name in controls}
-    for name in controls:
-        table.column(plan[name].column)
-    measured = {name: source for name, source in stated.items() if name not in plan}
-    if not measured:
-        known = {*controls, *channels.measurable}
-        for name in table.names:
-            if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
-                raise RecordingError(
-                    f"{table.source}: {unknown('column', name, ['t', *sorted(known)])}"
-                )
-        measured = {name: ColumnSpec(column=own[name]) for name in channels.outputs if name in own}
-    if not any(name in measured for name in channels.outputs):
-        taken = {channels.spec.time, *(s.column for s in plan.values())}
-        strays = ", ".join(measured or [c for c in table.names if c not in taken]) or "none"
-        raise RecordingError(
-            f"{table.source}: no measured column; {unknown('column', strays, channels.outputs)}"
-        )
-    return {**plan, **measured}
-
-
-def _own(table: Table, channels: Channels) -> dict[str, str]:
-    """Columns of the table by mjfim's names: also those of a bag, and the matrices of a design.npz."""
-    names, model = table.names, channels.model
-    found = {
-        name.replace(kind, q, 1): name
-        for kind, q in (("position:", "qpos:"), ("velocity:", "qvel:"))
-        for name in names
-        if name.startswith(kind)
-    }
-    state = [c.name for c in state_components(model)]
-    wholes = {
-        "qpos": state[: model.nq],
-        "qvel": state[model.nq :],
-        "ctrl": [f"ctrl:{n}" for n in channels.controls],
-    }
     stated = channels.spec.sources
-    if any(not name.startswith("ctrl:") for name in stated):
-        del wholes["qpos"], wholes["qvel"]
-    if all(name in stated for name in wholes["ctrl"]):
-        del wholes["ctrl"]
-    for whole, parts in wholes.items():
-        labels = [name for name in names if name == whole or name.startswith(f"{whole}[")]
-        if labels and len(labels) != len(parts):
+    default = _columns_by_default_name(table, channels)
+
+    controls = {
+        name: stated.get(name) or ColumnSpec(column=default.get(name, name))
+        for name in channels.control_columns
+    }
+    # Looking up a missing column raises the error that explains it.
+    for source in controls.values():
+        table.column(source.column)
+
+    measured = {name: source for name, source in stated.items() if name not in controls}
+    if not measured:
+        _check_names(table, channels)
+        measured = {
+            name: ColumnSpec(column=default[name]) for name in channels.outputs if name in default
+        }
+
+    if not any(name in measured for name in channels.outputs):
+        used = {channels.spec.time, *(source.column for source in controls.values())}
+        found = measured or [name for name in table.names if name not in used]
+        fault = unknown("column", ", ".join(found) or "none", channels.outputs)
+        raise RecordingError(f"{table.source}: no measured column; {fault}")
+
+    return {**controls, **measured}
+
+
+def _check_names(table: Table, channels: Channels) -> None:
+    """Refuse a column that looks like one of mjfim's but is none of this model, such as a misspelled joint."""
+    known = {*channels.control_columns, *channels.measurable}
+    for name in table.names:
+        if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
+            fault = unknown("column", name, ["t", *sorted(known)])
+            raise RecordingError(f"{table.source}: {fault}")
+
+
+def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]:
+    """Columns of the table by mjfim's name: joint states of a bag, matrices of a design.npz, and every column itself."""
+    found = {}
+    for name in table.names:
+        for quantity, coordinate in (("position:", "qpos:"), ("velocity:", "qvel:")):
+            if name.startswith(quantity):
+                found[coordinate + name.removeprefix(quantity)] = name
+
+    for matrix, parts in _matrices(channels).items():
+        labels = [name for name in table.names if name == matrix or name.startswith(f"{matrix}[")]
+        if not labels:
+            continue
+        if len(labels) != len(parts):
             raise RecordingError(
-                f"{table.source}: array {whole!r} has {len(labels)} columns, the model {len(parts)}: {', '.join(parts)}"
+                f"{table.source}: array {matrix!r} has {len(labels)} columns, the model {len(parts)}: {', '.join(parts)}"
             )
-        found.update(zip(parts, labels, strict=bool(labels)))
-    return {**found, **{name: name for name in names}}
+        found.update(zip(parts, labels, strict=True))
+
+    found.update({name: name for name in table.names})
+    return found
+
+
+def _matrices(channels: Channels) -> dict[str, list[str]]:
+    """Default names of the columns of qpos, qvel and ctrl, without the matrices that stated rules replace."""
+    stated = channels.spec.sources
+    state = [component.name for component in state_components(channels.model)]
+    nq = channels.model.nq
+
+    matrices = {}
+    if all(name.startswith("ctrl:") for name in stated):
+        matrices["qpos"] = state[:nq]
+        matrices["qvel"] = state[nq:]
+    if any(name not in stated for name in channels.control_columns):
+        matrices["ctrl"] = list(channels.control_columns)
+    return matrices
 
 
 def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
-    """(M,) times [s] of all rows and the rows that are used: from the window's begin to the first time after its end."""
+    """(M,) times of all rows [s], and the rows from the begin of the window to the first time after its end."""
     t = table.column(spec.time) * SECONDS[spec.time_unit]
     if spec.window is None or not len(t):
         return t, slice(0, len(t))
+
     since = t - t[0]
-    reached = since >= spec.window[0] - ROUNDING
-    begin = int(np.argmax(reached)) if reached.any() else len(t)
-    after = since[begin:] > spec.window[1] + ROUNDING
-    end = begin + (int(np.argmax(after)) if after.any() else len(after))
-    if end - begin < 1:
+    begin = _first_true(since >= spec.window[0] - WINDOW_TOLERANCE)
+
+    # Only rows after the begin count: a clock that restarts later must not end the window earlier.
+    end = begin + _first_true(since[begin:] > spec.window[1] + WINDOW_TOLERANCE)
+
+    if end == begin:
         raise RecordingError(
             f"{table.source}: recording.window: no row between {spec.window[0]:g} and {spec.window[1]:g} s; "
             f"the log lasts {t[-1] - t[0]:g} s"
@@ -156,19 +226,29 @@ def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
     return t, slice(begin, end)
 
 
+def _first_true(condition: np.ndarray) -> int:
+    """Index of the first True of condition: (M,); M if there is none."""
+    return int(np.argmax(condition)) if condition.any() else len(condition)
+
+
 def _columns(
-    table: Table, plan: Mapping[str, ColumnSpec], t: Array, rows: slice, spec: RecordingSpec
+    table: Table, sources: Mapping[str, ColumnSpec], t: Array, rows: slice, spec: RecordingSpec
 ) -> dict[str, Array]:
-    """Converted columns in the window; controls held where they are empty, from before the window too."""
+    """Converted columns inside the window; controls are held where they are empty, also from before the window."""
     columns = {}
-    for name, source in plan.items():
+
+    for name, source in sources.items():
         for raw in (source.column, *source.multiply_by):
             check_finite(f"{table.source}: column {raw!r}", table.column(raw)[rows], rows.start)
-        values = converted(table, source)
+
+        values = convert(table, source)
         if name.startswith("ctrl:"):
-            values, age = held(t, values)
+            values, age = hold_last_value(t, values)
             where = f"{table.source}: column {source.column!r} (the control {name!r})"
             check_held(where, t[rows][:-1], values[rows][:-1], age[rows][:-1], spec.gap)
+
+        # The conversion itself may overflow.
         columns[name] = values[rows]
         check_finite(f"{table.source}: column {name!r}", columns[name], rows.start)
+
     return columns

@@ -24,7 +24,7 @@ class Section(BaseModel):
 
 
 class ColumnSpec(Section):
-    """How one column of a recording is computed from the columns of a log.
+    """Rule by which one column of a recording is computed from the columns of a log.
 
     The value is `(scale * unit * raw + offset)` times the product of the columns in `multiply_by`.
     """
@@ -61,7 +61,7 @@ class ColumnSpec(Section):
 
 
 class RecordingSpec(Section):
-    """How the log of a robot becomes a recording. Without this table a log has the columns of mjfim's own CSV files."""
+    """Rules by which the log of a robot becomes a recording; by default it has the columns of mjfim's CSV files."""
 
     time: str = Field(default="t", description="Column of the time stamps.")
     time_unit: Literal["s", "ms", "us", "ns"] = Field(
@@ -91,14 +91,15 @@ class RecordingSpec(Section):
     )
 
     @model_validator(mode="after")
-    def _forward(self) -> RecordingSpec:
+    def _window_increases(self) -> RecordingSpec:
+        """Refuse a window that begins before the log or ends before it begins."""
         if self.window is not None and not 0.0 <= self.window[0] < self.window[1]:
             raise ValueError(f"window {list(self.window)} needs 0 <= begin < end")
         return self
 
     @property
     def sources(self) -> dict[str, ColumnSpec]:
-        """Sources of the columns as tables, whether the file gives a name or a table."""
+        """Rule of every stated column; the name of a column is a rule without conversion."""
         return {
             name: ColumnSpec(column=source) if isinstance(source, str) else source
             for name, source in self.columns.items()

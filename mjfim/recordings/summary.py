@@ -1,4 +1,4 @@
-"""How a log looks, in plain numbers: its clock and its columns."""
+"""Summary of a log in plain numbers: its clock and the range of its columns."""
 
 from __future__ import annotations
 
@@ -9,15 +9,21 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-ROUNDING = 1e-12  # of the largest value: closer ones are one value, computed twice
+# Values closer than this share of the column's largest value differ only by rounding.
+ROUNDING = 1e-12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ColumnSummary:
-    """One column of a recording, in the model's unit.
+    """Range and resolution of one column of a recording, in the model's unit.
 
-    source: column of the log;  minimum, maximum: NaN where it is empty;  empty_share: share of the rows, 0 ... 1
-    resolution: least difference between two values that differ, 0 where none do
+    Attributes:
+        name: Name of the column in the recording.
+        source: Name of the column in the log.
+        minimum: Smallest value, NaN if the column is empty.
+        maximum: Largest value, NaN if the column is empty.
+        empty_share: Share of the rows that are empty, 0 to 1.
+        resolution: Smallest difference between two different values, 0 if all values are equal.
     """
 
     name: str
@@ -28,12 +34,20 @@ class ColumnSummary:
     resolution: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LogSummary:
-    """One log as it was read.
+    """Clock and columns of one log.
 
-    duration [s];  rate: [Hz] from the median step;  jitter_std, jitter_max: [s] of the steps about their median
-    longest_step: [s] longest step;  dropped: rows outside the window
+    Attributes:
+        file: The log.
+        rows: Number of rows inside the window.
+        duration: Time from the first to the last row [s].
+        rate: Inverse of the median step [Hz].
+        jitter_std: Standard deviation of the steps about their median [s].
+        jitter_max: Largest deviation of a step from the median [s].
+        longest_step: Longest step [s].
+        dropped: Number of rows outside the window.
+        columns: Summary of each column of the recording.
     """
 
     file: str
@@ -50,35 +64,59 @@ class LogSummary:
 def summarize(
     file: str, t: Array, columns: Mapping[str, Array], sources: Mapping[str, str], dropped: int
 ) -> LogSummary:
-    """t: (M,) [s], M > 1;  columns: (M,) each by name;  sources: what they are called in the log"""
+    """Summarize a log.
+
+    Args:
+        file: The log.
+        t: (M,) times inside the window [s], M > 1.
+        columns: (M,) values by name of the recording's column, NaN where empty.
+        sources: Name of the log's column, by name of the recording's column.
+        dropped: Number of rows outside the window.
+
+    Returns:
+        The summary.
+    """
     steps = np.diff(t)
     median = float(np.median(steps))
-    off = steps - median
+    jitter = steps - median
+
     return LogSummary(
-        file,
-        len(t),
-        float(t[-1] - t[0]),
-        1.0 / median,
-        float(off.std()),
-        float(np.abs(off).max()),
-        float(steps.max()),
-        dropped,
-        tuple(_column(name, sources[name], values) for name, values in columns.items()),
+        file=file,
+        rows=len(t),
+        duration=float(t[-1] - t[0]),
+        rate=1.0 / median,
+        jitter_std=float(jitter.std()),
+        jitter_max=float(np.abs(jitter).max()),
+        longest_step=float(steps.max()),
+        dropped=dropped,
+        columns=tuple(_column(name, sources[name], values) for name, values in columns.items()),
     )
 
 
 def _column(name: str, source: str, values: Array) -> ColumnSummary:
-    there = np.sort(values[np.isfinite(values)])
-    empty = 1.0 - len(there) / len(values)
-    if not len(there):
-        return ColumnSummary(name, source, float("nan"), float("nan"), empty, 0.0)
-    apart = np.diff(there)
-    apart = apart[apart > ROUNDING * np.abs(there[[0, -1]]).max()]
+    """Summary of one column; values: (M,), NaN where empty."""
+    present = np.sort(values[np.isfinite(values)])
+    empty_share = 1.0 - len(present) / len(values)
+
+    if not len(present):
+        return ColumnSummary(
+            name=name,
+            source=source,
+            minimum=float("nan"),
+            maximum=float("nan"),
+            empty_share=empty_share,
+            resolution=0.0,
+        )
+
+    differences = np.diff(present)
+    rounding = ROUNDING * np.abs(present[[0, -1]]).max()
+    differences = differences[differences > rounding]
+
     return ColumnSummary(
-        name,
-        source,
-        float(there[0]),
-        float(there[-1]),
-        empty,
-        float(apart.min()) if len(apart) else 0.0,
+        name=name,
+        source=source,
+        minimum=float(present[0]),
+        maximum=float(present[-1]),
+        empty_share=empty_share,
+        resolution=float(differences.min()) if len(differences) else 0.0,
     )

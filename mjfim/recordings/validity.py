@@ -1,4 +1,4 @@
-"""What makes a log unusable: a clock that stands still, jumps or counts something else, holes, dead columns."""
+"""Checks that refuse an unusable log: a clock that stops, jumps or has another unit; gaps; columns without content."""
 
 from __future__ import annotations
 
@@ -7,117 +7,208 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 
-FEWEST = 3  # rows
+# Smallest number of rows of a usable log.
+MIN_ROWS = 3
 
+# Shortest and longest median step of a robot's log [s]; outside, the unit of time is probably wrong.
+MIN_MEDIAN_STEP = 1e-6
+MAX_MEDIAN_STEP = 1.0
 
-SLOWEST, FASTEST = 1.0, 1e-6  # [s] median steps that a log in seconds has
+# Typical step of a robot's log [s], by which the unit of time is guessed.
+TYPICAL_STEP = 5e-3
 
+# A pause is bridged up to this number of median steps, even where `gap` is shorter.
+MIN_GAP_STEPS = 5.0
 
-TYPICAL = 5e-3  # [s] step of a log
-HOLE = 5.0  # steps that are a hole
-DEAD = 10  # equal values, and nothing else, of a column that measures nothing
+# Number of values from which on a measured column of equal values counts as a dead channel.
+DEAD_CHANNEL_ROWS = 10
+
+# A clock that falls back below this share of the elapsed time has restarted; above, rows are out of order.
+RESTART_SHARE = 0.1
+
+# Seconds per unit of time.
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None:
-    """t: (M,) [s], as read in a unit;  first: row of the file that t begins with, from 0. Raises RecordingError."""
-    if len(t) < FEWEST:
+    """Refuse times that are not a clock of a robot's log.
+
+    Args:
+        where: File and column, for messages.
+        t: (M,) times [s].
+        first: Row of the file in which `t` begins, counted from 0.
+        unit: Unit of time that the experiment file states.
+        gap: Longest gap that is bridged [s].
+
+    Raises:
+        RecordingError: There are too few rows, a time is missing or not after the time before, the unit is
+            probably wrong, or there is too long a gap.
+    """
+    if len(t) < MIN_ROWS:
         raise RecordingError(
-            f"{where}: too few rows ({len(t)}); an identification needs at least {FEWEST}"
+            f"{where}: too few rows ({len(t)}); an identification needs at least {MIN_ROWS}"
         )
+
     if not np.isfinite(t).all():
         row = int(np.argmax(~np.isfinite(t)))
-        raise RecordingError(
-            f"{where} holds {'NaN' if np.isnan(t[row]) else 'an infinite time'} in data row {first + row + 1}"
-        )
+        fault = "NaN" if np.isnan(t[row]) else "an infinite time"
+        raise RecordingError(f"{where} holds {fault} in data row {first + row + 1}")
+
     steps = np.diff(t)
     if np.any(steps <= 0.0):
-        raise RecordingError(_backwards(where, t, steps, first))
+        raise RecordingError(_describe_reversal(where, t, steps, first))
+
     median = float(np.median(steps))
-    if not FASTEST <= median <= SLOWEST:
+    if not MIN_MEDIAN_STEP <= median <= MAX_MEDIAN_STEP:
         raise RecordingError(
-            f"{where}: the median step is {median:g} s, which is hardly one of a robot's log; "
-            f'is it recording.time_unit = "{_likely(median, unit)}"?'
-        )
-    limit = gap_limit(t, gap)
-    hole = int(np.argmax(steps))
-    if steps[hole] > limit:
-        raise RecordingError(
-            f"{where}: a hole of {steps[hole]:g} s after data row {first + hole + 1} ({t[hole] - t[0]:g} s after the first one); "
-            f"longer than {limit:g} s is not bridged: leave it out by recording.window, or raise recording.gap"
+            f"{where}: the median step is {median:g} s, which is unlikely for a robot's log; "
+            f'should it be recording.time_unit = "{_likely_unit(median, unit)}"?'
         )
 
+    limit = longest_bridged_gap(t, gap)
+    row = int(np.argmax(steps))
+    if steps[row] > limit:
+        raise RecordingError(
+            f"{where}: a gap of {steps[row]:g} s after data row {first + row + 1} "
+            f"({t[row] - t[0]:g} s after the first one); gaps longer than {limit:g} s are not bridged: "
+            "exclude it by recording.window, or raise recording.gap"
+        )
 
-def gap_limit(t: Array, gap: float) -> float:
-    """Longest hole [s] that is bridged."""
-    return max(gap, HOLE * float(np.median(np.diff(t))))
+
+def longest_bridged_gap(t: Array, gap: float) -> float:
+    """Compute the longest gap that is bridged.
+
+    Args:
+        t: (M,) times of rows that have a value [s], M > 1.
+        gap: Longest gap that the experiment file allows [s].
+
+    Returns:
+        That gap, or a few median steps where these are longer [s].
+    """
+    return max(gap, MIN_GAP_STEPS * float(np.median(np.diff(t))))
 
 
-def _backwards(where: str, t: Array, steps: Array, first: int) -> str:
+def _describe_reversal(where: str, t: Array, steps: Array, first: int) -> str:
+    """Message about the first time that is not after the time before. t: (M,), steps: (M-1,) [s]."""
     row = int(np.argmax(steps <= 0.0))
-    place = f"{where} does not increase in data row {first + row + 2}: {t[row]:.9g} s, then {t[row + 1]:.9g} s"
+    before, after = t[row], t[row + 1]
+    place = f"{where} does not increase in data row {first + row + 2}: {before:.9g} s, then {after:.9g} s"
+
     if steps[row] == 0.0:
         count = int(np.sum(steps == 0.0))
-        return f"{place} (a duplicate{f', one of {count}' if count > 1 else ''}); every row needs its own time"
-    if t[row + 1] - t[0] < 0.1 * (t[row] - t[0]) and row + 2 < len(t):
-        return f"{place} (the clock began anew, or wrapped around); cut the log there by recording.window, or in two files"
+        others = f", one of {count}" if count > 1 else ""
+        return f"{place} (a duplicate{others}); every row needs its own time"
+
+    # A clock that restarts goes back to the beginning, and continues from there.
+    is_last = row + 2 == len(t)
+    if after - t[0] < RESTART_SHARE * (before - t[0]) and not is_last:
+        return f"{place} (the clock restarted or wrapped around); cut the log there by recording.window, or in two files"
+
     return f"{place} (rows out of order); sort them by time"
 
 
-def _likely(median: float, unit: str) -> str:
-    """Unit in which the steps would be those of a usual log."""
+def _likely_unit(median: float, unit: str) -> str:
+    """Unit of time in which a median step [s], read in another unit, is that of a typical log."""
     raw = median / SECONDS[unit]
-    return min(SECONDS, key=lambda u: abs(np.log(raw * SECONDS[u] / TYPICAL)))
+    return min(SECONDS, key=lambda other: abs(np.log(raw * SECONDS[other] / TYPICAL_STEP)))
 
 
 def check_finite(where: str, values: Array, first: int) -> None:
-    """Raise RecordingError where values: (M,) hold an infinite one."""
-    wrong = np.isinf(values)
-    if wrong.any():
+    """Refuse a column with an infinite value.
+
+    Args:
+        where: File and column, for messages.
+        values: (M,) values; NaN is allowed.
+        first: Row of the file in which they begin, counted from 0.
+
+    Raises:
+        RecordingError: A value is infinite.
+    """
+    infinite = np.isinf(values)
+    if infinite.any():
+        row = first + int(np.argmax(infinite)) + 1
         raise RecordingError(
-            f"{where} is infinite in data row {first + int(np.argmax(wrong)) + 1}; leave a field empty where there is no number"
+            f"{where} is infinite in data row {row}; leave a field empty where there is no number"
         )
 
 
 def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
-    """Raise RecordingError where a measured column is dead, or has holes that its own rate does not explain."""
-    there = np.flatnonzero(np.isfinite(values))
-    leave = "leave it out of the file or of [recording.columns]"
-    if not len(there):
-        raise RecordingError(f"{where} holds no number; {leave}")
-    if len(there) >= DEAD and np.ptp(values[there]) == 0.0:
+    """Refuse a measured column that is empty or dead, or has gaps that its own rate does not explain.
+
+    Args:
+        where: File and column, for messages.
+        t: (M,) times [s].
+        values: (M,) values, NaN where empty.
+        gap: Longest gap that is bridged [s].
+
+    Raises:
+        RecordingError: The column is empty, constant, or has too long a gap.
+    """
+    present = np.flatnonzero(np.isfinite(values))
+    cure = "leave it out of the file or of [recording.columns]"
+
+    if not len(present):
+        raise RecordingError(f"{where} holds no number; {cure}")
+
+    if len(present) >= DEAD_CHANNEL_ROWS and np.ptp(values[present]) == 0.0:
         raise RecordingError(
-            f"{where} is {values[there[0]]:g} in all of its {len(there)} rows, a dead channel; {leave}"
+            f"{where} is {values[present[0]]:g} in all of its {len(present)} rows, a dead channel; {cure}"
         )
-    limit = gap_limit(t[there], gap) if len(there) > 1 else gap
-    edges = np.concatenate([t[:1], t[there], t[-1:]])
-    hole = int(np.argmax(np.diff(edges)))
-    if edges[hole + 1] - edges[hole] > limit:
-        begin, end = edges[hole] - t[0], edges[hole + 1] - t[0]
+
+    # A slow column is empty in most rows: its gaps are measured against its own steps.
+    limit = longest_bridged_gap(t[present], gap) if len(present) > 1 else gap
+    edges = np.concatenate([t[:1], t[present], t[-1:]])
+    longest = int(np.argmax(np.diff(edges)))
+
+    if edges[longest + 1] - edges[longest] > limit:
+        begin, end = edges[longest] - t[0], edges[longest + 1] - t[0]
         raise RecordingError(
-            f"{where} is empty from {begin:g} to {end:g} s; longer than {limit:g} s is not bridged: "
-            "leave that out by recording.window, or raise recording.gap"
+            f"{where} is empty from {begin:g} to {end:g} s; gaps longer than {limit:g} s are not bridged: "
+            "exclude that time by recording.window, or raise recording.gap"
         )
 
 
-def held(t: Array, values: Array) -> tuple[Array, Array]:
-    """A control held over its empty rows, NaN before its first value, and for how long it has been: (M,) each."""
-    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+def hold_last_value(t: Array, values: Array) -> tuple[Array, Array]:
+    """Fill the empty rows of a control with the last value before them.
+
+    Args:
+        t: (M,) times [s].
+        values: (M,) values of the control, NaN where empty.
+
+    Returns:
+        (M,) filled values, NaN before the first value, and (M,) time since each value was logged [s].
+    """
+    rows = np.where(np.isfinite(values), np.arange(len(values)), 0)
+    last = np.maximum.accumulate(rows)
     return values[last], t - t[last]
 
 
 def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> None:
-    """Raise RecordingError where a control, (M-1,) rows that count, is missing or was held for too long."""
+    """Refuse a control that is missing at the start or was held for too long.
+
+    Args:
+        where: File and column, for messages.
+        t: (M-1,) times of the rows that have a control [s].
+        values: (M-1,) control with its empty rows filled, NaN before its first value.
+        age: (M-1,) time since each value was logged [s].
+        gap: Longest time for which a control is held [s].
+
+    Raises:
+        RecordingError: The control is missing in the first row, or held for too long.
+    """
     if np.isnan(values[0]):
-        row = int(np.argmax(~np.isnan(values))) if np.isfinite(values).any() else None
-        begins = "it holds no number" if row is None else f"it begins {t[row] - t[0]:g} s later"
+        reason = "it holds no number"
+        if np.isfinite(values).any():
+            row = int(np.argmax(~np.isnan(values)))
+            reason = f"it begins {t[row] - t[0]:g} s later"
         raise RecordingError(
-            f"{where} has no value in the first row; {begins}; every control is needed from the start"
+            f"{where} has no value in the first row; {reason}; every control is needed from the start"
         )
-    limit = gap_limit(t, gap)
+
+    limit = longest_bridged_gap(t, gap)
     if age.max() > limit:
         end = int(np.argmax(age))
         raise RecordingError(
-            f"{where} is empty for {age[end]:g} s until {t[end] - t[0]:g} s; longer than {limit:g} s is not held: "
-            "leave that out by recording.window, or raise recording.gap"
+            f"{where} is empty for {age[end]:g} s until {t[end] - t[0]:g} s; a control is not held longer than {limit:g} s: "
+            "exclude that time by recording.window, or raise recording.gap"
         )

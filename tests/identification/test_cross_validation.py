@@ -128,7 +128,7 @@ def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experime
     y = np.array(swung.y)
     y[:, 3] *= 2.0
     assert any(
-        "part by" in s
+        "differ by" in s
         for s in plausibility_remarks(
             setup.channels,
             Recording(t=swung.t, ctrl=swung.ctrl, y=y, outputs=swung.outputs, name="x"),

@@ -200,7 +200,7 @@ def test_text_is_no_fault_until_it_is_used(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("t,q,q\n0,1,2\n", "'q' stands there more than once"),
+        ("t,q,q\n0,1,2\n", "there is more than one column 'q'"),
         ("t,q\n0,1\n1\n", "not a readable CSV table: .*Expected 2 columns, got 1"),
         ("t,q\xff\n0,1\n", "not a readable CSV table"),
     ],
@@ -240,11 +240,11 @@ def test_bombs(
     assert path.stat().st_size < 16_000
     assert len(read_columns(path, ALL).column("t")) == 1_000_000
     with monkeypatch.context() as patch:
-        patch.setattr(limits, "LARGEST", 2_000_000)
+        patch.setattr(limits, "MAX_UNPACKED_SIZE", 2_000_000)
         with pytest.raises(RecordingError, match=rf"{name}: .* more than 0\.00186 GiB"):
             read_columns(path, ALL)
     if name != "log.parquet":
-        monkeypatch.setattr(limits, "SUSPECT", 1_000_000)
+        monkeypatch.setattr(limits, "UNSUSPICIOUS_SIZE", 1_000_000)
         with pytest.raises(
             RecordingError, match=rf"{name}: unpacks to more than 200 times its size"
         ):
@@ -255,7 +255,7 @@ def test_packed_logs_are_no_bombs(
     columns: Columns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The ratio alone tells."""
-    monkeypatch.setattr(limits, "SUSPECT", 100)
+    monkeypatch.setattr(limits, "UNSUSPICIOUS_SIZE", 100)
     as_gzip(tmp_path / "log.csv.gz", columns)
     assert same(read_columns(tmp_path / "log.csv.gz", ALL), columns)
 
@@ -339,7 +339,8 @@ def test_rows_that_are_columns(tmp_path: Path) -> None:
     """A matrix whose time runs to the right; a time that is one."""
     np.savez(tmp_path / "log.npz", t=np.arange(5000.0), qpos=np.zeros((2, 5000)))
     with pytest.raises(
-        RecordingError, match=r"'qpos' of shape \(2, 5000\) has too many columns; time runs down"
+        RecordingError,
+        match=r"'qpos' of shape \(2, 5000\) has too many columns; each row must be one time",
     ):
         read_columns(tmp_path / "log.npz", ALL)
     np.savez(tmp_path / "log.npz", t=np.zeros((5, 1)))

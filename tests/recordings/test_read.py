@@ -176,7 +176,7 @@ def test_unit_of_a_control(read: Read) -> None:
         ),
         ("qvel:pin", {"unit": "m/s"}, r"valid: deg/s, rad/s, rev/s, rpm"),
         ("ruler", {"unit": "rpm"}, r"ruler\.unit: .*valid: m/s, mm/s"),
-        ("cell[0]", {"unit": "m"}, r"cell\[0\]\.unit: .*valid: none; for others there is scale"),
+        ("cell[0]", {"unit": "m"}, r"cell\[0\]\.unit: .*valid: none; use scale for any other unit"),
         ("qpos:rail", {"unwrap": True}, r"qpos:rail\.unwrap: only angles"),
         ("qpos:pinn", {}, r": unknown column 'qpos:pinn' \(did you mean 'qpos:pin'\?\)"),
         ("ctrl:twist", {}, r"unknown column 'ctrl:twist'.*ctrl:turn"),
@@ -290,15 +290,15 @@ def test_window_cuts_what_is_wrong(read: Read) -> None:
         (lambda t: np.floor(t * 50) / 50, r"in data row 2: .*\(a duplicate, one of 3\d\d\)"),
         (
             lambda t: np.mod(t, 1.2),
-            r"in data row 241: 1\.195 s, then 0 s \(the clock began anew, or wrapped around\)",
+            r"in data row 241: 1\.195 s, then 0 s \(the clock restarted or wrapped around\)",
         ),
         (lambda t: np.where(t == t[7], t[5] + 1e-4, t), r"in data row 8: .*\(rows out of order\)"),
-        (lambda t: 1e3 * t, r'median step is 5 s, .* is it recording\.time_unit = "ms"\?'),
+        (lambda t: 1e3 * t, r'median step is 5 s, .* should it be recording\.time_unit = "ms"\?'),
         (lambda t: 1e6 * t, r'recording\.time_unit = "us"\?'),
         (lambda t: 1e9 * t, r'recording\.time_unit = "ns"\?'),
         (
             lambda t: t + 0.2 * (t > t[99]),
-            r"a hole of 0\.205 s after data row 100 \(0\.495 s .*longer than 0\.1 s",
+            r"a gap of 0\.205 s after data row 100 \(0\.495 s .*longer than 0\.1 s",
         ),
     ],
 )
@@ -344,7 +344,8 @@ def test_holes_in_columns(read: Read) -> None:
         q = wave()
         q[begin:end] = np.nan
         with pytest.raises(
-            RecordingError, match=rf"column 'qpos:pin' is empty .*{said}; longer than 0\.1 s"
+            RecordingError,
+            match=rf"column 'qpos:pin' is empty .*{said}; gaps longer than 0\.1 s are not bridged",
         ):
             read({"qpos:pin": q})
         assert np.isnan(column(read({"qpos:pin": q}, gap=0.5), "qpos:pin")).sum() == end - begin
@@ -365,7 +366,7 @@ def test_controls_are_held(read: Read) -> None:
     u[10:40] = np.nan
     with pytest.raises(
         RecordingError,
-        match=r"'ctrl:push'.* is empty for 0\.15 s until 0\.195 s; longer than 0\.1 s",
+        match=r"'ctrl:push'.* is empty for 0\.15 s until 0\.195 s; a control is not held longer than 0\.1 s",
     ):
         read({"qpos:pin": wave(), "ctrl:push": u})
     assert read({"qpos:pin": wave(), "ctrl:push": u}, gap=0.2).recording.ctrl[39, 0] == 9.0
@@ -462,7 +463,7 @@ def test_range_tells_degrees(read: Read) -> None:
     """Far beyond the joint's range, and inside as degrees."""
     with pytest.raises(
         RecordingError,
-        match=r"'qpos:stop' goes from -\d+.* from -1\.047\d* to 1\.57\d* rad; .*in deg",
+        match=r"'qpos:stop' ranges from -\d+.* from -1\.047\d* to 1\.57\d* rad; .*in deg",
     ):
         read({"qpos:stop": wave(50.0, 6.0)})
     for fine in (wave(1.5, 6.0), wave(4.0, 6.0), wave(700.0, 0.25)):

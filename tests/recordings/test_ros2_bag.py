@@ -116,11 +116,11 @@ def test_received_where_there_is_no_stamp(tmp_path: Path) -> None:
                 State(EPOCH, ["a"], [0.0], received=EPOCH),
                 State(EPOCH - 10**9, ["a"], [1.0], received=EPOCH + 1),
             ],
-            r"message 2: has a stamp before the last one's \(-1 s\)",
+            r"message 2: has an earlier stamp than the previous message \(-1 s\)",
         ),
         (
             [State(EPOCH, ["a", "b"], [0.0])],
-            r"message 1: as many names as numbers are wanted \(2 names\)",
+            r"message 1: the numbers of names and of values differ \(2 names\)",
         ),
         ([State(EPOCH, ["a", "a"], [0.0, 1.0])], "message 1: a joint is named twice: a, a"),
         ([], "topic /j has no message"),

@@ -1,3 +1,3 @@
-"""Columns of numbers from files of every format that is read. Nothing that a file holds is executed or unpickled."""
+"""Columns of numbers from files of every supported format. No content of a file is executed or unpickled."""
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""JSON logs as columns: a list of records, in whatever object it stands."""
+"""JSON logs as columns: a list of records somewhere in the file, or one list of numbers per column."""
 
 from __future__ import annotations
 
@@ -11,159 +11,201 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, unknown
-from mjfim.recordings.formats.table import Table, said
+from mjfim.recordings.formats.table import NOT_NUMERIC, Table, length_fault, one_line
 from mjfim.recordings.spec import RecordingSpec
 
+# JSON values that are numbers; true is 1 and false is 0.
 NUMBERS = (bool, int, float)
-TEXT = "is not numeric"
 
 
-def read_nested(path: Path, spec: RecordingSpec) -> Table:
-    """Columns of a JSON file: fields of its records (`a.b` inside objects, `a[0]` inside lists), true as 1, null as empty.
+def read_json(path: Path, spec: RecordingSpec) -> Table:
+    """Read the records of a JSON file; where there are none, its lists of numbers are the columns.
 
-    Numbers beside the list hold for all rows. Where there are no records, lists of numbers are columns.
-    Raises RecordingError where the file is damaged or where the records are is not clear.
+    A field inside an object is named `a.b`, an item of a list `a[0]`. null is an empty field. Numbers beside the
+    list of records hold for all rows.
+
+    Args:
+        path: The file.
+        spec: The `[recording]` table; `records` says where the list of records is.
+
+    Returns:
+        All columns.
+
+    Raises:
+        RecordingError: The file is damaged, or the place of the records is not clear.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return _table(path, content, spec)
     except (ValueError, OSError) as error:
         raise RecordingError(
-            f"{path}: not readable JSON (damaged or truncated?): {said(error)}"
+            f"{path}: not readable JSON (damaged or truncated?): {one_line(error)}"
         ) from None
     except RecursionError:
         raise RecordingError(f"{path}: not readable JSON: nested too deeply") from None
 
 
 def _table(path: Path, content: Any, spec: RecordingSpec) -> Table:
-    place = _place(path, content, spec)
-    if place is None:
-        return _lists(path, content, spec.time)
+    """Columns of the records and of the constants beside them."""
+    keys = _keys_of_records(path, content, spec)
+    if keys is None:
+        return _table_of_lists(path, content, spec.time)
+
     records = content
-    for key in place:
+    for key in keys:
         records = records[key]
-    columns, faults = _fields(records)
-    for name, value in _flat(_without(content, place)):
+    columns, faults = _columns_of_records(records)
+
+    # A field of the records hides a constant of the same name.
+    for name, value in _leaves(_without_records(content, keys)):
         if name in columns or name in faults:
             continue
         if isinstance(value, NUMBERS):
             columns[name] = np.full(len(records), _number(value))
         elif isinstance(value, str):
-            faults[name] = TEXT
-    return Table(path, columns, faults)
+            faults[name] = NOT_NUMERIC
+
+    return Table(source=path, columns=columns, faults=faults)
 
 
-def _place(path: Path, content: Any, spec: RecordingSpec) -> tuple[str, ...] | None:
-    """Keys that lead to the records; None where the file has lists of numbers instead."""
+def _keys_of_records(path: Path, content: Any, spec: RecordingSpec) -> tuple[str, ...] | None:
+    """Keys that lead to the list of records; None where the file has lists of numbers instead."""
     if spec.records is not None:
-        place = tuple(spec.records.split("."))
-        found = content
-        for key in place:
-            if not isinstance(found, Mapping) or key not in found:
-                valid = [".".join(p) for p in _lists_of_objects(content)]
-                raise RecordingError(
-                    f"{path}: recording.records: {unknown('list of records', spec.records, valid)}"
-                )
-            found = found[key]
-        if not _is_records(found):
-            raise RecordingError(
-                f"{path}: recording.records: {spec.records!r} is not a list of records (objects)"
-            )
-        return place
-    lists = list(_lists_of_objects(content))
-    if len(lists) > 1:
-        listed = ", ".join(".".join(p) for p in lists)
+        return _stated_keys(path, content, spec.records)
+
+    found = list(_lists_of_records(content))
+    if len(found) > 1:
+        listed = ", ".join(".".join(keys) for keys in found)
         raise RecordingError(
-            f"{path}: several lists of records: {listed}; say which by recording.records"
+            f"{path}: several lists of records: {listed}; select one by recording.records"
         )
-    if lists:
-        return lists[0]
+    if found:
+        return found[0]
+
     if isinstance(content, Mapping) and any(isinstance(v, list) for v in content.values()):
         return None
     raise RecordingError(
-        f"{path}: holds no list of records (objects); a log is one, or an object that holds one"
+        f"{path}: holds no list of records (objects); a log is such a list, or an object that holds one"
     )
 
 
+def _stated_keys(path: Path, content: Any, stated: str) -> tuple[str, ...]:
+    """Keys of the list of records that the experiment file names by a dotted path."""
+    keys = tuple(stated.split("."))
+
+    found = content
+    for key in keys:
+        if not isinstance(found, Mapping) or key not in found:
+            valid = [".".join(other) for other in _lists_of_records(content)]
+            fault = unknown("list of records", stated, valid)
+            raise RecordingError(f"{path}: recording.records: {fault}")
+        found = found[key]
+
+    if not _is_records(found):
+        raise RecordingError(
+            f"{path}: recording.records: {stated!r} is not a list of records (objects)"
+        )
+    return keys
+
+
 def _is_records(value: Any) -> bool:
+    """Whether a value is a list of objects that is not empty."""
     return isinstance(value, list) and bool(value) and all(isinstance(v, Mapping) for v in value)
 
 
-def _lists_of_objects(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+def _lists_of_records(value: Any, keys: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Keys of every list of records inside a value, which is itself reached by `keys`."""
     if _is_records(value):
-        yield place
+        yield keys
     elif isinstance(value, Mapping):
         for key, inner in value.items():
-            yield from _lists_of_objects(inner, (*place, key))
+            yield from _lists_of_records(inner, (*keys, key))
 
 
-def _without(content: Any, place: tuple[str, ...]) -> dict[str, Any]:
-    """What stands beside the records."""
-    if not place:
+def _without_records(content: Any, keys: tuple[str, ...]) -> dict[str, Any]:
+    """Content of the file without the list of records."""
+    if not keys:
         return {}
-    inner = {place[0]: _without(content[place[0]], place[1:])} if len(place) > 1 else {}
-    return {**{k: v for k, v in content.items() if k != place[0]}, **inner}
+
+    first, *rest = keys
+    others = {key: value for key, value in content.items() if key != first}
+    if rest:
+        others[first] = _without_records(content[first], tuple(rest))
+    return others
 
 
-def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Leaves by dotted name."""
+def _leaves(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted name and value of everything in nested objects that is not an object itself."""
     for key, inner in value.items():
         if isinstance(inner, Mapping):
-            yield from _flat(inner, f"{prefix}{key}.")
+            yield from _leaves(inner, f"{prefix}{key}.")
         else:
             yield prefix + key, inner
 
 
-def _fields(records: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Array], dict[str, str]]:
-    """Columns and faults of records, which need not have the same fields."""
-    columns, faults, widths = dict[str, Array](), dict[str, str](), dict[str, int]()
+def _columns_of_records(
+    records: Sequence[Mapping[str, Any]],
+) -> tuple[dict[str, Array], dict[str, str]]:
+    """Columns and faults of records, which need not all have the same fields."""
+    columns, faults, lengths = dict[str, Array](), dict[str, str](), dict[str, int]()
+
     for row, record in enumerate(records):
-        for field, value in _flat(record):
-            leaves = [(field, value)]
+        for field, value in _leaves(record):
+            items = {field: value}
             if isinstance(value, list):
-                leaves = [(f"{field}[{i}]", v) for i, v in enumerate(value)]
-                if widths.setdefault(field, len(value)) != len(value):
-                    ragged = f"is ragged: {len(value)} numbers in record {row + 1}, {widths[field]} before"
-                    faults.update(
-                        {f"{field}[{i}]": ragged for i in range(max(len(value), widths[field]))}
-                    )
-            for name, leaf in leaves:
-                if leaf is None or isinstance(leaf, NUMBERS):
-                    column = columns.get(name)
-                    if column is None:
-                        column = columns[name] = np.full(len(records), np.nan)
-                    column[row] = np.nan if leaf is None else _number(leaf)
-                else:
-                    faults.setdefault(name, TEXT)
+                items = {f"{field}[{i}]": item for i, item in enumerate(value)}
+                faults.update(_ragged(field, value, row, lengths))
+
+            for name, item in items.items():
+                if not (item is None or isinstance(item, NUMBERS)):
+                    faults.setdefault(name, NOT_NUMERIC)
+                    continue
+
+                column = columns.get(name)
+                if column is None:
+                    column = columns[name] = np.full(len(records), np.nan)
+                column[row] = _number(item)
+
     return {name: column for name, column in columns.items() if name not in faults}, faults
 
 
-def _lists(path: Path, content: Mapping[str, Any], time: str) -> Table:
-    """One list of numbers per column."""
-    lists = {name: value for name, value in _flat(content) if isinstance(value, list)}
+def _ragged(field: str, items: list[Any], row: int, lengths: dict[str, int]) -> dict[str, str]:
+    """Faults of a list field whose length differs from that in the first record; `lengths` keeps that length."""
+    first = lengths.setdefault(field, len(items))
+    if first == len(items):
+        return {}
+
+    fault = f"is ragged: {len(items)} numbers in record {row + 1}, {first} before"
+    return {f"{field}[{i}]": fault for i in range(max(first, len(items)))}
+
+
+def _table_of_lists(path: Path, content: Mapping[str, Any], time: str) -> Table:
+    """Columns of a file with one list of numbers per column."""
+    values = dict(_leaves(content))
+    lists = {name: value for name, value in values.items() if isinstance(value, list)}
     if time not in lists:
-        raise RecordingError(
-            f"{path}: column {time!r} is missing; found: {', '.join(lists) or 'none'}"
-        )
-    rows, columns, faults = len(lists[time]), dict[str, Array](), dict[str, str]()
-    for name, value in _flat(content):
-        if isinstance(value, list) and len(value) != rows:
-            faults[name] = (
-                f"has {len(value)} rows where {time!r} has {rows}; all columns need equally many"
-            )
-        elif isinstance(value, list) and all(v is None or isinstance(v, NUMBERS) for v in value):
-            columns[name] = np.array(
-                [np.nan if v is None else _number(v) for v in value], dtype=np.float64
-            )
+        found = ", ".join(lists) or "none"
+        raise RecordingError(f"{path}: column {time!r} is missing; found: {found}")
+
+    rows = len(lists[time])
+    columns, faults = dict[str, Array](), dict[str, str]()
+    for name, value in values.items():
+        if name in lists and len(value) != rows:
+            faults[name] = length_fault(len(value), time, rows)
+        elif name in lists and all(v is None or isinstance(v, NUMBERS) for v in value):
+            columns[name] = np.array([_number(v) for v in value], dtype=np.float64)
         elif isinstance(value, NUMBERS):
             columns[name] = np.full(rows, _number(value))
         else:
-            faults[name] = TEXT
-    return Table(path, columns, faults)
+            faults[name] = NOT_NUMERIC
+
+    return Table(source=path, columns=columns, faults=faults)
 
 
-def _number(value: float) -> float:
-    """As float64, infinite where it is beyond it."""
+def _number(value: float | None) -> float:
+    """Value of a field as float64: NaN if it is empty, infinite if it is too large."""
+    if value is None:
+        return float("nan")
     try:
         return float(value)
     except OverflowError:

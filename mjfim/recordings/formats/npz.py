@@ -1,152 +1,146 @@
-"""npz files as columns: one array per column, or matrices with one column each. Nothing is unpickled."""
+"""NPZ archives as columns: one array per column, or matrices with one column per matrix column."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
-from mjfim.recordings.formats.table import Table, chosen, refuse_bomb, said
+from mjfim.recordings.formats.table import (
+    NOT_NUMERIC,
+    Table,
+    check_unpacked_size,
+    columns_to_read,
+    length_fault,
+    one_line,
+)
 from mjfim.recordings.spec import RecordingSpec
 
-WIDEST = 4096  # columns of one matrix
-HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-BROKEN = (
-    ValueError,
-    OSError,
-    EOFError,
-    KeyError,
-    NotImplementedError,
-    RuntimeError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+# Largest number of columns of one matrix; more are a matrix whose time runs along the rows.
+MAX_COLUMNS = 4096
+
+# NumPy's readers of array headers, by version of the NPY format.
+HEADER_READERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+# Errors that zipfile and NumPy raise for a damaged archive.
+DAMAGED = (
+    ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Member:
-    """One array of the archive, known by its header."""
+def read_npz(path: Path, spec: RecordingSpec) -> Table:
+    """Read the one- and two-dimensional arrays of an archive; nothing is unpickled.
 
-    info: zipfile.ZipInfo
-    shape: tuple[int, ...]
-    numeric: bool
+    A number holds for all rows. A control may lack the last row.
 
-    @property
-    def name(self) -> str:
-        """Of the array."""
-        return self.info.filename.removesuffix(".npy")
+    Args:
+        path: The archive.
+        spec: The `[recording]` table; its time is one of the arrays.
 
-    @property
-    def labels(self) -> list[str]:
-        """Columns that it makes: its name, or `name[i]` of a matrix."""
-        return (
-            [self.name]
-            if len(self.shape) < 2
-            else [f"{self.name}[{i}]" for i in range(self.shape[1])]
-        )
+    Returns:
+        The columns `name` of vectors and `name[i]` of matrices.
 
-
-def read_arrays(path: Path, spec: RecordingSpec) -> Table:
-    """Columns of an npz file; numbers that stand alone hold for all rows, a control may lack the last row.
-
-    Raises RecordingError where the file is damaged, unpacks to too much, holds pickles or lacks the time.
+    Raises:
+        RecordingError: The archive is damaged, too large, holds pickled objects or lacks the time.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            infos = [info for info in archive.infolist() if info.filename.endswith(".npy")]
-            refuse_bomb(
-                path, path.stat().st_size, sum(info.file_size for info in archive.infolist())
-            )
-            members = [_member(path, archive, info) for info in infos]
-            flat = [m for m in members if len(m.shape) <= 2]
-            wide = next((m for m in flat if len(m.shape) == 2 and m.shape[1] > WIDEST), None)
-            if wide is not None:
-                raise RecordingError(
-                    f"{path}: array {wide.name!r} of shape {wide.shape} has too many columns; time runs down"
-                )
-            wanted = set(chosen([label for m in flat for label in m.labels], spec))
-            return _table(path, archive, flat, wanted, spec)
-    except BROKEN as error:
+            # All sizes are checked before memory is taken: first the archive's, then each array's.
+            unpacked = sum(info.file_size for info in archive.infolist())
+            check_unpacked_size(path, path.stat().st_size, unpacked)
+
+            members = [name for name in archive.namelist() if name.endswith(".npy")]
+            headers = {name.removesuffix(".npy"): _header(path, archive, name) for name in members}
+            return _table(path, archive, headers, spec)
+    except DAMAGED as error:
         raise RecordingError(
-            f"{path}: not a readable npz archive (damaged or truncated?): {said(error)}"
+            f"{path}: not a readable npz archive (damaged or truncated?): {one_line(error)}"
         ) from None
 
 
-def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Member:
-    """Reads the header alone; what it promises must be there."""
-    with archive.open(info) as stream:
-        shape, _, dtype = _header(stream)
+def _header(path: Path, archive: zipfile.ZipFile, member: str) -> tuple[tuple[int, ...], np.dtype]:
+    """Read shape and type of one array, and refuse what must not be loaded."""
+    with archive.open(member) as stream:
+        shape, _, dtype = HEADER_READERS[np.lib.format.read_magic(stream)](stream)
+
+    name = member.removesuffix(".npy")
     if dtype.hasobject:
         raise RecordingError(
-            f"{path}: array {info.filename.removesuffix('.npy')!r} holds pickled objects, which are never read; "
-            "save it as numbers"
+            f"{path}: array {name!r} holds pickled objects, which are never read; save it as numbers"
         )
-    if math.prod(shape) * dtype.itemsize > info.file_size:
-        raise ValueError(f"{info.filename} promises more numbers than it holds")
-    return Member(info, shape, dtype.kind in "fiub")
 
+    if len(shape) == 2 and shape[1] > MAX_COLUMNS:
+        raise RecordingError(
+            f"{path}: array {name!r} of shape {shape} has too many columns; each row must be one time"
+        )
 
-def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    version = np.lib.format.read_magic(stream)
-    if version not in HEADERS:
-        raise ValueError(f"npy version {version} is not known")
-    shape, fortran, dtype = HEADERS[version](stream)
-    return shape, fortran, dtype
+    # NumPy allocates the whole array before it reads the content.
+    if math.prod(shape) * dtype.itemsize > archive.getinfo(member).file_size:
+        raise ValueError(f"{member} promises more numbers than it holds")
+
+    return shape, dtype
 
 
 def _table(
     path: Path,
     archive: zipfile.ZipFile,
-    members: list[Member],
-    wanted: set[str],
+    headers: Mapping[str, tuple[tuple[int, ...], np.dtype]],
     spec: RecordingSpec,
 ) -> Table:
-    time = next((m for m in members if m.name == spec.time), None)
-    if time is None or len(time.shape) != 1:
-        what = "is missing" if time is None else f"has shape {time.shape}, wanted one row of times"
-        raise RecordingError(
-            f"{path}: array {spec.time!r} {what}; found: {', '.join(m.name for m in members) or 'none'}"
-        )
-    rows, columns, faults = time.shape[0], dict[str, Array](), dict[str, str]()
+    """Read the arrays that are needed; headers: shape and type by name of the array."""
+    labels = {name: _labels(name, shape) for name, (shape, _) in headers.items() if len(shape) <= 2}
+    time = headers[spec.time][0] if spec.time in headers else None
+    if time is None or len(time) != 1:
+        fault = "is missing" if time is None else f"has shape {time}; times are a vector"
+        found = ", ".join(labels) or "none"
+        raise RecordingError(f"{path}: array {spec.time!r} {fault}; found: {found}")
+
+    rows = time[0]
+    needed = set(columns_to_read(itertools.chain.from_iterable(labels.values()), spec))
     controls = {s.column for key, s in spec.sources.items() if key.startswith("ctrl:")}
-    unread = []
-    for member in members:
-        held = member.name.startswith("ctrl") or not controls.isdisjoint(member.labels)
-        fault = _fault(member, rows, held, spec.time)
-        if fault is not None:
-            faults.update(dict.fromkeys(member.labels, fault))
-        elif wanted.isdisjoint(member.labels):
-            unread += member.labels
+
+    columns, faults, unread = dict[str, Array](), dict[str, str](), list[str]()
+    for name, parts in labels.items():
+        shape, dtype = headers[name]
+
+        # A control is held from each row to the next one, so that the last row may have none.
+        is_control = name.startswith("ctrl") or not controls.isdisjoint(parts)
+        fits = not shape or shape[0] == rows or (is_control and shape[0] == rows - 1)
+
+        if dtype.kind not in "fiub":
+            faults.update(dict.fromkeys(parts, NOT_NUMERIC))
+        elif not fits:
+            faults.update(dict.fromkeys(parts, length_fault(shape[0], spec.time, rows)))
+        elif needed.isdisjoint(parts):
+            unread += parts
         else:
-            columns.update(_columns(archive, member, rows))
-    return Table(path, columns, faults, tuple(unread))
+            columns.update(zip(parts, _values(archive, name, rows).T, strict=True))
+
+    return Table(source=path, columns=columns, faults=faults, unread=tuple(unread))
 
 
-def _fault(member: Member, rows: int, held: bool, time: str) -> str | None:
-    """Why an array makes no column."""
-    if not member.numeric:
-        return "is not numeric"
-    if member.shape and member.shape[0] != rows and not (held and member.shape[0] == rows - 1):
-        return (
-            f"has {member.shape[0]} rows where {time!r} has {rows}; all columns need equally many"
-        )
-    return None
+def _labels(name: str, shape: tuple[int, ...]) -> list[str]:
+    """Names of the columns that a number, a vector or a matrix becomes."""
+    return [name] if len(shape) < 2 else [f"{name}[{i}]" for i in range(shape[1])]
 
 
-def _columns(archive: zipfile.ZipFile, member: Member, rows: int) -> Iterator[tuple[str, Array]]:
-    with archive.open(member.info) as stream:
+def _values(archive: zipfile.ZipFile, name: str, rows: int) -> Array:
+    """(rows, k) numbers of one array; a missing last row is NaN."""
+    with archive.open(f"{name}.npy") as stream:
         values = np.asarray(np.lib.format.read_array(stream, allow_pickle=False), dtype=np.float64)
+
     if values.ndim == 0:
-        yield member.name, np.full(rows, float(values))
-        return
+        return np.full((rows, 1), float(values))
     if len(values) == rows - 1:
         values = np.concatenate([values, np.full((1, *values.shape[1:]), np.nan)])
-    yield from zip(member.labels, values.reshape(rows, -1).T, strict=True)
+    return values.reshape(rows, -1)

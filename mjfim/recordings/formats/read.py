@@ -1,4 +1,4 @@
-"""Log files of every format as columns of numbers; CSV and Parquet here, the others in modules of their own."""
+"""Log files of every format as columns of numbers; CSV and Parquet here, the other formats in their own modules."""
 
 from __future__ import annotations
 
@@ -10,157 +10,217 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow
 import pyarrow.csv
 import pyarrow.parquet
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
-from mjfim.recordings.formats import table as limits
-from mjfim.recordings.formats.json_records import read_nested
-from mjfim.recordings.formats.npz import read_arrays
+from mjfim.recordings.formats.json_records import read_json
+from mjfim.recordings.formats.npz import read_npz
 from mjfim.recordings.formats.ros2_bag import read_bag
-from mjfim.recordings.formats.table import Table, chosen, refuse_bomb, said
+from mjfim.recordings.formats.table import (
+    NOT_NUMERIC,
+    Table,
+    check_column_size,
+    check_unpacked_size,
+    columns_to_read,
+    one_line,
+)
 from mjfim.recordings.spec import RecordingSpec
 
-BROKEN = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.error)
-TEXT = "is not numeric"
+# Errors that pyarrow and gzip raise for a damaged file.
+DAMAGED = (pyarrow.ArrowException, OSError, EOFError, UnicodeDecodeError, zlib.error)
+
+# Bytes that are unpacked at once where the reader states no size.
+CHUNK = 1 << 20
 
 
 def read_columns(path: Path, spec: RecordingSpec) -> Table:
-    """Columns of a log, in whatever format its ending says. Raises RecordingError naming the file and the fault."""
+    """Read the columns of a log.
+
+    Args:
+        path: A file whose ending tells its format, or the folder of a ROS 2 bag.
+        spec: The `[recording]` table; it tells which columns are needed.
+
+    Returns:
+        The columns that are needed, and the names of the others.
+
+    Raises:
+        RecordingError: The file is missing, of an unknown format, or damaged.
+    """
     if not path.exists():
         raise RecordingError(f"{path}: no such file")
+
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
             raise RecordingError(
                 f"{path}: a folder without metadata.yaml is no ROS 2 bag; name a file"
             )
         return read_bag(path, spec)
-    reader = next(
-        (read for ending, read in READERS.items() if path.name.lower().endswith(ending)), None
-    )
+
+    name = path.name.lower()
+    reader = next((read for ending, read in READERS.items() if name.endswith(ending)), None)
     if reader is None:
         raise RecordingError(
-            f"{path}: not a known kind of log; valid endings: {', '.join(READERS)}; or a bag's folder"
+            f"{path}: not a known kind of log; valid endings: {', '.join(READERS)}; or the folder of a bag"
         )
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty")
+
     return reader(path, spec)
 
 
 def read_table(path: Path) -> dict[str, Array]:
-    """Columns of a numeric CSV file (gzip by its ending). Raises RecordingError naming file, column and row."""
+    """Read all columns of a numeric CSV file, packed by gzip if it ends in `.gz`.
+
+    Args:
+        path: The file.
+
+    Returns:
+        (M,) numbers by column name, NaN where a field is empty.
+
+    Raises:
+        RecordingError: The file is missing or damaged, or a column is not numeric.
+    """
     table = _read_csv(path, RecordingSpec())
+
+    # Looking up a faulty column raises the error that explains its fault.
     for name in table.faults:
         table.column(name)
+
     return table.columns
 
 
 def _read_csv(path: Path, spec: RecordingSpec) -> Table:
+    """Read the needed columns of a CSV file."""
     try:
-        with _unpacked(path) as source, pyarrow.csv.open_csv(source) as head:
+        with _opened(path) as source, pyarrow.csv.open_csv(source) as head:
             names = list(head.schema.names)
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise RecordingError(f"{path}: column {twice!r} stands there more than once")
-        wanted = chosen(names, spec)
-        try:
-            table = _rows(path, wanted, {name: pyarrow.float64() for name in wanted})
-        except pyarrow.ArrowInvalid as error:
-            if "conversion error" not in str(error):
-                raise
-            table = _rows(path, wanted, {})  # slower, but says which columns hold text
+
+        duplicate = next((name for name in names if names.count(name) > 1), None)
+        if duplicate is not None:
+            raise RecordingError(f"{path}: there is more than one column {duplicate!r}")
+
+        needed = columns_to_read(names, spec)
+        table = _parse_csv(path, needed)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file") from None
-    except BROKEN as error:
-        raise RecordingError(f"{path}: not a readable CSV table: {said(error)}") from None
-    return _table(path, table, tuple(name for name in names if name not in wanted))
+    except DAMAGED as error:
+        raise RecordingError(f"{path}: not a readable CSV table: {one_line(error)}") from None
+
+    return _from_arrow(path, table, tuple(name for name in names if name not in needed))
 
 
-def _rows(path: Path, wanted: list[str], types: dict[str, Any]) -> Any:
-    """The wanted columns; those without a stated type have that of their content."""
-    options = pyarrow.csv.ConvertOptions(include_columns=wanted, column_types=types)
-    with _unpacked(path) as source:
+def _parse_csv(path: Path, names: list[str]) -> Any:
+    """Parse columns as numbers (an arrow table); where one holds text, all have the type of their content."""
+    try:
+        return _parse_csv_as(path, names, {name: pyarrow.float64() for name in names})
+    except pyarrow.ArrowInvalid as error:
+        if "conversion error" not in str(error):
+            raise
+
+    # Slower, but it tells which columns hold text.
+    return _parse_csv_as(path, names, {})
+
+
+def _parse_csv_as(path: Path, names: list[str], types: dict[str, Any]) -> Any:
+    """Parse columns of stated types; a column without a stated type has the type of its content."""
+    options = pyarrow.csv.ConvertOptions(include_columns=names, column_types=types)
+    with _opened(path) as source:
         return pyarrow.csv.read_csv(source, convert_options=options)
 
 
 @contextmanager
-def _unpacked(path: Path) -> Iterator[Any]:
-    """The file, or its content as it unpacks."""
+def _opened(path: Path) -> Iterator[Any]:
+    """Yield a source for pyarrow: the file, or its unpacked content if it ends in `.gz`."""
     if path.suffix.lower() != ".gz":
         yield str(path)
         return
+
     with path.open("rb") as packed, gzip.GzipFile(fileobj=packed) as stream:
-        yield _Counted(path, packed, stream)
+        yield _SizeCheckedStream(path, packed, stream)
 
 
-class _Counted(io.RawIOBase):
-    """Unpacks no more than is sensible."""
+class _SizeCheckedStream(io.RawIOBase):
+    """Stream of a gzip file's content that refuses to unpack a decompression bomb."""
 
     def __init__(self, path: Path, packed: io.BufferedReader, stream: gzip.GzipFile) -> None:
-        self._path, self._packed, self._stream = path, packed, stream
-        self._count = 0
+        self._path = path
+        self._packed = packed
+        self._stream = stream
+        self._unpacked_size = 0
 
     def readable(self) -> bool:
+        """Tell the reader that this stream can be read."""
         return True
 
     def read(self, size: int = -1) -> bytes:
-        data = self._stream.read(size if size >= 0 else 1 << 20)
-        self._count += len(data)
-        refuse_bomb(self._path, self._packed.tell(), self._count)
+        """Read the next bytes of the content; fewer than `size` at its end."""
+        data = self._stream.read(size if size >= 0 else CHUNK)
+
+        self._unpacked_size += len(data)
+        check_unpacked_size(self._path, self._packed.tell(), self._unpacked_size)
         return data
 
 
 def _read_parquet(path: Path, spec: RecordingSpec) -> Table:
+    """Read the needed columns of a Parquet file."""
     try:
         with pyarrow.parquet.ParquetFile(path) as file:
             names = list(file.schema_arrow.names)
-            wanted = chosen(names, spec)
-            if file.metadata.num_rows * len(wanted) * 8 > limits.LARGEST:
-                raise RecordingError(
-                    f"{path}: {file.metadata.num_rows} rows of {len(wanted)} columns are more than "
-                    f"{limits.LARGEST / 2**30:.3g} GiB, the most that is read; name fewer in [recording.columns]"
-                )
-            table = file.read(columns=wanted)
-    except BROKEN as error:
+            needed = columns_to_read(names, spec)
+            check_column_size(path, file.metadata.num_rows, len(needed))
+            table = file.read(columns=needed)
+    except DAMAGED as error:
         raise RecordingError(
-            f"{path}: not a readable Parquet file (damaged or truncated?): {said(error)}"
+            f"{path}: not a readable Parquet file (damaged or truncated?): {one_line(error)}"
         ) from None
-    return _table(path, table, tuple(name for name in names if name not in wanted))
+
+    return _from_arrow(path, table, tuple(name for name in names if name not in needed))
 
 
-def _table(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
-    """Arrow's columns as float64, one after the other so that no two copies of all are held."""
+def _from_arrow(path: Path, table: Any, unread: tuple[str, ...]) -> Table:
+    """Convert the columns of an arrow table to float64."""
     columns, faults = dict[str, Array](), dict[str, str]()
+
+    # Each column is dropped once it is converted, so that memory never holds two copies of all.
     while table.num_columns:
         name, column = table.column_names[0], table.column(0)
         table = table.remove_column(0)
-        try:
-            whole = (
-                column.cast(pyarrow.float64(), safe=False) if not _is_text(column.type) else None
-            )
-        except (pyarrow.ArrowInvalid, pyarrow.ArrowNotImplementedError):
-            whole = None
-        if whole is None:
-            faults[name] = TEXT
+
+        numbers = _as_numbers(column)
+        if numbers is None:
+            faults[name] = NOT_NUMERIC
         else:
-            columns[name] = whole.to_numpy(zero_copy_only=False)
-    return Table(path, columns, faults, unread)
+            columns[name] = numbers
+
+    return Table(source=path, columns=columns, faults=faults, unread=unread)
 
 
-def _is_text(kind: Any) -> bool:
-    """Text is no number, even where it reads like one in every row."""
-    return bool(pyarrow.types.is_string(kind) or pyarrow.types.is_large_string(kind))
+def _as_numbers(column: Any) -> Array | None:
+    """(M,) numbers of an arrow column; None for text, even where every field reads like a number."""
+    kind = column.type
+    if pyarrow.types.is_string(kind) or pyarrow.types.is_large_string(kind):
+        return None
+
+    try:
+        numbers = column.cast(pyarrow.float64(), safe=False)
+    except (pyarrow.ArrowInvalid, pyarrow.ArrowNotImplementedError):
+        return None
+    return np.asarray(numbers.to_numpy(zero_copy_only=False))
 
 
 Reader = Callable[[Path, RecordingSpec], Table]
+
+# Reader of a log file by the ending of its name in lower case.
 READERS: dict[str, Reader] = {
     ".csv": _read_csv,
     ".csv.gz": _read_csv,
     ".parquet": _read_parquet,
-    ".npz": read_arrays,
-    ".json": read_nested,
+    ".npz": read_npz,
+    ".json": read_json,
     ".mcap": read_bag,
     ".db3": read_bag,
 }

@@ -1,7 +1,7 @@
-"""ROS 2 bags as columns: joint states by topic. The library `rosbags` is brought only where a bag is read.
+"""ROS 2 bags as columns: joint states by topic. The library `rosbags` is imported only when a bag is read.
 
-Messages are read by the definition that ROS publishes, not by the one inside the bag: the library turns definitions into
-code, and a file from elsewhere has no say in that.
+Messages are read by the definition that ROS publishes, not by the one inside the bag: the library generates code from
+definitions, and a file of unknown origin must not control that code.
 """
 
 from __future__ import annotations
@@ -17,141 +17,205 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, unknown
-from mjfim.recordings.formats.table import Table, said
+from mjfim.recordings.formats.table import Table, one_line
 from mjfim.recordings.spec import RecordingSpec
 
+# The only type of message that is read.
 JOINT_STATE = "sensor_msgs/msg/JointState"
-KINDS = ("position", "velocity", "effort")
-NANO = 1_000_000_000
+
+# Fields of a joint state that become columns.
+QUANTITIES = ("position", "velocity", "effort")
+
+# Nanoseconds per second.
+NANOSECONDS = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class Layout:
-    """What messages of one shape hold. kinds: those that are not empty"""
+@dataclass(frozen=True, kw_only=True)
+class _Layout:
+    """Shape that several messages of one topic share.
+
+    Attributes:
+        topic: Name of the topic.
+        joints: Names of the joints, in the order of the messages.
+        quantities: Fields of `QUANTITIES` that are not empty.
+    """
 
     topic: str
     joints: tuple[str, ...]
-    kinds: tuple[str, ...]
+    quantities: tuple[str, ...]
 
-    def labels(self, several: bool) -> list[str]:
-        """Names of the columns, with the topic where there are several."""
-        prefix = f"{self.topic}:" if several else ""
-        return [f"{prefix}{kind}:{joint}" for kind in self.kinds for joint in self.joints]
+    def column_names(self, with_topic: bool) -> list[str]:
+        """Names of the columns, in the order of a message's numbers."""
+        prefix = f"{self.topic}:" if with_topic else ""
+        return [
+            f"{prefix}{quantity}:{joint}" for quantity in self.quantities for joint in self.joints
+        ]
 
 
-@dataclass
-class Block:
-    """Messages of one layout. stamps: [ns];  values: row by row"""
+@dataclass(kw_only=True)
+class _Block:
+    """Messages of one layout, appended while the bag is read.
+
+    Attributes:
+        stamps: M time stamps [ns].
+        values: The numbers of all messages, message by message.
+    """
 
     stamps: array[int] = field(default_factory=lambda: array("q"))
     values: array[float] = field(default_factory=lambda: array("d"))
 
 
 def read_bag(path: Path, spec: RecordingSpec) -> Table:
-    """`t` [s] from the first stamp, `position:<joint>`, `velocity:<joint>`, `effort:<joint>` of a bag's joint states.
+    """Read the joint states of a ROS 2 bag.
 
-    With several topics in the recording, `<topic>:position:<joint>`, rows of all merged by time. Raises RecordingError.
+    The columns are `t` [s after the first stamp] and `position:<joint>`, `velocity:<joint>`, `effort:<joint>`. Where
+    the recording has several topics, they are `<topic>:position:<joint>`, and the rows of all topics are merged by time.
+
+    Args:
+        path: The folder of the bag, or its file.
+        spec: The `[recording]` table; `topics` selects topics.
+
+    Returns:
+        All columns, NaN where a topic has no message at a time.
+
+    Raises:
+        RecordingError: The bag is damaged, has no joint states, or it is not clear which topic to read; or the library
+            is not installed.
     """
     if spec.time_unit != "s":
         raise RecordingError(
             f"{path}: recording.time_unit: the stamps of a bag are in seconds; leave it out"
         )
-    rosbag2, typesys = _library(path, "rosbags.rosbag2"), _library(path, "rosbags.typesys")
+
+    rosbag2 = _library(path, "rosbags.rosbag2")
+    typesys = _library(path, "rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
     try:
         with rosbag2.Reader(path) as reader:
             connections = _connections(path, reader.connections, spec.topics)
             blocks = _blocks(path, reader, connections, store)
     except RecordingError:
         raise
-    except Exception as error:  # what a damaged bag makes of a reader written for sound ones
+    except Exception as error:
+        # The reader assumes an intact bag; a damaged one can cause any exception inside it.
         raise RecordingError(
-            f"{path}: not a readable ROS 2 bag (damaged or truncated?): {said(error)}"
+            f"{path}: not a readable ROS 2 bag (damaged or truncated?): {one_line(error)}"
         ) from None
+
     if not blocks:
-        raise RecordingError(
-            f"{path}: topic {', '.join(c.topic for c in connections)} has no message"
-        )
-    return _merged(path, blocks, several=len(spec.topics) > 1)
+        topics = ", ".join(connection.topic for connection in connections)
+        raise RecordingError(f"{path}: topic {topics} has no message")
+    return _merged(path, blocks, with_topic=len(spec.topics) > 1)
 
 
 def _library(path: Path, name: str) -> Any:
+    """Import a module of the optional library."""
     try:
         return import_module(name)
     except ImportError:
         raise RecordingError(
-            f"{path}: bags are read through the library rosbags; pip install 'mjfim[ros]'"
+            f"{path}: ROS 2 bags need the library rosbags; pip install 'mjfim[ros]'"
         ) from None
 
 
 def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]) -> list[Any]:
-    """Of the wanted topics, or of the only one."""
+    """Connections of the stated topics, or of the only topic of joint states."""
+    connections = list(connections)
     states = [c for c in connections if c.msgtype == JOINT_STATE]
-    held = sorted({c.topic for c in states})
-    if not held:
-        others = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in connections})) or "none"
+    available = sorted({c.topic for c in states})
+
+    if not available:
+        others = sorted({f"{c.topic} ({c.msgtype})" for c in connections})
         raise RecordingError(
-            f"{path}: no topic of {JOINT_STATE}, the only messages that are read; found: {others}"
+            f"{path}: no topic of {JOINT_STATE}, the only type of message that is read; "
+            f"found: {', '.join(others) or 'none'}"
         )
     for topic in topics:
-        if topic not in held:
-            raise RecordingError(f"{path}: recording.topics: {unknown('topic', topic, held)}")
-    if len(held) > 1 and not topics:
+        if topic not in available:
+            raise RecordingError(f"{path}: recording.topics: {unknown('topic', topic, available)}")
+    if len(available) > 1 and not topics:
         raise RecordingError(
-            f"{path}: several topics of joint states: {', '.join(held)}; say which by recording.topics"
+            f"{path}: several topics of joint states: {', '.join(available)}; select one by recording.topics"
         )
-    return [c for c in states if c.topic in (topics or held)]
+
+    return [c for c in states if c.topic in (topics or available)]
 
 
-def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict[Layout, Block]:
-    """All messages by layout. Raises RecordingError where the stamps of like messages do not increase."""
-    blocks: dict[Layout, Block] = {}
+def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict[_Layout, _Block]:
+    """Read all messages and collect them by layout."""
+    blocks: dict[_Layout, _Block] = {}
+
+    # Several publishers of one topic may interleave: the stamps of each set of joints increase separately.
     last: dict[tuple[str, frozenset[str]], int] = {}
+
     for number, (connection, received, raw) in enumerate(reader.messages(connections=connections)):
         message = store.deserialize_cdr(raw, JOINT_STATE)
         where = f"{path}: topic {connection.topic!r}, message {number + 1}"
-        joints = tuple(message.name)
-        layout = Layout(
-            connection.topic, joints, tuple(k for k in KINDS if len(getattr(message, k)))
-        )
-        if any(len(getattr(message, kind)) != len(joints) for kind in layout.kinds):
-            raise RecordingError(
-                f"{where}: as many names as numbers are wanted ({len(joints)} names)"
-            )
-        stamp = message.header.stamp.sec * NANO + message.header.stamp.nanosec or received
-        before = last.get((connection.topic, frozenset(joints)))
-        if before is not None and stamp <= before:
-            said = (
-                "has the stamp of the one before"
-                if stamp == before
-                else "has a stamp before the last one's"
-            )
-            raise RecordingError(
-                f"{where}: {said} ({(stamp - before) / NANO:g} s); time must increase"
-            )
-        last[connection.topic, frozenset(joints)] = stamp
+        layout = _layout(where, connection.topic, message)
+
+        # A message without a stamp has the time at which it was received.
+        stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec or received
+        publisher = (connection.topic, frozenset(layout.joints))
+        _check_order(where, stamp, last.get(publisher))
+        last[publisher] = stamp
+
         block = blocks.get(layout)
         if block is None:
-            if len(set(joints)) < len(joints):
-                raise RecordingError(f"{where}: a joint is named twice: {', '.join(joints)}")
-            block = blocks[layout] = Block()
+            if len(set(layout.joints)) < len(layout.joints):
+                raise RecordingError(f"{where}: a joint is named twice: {', '.join(layout.joints)}")
+            block = blocks[layout] = _Block()
+
         block.stamps.append(stamp)
-        for kind in layout.kinds:
-            block.values.frombytes(np.asarray(getattr(message, kind), dtype=np.float64).tobytes())
+        for quantity in layout.quantities:
+            numbers = np.asarray(getattr(message, quantity), dtype=np.float64)
+            block.values.frombytes(numbers.tobytes())
+
     return blocks
 
 
-def _merged(path: Path, blocks: dict[Layout, Block], several: bool) -> Table:
-    """One row per stamp."""
-    stamps = np.unique(
-        np.concatenate([np.frombuffer(b.stamps, dtype=np.int64) for b in blocks.values()])
+def _layout(where: str, topic: str, message: Any) -> _Layout:
+    """Layout of a message, whose fields that are not empty need one number per joint."""
+    joints = tuple(message.name)
+    quantities = tuple(name for name in QUANTITIES if len(getattr(message, name)))
+
+    if any(len(getattr(message, name)) != len(joints) for name in quantities):
+        raise RecordingError(
+            f"{where}: the numbers of names and of values differ ({len(joints)} names)"
+        )
+    return _Layout(topic=topic, joints=joints, quantities=quantities)
+
+
+def _check_order(where: str, stamp: int, last: int | None) -> None:
+    """Refuse a stamp [ns] that is not later than the last one."""
+    if last is None or stamp > last:
+        return
+
+    fault = (
+        "has the stamp of the previous message"
+        if stamp == last
+        else "has an earlier stamp than the previous message"
     )
-    # whole nanoseconds first: since 1970 they are too many for a float64
-    columns: dict[str, Array] = {"t": (stamps - stamps[0]).astype(np.float64) / NANO}
-    for layout, block in blocks.items():
-        labels = layout.labels(several)
-        rows = np.searchsorted(stamps, np.frombuffer(block.stamps, dtype=np.int64))
-        values = np.frombuffer(block.values, dtype=np.float64).reshape(len(rows), len(labels))
-        for label, column in zip(labels, values.T, strict=True):
-            columns.setdefault(label, np.full(len(stamps), np.nan))[rows] = column
-    return Table(path, columns)
+    raise RecordingError(
+        f"{where}: {fault} ({(stamp - last) / NANOSECONDS:g} s); time must increase"
+    )
+
+
+def _merged(path: Path, blocks: dict[_Layout, _Block], with_topic: bool) -> Table:
+    """Merge all messages into one table with one row per stamp."""
+    all_stamps = [np.frombuffer(block.stamps, dtype=np.int64) for block in blocks.values()]
+    stamps = np.unique(np.concatenate(all_stamps))
+
+    # Subtract whole nanoseconds first: since 1970 there are too many for a float64.
+    t = (stamps - stamps[0]).astype(np.float64) / NANOSECONDS
+    columns: dict[str, Array] = {"t": t}
+
+    for (layout, block), block_stamps in zip(blocks.items(), all_stamps, strict=True):
+        names = layout.column_names(with_topic)
+        rows = np.searchsorted(stamps, block_stamps)
+        values = np.frombuffer(block.values, dtype=np.float64).reshape(len(rows), len(names))
+
+        for name, column in zip(names, values.T, strict=True):
+            columns.setdefault(name, np.full(len(stamps), np.nan))[rows] = column
+
+    return Table(source=path, columns=columns)

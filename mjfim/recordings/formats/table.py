@@ -1,4 +1,4 @@
-"""What a log file holds before anyone knows what it means: columns of numbers by name."""
+"""A log file as columns of numbers by name, before the columns have a meaning."""
 
 from __future__ import annotations
 
@@ -10,19 +10,31 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.recordings.spec import RecordingSpec
 
-# What a file may unpack to [bytes]: never more than LARGEST, nor SUSPECT at more than RATIO times its own size.
-LARGEST = 4 * 2**30
-SUSPECT = 64 * 2**20
-RATIO = 200.0
-LONGEST = 200  # characters of a library's message
+# Largest size of a file's unpacked content, and of the columns read from it [bytes].
+MAX_UNPACKED_SIZE = 4 * 2**30
+
+# Unpacked size below which the packing ratio of a file is not questioned [bytes].
+UNSUSPICIOUS_SIZE = 64 * 2**20
+
+# Largest plausible ratio of unpacked to packed size of a log.
+MAX_PACKING_RATIO = 200.0
+
+# Longest quotation of another library's error message [characters].
+MAX_QUOTATION = 200
+
+# Fault of a column that holds text or objects.
+NOT_NUMERIC = "is not numeric"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Table:
-    """Columns of one file, all of M rows.
+    """Columns of one file, all with M rows.
 
-    columns: (M,) float64 by name, NaN where empty
-    faults: why a column that is there cannot be used, by name (`is not numeric`);  unread: names of columns left out
+    Attributes:
+        source: The file.
+        columns: (M,) float64 numbers by column name, NaN where a field is empty.
+        faults: Reason why a column cannot be used, by column name, as the end of a sentence (`is not numeric`).
+        unread: Names of the columns that were not read because nobody asked for them.
     """
 
     source: Path
@@ -32,45 +44,120 @@ class Table:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Everything that the file holds."""
+        """Names of all columns of the file: usable, faulty and unread ones."""
         return (*self.columns, *self.faults, *self.unread)
 
     def column(self, name: str) -> Array:
-        """(M,) Raises RecordingError where it is not there or cannot be used."""
+        """Return one column.
+
+        Args:
+            name: Name of the column in the file.
+
+        Returns:
+            (M,) numbers, NaN where a field is empty.
+
+        Raises:
+            RecordingError: The column is missing or cannot be used.
+        """
         if name in self.columns:
             return self.columns[name]
+
         if name in self.faults:
             raise RecordingError(f"{self.source}: column {name!r} {self.faults[name]}")
-        raise RecordingError(
-            f"{self.source}: column {name!r} is missing; found: {', '.join(self.names) or 'none'}"
-        )
+
+        found = ", ".join(self.names) or "none"
+        raise RecordingError(f"{self.source}: column {name!r} is missing; found: {found}")
 
 
-def chosen(names: Iterable[str], spec: RecordingSpec) -> list[str]:
-    """Columns that have to be read: all, unless the recording says which; controls may always stand by their own name."""
+def columns_to_read(names: Iterable[str], spec: RecordingSpec) -> list[str]:
+    """Select the columns of a file that a recording needs.
+
+    Args:
+        names: Names of all columns of the file.
+        spec: The `[recording]` table.
+
+    Returns:
+        All names where the table states no measured column, else the stated columns, the time and
+        everything that may be a control under its default name.
+    """
     sources = spec.sources
     if all(key.startswith("ctrl:") for key in sources):
         return list(names)
-    wanted = {spec.time}.union(*({s.column, *s.multiply_by} for s in sources.values()))
-    return [name for name in names if name in wanted or name.startswith("ctrl")]
+
+    stated = {spec.time}
+    for source in sources.values():
+        stated.update((source.column, *source.multiply_by))
+
+    return [name for name in names if name in stated or name.startswith("ctrl")]
 
 
-def refuse_bomb(path: Path, packed: int, unpacked: int) -> None:
-    """Raise RecordingError where packed bytes unpack to too many."""
-    if unpacked > LARGEST:
+def check_unpacked_size(path: Path, packed: int, unpacked: int) -> None:
+    """Refuse a decompression bomb.
+
+    Args:
+        path: The file, for messages.
+        packed: Size of the packed content [bytes].
+        unpacked: Size of the unpacked content so far, or as the file declares it [bytes].
+
+    Raises:
+        RecordingError: The unpacked content is too large, or far larger than the packed one.
+    """
+    if unpacked > MAX_UNPACKED_SIZE:
         raise RecordingError(
-            f"{path}: unpacks to more than {LARGEST / 2**30:.3g} GiB, the most that is read; split the file"
+            f"{path}: unpacks to more than {MAX_UNPACKED_SIZE / 2**30:.3g} GiB, the largest size that is read; "
+            "split the file"
         )
-    if unpacked > SUSPECT and unpacked > RATIO * packed:
+
+    if unpacked > UNSUSPICIOUS_SIZE and unpacked > MAX_PACKING_RATIO * packed:
         raise RecordingError(
-            f"{path}: unpacks to more than {RATIO:g} times its size, as logs do not; unpack it yourself if it is one"
+            f"{path}: unpacks to more than {MAX_PACKING_RATIO:g} times its size, which is unusual for a log; "
+            "if it is one, unpack it first"
         )
 
 
-def said(error: Exception) -> str:
-    """What a library says, in one line that is not too long."""
-    printable = "".join(
-        c if c.isprintable() or c.isspace() else "?" for c in str(error)
-    )  # it may quote the file
+def check_column_size(path: Path, rows: int, columns: int) -> None:
+    """Refuse columns that would not fit into memory.
+
+    Args:
+        path: The file, for messages.
+        rows: Number of rows of the file.
+        columns: Number of columns that are to be read.
+
+    Raises:
+        RecordingError: The columns are too large as float64 numbers.
+    """
+    if rows * columns * 8 > MAX_UNPACKED_SIZE:
+        raise RecordingError(
+            f"{path}: {rows} rows of {columns} columns are more than {MAX_UNPACKED_SIZE / 2**30:.3g} GiB, "
+            "the largest size that is read; name fewer columns in [recording.columns]"
+        )
+
+
+def length_fault(length: int, time: str, rows: int) -> str:
+    """Describe the fault of a column whose length differs from that of the time.
+
+    Args:
+        length: Number of rows of the column.
+        time: Name of the column of times.
+        rows: Number of times.
+
+    Returns:
+        The end of a sentence that begins with the column's name.
+    """
+    return f"has {length} rows where {time!r} has {rows}; all columns need the same number of rows"
+
+
+def one_line(error: Exception) -> str:
+    """Quote another library's error message in one short line.
+
+    Args:
+        error: An error whose message may quote the damaged file.
+
+    Returns:
+        The message without line breaks and control characters, at most `MAX_QUOTATION` characters.
+    """
+    # A damaged file may hold anything, also sequences that a terminal obeys.
+    printable = "".join(c if c.isprintable() or c.isspace() else "?" for c in str(error))
+
     line = " ".join(printable.split()) or type(error).__name__
-    return line if len(line) <= LONGEST else f"{line[:LONGEST]}..."
+    return line if len(line) <= MAX_QUOTATION else f"{line[:MAX_QUOTATION]}..."
