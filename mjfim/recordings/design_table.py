@@ -51,9 +51,7 @@ def read_playback(path: Path, channels: Channels) -> Playback:
     ctrl = _stacked(path, table, controls, len(t) - 1)
     gain = _stacked(path, table, gains, len(t) - 1)
 
-    return Playback(
-        t=t, state=state, ctrl=ctrl, gain=gain.reshape(len(ctrl), len(controls), -1)
-    )
+    return Playback(t=t, state=state, ctrl=ctrl, gain=gain.reshape(len(ctrl), len(controls), -1))
 
 
 def _grid(path: Path, t: Array, timestep: float) -> Array:
