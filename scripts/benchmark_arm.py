@@ -23,7 +23,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import survey
 from mjfim.parallel import cores
-from mjfim.plant.plant import FAST
+from mjfim.plant.plant import FORWARD_DIFFERENCES
 
 ARM = (
     Path(__file__).resolve().parents[2]
@@ -84,7 +84,7 @@ def measured(model: Path, p: int, iterations: int) -> Cost:
         raise SystemExit("the arm diverges")
     problem = Stage(setup, survey(setup, curve, sensitivity).basis).problem
     clock = time.perf_counter()
-    point = problem.point(curve, FAST)
+    point = problem.point(curve, FORWARD_DIFFERENCES)
     value = time.perf_counter() - clock
     clock = time.perf_counter()
     problem.expand(point)

@@ -74,10 +74,10 @@ def played(setup: Setup, seconds: float, seed: int) -> Recording:
         amplitude * multisine(minute, 2, 0.1, 30, rng) for _ in range(int(np.ceil(seconds / 60.0)))
     ]
     ctrl = np.concatenate(parts)[: round(seconds * rate)]
-    theta, states = setup.parameters.true, [setup.plant.start(setup.parameters.true)[None]]
+    theta, states = setup.parameters.true, [setup.plant.initial_state(setup.parameters.true)[None]]
     for first in range(0, len(ctrl), 100_000):
         model = [setup.plant.model(theta)]
-        out = setup.plant.engine.rollout(
+        out = setup.plant.simulator.rollout(
             model, states[-1][-1:], ctrl[None, first : first + 100_000]
         )
         states.append(out.states[0, 1:])
@@ -90,14 +90,14 @@ def played(setup: Setup, seconds: float, seed: int) -> Recording:
 
 def bare(setup: Setup, samples: int) -> float:
     """Seconds that the engine takes for so many steps on all threads."""
-    count = setup.plant.engine.threads * 50
+    count = setup.plant.simulator.threads * 50
     steps = 2000
-    starts = np.tile(setup.plant.start(setup.theta), (count, 1))
+    starts = np.tile(setup.plant.initial_state(setup.theta), (count, 1))
     ctrl = np.zeros((count, steps, len(setup.controls)))
     model = [setup.plant.model(setup.theta)]
-    setup.plant.engine.rollout(model, starts, ctrl)
+    setup.plant.simulator.rollout(model, starts, ctrl)
     clock = time.perf_counter()
-    setup.plant.engine.rollout(model, starts, ctrl)
+    setup.plant.simulator.rollout(model, starts, ctrl)
     return (time.perf_counter() - clock) / (count * steps) * samples
 
 

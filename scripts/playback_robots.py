@@ -29,7 +29,7 @@ from mjfim.experiment.system import Setup
 from mjfim.information.marginal import standard_deviations
 from mjfim.model.coordinates import joint_names
 from mjfim.model.paths import joint_width
-from mjfim.plant.batch import Engine
+from mjfim.plant.batch import BatchSimulator
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
@@ -117,7 +117,7 @@ class Bench:
         self.fence = fence_of(self.stated)
         self.limits = _looked_at(self.stated)
         self.rest = self._rest()
-        self._engine = Engine(
+        self._simulator = BatchSimulator(
             self.stated.model_at(self.stated.theta), 1, self.stated.outputs.needs_sensors, threads=1
         )
         self.setup, self.sensed = self.stated, _sensed(self.stated)
@@ -160,7 +160,7 @@ class Bench:
             self._drawn(np.random.default_rng(i)) for i in range(2 * len(setup.parameters))
         ):
             start = self._start(setup.model_at(theta), theta, self.conditions.feedback)
-            deviation = setup.space.minus(start, setup.plant.nominal_start)
+            deviation = setup.space.minus(start, setup.plant.nominal_initial_state)
             moved |= np.abs(deviation[: setup.space.nv]) > MOVED
         return [label for label, hit in zip(_dof_labels(setup.model), moved, strict=True) if hit]
 
@@ -218,8 +218,8 @@ class Bench:
         """(ns,) where a robot stands still before the start. Raises SimulationDiverged where it stands nowhere near."""
         space = self.stated.space
         if self.rest is None:
-            return self.setup.plant.start(theta)
-        data, state = mujoco.MjData(model), np.array(self.stated.plant.nominal_start)
+            return self.setup.plant.initial_state(theta)
+        data, state = mujoco.MjData(model), np.array(self.stated.plant.nominal_initial_state)
         moves = np.delete(np.eye(space.nx), np.arange(space.nv, 2 * space.nv), axis=0)
 
         def push(x: Array) -> Array:
@@ -245,7 +245,7 @@ class Bench:
         if left <= STILL:
             return state
         if self.late == 0:
-            return np.array(self.stated.plant.nominal_start)
+            return np.array(self.stated.plant.nominal_initial_state)
         raise SimulationDiverged(
             f"a robot with other parameters does not stand still at the start (it accelerates by {left:.2g} per s²): "
             + (
@@ -306,10 +306,10 @@ class Bench:
         Activations are none: they follow from the control that was sent before the start.
         """
         setup, na = self.setup, self.setup.space.na
-        setup.plant.nominal_start[len(start) - na :] = start[len(start) - na :]
+        setup.plant.nominal_initial_state[len(start) - na :] = start[len(start) - na :]
         matrix = setup.parameters.initial_state_derivative(setup.space.nx)
         used = matrix.any(axis=0)
-        deviation = setup.space.minus(start, setup.plant.nominal_start)
+        deviation = setup.space.minus(start, setup.plant.nominal_initial_state)
         theta[used] = np.linalg.lstsq(matrix[:, used], deviation)[0]
 
     def _identified(self, recording: Recording) -> tuple[Estimate, bool]:
@@ -350,8 +350,8 @@ class Bench:
         applied = np.concatenate(
             [np.tile(before, (self.late, 1)), np.repeat(sent, self.every, axis=0)]
         )
-        out = self._engine.rollout([model], start[None], applied[None], self.fence.taps)
-        if not out.finite[0] or out.tapped is None:
+        out = self._simulator.rollout([model], start[None], applied[None], self.fence.observations)
+        if not out.finite[0] or out.observed is None:
             raise SimulationDiverged("the robot's simulation diverges")
         last = M * self.every + 1
         y = setup.outputs(
@@ -368,7 +368,7 @@ class Bench:
             name="robot",
         )
         margins = self._margins(
-            out.tapped[0, :, 0], sent, before, out.states[0][:, : setup.space.nq], feedback
+            out.observed[0, :, 0], sent, before, out.states[0][:, : setup.space.nq], feedback
         )
         return recording, margins, start
 
@@ -414,7 +414,7 @@ class Bench:
 
 
 def _looked_at(setup: Setup) -> tuple[Limit, ...]:
-    """All limits, those that are held within samples first, in the order of the taps."""
+    """All limits, those that are held within samples first, in the order of the observations."""
     within = [limit for kind in SHOWN for limit in setup.limits if limit.kind == kind]
     least = setup.experiment.limits.clearance
     near = [] if least is None else [Limit("clearance", "nearest pair", 0, least, np.inf)]

@@ -100,7 +100,7 @@ def stepped(
 ) -> Array:
     """States at every step; the control changes at the controller's own ticks."""
     data = mujoco.MjData(model)
-    qpos, qvel, _ = setup.space.split(setup.plant.start(theta))
+    qpos, qvel, _ = setup.space.split(setup.plant.initial_state(theta))
     data.qpos[:], data.qvel[:] = qpos, qvel
     count = round(ticks[-1] / STEP)
     tick = np.clip(

@@ -23,7 +23,7 @@ from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import study_summary, write_design, write_json
 from mjfim.output.labels import Labels
-from mjfim.plant.plant import CENTRAL
+from mjfim.plant.plant import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.trajectory import Trajectory
@@ -70,7 +70,7 @@ UPPER = tuple(zip(*np.triu_indices(3), strict=True))
 def information_at(setup: Setup, trajectory: Trajectory, measure_rate: float) -> Array:
     """(p, p) Fisher information of a trajectory sampled at another rate [Hz]."""
     other = Setup(setup.experiment.replace(measure_rate=measure_rate))
-    point = other.problem.point(trajectory, CENTRAL)
+    point = other.problem.point(trajectory, CENTRAL_DIFFERENCES)
     assert point.information is not None
     return point.information
 

@@ -92,7 +92,7 @@ def simulated(folder: Folder, rounds: int, seed: int) -> Campaign:
         write_recording(folder.round(number) / "recording.csv", recording, folder.setup)
         return recording
 
-    threads = folder.setup.plant.engine.threads
+    threads = folder.setup.plant.simulator.threads
     return mjfim.sequential(experiment, measure, rounds, threads=threads, report=folder.report)
 
 
@@ -101,7 +101,7 @@ def real(folder: Folder, rounds: int, files: Sequence[Path]) -> Campaign:
     folder.take(files)
     done = list(folder.done())
     waits = folder.designed > folder.recorded
-    experiment, threads = folder.setup.experiment, folder.setup.plant.engine.threads
+    experiment, threads = folder.setup.experiment, folder.setup.plant.simulator.threads
 
     def measure(design: Design, number: int) -> None:
         folder.leave_design(design, number)

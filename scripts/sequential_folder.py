@@ -106,7 +106,7 @@ class Folder:
     def leave_design(self, design: Design, number: int) -> None:
         """What the robot needs."""
         last = self.rounds[-1].estimate if self.rounds else None
-        made = Setup(restated(self.setup, design.theta, last), self.setup.plant.engine.threads)
+        made = Setup(restated(self.setup, design.theta, last), self.setup.plant.simulator.threads)
         write_design(self.round(number), design, made)
 
     def report(self, now: Round) -> None:

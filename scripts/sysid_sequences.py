@@ -101,7 +101,7 @@ def export(setup: Setup, recordings: Sequence[Recording]) -> Exported:
     _require_followed(setup, parameters, spec)
     tracks = [track_of(setup, recording) for recording in recordings]
     nq, nv = setup.model.nq, setup.model.nv
-    start = setup.plant.start(setup.parameters.guess)
+    start = setup.plant.initial_state(setup.parameters.guess)
     state = sysid.create_initial_state(
         setup.model, start[:nq], start[nq : nq + nv], start[nq + nv :]
     )

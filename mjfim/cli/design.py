@@ -38,7 +38,7 @@ def several(setup: Setup) -> Iterator[Executor | None]:
     if count == 1 or not setup.enforced:
         yield None
         return
-    with Pool(min(count, setup.plant.engine.threads)) as pool:
+    with Pool(min(count, setup.plant.simulator.threads)) as pool:
         yield pool
 
 
@@ -106,7 +106,7 @@ def _shortest(
         return mjfim.shortest(
             setup.experiment,
             monitor=monitor,
-            threads=setup.plant.engine.threads,
+            threads=setup.plant.simulator.threads,
             report=lambda tried: errors.print(str(tried), markup=False),
             executor=executor,
         )

@@ -73,7 +73,7 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
     if setup is None or repeats > 1:
         experiment = task.experiment.replace(horizon=task.experiment.horizon / repeats)
         setup = Setup(experiment, task.threads, task.added, task.level)
-    begun = setup.plant.steps
+    begun = setup.plant.engine_steps
     exact, smooth = Stage(setup, task.combinations).problem, smoothed(setup, task.combinations)
     fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
     basis = None if fine is None else independent(setup.averaged(fine))
@@ -85,7 +85,7 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
         own = rung.iterate.point
         point = None if own.point is None else exact.judged(_repeated(own.point, repeats))
         chase.slope, chase.status = rung.iterate.slope, rung.status or Status.INTERRUPTED
-        chase.steps = setup.plant.steps - begun
+        chase.steps = setup.plant.engine_steps - begun
         cost = np.inf if point is None or not rung.feasible else point.cost
         if cost <= chase.cost:
             chase.control, chase.cost = np.tile(_stated(setup, own.ctrl, fine), (repeats, 1)), cost

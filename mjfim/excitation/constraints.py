@@ -15,14 +15,20 @@ from mjfim.experiment.system import Setup
 from mjfim.model.geom_distance import GeomDistances, find_geom_pairs
 from mjfim.optimize.barrier import BarrierExpansion, Bounds
 from mjfim.optimize.lq import Weights
-from mjfim.plant.batch import Taps
+from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Trajectory
 from mjfim.signals import spline_basis
 
 LOOKS = 5  # engine steps of a sample that the barrier looks at, at most
 REACH = 0.1  # [m] beyond the least clearance at which distances begin to matter
-SHOWN = ("position", "velocity", "acceleration", "force", "joint_force")  # in the order of the taps
+SHOWN = (
+    "position",
+    "velocity",
+    "acceleration",
+    "force",
+    "joint_force",
+)  # in the order of the observations
 
 
 def looked_at(substeps: int) -> tuple[int, ...]:
@@ -58,8 +64,14 @@ def fence_of(setup: Setup, every: bool = False) -> Fence:
     q, v, a, f, j = (
         np.array([limit.index for limit in rows[kind]], dtype=np.intp) for kind in SHOWN
     )
-    taps = Taps(
-        q, v, a, f, j, looked_at(setup.substeps), float(setup.plant.engine.model.opt.timestep)
+    observations = SubstepObservations(
+        positions=q,
+        velocities=v,
+        accelerations=a,
+        actuator_forces=f,
+        joint_forces=j,
+        derivative_substeps=looked_at(setup.substeps),
+        timestep=float(setup.plant.simulator.model.opt.timestep),
     )
     shown = Bounds.from_range(
         np.array([limit.lower for limit in flat]), np.array([limit.upper for limit in flat])
@@ -75,7 +87,7 @@ def fence_of(setup: Setup, every: bool = False) -> Fence:
     return Fence(
         space=setup.space,
         dt=setup.dt,
-        taps=taps,
+        observations=observations,
         shown=shown,
         kinds=tuple(limit.kind for limit in flat),
         names=tuple(limit.name for limit in flat),
@@ -140,12 +152,12 @@ END_WEIGHT = 0.1  # of a condition at the end, over that of one that is held all
 class Sight:
     """What the limits look at along a trajectory.
 
-    tapped: (N, substeps, w);  distances: (N, m) [m] at the samples 1 ... N, or None
+    observed: (N, substeps, w);  distances: (N, m) [m] at the samples 1 ... N, or None
     slopes: (N, m, nv) their derivatives by position, or None where not wanted
     """
 
     trajectory: Trajectory
-    tapped: Array
+    observed: Array
     distances: Array | None = None
     slopes: Array | None = None
 
@@ -154,7 +166,7 @@ class Sight:
 class Fence:
     """The limits of an experiment.
 
-    taps, shown: what is looked at within samples, its ranges (w,), and the kind of each
+    observations, shown: what is looked at within samples, its ranges (w,), and the kind of each
     control, rate: ranges of (nu,), the latter per second, or None
     before, after: (nu,) control before the first and after the last sample, None where free;  seam: after is the first one
     end, target: ranges of x_N - target, (nx,) and (ns,), or None
@@ -163,7 +175,7 @@ class Fence:
 
     space: StateSpace
     dt: float
-    taps: Taps
+    observations: SubstepObservations
     shown: Bounds
     kinds: tuple[str, ...]
     names: tuple[str, ...]
@@ -205,12 +217,12 @@ class Fence:
         """Positions, velocities and activations in the tangent space."""
         return self.space.nv, self.space.nv, self.space.na
 
-    def sight(self, trajectory: Trajectory, tapped: Array, slopes: bool) -> Sight:
-        """Look at a trajectory. tapped: (N, substeps, w) at every engine step"""
+    def sight(self, trajectory: Trajectory, observed: Array, slopes: bool) -> Sight:
+        """Look at a trajectory. observed: (N, substeps, w) at every engine step"""
         if self.clearance is None:
-            return Sight(trajectory, tapped)
+            return Sight(trajectory, observed)
         near = self.clearance(trajectory.qpos[1:], slopes)
-        return Sight(trajectory, tapped, near.d, near.slope)
+        return Sight(trajectory, observed, near.d, near.slope)
 
     def rates(self, ctrl: Array) -> Array:
         """(N+1, nu) rates of the control into each sample and out of the last, zero where free."""
@@ -236,7 +248,7 @@ class Fence:
             if np.isfinite(margin):
                 worst[kind] = min(margin, worst.get(kind, margin))
 
-        shown, ctrl = self.shown.margin(sight.tapped), sight.trajectory.ctrl
+        shown, ctrl = self.shown.margin(sight.observed), sight.trajectory.ctrl
         for i, kind in enumerate(self.kinds):
             tell(kind, shown[..., i], float(self.shown.scale[i]))
         tell("control", self.control.margin(ctrl), self.control.scale)
@@ -261,9 +273,9 @@ class Fence:
 
     def value(self, sight: Sight, delta: float) -> float:
         """The barrier."""
-        N, looked = len(sight.tapped), np.array(self.taps.substeps) - 1
+        N, looked = len(sight.observed), np.array(self.observations.derivative_substeps) - 1
         weight, ctrl = self._weight(N), sight.trajectory.ctrl
-        total = self.shown.barrier(sight.tapped[:, looked], delta, weight / len(looked)).value
+        total = self.shown.barrier(sight.observed[:, looked], delta, weight / len(looked)).value
         total += self.control.barrier(ctrl, delta, weight).value
         if self.rate is not None:
             total += self.rate.barrier(self.rates(ctrl), delta, weight).value
@@ -285,11 +297,11 @@ class Fence:
         )
 
     def expand(self, sight: Sight, rise: Array, delta: float) -> BarrierExpansion:
-        """Expansion about a trajectory. rise: (N, looked-at substeps, w, nx+nu) derivative of what the taps show"""
-        N, looked = len(sight.tapped), np.array(self.taps.substeps) - 1
+        """Expansion about a trajectory. rise: (N, looked-at substeps, w, nx+nu) derivative of the observations"""
+        N, looked = len(sight.observed), np.array(self.observations.derivative_substeps) - 1
         nx, ctrl = self.space.nx, sight.trajectory.ctrl
         nu, weight = ctrl.shape[1], self._weight(N)
-        barrier = self.shown.barrier(sight.tapped[:, looked], delta, weight / len(looked))
+        barrier = self.shown.barrier(sight.observed[:, looked], delta, weight / len(looked))
         both = np.einsum("kswi,ksw->ki", rise, barrier.slope)
         flat = rise.reshape(N, -1, nx + nu)
         H = np.swapaxes(flat * barrier.curvature.reshape(N, -1, 1), 1, 2) @ flat

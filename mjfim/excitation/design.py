@@ -26,7 +26,7 @@ from mjfim.information.identifiability import PROBES, Survey, survey
 from mjfim.information.marginal import shared
 from mjfim.information.smoothness import roughness
 from mjfim.plant.active_constraints import saturated
-from mjfim.plant.plant import CENTRAL
+from mjfim.plant.plant import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import ParameterGroup, join_names
 from mjfim.records.design import Design, HistoryRow, StartResult, Status
 
@@ -57,8 +57,8 @@ def design(
     """
     setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
     require_inside(setup)
-    clock, begun = time.perf_counter(), setup.plant.steps
-    first = setup.problem.point(setup.initial, CENTRAL)
+    clock, begun = time.perf_counter(), setup.plant.engine_steps
+    first = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
     if start is not None:
         start = np.asarray(start, dtype=np.float64)
         if start.shape != setup.control.shape:
@@ -69,7 +69,7 @@ def design(
     begin = (
         first
         if start is None
-        else setup.problem.point(setup.plant.simulate(setup.theta, start), CENTRAL)
+        else setup.problem.point(setup.plant.simulate(setup.theta, start), CENTRAL_DIFFERENCES)
     )
     if first.information is None or begin.trajectory is None or begin.sensitivity is None:
         why = "when the parameters move a little along the initial control"
@@ -97,7 +97,7 @@ def design(
             rows.close()  # what a monitor interrupts is not yet told
             for run in runs[-1:]:
                 run.status = Status.INTERRUPTED
-    spent = setup.plant.steps - begun + sum(run.steps for run in runs)
+    spent = setup.plant.engine_steps - begun + sum(run.steps for run in runs)
     return _conclude(stage, seen, first, runs, time.perf_counter() - clock, spent)
 
 
@@ -114,17 +114,17 @@ def _free(
     until = clock + (setup.experiment.descent.seconds or np.inf)
     coarse = coarse_level(setup, first, stage.basis)
     levels = (setup,) if coarse is None else (coarse, setup)
-    begun = sum(level.plant.steps for level in levels)
+    begun = sum(level.plant.engine_steps for level in levels)
     for begin in starts:
         runs.append(Run(begin.name))
         elsewhere = sum(run.steps for run in runs)
         for row in descend(
             [Stage(level, stage.basis) for level in levels], begin.whole, runs[-1], fence
         ):
-            spent = sum(level.plant.steps for level in levels) - begun
+            spent = sum(level.plant.engine_steps for level in levels) - begun
             told = replace(row, seconds=time.perf_counter() - clock, steps=spent)
             runs[-1].history += (told,)
-            runs[-1].steps = 0 if coarse is None else coarse.plant.steps - elsewhere
+            runs[-1].steps = 0 if coarse is None else coarse.plant.engine_steps - elsewhere
             yield told
             if time.perf_counter() > until:
                 if runs[-1].status is Status.INTERRUPTED:
@@ -303,7 +303,7 @@ def _conclude(
 
 def designable(setup: Setup) -> Survey:
     """Look along the initial control. Raises UnidentifiableError or SimulationDiverged where no design can begin there."""
-    first = setup.problem.point(setup.initial, CENTRAL)
+    first = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
     if first.trajectory is None or first.sensitivity is None:
         raise SimulationDiverged(
             "the simulation diverges when the parameters move a little along the initial control"

@@ -14,7 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import survey
 from mjfim.optimize.lq import largest_amplification, regulator
-from mjfim.plant.plant import CENTRAL
+from mjfim.plant.plant import CENTRAL_DIFFERENCES
 from mjfim.records.check import Roughness
 from mjfim.records.design import Evaluation
 from mjfim.records.trajectory import Trajectory
@@ -113,7 +113,9 @@ def left_open(setup: Setup) -> Iterator[str]:
 def evaluate_trajectory(experiment: Experiment | Setup, trajectory: Trajectory) -> Evaluation:
     """What a given trajectory's control tells about the parameters at the experiment's theta."""
     setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
-    point = setup.problem.point(setup.plant.simulate(setup.theta, trajectory.ctrl), CENTRAL)
+    point = setup.problem.point(
+        setup.plant.simulate(setup.theta, trajectory.ctrl), CENTRAL_DIFFERENCES
+    )
     if point.trajectory is None or point.sensitivity is None:
         raise SimulationDiverged("the trajectory diverges when the parameters move a little")
     stage = Stage(setup, survey(setup, point.trajectory, point.sensitivity).basis)

@@ -66,14 +66,14 @@ class InteriorProblem:
 
     def point(self, ctrl: Array) -> InteriorPoint:
         """Evaluate along the open-loop trajectory of a control."""
-        watched = self.base.plant.watch(self.base.theta, ctrl, self.fence.taps)
+        watched = self.base.plant.observe(self.base.theta, ctrl, self.fence.observations)
         if watched is None:
             return DIVERGED_POINT
         sight = self.fence.sight(*watched, slopes=False)
         barrier = self.fence.value(sight, self.delta)
         if not self.costs:
             return InteriorPoint(sight, None, 0.0, barrier)
-        point = self.base.point(sight.trajectory, self.base.plant.draft)
+        point = self.base.point(sight.trajectory, self.base.plant.quickest_accuracy)
         return (
             DIVERGED_POINT
             if point is DIVERGED
@@ -117,14 +117,16 @@ class InteriorProblem:
     def expand(self, point: InteriorPoint) -> Expansion:
         """Expansion of the sum; the barrier's share stands apart as well."""
         sight = seen(point)
-        sight = self.fence.sight(sight.trajectory, sight.tapped, slopes=True)
+        sight = self.fence.sight(sight.trajectory, sight.observed, slopes=True)
         if point.point is None:
-            A, B, rise = self.base.plant.tapped(self.base.theta, sight.trajectory, self.fence.taps)
+            A, B, rise = self.base.plant.observation_jacobians(
+                self.base.theta, sight.trajectory, self.fence.observations
+            )
             e = Expansion(
                 A=A, B=B, a=np.zeros((len(A) + 1, A.shape[1])), b=np.zeros((len(A), B.shape[2]))
             )
         else:
-            e, found = self.base.tapped(point.point, self.fence.taps)
+            e, found = self.base.expand_observed(point.point, self.fence.observations)
             if found is None:
                 raise ValueError("an expansion along a criterion without directions")
             rise = found

@@ -14,7 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import survey
 from mjfim.information.marginal import shared
-from mjfim.plant.plant import CENTRAL
+from mjfim.plant.plant import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 
 
@@ -62,7 +62,7 @@ def design_together(
 
 def _data(setup: Setup) -> Array:
     """What the initial control tells about the parameters that all experiments share."""
-    point = setup.problem.point(setup.initial, CENTRAL)
+    point = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
     if point.information is None or point.sensitivity is None:
         raise SimulationDiverged(
             "the simulation diverges when the parameters move a little along the initial control"

@@ -205,7 +205,7 @@ class Contest:
     def _worth(self, control: Array) -> float:
         """J on the stated model, infinite outside the limits, also where a clamp alone keeps a force inside."""
         setup, fence = self.fine.setup, self._fence
-        watched = setup.plant.watch(setup.theta, control, fence.taps)
+        watched = setup.plant.observe(setup.theta, control, fence.observations)
         if watched is None:
             return np.inf
         sight = fence.sight(*watched, slopes=False)
@@ -254,7 +254,7 @@ class Contest:
             level.level,
             max(workers_of(self.executor) // len(starts), 1)
             if self.executor is not None
-            else level.plant.engine.threads,
+            else level.plant.simulator.threads,
             held or {},
             time.time() - (time.perf_counter() - self.begun),
         )

@@ -18,8 +18,14 @@ from mjfim.information.criteria import Criterion
 from mjfim.information.fisher import Information
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.batch import Taps
-from mjfim.plant.plant import CENTRAL, FAST, Accuracy, Bilinear, Plant
+from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.plant import (
+    CENTRAL_DIFFERENCES,
+    FORWARD_DIFFERENCES,
+    Bilinear,
+    DifferenceAccuracy,
+    Plant,
+)
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
@@ -86,7 +92,7 @@ class Point:
     information: Array | None
     criterion: Criterion | None
     cost: float
-    accuracy: Accuracy
+    accuracy: DifferenceAccuracy
     others: tuple[Point, ...] = ()
 
     @property
@@ -97,7 +103,7 @@ class Point:
         )
 
 
-DIVERGED = Point(None, None, None, None, np.inf, FAST)
+DIVERGED = Point(None, None, None, None, np.inf, FORWARD_DIFFERENCES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +122,9 @@ class DesignProblem:
     draft: bool = False
     pool: Pool | None = None
 
-    def point(self, trajectory: Trajectory, accuracy: Accuracy = FAST) -> Point:
+    def point(
+        self, trajectory: Trajectory, accuracy: DifferenceAccuracy = FORWARD_DIFFERENCES
+    ) -> Point:
         """Evaluate J along a trajectory."""
         point = self._sensed(self.theta, trajectory, accuracy)
         if point.criterion is None:
@@ -148,7 +156,7 @@ class DesignProblem:
         phi = criterion.value if self.pool is None else self.pool.value(point.phi)
         return replace(point, cost=phi + self.running.value(trajectory))
 
-    def _sensed(self, theta: Array, trajectory: Trajectory, accuracy: Accuracy) -> Point:
+    def _sensed(self, theta: Array, trajectory: Trajectory, accuracy: DifferenceAccuracy) -> Point:
         """A trajectory of the model at theta with its information; its cost is left open."""
         sensitivity = self.plant.sensitivity(theta, trajectory, central=not accuracy.shared)
         if sensitivity is None:
@@ -176,14 +184,16 @@ class DesignProblem:
 
     def expand(self, point: Point) -> Expansion:
         """Expansion of J about a point: mixed differences for the information, closed form for the rest."""
-        return self.tapped(point, None)[0]
+        return self.expand_observed(point, None)[0]
 
-    def tapped(self, point: Point, taps: Taps | None) -> tuple[Expansion, Array | None]:
-        """The expansion, and the derivatives (N, looked-at substeps, w, nx+nu) of what the taps show, from the same steps."""
+    def expand_observed(
+        self, point: Point, observations: SubstepObservations | None
+    ) -> tuple[Expansion, Array | None]:
+        """The expansion, and the derivatives (N, looked-at substeps, w, nx+nu) of the observations, from the same steps."""
         trajectory, sensitivity, criterion = _computed(point)
-        bilinear, a, b = self._slope(self.theta, point, taps)
+        bilinear, a, b = self._slope(self.theta, point, observations)
         spectral = None
-        if self.pool is None and np.isfinite(criterion.power) and taps is not None:
+        if self.pool is None and np.isfinite(criterion.power) and observations is not None:
             spectral = self.information.spectral(criterion, sensitivity, bilinear, point.cost)
         if self.pool is not None:
             weights = self.pool.weights(point.phi)
@@ -210,15 +220,15 @@ class DesignProblem:
             extended=extended,
             barrier=None,
             eigenvalue_model=spectral,
-        ), bilinear.taps
+        ), bilinear.observation_jacobian
 
     def _slope(
-        self, theta: Array, point: Point, taps: Taps | None = None
+        self, theta: Array, point: Point, observations: SubstepObservations | None = None
     ) -> tuple[Bilinear, Array, Array]:
         """Derivatives at a point, and those of phi by x (N+1, nx) and u (N, nu)."""
         trajectory, sensitivity, criterion = _computed(point)
         bilinear = self.plant.bilinear(
-            theta, trajectory, sensitivity.psi, criterion.directions, point.accuracy, taps
+            theta, trajectory, sensitivity.psi, criterion.directions, point.accuracy, observations
         )
         return bilinear, *self.information.gradient(criterion, sensitivity, bilinear)
 
@@ -234,12 +244,12 @@ class DesignProblem:
 
     def refine(self, point: Point) -> Point | None:
         """The same point, to be expanded with central differences."""
-        if self.draft or point.accuracy is CENTRAL:
+        if self.draft or point.accuracy is CENTRAL_DIFFERENCES:
             return None
         return replace(
             point,
-            accuracy=CENTRAL,
-            others=tuple(replace(o, accuracy=CENTRAL) for o in point.others),
+            accuracy=CENTRAL_DIFFERENCES,
+            others=tuple(replace(o, accuracy=CENTRAL_DIFFERENCES) for o in point.others),
         )
 
 

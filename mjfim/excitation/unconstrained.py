@@ -164,7 +164,7 @@ def descend(
 
 def _margin(setup: Setup, fence: Fence, control: Array) -> float:
     """Sign of the worst margin at any engine step of the level, for a control at the stated rate; 0 where a force is clamped."""
-    watched = setup.plant.watch(setup.theta, setup.averaged(control), fence.taps)
+    watched = setup.plant.observe(setup.theta, setup.averaged(control), fence.observations)
     if watched is None:
         return -1.0
     margins = fence.margins(fence.sight(*watched, slopes=False))

@@ -12,7 +12,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import Fence, Sight, basis_of, fence_of
 from mjfim.experiment.system import Setup
-from mjfim.plant.batch import Engine
+from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage
 from mjfim.records.trajectory import Trajectory
 
@@ -49,19 +49,22 @@ def audit(setup: Setup, trajectory: Trajectory) -> Audit:
         else {"clearance", *(limit.kind for limit in setup.limits)}
     )
     model = setup.model_at(setup.theta)
-    engine = Engine(model, setup.substeps)
-    out = engine.rollout(
-        [model], setup.plant.start(setup.theta)[None], trajectory.ctrl[None], fence.taps
+    simulator = BatchSimulator(model, setup.substeps)
+    out = simulator.rollout(
+        [model],
+        setup.plant.initial_state(setup.theta)[None],
+        trajectory.ctrl[None],
+        fence.observations,
     )
-    if not out.finite[0] or out.tapped is None:
+    if not out.finite[0] or out.observed is None:
         lost = dict.fromkeys((*fence.kinds, "simulation"), -np.inf)
         return Audit(lost, lost, np.inf, frozenset(told))
     played = setup.plant.trajectory(out.states[0], trajectory.ctrl)
-    sight = replace(fence, clearance=None).sight(played, out.tapped[0], slopes=False)
+    sight = replace(fence, clearance=None).sight(played, out.observed[0], slopes=False)
     margins, shares = fence.margins(sight), fence.shares(sight)
     usage = [*_usage(setup, fence, sight)]
     if fence.clearance is not None:
-        positions = _positions(setup, engine, played)
+        positions = _positions(setup, simulator, played)
         distance, _, pair = fence.clearance.nearest(positions)
         margins["clearance"] = distance - fence.least
         over = np.maximum(fence.clearance(positions, slopes=False).d.min(axis=1), 1e-9)
@@ -74,11 +77,11 @@ def audit(setup: Setup, trajectory: Trajectory) -> Audit:
 
 def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
     """Of whatever has a range, within samples at every engine step."""
-    N, substeps, w = sight.tapped.shape
-    tapped, ctrl = sight.tapped.reshape(N * substeps, w), sight.trajectory.ctrl
-    t = np.arange(1, len(tapped) + 1) * setup.dt / setup.substeps
+    N, substeps, w = sight.observed.shape
+    observed, ctrl = sight.observed.reshape(N * substeps, w), sight.trajectory.ctrl
+    t = np.arange(1, len(observed) + 1) * setup.dt / setup.substeps
     for kind, name, share in zip(
-        fence.kinds, fence.names, fence.shown.relative_position(tapped).T, strict=True
+        fence.kinds, fence.names, fence.shown.relative_position(observed).T, strict=True
     ):
         yield LimitUsage(kind=kind, name=name, t=t, share=share)
     bands = [("control", fence.control, ctrl, setup.t)]
@@ -99,12 +102,14 @@ def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
                 )
 
 
-def _positions(setup: Setup, engine: Engine, played: Trajectory) -> Array:
+def _positions(setup: Setup, simulator: BatchSimulator, played: Trajectory) -> Array:
     """(N * substeps, nq) positions at every engine step."""
-    fine = Engine(engine.model, 1)
+    fine = BatchSimulator(simulator.model, 1)
     held = np.repeat(played.ctrl, setup.substeps, axis=0)
     return np.asarray(
-        fine.rollout([engine.model], played.state[:1], held[None]).states[0][1:, : setup.space.nq]
+        fine.rollout([simulator.model], played.state[:1], held[None]).states[0][
+            1:, : setup.space.nq
+        ]
     )
 
 
@@ -113,13 +118,13 @@ def require_inside(setup: Setup) -> None:
     try:
         fence = fence_of(setup, every=True)
         basis_of(setup, setup.stated_times)
-        places = {"the start": setup.plant.start(setup.theta)}
+        places = {"the start": setup.plant.initial_state(setup.theta)}
         if setup.experiment.boundary.end == "rest":
             places["the end"] = setup.target
         if setup.experiment.limits.enforce:
             for where, state in places.items():
                 _require_inside(setup, fence, where, state)
-            start, end = setup.plant.start(setup.theta), setup.target
+            start, end = setup.plant.initial_state(setup.theta), setup.target
             for where, state, hold in (
                 ("boundary.start", start, fence.before),
                 ("boundary.end", end, fence.after),

@@ -270,13 +270,15 @@ class Setup:
     @cached_property
     def hold(self) -> Array:
         """(nu,) control that holds the start. Raises ExperimentError where none does."""
-        return self._holding(self.plant.start(self.theta), self.rest, "boundary.start", "the start")
+        return self._holding(
+            self.plant.initial_state(self.theta), self.rest, "boundary.start", "the start"
+        )
 
     @cached_property
     def target(self) -> Array:
         """(ns,) state at which the design ends, where it has to end somewhere."""
         key = self._key("boundary.keyframe", self.experiment.boundary.keyframe)
-        start = self.plant.start(self.theta)
+        start = self.plant.initial_state(self.theta)
         if self.experiment.boundary.end != "rest":
             return start
         qpos, _, act = self.space.split(
@@ -299,7 +301,7 @@ class Setup:
         def drift(controls: Array) -> Array:
             held = np.broadcast_to(state, (len(controls), len(state)))
             return self.space.minus(
-                plant.engine.step([plant.model(self.theta)], held, controls).states, state
+                plant.simulator.step([plant.model(self.theta)], held, controls).states, state
             )
 
         for _ in range(HOLDS):
@@ -582,5 +584,8 @@ class Setup:
 
     def _at(self, **changes: Any) -> Setup:
         return Setup(
-            self.experiment, self.plant.engine.threads, self.added, replace(self.level, **changes)
+            self.experiment,
+            self.plant.simulator.threads,
+            self.added,
+            replace(self.level, **changes),
         )

@@ -122,7 +122,7 @@ class _Identification:
         held_out: Sequence[Recording],
         callback: Callback | None,
     ) -> None:
-        self.clock, self.steps = time.perf_counter(), setup.plant.steps
+        self.clock, self.steps = time.perf_counter(), setup.plant.engine_steps
         self.setup, self.method, self.theta0, self.callback = setup, method, theta0, callback
         self.budget = Budget()
         fit = Fit(setup, recordings)
@@ -350,7 +350,7 @@ class _Identification:
             motion=fit.motion(at, 0),
             interrupted=self.interrupted,
             seconds=time.perf_counter() - self.clock,
-            steps=setup.plant.steps - self.steps,
+            steps=setup.plant.engine_steps - self.steps,
         )
 
     def _afterwards(self, work: Callable[[], tuple[Found, ...]]) -> tuple[Found, ...]:

@@ -56,7 +56,7 @@ def suspects(
         f"?{i}": {"target": c.path, "guess": c.at, "scale": FAINT} for i, c in enumerate(tested)
     }
     try:
-        wider = Setup(setup.experiment.replace(parameters=stated), setup.plant.engine.threads)
+        wider = Setup(setup.experiment.replace(parameters=stated), setup.plant.simulator.threads)
     except ExperimentError:
         return ()
     own = [wider.parameters.names.index(name) for name in setup.parameters.names]

@@ -23,9 +23,9 @@ from mjfim.information.null_space import COARSER, Null
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import Loss
-from mjfim.plant.delay import Lag
+from mjfim.plant.delay import OutputDelay
 from mjfim.plant.noise import Noise
-from mjfim.plant.plant import CHUNK, SENSITIVITY_STEP, Response
+from mjfim.plant.plant import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
@@ -84,7 +84,7 @@ class Fit:
             self.pieces = cut(setup, self.tracks, fit.segments, self._lead())
         else:
             self.free = p.initial_state_derivative(setup.space.nx)[:, p.initial_deviations]
-            self.pieces = whole(self.tracks, setup.plant.nominal_start)
+            self.pieces = whole(self.tracks, setup.plant.nominal_initial_state)
         self.masks = [self._used(i) for i in range(len(self.tracks))]
         if not any(mask.any() for mask in self.masks):
             raise RecordingError("the recordings hold no measured value after t = 0")
@@ -251,11 +251,11 @@ class Fit:
             self.tracks[track],
             self.layout.of_recording(at, track),
         )
-        states = np.full((len(whole.ctrl) + 1, plant.nominal_start.size), np.nan)
+        states = np.full((len(whole.ctrl) + 1, plant.nominal_initial_state.size), np.nan)
         mine = [i for i, piece in enumerate(self.pieces) if piece.track == track]
         for i in mine:
             own = self.pieces[i]
-            out = plant.engine.rollout(
+            out = plant.simulator.rollout(
                 [plant.model(theta)], self._start(at, i)[None], self._control(i, own.samples)[None]
             )
             if not out.finite[0]:
@@ -264,7 +264,9 @@ class Fit:
             states[own.begin : own.begin + own.samples + 1][seen] = out.states[0][seen]
         gap = np.isnan(states[:, 0])
         if gap.any():  # rows without a piece
-            states[gap] = states[np.flatnonzero(~gap)[0]] if not gap.all() else plant.nominal_start
+            states[gap] = (
+                states[np.flatnonzero(~gap)[0]] if not gap.all() else plant.nominal_initial_state
+            )
         return plant.trajectory(states, whole.ctrl)
 
     def cost(self, at: UnknownValues) -> float:
@@ -433,7 +435,11 @@ class Fit:
         q = int(sought.sum()) + self.free.shape[1]
         central = self.samples * 2 * q < LARGE if central is None else central
         sides = 1 + (q * (2 if central else 1) if derivatives else 0)
-        most = max(CHUNK // (sides * self.setup.substeps * (1 + plant.nominal_start.size)), 1)
+        most = max(
+            MAX_NUMBERS_AT_ONCE
+            // (sides * self.setup.substeps * (1 + plant.nominal_initial_state.size)),
+            1,
+        )
         step = step if central else 0.1 * step
         for track, batch in self._batches(most):
             theta = self.layout.of_recording(at, track)
@@ -442,7 +448,7 @@ class Fit:
             ctrl = np.stack([self._control(i, longest) for i in batch])
             free = self.free if derivatives else None
             for response in plant.responses(
-                theta, starts, ctrl, free, central, CHUNK, step, sought
+                theta, starts, ctrl, free, central, MAX_NUMBERS_AT_ONCE, step, sought
             ):
                 if response is None:
                     yield None
@@ -498,13 +504,16 @@ class Fit:
                 for i, v in enumerate(values)
             )
         else:
-            lag = Lag.at(wanted[hit] - response.first, n + 1, track.dt)
+            output_delay = OutputDelay.at(wanted[hit] - response.first, n + 1, track.dt)
             y, common, private = (
-                None if v is None else lag.apply(v if i == 0 else v[place])
+                None if v is None else output_delay.apply(v if i == 0 else v[place])
                 for i, v in enumerate(values)
             )
             if common is not None and p.delay_derivative.any():
-                common = common + lag.rate(response.y[place])[..., None] * p.delay_derivative
+                common = (
+                    common
+                    + output_delay.derivative(response.y[place])[..., None] * p.delay_derivative
+                )
         if y is None:
             raise ValueError("a response without outputs")
         return Rows(piece, rows, y, common, private)

@@ -125,12 +125,14 @@ def _nearest(track: Track, columns: Sequence[int], t0: float) -> Array:
 
 def _nominal(setup: Setup, track: Track, begins: np.ndarray) -> Array:
     """(n, ns) states of the model at the guess from the stated start; the start itself where that diverges."""
-    start = setup.plant.start(setup.parameters.guess)
+    start = setup.plant.initial_state(setup.parameters.guess)
     out = np.tile(start, (len(begins), 1))
     if set(_shown(setup, track)).issuperset(range(len(start))) or not begins.any():
         return out
     model = setup.plant.model(setup.parameters.guess)
-    rolled = setup.plant.engine.rollout([model], start[None], track.ctrl[None, : int(begins.max())])
+    rolled = setup.plant.simulator.rollout(
+        [model], start[None], track.ctrl[None, : int(begins.max())]
+    )
     return np.array(rolled.states[0][begins]) if rolled.finite[0] else out
 
 

@@ -238,7 +238,7 @@ class Information:
         """Each ray, as the outputs themselves see it, and its costate."""
         recursion, backs = LinearRecursion(bilinear.A), []
         for v in rays:
-            own = v if bilinear.lag is None else bilinear.lag.apply_transposed(v)
+            own = v if bilinear.output_delay is None else bilinear.output_delay.apply_transposed(v)
             backs.append((v, own, recursion.adjoint(np.einsum("kyx,ky->kx", bilinear.C, own))))
         return backs
 
@@ -256,8 +256,10 @@ class Information:
         share[:-1] = np.einsum("kzx,kx->kz", bilinear.F_mixed[direction], costate[1:])
         if bilinear.h_mixed is not None:
             share += np.einsum("kzy,ky->kz", bilinear.h_mixed[direction], own)
-        if bilinear.lag is not None and bilinear.delay is not None:
-            share += _delayed(bilinear, v * float(bilinear.delay @ criterion.directions[direction]))
+        if bilinear.output_delay is not None and bilinear.delay_derivative is not None:
+            share += _delayed(
+                bilinear, v * float(bilinear.delay_derivative @ criterion.directions[direction])
+            )
         share[-2, nx:] += share[
             -1, nx:
         ]  # the last control is held for the outputs of the last sample
@@ -272,21 +274,21 @@ class Information:
         """
         V = np.einsum("rky,rp->kyp", self._rays(criterion, sensitivity), criterion.directions)
         nx = full.A.shape[1]
-        own = V if full.lag is None else full.lag.apply_transposed(V)
+        own = V if full.output_delay is None else full.output_delay.apply_transposed(V)
         direct = np.zeros((len(V), nx + full.B.shape[2]))
         if full.h_mixed is not None:
             direct = np.einsum("pkzy,kyp->kz", full.h_mixed, own)
-        if full.lag is not None and full.delay is not None:
-            direct += _delayed(full, V @ full.delay)
+        if full.output_delay is not None and full.delay_derivative is not None:
+            direct += _delayed(full, V @ full.delay_derivative)
         direct[-2, nx:] += direct[-1, nx:]
         return np.einsum("kyx,kyp->kxp", full.C, own), direct[:, :nx], direct[:-1, nx:]
 
 
 def _delayed(bilinear: Bilinear, v: Array) -> Array:
     """Derivative by (x, u): (N+1, nx+nu) of `sum_k v_k' dy_k/d(delay)`, linear in the outputs themselves."""
-    if bilinear.lag is None:
+    if bilinear.output_delay is None:
         raise ValueError("nothing delays the outputs")
-    e = bilinear.lag.rate_transposed(v)
+    e = bilinear.output_delay.derivative_transposed(v)
     return np.concatenate(
         [np.einsum("kyx,ky->kx", bilinear.C, e), np.einsum("kyu,ky->ku", bilinear.D, e)], axis=1
     )

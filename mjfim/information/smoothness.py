@@ -32,7 +32,7 @@ def roughness(
     """The worst disagreement along a trajectory, or None where it is below `TOLERANCE`. fine: by the first step, if known"""
     plant = setup.plant
     fine = plant.sensitivity(theta, trajectory) if fine is None else fine
-    longer = np.maximum(LONGER * setup.parameters.magnitude / plant.span, LEAST)
+    longer = np.maximum(LONGER * setup.parameters.magnitude / plant.parameter_scale, LEAST)
     coarse = plant.sensitivity(theta, trajectory, longer * SENSITIVITY_STEP)
     names = setup.parameters.names
     if fine is None or coarse is None:

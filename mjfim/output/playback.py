@@ -14,7 +14,7 @@ from mjfim.errors import SimulationDiverged
 from mjfim.experiment.system import Setup
 from mjfim.model.coordinates import gain_names, state_components, state_names
 from mjfim.plant.active_constraints import forwarded
-from mjfim.plant.batch import Engine
+from mjfim.plant.batch import BatchSimulator
 from mjfim.records.playback import Playback
 from mjfim.records.trajectory import Trajectory
 
@@ -25,9 +25,9 @@ def simulate_playback(setup: Setup, trajectory: Trajectory, gain: Array) -> Play
     Raises SimulationDiverged where it cannot be simulated.
     """
     rows = setup.substeps // setup.playback_steps
-    engine = Engine(setup.plant.engine.model, setup.playback_steps)
+    simulator = BatchSimulator(setup.plant.simulator.model, setup.playback_steps)
     held = np.repeat(trajectory.ctrl, rows, axis=0)
-    out = engine.rollout([setup.plant.model(setup.theta)], trajectory.state[:1], held[None])
+    out = simulator.rollout([setup.plant.model(setup.theta)], trajectory.state[:1], held[None])
     if not out.finite[0]:
         raise SimulationDiverged("the designed control diverges when it is simulated again")
     t = np.arange(len(held) + 1, dtype=np.float64) * (setup.dt / rows)

@@ -15,7 +15,7 @@ from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.parallel import cores
 from mjfim.plant.state_space import StateSpace
 
-RECORD = int(
+RECORDED_STATE = int(
     mujoco.mjtState.mjSTATE_TIME
     | mujoco.mjtState.mjSTATE_QPOS
     | mujoco.mjtState.mjSTATE_QVEL
@@ -24,11 +24,13 @@ RECORD = int(
 
 
 # MuJoCo resets a state it finds bad, time included: starting late makes that visible at any sample.
-START = 1.0
+START_TIME = 1.0
 # Larger controls MuJoCo replaces by zero.
 MAX_CONTROL = float(mujoco.mjMAXVAL)
-CLOCK = int(mujoco.mjtSensor.mjSENS_CLOCK)
-FEW = 64  # rollouts of a handful of models keep their own batch beside those of a Monte-Carlo study
+CLOCK_SENSOR = int(mujoco.mjtSensor.mjSENS_CLOCK)
+SMALL_BATCH = (
+    64  # rollouts of a handful of models keep their own batch beside those of a Monte-Carlo study
+)
 
 
 def state_space(model: Any) -> StateSpace:
@@ -55,8 +57,8 @@ def state_space(model: Any) -> StateSpace:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Taps:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SubstepObservations:
     """What is looked at between the samples, w numbers per engine step: addresses or dofs of each kind, side by side.
 
     q: positions, v: velocities after the step;  a: change of velocity over the step, per second
@@ -64,30 +66,34 @@ class Taps:
     substeps: engine steps of a sample that derivatives look at, counted from 1;  timestep: [s]
     """
 
-    q: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    f: np.ndarray
-    j: np.ndarray
-    substeps: tuple[int, ...]
+    positions: np.ndarray
+    velocities: np.ndarray
+    accelerations: np.ndarray
+    actuator_forces: np.ndarray
+    joint_forces: np.ndarray
+    derivative_substeps: tuple[int, ...]
     timestep: float
 
     @property
     def fields(self) -> tuple[str, ...]:
         """MjData fields that are recorded beside the state."""
-        return ("actuator_force",) * bool(len(self.f)) + ("qfrc_actuator",) * bool(len(self.j))
+        return ("actuator_force",) * bool(len(self.actuator_forces)) + ("qfrc_actuator",) * bool(
+            len(self.joint_forces)
+        )
 
-    def rows(self, qpos: Array, qvel: Array, before: Array, read: Callable[[str], Array]) -> Array:
+    def values(
+        self, qpos: Array, qvel: Array, before: Array, read: Callable[[str], Array]
+    ) -> Array:
         """(..., w) from states after a step, velocities before it, and a reader of MjData fields."""
         parts = [
-            qpos[..., self.q],
-            qvel[..., self.v],
-            (qvel[..., self.a] - before[..., self.a]) / self.timestep,
+            qpos[..., self.positions],
+            qvel[..., self.velocities],
+            (qvel[..., self.accelerations] - before[..., self.accelerations]) / self.timestep,
         ]
-        if len(self.f):
-            parts.append(read("actuator_force")[..., self.f])
-        if len(self.j):
-            parts.append(read("qfrc_actuator")[..., self.j])
+        if len(self.actuator_forces):
+            parts.append(read("actuator_force")[..., self.actuator_forces])
+        if len(self.joint_forces):
+            parts.append(read("qfrc_actuator")[..., self.joint_forces])
         return np.concatenate(parts, axis=-1)
 
 
@@ -96,28 +102,28 @@ class Rollouts:
     """Many simulated curves.
 
     states: (m, N+1, ns);  sensors: (m, N+1, nsensordata) or None;  finite: (m,) False = diverged
-    tapped: (m, N, substeps, w) at every engine step, or None
+    observed: (m, N, substeps, w) at every engine step, or None
     """
 
     states: Array
     sensors: Array | None
     finite: np.ndarray
-    tapped: Array | None = None
+    observed: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Stepped:
     """One sample of many simulations. states: (n, ns) after it;  sensors: (n, nsensordata) before it, or None
 
-    tapped: (n, looked-at substeps, w), or None
+    observed: (n, looked-at substeps, w), or None
     """
 
     states: Array
     sensors: Array | None
-    tapped: Array | None
+    observed: Array | None
 
 
-class Engine:
+class BatchSimulator:
     """Steps many simulations of models that share one layout.
 
     model: the caller's private copy;  substeps: `mj_step` calls per sample;  sensors: whether sensor data is wanted
@@ -135,7 +141,7 @@ class Engine:
         self.steps = 0
         self._batches: dict[str, Batch] = {}
         self._data = mujoco.MjData(model)
-        self._clocks = model.sensor_adr[model.sensor_type == CLOCK]
+        self._clocks = model.sensor_adr[model.sensor_type == CLOCK_SENSOR]
         self._mocap = np.flatnonzero(model.body_mocapid >= 0)[
             np.argsort(model.body_mocapid[model.body_mocapid >= 0])
         ]
@@ -156,7 +162,7 @@ class Engine:
         if self.space.na:
             batch.bind("act")[:n] = act
         batch.bind("qacc_warmstart")[:n] = 0.0
-        batch.bind("time")[:n] = START
+        batch.bind("time")[:n] = START_TIME
         if len(self._mocap):  # a batch keeps the places of the model that it was made with
             mocap_pos, mocap_quat = batch.bind("mocap_pos"), batch.bind("mocap_quat")
             for i, model in enumerate(models):
@@ -168,7 +174,11 @@ class Engine:
         return None if n == batch.nsim else np.arange(n)
 
     def step(
-        self, models: Sequence[Any], states: Array, ctrl: Array, taps: Taps | None = None
+        self,
+        models: Sequence[Any],
+        states: Array,
+        ctrl: Array,
+        observations: SubstepObservations | None = None,
     ) -> Stepped:
         """One sample of every simulation.
 
@@ -177,7 +187,10 @@ class Engine:
         share = len(states) // len(models)
         parts = [
             self._share(
-                model, states[i * share : (i + 1) * share], ctrl[i * share : (i + 1) * share], taps
+                model,
+                states[i * share : (i + 1) * share],
+                ctrl[i * share : (i + 1) * share],
+                observations,
             )
             for i, model in enumerate(models)
         ]
@@ -186,24 +199,26 @@ class Engine:
             if self.sensors
             else None
         )
-        tapped = (
+        observed = (
             None
-            if taps is None
-            else np.concatenate([p.tapped for p in parts if p.tapped is not None])
+            if observations is None
+            else np.concatenate([p.observed for p in parts if p.observed is not None])
         )
-        return Stepped(np.concatenate([p.states for p in parts]), sensed, tapped)
+        return Stepped(np.concatenate([p.states for p in parts]), sensed, observed)
 
-    def _share(self, model: Any, states: Array, ctrl: Array, taps: Taps | None) -> Stepped:
+    def _share(
+        self, model: Any, states: Array, ctrl: Array, observations: SubstepObservations | None
+    ) -> Stepped:
         count = len(states)
         batch = self._batch("step", count)
         batch.set_models(model)
         ids = self._load(batch, states, [model])
         batch.bind("ctrl")[:count] = ctrl
-        looks = () if taps is None else taps.substeps
-        sensed, done, tapped = None, 0, []
+        looks = () if observations is None else observations.derivative_substeps
+        sensed, done, observed = None, 0, []
         if self.sensors:
             batch.bind("sensordata")
-        for name in () if taps is None else taps.fields:
+        for name in () if observations is None else observations.fields:
             batch.bind(name)
         with silence_mujoco_log():
             for stop in sorted({*looks, *((1,) if self.sensors else ()), self.substeps}):
@@ -212,63 +227,79 @@ class Engine:
                     done = stop - 1
                 before = (
                     np.array(batch.bind("qvel")[:count])
-                    if taps is not None and len(taps.a)
+                    if observations is not None and len(observations.accelerations)
                     else np.empty((0, 0))
                 )
                 batch.step(ids, nstep=stop - done)
                 done = stop
                 if self.sensors and stop == 1:
                     sensed = self._sensed(batch.bind("sensordata")[:count])
-                if taps is not None and stop in looks:
-                    before = before if len(taps.a) else batch.bind("qvel")[:count]
+                if observations is not None and stop in looks:
+                    before = (
+                        before if len(observations.accelerations) else batch.bind("qvel")[:count]
+                    )
                     now = (batch.bind("qpos")[:count], batch.bind("qvel")[:count], before)
-                    tapped.append(taps.rows(*now, lambda name: batch.bind(name)[:count]))
+                    observed.append(
+                        observations.values(*now, lambda name: batch.bind(name)[:count])
+                    )
         self.steps += self.substeps * count
         names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
         out = np.concatenate([batch.bind(name)[:count] for name in names], axis=1)
         timestep = float(self.model.opt.timestep)
-        elapsed = batch.bind("time").reshape(-1)[:count] - START
+        elapsed = batch.bind("time").reshape(-1)[:count] - START_TIME
         bad = np.abs(elapsed - self.substeps * timestep) > 0.5 * timestep
         out[bad | ~_acceptable(ctrl).all(axis=1)] = np.nan
-        return Stepped(out, sensed, np.stack(tapped, axis=1) if tapped else None)
+        return Stepped(out, sensed, np.stack(observed, axis=1) if observed else None)
 
     def rollout(
-        self, models: Sequence[Any], start: Array, ctrl: Array, taps: Taps | None = None
+        self,
+        models: Sequence[Any],
+        start: Array,
+        ctrl: Array,
+        observations: SubstepObservations | None = None,
     ) -> Rollouts:
         """Open-loop simulations from start: (m, ns) under ctrl: (m, N, nu), each sample held over its substeps."""
         count, N, _ = ctrl.shape
-        batch = self._batch("rollout" if count <= FEW else "rollouts", count)
+        batch = self._batch("rollout" if count <= SMALL_BATCH else "rollouts", count)
         batch.set_models(
             models[0] if len(models) == 1 else [*models, *[models[-1]] * (batch.nsim - count)]
         )
         ids = self._load(batch, start, models)
         held = np.repeat(ctrl, self.substeps, axis=1)
-        record: tuple[Any, ...] = (RECORD,)
+        record: tuple[Any, ...] = (RECORDED_STATE,)
         if self.sensors:  # one more step: sensor data belongs to the state before a step
-            held, record = np.concatenate([held, held[:, -1:]], axis=1), (RECORD, "sensordata")
-        if taps is not None:
-            record = (*record, *taps.fields)
+            held, record = (
+                np.concatenate([held, held[:, -1:]], axis=1),
+                (RECORDED_STATE, "sensordata"),
+            )
+        if observations is not None:
+            record = (*record, *observations.fields)
         with silence_mujoco_log():
             out = batch.rollout(held.shape[1], np.ascontiguousarray(held), record=record, ids=ids)
         self.steps += count * held.shape[1]
         last = N * self.substeps
-        rows = out[RECORD][:, self.substeps - 1 : last : self.substeps]
+        rows = out[RECORDED_STATE][:, self.substeps - 1 : last : self.substeps]
         states = np.concatenate([start[:, None], rows[:, :, 1:]], axis=1)
         on_time = (
-            np.abs(rows[:, -1, 0] - START - last * self.model.opt.timestep)
+            np.abs(rows[:, -1, 0] - START_TIME - last * self.model.opt.timestep)
             < 0.5 * self.model.opt.timestep
         )
         finite = on_time & np.isfinite(states).all(axis=(1, 2)) & _acceptable(ctrl).all(axis=(1, 2))
         sensed = self._sensed(out["sensordata"][:, :: self.substeps]) if self.sensors else None
         return Rollouts(
-            states, sensed, finite, None if taps is None else self._tapped(taps, start, out, last)
+            states,
+            sensed,
+            finite,
+            None if observations is None else self._observed(observations, start, out, last),
         )
 
-    def _tapped(self, taps: Taps, start: Array, out: dict[Any, Array], last: int) -> Array:
+    def _observed(
+        self, observations: SubstepObservations, start: Array, out: dict[Any, Array], last: int
+    ) -> Array:
         """(m, N, substeps, w) from the records of a rollout of `last` engine steps."""
-        qpos, qvel, _ = self.space.split(out[RECORD][:, :last, 1:])
+        qpos, qvel, _ = self.space.split(out[RECORDED_STATE][:, :last, 1:])
         before = np.concatenate([self.space.split(start)[1][:, None], qvel[:, :-1]], axis=1)
-        rows = taps.rows(qpos, qvel, before, lambda name: out[name][:, :last])
+        rows = observations.values(qpos, qvel, before, lambda name: out[name][:, :last])
         return np.asarray(
             rows.reshape(len(start), last // self.substeps, self.substeps, rows.shape[-1])
         )
@@ -276,7 +307,7 @@ class Engine:
     def _sensed(self, data: Array) -> Array:
         """A copy of sensor data: (..., nsensordata), its clocks as if time had begun at zero."""
         out = np.array(data)
-        out[..., self._clocks] -= START
+        out[..., self._clocks] -= START_TIME
         return out
 
     def closed_loop(
@@ -290,7 +321,7 @@ class Engine:
         scalar = not space.quaternions
         data = self._data
         mujoco.mj_resetData(model, data)
-        data.time = START
+        data.time = START_TIME
         data.qpos[:], data.qvel[:], data.act[:] = space.split(reference[0])
         states, used = np.empty((N + 1, reference.shape[1])), np.empty_like(mu)
         states[0] = reference[0]
@@ -306,7 +337,8 @@ class Engine:
                 q[:], v[:], a[:] = qpos, qvel, act
         self.steps += N * substeps
         on_time = (
-            abs(data.time - START - N * substeps * model.opt.timestep) < 0.5 * model.opt.timestep
+            abs(data.time - START_TIME - N * substeps * model.opt.timestep)
+            < 0.5 * model.opt.timestep
         )
         return states, used, bool(on_time and np.isfinite(states).all() and _acceptable(used).all())
 

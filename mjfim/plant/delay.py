@@ -12,7 +12,7 @@ from mjfim.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Lag:
+class OutputDelay:
     """`y(t_k - d)` from samples y_k by cubic Lagrange interpolation (of lower order below 4 samples).
 
     What was before the start is the start.
@@ -24,12 +24,12 @@ class Lag:
     slope: Any
 
     @staticmethod
-    def of(samples: int, delay: float, dt: float) -> Lag:
+    def on_grid(samples: int, delay: float, dt: float) -> OutputDelay:
         """samples: N+1;  delay: d [s];  dt: sample period [s]"""
-        return Lag.at(np.arange(samples, dtype=np.float64) - delay / dt, samples, dt)
+        return OutputDelay.at(np.arange(samples, dtype=np.float64) - delay / dt, samples, dt)
 
     @staticmethod
-    def at(wanted: Array, samples: int, dt: float) -> Lag:
+    def at(wanted: Array, samples: int, dt: float) -> OutputDelay:
         """Of outputs that were read at other times. wanted: (M,) t/dt - d/dt in samples;  samples: N+1"""
         place = np.clip(wanted, 0.0, samples - 1.0)
         count = min(4, samples)
@@ -39,7 +39,7 @@ class Lag:
         inside = (wanted >= 0.0) & (wanted <= samples - 1.0)
         slope *= np.where(inside, -1.0 / dt, 0.0)[:, None]
         rows = np.repeat(np.arange(len(wanted)), count)
-        return Lag(
+        return OutputDelay(
             *(
                 csr_array((w.ravel(), (rows, nodes.ravel())), shape=(len(wanted), samples))
                 for w in (value, slope)
@@ -50,7 +50,7 @@ class Lag:
         """Lagged values, (M, ...). values: (N+1, ...)"""
         return _apply(self.shift, values)
 
-    def rate(self, values: Array) -> Array:
+    def derivative(self, values: Array) -> Array:
         """Derivative of the lagged values by the delay. values: (N+1, ...)"""
         return _apply(self.slope, values)
 
@@ -58,8 +58,8 @@ class Lag:
         """Adjoint of `apply`."""
         return _apply(self.shift.T, values)
 
-    def rate_transposed(self, values: Array) -> Array:
-        """Adjoint of `rate`."""
+    def derivative_transposed(self, values: Array) -> Array:
+        """Adjoint of `derivative`."""
         return _apply(self.slope.T, values)
 
 

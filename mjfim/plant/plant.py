@@ -18,14 +18,14 @@ from mjfim.errors import ModelError, SimulationDiverged
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.variants import Source
 from mjfim.optimize.lq import TangentCurve
-from mjfim.plant.batch import Engine, Taps
-from mjfim.plant.delay import Lag
+from mjfim.plant.batch import BatchSimulator, SubstepObservations
+from mjfim.plant.delay import OutputDelay
 from mjfim.plant.outputs import OutputMap
 from mjfim.records.trajectory import Linearization, Sensitivity, Trajectory
 
 
 @dataclass(frozen=True)
-class Accuracy:
+class DifferenceAccuracy:
     """Steps of the differences, relative to the size of what is perturbed.
 
     central: two-sided in state and control, else one-sided
@@ -39,15 +39,17 @@ class Accuracy:
     shared: bool = False
 
 
-FAST = Accuracy(central=False, delta=1e-6, epsilon=3e-3)
-DRAFT = Accuracy(central=False, delta=1e-6, epsilon=1e-3, shared=True)
-DRY = Accuracy(central=False, delta=1e-6, epsilon=1e-5, shared=True)
-CENTRAL = Accuracy(central=True, delta=1e-4, epsilon=1e-3)
+FORWARD_DIFFERENCES = DifferenceAccuracy(central=False, delta=1e-6, epsilon=3e-3)
+SHARED_ORIGIN = DifferenceAccuracy(central=False, delta=1e-6, epsilon=1e-3, shared=True)
+SHARED_ORIGIN_SHORT = DifferenceAccuracy(central=False, delta=1e-6, epsilon=1e-5, shared=True)
+CENTRAL_DIFFERENCES = DifferenceAccuracy(central=True, delta=1e-4, epsilon=1e-3)
 FIRST_DERIVATIVE_STEP = 1e-6
 SENSITIVITY_STEP = 1e-5
-FAINT = 1e-2  # relative effect of a parameter below which its difference steps are lengthened
-LONGEST = 100.0  # times at most
-CHUNK = 8_000_000  # numbers that the states of many long curves take at once
+MIN_PARAMETER_EFFECT = (
+    1e-2  # relative effect of a parameter below which its difference steps are lengthened
+)
+MAX_STEP_FACTOR = 100.0  # times at most
+MAX_NUMBERS_AT_ONCE = 8_000_000  # numbers that the states of many long curves take at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +73,8 @@ class Bilinear:
     A: (N, nx, nx);  B: (N, nx, nu)
     F_mixed: (r, N, nx+nu, nx) d/dz_i of `DF[psi w, w]`;  h_mixed: (r, N+1, nx+nu, ny) likewise for h, or None where zero
     C: (N+1, ny, nx);  D: (N+1, ny, nu)
-    lag: of the outputs, or None;  delay: (p,) its derivative by theta
-    taps: (N, looked-at substeps, w, nx+nu) derivative of what the taps show, or None
+    output_delay: of the outputs, or None;  delay_derivative: (p,) its derivative by theta
+    observation_jacobian: (N, looked-at substeps, w, nx+nu) derivative of the observations, or None
     """
 
     A: Array
@@ -81,9 +83,9 @@ class Bilinear:
     D: Array
     F_mixed: Array
     h_mixed: Array | None
-    lag: Lag | None = None
-    delay: Array | None = None
-    taps: Array | None = None
+    output_delay: OutputDelay | None = None
+    delay_derivative: Array | None = None
+    observation_jacobian: Array | None = None
 
 
 class Plant:
@@ -107,9 +109,9 @@ class Plant:
         self.parameters = parameters
         self.outputs = outputs
         self.source = source
-        self.engine = Engine(source.model, substeps, outputs.needs_sensors, threads)
-        self.space = self.engine.space
-        self.nominal_start = np.array(start, dtype=np.float64)
+        self.simulator = BatchSimulator(source.model, substeps, outputs.needs_sensors, threads)
+        self.space = self.simulator.space
+        self.nominal_initial_state = np.array(start, dtype=np.float64)
         self.nu = int(source.model.nu)
         self.dt = substeps * float(source.model.opt.timestep)
         self._start_matrix = parameters.initial_state_derivative(self.space.nx)
@@ -134,41 +136,45 @@ class Plant:
             return self
 
         size = np.concatenate(
-            [self.steps_of(trajectory)[: self.space.nx], np.ones(len(self.outputs))]
+            [self.difference_sizes(trajectory)[: self.space.nx], np.ones(len(self.outputs))]
         )
         both = np.concatenate([found.psi, found.G], axis=1) * self.parameters.magnitude
         effect = (np.abs(both).max(axis=0) / size[:, None]).max(axis=0)
 
         other = copy.copy(self)
-        other._reach = np.clip(FAINT / np.maximum(effect, 1e-300), 1.0, LONGEST)
+        other._reach = np.clip(
+            MIN_PARAMETER_EFFECT / np.maximum(effect, 1e-300), 1.0, MAX_STEP_FACTOR
+        )
         if self.smooth is self:
             other.smooth = other
         return other
 
     @property
-    def steps(self) -> int:
+    def engine_steps(self) -> int:
         """MuJoCo steps taken so far, also for differences on the smooth one."""
-        return self.engine.steps + (0 if self.smooth is self else self.smooth.engine.steps)
+        return self.simulator.steps + (0 if self.smooth is self else self.smooth.simulator.steps)
 
     @property
-    def draft(self) -> Accuracy:
+    def quickest_accuracy(self) -> DifferenceAccuracy:
         """The quickest differences that this plant bears."""
-        return DRY if self.smooth.source.soft else DRAFT
+        return SHARED_ORIGIN_SHORT if self.smooth.source.soft else SHARED_ORIGIN
 
     @property
-    def span(self) -> Array:
+    def parameter_scale(self) -> Array:
         """(p,) change of each parameter that moves the trajectory noticeably; differences are relative to it."""
         return np.asarray(self.parameters.magnitude * self._reach)
 
-    def start(self, theta: Array) -> Array:
+    def initial_state(self, theta: Array) -> Array:
         """(..., ns) initial states at theta: (..., p)."""
-        return self.space.plus(self.nominal_start, np.asarray(theta) @ self._start_matrix.T)
+        return self.space.plus(self.nominal_initial_state, np.asarray(theta) @ self._start_matrix.T)
 
-    def lag(self, theta: Array, samples: int) -> Lag | None:
-        """The lag of the outputs at theta: (p,) over N+1 samples; None where nothing delays."""
+    def output_delay(self, theta: Array, samples: int) -> OutputDelay | None:
+        """The delay of the outputs at theta: (p,) over N+1 samples; None where nothing delays."""
         if not self.parameters.delay_derivative.any():
             return None
-        return Lag.of(samples, float(self.parameters.delay_derivative @ theta), self.dt)
+        return OutputDelay.on_grid(
+            samples, float(self.parameters.delay_derivative @ theta), self.dt
+        )
 
     def model(self, theta: Array) -> Any:
         """The model at theta: (p,); kept for the few values in use."""
@@ -192,8 +198,8 @@ class Plant:
 
     def simulate(self, theta: Array, ctrl: Array) -> Trajectory:
         """Open-loop trajectory from the start under ctrl: (N, nu). Raises SimulationDiverged."""
-        out = self.engine.rollout(
-            [self.model(theta)], self.start(theta)[None], np.asarray(ctrl)[None]
+        out = self.simulator.rollout(
+            [self.model(theta)], self.initial_state(theta)[None], np.asarray(ctrl)[None]
         )
         if not out.finite[0]:
             raise SimulationDiverged(
@@ -205,12 +211,15 @@ class Plant:
         """Outputs of many simulations under one control. theta: (m, p), ctrl: (N, nu) -> y (m, N+1, ny), finite (m,)."""
         held = np.broadcast_to(ctrl, (len(theta), *np.shape(ctrl)))
         models, sound = self._many(theta)
-        out = self.engine.rollout(models, self.start(theta), held)
+        out = self.simulator.rollout(models, self.initial_state(theta), held)
         y = self.outputs(out.states, out.sensors) + (theta @ self._bias.T)[:, None]
         if self.parameters.delay_derivative.any():
-            lags = (self.lag(row, y.shape[1]) for row in theta)
+            delays = (self.output_delay(row, y.shape[1]) for row in theta)
             y = np.stack(
-                [own if lag is None else lag.apply(own) for lag, own in zip(lags, y, strict=True)]
+                [
+                    own if delay is None else delay.apply(own)
+                    for delay, own in zip(delays, y, strict=True)
+                ]
             )
         return y, out.finite & sound
 
@@ -249,7 +258,7 @@ class Plant:
         self, theta: Array, ctrl: Array, step: float = SENSITIVITY_STEP
     ) -> tuple[Array, Array] | None:
         """Outputs y: (N+1, ny) and their derivative G: (N+1, ny, p) by central differences; None if one diverged."""
-        found = self._differences(theta, self.start(theta), ctrl, step, None)
+        found = self._differences(theta, self.initial_state(theta), ctrl, step, None)
         return None if found is None else (found[0], found[1].G)
 
     def responses(
@@ -259,7 +268,7 @@ class Plant:
         ctrl: Array,
         free: Array | None = None,
         central: bool = True,
-        chunk: int = CHUNK,
+        chunk: int = MAX_NUMBERS_AT_ONCE,
         step: float = SENSITIVITY_STEP,
         sought: np.ndarray | None = None,
     ) -> Iterator[Response | None]:
@@ -276,7 +285,7 @@ class Plant:
         )
         moving = np.flatnonzero(wanted & (free is not None))
         k, p, N = 0 if free is None else free.shape[1], len(theta), ctrl.shape[1]
-        h = (step * self.span)[moving]
+        h = (step * self.parameter_scale)[moving]
         moves = np.zeros((len(moving) + k, p))
         moves[np.arange(len(moving)), moving] = h
         nudges = moves @ self._start_matrix.T
@@ -288,12 +297,12 @@ class Plant:
         now = self.space.plus(starts, np.concatenate(pushes)[:, None])
         J, S = now.shape[:2]
         every = [model for model in models for _ in range(S)] if J > 1 else models
-        n = int(np.clip(chunk / (J * S * self.engine.substeps * (1 + now.shape[2])), 1, N))
+        n = int(np.clip(chunk / (J * S * self.simulator.substeps * (1 + now.shape[2])), 1, N))
         width = np.concatenate([h, np.full(k, step)]) * (2.0 if central else 1.0)
         for first in range(0, N, n):
             held = ctrl[:, first : first + n]
             used = np.broadcast_to(held, (J, *held.shape)).reshape(J * S, *held.shape[1:])
-            out = self.engine.rollout(every, now.reshape(J * S, -1), used)
+            out = self.simulator.rollout(every, now.reshape(J * S, -1), used)
             if not (out.finite.all() and sound.all()):
                 yield None
                 return
@@ -333,30 +342,35 @@ class Plant:
         mu = base.ctrl + gamma * zeta.v
         model = self.model(theta)
         if not K.any():
-            out = self.engine.rollout([model], base.state[:1], mu[None])
+            out = self.simulator.rollout([model], base.state[:1], mu[None])
             return self.trajectory(out.states[0], mu) if out.finite[0] else None
         with np.errstate(over="ignore", invalid="ignore"):
             alpha = self.space.plus(base.state, gamma * zeta.z)
-        states, ctrl, finite = self.engine.closed_loop(model, alpha, mu, K)
+        states, ctrl, finite = self.simulator.closed_loop(model, alpha, mu, K)
         return self.trajectory(states, ctrl) if finite else None
 
-    def watch(self, theta: Array, ctrl: Array, taps: Taps) -> tuple[Trajectory, Array] | None:
-        """The open-loop trajectory under ctrl: (N, nu) and what the taps show at every engine step, (N, substeps, w).
+    def observe(
+        self, theta: Array, ctrl: Array, observations: SubstepObservations
+    ) -> tuple[Trajectory, Array] | None:
+        """The open-loop trajectory under ctrl: (N, nu) and the observations at every engine step, (N, substeps, w).
 
         None if it diverged.
         """
-        out = self.engine.rollout(
-            [self.model(theta)], self.start(theta)[None], np.asarray(ctrl)[None], taps
+        out = self.simulator.rollout(
+            [self.model(theta)],
+            self.initial_state(theta)[None],
+            np.asarray(ctrl)[None],
+            observations,
         )
-        if not out.finite[0] or out.tapped is None:
+        if not out.finite[0] or out.observed is None:
             return None
-        return self.trajectory(out.states[0], ctrl), out.tapped[0]
+        return self.trajectory(out.states[0], ctrl), out.observed[0]
 
     def difference(self, new: Trajectory, old: Trajectory) -> TangentCurve:
         """(x_new - x_old, u_new - u_old) in the tangent space."""
         return TangentCurve(z=self.space.minus(new.state, old.state), v=new.ctrl - old.ctrl)
 
-    def steps_of(self, trajectory: Trajectory) -> Array:
+    def difference_sizes(self, trajectory: Trajectory) -> Array:
         """(nx+nu,) magnitudes to which difference steps are relative, at least 1 for states."""
         nv, na = self.space.nv, self.space.na
         dq = np.ones(nv)
@@ -376,7 +390,7 @@ class Plant:
     ) -> Sensitivity | None:
         """psi and G by differences of whole rollouts under the same control; None if one diverged.
 
-        step: relative to `span`, one number or (p,);  central: else one-sided where no sensor is an output
+        step: relative to `parameter_scale`, one number or (p,);  central: else one-sided where no sensor is an output
         """
         central = central or self.outputs.needs_sensors
         found = self._differences(
@@ -395,13 +409,13 @@ class Plant:
     ) -> tuple[Array, Sensitivity] | None:
         """Outputs (N+1, ny) and sensitivity from rollouts at theta +- h, one pair per parameter that moves anything.
 
-        states: (N+1, ns) at theta where they are known already; else, and where sensors lag, one more rollout
+        states: (N+1, ns) at theta where they are known already; else, and where sensors delay, one more rollout
         """
         moving = np.flatnonzero(self.parameters.changes_motion)
         m, p, N = len(moving), len(theta), len(ctrl)
-        lag = self.lag(theta, N + 1)
-        own = states is None or (lag is not None and self.outputs.needs_sensors)
-        h = (step * self.span)[moving]
+        delay = self.output_delay(theta, N + 1)
+        own = states is None or (delay is not None and self.outputs.needs_sensors)
+        h = (step * self.parameter_scale)[moving]
         moves = np.zeros((m, p))
         moves[np.arange(m), moving] = h
         moves = np.concatenate([moves, -moves if central else moves[:0], np.zeros((int(own), p))])
@@ -411,7 +425,7 @@ class Plant:
             starts = self.space.plus(start, moves @ self._start_matrix.T)
             held = np.broadcast_to(ctrl, (len(moves), *ctrl.shape))
             models, sound = self._many(theta + moves)
-            out = self.engine.rollout(models, starts, held)
+            out = self.simulator.rollout(models, starts, held)
             if not (out.finite & sound).all():
                 return None
             if own:
@@ -425,9 +439,9 @@ class Plant:
             G[..., moving] = np.moveaxis(self.outputs.tangent(here, dx, ds), 0, 2)
         G += self._bias
         y = self.outputs(here, sensors) + self._bias @ theta
-        if lag is not None:
-            G = lag.apply(G) + lag.rate(y)[..., None] * self.parameters.delay_derivative
-            y = lag.apply(y)
+        if delay is not None:
+            G = delay.apply(G) + delay.derivative(y)[..., None] * self.parameters.delay_derivative
+            y = delay.apply(y)
         return y, Sensitivity(psi=psi, G=G)
 
     def linearize(
@@ -454,7 +468,7 @@ class Plant:
         """
         p, states = len(self.parameters), trajectory.state[samples]
         dx, ds = self._by_theta(theta, states, trajectory.ctrl[samples], step)
-        parts = [_finite(dx) / (self.dt * self.steps_of(trajectory)[: self.space.nx])]
+        parts = [_finite(dx) / (self.dt * self.difference_sizes(trajectory)[: self.space.nx])]
         if ds is not None:
             dy = self.outputs.tangent(states, np.zeros_like(dx), ds)
             size = np.abs(dy * self.parameters.magnitude[:, None, None]).max(axis=(0, 1))
@@ -465,7 +479,7 @@ class Plant:
         self, theta: Array, states: Array, ctrl: Array, step: float
     ) -> tuple[Array, Array | None]:
         """Derivatives of one sample by every parameter: (p, n, nx), and of the sensors (p, n, ns) or None."""
-        p, h = len(self.parameters), step * self.span
+        p, h = len(self.parameters), step * self.parameter_scale
         models = self._all(np.concatenate([theta + np.diag(h), theta - np.diag(h)]))
         same = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
         held = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.nu)
@@ -476,7 +490,7 @@ class Plant:
     ) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D of `linearize` alone."""
         nx = self.space.nx
-        z_step = step * self.steps_of(trajectory)
+        z_step = step * self.difference_sizes(trajectory)
         count = len(z_step)
         xs, us = self._perturbed(
             *self._ends(trajectory), np.concatenate([np.diag(z_step), -np.diag(z_step)])
@@ -488,19 +502,23 @@ class Plant:
         )
         return dx[..., :nx], dx[..., nx:], dy[..., :nx], dy[..., nx:]
 
-    def tapped(
-        self, theta: Array, trajectory: Trajectory, taps: Taps, step: float = FIRST_DERIVATIVE_STEP
+    def observation_jacobians(
+        self,
+        theta: Array,
+        trajectory: Trajectory,
+        observations: SubstepObservations,
+        step: float = FIRST_DERIVATIVE_STEP,
     ) -> tuple[Array, Array, Array]:
-        """A, B and the derivatives (N, looked-at substeps, w, nx+nu) of what the taps show, by one-sided differences."""
+        """A, B and the derivatives (N, looked-at substeps, w, nx+nu) of the observations, by one-sided differences."""
         nx, states, ctrl = self.space.nx, trajectory.state[:-1], trajectory.ctrl
-        delta = step * self.steps_of(trajectory)
+        delta = step * self.difference_sizes(trajectory)
         moves = np.concatenate([np.diag(delta), np.zeros((1, len(delta)))])
         xs, us = self._perturbed(states, ctrl, moves)
-        stepped = self.engine.step([self.model(theta)], xs, us, taps)
-        if stepped.tapped is None:
-            raise ValueError("nothing was tapped")
+        stepped = self.simulator.step([self.model(theta)], xs, us, observations)
+        if stepped.observed is None:
+            raise ValueError("nothing was observed")
         out = stepped.states.reshape(len(moves), len(states), -1)
-        rise = stepped.tapped.reshape(len(moves), len(states), *stepped.tapped.shape[1:])
+        rise = stepped.observed.reshape(len(moves), len(states), *stepped.observed.shape[1:])
         AB = np.moveaxis(_finite(self.space.minus(out[:-1], out[-1:]) / delta[:, None, None]), 0, 2)
         slopes = np.moveaxis((rise[:-1] - rise[-1:]) / delta[:, None, None, None], 0, 3)
         return AB[..., :nx], AB[..., nx:], slopes
@@ -527,7 +545,7 @@ class Plant:
         self, models: list[Any], xs: Array, us: Array, count: int, step: Array
     ) -> tuple[Array, Array | None]:
         """Central quotients of a batch whose first half is the plus side: (count, n, nx) and sensors (count, n, ns)."""
-        stepped = self.engine.step(models, xs, us)
+        stepped = self.simulator.step(models, xs, us)
         out, sensed = stepped.states, stepped.sensors
         width = 2.0 * step[:, None, None]
         pair = out.reshape(2, count, -1, out.shape[1])
@@ -543,16 +561,16 @@ class Plant:
         trajectory: Trajectory,
         psi: Array,
         directions: Array,
-        accuracy: Accuracy,
-        taps: Taps | None = None,
+        accuracy: DifferenceAccuracy,
+        observations: SubstepObservations | None = None,
     ) -> Bilinear:
         """Derivatives of `DF[psi w, w]` by (x, u) for each direction w, and A, B.
 
         psi: (N+1, nx, p);  directions: (r, p). Mixed differences are those of the smooth plant, all else is this one's.
         """
-        if accuracy.shared and not self.engine.sensors:
-            return self._drafted(theta, trajectory, psi, directions, accuracy, taps)
-        found = self._paired(theta, trajectory, psi, directions, accuracy, taps)
+        if accuracy.shared and not self.simulator.sensors:
+            return self._drafted(theta, trajectory, psi, directions, accuracy, observations)
+        found = self._paired(theta, trajectory, psi, directions, accuracy, observations)
         if self.smooth is self:
             return found
         smooth = self.smooth._paired(theta, trajectory, psi, directions, accuracy, None)
@@ -564,12 +582,12 @@ class Plant:
         trajectory: Trajectory,
         psi: Array,
         directions: Array,
-        accuracy: Accuracy,
-        taps: Taps | None,
+        accuracy: DifferenceAccuracy,
+        observations: SubstepObservations | None,
     ) -> Bilinear:
         """Pairs +-epsilon along (psi w, w) at every (x, u) moved by +-delta (or +delta and none); their means give A and B."""
         states, ctrl = self._ends(trajectory)
-        delta = accuracy.delta * self.steps_of(trajectory)
+        delta = accuracy.delta * self.difference_sizes(trajectory)
         count = len(delta)
         moves = np.concatenate(
             [np.diag(delta), -np.diag(delta) if accuracy.central else np.zeros((1, count))]
@@ -577,7 +595,7 @@ class Plant:
         xs, us = self._perturbed(states, ctrl, moves)
         shape = (len(moves), len(states), -1)
         firsts, mixed, h_firsts, h_mixed = [], [], [], []
-        tapped = None
+        observed = None
         for r, w in enumerate(directions):
             push = psi @ w
             epsilon = self._epsilon(accuracy, push, w)
@@ -586,15 +604,17 @@ class Plant:
             )
             both = np.concatenate([self.space.plus(xs, shift), self.space.plus(xs, -shift)])
             models = self._all(np.stack([theta + epsilon * w, theta - epsilon * w]))
-            stepped = self.engine.step(
-                models, both, np.concatenate([us, us]), taps if r == 0 else None
+            stepped = self.simulator.step(
+                models, both, np.concatenate([us, us]), observations if r == 0 else None
             )
             sensed, pair = stepped.sensors, stepped.states.reshape(2, *shape)
             widths = (2.0 if accuracy.central else 1.0) * delta[:, None, None]
-            if stepped.tapped is not None:
-                t = stepped.tapped.reshape(2, len(moves), len(states), *stepped.tapped.shape[1:])
+            if stepped.observed is not None:
+                t = stepped.observed.reshape(
+                    2, len(moves), len(states), *stepped.observed.shape[1:]
+                )
                 rise = np.mean(t[:, :count] - t[:, count:], axis=0) / widths[..., None]
-                tapped = np.moveaxis(rise[:, :-1], 0, 3)
+                observed = np.moveaxis(rise[:, :-1], 0, 3)
             slope = self.space.minus(pair[0], pair[1]) / (2.0 * epsilon)
             mixed.append((slope[:count] - slope[count:]) / widths)
             firsts.append(
@@ -624,9 +644,9 @@ class Plant:
             CD[..., nx:],
             F_mixed,
             second,
-            self.lag(theta, len(states)),
+            self.output_delay(theta, len(states)),
             self.parameters.delay_derivative,
-            tapped,
+            observed,
         )
 
     def _drafted(
@@ -635,27 +655,27 @@ class Plant:
         trajectory: Trajectory,
         psi: Array,
         directions: Array,
-        accuracy: Accuracy,
-        taps: Taps | None,
+        accuracy: DifferenceAccuracy,
+        observations: SubstepObservations | None,
     ) -> Bilinear:
         """`bilinear` by one-sided differences, for outputs that are no sensors: a batch at the origin serves all directions."""
         states, ctrl = self._ends(trajectory)
-        delta = accuracy.delta * self.steps_of(trajectory)
+        delta = accuracy.delta * self.difference_sizes(trajectory)
         count, nx = len(delta), self.space.nx
         moves = np.concatenate([np.diag(delta), np.zeros((1, count))])
         xs, us = self._perturbed(states, ctrl, moves)
         shape, widths = (len(moves), len(states), -1), delta[:, None, None]
-        stepped = self.engine.step([self.model(theta)], xs, us, taps)
+        stepped = self.simulator.step([self.model(theta)], xs, us, observations)
         origin = stepped.states.reshape(shape)
         first = self.space.minus(origin[:count], origin[count:]) / widths
         if self.smooth is not self:
-            origin = self.smooth.engine.step([self.smooth.model(theta)], xs, us).states.reshape(
+            origin = self.smooth.simulator.step([self.smooth.model(theta)], xs, us).states.reshape(
                 shape
             )
-        tapped, mixed = None, []
-        if stepped.tapped is not None:
-            t = stepped.tapped.reshape(len(moves), len(states), *stepped.tapped.shape[1:])
-            tapped = np.moveaxis((t[:count, :-1] - t[count:, :-1]) / widths[..., None], 0, 3)
+        observed, mixed = None, []
+        if stepped.observed is not None:
+            t = stepped.observed.reshape(len(moves), len(states), *stepped.observed.shape[1:])
+            observed = np.moveaxis((t[:count, :-1] - t[count:, :-1]) / widths[..., None], 0, 3)
         for w in directions:
             push = psi @ w
             epsilon = self._epsilon(accuracy, push, w)
@@ -663,7 +683,7 @@ class Plant:
                 -1, push.shape[1]
             )
             models = self.smooth._all((theta + epsilon * w)[None])
-            out = self.smooth.engine.step(models, self.space.plus(xs, shift), us).states
+            out = self.smooth.simulator.step(models, self.space.plus(xs, shift), us).states
             slope = self.space.minus(out.reshape(shape), origin) / epsilon
             mixed.append((slope[:count] - slope[count:]) / widths)
         unit = self._identity(len(states))
@@ -675,13 +695,13 @@ class Plant:
         AB = np.moveaxis(first[:, :-1], 0, 2)
         CD = np.moveaxis(self.outputs.tangent(states, unit, None), 0, 2)
         F_mixed = np.moveaxis(np.array(mixed)[:, :, :-1], 1, 2)
-        lag = self.lag(theta, len(states))
+        delay = self.output_delay(theta, len(states))
         parts = (AB[..., :nx], AB[..., nx:], CD[..., :nx], CD[..., nx:], F_mixed, second)
-        return Bilinear(*parts, lag, self.parameters.delay_derivative, tapped)
+        return Bilinear(*parts, delay, self.parameters.delay_derivative, observed)
 
-    def _epsilon(self, accuracy: Accuracy, push: Array, w: Array) -> float:
+    def _epsilon(self, accuracy: DifferenceAccuracy, push: Array, w: Array) -> float:
         """Step along (psi w, w): relative to the larger of its two parts."""
-        inside = np.where(self.parameters.changes_model, np.abs(w / self.span), 0.0).max(
+        inside = np.where(self.parameters.changes_model, np.abs(w / self.parameter_scale), 0.0).max(
             initial=0.0
         )
         return float(accuracy.epsilon / max(np.abs(push).max(initial=0.0), inside, 1e-300))

@@ -126,7 +126,7 @@ class _Loop:
         Where there is none at the estimate, at the last place where there was one, and a warning.
         """
         if not self.rounds:
-            stated = Setup(restated(self.base), self.base.plant.engine.threads)
+            stated = Setup(restated(self.base), self.base.plant.simulator.threads)
             return design(stated, self.monitor, executor=self.executor), ()
         first, last = self.rounds[0], self.rounds[-1]
         count = sum(len(r.recordings) for r in self.rounds)

@@ -15,7 +15,7 @@ from mjfim.identification.residuals import Fit
 from mjfim.information.fisher import Information
 from mjfim.information.identifiability import Survey, survey, survey_rows
 from mjfim.information.marginal import shared
-from mjfim.plant.plant import CENTRAL
+from mjfim.plant.plant import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
     CONFOUNDED_CORRELATION,
     Check,
@@ -64,7 +64,7 @@ def check(
         source = f"{len(recordings)} recording{'s' if len(recordings) > 1 else ''}"
     problem = setup.problem
     problem = replace(problem, running=replace(problem.running, desired=curve.state))
-    point = problem.point(curve, CENTRAL)
+    point = problem.point(curve, CENTRAL_DIFFERENCES)
     if point.information is None or point.sensitivity is None:
         raise SimulationDiverged("the simulation diverges when the parameters move a little")
     if not recordings:

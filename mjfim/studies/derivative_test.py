@@ -70,7 +70,7 @@ def slope_error(setup: Setup, problem: DesignProblem, point: Point) -> float:
     expansion = problem.expand(point)
     K = regulator_for(setup).gain(expansion)
     zeta = LBFGS(np.diag(setup.control_weight) * setup.dt)(expansion, K)
-    size = setup.plant.steps_of(point.trajectory)
+    size = setup.plant.difference_sizes(point.trajectory)
     relative = max(
         np.abs(zeta.z / size[: zeta.z.shape[1]]).max(),
         np.abs(zeta.v / size[zeta.z.shape[1] :]).max(),

@@ -56,7 +56,7 @@ def redesigned(
     base: of the experiment as stated. Raises as `design` does.
     """
     moved = restated(base, theta, past.estimate)
-    threads, told = base.plant.engine.threads, past.estimate.data
+    threads, told = base.plant.simulator.threads, past.estimate.data
     moved = moved.replace(cost={"information": _worth(base, moved, past)})
     setup = Setup(moved, threads, added=told)
     found = [design(setup, monitor, executor=executor)]
@@ -74,7 +74,7 @@ def _worth(base: Setup, moved: Experiment, past: Past) -> float:
     stated, count = moved.cost.information, past.count + 1
     if moved.cost.criterion == "D":
         return stated * count
-    threads = base.plant.engine.threads
+    threads = base.plant.simulator.threads
     try:
         begun = _phi(Setup(restated(base, past.begun), threads), past.first)
         now = _phi(Setup(moved, threads, added=past.estimate.data), past.last)

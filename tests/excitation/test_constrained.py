@@ -124,7 +124,7 @@ def test_and_no_engine_step_leaves_them(paper: Design) -> None:
 
 def assert_inside(setup: Setup, ctrl: Array) -> None:
     """Every range of the experiment on a cart-pendulum holds at every engine step of a plain loop."""
-    start = setup.space.split(setup.plant.nominal_start)[:2]
+    start = setup.space.split(setup.plant.nominal_initial_state)[:2]
     rows, places = (
         played(setup.model, start, ctrl, setup.substeps),
         {"position": "q", "velocity": "v", "acceleration": "a"},
@@ -139,7 +139,7 @@ def test_a_start_that_leaves_the_limits_is_driven_inside(tmp_path: Path) -> None
     wild = {"kind": "sine", "amplitude": 40.0, "frequency": 1.0}
     setup = cart_inside(tmp_path, control=wild)
     outside = fence_of(setup)
-    watched = setup.plant.watch(setup.theta, setup.control, outside.taps)
+    watched = setup.plant.observe(setup.theta, setup.control, outside.observations)
     assert watched is not None
     assert set(outside.margins(outside.sight(*watched, slopes=False))) == {
         "control",

@@ -90,7 +90,7 @@ def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
 ) -> None:
     setup = arm_setup(tmp_path, **{**ALONE, **TOGETHER}[name])
     fence = fence_of(setup)
-    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
     assert watched is not None
     margins = fence.margins(fence.sight(*watched, slopes=False))
     if name in KINDS:
@@ -138,15 +138,17 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     assert ((w.W[0] == 0.0).all(), (w.W[-1] == 0.0).all()) == free
     assert (w.W[1:-1] > 0.0).all()
     # its own: the squares of what every limited number moves by, times the curvature of its barrier
-    sight, N = fence.sight(seen(point).trajectory, seen(point).tapped, slopes=True), setup.samples
-    _, _, rise = setup.plant.tapped(setup.theta, sight.trajectory, fence.taps)
-    looked, ctrl = np.array(fence.taps.substeps) - 1, setup.control
+    sight, N = fence.sight(seen(point).trajectory, seen(point).observed, slopes=True), setup.samples
+    _, _, rise = setup.plant.observation_jacobians(
+        setup.theta, sight.trajectory, fence.observations
+    )
+    looked, ctrl = np.array(fence.observations.derivative_substeps) - 1, setup.control
     assert sight.distances is not None and sight.slopes is not None and fence.rate is not None
     assert fence.clearance is not None
     m, least = sight.distances.shape[1], np.full(sight.distances.shape[1], 0.03)
     near = Bounds(lower=least, upper=np.full(m, np.inf), scale=fence.clearance.reach - least)
     bends = [
-        fence.shown.barrier(sight.tapped[:, looked], delta, 1.0 / N / len(looked)).curvature,
+        fence.shown.barrier(sight.observed[:, looked], delta, 1.0 / N / len(looked)).curvature,
         fence.control.barrier(ctrl, delta, 1.0 / N).curvature,
         fence.rate.barrier(fence.rates(ctrl), delta, 1.0 / N).curvature,
         near.barrier(sight.distances, delta, 1.0 / N).curvature,
@@ -197,9 +199,9 @@ def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> Non
     assert expansion.barrier is not None
     for way in 1e-4 * directions_of(setup, 4, seed=2):
         zeta = expansion.lift(np.zeros((setup.samples, 2, setup.space.nx)), way)
-        up, down = (seen(problem.point(setup.control + s * way)).tapped for s in (1.0, -1.0))
+        up, down = (seen(problem.point(setup.control + s * way)).observed for s in (1.0, -1.0))
         moved = (0.5 * np.abs(up - down) / fence.shown.scale)[
-            :, np.array(fence.taps.substeps) - 1
+            :, np.array(fence.observations.derivative_substeps) - 1
         ].max()
         wanted = max(moved, np.abs(way / fence.control.scale).max())
         assert expansion.barrier.largest_relative_move(zeta) == pytest.approx(wanted, rel=1e-3)
@@ -213,7 +215,7 @@ def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> Non
         boundary={"start": "rest", "end": "rest", "position": 0.2, "velocity": 3.0},
     )
     fence, model, limits = fence_of(setup), mujoco.MjModel.from_xml_string(ARM), setup.limits
-    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
     assert watched is not None
     data, rows, near = mujoco.MjData(model), {kind: [] for kind in KINDS}, []
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -271,7 +273,7 @@ def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> 
         tmp_path, limits=EVERY, boundary={"end": "periodic", "position": 0.2, "velocity": 3.0}
     )
     fence = fence_of(setup)
-    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
     assert watched is not None
     sight = fence.sight(*watched, slopes=False)
     shares = {kind: 0.01 * (i + 1) for i, kind in enumerate(sorted(fence.margins(sight)))}
@@ -311,7 +313,7 @@ def test_without_enforcement_only_the_boundary_is_left(tmp_path: Path) -> None:
     setup = arm_setup(tmp_path, limits={**EVERY, "enforce": False}, boundary={"end": "periodic"})
     for every, kinds in ((False, set()), (True, KINDS)):
         fence = fence_of(setup, every=every)
-        watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+        watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
         assert watched is not None
         sight = fence.sight(*watched, slopes=False)
         assert isinstance(sight, Sight)

@@ -17,7 +17,7 @@ from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.noise import Noise
-from mjfim.plant.plant import CENTRAL, Bilinear
+from mjfim.plant.plant import CENTRAL_DIFFERENCES, Bilinear
 from mjfim.records.trajectory import Sensitivity
 from tests.support.numerics import Array, Loop, body_setup, cart_setup, relative_error
 
@@ -30,7 +30,7 @@ CORRELATED = ({"outputs": ("angle", "drive"), "covariance": ((1e-4, 5e-4), (5e-4
 def expanded(setup: Setup) -> Expansion:
     """Expansion of J about the initial trajectory, psi among the states."""
     problem = replace(setup.problem, extended=True)
-    return problem.expand(problem.point(setup.initial, CENTRAL))
+    return problem.expand(problem.point(setup.initial, CENTRAL_DIFFERENCES))
 
 
 def both_directions(
@@ -223,7 +223,7 @@ def test_x_does_not_depend_on_psi_in_the_extended_system(tmp_path) -> None:
 
 def test_an_expansion_without_psi_is_refused(tmp_path) -> None:
     setup = cart_setup(tmp_path)
-    plain = setup.problem.expand(setup.problem.point(setup.initial, CENTRAL))
+    plain = setup.problem.expand(setup.problem.point(setup.initial, CENTRAL_DIFFERENCES))
     assert plain.extended is None
     with pytest.raises(ValueError, match="extended"):
         extended_direction(plain, np.zeros((50, 1, 4)), np.eye(16), np.eye(1), np.eye(16))

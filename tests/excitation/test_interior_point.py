@@ -89,7 +89,7 @@ def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> No
         J = point.point.cost
     expected = np.log(J) if "D" not in name else J / (3 * (3.0 if "heavier" in name else 1.0))
     assert point.merit == pytest.approx(expected, rel=1e-4)
-    sight = problem.fence.sight(seen(point).trajectory, seen(point).tapped, slopes=False)
+    sight = problem.fence.sight(seen(point).trajectory, seen(point).observed, slopes=False)
     assert point.barrier == problem.fence.value(sight, 0.05)
     assert problem.value(point) == pytest.approx(point.merit + 0.2 * point.barrier, rel=1e-12)
     assert problem.size(point) == 1.0
@@ -108,11 +108,11 @@ def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
         replace(problem, base=smooth),
         replace(problem, base=smooth, fence=tight, mu=1e-3, delta=3e-4),
     ):
-        begun = setup.plant.engine.steps
+        begun = setup.plant.simulator.steps
         again = other.again(point)
-        assert setup.plant.engine.steps == begun
+        assert setup.plant.simulator.steps == begun
         fresh = other.point(setup.control)
-        assert setup.plant.engine.steps > begun
+        assert setup.plant.simulator.steps > begun
         assert (again.merit, again.barrier) == (fresh.merit, fresh.barrier)
         assert other.value(again) == other.value(fresh) != problem.value(point)
         e, f = other.expand(again), other.expand(fresh)
@@ -123,10 +123,10 @@ def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
 def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
     setup, problem = problem_of("E", tmp_path)
     inward = replace(problem, mu=1.0, costs=False)
-    begun = setup.plant.engine.steps
+    begun = setup.plant.simulator.steps
     point = inward.point(setup.control)
     assert (
-        setup.plant.engine.steps - begun == setup.samples * setup.substeps
+        setup.plant.simulator.steps - begun == setup.samples * setup.substeps
     )  # one rollout, no sensitivity
     assert (point.point, point.merit) == (None, 0.0)
     assert inward.value(point) == point.barrier == problem.point(setup.control).barrier

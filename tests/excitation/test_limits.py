@@ -178,8 +178,8 @@ def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -
         limits=tables,
     )
     fence = fence_of(setup)
-    assert not len(fence.taps.f)
-    shown = fence.taps.rows(
+    assert not len(fence.observations.actuator_forces)
+    shown = fence.observations.values(
         trajectory.qpos[1:], trajectory.qvel[1:], trajectory.qvel[:-1], dict[str, np.ndarray]().get
     )
     return fence.margins(Sight(trajectory, shown[:, None]))

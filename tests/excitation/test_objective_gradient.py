@@ -19,7 +19,7 @@ from mjfim.excitation.unconstrained import Stage
 from mjfim.experiment.system import Setup
 from mjfim.optimize.lq import TangentCurve, regulator
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.plant import CENTRAL, FAST, Accuracy
+from mjfim.plant.plant import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, DifferenceAccuracy
 from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,
@@ -210,7 +210,7 @@ def directions(setup: Setup, gradient: Array) -> list[Array]:
     return [size * v / np.abs(v).max() for v in (smooth, white, gradient)]
 
 
-def expansion_of(setup: Setup, accuracy: Accuracy) -> tuple[Point, Expansion]:
+def expansion_of(setup: Setup, accuracy: DifferenceAccuracy) -> tuple[Point, Expansion]:
     """The initial trajectory and J expanded about it."""
     point = setup.problem.point(setup.initial, accuracy)
     assert np.isfinite(point.cost)
@@ -218,7 +218,7 @@ def expansion_of(setup: Setup, accuracy: Accuracy) -> tuple[Point, Expansion]:
 
 
 def gradient_error(
-    setup: Setup, K: Array, accuracy: Accuracy, h: float, factor: float = 1.0
+    setup: Setup, K: Array, accuracy: DifferenceAccuracy, h: float, factor: float = 1.0
 ) -> float:
     """Error of the slope (times a factor) along lifted tangent vectors, against J(P(xi + t zeta))."""
     point, expansion = expansion_of(setup, accuracy)
@@ -241,7 +241,7 @@ def test_gradient_by_central_differences_is_that_of_J_through_the_projection(
 ) -> None:
     setup = SETUPS[case](tmp_path)
     K = gain(setup) * feedback
-    assert gradient_error(setup, K, CENTRAL, STEPS.get(case, 5e-3)) < 1e-5
+    assert gradient_error(setup, K, CENTRAL_DIFFERENCES, STEPS.get(case, 5e-3)) < 1e-5
 
 
 @pytest.mark.parametrize("feedback", [False, True], ids=["open loop", "feedback"])
@@ -249,7 +249,7 @@ def test_gradient_by_central_differences_is_that_of_J_through_the_projection(
 def test_gradient_by_fast_differences_is_close(case: str, feedback: bool, tmp_path) -> None:
     setup = SETUPS[case](tmp_path)
     K = gain(setup) * feedback
-    assert gradient_error(setup, K, FAST, 5e-3) < 1e-3
+    assert gradient_error(setup, K, FORWARD_DIFFERENCES, 5e-3) < 1e-3
 
 
 OFF = [
@@ -266,12 +266,12 @@ def test_a_gradient_off_by_a_thousandth_would_be_rejected(case: str, tmp_path) -
     setup = SETUPS[case](tmp_path)
     K = gain(setup)
     for factor in (1.001, 0.999, -1.0):
-        assert gradient_error(setup, K, CENTRAL, 5e-3, factor) > 5e-4
+        assert gradient_error(setup, K, CENTRAL_DIFFERENCES, 5e-3, factor) > 5e-4
 
 
 def test_leaving_out_what_psi_does_to_the_information_would_be_rejected(tmp_path) -> None:
     setup = cart_setup(tmp_path)
-    point, expansion = expansion_of(setup, CENTRAL)
+    point, expansion = expansion_of(setup, CENTRAL_DIFFERENCES)
     K = np.zeros((setup.samples, 1, 4))
     a, b = setup.problem.running.gradient(setup.initial)
     wrong = Expansion(A=expansion.A, B=expansion.B, a=a, b=b)
@@ -301,13 +301,16 @@ def test_leaving_out_a_term_of_the_measurement_would_be_rejected(
     monkeypatch.setattr(
         setup.plant, "bilinear", lambda *given: replace(whole(*given), **{term: None})
     )
-    assert gradient_error(setup, K, CENTRAL, 5e-3) > 1e-3
+    assert gradient_error(setup, K, CENTRAL_DIFFERENCES, 5e-3) > 1e-3
 
 
 @pytest.mark.parametrize("case", ["robust mean", "robust worst", "robust worst D"])
 def test_leaving_out_a_sample_of_a_robust_design_would_be_rejected(case: str, tmp_path) -> None:
     setup = SETUPS[case](tmp_path)
-    point, K = setup.problem.point(setup.initial, CENTRAL), np.zeros((setup.samples, 1, 4))
+    point, K = (
+        setup.problem.point(setup.initial, CENTRAL_DIFFERENCES),
+        np.zeros((setup.samples, 1, 4)),
+    )
     whole, blind = setup.problem.expand(point), replace(setup.problem, pool=None).expand(point)
     zeta = whole.lift(K, directions(setup, whole.gradient(K))[0])
 
@@ -321,7 +324,7 @@ def test_leaving_out_a_sample_of_a_robust_design_would_be_rejected(case: str, tm
 @pytest.mark.parametrize("case", ["cart A tracking", "free body with ball joint"])
 def test_gradient_and_lift_are_dual_to_the_slope_under_any_feedback(case: str, tmp_path) -> None:
     setup = SETUPS[case](tmp_path)
-    _, expansion = expansion_of(setup, FAST)
+    _, expansion = expansion_of(setup, FORWARD_DIFFERENCES)
     rng = np.random.default_rng(3)
     for K in (gain(setup), 0.0 * gain(setup)):
         c = rng.normal(size=setup.control.shape)
@@ -374,7 +377,7 @@ def test_slopes_are_compared_with_J_or_where_J_may_vanish_with_what_cannot(
 
 def test_a_diverged_trial_costs_infinity_and_cannot_be_expanded(tmp_path) -> None:
     setup = cart_setup(tmp_path)
-    point, expansion = expansion_of(setup, FAST)
+    point, expansion = expansion_of(setup, FORWARD_DIFFERENCES)
     K = np.zeros((setup.samples, 1, 4))
     lost = setup.problem.project(point, expansion.lift(K, np.full((setup.samples, 1), 9e9)), 1.0, K)
     assert setup.problem.value(lost) == np.inf
@@ -384,9 +387,9 @@ def test_a_diverged_trial_costs_infinity_and_cannot_be_expanded(tmp_path) -> Non
 
 def test_refining_keeps_the_trajectory_and_its_cost_and_happens_once(tmp_path) -> None:
     setup = cart_setup(tmp_path)
-    point = setup.problem.point(setup.initial, FAST)
+    point = setup.problem.point(setup.initial, FORWARD_DIFFERENCES)
     better = setup.problem.refine(point)
-    assert better.accuracy is CENTRAL
+    assert better.accuracy is CENTRAL_DIFFERENCES
     assert better.trajectory is point.trajectory
     assert better.cost == point.cost
     assert setup.problem.refine(better) is None

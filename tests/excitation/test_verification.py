@@ -70,12 +70,12 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
     assert found.deviation < SAME
     # what a fence at the samples alone would have said
     fence = fence_of(setup)
-    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
     assert watched is not None
-    trajectory, tapped = watched
-    at_samples = fence.margins(fence.sight(trajectory, tapped[:, -1:], slopes=False))
+    trajectory, observed = watched
+    at_samples = fence.margins(fence.sight(trajectory, observed[:, -1:], slopes=False))
     assert min(at_samples.values()) > 0.0
-    assert fence.margins(fence.sight(trajectory, tapped, slopes=False)) == pytest.approx(
+    assert fence.margins(fence.sight(trajectory, observed, slopes=False)) == pytest.approx(
         found.margins
     )
 
@@ -84,7 +84,7 @@ def test_clearance_between_the_samples_counts(tmp_path: Path) -> None:
     """The wall is 0.19 m from the ball in the middle, and 0.15 m nearer where it turns."""
     setup = spring_setup(tmp_path, limits={"clearance": 0.1})
     fence = fence_of(setup)
-    watched = setup.plant.watch(setup.theta, setup.control, fence.taps)
+    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
     assert watched is not None
     assert fence.margins(fence.sight(*watched, slopes=False))["clearance"] > 0.05
     found = audit(setup, setup.initial)

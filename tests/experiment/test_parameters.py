@@ -388,7 +388,7 @@ def test_activations_are_starts_by_path(tmp_path: Path) -> None:
         tmp_path, parameters={"a": {"target": "initial/servo:act", "scale": 0.5}}
     )
     assert setup.parameters.initial_state_derivative(3).tolist() == [[0.0], [0.0], [1.0]]
-    assert setup.plant.start(np.array([0.3]))[2] == pytest.approx(0.5)
+    assert setup.plant.initial_state(np.array([0.3]))[2] == pytest.approx(0.5)
 
 
 # ---- functions of an MjSpec

@@ -297,7 +297,7 @@ def test_contract_resolves(resolve: Callable[[str], Setup]) -> None:
     assert setup.tracking.tolist() == [0.05, 0.0, 0.0, 0.1]
     assert setup.control_weight.tolist() == [1e-2]
     assert setup.theta.tolist() == setup.parameters.true.tolist()
-    assert setup.plant.nominal_start.tolist() == [0.0, np.pi, 0.0, 0.0]
+    assert setup.plant.nominal_initial_state.tolist() == [0.0, np.pi, 0.0, 0.0]
     assert setup.control.shape == (100, 1)
     assert {(x.kind, x.name, x.lower, x.upper) for x in setup.limits} == {
         ("position", "slide", -1.0, 1.0),
@@ -343,8 +343,8 @@ def test_mjcf_noise_is_the_default(resolve: Callable[[str], Setup]) -> None:
 def test_start_from_qpos(resolve: Callable[[str], Setup]) -> None:
     """Positions and velocities stand for themselves, what is missing is the model's."""
     setup = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
-    assert setup.plant.nominal_start.tolist() == [0.5, 3.0, 0.0, -1.0]
-    assert resolve(edited('keyframe = "hanging"', "")).plant.nominal_start.tolist() == [
+    assert setup.plant.nominal_initial_state.tolist() == [0.5, 3.0, 0.0, -1.0]
+    assert resolve(edited('keyframe = "hanging"', "")).plant.nominal_initial_state.tolist() == [
         0.0,
         0.0,
         0.0,

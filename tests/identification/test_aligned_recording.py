@@ -11,7 +11,7 @@ import pytest
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import Setup
 from mjfim.identification.aligned_recording import Track, held, measured_trajectory, track_of
-from mjfim.plant.delay import Lag
+from mjfim.plant.delay import OutputDelay
 from mjfim.records.recording import Recording
 from tests.support.numerics import Array, body_setup, cart_setup
 
@@ -222,28 +222,41 @@ def test_reading_between_samples_is_exact_for_cubics() -> None:
     rng = np.random.default_rng(0)
     wanted = rng.uniform(0.0, 29.0, 200)
     wanted[:3] = 0.0, 29.0, 14.0
-    lag, grid = Lag.at(wanted, 30, DT), np.arange(30.0)
+    output_delay, grid = OutputDelay.at(wanted, 30, DT), np.arange(30.0)
     for degree in range(5):
         curve = np.polynomial.Polynomial(rng.standard_normal(degree + 1), domain=[0, 29])
         values, size = curve(grid), np.abs(curve(grid)).max()
-        error = np.abs(lag.apply(values) - curve(wanted)).max() / size
-        slope = np.abs(lag.rate(values) + curve.deriv()(wanted) / DT)[2:].max() * DT / size
+        error = np.abs(output_delay.apply(values) - curve(wanted)).max() / size
+        slope = (
+            np.abs(output_delay.derivative(values) + curve.deriv()(wanted) / DT)[2:].max()
+            * DT
+            / size
+        )
         assert (max(error, slope) < 1e-11) == (degree <= 3)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.4 * DT, 3.7 * DT, -1.2 * DT])
 def test_reading_at_the_samples_is_the_lag_of_all_of_them(delay: float) -> None:
     """`of` is `at` every sample, and any rows of it are `at` those; before the start is the start, without a slope."""
-    all_of_them, y = Lag.of(40, delay, DT), np.random.default_rng(0).standard_normal((40, 2))
+    all_of_them, y = (
+        OutputDelay.on_grid(40, delay, DT),
+        np.random.default_rng(0).standard_normal((40, 2)),
+    )
     some = np.array([0, 3, 4, 17, 38, 39])
-    lag = Lag.at(some - delay / DT, 40, DT)
-    np.testing.assert_allclose(lag.apply(y), all_of_them.apply(y)[some], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(lag.rate(y), all_of_them.rate(y)[some], rtol=0, atol=1e-9)
-    early = Lag.at(np.array([-7.0, -0.01]), 40, DT)
+    output_delay = OutputDelay.at(some - delay / DT, 40, DT)
+    np.testing.assert_allclose(
+        output_delay.apply(y), all_of_them.apply(y)[some], rtol=0, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        output_delay.derivative(y), all_of_them.derivative(y)[some], rtol=0, atol=1e-9
+    )
+    early = OutputDelay.at(np.array([-7.0, -0.01]), 40, DT)
     np.testing.assert_array_equal(early.apply(y), y[[0, 0]])
-    assert not early.rate(y).any()
+    assert not early.derivative(y).any()
     v = np.random.default_rng(1).standard_normal((6, 2))
-    assert np.sum(v * lag.apply(y)) == pytest.approx(np.sum(lag.apply_transposed(v) * y), rel=1e-12)
+    assert np.sum(v * output_delay.apply(y)) == pytest.approx(
+        np.sum(output_delay.apply_transposed(v) * y), rel=1e-12
+    )
 
 
 def test_a_track_does_not_change(setup: Setup) -> None:

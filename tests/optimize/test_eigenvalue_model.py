@@ -119,7 +119,7 @@ def test_slopes_are_those_of_the_logarithm_of_simulated_information(
     problem = setup.problem
     problem = replace(problem, information=replace(problem.information, power=3.0, faint=0.0))
     point = problem.point(setup.initial)
-    expansion, _ = problem.tapped(point, fence_of(setup).taps)
+    expansion, _ = problem.expand_observed(point, fence_of(setup).observations)
     model = expansion.eigenvalue_model
     assert model is not None and point.information is not None
     assert len(model.eigenvalues) == 3
@@ -152,7 +152,8 @@ def test_other_criteria_and_plain_expansions_have_no_model(tmp_path: Path) -> No
     setup = cart_setup(tmp_path, limits={"control": {"force": (-9.0, 9.0)}}).free()
     point = setup.problem.point(setup.initial)
     assert (
-        setup.problem.tapped(point, fence_of(setup).taps)[0].eigenvalue_model is None
+        setup.problem.expand_observed(point, fence_of(setup).observations)[0].eigenvalue_model
+        is None
     )  # 1 / lambda_min itself
     smooth = replace(setup.problem, information=replace(setup.problem.information, power=40.0))
     assert smooth.expand(smooth.judged(point)).eigenvalue_model is None

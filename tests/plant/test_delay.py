@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjfim.plant.delay import Lag
+from mjfim.plant.delay import OutputDelay
 from tests.support.numerics import Array, cart_setup, richardson
 
 DT = 0.01
@@ -25,7 +25,7 @@ def test_a_lagged_curve_is_the_curve_shifted(delay: float) -> None:
     errors = []
     for dt in (DT, DT / 2):
         t = np.arange(round(1.2 / dt)) * dt
-        lagged = Lag.of(len(t), delay, dt).apply(curve(t))
+        lagged = OutputDelay.on_grid(len(t), delay, dt).apply(curve(t))
         inside = t - delay >= 2 * dt
         errors.append(np.abs(lagged - curve(t - delay))[inside].max())
     assert errors[0] < 1e-5
@@ -34,34 +34,36 @@ def test_a_lagged_curve_is_the_curve_shifted(delay: float) -> None:
 
 def test_a_cubic_is_shifted_exactly_and_a_quartic_is_not() -> None:
     """Everywhere, the first samples after the start included."""
-    lag = Lag.of(30, 0.3, 1.0)
+    output_delay = OutputDelay.on_grid(30, 0.3, 1.0)
     t = np.arange(30.0)
     for degree in range(5):
-        error = np.abs(lag.apply(t**degree) - np.maximum(t - 0.3, 0.0) ** degree)[1:].max()
+        error = np.abs(output_delay.apply(t**degree) - np.maximum(t - 0.3, 0.0) ** degree)[1:].max()
         assert (error < 1e-8) == (degree <= 3)
 
 
 def test_whole_samples_are_exact() -> None:
     """No interpolation where there is none to do; no delay leaves every bit."""
     y = curve(T)
-    np.testing.assert_array_equal(Lag.of(len(T), 0.0, DT).apply(y), y)
-    np.testing.assert_allclose(Lag.of(len(T), 3 * DT, DT).apply(y)[3:], y[:-3], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(OutputDelay.on_grid(len(T), 0.0, DT).apply(y), y)
+    np.testing.assert_allclose(
+        OutputDelay.on_grid(len(T), 3 * DT, DT).apply(y)[3:], y[:-3], rtol=0, atol=1e-12
+    )
 
 
 def test_what_was_before_the_start_is_the_start() -> None:
     """And does not change with the delay; a lead is clamped at the end."""
     y = curve(T)
-    lag = Lag.of(len(T), 0.055, DT)
-    np.testing.assert_array_equal(lag.apply(y)[:6], np.broadcast_to(y[0], (6, 2)))
-    assert not lag.rate(y)[:6].any()
-    assert lag.rate(y)[6:].any(axis=1).all()
-    lead = Lag.of(len(T), -0.055, DT)
+    output_delay = OutputDelay.on_grid(len(T), 0.055, DT)
+    np.testing.assert_array_equal(output_delay.apply(y)[:6], np.broadcast_to(y[0], (6, 2)))
+    assert not output_delay.derivative(y)[:6].any()
+    assert output_delay.derivative(y)[6:].any(axis=1).all()
+    lead = OutputDelay.on_grid(len(T), -0.055, DT)
     np.testing.assert_allclose(
         lead.apply(y)[-6:], np.broadcast_to(y[-1], (6, 2)), rtol=0, atol=1e-14
     )
-    assert not lead.rate(y)[-5:].any()
+    assert not lead.derivative(y)[-5:].any()
     np.testing.assert_allclose(lead.apply(y)[:-8], curve(T + 0.055)[:-8], rtol=0, atol=1e-5)
-    late = Lag.of(len(T), 100.0, DT)
+    late = OutputDelay.on_grid(len(T), 100.0, DT)
     np.testing.assert_array_equal(late.apply(y), np.broadcast_to(y[0], y.shape))
 
 
@@ -69,11 +71,14 @@ def test_what_was_before_the_start_is_the_start() -> None:
 def test_the_rate_is_the_derivative_by_the_delay(delay: float) -> None:
     """Against differences of the operator, and roughly minus the slope of the curve."""
     y = curve(T)
-    rate = Lag.of(len(T), delay, DT).rate(y)
+    rate = OutputDelay.on_grid(len(T), delay, DT).derivative(y)
     for k in range(0, len(T), 7):
         for i in range(2):
             slope = richardson(
-                lambda h, k=k, i=i: float(Lag.of(len(T), delay + h, DT).apply(y)[k, i]), 1e-4
+                lambda h, k=k, i=i: float(
+                    OutputDelay.on_grid(len(T), delay + h, DT).apply(y)[k, i]
+                ),
+                1e-4,
             )
             assert rate[k, i] == pytest.approx(slope, rel=1e-7, abs=1e-8)
     t = T - delay
@@ -86,19 +91,21 @@ def test_the_rate_without_a_delay_is_that_of_a_small_delay() -> None:
     """The guess of a delay is zero: its derivative there is from the side that can be."""
     y = curve(T)
     h = 1e-7
-    quotient = (Lag.of(len(T), h, DT).apply(y) - y) / h
-    np.testing.assert_allclose(Lag.of(len(T), 0.0, DT).rate(y)[1:], quotient[1:], rtol=0, atol=2e-2)
+    quotient = (OutputDelay.on_grid(len(T), h, DT).apply(y) - y) / h
+    np.testing.assert_allclose(
+        OutputDelay.on_grid(len(T), 0.0, DT).derivative(y)[1:], quotient[1:], rtol=0, atol=2e-2
+    )
 
 
 def test_adjoints_by_dot_products() -> None:
     """`<v, L y> = <L' v, y>` for arrays of any rank, in the shape that came in."""
     rng = np.random.default_rng(0)
-    lag = Lag.of(50, 0.0273, DT)
+    output_delay = OutputDelay.on_grid(50, 0.0273, DT)
     for shape in ((50,), (50, 3), (50, 2, 4)):
         y, v = rng.standard_normal(shape), rng.standard_normal(shape)
         for forward, backward in (
-            (lag.apply, lag.apply_transposed),
-            (lag.rate, lag.rate_transposed),
+            (output_delay.apply, output_delay.apply_transposed),
+            (output_delay.derivative, output_delay.derivative_transposed),
         ):
             assert forward(y).shape == backward(v).shape == shape
             left, right = np.sum(v * forward(y)), np.sum(backward(v) * y)
@@ -113,7 +120,7 @@ def test_short_recordings_are_interpolated_by_what_there_is(samples: int) -> Non
     """A polynomial through all samples."""
     t = np.arange(float(samples))
     y = 2.0 + (t**2 if samples == 3 else t)
-    lagged = Lag.of(samples, 0.4, 1.0).apply(y)
+    lagged = OutputDelay.on_grid(samples, 0.4, 1.0).apply(y)
     wanted = np.maximum(t - 0.4, 0.0)
     np.testing.assert_allclose(
         lagged, 2.0 + (wanted**2 if samples == 3 else wanted), rtol=0, atol=1e-12

@@ -17,7 +17,7 @@ from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.variants import Source
 from mjfim.optimize.lq import LinearRecursion, TangentCurve, regulator
 from mjfim.output.mjcf.write import write_spec
-from mjfim.plant.plant import CENTRAL, FAST
+from mjfim.plant.plant import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
 from mjfim.records.trajectory import Linearization
 from tests.support.numerics import (
     CART_PARAMETERS,
@@ -236,7 +236,9 @@ def test_prediction_gives_the_same_outputs_and_derivative_as_the_sensitivity(tmp
 @pytest.mark.parametrize(
     "make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"]
 )
-@pytest.mark.parametrize("accuracy", [CENTRAL, FAST], ids=["central", "fast"])
+@pytest.mark.parametrize(
+    "accuracy", [CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES], ids=["central", "fast"]
+)
 def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> None:
     setup = make(tmp_path)
     L, psi = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial).psi
@@ -256,7 +258,7 @@ def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, t
     theta, curve, nx = setup.theta, setup.initial, setup.space.nx
     psi = setup.plant.sensitivity(theta, curve).psi
     w = np.abs(theta) * np.linspace(1.0, 0.5, len(theta))
-    found = setup.plant.bilinear(theta, curve, psi, w[None], CENTRAL)
+    found = setup.plant.bilinear(theta, curve, psi, w[None], CENTRAL_DIFFERENCES)
     e, d = 3e-4, 3e-4
     rows, address = sensed(setup)
     plus, minus = (Loop(rebuilt(setup, theta + s * e * w), setup.substeps) for s in (1, -1))
@@ -491,7 +493,7 @@ def test_mujoco_itself_would_have_made_that_noise(tmp_path, monkeypatch, capfd) 
     setup = cart_setup(tmp_path)
     setup.initial  # noqa: B018  (quiet work first: afterwards MuJoCo's own settings must be back)
     loop = Loop(setup.plant.model(setup.theta), 5)
-    loop.F(setup.plant.nominal_start, np.array([9e9]))
+    loop.F(setup.plant.nominal_initial_state, np.array([9e9]))
     out = "".join(capfd.readouterr())
     assert "WARNING" in out or (tmp_path / "MUJOCO_LOG.TXT").exists()
 
@@ -511,7 +513,7 @@ def test_after_a_diverged_trial_the_plant_works_as_before(tmp_path) -> None:
 def test_results_do_not_depend_on_what_was_simulated_before_or_on_threads(tmp_path) -> None:
     (tmp_path / "b").mkdir()
     setup, other = body_setup(tmp_path), body_setup(tmp_path / "b")
-    other.plant.engine.threads = 2
+    other.plant.simulator.threads = 2
     other.plant.measure(1.3 * other.theta[None], -other.control)
     other.plant.linearize(0.8 * other.theta, other.initial)
     np.testing.assert_array_equal(
@@ -541,7 +543,7 @@ def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None
     np.testing.assert_array_equal(y[[0, 2, 3]], alone[[0, 2, 3]])
     states, ctrl = setup.initial.state, np.repeat(setup.control, 1, axis=0)
     for count in (5, 50, 1, 12):
-        out = setup.plant.engine.step(
+        out = setup.plant.simulator.step(
             [setup.plant.model(setup.theta)], states[:count], ctrl[:count]
         ).states
         np.testing.assert_array_equal(out, states[1 : count + 1])
@@ -549,7 +551,7 @@ def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None
 
 def test_every_mj_step_is_counted(tmp_path) -> None:
     setup = filtered_setup(tmp_path)
-    engine, N, n = setup.plant.engine, setup.samples, setup.substeps
+    engine, N, n = setup.plant.simulator, setup.samples, setup.substeps
     curve, count = setup.initial, engine.steps
     setup.plant.linearize(setup.theta, curve)
     assert engine.steps - count == (N + 1) * n * (2 * (3 + 1) + 2 * 2)
@@ -734,7 +736,7 @@ def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
 def test_faint_parameters_get_longer_differences_and_others_keep_theirs(tmp_path) -> None:
     faint = {"tiny": {"target": "body/bob:inertia[1]"}, **CART_PARAMETERS}
     setup = cart_setup(tmp_path, parameters=faint)
-    relative = setup.plant.span / setup.parameters.magnitude
+    relative = setup.plant.parameter_scale / setup.parameters.magnitude
     assert relative[0] > 5.0
     assert (relative >= 1.0).all() and (relative <= 100.0).all()
     np.testing.assert_array_equal(relative[1:3], 1.0)
@@ -751,7 +753,7 @@ def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> Non
     nx, ny, p = setup.space.nx, len(setup.outputs), len(setup.theta)
     states = (
         found[: 3 * nx].reshape(3, nx, p)
-        * (setup.dt * setup.plant.steps_of(setup.initial)[:nx])[:, None]
+        * (setup.dt * setup.plant.difference_sizes(setup.initial)[:nx])[:, None]
     )
     assert relative_error(states, L.E[picked]) < 1e-6
     sensors = found[3 * nx :].reshape(3, ny, p)
@@ -817,9 +819,9 @@ def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> Non
     np.testing.assert_allclose(setup.initial.state, wanted, **tolerance)
     np.testing.assert_allclose(y[0], sensed, **tolerance)
     model, K = setup.plant.model(setup.theta), np.zeros((setup.samples, 1, 4))
-    closed, _, _ = setup.plant.engine.closed_loop(model, setup.initial.state, setup.control, K)
+    closed, _, _ = setup.plant.simulator.closed_loop(model, setup.initial.state, setup.control, K)
     np.testing.assert_allclose(closed, wanted, **tolerance)
-    stepped = setup.plant.engine.step([model], wanted[:-1], setup.control)
+    stepped = setup.plant.simulator.step([model], wanted[:-1], setup.control)
     np.testing.assert_allclose(stepped.states, wanted[1:], **tolerance)
     whole = setup.model_at(setup.theta)
     np.testing.assert_allclose(whole.eq_data, setup.model.eq_data, atol=1e-12)
@@ -857,7 +859,7 @@ def test_clocks_begin_at_zero(tmp_path) -> None:
     t = np.arange(setup.samples + 1) * setup.dt
     np.testing.assert_allclose(y[0, :, setup.outputs.names.index("clock")], t, atol=1e-12)
     model = setup.plant.model(setup.theta)
-    sensed = setup.plant.engine.step([model], setup.initial.state[:1], setup.control[:1]).sensors
+    sensed = setup.plant.simulator.step([model], setup.initial.state[:1], setup.control[:1]).sensors
     assert sensed is not None
     assert sensed[0, setup.model.sensor("clock").adr[0]] == 0.0
 
@@ -866,7 +868,7 @@ def test_quaternions_of_the_start_have_unit_length_or_are_refused(tmp_path) -> N
     def start(*qpos: float) -> Array:
         return body_setup(
             tmp_path, initial={"qpos": qpos, "control": {"kind": "sine"}}
-        ).plant.nominal_start
+        ).plant.nominal_initial_state
 
     unit = start(1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0)
     np.testing.assert_array_equal(unit[:11], [1, 2, 3, 0.6, 0, 0.8, 0, 0, 0, 1, 0])

@@ -11,12 +11,12 @@ import pytest
 
 from mjfim.excitation.constraints import fence_of, looked_at
 from mjfim.experiment.system import Setup
-from mjfim.plant.batch import Taps
-from mjfim.plant.plant import CENTRAL, DRAFT, FAST
+from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.plant import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, SHARED_ORIGIN
 from tests.support.limits import FLOATING, floating_setup
 from tests.support.numerics import Array, Loop, relative_error
 
-# kinds, names in the order of the taps
+# kinds, names in the order of the observations
 SHOWN = [
     ("position", "shoulder"),
     ("position", "elbow"),
@@ -53,11 +53,11 @@ def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
     return rows
 
 
-def taps_of(setup: Setup) -> Taps:
+def observations_of(setup: Setup) -> SubstepObservations:
     """What the limits of the experiment look at."""
     fence = fence_of(setup)
     assert fence.kinds == tuple(kind for kind, _ in SHOWN)
-    return fence.taps
+    return fence.observations
 
 
 @pytest.mark.parametrize(
@@ -83,16 +83,16 @@ def test_what_is_watched_is_what_plain_steps_show_at_every_engine_step(
             .replace('actuatorfrcrange="-0.9 0.9"', "")
             .replace('forcerange="-0.7 0.7"', "")
         )
-    watched = plant.watch(setup.theta, setup.control, taps_of(setup))
+    watched = plant.observe(setup.theta, setup.control, observations_of(setup))
     assert watched is not None
-    trajectory, tapped = watched
+    trajectory, observed = watched
     np.testing.assert_array_equal(
         trajectory.state, plant.simulate(setup.theta, setup.control).state
     )
-    wanted = played(model, setup.plant.start(setup.theta), setup.control, setup.substeps)
-    assert tapped.shape == wanted.shape == (30, 5, len(SHOWN))
+    wanted = played(model, setup.plant.initial_state(setup.theta), setup.control, setup.substeps)
+    assert observed.shape == wanted.shape == (30, 5, len(SHOWN))
     for i, (kind, name) in enumerate(SHOWN):
-        assert relative_error(tapped[..., i], wanted[..., i]) < 1e-9, (kind, name)
+        assert relative_error(observed[..., i], wanted[..., i]) < 1e-9, (kind, name)
     # the clamps act, where they are
     forces, torques = wanted[..., SHOWN.index(("force", "elbow"))], wanted[..., -1]
     assert (np.abs(forces).max() == 0.7) is not lifted
@@ -101,41 +101,47 @@ def test_what_is_watched_is_what_plain_steps_show_at_every_engine_step(
 
 def test_a_batch_of_samples_shows_the_same_as_the_whole_curve(tmp_path: Path) -> None:
     setup = floating_setup(tmp_path)
-    taps, plant = taps_of(setup), setup.plant
-    watched = plant.watch(setup.theta, setup.control, taps)
+    observations, plant = observations_of(setup), setup.plant
+    watched = plant.observe(setup.theta, setup.control, observations)
     assert watched is not None
-    trajectory, tapped = watched
+    trajectory, observed = watched
     for order in (slice(None), slice(None, None, -1), slice(4, 9)):
-        stepped = plant.engine.step(
-            [plant.model(setup.theta)], trajectory.state[:-1][order], setup.control[order], taps
+        stepped = plant.simulator.step(
+            [plant.model(setup.theta)],
+            trajectory.state[:-1][order],
+            setup.control[order],
+            observations,
         )
         np.testing.assert_allclose(
-            stepped.tapped, tapped[order][:, np.array(taps.substeps) - 1], rtol=0, atol=1e-9
+            stepped.observed,
+            observed[order][:, np.array(observations.derivative_substeps) - 1],
+            rtol=0,
+            atol=1e-9,
         )
         np.testing.assert_allclose(stepped.states, trajectory.state[1:][order], rtol=0, atol=1e-12)
     assert (
-        plant.engine.step(
+        plant.simulator.step(
             [plant.model(setup.theta)], trajectory.state[:1], setup.control[:1]
-        ).tapped
+        ).observed
         is None
     )
 
 
 def test_a_control_that_diverges_shows_nothing(tmp_path: Path) -> None:
     setup = floating_setup(tmp_path)
-    assert setup.plant.watch(setup.theta, 1e12 * setup.control, taps_of(setup)) is None
+    assert setup.plant.observe(setup.theta, 1e12 * setup.control, observations_of(setup)) is None
 
 
 def test_taps_cost_no_further_steps(tmp_path: Path) -> None:
     setup = floating_setup(tmp_path)
-    taps, plant = taps_of(setup), setup.plant
+    observations, plant = observations_of(setup), setup.plant
     counts = []
-    for own in (None, taps):
-        begun = plant.engine.steps
-        plant.engine.step(
+    for own in (None, observations):
+        begun = plant.simulator.steps
+        plant.simulator.step(
             [plant.model(setup.theta)], setup.initial.state[:7], setup.control[:7], own
         )
-        counts.append(plant.engine.steps - begun)
+        counts.append(plant.simulator.steps - begun)
     assert counts == [35, 35]
 
 
@@ -153,10 +159,12 @@ def differences(setup: Setup, sample: int, substeps: tuple[int, ...], step: floa
     return np.stack(columns, axis=-1)
 
 
-def assert_slopes(found: Array, setup: Setup, taps: Taps, tolerance: float) -> None:
+def assert_slopes(
+    found: Array, setup: Setup, observations: SubstepObservations, tolerance: float
+) -> None:
     """Derivatives (N, looked-at substeps, 9, nx+nu) of every kind at some samples."""
     for sample in (0, 11, 29):
-        wanted = differences(setup, sample, taps.substeps)
+        wanted = differences(setup, sample, observations.derivative_substeps)
         for i, shown in enumerate(SHOWN):
             assert relative_error(found[sample, :, i], wanted[:, i]) < tolerance, (sample, shown)
 
@@ -166,16 +174,20 @@ def test_derivatives_of_taps_are_differences_of_independent_simulations(
     integrator: str, tmp_path: Path
 ) -> None:
     setup = floating_setup(tmp_path, integrator).free()
-    taps = taps_of(setup)
-    A, B, slopes = setup.plant.tapped(setup.theta, setup.initial, taps)
-    assert slopes.shape == (30, len(taps.substeps), len(SHOWN), 20)
-    assert_slopes(slopes, setup, taps, 1e-3)
+    observations = observations_of(setup)
+    A, B, slopes = setup.plant.observation_jacobians(setup.theta, setup.initial, observations)
+    assert slopes.shape == (30, len(observations.derivative_substeps), len(SHOWN), 20)
+    assert_slopes(slopes, setup, observations, 1e-3)
     exact = setup.plant.jacobians(setup.theta, setup.initial)
     assert relative_error(A, exact[0]) < 1e-5
     assert relative_error(B, exact[1]) < 1e-3
 
 
-@pytest.mark.parametrize("accuracy", [DRAFT, FAST, CENTRAL], ids=["draft", "fast", "central"])
+@pytest.mark.parametrize(
+    "accuracy",
+    [SHARED_ORIGIN, FORWARD_DIFFERENCES, CENTRAL_DIFFERENCES],
+    ids=["draft", "fast", "central"],
+)
 @pytest.mark.parametrize("sensors", [False, True], ids=["states", "sensors"])
 def test_derivatives_beside_those_of_the_information_are_the_same(
     sensors: bool, accuracy, tmp_path: Path
@@ -187,26 +199,43 @@ def test_derivatives_beside_those_of_the_information_are_the_same(
         else {"qpos:elbow": 0.01, "qpos:shoulder": 0.01}
     )
     setup = floating_setup(tmp_path, noise=noise).free()
-    assert setup.plant.engine.sensors is sensors
-    taps, psi = taps_of(setup), setup.plant.sensitivity(setup.theta, setup.initial).psi
+    assert setup.plant.simulator.sensors is sensors
+    observations, psi = (
+        observations_of(setup),
+        setup.plant.sensitivity(setup.theta, setup.initial).psi,
+    )
     directions = np.array([[1.0, 0.3], [-0.2, 0.9]])
-    found = setup.plant.bilinear(setup.theta, setup.initial, psi, directions, accuracy, taps)
-    assert found.taps is not None
-    assert_slopes(found.taps, setup, taps, 2e-3)
-    assert setup.plant.bilinear(setup.theta, setup.initial, psi, directions, accuracy).taps is None
+    found = setup.plant.bilinear(
+        setup.theta, setup.initial, psi, directions, accuracy, observations
+    )
+    assert found.observation_jacobian is not None
+    assert_slopes(found.observation_jacobian, setup, observations, 2e-3)
+    assert (
+        setup.plant.bilinear(
+            setup.theta, setup.initial, psi, directions, accuracy
+        ).observation_jacobian
+        is None
+    )
 
 
 def test_drafted_derivatives_are_the_careful_ones_to_a_hundredth(tmp_path: Path) -> None:
     """One-sided from one origin against central differences of every direction."""
     setup = floating_setup(tmp_path).free()
-    taps, psi = taps_of(setup), setup.plant.sensitivity(setup.theta, setup.initial).psi
+    observations, psi = (
+        observations_of(setup),
+        setup.plant.sensitivity(setup.theta, setup.initial).psi,
+    )
     directions = np.array([[1.0, 0.3], [-0.2, 0.9], [0.0, -1.0]])
-    begun = setup.plant.engine.steps
-    draft = setup.plant.bilinear(setup.theta, setup.initial, psi, directions, DRAFT, taps)
-    spent, begun = setup.plant.engine.steps - begun, setup.plant.engine.steps
-    careful = setup.plant.bilinear(setup.theta, setup.initial, psi, directions, CENTRAL, taps)
-    assert spent < 0.4 * (setup.plant.engine.steps - begun)
-    for name in ("A", "B", "C", "D", "taps"):
+    begun = setup.plant.simulator.steps
+    draft = setup.plant.bilinear(
+        setup.theta, setup.initial, psi, directions, SHARED_ORIGIN, observations
+    )
+    spent, begun = setup.plant.simulator.steps - begun, setup.plant.simulator.steps
+    careful = setup.plant.bilinear(
+        setup.theta, setup.initial, psi, directions, CENTRAL_DIFFERENCES, observations
+    )
+    assert spent < 0.4 * (setup.plant.simulator.steps - begun)
+    for name in ("A", "B", "C", "D", "observation_jacobian"):
         if getattr(careful, name).any():
             assert relative_error(getattr(draft, name), getattr(careful, name)) < 1e-2, name
         else:

@@ -158,7 +158,7 @@ def engine_loop(setup: Setup, model: Any, start: Array, reference: Array, K: Arr
     states = [start]
     for k in range(len(K)):
         u = setup.initial.ctrl[k] + K[k] @ setup.space.minus(reference[k], states[-1])
-        states.append(setup.plant.engine.step([model], states[-1][None], u[None]).states[0])
+        states.append(setup.plant.simulator.step([model], states[-1][None], u[None]).states[0])
     return np.array(states)
 
 
@@ -169,7 +169,7 @@ def test_gains_of_the_samples_serve_a_faster_controller(tmp_path: Path) -> None:
     push = np.array([0.3, 0.0, 0.0, 0.0])
     states, _, plan = closed_loop(path, tmp_path, push)
     model, start = setup.plant.model(setup.theta), setup.space.plus(setup.initial.state[:1], push)
-    alone = setup.plant.engine.rollout([model], start, setup.initial.ctrl[None]).states[0]
+    alone = setup.plant.simulator.rollout([model], start, setup.initial.ctrl[None]).states[0]
     assert abs(alone[-1, 0] - plan[-1, 0]) == pytest.approx(0.3, rel=1e-6)
     assert abs(states[-1, 0] - plan[-1, 0]) < 0.1
 

@@ -15,7 +15,7 @@ import mjfim
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.plant import CENTRAL
+from mjfim.plant.plant import CENTRAL_DIFFERENCES
 from mjfim.records.design import Status
 from tests.support.paths import ROOT
 
@@ -53,11 +53,15 @@ def test_eigenvalues_of_the_initial_trajectory(case: str, place: str) -> None:
 
 def test_gradient_of_the_information_term() -> None:
     setup = Setup(experiment("a"))
-    point = setup.problem.point(setup.initial, CENTRAL)
+    point = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
     assert point.sensitivity is not None
     assert point.criterion is not None
     bilinear = setup.plant.bilinear(
-        setup.theta, setup.initial, point.sensitivity.psi, point.criterion.directions, CENTRAL
+        setup.theta,
+        setup.initial,
+        point.sensitivity.psi,
+        point.criterion.directions,
+        CENTRAL_DIFFERENCES,
     )
     a, b = setup.information.gradient(point.criterion, point.sensitivity, bilinear)
     gradient = Expansion(A=bilinear.A, B=bilinear.B, a=a, b=b).gradient(np.zeros((400, 1, 4)))[:, 0]

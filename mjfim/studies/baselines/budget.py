@@ -79,7 +79,7 @@ class Arena:
         plain = Setup(self.job.experiment, self.job.threads, added=self.job.added)
         self.holds = plain.enforced
         self.setup = plain.free() if self.holds else plain
-        self.begun = self.setup.plant.steps
+        self.begun = self.setup.plant.engine_steps
         self.fence, self.centre = fence_of(self.setup), self.setup.centre
         self.exact = Stage(self.setup, self.job.combinations).problem
         self.rng = np.random.default_rng((self.job.seed, *self.job.part))
@@ -87,7 +87,7 @@ class Arena:
     @property
     def used(self) -> float:
         """Share of the budget."""
-        taken = self.setup.plant.steps - self.begun
+        taken = self.setup.plant.engine_steps - self.begun
         return max((time.perf_counter() - self.clock) / self.job.seconds, taken / self.job.steps)
 
     def require(self, limit: float = 1.0) -> None:
@@ -101,7 +101,7 @@ class Arena:
     def finished(self) -> Attempt:
         """The attempt with what it took."""
         self.attempt.seconds = time.perf_counter() - self.clock
-        self.attempt.steps = self.setup.plant.steps - self.begun
+        self.attempt.steps = self.setup.plant.engine_steps - self.begun
         return self.attempt
 
     @cached_property
@@ -158,23 +158,25 @@ class Arena:
         """Index of the first of falling scales at which all limits hold."""
         plant, theta = self.setup.plant, self.setup.theta
         ctrl = self.centre + scales[:, None, None] * swing
-        start = np.repeat(plant.start(theta)[None], len(scales), axis=0)
-        out = plant.engine.rollout([plant.model(theta)], start, ctrl, self.fence.taps)
+        start = np.repeat(plant.initial_state(theta)[None], len(scales), axis=0)
+        out = plant.simulator.rollout([plant.model(theta)], start, ctrl, self.fence.observations)
         for i in range(len(scales)):
-            if not out.finite[i] or out.tapped is None:
+            if not out.finite[i] or out.observed is None:
                 continue
-            trajectory, tapped = plant.trajectory(out.states[i], ctrl[i]), out.tapped[i]
-            share = _share(replace(self.fence, clearance=None), trajectory, tapped)
+            trajectory, observed = plant.trajectory(out.states[i], ctrl[i]), out.observed[i]
+            share = _share(replace(self.fence, clearance=None), trajectory, observed)
             if (
                 share >= 0.0 and self.fence.clearance is not None
             ):  # distances take long, and are looked at last
-                share = _share(self.fence, trajectory, tapped)
+                share = _share(self.fence, trajectory, observed)
             if share >= 0.0:
                 return i
             self.keep(ctrl[i], np.inf, share)
         return None
 
 
-def _share(fence: Fence, trajectory: Trajectory, tapped: Array) -> float:
+def _share(fence: Fence, trajectory: Trajectory, observed: Array) -> float:
     """The worst margin over half of its range."""
-    return min(fence.shares(fence.sight(trajectory, tapped, slopes=False)).values(), default=np.inf)
+    return min(
+        fence.shares(fence.sight(trajectory, observed, slopes=False)).values(), default=np.inf
+    )
