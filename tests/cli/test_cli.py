@@ -273,16 +273,13 @@ def test_design_that_misses_its_goal(
     assert bool(data["warnings"]) is not satisfied
 
 
-def test_misfit(
-    study: Path, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_misfit(study: Path, recorded: Path, tmp_path: Path) -> None:
     """A recording that the model cannot explain: results are written, the exit code and the text say so."""
     header, *rows = recorded.read_text(encoding="utf-8").splitlines()
     cells = [row.split(",") for row in rows]
     bent = [[t, u, str(float(s) + 0.5 * float(t)), *rest] for t, u, s, *rest in cells]
     odd = tmp_path / "odd.csv"
     odd.write_text("\n".join([header, *(",".join(row) for row in bent)]) + "\n", encoding="utf-8")
-    monkeypatch.setattr(plots, "save", lambda *_: None)
     result = run("identify", study, odd, "-o", tmp_path / "fit")
     assert result.exit_code == 1
     assert read(tmp_path / "fit" / "estimate.json")["misfit"] is True
@@ -437,10 +434,10 @@ def test_replay_into_a_folder(home: Path, designed: Result, tmp_path: Path) -> N
 def test_disk_full(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the system says, in one message."""
 
-    def full(*_: object) -> None:
+    def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device", str(tmp_path / "out" / "design.npz"))
 
-    monkeypatch.setattr(archive, "write_design", full)
+    monkeypatch.setattr(np, "savez_compressed", full)
     result = run("design", study, "-o", tmp_path / "out")
     assert isinstance(result.exception, SystemExit), repr(result.exception)
     assert result.exit_code in (1, 2)
@@ -550,22 +547,22 @@ def test_trials_that_diverge(
     """A step into divergence is a step too long: the descent goes on, silently."""
     monkeypatch.chdir(tmp_path)
     diverged = []
-    project = mjfim.plant.plant.Plant.project
-
-    def spy(self: Any, *words: Any) -> Any:
-        trial = project(self, *words)
-        diverged.append(trial is None)
-        return trial
-
-    monkeypatch.setattr(mjfim.plant.plant.Plant, "project", spy)
     experiment = mjfim.Experiment.from_file(
         write_experiment(tmp_path, horizon="0.5", tolerance="1e-7")
     )
     for amplitude in np.geomspace(1.2e4, 4.8e4, 7):
         wave = {"kind": "sine", "frequency": 2.0, "amplitude": float(amplitude)}
-        result = mjfim.design(
-            experiment.replace(initial={"control": wave}, descent={"max_iterations": 4})
-        )
+        descent = {"max_iterations": 4, "coarse": 1}
+        setup = Setup(experiment.replace(initial={"control": wave}, descent=descent))
+        project = setup.plant.project
+
+        def spy(*words: Any, project: Any = project) -> Any:
+            trial = project(*words)
+            diverged.append(trial is None)
+            return trial
+
+        monkeypatch.setattr(setup.plant, "project", spy)
+        result = mjfim.design(setup)
         assert result.final.cost < result.initial.cost
     assert any(diverged), "no trial diverged: this test has lost its object"
     assert capfd.readouterr() == ("", "")

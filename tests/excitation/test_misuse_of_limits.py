@@ -12,7 +12,6 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.limits import unwatched
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
-from mjfim.output import folders as results
 from tests.support.cli import loads, misused, names, run, write_experiment
 from tests.support.numerics import CART_PENDULUM, make_setup
 
@@ -245,10 +244,9 @@ def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) 
 
 
 def test_limits_that_no_control_can_keep_are_no_misuse(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     """The pendulum falls faster than it may: exit code 1 after the work, and said which limit is missed."""
-    monkeypatch.setattr(results, "leave_design", lambda *_: [])
     hard = "[limits]\nvelocity = { hinge = 0.5 }\ncontrol = { force = [-0.01, 0.01] }"
     path = write_experiment(tmp_path, max_iterations=f"4\n{hard}")
     model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mjfim.information.identifiability
 from mjfim.errors import SimulationDiverged, UnidentifiableError
 from mjfim.excitation.design import design, require_designable
 from mjfim.excitation.initial_controls import probes
@@ -61,16 +60,22 @@ def look(setup: Setup) -> Survey:
 def test_an_experiment_that_shows_everything_needs_no_random_controls(
     tmp_path, monkeypatch
 ) -> None:
-    def refused(setup: Setup, count: int) -> None:
+    def refused(theta: Array, ctrl: Array) -> None:
         raise AssertionError("not needed")
 
-    monkeypatch.setattr(mjfim.information.identifiability, "probes", refused)
-    seen = look(cart_setup(tmp_path))
+    def look_without_simulations(setup: Setup) -> Survey:
+        """Survey along the initial control on a plant that simulates no further control."""
+        curve = setup.initial
+        found = setup.plant.sensitivity(setup.theta, curve)
+        monkeypatch.setattr(setup.plant, "simulate", refused)
+        return survey(setup, curve, found)
+
+    seen = look_without_simulations(cart_setup(tmp_path))
     assert seen.basis is None
     assert (seen.here.count, seen.always.count) == (0, 0)
     assert (seen.groups_here, seen.groups_always) == ((), ())
     with pytest.raises(AssertionError, match="not needed"):
-        look(cart_setup(tmp_path, parameters=PRODUCT))
+        look_without_simulations(cart_setup(tmp_path, parameters=PRODUCT))
 
 
 def test_a_start_that_moves_half_of_the_model_is_told_from_what_never_shows(tmp_path) -> None:

@@ -27,6 +27,7 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
+from tests.support.paths import ROOT
 
 SIZES = [(1, 1), (14, 30), (1, 70)]
 
@@ -445,25 +446,26 @@ def test_save_writes_a_png_and_leaves_nothing_else(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["convergence.png"]
 
 
-def test_failed_save_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_save_keeps_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "figure.png"
     path.write_bytes(b"old")
 
-    def break_off(self: Figure, name: Path, **_: object) -> None:
-        Path(name).write_bytes(b"half")
-        raise OSError("disk full")
+    class FailingFigure(Figure):
+        """A figure that is written in part before the disk is full."""
 
-    monkeypatch.setattr(Figure, "savefig", break_off)
+        def savefig(self, name: Path, **_: object) -> None:
+            Path(name).write_bytes(b"half")
+            raise OSError("disk full")
+
     with pytest.raises(OSError, match="disk full"):
-        plots.save(plots.convergence(make_design()), path)
+        plots.save(FailingFigure(), path)
     assert path.read_bytes() == b"old"
     assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
 
 
 def test_pyplot_is_never_imported() -> None:
-    code = "import sys, mjfim.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
-    root = Path(plots.__file__).parents[1]
-    assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
+    code = "import sys, mjfim.output.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
 def test_only_the_plot_modules_import_matplotlib() -> None:

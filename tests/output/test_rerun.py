@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError
 from mjfim.model.coordinates import output_label
 from mjfim.output.labels import Labels
-from mjfim.output.rerun import documents
 from mjfim.output.rerun.documents import log_design, log_estimate, log_trajectories, show
 from mjfim.output.rerun.panels import dof_positions, history_series
 from mjfim.output.rerun.scene import camera, entity, motion
@@ -327,17 +327,20 @@ class TestDesign:
         np.testing.assert_allclose(peak["initial"], [1.5 / 16, 1.0 / 16], rtol=1e-6)
 
     def test_replaces_the_file_only_when_complete(
-        self, cart: mujoco.MjModel, design: Design, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, cart: mujoco.MjModel, design: Design, tmp_path: Path
     ) -> None:
         path = tmp_path / "design.rrd"
         path.write_text("old")
 
-        def fail(*_: object) -> None:
-            raise RuntimeError("disk full")
+        class FailingHistory(tuple[HistoryRow, ...]):
+            """A history that cannot be read."""
 
-        monkeypatch.setattr(documents, "log_history", fail)
+            def __iter__(self) -> Iterator[HistoryRow]:
+                raise RuntimeError("disk full")
+
+        failing = replace(design, history=FailingHistory(design.history))
         with pytest.raises(RuntimeError, match="disk full"):
-            log_design(path, cart, design, Labels.of_model(cart))
+            log_design(path, cart, failing, Labels.of_model(cart))
         assert path.read_text() == "old"
         assert list(tmp_path.iterdir()) == [path]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
 from mjfim.information.fisher import Information
 from mjfim.output import archive
-from mjfim.plant.plant import Plant
 from mjfim.records.recording import Recording
 from mjfim.studies.check import check
 from tests.support.numerics import CART_PARAMETERS, Array, cart_setup, make_setup, relative_error
@@ -169,14 +169,15 @@ def test_dry_friction_is_flagged_with_its_sample_and_cause(tmp_path) -> None:
 
 
 def test_a_wrong_sensitivity_is_caught_by_the_recursion(tmp_path, monkeypatch) -> None:
-    right = Plant.sensitivity
+    setup = cart_setup(tmp_path)
+    right = setup.plant.sensitivity
 
-    def wrong(plant: Plant, *arguments, **options):
-        found = right(plant, *arguments, **options)
-        return type(found)(found.psi * 1.01, found.G)
+    def wrong(*arguments, **options):
+        found = right(*arguments, **options)
+        return replace(found, psi=found.psi * 1.01)
 
-    monkeypatch.setattr(Plant, "sensitivity", wrong)
-    tested = check(cart_setup(tmp_path)).self_test
+    monkeypatch.setattr(setup.plant, "sensitivity", wrong)
+    tested = check(setup).self_test
     assert tested.recursion == pytest.approx(0.01, rel=0.05)
     assert not tested.passed
 
