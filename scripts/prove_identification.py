@@ -125,7 +125,7 @@ def run(task: tuple[int, int, float]) -> Outcome:
     found = mjfim.identify(setup, [recording])
     error = (found.theta - theta) / found.std
     inside = (found.interval[:, 0] <= theta) & (theta <= found.interval[:, 1])
-    named = bool(found.suspects) and found.suspects[0].path == "joint/slide:frictionloss"
+    named = bool(found.missing_terms) and found.missing_terms[0].path == "joint/slide:frictionloss"
     return Outcome(inside, np.abs(error) <= 1.96, error, found.misfit, named)
 
 

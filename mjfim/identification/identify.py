@@ -332,21 +332,21 @@ class _Identification:
             warnings=tuple(self._sentences(solution, rest, known, why, missing, at_bound, outside)),
             combinations=tuple(str(group) for group in known.groups),
             data=known.data,
-            sandwich=known.sandwich,
+            std_sandwich=known.sandwich,
             interval=known.interval,
-            between=known.between,
+            between_recordings=known.between,
             sigma=dict(zip(setup.outputs.names, fit.noise.sigma.tolist(), strict=True)),
             reasons=why,
             whiteness=rest.white,
             sloppy=tuple(name for name, _ in known.sloppy),
-            suspects=missing,
-            each={
+            missing_terms=missing,
+            per_recording={
                 p.names[j]: tuple(at.per_recording[:, i].tolist())
                 for i, j in enumerate(fit.layout.own)
             },
-            worst=rest.worst if why else None,
+            worst_residual=rest.worst if why else None,
             predictions=predictions,
-            detail=known.detail,
+            robust_uncertainty=known.detail,
             motion=fit.motion(at, 0),
             interrupted=self.interrupted,
             seconds=time.perf_counter() - self.clock,

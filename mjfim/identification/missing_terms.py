@@ -95,7 +95,7 @@ def suspects(
         if not wrong and sigmas > norm.isf(0.5 * LEVEL / len(tested)) and WORTH < share < 1.0:
             named.append(
                 MissingTerm(
-                    words=candidate.words,
+                    description=candidate.words,
                     path=candidate.path,
                     value=float(value),
                     unit=candidate.unit,

@@ -58,7 +58,7 @@ class Survey:
 
         columns = zip(words, combined_values, std_before, std_after, strict=True)
         return tuple(
-            CombinationAccuracy(words=name, value=value, std_initial=initial, std_final=final)
+            CombinationAccuracy(expression=name, value=value, std_initial=initial, std_final=final)
             for name, value, initial, final in columns
         )
 

@@ -22,7 +22,7 @@ from mjfim.records.check import Check
 from mjfim.records.combinations import ParameterGroup
 from mjfim.records.comparison import Comparison, MethodResult
 from mjfim.records.design import Design, Evaluation
-from mjfim.records.estimate import Estimate, Prediction, PredictionErrors
+from mjfim.records.estimate import Estimate, MissingTerm, Prediction, PredictionErrors
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
@@ -87,7 +87,7 @@ def design_summary(design: Design) -> dict[str, Any]:
         "combinations": list(design.combinations),
         "combined": [
             {
-                "words": c.words,
+                "words": c.expression,
                 "value": c.value,
                 "std_initial": c.std_initial,
                 "std_final": c.std_final,
@@ -243,13 +243,13 @@ def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
         "sigma": estimate.sigma,
         "misfit": estimate.misfit,
         "reasons": list(estimate.reasons),
-        "worst": None if estimate.worst is None else vars(estimate.worst),
+        "worst": None if estimate.worst_residual is None else vars(estimate.worst_residual),
         "whiteness": [vars(w) for w in estimate.whiteness],
-        "per_recording": estimate.each,
-        "suspects": [vars(s) for s in estimate.suspects],
-        "std_sandwich": estimate.sandwich,
+        "per_recording": estimate.per_recording,
+        "suspects": [_missing_term(term) for term in estimate.missing_terms],
+        "std_sandwich": estimate.std_sandwich,
         "interval": estimate.interval,
-        "between_recordings": estimate.between,
+        "between_recordings": estimate.between_recordings,
         "predictions": [
             {
                 "name": p.name,
@@ -268,6 +268,18 @@ def estimate_summary(estimate: Estimate, setup: Setup) -> dict[str, Any]:
         "prior": setup.parameters.prior_information,
         "data": estimate.data,
         "combinations": list(estimate.combinations),
+    }
+
+
+def _missing_term(term: MissingTerm) -> dict[str, Any]:
+    """Contents of one entry of `suspects`."""
+    return {
+        "words": term.description,
+        "path": term.path,
+        "value": term.value,
+        "unit": term.unit,
+        "sigmas": term.sigmas,
+        "share": term.share,
     }
 
 
@@ -306,7 +318,7 @@ def study_summary(study: MonteCarloStudy) -> dict[str, Any]:
 
 def check_summary(check: Check) -> dict[str, Any]:
     """Contents of check.json."""
-    rough = check.self_test.rough
+    rough = check.self_test.roughness
     return {
         "ok": check.ok,
         "verdict": list(check.verdict),
@@ -335,16 +347,16 @@ def check_summary(check: Check) -> dict[str, Any]:
         "confounded": [
             {"a": p.first, "b": p.second, "correlation": p.correlation} for p in check.confounded
         ],
-        "combinations": [_group(g) for g in check.never],
+        "combinations": [_group(g) for g in check.not_separable],
         "combined": [
-            {"words": c.words, "value": c.value, "std": c.std_final} for c in check.combined
+            {"words": c.expression, "value": c.value, "std": c.std_final} for c in check.combined
         ],
-        "not_excited": [_group(g) for g in check.not_here],
+        "not_excited": [_group(g) for g in check.not_excited],
         "self_test": {
             "passed": check.self_test.passed,
             "recursion": check.self_test.recursion,
             "slope": check.self_test.slope,
-            "suspect": check.self_test.suspect,
+            "suspect": check.self_test.likely_cause,
             "rough": None
             if rough is None
             else {

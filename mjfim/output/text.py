@@ -41,7 +41,7 @@ def design_report(design: Design, units: tuple[str, ...]) -> RenderableType:
         relative = f"{100 * c.std_final / abs(c.value):.2g} %" if c.value else "-"
         stds = (f"{c.std_initial:.3g}", f"{c.std_final:.3g}")
         table.add_row(
-            escape(c.words),
+            escape(c.expression),
             f"{c.value:.4g}",
             *stds,
             relative,
@@ -87,7 +87,7 @@ def estimate_report(estimate: Estimate, units: tuple[str, ...]) -> RenderableTyp
     rms = ", ".join(f"{escape(name)} {value:.3g}" for name, value in estimate.residual_rms.items())
     each = [
         f"{escape(name)} of each recording: {', '.join(f'{value:.3g}' for value in values)}"
-        for name, values in estimate.each.items()
+        for name, values in estimate.per_recording.items()
         if len(values) > 1
     ]
     lines = [
@@ -244,9 +244,9 @@ def check_report(check: Check) -> RenderableType:
     for title, groups in (
         (
             "Identifiable in combination only; neither this control nor random ones from this start tell more",
-            check.never,
+            check.not_separable,
         ),
-        ("Not excited here; another control would show", check.not_here),
+        ("Not excited here; another control would show", check.not_excited),
     ):
         if groups:
             parts.append(Text(f"{title}:", style="bold"))
@@ -259,7 +259,7 @@ def check_report(check: Check) -> RenderableType:
     parts += [
         f"eigenvalues{' (smallest four, largest two)' if len(few) > 8 else ''}: {shown}; condition {check.condition:.3g}",
         f"derivative self-test {'passed' if tested.passed else 'FAILED'}: psi recursion {tested.recursion:.1e}, slope "
-        f"{tested.slope:.1e}, two steps {'agree' if tested.rough is None else 'disagree'}",
+        f"{tested.slope:.1e}, two steps {'agree' if tested.roughness is None else 'disagree'}",
         Text("Verdict", style="bold"),
         *(Text(f"• {sentence}", style="" if check.ok else "yellow") for sentence in check.verdict),
         Text(BEST_CASE, style="dim"),
@@ -360,7 +360,7 @@ def _lines(group: ParameterGroup, check: Check) -> list[str]:
     """A group of parameters: its members, then one combination a line, with its value and standard deviation."""
     if not group.combinations:
         return [f"  {group}"]
-    known = {c.words: f" = {c.value:.4g} ± {c.std_final:.2g}" for c in check.combined}
+    known = {c.expression: f" = {c.value:.4g} ± {c.std_final:.2g}" for c in check.combined}
     return [
         f"  {', '.join(group.members)} only as",
         *(f"    {c}{known.get(str(c), '')}" for c in group.combinations),

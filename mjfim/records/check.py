@@ -64,8 +64,8 @@ class Check:
     eigenvalues: Array
     correlation: Array
     confounded: tuple[ConfoundedPair, ...]
-    never: tuple[ParameterGroup, ...]
-    not_here: tuple[ParameterGroup, ...]
+    not_separable: tuple[ParameterGroup, ...]
+    not_excited: tuple[ParameterGroup, ...]
     self_test: SelfTest
     verdict: tuple[str, ...]
     combined: tuple[CombinationAccuracy, ...] = ()
@@ -84,8 +84,8 @@ class Check:
         """Derivatives hold, every parameter can be told (if only by its prior), one repetition reaches what was stated."""
         reached = all(row.repetitions == 1 for row in self.rows if row.stated and not row.nuisance)
         known = {row.name for row in self.rows if np.isfinite(row.std)}
-        apart = all(set(group.members) <= known for group in self.never)
-        return self.self_test.passed and apart and not self.not_here and reached
+        apart = all(set(group.members) <= known for group in self.not_separable)
+        return self.self_test.passed and apart and not self.not_excited and reached
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,16 +126,16 @@ class SelfTest:
     recursion: psi by rollouts against `psi_{k+1} = A psi + E`;  slope: DJ.zeta against differences of J(P(xi + gamma zeta))
     """
 
-    rough: Roughness | None
+    roughness: Roughness | None
     recursion: float
     slope: float
-    suspect: str = ""
+    likely_cause: str = ""
 
     @property
     def passed(self) -> bool:
         """True where all derivatives agree."""
         return (
-            self.rough is None
+            self.roughness is None
             and not self.recursion > RECURSION_TOLERANCE
             and not self.slope > SLOPE_TOLERANCE
         )

@@ -96,7 +96,7 @@ class StartResult:
 class CombinationAccuracy:
     """An identifiable combination of parameters that are not so alone: its words, value and standard deviations."""
 
-    words: str
+    expression: str
     value: float
     std_initial: float
     std_final: float

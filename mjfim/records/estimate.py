@@ -50,18 +50,18 @@ class Estimate:
     warnings: tuple[str, ...] = ()
     combinations: tuple[str, ...] = ()
     data: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    sandwich: Array = field(default_factory=lambda: np.zeros(0))
+    std_sandwich: Array = field(default_factory=lambda: np.zeros(0))
     interval: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    between: Array = field(default_factory=lambda: np.zeros(0))
+    between_recordings: Array = field(default_factory=lambda: np.zeros(0))
     sigma: dict[str, float] = field(default_factory=dict)
     reasons: tuple[str, ...] = ()
     whiteness: tuple[Whiteness, ...] = ()
-    worst: WorstResidual | None = None
+    worst_residual: WorstResidual | None = None
     predictions: tuple[Prediction, ...] = ()
     sloppy: tuple[str, ...] = ()
-    suspects: tuple[MissingTerm, ...] = ()
-    each: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    detail: Uncertainty | None = None
+    missing_terms: tuple[MissingTerm, ...] = ()
+    per_recording: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    robust_uncertainty: Uncertainty | None = None
     motion: Trajectory | None = None
     interrupted: bool = False
     seconds: float = 0.0
@@ -72,7 +72,7 @@ class Estimate:
         if len(self.interval) != count:  # none but the formal ones
             theta, half = np.asarray(self.theta), 1.96 * np.asarray(self.std)
             object.__setattr__(self, "interval", np.column_stack([theta - half, theta + half]))
-        for name, own in (("sandwich", self.std), ("between", np.zeros(count))):
+        for name, own in (("std_sandwich", self.std), ("between_recordings", np.zeros(count))):
             if len(getattr(self, name)) != count:
                 object.__setattr__(self, name, own)
         names = (
@@ -81,9 +81,9 @@ class Estimate:
             "covariance",
             "initial_theta",
             "data",
-            "sandwich",
+            "std_sandwich",
             "interval",
-            "between",
+            "between_recordings",
         )
         freeze(self, *names)
 
@@ -149,7 +149,7 @@ class MissingTerm:
     sigmas: its value over its standard deviation;  share: of all squared residuals that it explains
     """
 
-    words: str
+    description: str
     path: str
     value: float
     unit: str
@@ -159,7 +159,7 @@ class MissingTerm:
     def __str__(self) -> str:
         amount = f"{self.value:.2g} {self.unit}".strip()
         told = f"about {amount} ({self.sigmas:.0f} σ, {100 * self.share:.2g} % of all squares)"
-        return f'{self.words}, {told}; to find it out: target = "{self.path}"'
+        return f'{self.description}, {told}; to find it out: target = "{self.path}"'
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

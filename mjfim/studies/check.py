@@ -114,8 +114,8 @@ def _concluded(
         eigenvalues=eigenvalues,
         correlation=correlation,
         confounded=confounded,
-        never=never,
-        not_here=not_here,
+        not_separable=never,
+        not_excited=not_here,
         self_test=tested,
         verdict=verdict,
         combined=combined,
@@ -202,11 +202,11 @@ def _verdict(
     source: str,
 ) -> Iterator[str]:
     """Sentences that a person can act on, the gravest first."""
-    if tested.rough is not None:
-        yield f"{tested.rough}"
+    if tested.roughness is not None:
+        yield f"{tested.roughness}"
     elif not tested.passed:
         yield (
-            f"derivatives do not agree (psi recursion {tested.recursion:.1e}, slope {tested.slope:.1e}); {tested.suspect}. "
+            f"derivatives do not agree (psi recursion {tested.recursion:.1e}, slope {tested.slope:.1e}); {tested.likely_cause}. "
             "Shorten horizon or timestep, or smooth the switch, before trusting numbers here"
         )
     known = {row.name for row in rows if np.isfinite(row.std)}

@@ -26,22 +26,22 @@ def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
     if trajectory is None or point.sensitivity is None:
         raise SimulationDiverged("the trajectory diverges when the parameters move a little")
     found = SelfTest(
-        rough=roughness(setup, setup.theta, trajectory, point.sensitivity),
+        roughness=roughness(setup, setup.theta, trajectory, point.sensitivity),
         recursion=recursion_error(setup, trajectory, point.sensitivity),
         slope=slope_error(setup, problem, point),
     )
-    if found.passed or found.rough is not None:
+    if found.passed or found.roughness is not None:
         return found
     active = first_active(setup.model_at(setup.theta), trajectory)
     if active is None:
         return replace(
             found,
-            suspect="the motion may be too unstable, or something switches (muscle activation)",
+            likely_cause="the motion may be too unstable, or something switches (muscle activation)",
         )
     sample, causes = active
     where = f"sample {sample} (t = {trajectory.t[sample]:.4g} s)"
     return replace(
-        found, suspect=f"something that switches acts from {where} on: {', '.join(causes)}"
+        found, likely_cause=f"something that switches acts from {where} on: {', '.join(causes)}"
     )
 
 

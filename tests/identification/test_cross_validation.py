@@ -85,9 +85,9 @@ def test_every_recording_has_its_own_bias(base: mjfim.Experiment) -> None:
             Recording(t=clean.t, ctrl=clean.ctrl, y=clean.y + shift, outputs=clean.outputs)
         )
     found = mjfim.identify(setup, recordings)
-    np.testing.assert_allclose(found.each["bias qpos:hinge"], biases, atol=0.02)
+    np.testing.assert_allclose(found.per_recording["bias qpos:hinge"], biases, atol=0.02)
     j = found.parameters.index("bias qpos:hinge")
-    assert found.theta[j] == found.each["bias qpos:hinge"][0]
+    assert found.theta[j] == found.per_recording["bias qpos:hinge"][0]
     assert np.all(np.abs(found.theta[:3] - setup.parameters.true[:3]) < 4.0 * found.std[:3])
     assert not found.misfit
     assert mjfim.identify(

@@ -142,8 +142,10 @@ def test_double_pendulum_in_base_parameters_and_its_held_out_file() -> None:
         j = found.parameters.index(name)
         low, high = found.interval[j]
         assert abs(found.theta[j] / published - 1.0) < 0.15 or not low <= published <= high, name
-    assert len(found.each["bias elbow_angle"]) == 3  # the encoder's zero differs from log to log
-    assert np.ptp(found.each["bias elbow_angle"]) > 0.1
+    assert (
+        len(found.per_recording["bias elbow_angle"]) == 3
+    )  # the encoder's zero differs from log to log
+    assert np.ptp(found.per_recording["bias elbow_angle"]) > 0.1
     assert [p.name for p in found.predictions] == [str(file) for file in files]
     assert all(p.ratio < 1.15 for p in found.predictions)
     assert sum(p.ratio < 0.95 for p in found.predictions) >= 2

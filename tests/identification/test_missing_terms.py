@@ -48,9 +48,9 @@ def test_the_missing_term_comes_first_and_in_about_its_size(
     recording = robot(tmp_path, 'axis="1 0 0"/>', f'axis="1 0 0" {added}/>')
     found = mjfim.identify(stated(), [recording])
     assert found.misfit
-    rank = [s.path for s in found.suspects].index(path)
+    rank = [s.path for s in found.missing_terms].index(path)
     assert rank == 0 or path.endswith("armature")  # the bob's inertia does nearly the same
-    first = found.suspects[rank]
+    first = found.missing_terms[rank]
     assert first.sigmas > 5.0
     assert amount / 2.0 < first.value < 2.0 * amount
     assert any(path in sentence for sentence in found.warnings)
@@ -64,13 +64,13 @@ def test_a_bias_and_a_lag_are_told(tmp_path: Path) -> None:
     biased = mjfim.identify(
         setup, [Recording(t=clean.t, ctrl=clean.ctrl, y=off, outputs=clean.outputs)]
     )
-    assert biased.suspects[0].path == "output/qvel:hinge:bias"
-    assert biased.suspects[0].value == pytest.approx(0.03, rel=0.4)
+    assert biased.missing_terms[0].path == "output/qvel:hinge:bias"
+    assert biased.missing_terms[0].value == pytest.approx(0.03, rel=0.4)
     late = Recording(
         t=clean.t[2:] - clean.t[2], ctrl=clean.ctrl[2:], y=clean.y[:-2], outputs=clean.outputs
     )
     lagging = mjfim.identify(setup, [late])
-    assert "output:delay" in [s.path for s in lagging.suspects]
+    assert "output:delay" in [s.path for s in lagging.missing_terms]
 
 
 @pytest.mark.slow
@@ -79,7 +79,7 @@ def test_a_right_model_lacks_nothing() -> None:
     found = [
         mjfim.identify(setup, [mjfim.simulate(setup, setup.initial, seed)]) for seed in range(12)
     ]
-    assert not any(e.suspects or e.misfit for e in found)
+    assert not any(e.missing_terms or e.misfit for e in found)
 
 
 def test_what_is_sought_already_is_no_suspect(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def test_criterion_c_refuses_what_cannot_be_identified(tmp_path) -> None:
         mjfim.design(pendulum(tmp_path, cost={"criterion": "c", "subset": ["m2"]}))
     visible = {"criterion": "c", "combination": {"I1": 1.0, "m2": 0.09}}
     design = mjfim.design(pendulum(tmp_path, cost=visible))
-    known = {c.words.split()[0]: c for c in design.combined}
+    known = {c.expression.split()[0]: c for c in design.combined}
     assert design.final.criterion == pytest.approx(
         known["I1"].std_final ** 2 * 100.0, rel=1e-6
     )  # per second, 100 Hz

@@ -61,5 +61,5 @@ def test_a_short_design_improves_and_leaves_everything(name: str, tmp_path: Path
     assert names(tmp_path) == DESIGN | ({"limits.png"} if design.usage else set())
     told = read(tmp_path / "design.json")
     assert len(told["final"]["std"]) == len(told["parameters"])
-    assert [c["words"] for c in told["combined"]] == [c.words for c in design.combined]
+    assert [c["words"] for c in told["combined"]] == [c.expression for c in design.combined]
     assert bool(design.combined) == (name in TOGETHER)

@@ -72,8 +72,8 @@ def test_a_product_is_told_with_its_combination(tmp_path) -> None:
     }
     found = check(cart_setup(tmp_path, parameters=parameters))
     assert not found.ok
-    assert len(found.never) == 1
-    group = found.never[0]
+    assert len(found.not_separable) == 1
+    group = found.not_separable[0]
     assert set(group.members) == {"gear", "gain"}
     assert len(group.combinations) == 1
     first, second = group.combinations[0].members
@@ -96,8 +96,8 @@ def test_what_another_control_would_show_is_told_apart_from_what_none_would(tmp_
         "control": {"kind": "constant", "amplitude": 0.0},
     }
     found = check(cart_setup(tmp_path, initial=rest, parameters=CART_PARAMETERS))
-    assert not found.never
-    assert {name for group in found.not_here for name in group.members} == {"m", "l", "c"}
+    assert not found.not_separable
+    assert {name for group in found.not_excited for name in group.members} == {"m", "l", "c"}
     assert not found.ok
     assert any("another control would show" in sentence for sentence in found.verdict)
 
@@ -161,7 +161,7 @@ def test_dry_friction_is_flagged_with_its_sample_and_cause(tmp_path) -> None:
     )
     found = check(setup)
     assert not found.self_test.passed
-    rough = found.self_test.rough
+    rough = found.self_test.roughness
     assert rough is not None
     assert 0 < rough.sample <= setup.samples
     assert "dry friction of x" in rough.causes
@@ -197,10 +197,10 @@ def test_a_wrong_gradient_is_caught_by_the_slope(tmp_path, monkeypatch) -> None:
 
 def double_pendulum_groups(found: mjfim.Check) -> dict[str, dict[str, float]]:
     """Combinations of the one group that is expected, by their first member."""
-    assert [set(group.members) for group in found.never] == [{"m1r1", "I1", "m2"}]
+    assert [set(group.members) for group in found.not_separable] == [{"m1r1", "I1", "m2"}]
     return {
         c.members[0]: dict(zip(c.members, c.coefficients, strict=True))
-        for c in found.never[0].combinations
+        for c in found.not_separable[0].combinations
     }
 
 

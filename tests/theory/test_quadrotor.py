@@ -93,6 +93,6 @@ def test_the_shipped_experiment_is_identifiable_and_designs() -> None:
     experiment = mjfim.Experiment.from_file(MODELS / "quadrotor.toml")
     looked = mjfim.check(experiment)
     assert looked.self_test.passed
-    assert not looked.never
+    assert not looked.not_separable
     design = mjfim.design(experiment.replace(descent={"max_iterations": 12}))
     assert design.final.eigenvalues[0] > 2.0 * design.initial.eigenvalues[0]

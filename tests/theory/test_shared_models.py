@@ -91,12 +91,12 @@ def test_design_knows_ten_times_more_than_the_chirp(name: str) -> None:
 @pytest.mark.parametrize("name", list(EXPERIMENTS))
 def test_check_passes_or_names_the_sample(name: str) -> None:
     found = mjfim.check(experiment(name))
-    assert not found.never
-    assert not found.not_here
+    assert not found.not_separable
+    assert not found.not_excited
     assert all(np.isfinite(row.std) for row in found.rows)
     assert found.verdict
     if not found.self_test.passed:
-        rough = found.self_test.rough
+        rough = found.self_test.roughness
         assert rough is not None, found.self_test
         assert rough.sample > 0
         assert any(

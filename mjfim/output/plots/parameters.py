@@ -120,7 +120,7 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     shown = list(design.wanted)
     names = [
         *(brief(labels.parameter(j)) for j in shown),
-        *(shorten(c.words) for c in design.combined),
+        *(shorten(c.expression) for c in design.combined),
     ]
     values = np.array([*design.theta[shown], *(c.value for c in design.combined)])
     before = np.array([*design.initial.std[shown], *(c.std_initial for c in design.combined)])

@@ -192,7 +192,7 @@ def bound_block(design: Design, labels: Labels) -> Block:
             stds = (number(c.std_initial), relative[0], number(c.std_final), relative[1])
             rows.append(
                 (
-                    shorten(c.words),
+                    shorten(c.expression),
                     number(c.value, 4),
                     *stds,
                     f"{number(c.std_initial / c.std_final)}×",
