@@ -9,13 +9,26 @@ Array = NDArray[np.float64]
 
 
 def freeze(record: object, *names: str) -> None:
-    """Replace each named field of a frozen record by a read-only float64 array."""
+    """Replace named fields of a frozen record by read-only float64 arrays.
+
+    Args:
+        record: Instance of a frozen dataclass.
+        *names: Fields to replace.
+    """
     for name in names:
         array = np.array(getattr(record, name), dtype=np.float64)
         array.setflags(write=False)
         object.__setattr__(record, name, array)
 
 
-def thinned(count: int, most: int) -> NDArray[np.intp]:
-    """Indices of at most so many of count rows, evenly spread: what a picture can show."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
+def evenly_spread_indices(count: int, limit: int) -> NDArray[np.intp]:
+    """Indices of at most `limit` of `count` rows, evenly spread from the first to the last one.
+
+    Args:
+        count: Number of rows.
+        limit: Largest number of indices.
+
+    Returns:
+        (min(count, limit),) ascending indices.
+    """
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).astype(np.intp))

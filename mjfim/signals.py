@@ -1,4 +1,7 @@
-"""Curves that a control may follow: linear combinations of a few functions of time. Arrays only."""
+"""Bases and signals for controls: splines, Fourier series, chirps, multisines and random steps, as functions of time.
+
+A parametric excitation maps parameters in [0, 1] to a curve for every actuator, for searches over all excitations of a kind.
+"""
 
 from __future__ import annotations
 
@@ -11,204 +14,349 @@ from scipy.signal import chirp
 
 from mjfim.arrays import Array
 
-DEGREE = 3
-FAINT = 1e-5  # size of a combination of curves, over the largest
+# Degree of the splines.
+SPLINE_DEGREE = 3
+
+# Curves whose singular value is below this share of the largest one count as linearly dependent.
+DEPENDENCE_TOLERANCE = 1e-5
+
+# Largest number of harmonics of a parametric multisine.
+MAX_HARMONICS = 30
+
+# Largest number of levels of parametric random steps.
+MAX_LEVELS = 24
+
+# Smallest amplitude of an actuator, relative to the actuator with the largest amplitude.
+MIN_RELATIVE_AMPLITUDE = 0.05
+
+# Amplitudes of a parametric multisine fall at most with this power of the frequency.
+MAX_ROLL_OFF = 2.0
+
+# Smallest share of the time of a level that the transition to it takes; protects a division by zero.
+SHORTEST_TRANSITION = 1e-9
 
 
 def spline_basis(
-    t: Array, horizon: float, bandwidth: float, begins: bool, ends: bool, periodic: bool
+    t: Array,
+    horizon: float,
+    bandwidth: float,
+    starts_at_rest: bool,
+    ends_at_rest: bool,
+    periodic: bool,
 ) -> Array:
-    """(N, M) cubic B-splines at times t: (N,) [s] with a knot every 1/(2 bandwidth) s.
+    """Cubic B-splines with a knot every 1 / (2 bandwidth) seconds.
 
-    begins, ends: value and slope are zero there;  periodic: the curve and two derivatives meet at the ends
+    Args:
+        t: (N,) times [s].
+        horizon: Duration of the curves [s].
+        bandwidth: Highest frequency that the splines have to follow [Hz].
+        starts_at_rest: Whether value and slope are zero at the beginning.
+        ends_at_rest: Whether value and slope are zero at the end.
+        periodic: Whether the end continues at the beginning with two derivatives.
+
+    Returns:
+        (N, M) values of the M splines.
     """
-    pieces = max(int(np.ceil(2.0 * bandwidth * horizon)), DEGREE + 1)
-    knots = horizon / pieces * np.arange(-DEGREE, pieces + DEGREE + 1)
+    intervals = max(int(np.ceil(2.0 * bandwidth * horizon)), SPLINE_DEGREE + 1)
+    knots = horizon / intervals * np.arange(-SPLINE_DEGREE, intervals + SPLINE_DEGREE + 1)
+
+    # Splines that leave at the end of the horizon come back at its beginning.
     if periodic:
-        values = BSpline.design_matrix(t, knots, DEGREE).toarray()
-        values[:, :DEGREE] += values[:, pieces:]
-        return np.asarray(values[:, :pieces])
+        values = BSpline.design_matrix(t, knots, SPLINE_DEGREE).toarray()
+        values[:, :SPLINE_DEGREE] += values[:, intervals:]
+        return np.asarray(values[:, :intervals])
+
+    # Knots are repeated at both ends, so that the first two splines alone have a value or a slope there.
     knots = np.clip(knots, 0.0, horizon)
-    values = BSpline.design_matrix(t, knots, DEGREE).toarray()
-    return np.asarray(values[:, 2 * begins : values.shape[1] - 2 * ends])
+    values = BSpline.design_matrix(t, knots, SPLINE_DEGREE).toarray()
+    first = 2 if starts_at_rest else 0
+    last = values.shape[1] - (2 if ends_at_rest else 0)
+    return np.asarray(values[:, first:last])
 
 
 def fourier_basis(
-    t: Array, horizon: float, frequency: float, harmonics: int, begins: bool, ends: bool
+    t: Array,
+    horizon: float,
+    frequency: float,
+    harmonics: int,
+    starts_at_rest: bool,
+    ends_at_rest: bool,
 ) -> Array:
-    """(N, 2 harmonics) sines and cosines of multiples of a base frequency [Hz], each of size 1.
+    """Sines and cosines of the multiples of a base frequency, each with amplitude 1.
 
-    Where the curve has to begin or end at rest, the polynomial of least degree that has the same value and first two
-    derivatives there is taken off (a finite Fourier series with a quintic, as for point-to-point excitation).
+    Where a curve has to begin or end at rest, the polynomial of lowest degree with its value and first two derivatives there is
+    subtracted: a finite Fourier series with a quintic polynomial, as in point-to-point excitation of robots.
+
+    Args:
+        t: (N,) times [s].
+        horizon: Duration of the curves [s].
+        frequency: Base frequency [Hz].
+        harmonics: Number of multiples of the base frequency.
+        starts_at_rest: Whether value and two derivatives are zero at the beginning.
+        ends_at_rest: Whether value and two derivatives are zero at the end.
+
+    Returns:
+        (N, 2 harmonics) sines, then cosines.
     """
-    omega = 2.0 * np.pi * frequency * np.arange(1, harmonics + 1)
+    omega: Array = 2.0 * np.pi * frequency * np.arange(1.0, harmonics + 1.0)
+    waves = _wave_derivatives(t, omega, 0)
 
-    def waves(times: Array, order: int) -> Array:
-        angle = np.outer(times, omega) + 0.5 * np.pi * order
-        return np.asarray(
-            np.concatenate([np.sin(angle), np.cos(angle)], axis=1) * np.tile(omega**order, 2)
-        )
+    times = []
+    if starts_at_rest:
+        times.append(0.0)
+    if ends_at_rest:
+        times.append(horizon)
+    if not times:
+        return waves
 
-    places = [*([0.0] if begins else []), *([horizon] if ends else [])]
-    conditions = [(place, order) for place in places for order in range(3)]
-    if not conditions:
-        return waves(t, 0)
-    powers = np.arange(len(conditions))
+    # Value and two derivatives at each end fix the coefficients of the polynomials.
+    powers = np.arange(3 * len(times))
+    conditions = [(np.array([time]), order) for time in times for order in range(3)]
+    polynomials = [_power_derivatives(at, horizon, powers, order) for at, order in conditions]
+    values = [_wave_derivatives(at, omega, order) for at, order in conditions]
+    coefficients = np.linalg.solve(np.concatenate(polynomials), np.concatenate(values))
 
-    def polynomials(times: Array, order: int) -> Array:
-        factor = np.array(
-            [np.prod(np.arange(k - order + 1, k + 1)) if k >= order else 0.0 for k in powers]
-        )
-        return np.asarray(
-            factor * (times[:, None] / horizon) ** np.maximum(powers - order, 0) / horizon**order
-        )
-
-    system = np.concatenate([polynomials(np.array([place]), order) for place, order in conditions])
-    wanted = np.concatenate([waves(np.array([place]), order) for place, order in conditions])
-    return waves(t, 0) - polynomials(t, 0) @ np.linalg.solve(system, wanted)
+    return waves - _power_derivatives(t, horizon, powers, 0) @ coefficients
 
 
-def independent(curves: Array) -> Array:
-    """(N, M) curves, or fewer that span the same but for what is faint: splines finer than samples, waves like polynomials."""
+def _wave_derivatives(t: Array, omega: Array, order: int) -> Array:
+    """(N, 2 H) derivatives of an order of sin(omega t) and cos(omega t) at times t: (N,), omega: (H,) [rad/s]."""
+    angle = np.outer(t, omega) + 0.5 * np.pi * order
+    waves = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
+    return np.asarray(waves * np.tile(omega**order, 2))
+
+
+def _power_derivatives(t: Array, horizon: float, powers: np.ndarray, order: int) -> Array:
+    """(N, K) derivatives of an order of (t / horizon)^k at times t: (N,), for every k of powers: (K,)."""
+    factors = [
+        np.prod(np.arange(k - order + 1, k + 1)) if k >= order else 0.0 for k in powers.tolist()
+    ]
+    remaining = np.maximum(powers - order, 0)
+    return np.asarray(np.array(factors) * (t[:, None] / horizon) ** remaining / horizon**order)
+
+
+def independent_curves(curves: Array) -> Array:
+    """Linearly independent curves with the same span.
+
+    Curves may be nearly dependent: splines with more knots than there are samples, or waves that resemble polynomials.
+
+    Args:
+        curves: (N, M) curves.
+
+    Returns:
+        The curves themselves where they are independent, else (N, K < M) orthogonal ones with root mean square 1 / sqrt(2).
+    """
     U, sizes, _ = np.linalg.svd(curves, full_matrices=False)
-    kept = sizes > FAINT * sizes[0]
+    kept = sizes > DEPENDENCE_TOLERANCE * sizes[0]
     if kept.sum() == curves.shape[1]:
         return curves
+
     return np.asarray(U[:, kept] * np.sqrt(0.5 * len(curves)))
 
 
-HARMONICS = 30  # of a multisine at most
-LEVELS = 24  # of random steps at most
-FAINTEST = 0.05  # amplitude of one actuator over that of another, at least
-STEEPEST = 2.0  # amplitudes of a multisine fall with this power of the frequency at most
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ExcitationSettings:
+    """Settings that all parametric excitations of an experiment share.
 
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """What all excitations of an experiment have in common.
-
-    t: (N,) sample times, horizon [s];  nu: actuators;  slowest, fastest: [Hz]
-    jumps: whether controls may jump from one sample to the next
+    Attributes:
+        t: (N,) sample times [s].
+        horizon: Duration [s].
+        nu: Number of actuators.
+        min_frequency: Lowest frequency [Hz].
+        max_frequency: Highest frequency [Hz].
+        may_jump: Whether controls may jump from one sample to the next.
     """
 
     t: Array
     horizon: float
     nu: int
-    slowest: float
-    fastest: float
-    jumps: bool
+    min_frequency: float
+    max_frequency: float
+    may_jump: bool
 
-    def pitch(self, z: Array) -> Array:
-        """Frequencies [Hz] from numbers."""
-        return np.asarray(self.slowest * (self.fastest / self.slowest) ** z)
+    def frequency(self, z: Array) -> Array:
+        """Frequencies [Hz] of parameters in [0, 1], on a logarithmic scale.
+
+        Args:
+            z: (...) parameters.
+
+        Returns:
+            (...) frequencies [Hz].
+        """
+        return np.asarray(self.min_frequency * (self.max_frequency / self.min_frequency) ** z)
 
 
 class Excitation(Protocol):
-    """numbers: how many it is made of"""
+    """Excitation that is a function of parameters in [0, 1]."""
 
     @property
-    def numbers(self) -> int:
-        """How many."""
+    def parameter_count(self) -> int:
+        """Number of parameters."""
         ...
 
-    def wave(self, z: Array) -> Array:
-        """(N, nu) about zero, of size 1 at most or little more."""
+    def curve(self, z: Array) -> Array:
+        """(N, nu) curves about zero with a peak of about 1, from z: (parameter_count,)."""
         ...
 
 
-def amplitudes(z: Array) -> Array:
-    """Amplitudes from numbers, the largest one 1."""
-    size = FAINTEST ** (1.0 - z)
-    return np.asarray(size / size.max())
+def relative_amplitudes(z: Array) -> Array:
+    """Amplitudes of several actuators; the largest one is 1.
+
+    Args:
+        z: (nu,) parameters in [0, 1].
+
+    Returns:
+        (nu,) amplitudes.
+    """
+    amplitude = MIN_RELATIVE_AMPLITUDE ** (1.0 - z)
+    return np.asarray(amplitude / amplitude.max())
 
 
 @dataclass(frozen=True)
 class Chirp:
-    """A linear sweep of each actuator: amplitude, first and last frequency, phase, offset."""
+    """A linear frequency sweep of every actuator.
 
-    frame: Frame
+    Its parameters are amplitude, first frequency, last frequency, phase and offset of every actuator.
+
+    Attributes:
+        settings: Settings of all excitations.
+    """
+
+    settings: ExcitationSettings
 
     @property
-    def numbers(self) -> int:
-        """Five of each actuator."""
-        return 5 * self.frame.nu
+    def parameter_count(self) -> int:
+        """Number of parameters: five of each actuator."""
+        return 5 * self.settings.nu
 
-    def wave(self, z: Array) -> Array:
-        """(N, nu)."""
-        f = self.frame
-        size, first, last, phase, offset = z.reshape(5, f.nu)
-        ends = zip(
-            f.pitch(first).tolist(), f.pitch(last).tolist(), (360.0 * phase).tolist(), strict=True
-        )
-        sweeps = np.stack([chirp(f.t, a, f.horizon, b, phi=p) for a, b, p in ends], axis=1)
-        return np.asarray(amplitudes(size) * (sweeps + (offset - 0.5)))
+    def curve(self, z: Array) -> Array:
+        """(N, nu) sweeps, from z: (5 nu,)."""
+        settings = self.settings
+        amplitude, first, last, phase, offset = z.reshape(5, settings.nu)
+
+        first_frequency = settings.frequency(first).tolist()
+        last_frequency = settings.frequency(last).tolist()
+        degrees = (360.0 * phase).tolist()
+        sweeps = [
+            chirp(settings.t, f0, settings.horizon, f1, phi=phi)
+            for f0, f1, phi in zip(first_frequency, last_frequency, degrees, strict=True)
+        ]
+
+        centred = np.stack(sweeps, axis=1) + (offset - 0.5)
+        return np.asarray(relative_amplitudes(amplitude) * centred)
 
 
-def schroeder(power: Array) -> Array:
-    """(K,) phases of harmonics with powers (K,) that sum up to a signal of low peak (Schroeder 1970)."""
+def schroeder_phases(power: Array) -> Array:
+    """Phases with which harmonics add up to a signal of low peak (Schroeder 1970).
+
+    Args:
+        power: (K,) power of every harmonic.
+
+    Returns:
+        (K,) phases [rad].
+    """
     share = power / power.sum()
     return np.asarray(-2.0 * np.pi * np.concatenate([[0.0], np.cumsum(np.cumsum(share))[:-1]]))
 
 
 @dataclass(frozen=True)
 class Multisine:
-    """Harmonics with Schroeder phases: base frequency, their number, how they fall; amplitude and delay of each actuator."""
+    """Harmonics with Schroeder phases.
 
-    frame: Frame
+    Its parameters are the base frequency, the number of harmonics and their roll-off; then amplitude and delay of every actuator.
+
+    Attributes:
+        settings: Settings of all excitations.
+    """
+
+    settings: ExcitationSettings
 
     @property
-    def numbers(self) -> int:
-        """Three in common and two of each actuator."""
-        return 3 + 2 * self.frame.nu
+    def parameter_count(self) -> int:
+        """Number of parameters: three in common and two of each actuator."""
+        return 3 + 2 * self.settings.nu
 
-    def wave(self, z: Array) -> Array:
-        """(N, nu)."""
-        f = self.frame
-        base = (
-            f.slowest * (0.5 * f.fastest / f.slowest) ** z[0]
-            if f.fastest > 2.0 * f.slowest
-            else f.slowest
-        )
-        most = min(HARMONICS, max(int(f.fastest / base), 1))
-        order = np.arange(1, 1 + max(round(most * float(z[1])), min(2, most)))
-        power = order ** (-2.0 * STEEPEST * z[2])
-        size, delay = z[3:].reshape(2, f.nu)
-        angle = 2.0 * np.pi * base * order * (f.t[:, None, None] - (delay / base)[:, None])
-        wave = (np.sqrt(power) * np.cos(angle + schroeder(power))).sum(axis=2)
-        return np.asarray(amplitudes(size) * wave / np.abs(wave).max(axis=0))
+    def curve(self, z: Array) -> Array:
+        """(N, nu) multisines, from z: (3 + 2 nu,)."""
+        settings = self.settings
+        base = self._base_frequency(float(z[0]))
+        amplitude, delay = z[3:].reshape(2, settings.nu)
+
+        most = min(MAX_HARMONICS, max(int(settings.max_frequency / base), 1))
+        count = max(round(most * float(z[1])), min(2, most))
+        order = np.arange(1, 1 + count)
+        power = order ** (-2.0 * MAX_ROLL_OFF * z[2])
+
+        delayed = settings.t[:, None, None] - (delay / base)[:, None]
+        angle = 2.0 * np.pi * base * order * delayed
+        waves = np.sqrt(power) * np.cos(angle + schroeder_phases(power))
+        curve = waves.sum(axis=2)
+        return np.asarray(relative_amplitudes(amplitude) * curve / np.abs(curve).max(axis=0))
+
+    def _base_frequency(self, z: float) -> float:
+        """Base frequency [Hz] that leaves room for at least two harmonics, where the range of frequencies allows it."""
+        lowest = self.settings.min_frequency
+        highest = self.settings.max_frequency
+        if highest <= 2.0 * lowest:
+            return lowest
+
+        return float(lowest * (0.5 * highest / lowest) ** z)
 
 
 @dataclass(frozen=True)
-class Steps:
-    """Random levels, each held for a while: how long, how much of it is a smooth passage (none where jumps are allowed)."""
+class RandomSteps:
+    """Random levels, each of which is held for a while.
 
-    frame: Frame
+    Its parameters are how long a level is held and which share of that time is a smooth transition to the next one (none where
+    jumps are allowed); then the levels of every actuator.
+
+    Attributes:
+        settings: Settings of all excitations.
+    """
+
+    settings: ExcitationSettings
 
     @property
-    def numbers(self) -> int:
-        """Two in common and the levels of each actuator."""
-        return 2 + LEVELS * self.frame.nu
+    def parameter_count(self) -> int:
+        """Number of parameters: two in common and the levels of each actuator."""
+        return 2 + MAX_LEVELS * self.settings.nu
 
-    def wave(self, z: Array) -> Array:
-        """(N, nu)."""
-        f = self.frame
-        held = f.horizon / (3.0 * (LEVELS / 3.0) ** z[0])
-        place = np.minimum((f.t / held).astype(int), LEVELS - 1)
-        levels = np.concatenate([np.zeros((1, f.nu)), 2.0 * z[2:].reshape(LEVELS, f.nu) - 1.0])
-        share = (f.t / held - place) / max(float(z[1]), 1e-9)
-        passed = np.where(f.jumps, 1.0, 0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0)))[
-            :, None
-        ]
-        return np.asarray((1.0 - passed) * levels[place] + passed * levels[place + 1])
+    def curve(self, z: Array) -> Array:
+        """(N, nu) steps, from z: (2 + MAX_LEVELS nu,)."""
+        settings = self.settings
+        held = settings.horizon / (3.0 * (MAX_LEVELS / 3.0) ** z[0])
+        index = np.minimum((settings.t / held).astype(int), MAX_LEVELS - 1)
+
+        levels = 2.0 * z[2:].reshape(MAX_LEVELS, settings.nu) - 1.0
+        levels = np.concatenate([np.zeros((1, settings.nu)), levels])
+
+        # Share of the way from the previous level to the present one.
+        duration = max(float(z[1]), SHORTEST_TRANSITION)
+        progress = (settings.t / held - index) / duration
+        smooth = 0.5 - 0.5 * np.cos(np.pi * np.clip(progress, 0.0, 1.0))
+        share = np.where(settings.may_jump, 1.0, smooth)[:, None]
+        return np.asarray((1.0 - share) * levels[index] + share * levels[index + 1])
 
 
 def multisine(
     t: Array, nu: int, frequency: float, harmonics: int, rng: np.random.Generator
 ) -> Array:
-    """(N, nu) sums of harmonics of a base frequency [Hz] with random phases and weights, peak 1."""
+    """Sums of harmonics with random phases and weights, each with a peak of 1.
+
+    Args:
+        t: (N,) times [s].
+        nu: Number of actuators.
+        frequency: Base frequency [Hz].
+        harmonics: Number of multiples of the base frequency.
+        rng: Source of the phases and weights.
+
+    Returns:
+        (N, nu) curves.
+    """
     order = np.arange(1, harmonics + 1)
     phases = rng.uniform(0.0, 2 * np.pi, (nu, harmonics))
     weights = rng.uniform(0.2, 1.0, (nu, harmonics))
+
     waves = np.sin(2 * np.pi * frequency * t[:, None, None] * order + phases) * weights
     total = waves.sum(axis=2)
     return np.asarray(total / np.abs(total).max(axis=0))

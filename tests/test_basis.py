@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from mjfim.signals import fourier_basis, independent, spline_basis
+from mjfim.signals import fourier_basis, independent_curves, spline_basis
 
 HORIZON = 2.0
 BANDWIDTH = 4.0
@@ -148,7 +148,7 @@ def test_a_fourier_series_keeps_as_many_dimensions_as_it_has_waves(
     values = np.linalg.svd(basis, compute_uv=False)
     assert len(values) == 2 * HARMONICS
     assert values[-1] > 1e-4 * values[0]
-    assert independent(basis) is basis
+    assert independent_curves(basis) is basis
 
 
 @pytest.mark.parametrize("name", ["slow waves", "splines finer than samples"])
@@ -158,7 +158,7 @@ def test_curves_that_are_hardly_independent_are_replaced_by_fewer_that_are(name:
     if name != "slow waves":
         curves = spline_basis(T[::50], HORIZON, 15.0, False, False, False)
     N, M = curves.shape
-    fewer = independent(curves)
+    fewer = independent_curves(curves)
     assert 0.3 * M < fewer.shape[1] < M and fewer.shape[1] <= N
     assert np.linalg.cond(fewer) < 1.0 + 1e-9
     assert np.linalg.norm(fewer[:, 0]) == pytest.approx(np.sqrt(0.5 * N))

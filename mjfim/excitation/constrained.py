@@ -21,7 +21,7 @@ from mjfim.experiment.system import Setup
 from mjfim.model.variants import FREE, Level
 from mjfim.parallel import stopped
 from mjfim.records.design import HistoryRow, Status
-from mjfim.signals import independent
+from mjfim.signals import independent_curves
 
 POWER = (
     40.0  # of the smooth E-criterion: several of the smallest eigenvalues meet under hard limits
@@ -76,7 +76,7 @@ def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[His
     begun = setup.plant.engine_steps
     exact, smooth = Stage(setup, task.combinations).problem, smoothed(setup, task.combinations)
     fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
-    basis = None if fine is None else independent(setup.averaged(fine))
+    basis = None if fine is None else independent_curves(setup.averaged(fine))
     regulate = replace(regulator_for(setup), feedback_threshold=CALM if basis is None else np.inf)
     fence = fence_of(setup).tightened(task.held)
     ladder = Ladder(smooth, fence, setup.centre, basis, regulate, task.rungs)

@@ -22,7 +22,7 @@ from mjfim.excitation.unconstrained import AUTO, COARSEST
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.experiment.system_tables import Signal
-from mjfim.optimize.bracketing import Grid, bracket
+from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
 from mjfim.recordings.formats.read import read_table
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
@@ -148,21 +148,24 @@ class _Hunt:
         self.wanted = wanted_of(self.base)
         self.grid = _grid(self.base)
         self.longest = _longest(self.base) if longest is None else longest
-        if self.longest * experiment.rate < self.grid.least:
+        if self.longest * experiment.rate < self.grid.minimum:
             raise ExperimentError(
-                f"shortest: longest {self.longest:g} s is less than {self.grid.least} samples"
+                f"shortest: longest {self.longest:g} s is less than {self.grid.minimum} samples"
             )
         self.tried: dict[int, Tried] = {}
         self.designs: dict[int, Design] = {}
+        self.stopped = False
 
     def run(self) -> Shortest:
         """Bracket, then narrow."""
-        most = self.grid.down(self.longest * self.experiment.rate)
-        first = min(self.grid.up(self.base.samples), most)
-        found, below = bracket(self.ratio, first, most, self.grid, self.slack)
+        most = self.grid.round_down(self.longest * self.experiment.rate)
+        first = min(self.grid.round_up(self.base.samples), most)
+        found, below = smallest_feasible(self.ratio, first, most, self.grid, self.slack)
+        if found is None and self.stopped:
+            raise KeyboardInterrupt
         if found is None:
             self._fail(most)
-        least = found <= self.grid.least
+        least = found <= self.grid.minimum
         closed = least or (below is not None and found - below <= self.slack(found))
         own, tolerance = self.at(found), self.slack(found) / self.experiment.rate
         return Shortest(own, self.designs[found], tuple(self.tried.values()), tolerance, closed)
@@ -172,7 +175,7 @@ class _Hunt:
         wide = (
             TOLERANCE * samples if self.tolerance is None else self.tolerance * self.experiment.rate
         )
-        return max(int(wide + 1e-9), samples - self.grid.down(samples - 1))
+        return max(int(wide + 1e-9), samples - self.grid.round_down(samples - 1))
 
     def at(self, samples: int) -> Experiment:
         """The experiment with so many samples."""
@@ -181,23 +184,29 @@ class _Hunt:
             horizon=samples / self.experiment.rate, descent={"repeats": dividing}
         )
 
-    def ratio(self, samples: int) -> float:
-        """Of the worst σ to the wanted one, of the design of so many samples. Raises KeyboardInterrupt where that was one."""
-        self.tried[samples] = tried = self._try(samples)
+    def ratio(self, samples: int) -> float | None:
+        """Largest ratio of a predicted σ to the wanted one with a number of samples; None where its design was interrupted."""
+        tried = self._try(samples)
+        if tried is None:
+            self.stopped = True
+            return None
+        self.tried[samples] = tried
         if self.report is not None:
             self.report(tried)
         return tried.ratio
 
-    def _try(self, samples: int) -> Tried:
+    def _try(self, samples: int) -> Tried | None:
         """The better of a design from the nearest one so far and, where that is not good enough, from the initial control."""
         near = min(self.designs, key=lambda n: abs(np.log(n / samples)), default=None)
         tried = self._design(samples, near)
-        if near is not None and not tried.reached:
+        if near is not None and tried is not None and not tried.reached:
             again = self._design(samples, None)
+            if again is None:
+                return None
             tried = again if again.ratio <= tried.ratio else tried
         return tried
 
-    def _design(self, samples: int, near: int | None) -> Tried:
+    def _design(self, samples: int, near: int | None) -> Tried | None:
         """One design of so many samples, its control begun from another one's; kept where it is the best of them."""
         horizon = samples / self.experiment.rate
         try:
@@ -205,7 +214,7 @@ class _Hunt:
             begin = None if near is None else fitted(setup, self.designs[near].trajectory.ctrl)
             found = design(setup, self.monitor, begin, executor=self.executor)
             if found.status is Status.INTERRUPTED:
-                raise KeyboardInterrupt
+                return None
             require_reachable(setup, found, self.wanted)
         except MjfimError as error:
             if not self.tried:
@@ -256,14 +265,14 @@ def fitted(setup: Setup, control: Array) -> Array:
     return np.stack([np.interp(wanted, middle, column) for column in control.T], axis=1)
 
 
-def _grid(setup: Setup) -> Grid:
+def _grid(setup: Setup) -> SampleGrid:
     """What coarse levels need: samples that they divide, where they are used."""
     d = setup.experiment.descent
     if d.method != "lbfgs":
-        return Grid(1, 0)
+        return SampleGrid(unit=1, first_multiple=0)
     if d.coarse == "auto":
-        return Grid(AUTO, COARSEST * AUTO)
-    return Grid(d.coarse, 0, max(d.coarse, 2))
+        return SampleGrid(unit=AUTO, first_multiple=COARSEST * AUTO)
+    return SampleGrid(unit=d.coarse, first_multiple=0, minimum=max(d.coarse, 2))
 
 
 def _longest(setup: Setup) -> float:

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mjfim.arrays import Array, thinned
+from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
@@ -63,7 +63,9 @@ def predicted(
 def _folds(fit: Fit, at: UnknownValues, nominal: Array, budget: Budget) -> Iterator[Prediction]:
     """What the rest says of each part; of much data, pieces all over it."""
     if fit.samples > MANY and len(fit.pieces) > 1:
-        places = thinned(len(fit.pieces), max(MANY * len(fit.pieces) // fit.samples, 2))
+        places = evenly_spread_indices(
+            len(fit.pieces), max(MANY * len(fit.pieces) // fit.samples, 2)
+        )
         fit, at = fit.part(places), replace(at, private=at.private[places])
     for names, masks in _parts(fit):
         rest = fit.masked([~mask for mask in masks])

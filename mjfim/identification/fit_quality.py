@@ -64,7 +64,7 @@ def left(fit: Fit, solution: Solution) -> Left:
     tracks = fit.tracks
     return Left(
         tuple(values),
-        float(np.nansum(inside**2)) / fit.loss.inliers,
+        float(np.nansum(inside**2)) / fit.loss.inlier_mean_square,
         max(int(np.isfinite(inside).sum()) - solution.condensed.rank, 1),
         rms,
         tuple(whiteness(name, [z[:, j] for z in whitened]) for j, name in enumerate(names)),
@@ -86,4 +86,4 @@ def _whitened(fit: Fit, values: Sequence[Array]) -> list[Array]:
 def _inside(fit: Fit, whitened: Sequence[Array]) -> Array:
     """All whitened residuals; with a robust loss without outliers."""
     every = np.concatenate([z.ravel() for z in whitened])
-    return np.where(np.abs(every) <= fit.loss.outlier, every, np.nan)
+    return np.where(np.abs(every) <= fit.loss.outlier_threshold, every, np.nan)

@@ -16,7 +16,7 @@ from typing import Literal, TypeVar, get_args
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from mjfim.arrays import Array, thinned
+from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget, stop_on_interrupt
 from mjfim.errors import ExperimentError, SimulationDiverged, unknown
 from mjfim.experiment.schema import Experiment
@@ -172,7 +172,9 @@ class _Identification:
         """Pieces all over the data that are quick to look at; all of them where that is quick."""
         fit, count = self.fit, len(self.fit.pieces)
         quick = fit.samples <= SAMPLE or count == 1
-        return thinned(count, count if quick else max(int(SAMPLE * count / fit.samples), 1))
+        return evenly_spread_indices(
+            count, count if quick else max(int(SAMPLE * count / fit.samples), 1)
+        )
 
     def _sampled(self, at: UnknownValues) -> UnknownValues:
         return replace(at, private=at.private[self._places])

@@ -22,7 +22,7 @@ from mjfim.identification.unknowns import Layout
 from mjfim.information.null_space import COARSER, Null
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
-from mjfim.optimize.robust_losses import Loss
+from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.noise import Noise
 from mjfim.plant.plant import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
@@ -73,7 +73,7 @@ class Fit:
             raise RecordingError("identify needs at least one recording")
         self.setup, self.data_only = setup, data_only
         p, fit = setup.parameters, setup.experiment.fit
-        self.loss = Loss(fit.loss, fit.loss_scale)
+        self.loss = RobustLoss(kind=fit.loss, scale=fit.loss_scale)
         self.noise: Noise = setup.noise
         self.recordings = list(recordings)
         self.tracks = [track_of(setup, r) for r in recordings]

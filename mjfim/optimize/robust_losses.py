@@ -1,4 +1,4 @@
-"""Losses of whitened residuals, by the names and formulas of `scipy.optimize.least_squares`."""
+"""Robust losses of whitened residuals, with the names and formulas of `scipy.optimize.least_squares`."""
 
 from __future__ import annotations
 
@@ -10,50 +10,78 @@ from scipy.stats import norm
 
 from mjfim.arrays import Array
 
-RARE = 3.0  # standard deviations
+# Smallest threshold [standard deviations] beyond which a residual counts as an outlier; normal noise hardly ever exceeds it.
+MIN_OUTLIER_THRESHOLD = 3.0
+
+# Smallest squared residual in a weight; protects a negative power of zero.
+SMALLEST_SQUARE = 1e-300
 
 
-@dataclass(frozen=True)
-class Loss:
-    """`scale^2 rho((r / scale)^2)`; scale: standard deviations at which it leaves the square."""
+@dataclass(frozen=True, kw_only=True)
+class RobustLoss:
+    """Loss `scale^2 rho((r / scale)^2)` of a whitened residual r.
+
+    Attributes:
+        kind: Function rho: linear is ordinary least squares; huber, soft_l1 and cauchy grow more slowly.
+        scale: Residual [standard deviations] at which the loss departs from the square.
+    """
 
     kind: Literal["linear", "huber", "soft_l1", "cauchy"] = "linear"
     scale: float = 3.0
 
     @property
-    def outlier(self) -> float:
-        """Standard deviations beyond which a residual says nothing of the noise: normal noise is hardly ever there."""
-        return np.inf if self.kind == "linear" else max(self.scale, RARE)
+    def outlier_threshold(self) -> float:
+        """Residual [standard deviations] beyond which it says nothing about the noise; infinite without a robust loss."""
+        return np.inf if self.kind == "linear" else max(self.scale, MIN_OUTLIER_THRESHOLD)
 
     @property
-    def inliers(self) -> float:
-        """Mean square of standard normal residuals that are no outliers."""
+    def inlier_mean_square(self) -> float:
+        """Mean square of standard normal residuals that are not outliers."""
         if self.kind == "linear":
             return 1.0
-        return float(
-            1.0 - 2.0 * self.outlier * norm.pdf(self.outlier) / (1.0 - 2.0 * norm.sf(self.outlier))
-        )
+
+        # Variance of the normal distribution truncated at both sides.
+        limit = self.outlier_threshold
+        inside = 1.0 - 2.0 * norm.sf(limit)
+        return float(1.0 - 2.0 * limit * norm.pdf(limit) / inside)
 
     def value(self, r: Array) -> float:
-        """Sum over residuals of any shape."""
-        z = (r / self.scale) ** 2
+        """Sum of the loss over residuals.
+
+        Args:
+            r: (...) whitened residuals.
+
+        Returns:
+            The sum.
+        """
         if self.kind == "linear":
             return float(np.sum(r**2))
+
+        z = (r / self.scale) ** 2
         if self.kind == "huber":
             rho = np.where(z <= 1.0, z, 2.0 * np.sqrt(z) - 1.0)
         elif self.kind == "soft_l1":
             rho = 2.0 * (np.sqrt(1.0 + z) - 1.0)
         else:
             rho = np.log1p(z)
+
         return float(self.scale**2 * rho.sum())
 
     def weight(self, r: Array) -> Array:
-        """Root of the derivative of rho: what each row is multiplied with (iterated reweighting)."""
+        """Weights of the rows in iteratively reweighted least squares: square root of the derivative of rho.
+
+        Args:
+            r: (...) whitened residuals.
+
+        Returns:
+            (...) weights between 0 and 1.
+        """
         z = (r / self.scale) ** 2
         if self.kind == "huber":
-            return np.asarray(np.minimum(1.0, np.maximum(z, 1e-300) ** -0.25))
+            return np.asarray(np.minimum(1.0, np.maximum(z, SMALLEST_SQUARE) ** -0.25))
         if self.kind == "soft_l1":
             return np.asarray((1.0 + z) ** -0.25)
         if self.kind == "cauchy":
             return np.asarray((1.0 + z) ** -0.5)
+
         return np.ones_like(r)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from mjfim.errors import ExperimentError, SimulationDiverged
 from mjfim.excitation.shortest_horizon import OutOfReachError, Tried, fitted
 from mjfim.excitation.target_accuracy import furthest, wanted_of
 from mjfim.experiment.system import Setup
-from mjfim.optimize.bracketing import Grid, bracket
 from mjfim.records.design import HistoryRow
 from tests.support.paths import MODELS
 
@@ -40,51 +38,6 @@ def worst(experiment: mjfim.Experiment) -> float:
     """Of a design's predicted σ over the wanted ones."""
     setup = Setup(experiment)
     return furthest(mjfim.design(setup).final.std, wanted_of(setup))[0]
-
-
-LAWS: dict[str, Callable[[int], float]] = {
-    "square root": lambda n: (173 / n) ** 0.5,
-    "steep": lambda n: (173 / n) ** 4,
-    "knee": lambda n: max((173 / n) ** 0.5, (150 / n) ** 6),
-    "nothing when short": lambda n: np.inf if n < 173 else 0.4,
-    "step": lambda n: 1.3 if n < 173 else 0.99,
-    "hardly falling": lambda n: 1.0 + 1e-3 * (173 - n) / 173,
-}
-
-
-@pytest.mark.parametrize("first", [60, 172, 173, 174, 500])
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("grid", [Grid(1, 0), Grid(4, 0, 4), Grid(4, 120)])
-def test_the_search_ends_at_the_smallest_that_is_enough(first: int, law: str, grid: Grid) -> None:
-    asked: list[int] = []
-
-    def ratio(n: int) -> float:
-        asked.append(n)
-        return LAWS[law](n)
-
-    def slack(n: int) -> int:
-        return max(n // 50, n - grid.down(n - 1))
-
-    high, low = bracket(ratio, grid.up(first), grid.down(700), grid, slack)
-    assert high is not None and low is not None
-    assert LAWS[law](high) <= 1.0 < LAWS[law](low)
-    assert 0 < high - low <= slack(high)
-    assert len(asked) == len(set(asked)) <= 20
-    assert all(grid.up(n) == n for n in asked)
-    if law == "square root":
-        assert len(asked) <= 5, "the secant does not help"
-
-
-def test_the_search_ends_at_either_end_of_what_is_allowed() -> None:
-    grid = Grid(1, 0, 3)
-    assert bracket(lambda n: 0.5, 40, 100, grid, lambda n: 1) == (3, None)
-    assert bracket(lambda n: 2.0, 40, 100, grid, lambda n: 1) == (None, 100)
-
-
-def test_grid_keeps_what_a_coarse_level_divides() -> None:
-    grid = Grid(4, 200)
-    assert [grid.down(n) for n in (1, 7.5, 199, 200, 203, 204)] == [2, 7, 199, 200, 200, 204]
-    assert [grid.up(n) for n in (1, 7.5, 199, 200, 201)] == [2, 8, 199, 200, 204]
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mjfim.optimize.robust_losses import Loss
+from mjfim.optimize.robust_losses import RobustLoss
 from tests.support.numerics import Array, richardson
 
 Kind = Literal["linear", "huber", "soft_l1", "cauchy"]
@@ -29,7 +29,7 @@ def residuals(x: Array, y: Array) -> Array:
     return np.asarray(x[0] + x[1] * T - y)
 
 
-def reweighted(loss: Loss, y: Array) -> Array:
+def reweighted(loss: RobustLoss, y: Array) -> Array:
     """The line by rows multiplied with their weights, again and again."""
     A, x = np.column_stack([np.ones_like(T), T]), np.zeros(2)
     for _ in range(2000):
@@ -42,7 +42,7 @@ def reweighted(loss: Loss, y: Array) -> Array:
 @pytest.mark.parametrize("scale", [0.7, 3.0])
 def test_the_optimum_is_that_of_scipy(kind: Kind, scale: float) -> None:
     """And so is the value there."""
-    loss, y = Loss(kind, scale), points(0)
+    loss, y = RobustLoss(kind=kind, scale=scale), points(0)
     x = reweighted(loss, y)
     wanted = least_squares(
         residuals, x, args=(y,), loss=kind, f_scale=scale, xtol=1e-15, ftol=1e-15, gtol=1e-13
@@ -57,7 +57,7 @@ def test_the_optimum_is_that_of_scipy(kind: Kind, scale: float) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_weight_follows_from_the_value(kind: Kind) -> None:
     """Half of the slope of the value is the squared weight times the residual, below and above the scale."""
-    loss = Loss(kind, 2.0)
+    loss = RobustLoss(kind=kind, scale=2.0)
     for r in (-40.0, -2.5, -1.0, -1e-3, 0.3, 1.9, 2.1, 7.0, 1e3):
         slope = 0.5 * richardson(
             lambda h, r=r: loss.value(np.array([r + h])), 1e-3 * max(abs(r), 0.1)
@@ -72,11 +72,11 @@ def test_outliers_count_less_and_less_and_small_residuals_fully() -> None:
     """All losses agree with squares near zero; far away they are in the order of scipy's table."""
     small, large = np.full(5, 1e-4), np.full(5, 1e3)
     for kind in KINDS:
-        assert Loss(kind).value(small) == pytest.approx(5e-8, rel=1e-6)
-    values = [Loss(kind).value(large) for kind in KINDS]
+        assert RobustLoss(kind=kind).value(small) == pytest.approx(5e-8, rel=1e-6)
+    values = [RobustLoss(kind=kind).value(large) for kind in KINDS]
     assert values == sorted(values, reverse=True)
     assert values[1] == pytest.approx(5 * 9 * (2 * 1e3 / 3 - 1), rel=1e-12)
-    huber = Loss("huber", 3.0)
+    huber = RobustLoss(kind="huber", scale=3.0)
     np.testing.assert_array_equal(huber.weight(np.array([-3.0, 0.0, 2.9, 3.0])), 1.0)
     assert huber.weight(np.array([3.3]))[0] < 1.0
 
@@ -86,17 +86,19 @@ def test_the_mean_square_of_what_is_no_outlier(scale: float) -> None:
     """Of a million normal numbers; a linear loss knows no outliers."""
     r = np.random.default_rng(2).standard_normal(1_000_000)
     for kind in KINDS:
-        loss = Loss(kind, scale)
-        assert loss.outlier == (np.inf if kind == "linear" else max(scale, 3.0))
-        assert loss.inliers == pytest.approx(
-            float(np.mean(r[np.abs(r) <= loss.outlier] ** 2)), rel=5e-3
+        loss = RobustLoss(kind=kind, scale=scale)
+        assert loss.outlier_threshold == (np.inf if kind == "linear" else max(scale, 3.0))
+        assert loss.inlier_mean_square == pytest.approx(
+            float(np.mean(r[np.abs(r) <= loss.outlier_threshold] ** 2)), rel=5e-3
         )
 
 
 def test_outliers_hardly_move_a_robust_line() -> None:
     """Against many draws: squares are pulled away, the robust ones stay within a few deviations."""
     found = {
-        kind: np.array([reweighted_few(Loss(kind, 1.5), points(seed)) for seed in range(30)])
+        kind: np.array(
+            [reweighted_few(RobustLoss(kind=kind, scale=1.5), points(seed)) for seed in range(30)]
+        )
         for kind in KINDS
     }
     off = {kind: abs(float(x[:, 0].mean()) - 2.0) for kind, x in found.items()}
@@ -106,7 +108,7 @@ def test_outliers_hardly_move_a_robust_line() -> None:
     assert off["cauchy"] < 0.1 * off["linear"]
 
 
-def reweighted_few(loss: Loss, y: Array) -> Array:
+def reweighted_few(loss: RobustLoss, y: Array) -> Array:
     """As `reweighted`, to a coarse tolerance."""
     A, x = np.column_stack([np.ones_like(T), T]), np.zeros(2)
     for _ in range(40):

@@ -14,7 +14,14 @@ from mjfim.arrays import Array
 from mjfim.excitation.interior_point import InteriorProblem
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
-from mjfim.signals import Chirp, Frame, Multisine, Steps, fourier_basis, schroeder
+from mjfim.signals import (
+    Chirp,
+    ExcitationSettings,
+    Multisine,
+    RandomSteps,
+    fourier_basis,
+    schroeder_phases,
+)
 from mjfim.studies.baselines.budget import Arena, Attempt, Job, Spent
 from mjfim.studies.baselines.methods import METHODS, Shaper, perform, reflected, search
 from mjfim.studies.baselines.parametric import (
@@ -30,7 +37,9 @@ from tests.support.baselines import pendulum, played
 from tests.support.paths import MODELS
 
 STEPS = 120_000
-FRAME = Frame(np.arange(500) * 0.01, 5.0, 2, 0.1, 5.0, jumps=True)
+FRAME = ExcitationSettings(
+    t=np.arange(500) * 0.01, horizon=5.0, nu=2, min_frequency=0.1, max_frequency=5.0, may_jump=True
+)
 
 
 def arm(**limits: Any) -> Experiment:
@@ -60,7 +69,7 @@ def crest(wave: Array) -> float:
 def test_schroeder_phases_lower_the_peak(count: int) -> None:
     order, t = np.arange(1, count + 1), np.arange(2000) / 2000
     for power in (np.ones(count), order**-1.0):
-        phases = schroeder(power)
+        phases = schroeder_phases(power)
         low, high = (
             crest((np.sqrt(power) * np.cos(2 * np.pi * np.outer(t, order) + p)).sum(axis=1))
             for p in (phases, 0.0)
@@ -72,34 +81,42 @@ def test_schroeder_phases_lower_the_peak(count: int) -> None:
 def test_schroeder_phases_of_equal_powers_are_the_known_ones() -> None:
     k = np.arange(1, 9)
     np.testing.assert_allclose(
-        np.exp(1j * schroeder(np.ones(8))), np.exp(-1j * np.pi * k * (k - 1) / 8), atol=1e-12
+        np.exp(1j * schroeder_phases(np.ones(8))), np.exp(-1j * np.pi * k * (k - 1) / 8), atol=1e-12
     )
 
 
-@pytest.mark.parametrize("kind", [Chirp, Multisine, Steps])
+@pytest.mark.parametrize("kind", [Chirp, Multisine, RandomSteps])
 def test_waves_are_of_size_one_whatever_the_numbers(kind: Any) -> None:
     rng, made = np.random.default_rng(0), kind(FRAME)
-    for z in (np.zeros(made.numbers), np.ones(made.numbers), *rng.random((20, made.numbers))):
-        wave = made.wave(z)
+    for z in (
+        np.zeros(made.parameter_count),
+        np.ones(made.parameter_count),
+        *rng.random((20, made.parameter_count)),
+    ):
+        wave = made.curve(z)
         assert wave.shape == (500, 2)
         assert np.isfinite(wave).all()
         assert np.abs(wave).max() <= 1.5 + 1e-9
-        np.testing.assert_array_equal(wave, made.wave(z))
+        np.testing.assert_array_equal(wave, made.curve(z))
 
 
 def test_chirps_stay_within_their_band() -> None:
     z = np.repeat([1.0, 0.3, 0.8, 0.25, 0.5], 2)
-    wave = Chirp(FRAME).wave(z)[:, 0]
+    wave = Chirp(FRAME).curve(z)[:, 0]
     crossings = np.flatnonzero(np.diff(np.sign(wave)))
-    assert 0.5 / 0.01 / np.diff(crossings).max() >= 0.9 * FRAME.pitch(np.array([0.3]))[0]
-    assert 0.5 / 0.01 / np.diff(crossings).min() <= 1.3 * FRAME.pitch(np.array([0.8]))[0]
+    assert 0.5 / 0.01 / np.diff(crossings).max() >= 0.9 * FRAME.frequency(np.array([0.3]))[0]
+    assert 0.5 / 0.01 / np.diff(crossings).min() <= 1.3 * FRAME.frequency(np.array([0.8]))[0]
 
 
 def test_steps_are_held_or_pass_smoothly() -> None:
-    z = np.random.default_rng(3).random(Steps(FRAME).numbers)
+    z = np.random.default_rng(3).random(RandomSteps(FRAME).parameter_count)
     z[:2] = 0.5, 1.0
-    held = Steps(FRAME).wave(z)
-    smooth = Steps(Frame(FRAME.t, 5.0, 2, 0.1, 5.0, jumps=False)).wave(z)
+    held = RandomSteps(FRAME).curve(z)
+    smooth = RandomSteps(
+        ExcitationSettings(
+            t=FRAME.t, horizon=5.0, nu=2, min_frequency=0.1, max_frequency=5.0, may_jump=False
+        )
+    ).curve(z)
     assert np.mean(np.abs(np.diff(held, axis=0)) > 0.0) < 0.05
     assert np.abs(np.diff(held, axis=0)).max() > 10.0 * np.abs(np.diff(smooth, axis=0)).max()
     assert np.abs(smooth[0]).max() < 1e-3  # it begins at rest
@@ -271,6 +288,6 @@ def test_the_best_of_a_search_only_gets_better() -> None:
         Job(pendulum(), "steps", 60.0, 60_000), lambda used, attempt: costs.append(attempt.cost)
     )
     with pytest.raises(Spent):
-        search(arena, Steps)
+        search(arena, RandomSteps)
     assert len(costs) > 3
     assert all(b <= a for a, b in pairwise(costs))

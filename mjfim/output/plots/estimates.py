@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from mjfim.arrays import Array, thinned
+from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.errors import MjfimError
 from mjfim.model.coordinates import split_unit
 from mjfim.output.labels import Labels
@@ -182,7 +182,7 @@ def shown_outputs(residual: Array, sigma: Array) -> NDArray[np.intp]:
 
 def draw_fit(axes: Axes, recording: Recording, predicted: Array, column: int) -> None:
     """Measured dots and predicted line of one output."""
-    rows = thinned(len(recording.t), MAX_ROWS)
+    rows = evenly_spread_indices(len(recording.t), MAX_ROWS)
     size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
     axes.plot(recording.t[rows], recording.y[rows, column], ".", color=MEASURED, markersize=size)
     axes.plot(recording.t[rows], predicted[rows, column], color=INK, linewidth=1.2)
@@ -193,7 +193,7 @@ def draw_residual(axes: Axes, t: Array, residual: Array, sigma: float) -> None:
     known = residual[np.isfinite(residual)]
     axes.axhspan(-2.0 * sigma, 2.0 * sigma, color=FAINT, alpha=0.8, linewidth=0)
     axes.axhline(0.0, color=INK, linewidth=0.8)
-    rows = thinned(len(t), MAX_ROWS)
+    rows = evenly_spread_indices(len(t), MAX_ROWS)
     size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
     axes.plot(t[rows], residual[rows], ".", color=MEASURED, markersize=size)
     if not known.size:

@@ -13,7 +13,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from mjfim.arrays import thinned
+from mjfim.arrays import evenly_spread_indices
 from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError, RecordingError
 from mjfim.model.coordinates import output_label
@@ -160,7 +160,7 @@ def log_estimate(
         for k, (recording, y) in enumerate(
             zip(estimate.recordings, estimate.predicted, strict=True)
         ):
-            rows = thinned(len(recording.t), MOST)
+            rows = evenly_spread_indices(len(recording.t), MOST)
             t = recording.t[rows]
             for column, output in enumerate(recording.outputs):
                 root = (f"recording {k + 1}", output_label(model, output))
@@ -211,7 +211,7 @@ def show(path: Path) -> None:
 
 def _thin(trajectory: Trajectory) -> Trajectory:
     """At most so many rows, evenly spread."""
-    rows = thinned(len(trajectory.t), MOST)
+    rows = evenly_spread_indices(len(trajectory.t), MOST)
     ctrl = trajectory.ctrl[rows[:-1]]
     return Trajectory(
         t=trajectory.t[rows],

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from mjfim.arrays import Array
 from mjfim.excitation.constraints import basis_of
 from mjfim.excitation.initial_controls import swell
-from mjfim.signals import Chirp, Excitation, Frame, Multisine, Steps
+from mjfim.signals import Chirp, Excitation, ExcitationSettings, Multisine, RandomSteps
 from mjfim.studies.baselines.budget import Arena, Attempt, Job, Monitor, Spent
 from mjfim.studies.baselines.parametric import (
     BASES,
@@ -57,7 +57,7 @@ def perform(job: Job, monitor: Monitor | None = None) -> Attempt:
         return arena.finished()
 
 
-def search(arena: Arena, kind: Callable[[Frame], Excitation]) -> None:
+def search(arena: Arena, kind: Callable[[ExcitationSettings], Excitation]) -> None:
     """Random search over the numbers of an excitation, about the best or anywhere, until the budget is used up."""
     shaper = Shaper(arena)
     excitation, rng = kind(shaper.frame), arena.rng
@@ -65,13 +65,13 @@ def search(arena: Arena, kind: Callable[[Frame], Excitation]) -> None:
     while True:
         arena.require()
         z = rng.random(
-            1 + excitation.numbers
+            1 + excitation.parameter_count
         )  # the first one: how large, where weights decide that
         about = len(best) > 0 and rng.random() > STRAY
         if about:
             changed = rng.random(len(z)) < max(MUTATED, 2.0 / len(z))
             z = reflected(best + spread * changed * rng.normal(size=len(z)))
-        swing = shaper.swing(excitation.wave(z[1:]))
+        swing = shaper.swing(excitation.curve(z[1:]))
         scale = arena.largest(swing, shaper.most)
         if scale == 0.0:
             continue
@@ -101,8 +101,13 @@ class Shaper:
         e = setup.experiment
         fastest = min(e.limits.bandwidth or np.inf, 0.25 * e.rate, CYCLES / e.horizon)
         jumps = fence.rate is None and e.limits.bandwidth is None and e.boundary.start != "rest"
-        self.frame = Frame(
-            setup.t, e.horizon, len(setup.controls), min(0.5 / e.horizon, fastest), fastest, jumps
+        self.frame = ExcitationSettings(
+            t=setup.t,
+            horizon=e.horizon,
+            nu=len(setup.controls),
+            min_frequency=min(0.5 / e.horizon, fastest),
+            max_frequency=fastest,
+            may_jump=jumps,
         )
         self.weighted = bool(setup.control_weight.any() or setup.tracking.any()) or not arena.holds
         self.most = BOUNDED if np.isfinite(fence.control.lower).all() else LARGEST
@@ -131,7 +136,7 @@ def _knots(optimise: Optimiser) -> Callable[[Arena], None]:
 METHODS = {
     "chirp": Baseline("chirp", partial(search, kind=Chirp)),
     "multisine": Baseline("multisine (Schroeder)", partial(search, kind=Multisine)),
-    "steps": Baseline("random steps", partial(search, kind=Steps)),
+    "steps": Baseline("random steps", partial(search, kind=RandomSteps)),
     "fourier5": Baseline("Fourier 5", _harmonics(5, scipy_own)),
     "fourier5-D": Baseline("Fourier 5, on D", _harmonics(5, scipy_determinant)),
     "fourier15": Baseline("Fourier 15", _harmonics(15, scipy_own)),

@@ -33,7 +33,7 @@ from mjfim.excitation.objective import DesignProblem
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.optimize.lq import Weights
 from mjfim.optimize.structured_bfgs import BasisMetric
-from mjfim.signals import fourier_basis, independent
+from mjfim.signals import fourier_basis, independent_curves
 from mjfim.studies.baselines.budget import Arena, Spent
 
 BASES = (0.2, 0.1, 0.4, 0.8, 0.15)  # [Hz] of Fourier series, to begin with
@@ -85,7 +85,7 @@ def fourier(arena: Arena, harmonics: int) -> Iterator[Series]:
 
     def made(frequency: float) -> Array:
         count = max(min(harmonics, int(fastest / frequency + 1e-9)), 1)
-        return independent(fourier_basis(arena.setup.t, e.horizon, frequency, count, *rest))
+        return independent_curves(fourier_basis(arena.setup.t, e.horizon, frequency, count, *rest))
 
     ends = tuple(min(periods / e.horizon, fastest / min(harmonics, BUSIEST)) for periods in PERIODS)
     return _any(arena, [f for f in BASES if f <= fastest], ends, made)
@@ -97,7 +97,7 @@ def splines(arena: Arena) -> Iterator[Series]:
     fastest = e.limits.bandwidth or 0.5 * e.rate
 
     def made(bandwidth: float) -> Array:
-        return independent(splines_of(e, arena.setup.t, bandwidth))
+        return independent_curves(splines_of(e, arena.setup.t, bandwidth))
 
     ends = (min(0.5 * KNOTS[0], fastest), min(2.0 * KNOTS[-1], fastest))
     return _any(arena, [f for f in KNOTS if f <= fastest], ends, made)
