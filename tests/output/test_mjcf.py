@@ -17,9 +17,9 @@ from mjfim.errors import ModelError
 from mjfim.experiment.system import Setup
 from mjfim.model.paths import KINDS, fields_of
 from mjfim.output.mjcf.actuators import SHORTCUTS
-from mjfim.output.mjcf.document import Sheet
+from mjfim.output.mjcf.document import MjcfDocument
 from mjfim.output.mjcf.write import COMPARED, NOT_DYNAMICS, write_identified
-from mjfim.output.mjcf.xml_edit import Markup
+from mjfim.output.mjcf.xml_edit import XmlText
 from tests.support.numerics import make_setup, shared_model
 from tests.support.paths import MODELS, SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
@@ -346,16 +346,16 @@ ENTITIES = '<!DOCTYPE mujoco [<!ENTITY a "0.3"><!ENTITY b "&a;&a;&a;">]>\n'
 
 def test_a_doctype_is_not_followed(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="DOCTYPE"):
-        Markup((ENTITIES + "<mujoco>&b;</mujoco>").encode())
+        XmlText((ENTITIES + "<mujoco>&b;</mujoco>").encode())
     with pytest.raises(ModelError, match="not well-formed"):
-        Markup(b"<mujoco a='1' a='2'/>")
+        XmlText(b"<mujoco a='1' a='2'/>")
     with pytest.raises(ModelError, match="not well-formed"):
-        Markup("<mujoco a='ü'/>".encode("latin-1"))
+        XmlText("<mujoco a='ü'/>".encode("latin-1"))
     with pytest.raises(ModelError, match="<robot>"):
-        Sheet(b"<robot/>")
+        MjcfDocument(b"<robot/>")
     setup = setup_of("<!DOCTYPE mujoco>\n" + RICH.split("?>\n", 1)[1], tmp_path, "joint/j:damping")
     said = write_identified(tmp_path / "identified.xml", setup, np.array([0.7]))
-    assert said is not None and "MuJoCo's own printing" in said and "DOCTYPE" in said
+    assert said is not None and "printed by MuJoCo" in said and "DOCTYPE" in said
     assert (
         mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")).joint("j").damping[0] == 0.7
     )
@@ -383,7 +383,7 @@ BEYOND = {
             '<muscle name="x" joint="j" force="5" lengthrange="0 1" ctrlrange="0 1"/></actuator>',
         ),
         "actuator/x:gainprm[2]",
-        r"<muscle> has no attribute that says biasprm\[2\]|gainprm\[2\]",
+        r"<muscle> has no attribute that sets biasprm\[2\]|gainprm\[2\]",
     ),
 }
 
@@ -396,7 +396,7 @@ def test_what_the_text_cannot_say_mujoco_prints(case: str, tmp_path: Path) -> No
         xml = xml.replace("</body>\n  </worldbody>", "</body></frame>\n  </worldbody>")
     setup = setup_of(xml, tmp_path, {"target": path, "guess": 0.5, "scale": 1.0})
     said = write_identified(tmp_path / "identified.xml", setup, np.array([0.6]))
-    assert said is not None and said.startswith("identified.xml: it is MuJoCo's own printing")
+    assert said is not None and said.startswith("identified.xml: it is printed by MuJoCo")
     assert re.search(reason, said)
     found, wanted = (
         mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")),
@@ -439,7 +439,7 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
     assert_one_model(new, setup, [0.7])
     inside = setup_of(source, tmp_path, "joint/dj:damping")
     said = write_identified(new, inside, np.array([0.7]))
-    assert said is not None and "joint 'dj' does not stand in the MJCF itself" in said
+    assert said is not None and "joint 'dj' is not in the MJCF file itself" in said
     assert mujoco.MjModel.from_xml_path(str(new)).joint("dj").damping[0] == 0.7
 
 
@@ -452,12 +452,12 @@ def test_attached_models_are_printed_by_mujoco(tmp_path: Path) -> None:
     )
     xml = xml.replace("  </worldbody>", '<attach model="leg" body="d" prefix="x_"/></worldbody>')
     for path, folder, reason in (
-        ("joint/x_dj:damping", "", "joint 'x_dj' does not stand in the MJCF itself"),
+        ("joint/x_dj:damping", "", "joint 'x_dj' is not in the MJCF file itself"),
         ("joint/j:damping", "out", "leg.xml"),
     ):
         setup = setup_of(xml, tmp_path, path)
         said = write_identified(tmp_path / folder / "identified.xml", setup, np.array([0.7]))
-        assert said is not None and "MuJoCo's own printing" in said and reason in said
+        assert said is not None and "printed by MuJoCo" in said and reason in said
         found = mujoco.MjModel.from_xml_path(str(tmp_path / folder / "identified.xml"))
         assert found.joint(path[6:-8]).damping[0] == 0.7
 
@@ -541,7 +541,7 @@ def test_what_the_compiler_would_derive_anew_is_stated(case: str, tmp_path: Path
     said = write_identified(tmp_path / "identified.xml", setup, np.array([value]))
     assert (
         said
-        == f"identified.xml: it also states what MuJoCo would derive anew from the identified values: {stated}"
+        == f"identified.xml: it also states numbers that MuJoCo would otherwise derive from the identified values: {stated}"
     )
     assert "größer als ASCII" in (tmp_path / "identified.xml").read_text(encoding="utf-8")
     assert_one_model(tmp_path / "identified.xml", setup, [value])
@@ -624,7 +624,7 @@ def test_models_of_others(name: str, tmp_path: Path) -> None:
     )
     said = write_identified(tmp_path / "identified.xml", setup, theta)
     if name == "so_arm100":  # its servos have damping ratios
-        assert said is not None and "it also states" in said and "printing" not in said
+        assert said is not None and "it also states" in said and "printed" not in said
     else:
         assert said is None
     assert_one_model(tmp_path / "identified.xml", setup, theta)

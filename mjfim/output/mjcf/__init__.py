@@ -1,3 +1,3 @@
-"""The user's MJCF text with single numbers changed, everything else to the byte as it was."""
+"""Changes to numbers of the user's MJCF text that leave every other byte as it is."""
 
 from __future__ import annotations

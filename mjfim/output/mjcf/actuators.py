@@ -1,7 +1,8 @@
-"""MJCF's actuator elements: which attribute says which numbers of an actuator's gain, bias and dynamics."""
+"""Attributes of MJCF's actuator elements, and the numbers of gain, bias and dynamics that each of them sets."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,31 +10,34 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError
-from mjfim.output.mjcf.document import close
+from mjfim.output.mjcf.document import nearly_equal
 
+# Arrays that determine an actuator's force; `actuator_<name>` in MjModel.
 ARRAYS = ("gainprm", "biasprm", "dynprm")
-Place = tuple[str, int, float]  # array, column, factor
-KP: tuple[Place, ...] = (("gainprm", 0, 1.0), ("biasprm", 1, -1.0))
-KV: tuple[Place, ...] = (("biasprm", 2, -1.0),)
-LAG: tuple[Place, ...] = (("dynprm", 0, 1.0),)
+
+# Array, column and factor of a number that an attribute sets: array[column] = factor * value.
+Entry = tuple[str, int, float]
+
+# Entries that the gains and the time constant of the servo elements set.
+KP: tuple[Entry, ...] = (("gainprm", 0, 1.0), ("biasprm", 1, -1.0))
+KV: tuple[Entry, ...] = (("biasprm", 2, -1.0),)
+TIME_CONSTANT: tuple[Entry, ...] = (("dynprm", 0, 1.0),)
 
 
-def _muscle(column: int) -> tuple[Place, ...]:
-    return (
-        ("gainprm", column, 1.0),
-        ("biasprm", column, 1.0),
-    )  # the passive force has its own copy
+def _muscle(column: int) -> tuple[Entry, ...]:
+    """Entries of a muscle parameter: the passive force has a copy of the active force's parameters."""
+    return (("gainprm", column, 1.0), ("biasprm", column, 1.0))
 
 
-# Element -> attribute -> for each number of it, the places that it fills. `general` says everything itself.
-SHORTCUTS: dict[str, dict[str, tuple[tuple[Place, ...], ...]]] = {
-    "position": {"kp": (KP,), "kv": (KV,), "timeconst": (LAG,)},
+# By element and attribute, for each number of the attribute, the entries that it sets. `general` sets the arrays directly.
+SHORTCUTS: dict[str, dict[str, tuple[tuple[Entry, ...], ...]]] = {
+    "position": {"kp": (KP,), "kv": (KV,), "timeconst": (TIME_CONSTANT,)},
     "intvelocity": {"kp": (KP,), "kv": (KV,)},
     "velocity": {"kv": ((("gainprm", 0, 1.0), ("biasprm", 2, -1.0)),)},
     "pid": {"ki": ((("gainprm", 0, 1.0),),), "kp": ((("biasprm", 1, -1.0),),), "kv": (KV,)},
     "damper": {"kv": ((("gainprm", 2, -1.0),),)},
     "cylinder": {
-        "timeconst": (LAG,),
+        "timeconst": (TIME_CONSTANT,),
         "area": ((("gainprm", 0, 1.0),),),
         "bias": tuple((("biasprm", i, 1.0),) for i in range(3)),
     },
@@ -50,40 +54,83 @@ SHORTCUTS: dict[str, dict[str, tuple[tuple[Place, ...], ...]]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Wording:
-    """An attribute and its numbers: as they are and as they shall be. whole: how many must stand."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AttributeChange:
+    """Change of the numbers of one attribute.
+
+    Attributes:
+        attribute: Name of the attribute.
+        old: (n,) numbers of the compiled text.
+        new: (n,) wanted numbers.
+        min_count: Smallest number of numbers that MuJoCo accepts for this attribute.
+    """
 
     attribute: str
     old: Array
     new: Array
-    whole: int = 1
+    min_count: int = 1
 
 
-def wordings(element: str, old: Any, wanted: Any, actuator: int) -> list[Wording]:
-    """Attributes of an actuator element that differ between two models. Raises ModelError where it cannot say the change."""
-    before = {a: np.array(getattr(old, f"actuator_{a}")[actuator]) for a in ARRAYS}
-    after = {a: np.array(getattr(wanted, f"actuator_{a}")[actuator]) for a in ARRAYS}
+def attribute_changes(element: str, old: Any, wanted: Any, actuator: int) -> list[AttributeChange]:
+    """Express the difference of an actuator between two models by attributes of its element.
+
+    Args:
+        element: Name of the MJCF element, such as `position`.
+        old: Model that the text compiles to.
+        wanted: Model that it shall compile to.
+        actuator: Index of the actuator.
+
+    Returns:
+        Changes of the attributes that differ.
+
+    Raises:
+        ModelError: No attribute of the element sets one of the numbers alone. The message is a clause.
+    """
+    before = {name: np.array(getattr(old, f"actuator_{name}")[actuator]) for name in ARRAYS}
+    after = {name: np.array(getattr(wanted, f"actuator_{name}")[actuator]) for name in ARRAYS}
+
+    # A motor becomes a <general>, whose attributes are the arrays.
     if element in ("general", "motor"):
-        return [Wording(a, before[a], after[a]) for a in ARRAYS]
-    changed = {(a, int(i)) for a in ARRAYS for i in np.flatnonzero(~close(before[a], after[a]))}
-    found = []
+        return [
+            AttributeChange(attribute=name, old=before[name], new=after[name]) for name in ARRAYS
+        ]
+
+    changed = {
+        (name, int(column))
+        for name in ARRAYS
+        for column in np.flatnonzero(~nearly_equal(before[name], after[name]))
+    }
+
+    changes = []
     for attribute, numbers in SHORTCUTS.get(element, {}).items():
-        places = {(array, column) for number in numbers for array, column, _ in number}
-        if not places & changed:
+        entries = {(name, column) for number in numbers for name, column, _ in number}
+        if not entries & changed or not _is_consistent(numbers, after):
             continue
-        if any(
-            len({factor * after[array][column] for array, column, factor in number}) > 1
-            for number in numbers
-        ):
-            continue
-        changed -= places
-        first = [number[0] for number in numbers]
-        old, new = (
-            np.array([factor * m[array][i] for array, i, factor in first]) for m in (before, after)
+
+        changed -= entries
+        old_values, new_values = _values(numbers, before), _values(numbers, after)
+        changes.append(
+            AttributeChange(
+                attribute=attribute, old=old_values, new=new_values, min_count=len(numbers)
+            )
         )
-        found.append(Wording(attribute, old, new, len(first)))
+
     if changed:
-        array, column = sorted(changed)[0]
-        raise ModelError(f"<{element}> has no attribute that says {array}[{column}] alone")
-    return found
+        name, column = min(changed)
+        raise ModelError(f"<{element}> has no attribute that sets {name}[{column}] alone")
+    return changes
+
+
+def _is_consistent(numbers: tuple[tuple[Entry, ...], ...], arrays: Mapping[str, Array]) -> bool:
+    """Whether all entries that one number sets agree on its value."""
+    for number in numbers:
+        values = {factor * arrays[name][column] for name, column, factor in number}
+        if len(values) > 1:
+            return False
+    return True
+
+
+def _values(numbers: tuple[tuple[Entry, ...], ...], arrays: Mapping[str, Array]) -> Array:
+    """(n,) numbers of an attribute, each read from its first entry."""
+    first = [number[0] for number in numbers]
+    return np.array([factor * arrays[name][column] for name, column, factor in first])

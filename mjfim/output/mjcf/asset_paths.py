@@ -1,55 +1,78 @@
-"""An MJCF that moves to another folder: the places at which it finds its files are said from there."""
+"""Asset folders and included files of an MJCF that is written to another folder."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from mjfim.output.mjcf.document import Sheet
+from mjfim.output.mjcf.document import MjcfDocument
+
+# Folders that <compiler> may state for one type of asset; `assetdir` stands for both.
+TYPED_FOLDERS = ("meshdir", "texturedir")
 
 
-def repoint(sheet: Sheet, spec: Any, source: Path, target: Path) -> None:
-    """Change asset folders and `<include>`s of a text from folder `source` so that it loads from folder `target`.
+def relocate_assets(document: MjcfDocument, spec: Any, source: Path, target: Path) -> None:
+    """Change asset folders and `<include>`s so that a text of one folder loads from another one.
 
-    spec: what the text says; folders are left alone where it reads no file from them
+    Folders from which the model reads no file stay as they are.
+
+    Args:
+        document: The text.
+        spec: MjSpec of the text.
+        source: Folder from which the text loads now.
+        target: Folder from which it shall load.
     """
     if source == target:
         return
-    for i, tag in enumerate(sheet.tags):
+
+    for i, tag in enumerate(document.tags):
         if tag.name == "include" and "file" in tag.attributes:
-            sheet.set(i, "file", _from(target, source, tag.attributes["file"]))
-    parts = [element.file for element in (*spec.meshes, *spec.hfields, *spec.skins)]
-    parts += [tag.attributes.get("file", "") for tag in sheet.tags if tag.name == "flexcomp"]
-    pictures = [file for texture in spec.textures for file in (texture.file, *texture.cubefiles)]
-    read = {"meshdir": _beside(parts), "texturedir": _beside(pictures)}
-    read["assetdir"] = any(read.values())
-    compilers, said = sheet.top("compiler"), set()
+            document.set(i, "file", _relocated(tag.attributes["file"], source, target))
+
+    used = _used_folders(document, spec)
+    compilers = document.top_level("compiler")
+    stated = set()
     for i in compilers:
-        for folder in read:
-            value = sheet.attribute(i, folder)
-            if value is not None and read[folder]:
-                sheet.set(i, folder, _from(target, source, value))
-                said.add(folder)
-    if "assetdir" in said or not any(
-        read[folder] and folder not in said for folder in ("meshdir", "texturedir")
-    ):
+        for folder in used:
+            value = document.attribute(i, folder)
+            if value is not None:
+                document.set(i, folder, _relocated(value, source, target))
+                stated.add(folder)
+
+    # Without a stated folder MuJoCo looks for the files beside the text.
+    missing = [folder for folder in TYPED_FOLDERS if folder in used and folder not in stated]
+    if "assetdir" in stated or not missing:
         return
+    folder = _relocated("", source, target)
     if compilers:
-        sheet.set(compilers[-1], "assetdir", _from(target, source, ""))
+        document.set(compilers[-1], "assetdir", folder)
     else:
-        sheet.insert(0, "compiler", {"assetdir": _from(target, source, "")})
+        document.insert_child(0, "compiler", {"assetdir": folder})
 
 
-def _beside(files: list[str]) -> bool:
-    """True where some file is named relative to a folder."""
+def _used_folders(document: MjcfDocument, spec: Any) -> list[str]:
+    """Attributes of <compiler> that name a folder from which the model reads files."""
+    parts = [element.file for element in (*spec.meshes, *spec.hfields, *spec.skins)]
+    parts += [tag.attributes.get("file", "") for tag in document.tags if tag.name == "flexcomp"]
+
+    pictures = []
+    for texture in spec.textures:
+        pictures += [texture.file, *texture.cubefiles]
+
+    files = {"meshdir": parts, "texturedir": pictures}
+    used = [folder for folder in TYPED_FOLDERS if _any_relative(files[folder])]
+    return [*used, "assetdir"] if used else []
+
+
+def _any_relative(files: Iterable[str]) -> bool:
+    """Whether some file is named relative to a folder."""
     return any(file and not Path(file).is_absolute() for file in files)
 
 
-def _from(target: Path, source: Path, name: str) -> str:
-    """A file or folder that is named from `source`, named from `target`."""
-    return (
-        name
-        if Path(name).is_absolute()
-        else Path(os.path.relpath(source / name, target)).as_posix()
-    )
+def _relocated(name: str, source: Path, target: Path) -> str:
+    """Name, relative to the target folder, of a file or folder that is named relative to the source folder."""
+    if Path(name).is_absolute():
+        return name
+    return Path(os.path.relpath(source / name, target)).as_posix()

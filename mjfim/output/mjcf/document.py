@@ -1,4 +1,4 @@
-"""An MJCF text under change: where its named elements stand, and numbers written into their attributes by all digits."""
+"""An MJCF text in which numbers of named elements are changed and written with all digits."""
 
 from __future__ import annotations
 
@@ -8,14 +8,28 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError
-from mjfim.output.mjcf.xml_edit import Markup, Tag
+from mjfim.output.mjcf.xml_edit import Tag, XmlText
 
-SAME = 1e-14  # relative: numbers nearer than this are one
-TREE = {"body": "body", "joint": "joint", "freejoint": "joint", "geom": "geom", "site": "site"}
+# Relative difference below which two numbers differ only by rounding.
+RELATIVE_TOLERANCE = 1e-14
+
+# Kind of object that an element inside <worldbody> defines.
+TREE_KINDS = {
+    "body": "body",
+    "joint": "joint",
+    "freejoint": "joint",
+    "geom": "geom",
+    "site": "site",
+}
+
+# Sections of the MJCF whose children all define objects of the section's name.
 SECTIONS = ("actuator", "tendon")
+
+# Attributes that state an orientation.
 ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
-# Setting one takes the others out: they say the same, and MuJoCo would refuse or prefer them.
-INSTEAD = {
+
+# Attributes that state the same quantity as another one, which MuJoCo would refuse or prefer beside it.
+ALTERNATIVES = {
     "quat": ORIENTATIONS[1:],
     "fullinertia": ("diaginertia", *ORIENTATIONS),
     "diaginertia": ("fullinertia",),
@@ -26,93 +40,166 @@ INSTEAD = {
 }
 
 
-class Sheet(Markup):
-    """The text of an MJCF. Raises ModelError, as a clause that says why, where the text is none."""
+class MjcfDocument(XmlText):
+    """MJCF text with pending edits of its numbers."""
 
     def __init__(self, text: bytes) -> None:
+        """Parse an MJCF.
+
+        Args:
+            text: The MJCF in UTF-8.
+
+        Raises:
+            ModelError: The text is not well-formed XML or no MJCF. The message is a clause that completes a sentence.
+        """
         super().__init__(text)
         if self.tags[0].name != "mujoco":
             raise ModelError(f"the model is no MJCF but <{self.tags[0].name}>")
-        self._places = dict(_named(self.tags))
+        self._elements = dict(_named_elements(self.tags))
 
-    def place(self, kind: str, name: str) -> int:
-        """Index of the tag of a named element. Raises ModelError where it stands elsewhere or is generated."""
-        if (kind, name) not in self._places:
+    def element(self, kind: str, name: str) -> int:
+        """Find a named element.
+
+        Args:
+            kind: Kind of object: body, joint, geom, site, actuator or tendon.
+            name: Name of the object.
+
+        Returns:
+            Index of its start tag.
+
+        Raises:
+            ModelError: The element is in another file, or MuJoCo generates it.
+        """
+        if (kind, name) not in self._elements:
             raise ModelError(
-                f"{kind} {name!r} does not stand in the MJCF itself (<include>, <attach>, <replicate> or the like makes it)"
+                f"{kind} {name!r} is not in the MJCF file itself (it comes from <include>, <attach>, <replicate> or the like)"
             )
-        return self._places[kind, name]
+        return self._elements[kind, name]
 
-    def top(self, name: str) -> list[int]:
-        """Indices of the tags of a name right inside `<mujoco>`."""
+    def top_level(self, name: str) -> list[int]:
+        """Find all elements of a name directly inside `<mujoco>`.
+
+        Args:
+            name: Name of the elements.
+
+        Returns:
+            Indices of their start tags, in the order of the text.
+        """
         return [i for i, tag in enumerate(self.tags) if tag.name == name and tag.parent == 0]
 
-    def typed(self, tag: int, attribute: str) -> list[str]:
-        """The numbers of an attribute as they stand; none where it is absent."""
+    def written_numbers(self, tag: int, attribute: str) -> list[str]:
+        """Return the numbers of an attribute as they are written.
+
+        Args:
+            tag: Index of the tag.
+            attribute: Name of the attribute.
+
+        Returns:
+            The numbers, none if there is no such attribute.
+        """
         return (self.attribute(tag, attribute) or "").split()
 
-    def say(self, tag: int, attribute: str, value: str) -> None:
-        """Set an attribute, and take out those that say the same in other words."""
+    def set_exclusively(self, tag: int, attribute: str, value: str) -> None:
+        """Set an attribute, and remove all attributes that state the same quantity.
+
+        Args:
+            tag: Index of the tag.
+            attribute: Name of the attribute.
+            value: The new value.
+        """
         others = [
-            other for other in INSTEAD.get(attribute, ()) if self.attribute(tag, other) is not None
+            other
+            for other in ALTERNATIVES.get(attribute, ())
+            if self.attribute(tag, other) is not None
         ]
         for other in others:
             self.set(tag, other, None)
+
+        # A new attribute takes the place of the one that it replaces.
         if others and attribute not in self.tags[tag].attributes:
-            self.replace(tag, others[0], attribute, value)
+            self.replace_attribute(tag, others[0], attribute, value)
         else:
             self.set(tag, attribute, value)
 
-    def numbers(
+    def set_numbers(
         self,
         tag: int,
         attribute: str,
         old: Array | float,
         new: Array | float,
-        whole: int = 1,
-        size: float = 0.0,
+        *,
+        min_count: int = 1,
+        magnitude: float = 0.0,
     ) -> None:
-        """Write those of an attribute's numbers that differ between old and new: (n,); others stay as typed.
+        """Write those numbers of an attribute that differ between two models; the others stay as they are written.
 
-        whole: how many must stand;  size: magnitude that differences are compared with, besides the number's own
+        Args:
+            tag: Index of the tag.
+            attribute: Name of the attribute.
+            old: (n,) numbers of the compiled text.
+            new: (n,) wanted numbers.
+            min_count: Smallest number of numbers that MuJoCo accepts for this attribute.
+            magnitude: Typical size, relative to which a difference counts as rounding.
         """
         before, after = np.atleast_1d(old), np.atleast_1d(new)
-        changed = set(np.flatnonzero(~close(before, after, size)).tolist())
+        changed = set(np.flatnonzero(~nearly_equal(before, after, magnitude)).tolist())
         if not changed:
             return
-        typed = self.typed(tag, attribute)
-        count = max(len(typed), whole, *(i + 1 for i in changed))
-        keeps = [i < len(typed) and i not in changed for i in range(count)]
-        self.say(
-            tag,
-            attribute,
-            " ".join(typed[i] if keeps[i] else digits(after[i]) for i in range(count)),
-        )
+
+        written = self.written_numbers(tag, attribute)
+        count = max(len(written), min_count, *(i + 1 for i in changed))
+        numbers = [
+            written[i] if i < len(written) and i not in changed else all_digits(after[i])
+            for i in range(count)
+        ]
+        self.set_exclusively(tag, attribute, " ".join(numbers))
 
 
-def close(a: Array, b: Array, size: float = 0.0) -> np.ndarray:
-    """True where two numbers are one but for rounding; never for nan. size: magnitude that differences are compared with."""
-    return np.asarray(np.abs(a - b) <= SAME * np.maximum(np.maximum(np.abs(a), np.abs(b)), size))
+def nearly_equal(a: Array, b: Array, magnitude: float = 0.0) -> np.ndarray:
+    """Compare numbers up to rounding.
+
+    Args:
+        a: (n,) numbers.
+        b: (n,) numbers.
+        magnitude: Typical size, relative to which a difference counts as rounding if it exceeds the numbers.
+
+    Returns:
+        (n,) True where two numbers differ only by rounding; never where one is NaN.
+    """
+    size = np.maximum(np.maximum(np.abs(a), np.abs(b)), magnitude)
+    return np.asarray(np.abs(a - b) <= RELATIVE_TOLERANCE * size)
 
 
-def digits(*values: float) -> str:
-    """Numbers by as many digits as give them back exactly."""
-    return " ".join(repr(float(value) + 0.0) for value in values)  # no -0.0
+def all_digits(*values: float) -> str:
+    """Write numbers with the digits that give them back exactly.
+
+    Args:
+        values: The numbers.
+
+    Returns:
+        The numbers with blanks between them.
+    """
+    # Adding zero turns -0.0 into 0.0.
+    return " ".join(repr(float(value) + 0.0) for value in values)
 
 
-def _named(tags: Sequence[Tag]) -> Iterator[tuple[tuple[str, str], int]]:
-    """((kind, name), index of the tag) of the elements that stand for themselves: not copied, not generated."""
-    inside: set[int] = set()  # tags of the tree of bodies
+def _named_elements(tags: Sequence[Tag]) -> Iterator[tuple[tuple[str, str], int]]:
+    """Yield (kind, name) and tag of the elements that define exactly one object: neither copied nor generated."""
+    tree: set[int] = set()
+
     for i, tag in enumerate(tags):
         if tag.parent < 0:
             continue
-        top = tags[tag.parent]
-        kind = top.name if top.name in SECTIONS and top.parent == 0 else None
-        if tag.parent in inside:
-            kind = TREE.get(tag.name)
+
+        parent = tags[tag.parent]
+        in_tree = tag.parent in tree
         if (tag.name == "worldbody" and tag.parent == 0) or (
-            tag.parent in inside and tag.name in ("body", "frame")
+            in_tree and tag.name in ("body", "frame")
         ):
-            inside.add(i)
+            tree.add(i)
+
+        kind = parent.name if parent.name in SECTIONS and parent.parent == 0 else None
+        if in_tree:
+            kind = TREE_KINDS.get(tag.name)
         if kind is not None and "name" in tag.attributes:
             yield (kind, tag.attributes["name"]), i

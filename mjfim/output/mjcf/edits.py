@@ -1,7 +1,8 @@
-"""The user's MJCF with other numbers in it: each parameter changes the attributes that say it, and nothing else."""
+"""Parameter values written into the user's MJCF: each changes the attributes that state it, and nothing else."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -12,209 +13,293 @@ from mjfim.errors import ModelError
 from mjfim.model.parameters import ParameterSet, Target
 from mjfim.model.paths import OBJECTS, PATH
 from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TargetField
-from mjfim.output.mjcf.actuators import ARRAYS, wordings
-from mjfim.output.mjcf.document import Sheet, close, digits
-from mjfim.output.mjcf.inertials import weigh
+from mjfim.output.mjcf.actuators import ARRAYS, attribute_changes
+from mjfim.output.mjcf.document import MjcfDocument, all_digits, nearly_equal
+from mjfim.output.mjcf.inertials import write_inertial
 
-WHOLE = {
-    "pos": 3,
-    "gravity": 3,
-    "wind": 3,
-}  # attributes that MuJoCo reads only with all of their numbers
-MASS = ("mass", "ipos", "inertia")
-LONG = {
+# Number of numbers of the attributes that MuJoCo reads only with all of them.
+COMPLETE_COUNTS = {"pos": 3, "gravity": 3, "wind": 3}
+
+# Fields of a body that its <inertial> states.
+INERTIAL_FIELDS = ("mass", "ipos", "inertia")
+
+# Fields of a geom that the compiled model does not keep.
+UNCOMPILED_FIELDS = ("mass", "density")
+
+# Column of a geom's half length in its size, by type of geom; DEFAULT_LENGTH_COLUMN for all others.
+LENGTH_COLUMNS = {
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): 1,
     int(mujoco.mjtGeom.mjGEOM_CYLINDER): 1,
-}  # column of the half length, else 2
+}
+DEFAULT_LENGTH_COLUMN = 2
 
-
-# What the compiler may derive from other numbers: kind -> field -> array
+# Arrays of MjModel that the compiler may derive from other numbers, by kind of object and attribute.
 DERIVED = {
     "actuator": {"gainprm": "actuator_gainprm", "biasprm": "actuator_biasprm"},
     "joint": {"stiffness": "jnt_stiffness", "damping": "dof_damping"},
     "tendon": {"springlength": "tendon_lengthspring"},
 }
 
+# Relative difference above which a derived number must be stated.
+DERIVED_TOLERANCE = 1e-12
 
-APART = 1e-12  # relative: derived numbers farther apart than this are stated
 
+class ParameterEdits:
+    """Edits of an MJCF text that turn the model it compiles to into a wanted one.
 
-class Retouch:
-    """Changes to an MJCF that turn what it compiles to into a wanted model.
+    The methods raise ModelError, with a clause that gives the reason, where the text cannot express a change.
 
-    spec, old: what the text says and compiles to. What the text cannot say raises ModelError, as a clause that says why.
+    Attributes:
+        document: The text.
     """
 
-    def __init__(self, sheet: Sheet, spec: Any, old: Any, wanted: Any) -> None:
-        self.sheet, self._spec, self._old, self._wanted = sheet, spec, old, wanted
-        self._option: dict[str, str] = {}
+    def __init__(self, document: MjcfDocument, spec: Any, old: Any, wanted: Any) -> None:
+        """Prepare the edits.
 
-    def write(self, parameters: ParameterSet, theta: Array) -> None:
-        """Say theta: (p,), with which the wanted model was made. Called once."""
-        weighed: dict[str, bool] = {}
-        for parameter, slots, value in zip(
+        Args:
+            document: The text.
+            spec: MjSpec of the text.
+            old: Model that the text compiles to.
+            wanted: Model that it shall compile to.
+        """
+        self.document = document
+        self._spec = spec
+        self._old = old
+        self._wanted = wanted
+        self._new_option: dict[str, str] = {}
+
+    def write_parameters(self, parameters: ParameterSet, theta: Array) -> None:
+        """Write parameter values into the text. To be called once.
+
+        Args:
+            parameters: The parameters.
+            theta: (p,) values with which the wanted model was made.
+
+        Raises:
+            ModelError: The text cannot express a value.
+        """
+        # Whether the inertia matrix of a body is varied as a whole, by name of the body.
+        bodies: dict[str, bool] = {}
+
+        for parameter, fields, value in zip(
             parameters.parameters, parameters.fields, theta, strict=True
         ):
             if parameter.function is not None:
                 raise ModelError(f"parameters.{parameter.name} is a Python function of the MjSpec")
-            for target, slot in zip(parameter.targets, slots, strict=True):
+
+            for target, target_field in zip(parameter.targets, fields, strict=True):
                 kind, name, field = _parts(target)
-                if isinstance(slot, InertiaField) or (kind == "body" and field in MASS):
-                    weighed[name] = weighed.get(name, False) or isinstance(slot, InertiaField)
+                as_matrix = isinstance(target_field, InertiaField)
+
+                # All parameters of one body's inertia are written together.
+                if as_matrix or (kind == "body" and field in INERTIAL_FIELDS):
+                    bodies[name] = bodies.get(name, False) or as_matrix
                 else:
-                    self._target(
-                        kind, name, field, slot, target.scale * float(value) + target.offset
-                    )
-        for name, charted in weighed.items():
-            weigh(self.sheet, name, self._old, self._wanted, charted)
-        if self._option:
-            self.sheet.insert(0, "option", self._option)
+                    written = target.scale * float(value) + target.offset
+                    self._write_field(kind, name, field, target_field, written)
 
-    def settle(self, found: Any) -> list[str]:
-        """State what the compiler derives anew from the changed numbers. found: what the text compiles to.
+        for name, as_matrix in bodies.items():
+            write_inertial(self.document, name, self._old, self._wanted, as_matrix=as_matrix)
+        if self._new_option:
+            self.document.insert_child(0, "option", self._new_option)
 
-        Returns what was stated, `kind 'name'`.
+    def write_derived(self, compiled: Any) -> list[str]:
+        """State the numbers that the compiler would derive differently from the changed ones.
+
+        Args:
+            compiled: Model that the edited text compiles to.
+
+        Returns:
+            The objects of which a number was stated, as `kind 'name'`.
+
+        Raises:
+            ModelError: Such an object has no name.
         """
-        self._old, stated = found, []
-        for kind, fields in DERIVED.items():
-            for field, array in fields.items():
-                rows = (
-                    found.jnt_dofadr
-                    if array.startswith("dof_")
-                    else range(len(getattr(found, array)))
+        self._old = compiled
+
+        stated = []
+        for kind, field, array, row, index in _derived_rows(compiled):
+            found = np.asarray(getattr(compiled, array)[row])
+            wanted = np.asarray(getattr(self._wanted, array)[row])
+            if np.allclose(found, wanted, rtol=DERIVED_TOLERANCE, atol=0.0):
+                continue
+
+            name = mujoco.mj_id2name(compiled, OBJECTS[kind], index)
+            if not name:
+                raise ModelError(
+                    f"MuJoCo derives the {field} of a {kind} that has no name from changed values"
                 )
-                for ident, row in enumerate(rows):
-                    own, other = (
-                        np.asarray(getattr(m, array)[int(row)]) for m in (found, self._wanted)
-                    )
-                    if np.allclose(own, other, rtol=APART, atol=0.0):
-                        continue
-                    name = mujoco.mj_id2name(found, OBJECTS[kind], ident)
-                    if not name:
-                        raise ModelError(
-                            f"MuJoCo derives the {field} of a {kind} anew that has no name"
-                        )
-                    self._number(kind, name, field, ModelField(array, (int(row),), None))
-                    stated.append(f"{kind} {name!r}")
+            self._write_number(kind, name, field, ModelField(array, (row,), None))
+            stated.append(f"{kind} {name!r}")
+
         return list(dict.fromkeys(stated))
 
-    def _target(self, kind: str, name: str, field: str, slot: TargetField, value: float) -> None:
-        if isinstance(slot, SpecField) and field in (
-            "mass",
-            "density",
-        ):  # the compiled model no longer has them
+    def _write_field(
+        self, kind: str, name: str, field: str, target_field: TargetField, value: float
+    ) -> None:
+        """Write one target of a parameter. value: in the unit of the MJCF."""
+        if isinstance(target_field, SpecField) and field in UNCOMPILED_FIELDS:
             old = float(getattr(self._spec.geom(name), field))
-            if not close(np.array(old), np.array(value)):
-                self.sheet.numbers(self.sheet.place("geom", name), field, old, value)
+            if not nearly_equal(np.array(old), np.array(value)):
+                tag = self.document.element("geom", name)
+                self.document.set_numbers(tag, field, old, value)
         elif kind == "geom" and field in ("pos", "size"):
-            self._extent(name)
-        elif isinstance(slot, RotationField):
-            self._turn(kind, name)
-        elif isinstance(slot, ModelField):
-            self._number(kind, name, field, slot)
+            self._write_geom(name)
+        elif isinstance(target_field, RotationField):
+            self._write_orientation(kind, name)
+        elif isinstance(target_field, ModelField):
+            self._write_number(kind, name, field, target_field)
 
-    def _number(self, kind: str, name: str, field: str, slot: ModelField) -> None:
-        """A number that the MJCF has under the name of the path's field, or an actuator's gain."""
-        if slot.array.removeprefix("actuator_") in ARRAYS:
-            self._gain(name)
+    def _write_number(self, kind: str, name: str, field: str, target_field: ModelField) -> None:
+        """Write a number that the MJCF states under the name of the field, or a number of an actuator."""
+        if target_field.array.removeprefix("actuator_") in ARRAYS:
+            self._write_actuator(name)
             return
-        if slot.in_options:
-            old, new = (
-                np.atleast_1d(getattr(m.opt, slot.array)) for m in (self._old, self._wanted)
-            )
-        else:
-            old, new = (
-                np.atleast_1d(getattr(m, slot.array)[slot.rows[0]])
-                for m in (self._old, self._wanted)
-            )
-        if close(old, new).all():
+
+        old = _numbers(self._old, target_field)
+        new = _numbers(self._wanted, target_field)
+        if nearly_equal(old, new).all():
             return
         if kind == "option":
-            self._state(field, old, new)
+            self._write_option(field, old, new)
             return
-        tag, whole = self.sheet.place(kind, name), WHOLE.get(field, 1)
+
+        tag = self.document.element(kind, name)
+        min_count = COMPLETE_COUNTS.get(field, 1)
         if field == "pos":
-            self._refuse_elsewhere(tag, kind, name)
-        elif field == "springref" and self._spec.compiler.degree:
-            if self._spec.joint(name).type == mujoco.mjtJoint.mjJNT_HINGE:
-                old, new = np.rad2deg(old), np.rad2deg(new)
-        elif field == "springlength":  # one rest length stands for both ends of the range
-            whole = 1 if new[0] == new[1] and len(self.sheet.typed(tag, field)) < 2 else 2
-            old, new = old[:whole], new[:whole]
-        self.sheet.numbers(tag, field, old, new, whole)
+            self._check_coordinates(tag, kind, name)
+        elif field == "springref" and self._is_in_degrees(name):
+            old, new = np.rad2deg(old), np.rad2deg(new)
+        elif field == "springlength":
+            # One rest length stands for both ends of the range.
+            is_single = new[0] == new[1] and len(self.document.written_numbers(tag, field)) < 2
+            min_count = 1 if is_single else 2
+            old, new = old[:min_count], new[:min_count]
 
-    def _state(self, field: str, old: Array, new: Array) -> None:
-        """Write into the `<option>` that says a field last, else into the last one; one is made where there is none."""
-        found = self.sheet.top("option")
-        if found:
-            tag = next(
-                (i for i in reversed(found) if self.sheet.attribute(i, field) is not None),
-                found[-1],
-            )
-            self.sheet.numbers(tag, field, old, new, WHOLE.get(field, 1))
-        else:
-            self._option[field] = digits(*new)
+        self.document.set_numbers(tag, field, old, new, min_count=min_count)
 
-    def _gain(self, name: str) -> None:
-        """What makes an actuator's force: gain, bias and dynamics, in the words of its element."""
-        i = int(self._old.actuator(name).id)
+    def _is_in_degrees(self, joint: str) -> bool:
+        """Whether the text states the coordinate of a joint in degrees."""
+        is_hinge = self._spec.joint(joint).type == mujoco.mjtJoint.mjJNT_HINGE
+        return bool(self._spec.compiler.degree and is_hinge)
+
+    def _write_option(self, field: str, old: Array, new: Array) -> None:
+        """Write into the last `<option>` that states a field, else into the last one; make one if there is none."""
+        options = self.document.top_level("option")
+        if not options:
+            self._new_option[field] = all_digits(*new)
+            return
+
+        # MuJoCo lets a later option override an earlier one.
+        stating = [tag for tag in options if self.document.attribute(tag, field) is not None]
+        tag = stating[-1] if stating else options[-1]
+        min_count = COMPLETE_COUNTS.get(field, 1)
+        self.document.set_numbers(tag, field, old, new, min_count=min_count)
+
+    def _write_actuator(self, name: str) -> None:
+        """Write gain, bias and dynamics of an actuator by the attributes of its element."""
+        actuator = int(self._old.actuator(name).id)
         old, wanted = (
-            np.concatenate([getattr(m, f"actuator_{a}")[i] for a in ARRAYS])
-            for m in (self._old, self._wanted)
+            np.concatenate([getattr(model, f"actuator_{array}")[actuator] for array in ARRAYS])
+            for model in (self._old, self._wanted)
         )
-        if close(old, wanted).all():
+        if nearly_equal(old, wanted).all():
             return
-        tag = self.sheet.place("actuator", name)
-        element = self.sheet.tags[tag].name
-        if element == "motor":  # its gain is 1; a <general> is a motor that may have another
-            self.sheet.rename(tag, "general")
-        for words in wordings(element, self._old, self._wanted, i):
-            self.sheet.numbers(tag, words.attribute, words.old, words.new, words.whole)
 
-    def _turn(self, kind: str, name: str) -> None:
-        """Orientation of a body or site."""
-        old, new = (getattr(m, kind)(name).quat for m in (self._old, self._wanted))
-        if not close(old, new, 1.0).all():
-            tag = self.sheet.place(kind, name)
-            self._refuse_elsewhere(tag, kind, name)
-            self.sheet.say(tag, "quat", digits(*new))
+        tag = self.document.element("actuator", name)
+        element = self.document.tags[tag].name
 
-    def _extent(self, name: str) -> None:
-        """Place and size of a geom, or the end points that give both."""
-        old, new, stated = self._old.geom(name), self._wanted.geom(name), self._spec.geom(name)
-        moved, radius = new.pos - old.pos, float(self._old.geom_rbound[old.id])
-        stays = close(old.pos, new.pos, radius).all()
-        if stays and close(old.size, new.size).all():
-            return
-        tag = self.sheet.place("geom", name)
-        if not stays:
-            self._refuse_elsewhere(tag, "geom", name)
-        if not np.isfinite(stated.fromto[0]):
-            self.sheet.numbers(tag, "size", old.size, new.size)
-            place = (
-                stated.pos + moved if stated.meshname else new.pos
-            )  # the compiler adds the mesh's own offset
-            self.sheet.numbers(
-                tag, "pos", stated.pos if stated.meshname else old.pos, place, 3, radius
+        # The gain of a <motor> is 1; a <general> is a motor whose gain may differ.
+        if element == "motor":
+            self.document.rename_element(tag, "general")
+
+        for change in attribute_changes(element, self._old, self._wanted, actuator):
+            self.document.set_numbers(
+                tag, change.attribute, change.old, change.new, min_count=change.min_count
             )
+
+    def _write_orientation(self, kind: str, name: str) -> None:
+        """Write the orientation of a body or site."""
+        old = getattr(self._old, kind)(name).quat
+        new = getattr(self._wanted, kind)(name).quat
+        if nearly_equal(old, new, 1.0).all():
             return
-        along = LONG.get(int(stated.type), 2)
+
+        tag = self.document.element(kind, name)
+        self._check_coordinates(tag, kind, name)
+        self.document.set_exclusively(tag, "quat", all_digits(*new))
+
+    def _write_geom(self, name: str) -> None:
+        """Write position and size of a geom, or the end points that state both."""
+        old, new = self._old.geom(name), self._wanted.geom(name)
+        radius = float(self._old.geom_rbound[old.id])
+
+        same_position = nearly_equal(old.pos, new.pos, radius).all()
+        if same_position and nearly_equal(old.size, new.size).all():
+            return
+
+        tag = self.document.element("geom", name)
+        if not same_position:
+            self._check_coordinates(tag, "geom", name)
+
+        stated = self._spec.geom(name)
+        if np.isfinite(stated.fromto[0]):
+            self._write_end_points(tag, old, new, stated)
+            return
+
+        # The compiler adds the offset of a mesh to the stated position.
+        before, after = old.pos, new.pos
+        if stated.meshname:
+            before, after = stated.pos, stated.pos + (new.pos - old.pos)
+
+        self.document.set_numbers(tag, "size", old.size, new.size)
+        self.document.set_numbers(tag, "pos", before, after, min_count=3, magnitude=radius)
+
+    def _write_end_points(self, tag: int, old: Any, new: Any, stated: Any) -> None:
+        """Write the radius and the end points of a geom that is stated by them."""
+        radius = float(self._old.geom_rbound[old.id])
+        column = LENGTH_COLUMNS.get(int(stated.type), DEFAULT_LENGTH_COLUMN)
+
         ends = np.array(stated.fromto).reshape(2, 3)
         middle = ends.mean(axis=0)
-        placed = middle + moved + (ends - middle) * (new.size[along] / old.size[along])
-        self.sheet.numbers(tag, "size", old.size[:1], new.size[:1])
-        self.sheet.numbers(tag, "fromto", ends.ravel(), placed.ravel(), 6, radius)
+        stretch = new.size[column] / old.size[column]
+        moved = middle + (new.pos - old.pos) + (ends - middle) * stretch
 
-    def _refuse_elsewhere(self, tag: int, kind: str, name: str) -> None:
-        """Raise where a place is not said in the coordinates of the body by `pos` and `quat`."""
-        if self.sheet.tags[self.sheet.tags[tag].parent].name == "frame":
-            raise ModelError(f"{kind} {name!r} stands in a <frame>")
+        self.document.set_numbers(tag, "size", old.size[:1], new.size[:1])
+        self.document.set_numbers(
+            tag, "fromto", ends.ravel(), moved.ravel(), min_count=6, magnitude=radius
+        )
+
+    def _check_coordinates(self, tag: int, kind: str, name: str) -> None:
+        """Refuse an object whose `pos` and `quat` are not its pose in the coordinates of its body."""
+        parent = self.document.tags[self.document.tags[tag].parent]
+        if parent.name == "frame":
+            raise ModelError(f"{kind} {name!r} is inside a <frame>")
         if kind == "site" and np.isfinite(self._spec.site(name).fromto[0]):
             raise ModelError(f"site {name!r} is given by its end points")
 
 
+def _numbers(model: Any, target_field: ModelField) -> Array:
+    """(n,) all numbers of the array row in which a field is."""
+    if target_field.in_options:
+        return np.atleast_1d(getattr(model.opt, target_field.array))
+    return np.atleast_1d(getattr(model, target_field.array)[target_field.rows[0]])
+
+
+def _derived_rows(model: Any) -> Iterator[tuple[str, str, str, int, int]]:
+    """Yield kind, attribute, array, row and index of every object with a number that the compiler may derive."""
+    for kind, fields in DERIVED.items():
+        for field, array in fields.items():
+            # Arrays of degrees of freedom hold a joint in the row of its first one.
+            rows = (
+                model.jnt_dofadr if array.startswith("dof_") else range(len(getattr(model, array)))
+            )
+            for index, row in enumerate(rows):
+                yield kind, field, array, int(row), index
+
+
 def _parts(target: Target) -> tuple[str, str, str]:
-    """Kind, name and field of a path."""
+    """Kind, name and field of a parameter's path."""
     match = PATH.match(target.path)
     if match is None:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""A body's `<inertial>` rewritten: by the numbers that it has, by its matrix, or as a new element beside its geoms."""
+"""Changes of a body's `<inertial>` element: of single numbers, of its matrix, or a new element where geoms gave the mass."""
 
 from __future__ import annotations
 
@@ -11,72 +11,130 @@ from scipy.spatial.transform import Rotation
 from mjfim.arrays import Array
 from mjfim.model.inertia import INERTIA_COLUMNS, INERTIA_ROWS
 from mjfim.model.targets import inertial
-from mjfim.output.mjcf.document import ORIENTATIONS, Sheet, close, digits
+from mjfim.output.mjcf.document import (
+    ORIENTATIONS,
+    MjcfDocument,
+    all_digits,
+    nearly_equal,
+)
 
-SLIGHT = 1e-13  # of a body's size or trace of inertia: what is below is rounding of the charts
-DIGITS = 15  # significant decimal digits of a matrix that was rotated, counted from its trace; the next one is rounding
+# Products of inertia below this share of the trace are rounding errors of the parametrisation.
+PRODUCT_TOLERANCE = 1e-13
+
+# Significant decimal digits of a matrix that was rotated, counted from its trace; the next digit is rounding.
+DIGITS = 15
+
+# Changes of inertia and centre of mass are rounding relative to this multiple of the trace and of the body's radius.
+MAGNITUDE_FACTOR = 10.0
+
+# Quaternion of the body's axes.
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def weigh(sheet: Sheet, name: str, old: Any, wanted: Any, charted: bool) -> None:
-    """Give a named body the inertia that it has in the wanted model. old: what the text compiles to.
+def write_inertial(
+    document: MjcfDocument, name: str, old: Any, wanted: Any, *, as_matrix: bool
+) -> None:
+    """Give a body the inertia that it has in the wanted model.
 
-    charted: its matrix is varied as a whole, so that its principal axes may turn
+    Args:
+        document: The text.
+        name: Name of the body.
+        old: Model that the text compiles to.
+        wanted: Model that it shall compile to.
+        as_matrix: Whether the parameters vary the matrix as a whole, so that its principal axes may turn.
+
+    Raises:
+        ModelError: The body is not in the text.
     """
-    b = int(old.body(name).id)
-    before, after = inertial(old, b), inertial(wanted, b)
-    trace, radius = (
-        10.0 * float(np.trace(before.inertia)),
-        10.0 * before.radius if before.mass > 0.0 else 0.0,
-    )
-    turned = not close(before.inertia, after.inertia, trace).all()
-    moved = not close(before.com, after.com, radius).all()
-    if not turned and not moved and close(np.array(before.mass), np.array(after.mass)):
+    body = int(old.body(name).id)
+    before, after = inertial(old, body), inertial(wanted, body)
+    trace = MAGNITUDE_FACTOR * float(np.trace(before.inertia))
+    radius = MAGNITUDE_FACTOR * before.radius if before.mass > 0.0 else 0.0
+
+    same_inertia = nearly_equal(before.inertia, after.inertia, trace).all()
+    same_com = nearly_equal(before.com, after.com, radius).all()
+    if same_inertia and same_com and nearly_equal(np.array(before.mass), np.array(after.mass)):
         return
-    body = sheet.place("body", name)
-    own = next(
-        (i for i, tag in enumerate(sheet.tags) if tag.name == "inertial" and tag.parent == body),
+
+    parent = document.element("body", name)
+    tag = _child(document, parent, "inertial")
+
+    # A body whose inertia came from its geoms gets an element that replaces them.
+    if tag is None:
+        free_axes = as_matrix and not _axes_are_measured(old, body)
+        inertia = _full_inertia(after.inertia) if free_axes else _principal_inertia(wanted, body)
+        attributes = {"pos": all_digits(*after.com), "mass": all_digits(after.mass), **inertia}
+        document.insert_child(parent, "inertial", attributes)
+        return
+
+    document.set_numbers(tag, "mass", before.mass, after.mass)
+    document.set_numbers(tag, "pos", before.com, after.com, min_count=3, magnitude=radius)
+    if not same_inertia:
+        _write_inertia(document, tag, old, wanted, body=body, as_matrix=as_matrix)
+
+
+def _child(document: MjcfDocument, parent: int, name: str) -> int | None:
+    """Tag of the first child of a name, None if there is none."""
+    return next(
+        (i for i, tag in enumerate(document.tags) if tag.name == name and tag.parent == parent),
         None,
     )
-    if own is None:
-        matrix = (
-            _matrix(after.inertia) if charted and not _watched(old, b) else _principal(wanted, b)
-        )
-        sheet.insert(
-            body, "inertial", {"pos": digits(*after.com), "mass": digits(after.mass), **matrix}
-        )
+
+
+def _write_inertia(
+    document: MjcfDocument, tag: int, old: Any, wanted: Any, *, body: int, as_matrix: bool
+) -> None:
+    """Write the inertia matrix of an `<inertial>`, in its present form where that can express it."""
+    before, after = inertial(old, body).inertia, inertial(wanted, body).inertia
+    magnitude = MAGNITUDE_FACTOR * float(np.trace(before))
+    is_full = document.attribute(tag, "fullinertia") is not None
+
+    # The model's principal axes are written where they matter, or where only the moments are parameters.
+    if (as_matrix and _axes_are_measured(old, body)) or (is_full and not as_matrix):
+        _write_principal(document, tag, wanted, body)
         return
-    sheet.numbers(own, "mass", before.mass, after.mass)
-    sheet.numbers(own, "pos", before.com, after.com, 3, radius)
-    if turned:
-        _turn(sheet, own, b, old, wanted, charted)
+    if not as_matrix:
+        moments = old.body_inertia[body], wanted.body_inertia[body]
+        document.set_numbers(tag, "diaginertia", *moments, min_count=3)
+        return
 
+    # A matrix that is still diagonal in the present axes keeps them.
+    R = Rotation.from_quat(old.body_iquat[body], scalar_first=True).as_matrix()
+    in_old_axes = R.T @ after @ R
+    products = np.abs(in_old_axes[INERTIA_ROWS[3:], INERTIA_COLUMNS[3:]]).max()
 
-def _turn(sheet: Sheet, own: int, b: int, old: Any, wanted: Any, charted: bool) -> None:
-    """Write the matrix of an `<inertial>`: in the axes that it has where it is diagonal there."""
-    R = Rotation.from_quat(old.body_iquat[b], scalar_first=True).as_matrix()
-    before, after = inertial(old, b).inertia, inertial(wanted, b).inertia
-    inside, size = R.T @ after @ R, 10.0 * float(np.trace(before))
-    products = np.abs(inside[INERTIA_ROWS[3:], INERTIA_COLUMNS[3:]]).max()
-    full = sheet.attribute(own, "fullinertia") is not None
-    if (charted and _watched(old, b)) or (full and not charted):
-        words = _principal(wanted, b)
-        if any(sheet.attribute(own, turned) is not None for turned in ORIENTATIONS):
-            words["quat"] = digits(*wanted.body_iquat[b])
-        for attribute, value in words.items():
-            sheet.say(own, attribute, value)
-    elif not charted:
-        sheet.numbers(own, "diaginertia", old.body_inertia[b], wanted.body_inertia[b], 3)
-    elif not full and products <= SLIGHT * np.trace(after):
-        sheet.numbers(own, "diaginertia", old.body_inertia[b], np.diag(inside), 3, size)
+    if not is_full and products <= PRODUCT_TOLERANCE * np.trace(after):
+        attribute, numbers = "diaginertia", (old.body_inertia[body], np.diag(in_old_axes))
     else:
-        sheet.numbers(
-            own, "fullinertia", before[INERTIA_ROWS, INERTIA_COLUMNS], _rounded(after), 6, size
-        )
+        entries = before[INERTIA_ROWS, INERTIA_COLUMNS]
+        attribute, numbers = "fullinertia", (entries, _rounded(after))
+    document.set_numbers(tag, attribute, *numbers, min_count=len(numbers[0]), magnitude=magnitude)
 
 
-def _matrix(inertia: Array) -> dict[str, str]:
-    return {"fullinertia": digits(*_rounded(inertia))}
+def _write_principal(document: MjcfDocument, tag: int, wanted: Any, body: int) -> None:
+    """Write the principal moments and axes of the wanted model."""
+    attributes = _principal_inertia(wanted, body)
+
+    # An orientation that the text states is replaced even where the new one is the default.
+    if any(document.attribute(tag, name) is not None for name in ORIENTATIONS):
+        attributes["quat"] = all_digits(*wanted.body_iquat[body])
+
+    for attribute, value in attributes.items():
+        document.set_exclusively(tag, attribute, value)
+
+
+def _full_inertia(inertia: Array) -> dict[str, str]:
+    """Attributes that state a (3, 3) matrix in the axes of the body."""
+    return {"fullinertia": all_digits(*_rounded(inertia))}
+
+
+def _principal_inertia(model: Any, body: int) -> dict[str, str]:
+    """Attributes that state the principal moments and axes of a model's body."""
+    quat = model.body_iquat[body]
+    moments = {"diaginertia": all_digits(*model.body_inertia[body])}
+    if nearly_equal(quat, IDENTITY, 1.0).all():
+        return moments
+    return {"quat": all_digits(*quat), **moments}
 
 
 def _rounded(inertia: Array) -> Array:
@@ -87,26 +145,18 @@ def _rounded(inertia: Array) -> Array:
     """
     entries = inertia[INERTIA_ROWS, INERTIA_COLUMNS]
     trace = float(np.trace(inertia))
-    if trace <= 0.0:  # a body without inertia has nothing to round
+
+    # A body without inertia has nothing to round.
+    if trace <= 0.0:
         return np.asarray(entries)
 
     decimals = DIGITS - 1 - int(np.floor(np.log10(trace)))
     return np.array([round(float(entry), decimals) for entry in entries])
 
 
-def _principal(model: Any, b: int) -> dict[str, str]:
-    """Moments and axes as they are in a model."""
-    quat = (
-        {}
-        if close(model.body_iquat[b], IDENTITY, 1.0).all()
-        else {"quat": digits(*model.body_iquat[b])}
-    )
-    return {**quat, "diaginertia": digits(*model.body_inertia[b])}
-
-
-def _watched(model: Any, b: int) -> bool:
-    """True where a sensor reads the axes of the body's inertia, so that they must be those of the model, not only the matrix."""
-    body = int(mujoco.mjtObj.mjOBJ_BODY)
-    of = (model.sensor_objtype == body) & (model.sensor_objid == b)
-    to = (model.sensor_reftype == body) & (model.sensor_refid == b)
-    return bool((of | to).any())
+def _axes_are_measured(model: Any, body: int) -> bool:
+    """Whether a sensor reads the principal axes of a body, so that they matter besides the matrix."""
+    kind = int(mujoco.mjtObj.mjOBJ_BODY)
+    is_object = (model.sensor_objtype == kind) & (model.sensor_objid == body)
+    is_reference = (model.sensor_reftype == kind) & (model.sensor_refid == body)
+    return bool((is_object | is_reference).any())

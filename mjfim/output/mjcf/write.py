@@ -1,4 +1,4 @@
-"""The user's MJCF with identified values in it. A compile must give the model that was identified, or it is refused."""
+"""The user's MJCF with identified values; what it compiles to must be the identified model, else it is refused."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from mjfim.model.loading import compile_spec, unconstrained
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import FIELDS
 from mjfim.model.spec_writer import settle, write_element
-from mjfim.output.mjcf.asset_paths import repoint
-from mjfim.output.mjcf.document import Sheet
-from mjfim.output.mjcf.edits import Retouch
+from mjfim.output.mjcf.asset_paths import relocate_assets
+from mjfim.output.mjcf.document import MjcfDocument
+from mjfim.output.mjcf.edits import ParameterEdits
 
+# Prefixes of the arrays of MjModel that determine the motion.
 COMPARED = (
     "body_",
     "jnt_",
@@ -38,7 +39,7 @@ COMPARED = (
     "geom_solref",
 )
 
-
+# Prefixes of arrays that COMPARED covers but that only speed up the computation, or are compared as matrices.
 NOT_DYNAMICS = (
     "body_bvh",
     "body_simple",
@@ -49,139 +50,193 @@ NOT_DYNAMICS = (
     "dof_simplenum",
 )
 
+# Relative and absolute difference below which numbers of two models count as equal.
+RELATIVE_TOLERANCE = 1e-9
+ABSOLUTE_TOLERANCE = 1e-12
+
+# Constraint weights of bodies, which MuJoCo averages differently for 'simple' bodies.
+INVERSE_WEIGHT = "body_invweight0"
+
 
 def write_identified(path: Path, setup: Setup, theta: Array) -> str | None:
-    """Write the user's MJCF at theta: (p,): the text with other numbers in it, by all digits. It loads from `path`.
+    """Write the user's MJCF with parameter values: the text with other numbers in it, with all their digits.
 
-    Returns a sentence where more changes than the identified values: what the compiler would derive anew is stated, or, where
-    the text cannot say theta, MuJoCo prints the model (six significant digits). Raises ModelError where MJCF cannot say it.
+    Where the text cannot express the values, MuJoCo prints the model (six significant digits).
+
+    Args:
+        path: File that is written; its folder may differ from that of the model.
+        setup: The experiment with its model.
+        theta: (p,) parameter values.
+
+    Returns:
+        A sentence about everything that changes besides the values, None if nothing does.
+
+    Raises:
+        ModelError: No MJCF expresses the values.
     """
     wanted = setup.model_at(theta, placed=False)
-    said = []
+
+    remarks = []
     try:
-        stated = _retouch(path, setup, theta, wanted)
-        if stated:
-            said.append(
-                f"it also states what MuJoCo would derive anew from the identified values: {', '.join(stated)}"
-            )
+        stated = _write_edited(path, setup, theta, wanted)
     except ModelError as error:
-        _print(path, setup, theta, wanted)
-        said.append(f"it is MuJoCo's own printing, six significant digits and no comments: {error}")
+        _write_printed(path, setup, theta, wanted)
+        remarks.append(
+            f"it is printed by MuJoCo, with six significant digits and without comments: {error}"
+        )
+    else:
+        if stated:
+            remarks.append(
+                "it also states numbers that MuJoCo would otherwise derive from the identified values: "
+                f"{', '.join(stated)}"
+            )
+
     found = mujoco.MjModel.from_xml_path(str(path))
-    otherwise = _weighed_otherwise(found, wanted, alike=False)
-    if otherwise and not unconstrained(found):
-        said.append(
-            f"its contacts and other constraints of {', '.join(map(repr, otherwise))} are a little softer or harder than in "
+    reweighted = _reweighted_bodies(found, wanted, same_class=False)
+    if reweighted and not unconstrained(found):
+        remarks.append(
+            f"contacts and other constraints of {', '.join(map(repr, reweighted))} are slightly softer or stiffer than in "
             "the fit, where MuJoCo could not treat these bodies as 'simple' (body_invweight0)"
         )
-    return f"{path.name}: {'; '.join(said)}" if said else None
+    return f"{path.name}: {'; '.join(remarks)}" if remarks else None
 
 
-def _retouch(path: Path, setup: Setup, theta: Array, wanted: Any) -> list[str]:
-    """Write the text, changed; returns what had to be stated besides theta. Raises ModelError with a clause that says why not."""
+def _write_edited(path: Path, setup: Setup, theta: Array, wanted: Any) -> list[str]:
+    """Write the edited text; return the objects whose derived numbers had to be stated.
+
+    Raises ModelError, with a clause that gives the reason, where the text cannot express the values.
+    """
     source = setup.model_path.resolve()
-    sheet = Sheet(source.read_bytes())
-    repoint(sheet, setup.spec, source.parent, path.resolve().parent)
-    work = Retouch(sheet, setup.spec, setup.model, wanted)
-    work.write(setup.parameters, theta)
+    document = MjcfDocument(source.read_bytes())
+    relocate_assets(document, setup.spec, source.parent, path.resolve().parent)
+
+    edits = ParameterEdits(document, setup.spec, setup.model, wanted)
+    edits.write_parameters(setup.parameters, theta)
+
     stated: list[str] = []
     with replacing(path) as temporary:
-        found = _written(temporary, sheet)
+        found = _compiled(temporary, document)
         if not same_dynamics(found, wanted):
-            stated = work.settle(found)
-            found = _written(temporary, sheet)
-        unequal = _differences(found, wanted)
-        if unequal:
+            stated = edits.write_derived(found)
+            found = _compiled(temporary, document)
+
+        different = _differences(found, wanted)
+        if different:
             raise ModelError(
-                f"with the identified values the text compiles to another {', '.join(unequal)}"
+                f"with the identified values the text compiles to a different {', '.join(different)}"
             )
     return stated
 
 
-def _written(path: Path, sheet: Sheet) -> Any:
-    path.write_bytes(sheet.edited())
+def _compiled(path: Path, document: MjcfDocument) -> Any:
+    """Write the edited text to a file and compile it."""
+    path.write_bytes(document.edited())
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, mujoco.FatalError) as error:
-        said = " ".join(str(error).split())
+        reason = " ".join(str(error).split())
         raise ModelError(
-            f"MuJoCo does not load the text with the identified values ({said})"
+            f"MuJoCo does not load the text with the identified values ({reason})"
         ) from None
 
 
-def _print(path: Path, setup: Setup, theta: Array, wanted: Any) -> None:
-    """Write MuJoCo's printing. Raises ModelError where its compile is another model than the wanted one."""
-    for settled in (False, True):
+def _write_printed(path: Path, setup: Setup, theta: Array, wanted: Any) -> None:
+    """Write the model as MuJoCo prints it; refuse a print that compiles to another model."""
+    # If the plain values are refused or give another model, derived numbers are stated as well.
+    for states_derived in (False, True):
         spec = setup.spec.copy()
-        if settled:
+        if states_derived:
             settle(spec, setup.model)
+
         try:
             write_spec(spec, setup.model, wanted, setup.parameters, theta)
             compiled = compile_spec(spec, setup.model_path)
         except (ValueError, ModelError) as error:
-            if settled:
+            if states_derived:
                 raise ModelError(f"{path}: MuJoCo refuses the identified values: {error}") from None
             continue
+
         if same_dynamics(compiled, wanted):
             _save(path, spec, setup.model_path)
             return
+
     raise ModelError(
-        f"{path}: not written: compiling the identified values anew gives another model than the identified one"
+        f"{path}: not written: with the identified values the MJCF compiles to another model than the identified one"
     )
 
 
 def _save(path: Path, spec: Any, model_path: Path) -> None:
+    """Write an MjSpec to a file that loads from its folder."""
     source, target = model_path.resolve().parent, path.resolve().parent
-    for folder in ("meshdir", "texturedir"):
-        setattr(spec, folder, os.path.relpath(source / getattr(spec, folder), target))
+    for attribute in ("meshdir", "texturedir"):
+        folder = source / getattr(spec, attribute)
+        setattr(spec, attribute, os.path.relpath(folder, target))
     spec.modelfiledir = str(target)
+
     with replacing(path) as temporary:
         temporary.write_text(spec.to_xml(), encoding="utf-8")
         mujoco.MjModel.from_xml_path(str(temporary))
 
 
 def same_dynamics(a: Any, b: Any) -> bool:
-    """True where two models agree in everything that moves them."""
+    """Compare everything that determines the motion of two models.
+
+    Args:
+        a: A compiled MuJoCo model.
+        b: Another one.
+
+    Returns:
+        Whether they agree.
+    """
     return not _differences(a, b)
 
 
 def _differences(a: Any, b: Any) -> list[str]:
-    """Names of what moves two models and differs. Inertias are compared as matrices, whose axes may be named in any order."""
+    """Names of the arrays that determine the motion and differ between two models."""
     names = [n for n in dir(a) if n.startswith(COMPARED) and not n.startswith(NOT_DYNAMICS)]
-    pairs = {n: (np.asarray(getattr(a, n)), np.asarray(getattr(b, n))) for n in names}
-    pairs |= {
-        n: (np.asarray(getattr(a.opt, n)), np.asarray(getattr(b.opt, n))) for n in FIELDS["option"]
-    }
-    found = [
-        n
-        for n, (x, y) in pairs.items()
-        if x.shape != y.shape or not np.allclose(x, y, rtol=1e-9, atol=1e-12)
-    ]
-    if found == ["body_invweight0"] and not _weighed_otherwise(a, b, alike=True):
+    found = [name for name in names if not _equal(getattr(a, name), getattr(b, name))]
+    found += [n for n in FIELDS["option"] if not _equal(getattr(a.opt, n), getattr(b.opt, n))]
+
+    # The weights of a body that is 'simple' in one model only are averaged differently.
+    if found == [INVERSE_WEIGHT] and not _reweighted_bodies(a, b, same_class=True):
         found = []
+
+    # Principal axes may be named in any order: the inertias are compared as matrices.
+    if a.nbody != b.nbody:
+        return [*found, "body_inertia"]
     traces = np.sum(b.body_inertia, axis=1)[:, None, None]
-    unequal = a.nbody != b.nbody or bool(
-        (np.abs(_matrices(a) - _matrices(b)) > 1e-9 * traces).any()
+    difference = np.abs(_inertia_matrices(a) - _inertia_matrices(b))
+    if (difference > RELATIVE_TOLERANCE * traces).any():
+        return [*found, "body_inertia"]
+    return found
+
+
+def _equal(x: Any, y: Any) -> bool:
+    """Whether two arrays have the same shape and nearly the same numbers."""
+    x, y = np.asarray(x), np.asarray(y)
+    return x.shape == y.shape and np.allclose(
+        x, y, rtol=RELATIVE_TOLERANCE, atol=ABSOLUTE_TOLERANCE
     )
-    return [*found, "body_inertia"] if unequal else found
 
 
-def _weighed_otherwise(a: Any, b: Any, alike: bool) -> list[str]:
-    """Names of bodies of another body_invweight0, by which MuJoCo softens constraints.
+def _reweighted_bodies(a: Any, b: Any, same_class: bool) -> list[str]:
+    """Names of the bodies whose constraint weight differs between two models.
 
-    alike: of bodies that are 'simple' in both models or in neither, else in one of them, where MuJoCo averages it otherwise;
-    in a fit the bodies that a parameter moves are never 'simple'
+    In a fit the bodies that a parameter moves are never 'simple', and MuJoCo averages the weight of a simple body
+    differently. same_class: whether bodies are meant that are 'simple' in both models or in neither, else in one of them.
     """
-    far = ~np.isclose(a.body_invweight0, b.body_invweight0, rtol=1e-9, atol=1e-12).all(axis=1)
-    rows = far & (((a.body_simple > 0) == (b.body_simple > 0)) == alike)
-    return [
-        mujoco.mj_id2name(a, mujoco.mjtObj.mjOBJ_BODY, int(i)) or f"body{i}"
-        for i in np.flatnonzero(rows)
-    ]
+    close = np.isclose(
+        a.body_invweight0, b.body_invweight0, rtol=RELATIVE_TOLERANCE, atol=ABSOLUTE_TOLERANCE
+    )
+    in_same_class = (a.body_simple > 0) == (b.body_simple > 0)
+    bodies = np.flatnonzero(~close.all(axis=1) & (in_same_class == same_class))
+
+    kind = mujoco.mjtObj.mjOBJ_BODY
+    return [mujoco.mj_id2name(a, kind, int(i)) or f"body{i}" for i in bodies]
 
 
-def _matrices(model: Any) -> Array:
-    """(nbody, 3, 3) inertias in the axes of their bodies."""
+def _inertia_matrices(model: Any) -> Array:
+    """(nbody, 3, 3) inertias in the axes of their bodies [kg m²]."""
     R = Rotation.from_quat(model.body_iquat, scalar_first=True).as_matrix()
     return np.asarray(np.einsum("bij,bj,bkj->bik", R, model.body_inertia, R))
 
@@ -189,11 +244,19 @@ def _matrices(model: Any) -> Array:
 def write_spec(
     spec: Any, compiled: Any, wanted: Any, parameters: ParameterSet, theta: Array
 ) -> None:
-    """Write theta: (p,) into an MjSpec that the caller owns. compiled, wanted: its model as it is and at theta."""
+    """Write parameter values into an MjSpec.
+
+    Args:
+        spec: The MjSpec; it is changed.
+        compiled: Model that it compiles to before the change.
+        wanted: Model at the values.
+        parameters: The parameters.
+        theta: (p,) values.
+    """
     for parameter, value in zip(parameters.parameters, theta, strict=True):
         if parameter.function is not None:
             parameter.function(spec, float(value))
+
         for target in parameter.targets:
-            write_element(
-                spec, compiled, wanted, target.path, target.scale * float(value) + target.offset
-            )
+            written = target.scale * float(value) + target.offset
+            write_element(spec, compiled, wanted, target.path, written)

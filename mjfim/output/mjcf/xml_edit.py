@@ -1,4 +1,4 @@
-"""An XML text whose start tags are changed byte by byte: what is not named stays as it was typed."""
+"""Edits of an XML text that change only the bytes of the edited start tags."""
 
 from __future__ import annotations
 
@@ -10,16 +10,35 @@ from xml.sax.saxutils import escape
 
 from mjfim.errors import ModelError
 
+# Name of an element, up to white space or the end of its tag.
 NAME = re.compile(rb"[^\s/>]+")
+
+# An attribute with the white space before it: groups are that space, the name, and the value with its quotes.
 ATTRIBUTE = re.compile(rb"""(\s+)([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
+
+# White space, possibly none.
 SPACE = re.compile(rb"\s*")
-EMPTY = re.compile(rb"\s*/>")
+
+# End of an element without content.
+EMPTY_END = re.compile(rb"\s*/>")
+
+# Quotes inside a value, as entities, so that a value may stand in either kind of quotes.
 QUOTES = {'"': "&quot;", "'": "&apos;"}
 
+# First byte, byte after the last one, and replacement of one part of the text.
+TextChange = tuple[int, int, bytes]
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class Tag:
-    """A start tag: its name and attributes as read, its first byte, and the index of the tag around it (the root's is -1)."""
+    """Start tag of an element, as it was read.
+
+    Attributes:
+        name: Name of the element.
+        attributes: Values by name of the attribute, entities resolved.
+        start: Position of its first byte in the text.
+        parent: Index of the start tag of the enclosing element; -1 for the root.
+    """
 
     name: str
     attributes: dict[str, str]
@@ -27,129 +46,224 @@ class Tag:
     parent: int
 
 
-class Markup:
-    """A text under change. tags: all start tags, in order, the root first.
+class XmlText:
+    """XML text with pending edits of its start tags.
 
-    Raises ModelError, as a clause that says why, where the text is not well-formed UTF-8 or has a DOCTYPE, which could
-    declare entities.
+    Attributes:
+        tags: All start tags in the order of the text; the root is the first.
     """
 
     def __init__(self, text: bytes) -> None:
+        """Parse a text.
+
+        Args:
+            text: XML in UTF-8.
+
+        Raises:
+            ModelError: The text is not well-formed, or has a DOCTYPE, which could declare entities. The message is a
+                clause that completes a sentence.
+        """
         self._text = text
         self.tags: list[Tag] = []
-        self._ends: dict[int, int] = {}
-        self._read()
+        self._end_tags: dict[int, int] = {}
+        self._parse()
+
+        # Pending edits, by index of the tag.
         self._values: dict[int, dict[str, str | None]] = {}
-        self._heirs: dict[tuple[int, str], str] = {}
+        self._successors: dict[tuple[int, str], str] = {}
         self._names: dict[int, str] = {}
         self._children: dict[int, list[bytes]] = {}
 
-    def _read(self) -> None:
-        parser = expat.ParserCreate("UTF-8")  # whatever the declaration says: MuJoCo reads bytes
-        around: list[int] = []
+    def _parse(self) -> None:
+        """Find all start tags, and the position of each element's end tag."""
+        # MuJoCo reads bytes, whatever encoding the XML declaration states.
+        parser = expat.ParserCreate("UTF-8")
+        enclosing: list[int] = []
 
-        def start(name: str, attributes: dict[str, str]) -> None:
-            self.tags.append(
-                Tag(name, attributes, parser.CurrentByteIndex, around[-1] if around else -1)
-            )
-            around.append(len(self.tags) - 1)
+        def on_start(name: str, attributes: dict[str, str]) -> None:
+            """Record a start tag."""
+            parent = enclosing[-1] if enclosing else -1
+            position = parser.CurrentByteIndex
+            self.tags.append(Tag(name=name, attributes=attributes, start=position, parent=parent))
+            enclosing.append(len(self.tags) - 1)
 
-        def end(_: str) -> None:
-            self._ends[around.pop()] = parser.CurrentByteIndex
+        def on_end(_: str) -> None:
+            """Record an end tag."""
+            self._end_tags[enclosing.pop()] = parser.CurrentByteIndex
 
-        def doctype(*_: object) -> NoReturn:
+        def on_doctype(*_: object) -> NoReturn:
+            """Refuse entities, which could expand without limit."""
             raise ModelError("the MJCF has a DOCTYPE")
 
-        parser.StartElementHandler, parser.EndElementHandler = start, end
-        parser.StartDoctypeDeclHandler = doctype
+        parser.StartElementHandler = on_start
+        parser.EndElementHandler = on_end
+        parser.StartDoctypeDeclHandler = on_doctype
+
         try:
             parser.Parse(self._text, True)
         except expat.ExpatError as error:
             raise ModelError(f"the MJCF is not well-formed XML in UTF-8 ({error})") from None
 
     def attribute(self, tag: int, name: str) -> str | None:
-        """An attribute as it now stands, None where there is none."""
-        changed = self._values.get(tag, {})
-        return changed[name] if name in changed else self.tags[tag].attributes.get(name)
+        """Return the value of an attribute after the edits so far.
+
+        Args:
+            tag: Index of the tag.
+            name: Name of the attribute.
+
+        Returns:
+            The value, None if there is no such attribute.
+        """
+        edited = self._values.get(tag, {})
+        return edited[name] if name in edited else self.tags[tag].attributes.get(name)
 
     def set(self, tag: int, name: str, value: str | None) -> None:
-        """Replace an attribute where it stands, add it behind the others, or take it out (None)."""
+        """Change the value of an attribute in place, add the attribute after the others, or remove it.
+
+        Args:
+            tag: Index of the tag.
+            name: Name of the attribute.
+            value: The new value; None removes the attribute.
+        """
         if value != self.attribute(tag, name):
             self._values.setdefault(tag, {})[name] = value
 
-    def replace(self, tag: int, name: str, other: str, value: str) -> None:
-        """Put another attribute where one stands."""
-        self.set(tag, name, None)
-        self.set(tag, other, value)
-        self._heirs[tag, name] = other
+    def replace_attribute(self, tag: int, name: str, successor: str, value: str) -> None:
+        """Write another attribute in the place of an existing one.
 
-    def rename(self, tag: int, name: str) -> None:
-        """Give an element another name."""
+        Args:
+            tag: Index of the tag.
+            name: Name of the existing attribute.
+            successor: Name of the attribute that takes its place.
+            value: Value of the successor.
+        """
+        self.set(tag, name, None)
+        self.set(tag, successor, value)
+        self._successors[tag, name] = successor
+
+    def rename_element(self, tag: int, name: str) -> None:
+        """Change the name of an element.
+
+        Args:
+            tag: Index of the tag.
+            name: The new name.
+        """
         self._names[tag] = name
 
-    def insert(self, parent: int, name: str, attributes: dict[str, str]) -> None:
-        """Put a new element before all others inside `parent`, indented as the first of these."""
-        written = b"".join(b" " + _written(key, value) for key, value in attributes.items())
+    def insert_child(self, parent: int, name: str, attributes: dict[str, str]) -> None:
+        """Add an empty element as the first child of another one, with the indentation of the present first child.
+
+        Args:
+            parent: Index of the tag of the enclosing element.
+            name: Name of the new element.
+            attributes: Values by name of the attribute.
+        """
+        written = b"".join(b" " + _attribute_text(key, value) for key, value in attributes.items())
         self._children.setdefault(parent, []).append(b"<" + name.encode() + written + b"/>")
 
     def edited(self) -> bytes:
-        """The text with all changes."""
-        pieces: list[tuple[int, int, bytes]] = []
+        """Return the text with all edits applied.
+
+        Returns:
+            The text; bytes outside the edited parts are unchanged.
+
+        Raises:
+            ModelError: An element without content would need one.
+        """
+        changes: list[TextChange] = []
         for tag in {*self._values, *self._names, *self._children}:
-            pieces += self._pieces(tag)
+            changes += self._changes_of_tag(tag)
+
+        # From the end to the begin, so that positions of later changes stay valid.
         text = self._text
-        for start, stop, new in sorted(pieces, reverse=True):
+        for start, stop, new in sorted(changes, reverse=True):
             text = text[:start] + new + text[stop:]
         return text
 
-    def _pieces(self, tag: int) -> list[tuple[int, int, bytes]]:
-        """(first byte, byte behind the last, replacement) of the changes to one element."""
-        pieces, changed = [], dict(self._values.get(tag, {}))
-        at = self._name_end(self.tags[tag].start + 1)
-        names = [(self.tags[tag].start + 1, at)]
-        while found := ATTRIBUTE.match(self._text, at):
-            at = found.end()
-            name = found[2].decode()
-            if name not in changed:
-                continue
-            value, heir = changed.pop(name), self._heirs.get((tag, name), "")
-            if value is None and heir in changed:
-                pieces.append((found.start(2), found.end(), _written(heir, changed.pop(heir))))
-            elif value is None:
-                pieces.append((found.start(), found.end(), b""))
-            else:
-                pieces.append((found.start(3) + 1, found.end(3) - 1, _encoded(value)))
-        added = b"".join(b" " + _written(n, v) for n, v in changed.items() if v is not None)
-        if not EMPTY.match(self._text, at):
-            close = self._ends[tag] + 2
-            names.append((close, self._name_end(close)))
-        if tag in self._names:
-            pieces += [(start, stop, self._names[tag].encode()) for start, stop in names]
-        return [*pieces, (at, at, added), *self._inside(tag, at)]
+    def _changes_of_tag(self, tag: int) -> list[TextChange]:
+        """All changes to one element."""
+        name_start = self.tags[tag].start + 1
+        name_stop = self._name_stop(name_start)
 
-    def _name_end(self, start: int) -> int:
+        attributes, stop, added = self._attribute_changes(tag, name_stop)
+
+        # An element with content has its name in the end tag as well.
+        names = [(name_start, name_stop)]
+        if not EMPTY_END.match(self._text, stop):
+            end_name = self._end_tags[tag] + len(b"</")
+            names.append((end_name, self._name_stop(end_name)))
+
+        renamed: list[TextChange] = []
+        if tag in self._names:
+            renamed = [(start, end, self._names[tag].encode()) for start, end in names]
+
+        return [*attributes, *renamed, (stop, stop, added), *self._child_changes(tag, stop)]
+
+    def _attribute_changes(self, tag: int, position: int) -> tuple[list[TextChange], int, bytes]:
+        """Changes to the attributes that begin at a position.
+
+        Returns:
+            Changes to existing attributes, the position after the last attribute, and the text of new attributes.
+        """
+        pending = dict(self._values.get(tag, {}))
+        changes: list[TextChange] = []
+
+        while found := ATTRIBUTE.match(self._text, position):
+            position = found.end()
+            name = found[2].decode()
+            if name not in pending:
+                continue
+
+            value = pending.pop(name)
+            successor = self._successors.get((tag, name), "")
+            if value is not None:
+                changes.append((found.start(3) + 1, found.end(3) - 1, _escaped(value)))
+            elif successor in pending:
+                text = _attribute_text(successor, pending.pop(successor))
+                changes.append((found.start(2), found.end(), text))
+            else:
+                changes.append((found.start(), found.end(), b""))
+
+        added = [
+            b" " + _attribute_text(name, value)
+            for name, value in pending.items()
+            if value is not None
+        ]
+        return changes, position, b"".join(added)
+
+    def _name_stop(self, start: int) -> int:
+        """Position after the name that begins at a position."""
         found = NAME.match(self._text, start)
         return start if found is None else found.end()
 
-    def _inside(self, tag: int, at: int) -> list[tuple[int, int, bytes]]:
-        """The new children of an element whose last attribute ends at a byte."""
+    def _child_changes(self, tag: int, stop: int) -> list[TextChange]:
+        """Insertion of new children into an element whose last attribute ends at a position."""
         if tag not in self._children:
             return []
-        if EMPTY.match(self._text, at):
-            raise ModelError(f"an empty <{self.tags[tag].name}/> would need a content")
-        stop = self._text.index(b">", at) + 1
-        space = SPACE.match(self._text, stop)
-        lead = b"" if space is None else space[0]
-        newline = lead.rfind(b"\n")
-        if newline > 0 and lead[newline - 1 : newline] == b"\r":
-            newline -= 1
-        lead = lead[max(newline, 0) :]
-        return [(stop, stop, b"".join(lead + child for child in self._children[tag]))]
+        if EMPTY_END.match(self._text, stop):
+            raise ModelError(f"the empty element <{self.tags[tag].name}/> would need content")
+
+        content = self._text.index(b">", stop) + 1
+        lead = self._last_line_break(content)
+        inserted = b"".join(lead + child for child in self._children[tag])
+        return [(content, content, inserted)]
+
+    def _last_line_break(self, position: int) -> bytes:
+        """Line break and indentation before the text that follows the white space at a position."""
+        found = SPACE.match(self._text, position)
+        space = b"" if found is None else found[0]
+
+        line_break = space.rfind(b"\n")
+        if line_break > 0 and space[line_break - 1 : line_break] == b"\r":
+            line_break -= 1
+        return space[max(line_break, 0) :]
 
 
-def _encoded(value: str) -> bytes:
+def _escaped(value: str) -> bytes:
+    """Value of an attribute as it is written between quotes."""
     return escape(value, QUOTES).encode("utf-8", "surrogateescape")
 
 
-def _written(name: str, value: str | None) -> bytes:
-    return b'%s="%s"' % (name.encode(), _encoded(value or ""))
+def _attribute_text(name: str, value: str | None) -> bytes:
+    """Attribute as it is written in a start tag."""
+    return b'%s="%s"' % (name.encode(), _escaped(value or ""))
