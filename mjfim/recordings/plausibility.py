@@ -159,7 +159,7 @@ def _disagreement(
 
     Returns:
         Standard deviation of the difference and the one expected from the noise, both relative to the standard
-        deviation of the displacement; 0 and 0 where nothing moves.
+        deviation of the displacement; 0 and 0 if the joint does not move.
     """
     dq, dv, lag = displacements(t, q, v, COMPARISON_TIME, len(t) // 4)
     size = float(np.std(dq))

@@ -110,7 +110,12 @@ def _describe_reversal(where: str, t: Array, steps: Array, first: int) -> str:
 def _likely_unit(median: float, unit: str) -> str:
     """Unit of time in which a median step [s], read in another unit, is that of a typical log."""
     raw = median / SECONDS[unit]
-    return min(SECONDS, key=lambda other: abs(np.log(raw * SECONDS[other] / TYPICAL_STEP)))
+
+    def distance(other: str) -> float:
+        """Logarithmic distance of the step, read in another unit, from a typical one."""
+        return abs(float(np.log(raw * SECONDS[other] / TYPICAL_STEP)))
+
+    return min(SECONDS, key=distance)
 
 
 def check_finite(where: str, values: Array, first: int) -> None:

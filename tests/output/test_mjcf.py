@@ -1,4 +1,4 @@
-"""The user's MJCF with identified values in it: only those change, by all digits, however the file is written."""
+"""The user's MJCF with identified values: only these change, with all digits, however the file is written."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.support.shared_models import EXPERIMENTS
 
 PRECISE = 1e-12
 
-# Everything that a path can name, once by itself and once inherited; typed as people type.
+# Everything that a path can name, stated by the element and inherited, with irregular formatting.
 RICH = """<?xml version="1.0"?>
 <!-- größer als ASCII: 2 m² — <joint name="j" damping="99"/> stays a comment -->
 <mujoco model='rich'>
@@ -71,8 +71,8 @@ RICH = """<?xml version="1.0"?>
 </mujoco>
 """
 
-# path -> (value, how a line then reads)
-SAID: dict[str, tuple[float, str]] = {
+# By path, a value and a part of the line that then states it.
+STATED: dict[str, tuple[float, str]] = {
     "body/a:mass": (
         1.7,
         '      <inertial pos="0.010 0 0.20" mass="1.7" diaginertia="0.060 0.0660 0.030"/>',
@@ -157,7 +157,7 @@ OUTSIDE = (
 
 
 def setup_of(xml: str | Path, folder: Path, *targets: Any, **tables: Any) -> Setup:
-    """An experiment whose parameters p0, p1 ... are the targets: paths, or tables."""
+    """Experiment whose parameters p0, p1 ... have the given targets: paths or tables."""
     given = {
         f"p{i}": {"target": t, "scale": 1.0} if isinstance(t, str) else t
         for i, t in enumerate(targets)
@@ -173,7 +173,7 @@ def setup_of(xml: str | Path, folder: Path, *targets: Any, **tables: Any) -> Set
 
 
 def lines(old: Path, new: Path) -> tuple[list[str], list[str]]:
-    """Lines taken out and put in."""
+    """Removed and added lines."""
     texts = [path.read_text(encoding="utf-8").splitlines() for path in (old, new)]
     found = [line for line in difflib.ndiff(*texts) if line[0] in "-+"]
     return [line[2:] for line in found if line[0] == "-"], [
@@ -181,8 +181,8 @@ def lines(old: Path, new: Path) -> tuple[list[str], list[str]]:
     ]
 
 
-def assert_one_model(path: Path, setup: Setup, theta: Any) -> None:
-    """The file loads as the identified model, to 1e-12 of each array's largest number."""
+def assert_is_identified_model(path: Path, setup: Setup, theta: Any) -> None:
+    """Assert that the file loads as the identified model, to 1e-12 of each array's largest number."""
     found, wanted = (
         mujoco.MjModel.from_xml_path(str(path)),
         setup.model_at(np.asarray(theta, float), placed=False),
@@ -213,9 +213,9 @@ def assert_one_model(path: Path, setup: Setup, theta: Any) -> None:
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=PRECISE * np.trace(theirs))
 
 
-@pytest.mark.parametrize("path", SAID)
+@pytest.mark.parametrize("path", STATED)
 def test_one_value_changes_one_element(path: str, tmp_path: Path) -> None:
-    value, line = SAID[path]
+    value, line = STATED[path]
     target: Any = (
         {"target": path, "guess": 1.0, "scale": 1.0} if path.endswith(("mass", "density")) else path
     )
@@ -225,31 +225,33 @@ def test_one_value_changes_one_element(path: str, tmp_path: Path) -> None:
     gone, came = lines(tmp_path / "model.xml", new)
     assert any(line in text for text in came), came
     assert (len(gone), len(came)) == ((0, 1) if path.startswith("body/b ") else (1, 1))
-    assert_one_model(new, setup, [value])
+    assert_is_identified_model(new, setup, [value])
 
 
-def test_every_field_is_tried() -> None:
+def test_every_field_is_tested() -> None:
     tried = {
         (p.split("/")[0].split(":")[0], re.split(r"[:\[]", p.rsplit(":", 1)[1])[0])
-        for p in (*SAID, *OUTSIDE)
+        for p in (*STATED, *OUTSIDE)
     }
     every = {(kind, field) for kind in KINDS for field in fields_of(kind)}
     assert tried == every
 
 
-def test_what_is_not_in_the_model_changes_nothing(tmp_path: Path) -> None:
+def test_parameters_outside_the_model_change_nothing(tmp_path: Path) -> None:
     setup = setup_of(RICH, tmp_path, *OUTSIDE, noise={"seen": 0.1, "qpos:j": 0.1})
     assert write_identified(tmp_path / "identified.xml", setup, np.full(len(OUTSIDE), 0.01)) is None
     assert (tmp_path / "identified.xml").read_bytes() == (tmp_path / "model.xml").read_bytes()
 
 
-# no values of geoms here: the compiled model does not hold a mass, and a body takes one chart of its inertia
-STILL = [
+# Without masses of geoms, which the compiled model does not keep, and inertias, of which a body takes one parametrisation.
+UNCHANGED = [
     p
-    for p in SAID
+    for p in STATED
     if not p.startswith(("geom/h:mass", "geom/i:density")) and not re.match(r"body/[ac]:(?!pos)", p)
 ]
-STILL = [p for p in STILL if p not in ("actuator/g:biasprm[2]", "tendon/link:springlength[1]")]
+UNCHANGED = [
+    p for p in UNCHANGED if p not in ("actuator/g:biasprm[2]", "tendon/link:springlength[1]")
+]
 
 
 @pytest.mark.parametrize(
@@ -262,17 +264,15 @@ STILL = [p for p in STILL if p not in ("actuator/g:biasprm[2]", "tendon/link:spr
     ],
     ids=["moments", "matrix", "barycentric", "logcholesky"],
 )
-def test_without_a_change_the_file_is_the_same_to_the_byte(
-    more: tuple[str, ...], tmp_path: Path
-) -> None:
-    setup = setup_of(RICH, tmp_path, *(p for p in STILL if p != 'body/b "2":mass'), *more)
+def test_without_a_change_the_file_keeps_every_byte(more: tuple[str, ...], tmp_path: Path) -> None:
+    setup = setup_of(RICH, tmp_path, *(p for p in UNCHANGED if p != 'body/b "2":mass'), *more)
     assert write_identified(tmp_path / "identified.xml", setup, setup.parameters.guess) is None
     assert (tmp_path / "identified.xml").read_bytes() == (tmp_path / "model.xml").read_bytes()
 
 
-def test_an_identified_file_is_a_model_that_repeats_itself(tmp_path: Path) -> None:
-    """What was written is read as it was meant: as the next experiment's model it changes no more."""
-    paths = [p for p in STILL if p != 'body/b "2":mass'] + [
+def test_an_identified_file_reproduces_itself(tmp_path: Path) -> None:
+    """A written file has the identified values, and as the model of the next experiment it does not change any more."""
+    paths = [p for p in UNCHANGED if p != 'body/b "2":mass'] + [
         "body/a:firstmoment[0]",
         "body/c:fullinertia[3]",
     ]
@@ -322,7 +322,7 @@ def test_line_ends_and_byte_order_marks_stay(ending: str, head: str, tmp_path: P
 
 
 def test_empty_elements_without_spaces(tmp_path: Path) -> None:
-    """A motor that ends where its section does is renamed once, an open one twice."""
+    """An empty motor is renamed in its only tag, one with an end tag in both tags."""
     xml = re.sub(
         r"<actuator>.*</actuator>",
         '<actuator><motor name="m" joint="j"{}</actuator>',
@@ -361,8 +361,8 @@ def test_a_doctype_is_not_followed(tmp_path: Path) -> None:
     )
 
 
-# what the text cannot say: change of the model, path, words of the reason
-BEYOND = {
+# Changes that the text cannot express: change of the model, path, words of the reason.
+INEXPRESSIBLE = {
     "frame": (
         ('<body name="c" pos="1 0 0">', '<frame euler="0 0 9"><body name="c">'),
         "body/c:pos[0]",
@@ -388,9 +388,9 @@ BEYOND = {
 }
 
 
-@pytest.mark.parametrize("case", BEYOND)
-def test_what_the_text_cannot_say_mujoco_prints(case: str, tmp_path: Path) -> None:
-    (old, new), path, reason = BEYOND[case]
+@pytest.mark.parametrize("case", INEXPRESSIBLE)
+def test_mujoco_prints_values_that_the_text_cannot_express(case: str, tmp_path: Path) -> None:
+    (old, new), path, reason = INEXPRESSIBLE[case]
     xml = RICH.replace(old, new)
     if case == "frame":
         xml = xml.replace("</body>\n  </worldbody>", "</body></frame>\n  </worldbody>")
@@ -409,7 +409,7 @@ def test_what_the_text_cannot_say_mujoco_prints(case: str, tmp_path: Path) -> No
 
 
 def stiffen(spec: Any, value: float) -> None:
-    """A parameter that is a function of the MjSpec."""
+    """Function of the MjSpec that is a parameter."""
     spec.joint("j").armature = value
 
 
@@ -421,7 +421,7 @@ def test_functions_of_the_spec_are_printed_by_mujoco(tmp_path: Path) -> None:
 
 
 def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
-    """What stands in the file itself is changed there; what stands in an included one cannot be."""
+    """Elements of the file itself are changed there; those of an included file cannot be."""
     (tmp_path / "parts").mkdir()
     part = '<mujocoinclude><body name="d" pos="3 0 0"><joint name="dj"/><geom size=".1"/></body></mujocoinclude>'
     (tmp_path / "parts" / "d.xml").write_text(part, encoding="utf-8")
@@ -436,7 +436,7 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
     gone, came = lines(source, new)
     assert len(gone) == len(came) == 2
     assert '<include file="../../parts/d.xml"/></worldbody>' in came
-    assert_one_model(new, setup, [0.7])
+    assert_is_identified_model(new, setup, [0.7])
     inside = setup_of(source, tmp_path, "joint/dj:damping")
     said = write_identified(new, inside, np.array([0.7]))
     assert said is not None and "joint 'dj' is not in the MJCF file itself" in said
@@ -444,7 +444,7 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
 
 
 def test_attached_models_are_printed_by_mujoco(tmp_path: Path) -> None:
-    """Its elements stand in another file; from another folder that file would not be found by the text either."""
+    """The elements of an attached model are in another file, which the text would not find from another folder."""
     part = '<mujoco model="leg"><worldbody><body name="d"><joint name="dj"/><geom size=".1"/></body></worldbody></mujoco>'
     (tmp_path / "leg.xml").write_text(part, encoding="utf-8")
     xml = RICH.replace(
@@ -480,9 +480,7 @@ MESH = "v 0 0 0\nv 0.2 0 0\nv 0 0.3 0\nv 0 0 0.4\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2
         ("<compiler assetdir='sub'/>", "  <compiler assetdir='../model/sub'/>"),
     ],
 )
-def test_asset_folders_change_only_where_files_are_read_from_them(
-    compiler: str, line: str, tmp_path: Path
-) -> None:
+def test_only_asset_folders_in_use_change(compiler: str, line: str, tmp_path: Path) -> None:
     for folder in ("model", "model/sub"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "t.obj").write_text(MESH, encoding="utf-8")
@@ -499,7 +497,7 @@ def test_asset_folders_change_only_where_files_are_read_from_them(
         gone, came = lines(tmp_path / "model" / "model.xml", path)
         assert len(gone) == changed
         assert (line in came) == (path is away)
-        assert_one_model(path, setup, theta)
+        assert_is_identified_model(path, setup, theta)
     plain = setup_of(
         RICH.replace("  <default>\n", f"  {compiler}\n  <default>\n", 1),
         tmp_path / "model",
@@ -509,7 +507,7 @@ def test_asset_folders_change_only_where_files_are_read_from_them(
     assert len(lines(tmp_path / "model" / "model.xml", away)[1]) == 1
 
 
-# what the compiler would derive anew: (old, new), path, value, what is stated besides
+# Numbers that the compiler would derive: (old, new) text, path, value, object whose number is stated.
 DERIVED = {
     "damping ratio": (
         ('kp="12.0" kv="0.60"', 'kp="12.0" dampratio="1"'),
@@ -534,7 +532,7 @@ DERIVED = {
 
 
 @pytest.mark.parametrize("case", DERIVED)
-def test_what_the_compiler_would_derive_anew_is_stated(case: str, tmp_path: Path) -> None:
+def test_numbers_that_the_compiler_would_derive_are_stated(case: str, tmp_path: Path) -> None:
     (old, new), path, value, stated = DERIVED[case]
     assert old in RICH
     setup = setup_of(RICH.replace(old, new), tmp_path, path)
@@ -544,7 +542,7 @@ def test_what_the_compiler_would_derive_anew_is_stated(case: str, tmp_path: Path
         == f"identified.xml: it also states numbers that MuJoCo would otherwise derive from the identified values: {stated}"
     )
     assert "größer als ASCII" in (tmp_path / "identified.xml").read_text(encoding="utf-8")
-    assert_one_model(tmp_path / "identified.xml", setup, [value])
+    assert_is_identified_model(tmp_path / "identified.xml", setup, [value])
 
 
 def test_an_option_is_made_where_there_is_none(tmp_path: Path) -> None:
@@ -554,12 +552,12 @@ def test_an_option_is_made_where_there_is_none(tmp_path: Path) -> None:
     assert write_identified(tmp_path / "identified.xml", setup, np.array([0.1, 1.2])) is None
     gone, came = lines(tmp_path / "model.xml", tmp_path / "identified.xml")
     assert (gone, came) == ([], ['  <option gravity="0.1 0.0 -9.81" density="1.2"/>'])
-    assert_one_model(tmp_path / "identified.xml", setup, [0.1, 1.2])
+    assert_is_identified_model(tmp_path / "identified.xml", setup, [0.1, 1.2])
 
 
 @pytest.mark.parametrize("turned", ["", ' euler="10 20 30"', ' quat="0.6 0.8 0 0"'])
 def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: Path) -> None:
-    """`objtype="body"` is the frame of the body's inertia: the matrix alone would not tell which axis is which."""
+    """`objtype="body"` is the frame of the principal axes: the matrix alone would leave their order open."""
     watch = '<framequat objtype="body" objname="a" name="axes" noise=".01"/></sensor>'
     xml = RICH.replace("</sensor>", watch).replace('mass="1.50"', f'mass="1.50"{turned}')
     setup = setup_of(xml, tmp_path, "body/a:fullinertia[3]")
@@ -573,8 +571,8 @@ def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: 
 
 
 @pytest.mark.parametrize("element", SHORTCUTS)
-def test_shortcuts_fill_the_places_that_mujoco_fills(element: str) -> None:
-    """One attribute after the other against MuJoCo's own reading."""
+def test_shortcuts_set_the_entries_that_mujoco_sets(element: str) -> None:
+    """Compare each attribute with the arrays that MuJoCo compiles from it."""
     needs = {
         "intvelocity": 'actrange="-1 1"',
         "damper": 'ctrlrange="0 1"',
@@ -606,7 +604,7 @@ def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
     said = write_identified(tmp_path / "identified.xml", setup, theta)
     assert (said is None) == (name != "sliding_block"), said
     assert said is None or "body_invweight0" in said
-    assert_one_model(tmp_path / "identified.xml", setup, theta)
+    assert_is_identified_model(tmp_path / "identified.xml", setup, theta)
     gone, came = lines(setup.model_path, tmp_path / "identified.xml")
     assert 0 < len(gone) == len(came) <= sum(len(p.targets) for p in setup.parameters.parameters)
     numbers = re.compile(
@@ -616,7 +614,7 @@ def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_models_of_others(name: str, tmp_path: Path) -> None:
+def test_models_of_other_projects(name: str, tmp_path: Path) -> None:
     shared_model(EXPERIMENTS[name]["model"])
     setup = Setup(mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED_MODELS, source=name))
     theta = setup.parameters.guess * (
@@ -627,4 +625,4 @@ def test_models_of_others(name: str, tmp_path: Path) -> None:
         assert said is not None and "it also states" in said and "printed" not in said
     else:
         assert said is None
-    assert_one_model(tmp_path / "identified.xml", setup, theta)
+    assert_is_identified_model(tmp_path / "identified.xml", setup, theta)

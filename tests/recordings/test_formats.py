@@ -1,4 +1,4 @@
-"""Every format gives the same columns; what is damaged, unpacks to too much or holds pickles is refused with one sentence."""
+"""All formats give equal columns; damaged files, decompression bombs and pickles are refused with one sentence."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ROWS = 50
 
 @pytest.fixture
 def columns() -> Columns:
-    """Three columns of doubles, one with holes."""
+    """Three columns of numbers, one with empty fields."""
     rng = np.random.default_rng(2)
     q = rng.standard_normal(ROWS)
     q[7:12] = np.nan
@@ -41,31 +41,31 @@ def columns() -> Columns:
 
 
 def as_csv(path: Path, columns: Columns) -> None:
-    """Empty fields for NaN."""
+    """Write a CSV file with empty fields for NaN."""
     pyarrow.csv.write_csv(
         pyarrow.table({n: pyarrow.array(c, from_pandas=True) for n, c in columns.items()}), path
     )
 
 
 def as_gzip(path: Path, columns: Columns) -> None:
-    """The same, packed."""
+    """Write a CSV file that is packed by gzip."""
     as_csv(path.with_suffix(""), columns)
     path.write_bytes(gzip.compress(path.with_suffix("").read_bytes()))
 
 
 def as_parquet(path: Path, columns: Columns) -> None:
-    """Nulls for NaN."""
+    """Write a Parquet file with nulls for NaN."""
     table = pyarrow.table({n: pyarrow.array(c, from_pandas=True) for n, c in columns.items()})
     pyarrow.parquet.write_table(table, path)
 
 
 def as_npz(path: Path, columns: Columns) -> None:
-    """One array per column."""
+    """Write an archive with one array per column."""
     np.savez_compressed(path, **columns)
 
 
 def as_json(path: Path, columns: Columns) -> None:
-    """A list of records, null for NaN."""
+    """Write a JSON list of records with null for NaN."""
     rows = zip(*(c.tolist() for c in columns.values()), strict=True)
     path.write_text(
         json.dumps(
@@ -86,7 +86,7 @@ formats = pytest.mark.parametrize("ending", WRITERS)
 
 
 def same(table: Table, columns: Columns) -> bool:
-    """To the last bit, in float64."""
+    """Whether a table has exactly these columns, bit for bit in float64."""
     return set(table.columns) == set(columns) and all(
         table.column(name).dtype == np.float64
         and np.array_equal(table.column(name), column, equal_nan=True)
@@ -103,7 +103,7 @@ def test_formats_agree(ending: str, columns: Columns, tmp_path: Path) -> None:
 
 @formats
 def test_truncated_files(ending: str, columns: Columns, tmp_path: Path) -> None:
-    """However much is missing; a CSV that ends in the middle of a row is told by its number of fields."""
+    """A truncated file is refused; a CSV file that ends inside a row is recognised by its number of fields."""
     path = tmp_path / f"log{ending}"
     WRITERS[ending](path, columns)
     whole = path.read_bytes()
@@ -121,7 +121,7 @@ def test_truncated_files(ending: str, columns: Columns, tmp_path: Path) -> None:
 
 @formats
 def test_damaged_files(ending: str, columns: Columns, tmp_path: Path) -> None:
-    """Overwritten bytes: never another error than ours, and that in one line."""
+    """Overwritten bytes never cause another error than RecordingError, whose message is one line."""
     path = tmp_path / f"log{ending}"
     WRITERS[ending](path, columns)
     whole, rng, said = path.read_bytes(), np.random.default_rng(3), list[str]()
@@ -147,8 +147,8 @@ def test_empty_files(ending: str, tmp_path: Path) -> None:
 
 
 @formats
-def test_only_what_is_wanted_is_read(ending: str, columns: Columns, tmp_path: Path) -> None:
-    """Others may hold anything; their names stay known."""
+def test_only_needed_columns_are_read(ending: str, columns: Columns, tmp_path: Path) -> None:
+    """Columns that are not needed may hold anything; their names stay known."""
     path = tmp_path / f"log{ending}"
     WRITERS[ending](path, columns)
     table = read_columns(path, RecordingSpec(columns={"qpos:j": "q", "ctrl:m": "q"}))
@@ -159,7 +159,7 @@ def test_only_what_is_wanted_is_read(ending: str, columns: Columns, tmp_path: Pa
 
 
 def test_unknown_endings(tmp_path: Path) -> None:
-    """The message lists the known ones."""
+    """The message lists the known endings."""
     (tmp_path / "log.xlsx").write_text("x", encoding="utf-8")
     with pytest.raises(
         RecordingError,
@@ -175,8 +175,8 @@ def test_unknown_endings(tmp_path: Path) -> None:
 # ---- CSV and Parquet
 
 
-def test_text_is_no_fault_until_it_is_used(tmp_path: Path) -> None:
-    """Numbers beside it are read in full."""
+def test_text_is_a_fault_only_if_it_is_used(tmp_path: Path) -> None:
+    """A column of text does not affect the numbers beside it; using it is an error."""
     path = tmp_path / "log.csv"
     path.write_text(
         "t,mode,q,big\n0,idle,1.5,1700000000000000123\n0.1,run,,1700000000000000124\n",
@@ -213,17 +213,17 @@ def test_ill_formed_csv(text: str, message: str, tmp_path: Path) -> None:
 
 
 def bomb_csv(path: Path) -> None:
-    """Many rows that are alike, in few bytes."""
+    """Write many equal rows in a small gzip file."""
     path.write_bytes(gzip.compress(b"t,q\n" + b"0,0\n" * 1_000_000))
 
 
 def bomb_npz(path: Path) -> None:
-    """A million zeros."""
+    """Write a million zeros in a small archive."""
     np.savez_compressed(path, t=np.zeros(1_000_000))
 
 
 def bomb_parquet(path: Path) -> None:
-    """A million times the same number, written once."""
+    """Write a million equal numbers in a small Parquet file."""
     pyarrow.parquet.write_table(pyarrow.table({"t": np.zeros(1_000_000)}), path)
 
 
@@ -234,7 +234,7 @@ def bomb_parquet(path: Path) -> None:
 def test_bombs(
     name: str, write: Callable[[Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A few kB that unpack to MB: fine within the limits, refused beyond either of them."""
+    """A few kB that unpack to MB are read within the limits, and refused beyond either of them."""
     path = tmp_path / name
     write(path)
     assert path.stat().st_size < 16_000
@@ -251,10 +251,10 @@ def test_bombs(
             read_columns(path, ALL)
 
 
-def test_packed_logs_are_no_bombs(
+def test_packed_logs_are_not_refused_as_bombs(
     columns: Columns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The ratio alone tells."""
+    """A log that packs well is read whatever its size, as long as the ratio is plausible."""
     monkeypatch.setattr(limits, "UNSUSPICIOUS_SIZE", 100)
     as_gzip(tmp_path / "log.csv.gz", columns)
     assert same(read_columns(tmp_path / "log.csv.gz", ALL), columns)
@@ -264,7 +264,7 @@ def test_packed_logs_are_no_bombs(
 
 
 class Trap:
-    """Makes a folder when it is unpickled."""
+    """Object that makes a folder when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -274,7 +274,7 @@ class Trap:
 
 
 def test_pickles_are_not_loaded(tmp_path: Path) -> None:
-    """Neither where the array is wanted nor where it is not; the trap itself works."""
+    """An array of pickled objects is refused whether it is needed or not; the trap itself works."""
     np.savez(
         tmp_path / "log.npz",
         t=np.arange(3.0),
@@ -291,7 +291,7 @@ def test_pickles_are_not_loaded(tmp_path: Path) -> None:
 
 
 def test_matrices_become_columns(tmp_path: Path) -> None:
-    """`name[i]`; a control lacks its last row; a number alone holds for all rows; cubes are left out."""
+    """A matrix gives columns `name[i]`; a control may lack the last row; a number holds for all rows; cubes are ignored."""
     q = np.arange(8.0).reshape(4, 2)
     np.savez(
         tmp_path / "log.npz", t=np.arange(4.0), qpos=q, ctrl=q[:3], kp=2.5, gain=np.zeros((3, 2, 2))
@@ -304,7 +304,7 @@ def test_matrices_become_columns(tmp_path: Path) -> None:
 
 
 def test_arrays_of_other_lengths(tmp_path: Path) -> None:
-    """Only a control may lack a row, under whatever name."""
+    """Only a control may lack the last row, whatever its name in the log is."""
     np.savez(
         tmp_path / "log.npz", t=np.arange(4.0), q=np.zeros(3), u=np.zeros(3), name=np.array(["a"])
     )
@@ -319,7 +319,7 @@ def test_arrays_of_other_lengths(tmp_path: Path) -> None:
 
 
 def header(shape: tuple[int, ...]) -> bytes:
-    """Of an npy file without content."""
+    """Header of an NPY file without content."""
     stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(
         stream, {"descr": "<f8", "fortran_order": False, "shape": shape}
@@ -327,16 +327,16 @@ def header(shape: tuple[int, ...]) -> bytes:
     return stream.getvalue()
 
 
-def test_headers_that_promise_too_much(tmp_path: Path) -> None:
-    """Nothing is allocated for numbers that are not there."""
+def test_headers_that_announce_too_much(tmp_path: Path) -> None:
+    """No memory is allocated for numbers that the file does not hold."""
     with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
         archive.writestr("t.npy", header((10**13,)))
     with pytest.raises(RecordingError, match=r"promises more numbers than it holds"):
         read_columns(tmp_path / "log.npz", ALL)
 
 
-def test_rows_that_are_columns(tmp_path: Path) -> None:
-    """A matrix whose time runs to the right; a time that is one."""
+def test_transposed_matrices_are_refused(tmp_path: Path) -> None:
+    """A matrix whose times are its columns is refused, and a time that is a matrix."""
     np.savez(tmp_path / "log.npz", t=np.arange(5000.0), qpos=np.zeros((2, 5000)))
     with pytest.raises(
         RecordingError,
@@ -355,13 +355,13 @@ def test_rows_that_are_columns(tmp_path: Path) -> None:
 
 
 def read_json(content: object, tmp_path: Path, spec: RecordingSpec = ALL) -> Table:
-    """Columns of this content."""
+    """Write content as JSON and read its columns."""
     (tmp_path / "log.json").write_text(json.dumps(content), encoding="utf-8")
     return read_columns(tmp_path / "log.json", spec)
 
 
 def test_json_records(tmp_path: Path) -> None:
-    """Header numbers, booleans, nested objects and lists; what a record lacks is empty."""
+    """Constants, booleans, nested objects and lists become columns; a field that a record lacks is empty."""
     content = {
         "kp": 100,
         "motor": {"kt": 0.3, "name": "xl"},
@@ -386,8 +386,8 @@ def test_json_records(tmp_path: Path) -> None:
     assert set(table.faults) == {"motor.name", "note"}
 
 
-def test_json_place(tmp_path: Path) -> None:
-    """Several lists of records need a word; that word must be right."""
+def test_json_with_several_lists_of_records(tmp_path: Path) -> None:
+    """The experiment file must select one of several lists of records, by a path that exists."""
     content = {"k": 1, "a": {"gain": 2, "left": [{"t": 0}], "right": [{"t": 1}, {"t": 2}]}}
     with pytest.raises(
         RecordingError, match=r"several lists of records: a\.left, a\.right; .*recording\.records"
@@ -409,7 +409,7 @@ def test_json_place(tmp_path: Path) -> None:
 
 
 def test_json_lists(tmp_path: Path) -> None:
-    """One list per column; ragged ones are named when they are used."""
+    """Lists are columns; one of another length is refused when it is used."""
     table = read_json(
         {"t": [0, 1, 2], "q": [1, None, 3], "short": [1, 2], "k": 4, "s": ["a", 1, 2]}, tmp_path
     )
@@ -432,8 +432,8 @@ def test_json_without_records(content: object, tmp_path: Path) -> None:
         read_json(content, tmp_path)
 
 
-def test_json_of_odd_numbers(tmp_path: Path) -> None:
-    """Beyond float64 is infinite, which a recording refuses; too deep or too long is no JSON."""
+def test_json_of_numbers_beyond_float64(tmp_path: Path) -> None:
+    """A number beyond float64 is infinite, which a recording refuses; content that is too deep or too long is not readable."""
     assert read_json([{"t": 10**400}], tmp_path).column("t").tolist() == [np.inf]
     for text in ("[" * 100_000, "1" * 5000):
         (tmp_path / "log.json").write_text(text, encoding="utf-8")
@@ -441,8 +441,8 @@ def test_json_of_odd_numbers(tmp_path: Path) -> None:
             read_columns(tmp_path / "log.json", ALL)
 
 
-def test_a_message_never_quotes_what_a_terminal_would_obey(tmp_path: Path) -> None:
-    """A damaged file may hold anything, escape sequences too."""
+def test_messages_quote_no_control_characters(tmp_path: Path) -> None:
+    """A damaged file may hold anything, also escape sequences."""
     path = tmp_path / "log.csv"
     path.write_bytes(b"t\n0\n\x1b[2J\x07\xff,1,2\n")
     with pytest.raises(RecordingError) as refused:

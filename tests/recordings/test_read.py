@@ -1,4 +1,4 @@
-"""Logs as recordings: formula, units, counters, windows, holes; every refusal with its sentence; logs of real robots."""
+"""Logs as recordings: formula, units, counters, windows, gaps; the message of every refusal; logs of real robots."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def setup_of(folder: Path, recording: Mapping[str, Any], model: str = ARM) -> Se
 
 @pytest.fixture
 def read(tmp_path: Path) -> Read:
-    """Columns, written as CSV and read by a [recording] table; t and the controls are there unless stated otherwise."""
+    """Write columns as CSV and read them by a [recording] table; the time and the controls are added unless `bare`."""
 
     def run(columns: Mapping[str, Any], /, bare: bool = False, **recording: Any) -> Log:
         path = tmp_path / "lab.csv"
@@ -80,20 +80,20 @@ def read(tmp_path: Path) -> Read:
 
 
 def column(logged: Log, name: str) -> Array:
-    """Measured column by name."""
+    """Values of a measured column, by its name."""
     return logged.recording.y[:, logged.recording.outputs.index(name)]
 
 
 def wave(amplitude: float = 1.0, frequency: float = 2.0) -> Array:
-    """A motion (M,) of that amplitude [rad/s]."""
+    """(M,) sine of an amplitude and a frequency [rad/s]."""
     return amplitude * np.sin(frequency * T)
 
 
 # ---- the formula
 
 
-def test_own_columns(read: Read) -> None:
-    """Without a [recording] table: mjfim's names; other columns are no fault, not even text."""
+def test_default_column_names(read: Read) -> None:
+    """Without a [recording] table columns have mjfim's names; other columns are ignored, also text."""
     logged = read({"qpos:pin": wave(), "encoder": wave(0.9), "note": np.array(["x"] * M)})
     recording = logged.recording
     assert recording.outputs == ("qpos:pin", "encoder")
@@ -150,13 +150,13 @@ def test_the_former_name_of_multiply_by_is_refused(tmp_path: Path) -> None:
     ],
 )
 def test_units(name: str, unit: str, factor: float, read: Read) -> None:
-    """Each converts to the model's unit."""
+    """Each unit is converted to the model's unit."""
     logged = read({"raw": wave(7.0)}, columns={name: {"column": "raw", "unit": unit}})
     assert np.allclose(column(logged, name), factor * wave(7.0), rtol=1e-14, atol=0)
 
 
 def test_unit_of_a_control(read: Read) -> None:
-    """A servo's target may be in degrees."""
+    """The target of a servo may be in degrees."""
     source = {"column": "goal", "unit": "deg"}
     logged = read({"goal": wave(90.0), "qpos:pin": wave()}, columns={"ctrl:turn": source})
     assert np.allclose(
@@ -185,13 +185,13 @@ def test_unit_of_a_control(read: Read) -> None:
 def test_columns_that_do_not_fit_the_model(
     name: str, source: dict[str, Any], said: str, read: Read
 ) -> None:
-    """Said before the file is read, naming the experiment's key."""
+    """The rules are checked before the file is read; the message names the experiment's key."""
     with pytest.raises(ExperimentError, match=rf"study\.toml: recording\.columns.*{said}"):
         read({"raw": wave()}, columns={name: {"column": "raw", **source}})
 
 
 def test_signed(read: Read) -> None:
-    """Two's complement; numbers that are negative already stay."""
+    """Unsigned numbers are read as two's complement; negative numbers stay."""
     truth = np.rint(300.0 * np.sin(5.0 * T))
     raw = np.where(truth < 0, truth + 65536, truth)
     raw[3] = truth[3] = -7.0
@@ -207,8 +207,8 @@ def test_signed(read: Read) -> None:
             read({"raw": raw}, columns={"motor": {"column": "raw", "signed": 16}})
 
 
-def test_counters_begin_anew(read: Read) -> None:
-    """Raw numbers of a 12-bit encoder, through holes, in the scale of the encoder."""
+def test_counters_wrap_around(read: Read) -> None:
+    """Raw numbers of a 12-bit encoder are unwrapped across empty rows, before they are scaled."""
     truth = np.rint(9000.0 * np.sin(2.0 * T))
     raw = np.mod(truth, 4096)
     raw[50:53] = np.nan
@@ -223,7 +223,7 @@ def test_counters_begin_anew(read: Read) -> None:
 
 
 def test_angles_jump_by_turns(read: Read) -> None:
-    """In whatever unit they are; after a hole too."""
+    """Jumps by whole turns are removed in any unit, also after empty rows."""
     truth = 4.0 * np.sin(2.0 * T)
     raw = np.degrees(np.angle(np.exp(1j * truth)))
     raw[::7] = np.nan
@@ -240,7 +240,7 @@ def test_angles_jump_by_turns(read: Read) -> None:
 
 @pytest.mark.parametrize(("unit", "factor"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
 def test_time_units(unit: str, factor: float, read: Read) -> None:
-    """Irregular times stay as they are, from zero; seconds since 1970 too."""
+    """Irregular times are kept and begin at zero, also times since 1970."""
     rng = np.random.default_rng(1)
     t = T + rng.uniform(-1e-3, 1e-3, M)
     logged = read(
@@ -251,7 +251,7 @@ def test_time_units(unit: str, factor: float, read: Read) -> None:
 
 
 def test_window(read: Read) -> None:
-    """Rows from begin to end; time restarts; a control is known from before."""
+    """Rows from begin to end are read, time begins at zero, and a control is held from before the window."""
     ctrl = np.where(np.arange(M) % 3 == 0, np.arange(M, dtype=float), np.nan)
     columns = {"qpos:pin": wave(), "ctrl:push": ctrl}
     logged = read({**columns, "t": T + 5.0}, window=(0.52, 1.0))
@@ -266,8 +266,8 @@ def test_window(read: Read) -> None:
         read(columns, window=(7.0, 8.0))
 
 
-def test_window_cuts_what_is_wrong(read: Read) -> None:
-    """A clock that begins anew, a hole, an infinite value behind the window are no fault."""
+def test_faults_outside_the_window_do_not_matter(read: Read) -> None:
+    """A restarted clock, a gap or an infinite value after the window is no fault."""
     t, q = np.array(T), wave()
     t[300:] -= t[300]
     q[350] = np.inf
@@ -303,20 +303,20 @@ def test_window_cuts_what_is_wrong(read: Read) -> None:
     ],
 )
 def test_clocks_that_are_wrong(change: Callable[[Array], Array], said: str, read: Read) -> None:
-    """Row, and what it looks like."""
+    """The message names the row and the kind of fault."""
     t = change(T)
     columns = {"t": t, **{n: c[: len(t)] for n, c in CTRL.items()}, "qpos:pin": wave()[: len(t)]}
     with pytest.raises(RecordingError, match=rf"lab\.csv: column 't'.*{said}"):
         read(columns, bare=True)
 
 
-def test_unit_of_time_is_guessed_from_what_was_stated(read: Read) -> None:
+def test_unit_of_time_is_guessed_from_the_stated_one(read: Read) -> None:
     with pytest.raises(RecordingError, match=r'median step is 5e-12 s.*time_unit = "s"'):
         read({"qpos:pin": wave()}, time_unit="ns")
 
 
-def test_holes_in_time_may_be_allowed(read: Read) -> None:
-    """By a larger gap; and five steps of a slow log are no hole."""
+def test_gaps_in_time_can_be_allowed(read: Read) -> None:
+    """A larger `gap` bridges them; five steps of a slow log are always bridged."""
     hole = T + 0.2 * (np.arange(M) > 99)
     assert len(read({"t": hole, "qpos:pin": wave()}, gap=0.3).recording.t) == M
     slow = np.arange(M) * 0.05
@@ -328,14 +328,14 @@ def test_holes_in_time_may_be_allowed(read: Read) -> None:
 
 
 def test_measured_at_several_rates(read: Read) -> None:
-    """Regularly empty fields are no holes, however slow the column is."""
+    """Regularly empty fields are no gaps, however slow the column is."""
     slow = np.where(np.arange(M) % 50 == 3, wave(), np.nan)
     logged = read({"qpos:pin": wave(), "encoder": slow}, gap=0.02)
     assert np.isfinite(column(logged, "encoder")).sum() == 8
 
 
-def test_holes_in_columns(read: Read) -> None:
-    """A run that is longer than the gap, in the middle and at the ends; shorter ones stay empty."""
+def test_gaps_in_columns(read: Read) -> None:
+    """Empty rows for longer than the gap are refused, inside and at the ends; shorter ones stay empty."""
     for begin, end, said in (
         (100, 160, r"from 0\.495 to 0\.8 s"),
         (0, 30, "from 0 to 0.15 s"),
@@ -355,7 +355,7 @@ def test_holes_in_columns(read: Read) -> None:
 
 
 def test_controls_are_held(read: Read) -> None:
-    """Over less than the gap, never before they begin; the last row needs none."""
+    """A control is held for less than the gap, never before its first value; the last row needs none."""
     u = np.arange(M, dtype=float)
     u[10:20] = u[-5:] = np.nan
     logged = read({"qpos:pin": wave(), "ctrl:push": u})
@@ -400,7 +400,7 @@ def test_dead_channels(read: Read) -> None:
 
 @pytest.mark.parametrize("name", ["qpos:pin", "ctrl:push", "kp"])
 def test_infinite_values(name: str, read: Read) -> None:
-    """In the columns that are used, also as a factor."""
+    """Infinite values are refused in the columns that are used, also in a factor."""
     columns = {"qpos:pin": wave(), **CTRL, "kp": np.full(M, 2.0)}
     columns[name] = np.where(np.arange(M) == 11, np.inf, columns[name])
     source = {"column": "ctrl:turn", "multiply_by": ["kp"]}
@@ -409,7 +409,7 @@ def test_infinite_values(name: str, read: Read) -> None:
 
 
 def test_columns_that_are_missing(read: Read) -> None:
-    """Or text, where they are used."""
+    """A column that is used must exist and must be numeric."""
     for name, said in (
         ("lost", "column 'lost' is missing; found: .*note"),
         ("note", "column 'note' is not numeric"),
@@ -424,8 +424,8 @@ def test_columns_that_are_missing(read: Read) -> None:
 # ---- degrees
 
 
-def test_slope_tells_degrees(read: Read) -> None:
-    """Whichever of the two it is, with noise and a coarse resolution."""
+def test_degrees_are_found_by_the_slope(read: Read) -> None:
+    """Position or velocity in degrees is found from their ratio, despite noise and a coarse resolution."""
     rng = np.random.default_rng(4)
     q = np.round((1 - np.cos(2 * T)) / 1e-3) * 1e-3
     v = 2.0 * np.sin(2 * T) + 0.1 * rng.standard_normal(M)
@@ -449,8 +449,8 @@ def test_slope_tells_degrees(read: Read) -> None:
     assert column(read({"q": np.degrees(q), "v": v}, columns=silent), "qpos:pin").max() > 100
 
 
-def test_slopes_of_noise_say_nothing(read: Read) -> None:
-    """At rest the ratio is anything."""
+def test_slopes_of_noise_are_ignored(read: Read) -> None:
+    """At rest the ratio of position and velocity is random, and no reason to refuse."""
     for seed in range(20):
         rng = np.random.default_rng(seed)
         q, v = 2e-3 * rng.standard_normal(M), 0.5 * rng.standard_normal(M)
@@ -459,8 +459,8 @@ def test_slopes_of_noise_say_nothing(read: Read) -> None:
     assert len(read(rail).recording.t) == M
 
 
-def test_range_tells_degrees(read: Read) -> None:
-    """Far beyond the joint's range, and inside as degrees."""
+def test_degrees_are_found_by_the_range_of_the_joint(read: Read) -> None:
+    """Angles far beyond the joint's range are refused if they are inside it as degrees."""
     with pytest.raises(
         RecordingError,
         match=r"'qpos:stop' ranges from -\d+.* from -1\.047\d* to 1\.57\d* rad; .*in deg",
@@ -472,8 +472,8 @@ def test_range_tells_degrees(read: Read) -> None:
     assert len(read({"s": wave(50.0, 6.0)}, columns=stated).recording.t) == M
 
 
-def test_speed_tells_degrees(read: Read) -> None:
-    """Many turns, faster than a robot turns; also where the velocity is in degrees as well, and so no contradiction."""
+def test_degrees_are_found_by_the_speed(read: Read) -> None:
+    """Many turns at an implausible speed are refused, also where the velocity is in degrees as well."""
     with pytest.raises(
         RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"
     ):
@@ -493,7 +493,7 @@ def test_speed_tells_degrees(read: Read) -> None:
 
 
 def test_summary(read: Read) -> None:
-    """Numbers that can be counted by hand."""
+    """The summary has numbers that can be counted by hand."""
     t = np.array(T)
     t[100:] += 0.02
     q = np.round(wave(1.0, 3.0) / 0.01) * 0.01
@@ -512,7 +512,7 @@ def test_summary(read: Read) -> None:
 
 
 def test_resolution_ignores_rounding(read: Read) -> None:
-    """Equal angles stay equal after turns were undone, but for the last digits."""
+    """Angles that are equal except for their last digits after unwrapping count as equal."""
     truth = np.rint(300 * np.sin(2 * T)) * (2 * np.pi / 100)
     wrapped = np.mod(truth, 2 * np.pi)
     summary = read({"q": wrapped}, columns={"qpos:pin": {"column": "q", "unwrap": True}}).summary
@@ -523,7 +523,7 @@ def test_resolution_ignores_rounding(read: Read) -> None:
 
 
 def test_design_archives_are_recordings(tmp_path: Path) -> None:
-    """Matrices in the order of the model's joints and actuators, one control less than states."""
+    """Matrices are in the order of the model's joints and actuators, with one control less than states."""
     setup = setup_of(tmp_path, {})
     rng = np.random.default_rng(0)
     qpos, qvel, ctrl = (rng.standard_normal((n, k)) for n, k in ((M, 3), (M, 3), (M - 1, 2)))
@@ -543,8 +543,8 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     assert np.array_equal(read_recording(tmp_path / "d.npz", stated.channels).y[:, 0], qpos[:, 1])
 
 
-def test_names_beside_matrices(tmp_path: Path) -> None:
-    """One array per column is fine too; a control of full length is cut."""
+def test_archives_with_one_array_per_column(tmp_path: Path) -> None:
+    """An archive may have one array per column; the last row of a control of full length is dropped."""
     setup = setup_of(tmp_path, {})
     arrays = {
         "t": T,
@@ -560,7 +560,7 @@ def test_names_beside_matrices(tmp_path: Path) -> None:
 
 
 def test_bags_are_recordings(tmp_path: Path) -> None:
-    """Positions and velocities by the joints' names; the control has to be named."""
+    """Positions and velocities are found by the joints' names; the control must be stated."""
     pytest.importorskip("rosbags", reason="the extra `ros` is not installed")
     from rosbags.rosbag2 import StoragePlugin
 
@@ -637,7 +637,7 @@ ROBOTS: dict[str, dict[str, Any]] = {
 
 
 def robot(pattern: str, folder: Path, **changes: Any) -> tuple[list[Path], Setup]:
-    """Logs of one of them and how they are read; skips where they are absent."""
+    """Logs of one robot, and the experiment that reads them; skips where they are absent."""
     files = sorted(SHARED_DATA.glob(pattern))
     if not files:
         pytest.skip(f"no logs of robots at {SHARED_DATA}")
@@ -650,7 +650,7 @@ def robot(pattern: str, folder: Path, **changes: Any) -> tuple[list[Path], Setup
 
 @pytest.mark.parametrize("pattern", ROBOTS)
 def test_logs_of_robots(pattern: str, tmp_path: Path) -> None:
-    """They are read whole, and their velocities are the slopes of their positions."""
+    """All rows are read, and velocities are the slopes of positions."""
     files, setup = robot(pattern, tmp_path)
     for file in files:
         logged = read_log(file, setup.channels)
@@ -665,8 +665,8 @@ def test_logs_of_robots(pattern: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("pattern", ROBOTS)
 @pytest.mark.parametrize("kind", ["qpos", "qvel"])
-def test_robots_in_degrees(pattern: str, kind: str, tmp_path: Path) -> None:
-    """Had they been logged so, it would have been noticed in every one."""
+def test_logs_of_robots_in_degrees_are_refused(pattern: str, kind: str, tmp_path: Path) -> None:
+    """Every log would have been refused if it had been in degrees."""
     sources = dict(ROBOTS[pattern]["columns"])
     sources[f"{kind}:one"] = {"column": sources[f"{kind}:one"], "scale": 180.0 / np.pi}
     files, setup = robot(pattern, tmp_path, columns=sources)
@@ -676,7 +676,7 @@ def test_robots_in_degrees(pattern: str, kind: str, tmp_path: Path) -> None:
 
 
 def test_loads_of_a_servo(tmp_path: Path) -> None:
-    """What the log holds as 65 thousand is a small negative load."""
+    """A number near 65 thousand in the log is a small negative load."""
     files, setup = robot("bam_xl330/raw/*.json", tmp_path)
     loads = np.concatenate([read_recording(file, setup.channels).ctrl[:, 0] for file in files])
     assert loads.min() < -10.0 and loads.max() > 10.0

@@ -1,4 +1,4 @@
-"""ROS 2 bags, written by the library's own writer: both storages, joints in any order, topics merged by time."""
+"""ROS 2 bags that the library wrote: both storages, joints in any order, topics merged by time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ both = pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.
 
 
 def swing(count: int = 20) -> list[State]:
-    """Two joints whose order changes from message to message."""
+    """Messages of two joints whose order changes from message to message."""
     states = []
     for i in range(count):
         names = ["a", "b"] if i % 2 == 0 else ["b", "a"]
@@ -38,7 +38,7 @@ def swing(count: int = 20) -> list[State]:
 
 @both
 def test_joints_are_found_by_name(storage: Any, tmp_path: Path) -> None:
-    """The bag's folder or the file in it; time to the nanosecond; effort may be empty."""
+    """The folder of a bag and the file in it are read, times to the nanosecond; effort may be empty."""
     path = write(tmp_path / "bag", storage, {"/joint_states": swing()}, text=True)
     file = next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
     for place in (path, file):
@@ -52,7 +52,7 @@ def test_joints_are_found_by_name(storage: Any, tmp_path: Path) -> None:
 
 @both
 def test_topics_are_merged_by_time(storage: Any, tmp_path: Path) -> None:
-    """A row per stamp, empty where a topic has none."""
+    """There is one row per stamp, empty where a topic has no message."""
     arm = [State(EPOCH + i * PERIOD, ["a"], [float(i)]) for i in range(4)]
     hand = [
         State(EPOCH + i * PERIOD + (PERIOD // 2 if i else 0), ["a"], (), (), [10.0 * i])
@@ -80,7 +80,7 @@ def test_topics_are_merged_by_time(storage: Any, tmp_path: Path) -> None:
 
 
 def test_two_publishers_of_one_topic(tmp_path: Path) -> None:
-    """Each names its own joints, and their stamps interleave."""
+    """Two publishers may name different joints and interleave."""
     left = [
         State(EPOCH + i * PERIOD, ["a"], [float(i)], received=EPOCH + i * PERIOD + 100)
         for i in range(3)
@@ -96,7 +96,7 @@ def test_two_publishers_of_one_topic(tmp_path: Path) -> None:
     assert np.array_equal(table.column("position:b"), [5, 5, nan, 5, nan], equal_nan=True)
 
 
-def test_received_where_there_is_no_stamp(tmp_path: Path) -> None:
+def test_messages_without_a_stamp_have_the_time_of_reception(tmp_path: Path) -> None:
     states = [State(0, ["a"], [float(i)], received=EPOCH + i * PERIOD) for i in range(3)]
     table = read_columns(write(tmp_path / "bag", StoragePlugin.MCAP, {"/j": states}), ALL)
     assert table.column("t").tolist() == [0.0, 0.002, 0.004]
@@ -131,7 +131,7 @@ def test_messages_that_do_not_fit(states: list[State], said: str, tmp_path: Path
 
 
 def test_no_joint_states(tmp_path: Path) -> None:
-    """The message lists what there is."""
+    """The message lists the topics that the bag has."""
     path = write(tmp_path / "bag", StoragePlugin.MCAP, {}, text=True)
     with pytest.raises(
         RecordingError,
@@ -150,7 +150,7 @@ def test_stamps_have_their_unit(tmp_path: Path) -> None:
 
 @both
 def test_truncated_bags(storage: Any, tmp_path: Path) -> None:
-    """Cut anywhere, or a file of the bag missing."""
+    """A bag that is cut anywhere is refused, and a bag without its file."""
     path = write(tmp_path / "bag", storage, {"/j": swing(400)})
     file = next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
     whole = file.read_bytes()
@@ -165,7 +165,7 @@ def test_truncated_bags(storage: Any, tmp_path: Path) -> None:
 
 @both
 def test_damaged_bags(storage: Any, tmp_path: Path) -> None:
-    """Overwritten bytes: never another error than ours."""
+    """Overwritten bytes never cause another error than RecordingError."""
     path = write(tmp_path / "bag", storage, {"/j": swing(100)})
     file = next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
     whole, rng, refused = file.read_bytes(), np.random.default_rng(5), 0

@@ -1,3 +1,3 @@
-"""Changes to numbers of the user's MJCF text that leave every other byte as it is."""
+"""Changes to numbers of the user's MJCF text that leave every other byte unchanged."""
 
 from __future__ import annotations

@@ -132,5 +132,8 @@ def _is_consistent(numbers: tuple[tuple[Entry, ...], ...], arrays: Mapping[str, 
 
 def _values(numbers: tuple[tuple[Entry, ...], ...], arrays: Mapping[str, Array]) -> Array:
     """(n,) numbers of an attribute, each read from its first entry."""
-    first = [number[0] for number in numbers]
-    return np.array([factor * arrays[name][column] for name, column, factor in first])
+    values = []
+    for number in numbers:
+        name, column, factor = number[0]
+        values.append(factor * arrays[name][column])
+    return np.array(values)
