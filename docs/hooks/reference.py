@@ -1,0 +1,159 @@
+"""Hooks of mkdocs that write the reference pages from the package: the experiment file, its JSON schema, the command line.
+
+A page asks for generated text by a comment, `<!-- generated: experiment file -->` or `<!-- generated: command line -->`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from typer.cli import get_docs_for_click
+from typer.main import get_command
+
+from mjfim.cli.main import app
+from mjfim.experiment.schema import json_schema
+
+SCHEMA_FILE = "reference/experiment.schema.json"  # Place of the JSON schema on the site.
+
+Schema = Mapping[str, Any]
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Add the JSON schema to the files of the site."""
+    text = json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
+    files.append(File.generated(config, SCHEMA_FILE, content=text))
+
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put the generated text in the place of its comment."""
+    makers = {
+        "<!-- generated: experiment file -->": experiment_reference,
+        "<!-- generated: command line -->": command_line_reference,
+    }
+
+    for comment, make in makers.items():
+        if comment in markdown:
+            markdown = markdown.replace(comment, make())
+
+    return markdown
+
+
+def command_line_reference() -> str:
+    """Arguments and options of every verb, as Markdown that typer writes."""
+    command = get_command(app)
+    context = command.make_context("mjfim", [], resilient_parsing=True)
+    text = str(get_docs_for_click(obj=command, ctx=context, name="mjfim"))
+
+    # The page has a title already: drop that of typer.
+    return text.partition("\n")[2]
+
+
+def experiment_reference() -> str:
+    """Sections of the reference page: the keys of the file, then those of every table."""
+    schema = json_schema()
+    tables = schema["$defs"]
+    sections = [_section("Keys of the file", "", schema, tables)]
+
+    for key, field in schema["properties"].items():
+        for name in _referenced(field):
+            sections += _table_sections(_heading(key, field), name, tables)
+
+    return "\n".join(sections)
+
+
+def _table_sections(title: str, name: str, tables: Schema) -> Iterator[str]:
+    """Section of one table, then those of the tables inside it."""
+    table = tables[name]
+    yield _section(title, table.get("description", ""), table, tables)
+
+    for key, field in table["properties"].items():
+        for inner in _referenced(field):
+            yield from _table_sections(f"{title}, key `{key}`", inner, tables)
+
+
+def _heading(key: str, field: Schema) -> str:
+    """Heading of a table as it stands in TOML."""
+    if field.get("type") == "array":
+        return f"`[[{key}]]`"
+    if field.get("type") == "object":
+        return f"`[{key}.<name>]`"
+
+    return f"`[{key}]`"
+
+
+def _section(title: str, introduction: str, table: Schema, tables: Schema) -> str:
+    """A heading, the sentence of the table, and one row for each key."""
+    required = table.get("required", [])
+    rows = ["| key | values | default | meaning |", "|---|---|---|---|"]
+
+    for key, field in table["properties"].items():
+        default = "required" if key in required else _default(field)
+        meaning = field.get("description", "").replace("|", "\\|")
+        rows.append(f"| `{key}` | {_values(field, tables)} | {default} | {meaning} |")
+
+    return "\n".join([f"## {title}", "", introduction, "", *rows, ""])
+
+
+def _default(field: Schema) -> str:
+    """Default of a key; empty where the text says what happens without the key."""
+    value = field.get("default")
+    if value in (None, "", [], {}) or isinstance(value, dict):
+        return ""
+
+    return f"`{json.dumps(value)}`"
+
+
+def _referenced(field: Schema) -> list[str]:
+    """Names of the tables that a value may hold."""
+    reference = field.get("$ref")
+    found = [] if reference is None else [reference.rsplit("/", 1)[-1]]
+
+    for part in (*field.get("anyOf", ()), field.get("items"), field.get("additionalProperties")):
+        if isinstance(part, Mapping):
+            found += _referenced(part)
+
+    return found
+
+
+def _values(field: Schema, tables: Schema) -> str:
+    """Values of a key in words."""
+    if "$ref" in field:
+        return "table"
+    if "anyOf" in field:
+        branches = [_values(part, tables) for part in field["anyOf"] if part.get("type") != "null"]
+        return " or ".join(dict.fromkeys(branches))
+    if "const" in field:
+        return f"`{json.dumps(field['const'])}`"
+    if "enum" in field:
+        return ", ".join(f"`{json.dumps(value)}`" for value in field["enum"])
+    if field["type"] == "array":
+        return _array(field, tables)
+    if field["type"] == "object":
+        return f"table of {_values(field['additionalProperties'], tables)} by name"
+
+    return field["type"] + _range(field)
+
+
+def _array(field: Schema, tables: Schema) -> str:
+    """Values of a list in words."""
+    if "prefixItems" in field:
+        members = [_values(item, tables) for item in field["prefixItems"]]
+        return f"[{', '.join(members)}]"
+
+    return f"list of {_values(field['items'], tables)}"
+
+
+def _range(field: Schema) -> str:
+    """Range of a number, in words."""
+    if "exclusiveMinimum" in field:
+        return f" > {field['exclusiveMinimum']:g}"
+    if "minimum" in field:
+        return f" ≥ {field['minimum']:g}"
+
+    return ""
