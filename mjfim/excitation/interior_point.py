@@ -308,7 +308,13 @@ class Ladder:
         if begin.sight is None:  # it diverges
             return
         for iterate in optimize(
-            problem, begin, self._direction(), self.regulate, Armijo(), 1e-6, budget
+            problem,
+            begin,
+            self._direction(),
+            self.regulate,
+            Armijo(),
+            tolerance=1e-6,
+            max_iterations=budget,
         ):
             margins = self.fence.margins(seen(iterate.point))
             rung = Rung(iterate, np.inf, margins)
@@ -339,7 +345,13 @@ class Ladder:
                 r.tolerance, Rungs.tolerance
             )  # what leaks is mended by less slope than many a stated tolerance
             for iterate in optimize(
-                problem, point, direction, self.regulate, Armijo(), tight, patience
+                problem,
+                point,
+                direction,
+                self.regulate,
+                Armijo(),
+                tolerance=tight,
+                max_iterations=patience,
             ):
                 point, margins = iterate.point, self.fence.margins(seen(iterate.point))
                 kept = all(m >= 0.0 for m in margins.values())

@@ -220,7 +220,13 @@ class _Pass:
         budget = max((d.max_iterations if fine else d.max_iterations // 2) - done, 0)
         run.rate = rate
         for iterate in optimize(
-            self.problem, start, self.direction, regulator_for(level), Armijo(), tolerance, budget
+            self.problem,
+            start,
+            self.direction,
+            regulator_for(level),
+            Armijo(),
+            tolerance=tolerance,
+            max_iterations=budget,
         ):
             trajectory, criterion = iterate.point.trajectory, iterate.point.criterion
             if trajectory is None or criterion is None:

@@ -1,10 +1,10 @@
-"""The relaxed logarithmic barrier (Hauser & Saccon 2006) on ranges of numbers. Arrays only.
+"""The relaxed logarithmic barrier (Hauser & Saccon 2006) of numbers between bounds.
 
-    beta(s) = -log s                                    for s > delta
-              1/2 [((s - 2 delta) / delta)^2 - 1] - log delta   else
+    beta(s) = -log s                                           for s > delta
+              1/2 [((s - 2 delta) / delta)^2 - 1] - log delta  else
 
-twice differentiable, and defined outside as well, so that a descent may begin there. s is the distance to a bound over
-half of the range: 1 in the middle, where beta is zero.
+It is twice differentiable and defined outside the bounds as well, so that a descent may begin there. s is the distance to a bound
+over half of the range: 1 in the middle of the range, where beta is zero.
 """
 
 from __future__ import annotations
@@ -20,7 +20,13 @@ from mjfim.optimize.lq import TangentCurve, Weights
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BarrierDerivatives:
-    """Barrier of some numbers and its derivatives by them. value: the sum;  slope, curvature: (..., w) first and second"""
+    """Barrier of some numbers r: (..., w) with its derivatives.
+
+    Attributes:
+        value: Sum of the barrier over all numbers.
+        slope: (..., w) first derivative by each number.
+        curvature: (..., w) second derivative by each number.
+    """
 
     value: float
     slope: Array
@@ -28,21 +34,34 @@ class BarrierDerivatives:
 
 
 def relaxed_log_barrier(s: Array, delta: float) -> tuple[Array, Array, Array]:
-    """beta and its first two derivatives at s: (...,)."""
+    """Relaxed logarithmic barrier beta(s) with its derivatives.
+
+    Args:
+        s: (...) relative distances to the bound, negative outside.
+        delta: Distance below which a parabola replaces the logarithm.
+
+    Returns:
+        (...) beta, its first and its second derivative.
+    """
     inside = s > delta
     safe = np.where(inside, s, 1.0)
-    outside = (s - 2.0 * delta) / delta
-    value = np.where(inside, -np.log(safe), 0.5 * (outside**2 - 1.0) - np.log(delta))
-    return (
-        value,
-        np.where(inside, -1.0 / safe, outside / delta),
-        np.where(inside, safe**-2.0, delta**-2.0),
-    )
+    parabola = (s - 2.0 * delta) / delta
+
+    value = np.where(inside, -np.log(safe), 0.5 * (parabola**2 - 1.0) - np.log(delta))
+    first = np.where(inside, -1.0 / safe, parabola / delta)
+    second = np.where(inside, safe**-2.0, delta**-2.0)
+    return value, first, second
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bounds:
-    """Ranges of w numbers, infinite where free. lower, upper: (w,);  scale: (w,) half of each range"""
+    """Bounds of w numbers.
+
+    Attributes:
+        lower: (w,) lower bounds, -inf without one [unit of each number].
+        upper: (w,) upper bounds, inf without one [unit of each number].
+        scale: (w,) half of each range, which makes distances to the bounds relative [unit of each number].
+    """
 
     lower: Array
     upper: Array
@@ -50,57 +69,107 @@ class Bounds:
 
     @staticmethod
     def from_range(lower: Array, upper: Array) -> Bounds:
-        """With half of the range as scale; of one-sided ranges, the size of the bound, at least 1."""
-        both = np.isfinite(lower) & np.isfinite(upper)
-        one = np.maximum(np.where(np.isfinite(lower), np.abs(lower), np.abs(upper)), 1.0)
+        """Bounds with half of the range as scale.
+
+        Args:
+            lower: (w,) lower bounds, -inf without one.
+            upper: (w,) upper bounds, inf without one.
+
+        Returns:
+            Bounds. The scale of one-sided bounds is the magnitude of the bound, at least 1; without bounds it is 1.
+        """
+        two_sided = np.isfinite(lower) & np.isfinite(upper)
+        magnitude = np.where(np.isfinite(lower), np.abs(lower), np.abs(upper))
+        one_sided_scale = np.maximum(magnitude, 1.0)
+        one_sided_scale = np.where(np.isfinite(one_sided_scale), one_sided_scale, 1.0)
+
+        # inf - inf gives NaN where a number is free; it is not used there.
         with np.errstate(invalid="ignore"):
             half = 0.5 * (upper - lower)
-        return Bounds(
-            lower=lower,
-            upper=upper,
-            scale=np.where(both, half, np.where(np.isfinite(one), one, 1.0)),
-        )
 
-    def tightened(self, share: Array | float) -> Bounds:
-        """Both bounds moved inwards by a share of the scale."""
+        return Bounds(lower=lower, upper=upper, scale=np.where(two_sided, half, one_sided_scale))
+
+    def tightened(self, fraction: Array | float) -> Bounds:
+        """Bounds moved inwards, with the scale kept.
+
+        Args:
+            fraction: (w,) or one number for all; how far both bounds move, relative to the scale.
+
+        Returns:
+            The narrower bounds.
+        """
         return Bounds(
-            lower=self.lower + share * self.scale,
-            upper=self.upper - share * self.scale,
+            lower=self.lower + fraction * self.scale,
+            upper=self.upper - fraction * self.scale,
             scale=self.scale,
         )
 
     def margin(self, r: Array) -> Array:
-        """(..., w) distance to the nearer bound, negative outside, infinite where free."""
+        """Distance to the nearer bound.
+
+        Args:
+            r: (..., w) numbers.
+
+        Returns:
+            (..., w) distances [unit of each number], negative outside, infinite without a bound.
+        """
         return np.asarray(np.minimum(r - self.lower, self.upper - r))
 
     def relative_position(self, r: Array) -> Array:
-        """(..., w) where in its range each number is: -1 at the lower bound, 1 at the upper one; 0 where free."""
-        upper, lower = 1.0 - (self.upper - r) / self.scale, (r - self.lower) / self.scale - 1.0
-        both = np.where(
-            np.isfinite(self.upper), upper, np.where(np.isfinite(self.lower), lower, 0.0)
-        )
-        return np.asarray(both)
+        """Position of each number in its range.
+
+        Args:
+            r: (..., w) numbers.
+
+        Returns:
+            (..., w) positions: -1 at the lower bound, 1 at the upper bound, 0 without bounds.
+        """
+        from_upper = 1.0 - (self.upper - r) / self.scale
+        from_lower = (r - self.lower) / self.scale - 1.0
+
+        one_sided = np.where(np.isfinite(self.lower), from_lower, 0.0)
+        return np.asarray(np.where(np.isfinite(self.upper), from_upper, one_sided))
 
     def barrier(self, r: Array, delta: float, weight: float) -> BarrierDerivatives:
-        """Barrier of the numbers r: (..., w), each times weight."""
-        value, slope, curvature = 0.0, np.zeros(r.shape), np.zeros(r.shape)
+        """Barrier of numbers with its derivatives.
+
+        Args:
+            r: (..., w) numbers.
+            delta: Relative distance below which the barrier is relaxed.
+            weight: Factor of the barrier of every number.
+
+        Returns:
+            Sum and derivatives of the weighted barrier; zero where a number has no bound.
+        """
+        value = 0.0
+        slope = np.zeros(r.shape)
+        curvature = np.zeros(r.shape)
+
         for sign, bound in ((1.0, self.lower), (-1.0, self.upper)):
-            held = np.isfinite(bound)
-            b, first, second = relaxed_log_barrier(
-                sign * (r[..., held] - bound[held]) / self.scale[held], delta
-            )
-            value += weight * float(np.sum(b))
-            slope[..., held] += sign * weight * first / self.scale[held]
-            curvature[..., held] += weight * second / self.scale[held] ** 2
+            bounded = np.isfinite(bound)
+            scale = self.scale[bounded]
+            distance = sign * (r[..., bounded] - bound[bounded]) / scale
+
+            beta, first, second = relaxed_log_barrier(distance, delta)
+            value += weight * float(np.sum(beta))
+            slope[..., bounded] += sign * weight * first / scale
+            curvature[..., bounded] += weight * second / scale**2
+
         return BarrierDerivatives(value=value, slope=slope, curvature=curvature)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BarrierExpansion:
-    """Expansion of the barrier: its derivatives by x and u along the curve, and its Gauss-Newton Hessian.
+    """Expansion of the barrier of all limits about a trajectory: its gradient and its Gauss-Newton Hessian.
 
-    a: (N+1, nx);  b: (N, nu);  observations: (N, looked-at substeps, w, nx+nu) over the scale of what they show
-    control_scale: (nu,);  control_step_scale: (nu,) of its change from one sample to the next, infinite where free
+    Attributes:
+        a: (N+1, nx) derivative by the state at every sample [1 / x-unit].
+        b: (N, nu) derivative by the control at every sample [1 / u-unit].
+        weights: Gauss-Newton Hessian of the barrier as a quadratic form on tangent curves.
+        observations: (N, S, w, nx+nu) derivatives of the w limited quantities at S engine steps of every sample by its state and
+            control, over the scale of their bounds.
+        control_scale: (nu,) scale of the control [u-unit].
+        control_step_scale: (nu,) scale of the control's change from one sample to the next [u-unit], infinite without a limit.
     """
 
     a: Array
@@ -111,25 +180,31 @@ class BarrierExpansion:
     control_step_scale: Array
 
     def scaled(self, mu: float) -> BarrierExpansion:
-        """The same of mu times the barrier."""
+        """Expansion of mu times the barrier; the scales of the limits stay."""
         return replace(self, a=mu * self.a, b=mu * self.b, weights=self.weights.scaled(mu))
 
     def largest_relative_move(self, zeta: TangentCurve) -> float:
-        """The largest move along a tangent curve of anything limited, over half of its range."""
+        """Largest change of any limited quantity or control along a tangent curve, over half of its range."""
         both = np.concatenate([zeta.z[:-1], zeta.v], axis=1)
-        moves = np.abs(np.einsum("kswi,ki->ksw", self.observations, both)).max(initial=0.0)
-        return float(max(moves, np.abs(zeta.v / self.control_scale).max(initial=0.0)))
+        observed = np.abs(np.einsum("kswi,ki->ksw", self.observations, both)).max(initial=0.0)
+        controls = np.abs(zeta.v / self.control_scale).max(initial=0.0)
+        return float(max(observed, controls))
 
     @cached_property
     def uniform_weights(self) -> Weights:
-        """The mean square over time of such moves, of the control's changes too: a barrier's Hessian far from all bounds."""
+        """Mean square over time of all relative changes along a tangent curve: the barrier's Hessian far from all bounds.
+
+        Changes of the control from sample to sample are included where they are limited.
+        """
         N, looked, w, n = self.observations.shape
         nu = len(self.control_scale)
+        nx = n - nu
+
         flat = self.observations.reshape(N, looked * w, n)
         H = np.swapaxes(flat, 1, 2) @ flat / (N * looked)
-        Q, nx = np.zeros((N + 1, n - nu, n - nu)), n - nu
+
+        Q = np.zeros((N + 1, nx, nx))
         Q[:-1] = H[:, :nx, :nx]
+        R = H[:, nx:, nx:] + np.diag(self.control_scale**-2.0 / N)
         W = np.where(self.weights.W > 0.0, self.control_step_scale**-2.0 / N, 0.0)
-        return Weights(
-            Q=Q, S=H[:, nx:, :nx], R=H[:, nx:, nx:] + np.diag(self.control_scale**-2.0 / N), W=W
-        )
+        return Weights(Q=Q, S=H[:, nx:, :nx], R=R, W=W)

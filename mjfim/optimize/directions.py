@@ -1,4 +1,4 @@
-"""Descent directions of Algorithm 1: the paper's metric descent, its extended form, limited-memory BFGS. Arrays only."""
+"""Descent directions of Algorithm 1 without limits: the paper's metric descent, its extended form, limited-memory BFGS."""
 
 from __future__ import annotations
 
@@ -7,15 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.optimize.lq import TangentCurve, descent
+from mjfim.optimize.lq import CurveCoordinates, TangentCurve, descent
 from mjfim.optimize.projection_operator import Expansion
+from mjfim.optimize.quasi_newton import CurvaturePair, inverse_hessian_product
+
+# Smallest curvature of a stored pair, relative to the norms of the step and of the change of the gradient.
+MIN_RELATIVE_CURVATURE = 1e-10
 
 
 @dataclass
 class MetricDescent:
-    """The paper's direction: minimise `DJ.zeta + 1/2 <zeta, zeta>` over the tangent space (problem 8), no weight on psi.
+    """The paper's direction: it minimises `DJ.zeta + 1/2 <zeta, zeta>` over the tangent space (problem 8).
 
-    Q, terminal: (nx, nx) and R: (nu, nu), already multiplied by dt.
+    The metric does not weigh psi. All weights are already multiplied by the sample period.
+
+    Attributes:
+        Q: (nx, nx) metric on the state.
+        R: (nu, nu) metric on the control.
+        terminal: (nx, nx) metric on the last state.
     """
 
     Q: Array
@@ -23,24 +32,35 @@ class MetricDescent:
     terminal: Array
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """zeta by the Riccati equations."""
+        """The direction, by the Riccati equations."""
         return descent(
-            expansion.A, expansion.B, expansion.a, expansion.b, self.Q, self.R, self.terminal
+            expansion.A,
+            expansion.B,
+            expansion.a,
+            expansion.b,
+            Q=self.Q,
+            R=self.R,
+            terminal=self.terminal,
         )
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Nothing is learnt."""
+        """Ignore an accepted step; this direction has no memory."""
 
     def reset(self) -> bool:
-        """Nothing to forget."""
+        """Return False: there is no memory to clear."""
         return False
 
 
 @dataclass
 class ExtendedMetricDescent:
-    """Problem (8) as the paper states it: the metric also weighs the psi-part of zeta.
+    """Problem (8) as the paper states it, with a metric that also weighs the psi-part of zeta.
 
-    Q, terminal: (nx(1+p), nx(1+p)) over (x, psi stacked by parameter);  R: (nu, nu), already multiplied by dt
+    All weights are already multiplied by the sample period.
+
+    Attributes:
+        Q: (nx (1+p), nx (1+p)) metric on x and on psi, stacked parameter by parameter.
+        R: (nu, nu) metric on the control.
+        terminal: (nx (1+p), nx (1+p)) metric on the last x and psi.
     """
 
     Q: Array
@@ -48,90 +68,137 @@ class ExtendedMetricDescent:
     terminal: Array
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """zeta by the Riccati equations of the extended system, its psi-part dropped (P recomputes it)."""
-        e, nx = expansion.extended, expansion.A.shape[1]
-        if e is None:
+        """The direction, by the Riccati equations of the extended system; the projection recomputes its psi-part."""
+        extended = expansion.extended
+        if extended is None:
             raise ValueError(
                 "the problem must provide extended expansions for a metric with weight on psi"
             )
-        zeta = descent(e.A, e.B, e.a, e.b, self.Q, self.R, self.terminal)
+
+        zeta = descent(
+            extended.A,
+            extended.B,
+            extended.a,
+            extended.b,
+            Q=self.Q,
+            R=self.R,
+            terminal=self.terminal,
+        )
+        nx = expansion.A.shape[1]
         return TangentCurve(z=zeta.z[:, :nx], v=zeta.v)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Nothing is learnt."""
+        """Ignore an accepted step; this direction has no memory."""
 
     def reset(self) -> bool:
-        """Nothing to forget."""
+        """Return False: there is no memory to clear."""
         return False
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """A step s and the change y of the gradient along it, both (N, nu);  curvature: s'y > 0."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Evaluated:
+    """The gradient at an expansion under a regulator.
 
-    s: Array
-    y: Array
-    curvature: float
+    Attributes:
+        expansion: Expansion of the cost.
+        K: (N, nu, nx) gain of the projection operator.
+        gradient: (N, nu) derivative by the curve coordinate.
+    """
+
+    expansion: Expansion
+    K: Array
+    gradient: Array
 
 
 @dataclass
 class LBFGS:
-    """Limited-memory BFGS in the curve coordinate `c = u + K x`, where P(xi + gamma zeta) is affine in gamma.
+    """Limited-memory BFGS in the curve coordinate `c = u + K x`, in which P(xi + gamma zeta) is affine in gamma.
 
-    The inner product is the control metric `v' R v` (R: (nu, nu), multiplied by dt), so that the iteration count does not
-    depend on the sample period. Nocedal & Wright, algorithm 7.4.
+    The initial Hessian is the control metric, so that the number of iterations does not depend on the sample period.
+
+    Attributes:
+        R: (nu, nu) control metric, already multiplied by the sample period.
+        memory: Largest number of stored pairs.
     """
 
     R: Array
     memory: int = 40
-    _pairs: tuple[Pair, ...] = ()
-    _last: tuple[Expansion, Array, Array] | None = None
+    _pairs: tuple[CurvaturePair, ...] = ()
+    _last: _Evaluated | None = None
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """zeta = -H DJ by the two-loop recursion."""
-        q, alphas = np.array(self._gradient(expansion, K)), []
-        for pair in reversed(self._pairs):
-            alphas.append(np.vdot(pair.s, q) / pair.curvature)
-            q -= alphas[-1] * pair.y
-        q = self._raise(q)
+        """The quasi-Newton direction zeta = -H DJ."""
+        gradient = self._evaluated(expansion, K).gradient
+        c = -inverse_hessian_product(gradient, self._pairs, self._initial)
+        return expansion.lift(K, c)
+
+    def _initial(self, g: Array) -> Array:
+        """(N, nu) initial inverse Hessian times g: (N, nu): the inverse metric, scaled by the newest pair."""
+        scaled = self._inverse_metric(g)
         if self._pairs:
             newest = self._pairs[-1]
-            q *= newest.curvature / np.vdot(newest.y, self._raise(newest.y))
-        for pair, alpha in zip(self._pairs, reversed(alphas), strict=True):
-            q += pair.s * (alpha - np.vdot(pair.y, q) / pair.curvature)
-        return expansion.lift(K, -q)
+            scaled *= newest.curvature / np.vdot(newest.y, self._inverse_metric(newest.y))
 
-    def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Store the pair (s, y) if it has positive curvature."""
-        if self._last is None:
-            return
-        old = self._last[2]
-        s = moved.v + np.einsum("kui,ki->ku", K, moved.z[:-1])
-        y = self._gradient(expansion, K) - old
-        curvature = float(np.vdot(s, y))
-        if curvature > 1e-10 * np.linalg.norm(s) * np.linalg.norm(y):
-            self._pairs = (*self._pairs, Pair(s, y, curvature))[-self.memory :]
+        return scaled
 
-    def _gradient(self, expansion: Expansion, K: Array) -> Array:
-        """Gradient in the curve coordinate, computed once per expansion and regulator."""
-        if self._last is None or self._last[0] is not expansion or self._last[1] is not K:
-            self._last = (expansion, K, expansion.gradient(K))
-        return self._last[2]
-
-    def _raise(self, g: Array) -> Array:
-        """R^-1 g at every sample."""
+    def _inverse_metric(self, g: Array) -> Array:
+        """(N, nu) R^-1 g at every sample."""
         return np.asarray(np.linalg.solve(self.R, g.T).T, dtype=np.float64)
 
+    def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
+        """Store the curvature pair of an accepted step, if its curvature is positive.
+
+        Args:
+            expansion: Expansion at the new point.
+            K: (N, nu, nx) gain of the projection operator.
+            moved: Difference between the new and the old point.
+        """
+        if self._last is None:
+            return
+
+        before = self._last.gradient
+        s = CurveCoordinates(A=expansion.A, B=expansion.B, K=K).coordinate(moved)
+        y = self._evaluated(expansion, K).gradient - before
+
+        pair = CurvaturePair.where_convex(s, y, MIN_RELATIVE_CURVATURE)
+        if pair is not None:
+            self._pairs = (*self._pairs, pair)[-self.memory :]
+
+    def _evaluated(self, expansion: Expansion, K: Array) -> _Evaluated:
+        """The gradient, computed once per expansion and regulator."""
+        last = self._last
+        if last is None or last.expansion is not expansion or last.K is not K:
+            last = _Evaluated(expansion=expansion, K=K, gradient=expansion.gradient(K))
+            self._last = last
+
+        return last
+
     def refined(self, R: Array, factor: int) -> LBFGS:
-        """The same memory on a grid that is `factor` times finer: s is held, y (an integral over a sample) is shared out."""
-        held = (
-            (np.repeat(p.s, factor, axis=0), np.repeat(p.y, factor, axis=0) / factor)
-            for p in self._pairs
-        )
-        return LBFGS(R, self.memory, tuple(Pair(s, y, float(np.vdot(s, y))) for s, y in held))
+        """A direction with this memory on a finer grid of samples.
+
+        A step s is held over the finer samples; y is an integral over a sample and is divided among them.
+
+        Args:
+            R: (nu, nu) control metric, multiplied by the finer sample period.
+            factor: Number of finer samples in a coarse one.
+
+        Returns:
+            The direction on the finer grid.
+        """
+        pairs = []
+        for pair in self._pairs:
+            s = np.repeat(pair.s, factor, axis=0)
+            y = np.repeat(pair.y, factor, axis=0) / factor
+            pairs.append(CurvaturePair(s=s, y=y, curvature=float(np.vdot(s, y))))
+
+        return LBFGS(R, self.memory, tuple(pairs))
 
     def reset(self) -> bool:
-        """Drop all pairs."""
-        had = bool(self._pairs)
+        """Clear the memory.
+
+        Returns:
+            True if there was something to clear.
+        """
+        had_pairs = bool(self._pairs)
         self._pairs = ()
-        return had
+        return had_pairs

@@ -1,12 +1,12 @@
-"""A model of the smooth E-criterion that knows how eigenvalues repel and turn into each other. Arrays only.
+"""A model of the smooth E-criterion that knows how eigenvalues repel each other and exchange their eigenvectors.
 
-With r of the smallest eigenvalues and their vectors w_i, the information moves along a step s by `B_ij = d(w_i' I w_j).s`,
-off the diagonal too. The model takes `log I` as linear,
+With the r smallest eigenvalues Lambda and their vectors w_i, a step s changes the information by `B_ij = d(w_i' I w_j).s`, also
+off the diagonal. The model takes `log I` as linear in the step,
 
-    h(s) = 1/q log tr exp(-q (log Lambda + B(s))),
+    h(s) = 1/q log tr exp(-q (log Lambda + B(s))).
 
-exact to first order, convex, and stiff exactly where the criterion is: where eigenvalues meet. The others are left out:
-holding them still would stop a step where the smallest ones reach them, though they move as well.
+It is exact to first order, convex, and stiff where the criterion is: where eigenvalues meet. Larger eigenvalues are left out:
+holding them constant would stop a step where the smallest ones reach them, although they change as well.
 """
 
 from __future__ import annotations
@@ -17,18 +17,38 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-SQUARE = np.sqrt(2.0)
+# Off-diagonal entries count twice in the scalar product of symmetric matrices.
+SQRT_2 = np.sqrt(2.0)
 
+# Largest number of Newton steps of the proximal problem.
+MAX_NEWTON_STEPS = 50
 
-STEPS, SOLVED = 50, 1e-10
+# Gradient of the proximal problem, relative to its solution, below which it is solved.
+NEWTON_TOLERANCE = 1e-10
+
+# Share of the predicted decrease that a Newton step has to reach (Armijo's rule).
+SUFFICIENT_DECREASE = 1e-4
+
+# Shortest fraction of a Newton step.
+MIN_NEWTON_FRACTION = 1e-8
+
+# Step of the central differences of the gradient, for power 1.
+DIFFERENCE_STEP = 1e-5
+
+# Relative distance of two eigenvalues below which their divided difference is the derivative.
+EQUAL_EIGENVALUES = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EigenvalueModel:
-    """The model about a point, in m = r (r + 1) / 2 coordinates of B.
+    """The model about a point, in the m = r (r + 1) / 2 coordinates of B.
 
-    eigenvalues: (r,), ascending;  power: q;  weight: of the criterion in the cost
-    a: (m, N+1, nx), b: (m, N, nu) slopes of the coordinates, those of `B_ii` and of `sqrt(2) B_ij` for i < j
+    Attributes:
+        eigenvalues: (r,) smallest eigenvalues of the information, ascending.
+        power: Power q of the smooth E-criterion.
+        weight: Weight of the criterion in the cost.
+        a: (m, N+1, nx) derivative of each coordinate by the state: of `B_ii`, and of `sqrt(2) B_ij` for i < j.
+        b: (m, N, nu) derivative of each coordinate by the control.
     """
 
     eigenvalues: Array
@@ -38,77 +58,137 @@ class EigenvalueModel:
     b: Array
 
     def gradient(self, d: Array) -> Array:
-        """(m,) derivative of the model at coordinates d: (m,)."""
-        return self._weigh(d)[1]
+        """Gradient of the model.
+
+        Args:
+            d: (m,) coordinates of B.
+
+        Returns:
+            (m,) derivative by the coordinates.
+        """
+        return self._value_and_gradient(d)[1]
 
     def value(self, d: Array) -> float:
-        """h at coordinates d: (m,), less its value at 0."""
-        return self._weigh(d)[0] - self._weigh(np.zeros_like(d))[0]
+        """Change of the model from the point about which it was made.
 
-    def _weigh(self, d: Array) -> tuple[float, Array]:
-        q, logs = self.power, np.log(self.eigenvalues / self.eigenvalues[0])
-        moved, vectors = np.linalg.eigh(np.diag(logs) + symmetric_matrix(d, len(logs)))
-        weights = np.exp(-q * (moved - moved[0]))
-        total = weights.sum()
-        P = (vectors * (weights / total)) @ vectors.T
-        return self.weight * float(
-            np.log(total) / q - moved[0]
-        ), -self.weight * symmetric_coordinates(P)
+        Args:
+            d: (m,) coordinates of B.
+
+        Returns:
+            h(d) - h(0).
+        """
+        zero = np.zeros_like(d)
+        return self._value_and_gradient(d)[0] - self._value_and_gradient(zero)[0]
+
+    def _value_and_gradient(self, d: Array) -> tuple[float, Array]:
+        """The model, up to a constant, and its gradient: (m,), at coordinates d: (m,)."""
+        # Eigenvalues relative to the smallest one, so that the exponentials neither overflow nor vanish.
+        logs = np.log(self.eigenvalues / self.eigenvalues[0])
+        changed = np.diag(logs) + symmetric_matrix(d, len(logs))
+        moved, vectors = np.linalg.eigh(changed)
+        shares = np.exp(-self.power * (moved - moved[0]))
+        total = shares.sum()
+
+        value = self.weight * float(np.log(total) / self.power - moved[0])
+        P = (vectors * (shares / total)) @ vectors.T
+        return value, -self.weight * symmetric_coordinates(P)
 
     def minimising_gradient(self, d0: Array, spread: Array) -> Array:
-        """The gradient w at the minimum of `h(d) + 1/2 (d - d0)' spread^-1 (d - d0)`: there `d = d0 - spread w`.
+        """Gradient of the model at the minimum of `h(d) + 1/2 (d - d0)' spread^-1 (d - d0)`.
 
-        Newton's method in `d = d0 + L y`, `L L' = spread`. spread: (m, m), positive semidefinite
+        There `d = d0 - spread w` with the returned gradient w. Newton's method in y with `d = d0 + L y` and `L L' = spread` also
+        works where spread is singular.
+
+        Args:
+            d0: (m,) centre of the proximal term.
+            spread: (m, m) positive semidefinite matrix.
+
+        Returns:
+            (m,) the gradient w.
         """
         values, vectors = np.linalg.eigh(spread)
         L = vectors * np.sqrt(np.maximum(values, 0.0))
+
         y = np.zeros(len(d0))
-        for _ in range(STEPS):
+        for _ in range(MAX_NEWTON_STEPS):
             g = y + L.T @ self.gradient(d0 + L @ y)
-            if np.abs(g).max() <= SOLVED * max(1.0, np.abs(y).max()):
+            if np.abs(g).max() <= NEWTON_TOLERANCE * max(1.0, np.abs(y).max()):
                 break
+
             H = np.eye(len(y)) + L.T @ self._hessian(d0 + L @ y) @ L
             step = -np.linalg.solve(0.5 * (H + H.T), g)
-            here, length = self._pulled(y, L, d0), 1.0
-            while (
-                self._pulled(y + length * step, L, d0) > here + 1e-4 * length * float(g @ step)
-                and length > 1e-8
-            ):
-                length *= 0.5
-            y = y + length * step
+            y = self._line_search(y, step, float(g @ step), L, d0)
+
         return self.gradient(d0 + L @ y)
 
-    def _pulled(self, y: Array, L: Array, d0: Array) -> float:
-        return self._weigh(d0 + L @ y)[0] + 0.5 * float(y @ y)
+    def _line_search(self, y: Array, step: Array, slope: float, L: Array, d0: Array) -> Array:
+        """(m,) the point after a step: (m,) that is halved until the proximal objective falls sufficiently."""
+        here = self._proximal_objective(y, L, d0)
+        fraction = 1.0
+        while fraction > MIN_NEWTON_FRACTION:
+            there = self._proximal_objective(y + fraction * step, L, d0)
+            if there <= here + SUFFICIENT_DECREASE * fraction * slope:
+                break
+            fraction *= 0.5
+
+        return y + fraction * step
+
+    def _proximal_objective(self, y: Array, L: Array, d0: Array) -> float:
+        """The model at `d0 + L y` plus `1/2 |y|^2`."""
+        return self._value_and_gradient(d0 + L @ y)[0] + 0.5 * float(y @ y)
 
     def _hessian(self, d: Array) -> Array:
-        """(m, m) by differences of the gradient, in so few coordinates the cheapest way."""
-        step = 1e-5 / max(1.0, self.power)
-        moves = step * np.eye(len(d))
-        return np.stack(
-            [(self.gradient(d + move) - self.gradient(d - move)) / (2.0 * step) for move in moves]
-        )
+        """(m, m) Hessian at d: (m,) by central differences of the gradient; with so few coordinates this is the fastest way."""
+        h = DIFFERENCE_STEP / max(1.0, self.power)
+        rows = [
+            (self.gradient(d + move) - self.gradient(d - move)) / (2.0 * h)
+            for move in h * np.eye(len(d))
+        ]
+        return np.stack(rows)
 
 
 def symmetric_matrix(d: Array, r: int) -> Array:
-    """(r, r) symmetric matrix of coordinates (m,)."""
-    full = np.zeros((r, r))
+    """Symmetric matrix of given coordinates.
+
+    Args:
+        d: (m,) coordinates, m = r (r + 1) / 2.
+        r: Size of the matrix.
+
+    Returns:
+        (r, r) matrix.
+    """
     rows, columns = np.triu_indices(r)
-    scale = np.where(rows == columns, 1.0, 1.0 / SQUARE)
-    full[rows, columns] = d * scale
-    full[columns, rows] = d * scale
+    entries = d * np.where(rows == columns, 1.0, 1.0 / SQRT_2)
+
+    full = np.zeros((r, r))
+    full[rows, columns] = entries
+    full[columns, rows] = entries
     return full
 
 
 def symmetric_coordinates(full: Array) -> Array:
-    """(m,) coordinates of a symmetric matrix (r, r), such that their scalar product is that of matrices."""
+    """Coordinates of a symmetric matrix, such that their scalar product is that of matrices.
+
+    Args:
+        full: (r, r) symmetric matrix.
+
+    Returns:
+        (m,) coordinates: diagonal entries, and sqrt(2) times the entries above the diagonal, row by row.
+    """
     rows, columns = np.triu_indices(len(full))
-    return np.asarray(full[rows, columns] * np.where(rows == columns, 1.0, SQUARE))
+    return np.asarray(full[rows, columns] * np.where(rows == columns, 1.0, SQRT_2))
 
 
 def divided_log_differences(values: Array) -> Array:
-    """(r, r) divided differences of the logarithm: what turns a change of I into one of log I."""
+    """Divided differences of the logarithm, which turn a change of a matrix into the change of its logarithm.
+
+    Args:
+        values: (r,) positive eigenvalues.
+
+    Returns:
+        (r, r) `(log a - log b) / (a - b)` of every pair of eigenvalues, 1 / a where they are equal.
+    """
     ratio = values[:, None] / values
-    near = np.abs(ratio - 1.0) < 1e-6
-    safe = np.where(near, 2.0, ratio)
-    return np.where(near, 1.0, np.log(safe) / (safe - 1.0)) / values
+    equal = np.abs(ratio - 1.0) < EQUAL_EIGENVALUES
+    safe = np.where(equal, 2.0, ratio)
+    return np.where(equal, 1.0, np.log(safe) / (safe - 1.0)) / values

@@ -1,13 +1,13 @@
-"""Algorithm 1 of Wilson & Murphey: descend over the trajectory manifold through the projection operator.
+"""Algorithm 1 of Wilson & Murphey: descent on the trajectory manifold with the projection operator.
 
-Knows arrays and one protocol, neither MuJoCo nor Fisher information. The loop is a generator of iterates; progress
+The module knows arrays and two protocols, neither MuJoCo nor Fisher information. The loop is a generator of iterates; progress
 bars, logs, checkpoints and early stops consume it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -19,17 +19,30 @@ from mjfim.optimize.lq import CurveCoordinates, TangentCurve, largest_amplificat
 from mjfim.records.design import Status
 
 P = TypeVar("P")
-ROUND_OFF = 1e-12  # relative; a promised decrease below it says nothing
+
+# Predicted decrease, relative to the cost, that round-off hides.
+ROUND_OFF = 1e-12
+
+# A step is shortened at least to this fraction of its predecessor in the line search; the largest fraction is a setting.
+MIN_SHORTENING = 0.1
+
+# The first step may promise a decrease of at most this many times the scale of the cost.
+MAX_PREDICTED_DECREASE = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Expansion:
-    """First-order model of the cost on the tangent space, `DJ.zeta = sum a'z + b'v` with `z_{k+1} = A z_k + B v_k`.
+    """First-order model of the cost on the tangent space: `DJ.zeta = sum a'z + b'v` with `z_{k+1} = A_k z_k + B_k v_k`.
 
-    A: (N, nx, nx);  B: (N, nx, nu);  a: (N+1, nx) [1 / x-unit];  b: (N, nu) [1 / u-unit]
-    extended: the same with psi among the states (nx (1+p) of them), where a metric with weight on psi wants it
-    barrier: the share of hard limits in a and b, with its Gauss-Newton Hessian
-    eigenvalue_model: model of the cost's logarithm where a and b are of that, better than linear
+    Attributes:
+        A: (N, nx, nx) derivative of the next state by the state.
+        B: (N, nx, nu) derivative of the next state by the control [x-unit / u-unit].
+        a: (N+1, nx) derivative of the cost by the state [1 / x-unit].
+        b: (N, nu) derivative of the cost by the control [1 / u-unit].
+        extended: Expansion with psi among the states, nx (1+p) of them, for a metric with weight on psi; else None.
+        barrier: The barrier's share of a and b, with its Gauss-Newton Hessian, or None without limits.
+        eigenvalue_model: Model of the logarithm of the cost that is better than linear, where a and b belong to that logarithm;
+            else None.
     """
 
     A: Array
@@ -41,27 +54,42 @@ class Expansion:
     eigenvalue_model: EigenvalueModel | None = None
 
     def slope(self, zeta: TangentCurve) -> float:
-        """DJ.zeta."""
+        """Directional derivative DJ.zeta of the cost."""
         return float(np.sum(self.a * zeta.z) + np.sum(self.b * zeta.v))
 
     def gradient(self, K: Array) -> Array:
-        """(N, nu) derivative of the cost by the curve coordinate `c = u + K x`, i.e. through the projection."""
+        """Gradient by the curve coordinate `c = u + K x`, that is, through the projection operator.
+
+        Args:
+            K: (N, nu, nx) gain of the projection operator.
+
+        Returns:
+            (N, nu) gradient [1 / u-unit].
+        """
         return CurveCoordinates(A=self.A, B=self.B, K=K).gradient(self.a, self.b)
 
     def lift(self, K: Array, c: Array) -> TangentCurve:
-        """Tangent vector whose curve coordinate moves by c: (N, nu)."""
+        """Tangent vector of a change of the curve coordinate.
+
+        Args:
+            K: (N, nu, nx) gain of the projection operator.
+            c: (N, nu) change of the curve coordinate [u-unit].
+
+        Returns:
+            The tangent vector.
+        """
         return CurveCoordinates(A=self.A, B=self.B, K=K).lift(c)
 
 
 class Problem(Protocol[P]):
-    """What Algorithm 1 needs to know. A point P is a trajectory with whatever was computed along it."""
+    """Cost and dynamics as Algorithm 1 needs them. A point P is a trajectory with all that was computed along it."""
 
     def value(self, point: P) -> float:
-        """J at a point; infinite where the trial diverged."""
+        """Cost J at a point; infinite where the trial diverged."""
         ...
 
     def size(self, point: P) -> float:
-        """What a change of J is compared with, > 0: J itself where J is positive."""
+        """Positive scale with which changes of J are compared: J itself where J is positive."""
         ...
 
     def expand(self, point: P) -> Expansion:
@@ -69,39 +97,44 @@ class Problem(Protocol[P]):
         ...
 
     def project(self, point: P, zeta: TangentCurve, gamma: float, K: Array) -> P:
-        """The trajectory P(xi + gamma zeta) under the regulator K."""
+        """The trajectory P(xi + gamma zeta) under the regulator K: (N, nu, nx)."""
         ...
 
     def difference(self, new: P, old: P) -> TangentCurve:
-        """Tangent-space difference of two trajectories, (x_new - x_old, u_new - u_old)."""
+        """Difference of two trajectories in the tangent space, (x_new - x_old, u_new - u_old)."""
         ...
 
     def refine(self, point: P) -> P | None:
-        """The same point with more accurate differences, or None where they are already the most accurate."""
+        """This trajectory with more accurate derivatives, or None where they are the most accurate already."""
         ...
 
 
 class Direction(Protocol):
-    """Chooses zeta from the expansion; told of each accepted step."""
+    """Chooses a descent direction from the expansion and may learn from accepted steps."""
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """A descent direction."""
+        """A descent direction at an expansion, under the regulator K: (N, nu, nx)."""
         ...
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Called with the expansion at the new point and the difference to the old one."""
+        """Learn from a step: the expansion at the new point, and the difference from the old point to it."""
         ...
 
     def reset(self) -> bool:
-        """Forget what was learnt; True if there was something to forget."""
+        """Clear what was learnt; True if there was something to clear."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Armijo:
-    """Backtracking to `J(gamma) <= J(0) + sigma gamma DJ.zeta`.
+    """Backtracking line search until `J(gamma) <= J(0) + sigma gamma DJ.zeta`.
 
-    A rejected gamma shortens to the minimum of the parabola through J(0), slope and J(gamma), within [0.1, beta] gamma.
+    A rejected gamma is shortened to the minimum of the parabola through J(0), the slope and J(gamma), within [0.1, beta] gamma.
+
+    Attributes:
+        sigma: Share of the predicted decrease that a step has to reach.
+        beta: Largest factor by which a rejected step is shortened.
+        trials: Largest number of steps that are tried.
     """
 
     sigma: float = 1e-4
@@ -121,26 +154,53 @@ class Armijo:
         K: Array,
         first: float = 1.0,
     ) -> tuple[P, float] | None:
-        """The accepted point and its gamma, or None where even the shortest step does not lower J."""
-        value, gamma = problem.value(point), first
+        """Search along a direction.
+
+        Args:
+            problem: Cost and projection.
+            point: Point to start from.
+            zeta: Descent direction.
+            slope: Directional derivative DJ.zeta, negative.
+            K: (N, nu, nx) gain of the projection operator.
+            first: First step length.
+
+        Returns:
+            The accepted point and its gamma, or None where even the shortest step does not lower J.
+        """
+        value = problem.value(point)
+        gamma = first
+
         for _ in range(self.trials):
             if gamma * abs(slope) <= ROUND_OFF * abs(value):
                 return None
+
             trial = problem.project(point, zeta, gamma, K)
             new = problem.value(trial)
             if new <= value + self.sigma * gamma * slope:
                 return trial, gamma
-            curvature = new - value - gamma * slope
-            shorter = (
-                -0.5 * slope * gamma**2 / curvature if np.isfinite(new) and curvature > 0.0 else 0.0
-            )
-            gamma = float(np.clip(shorter, 0.1 * gamma, self.beta * gamma))
+
+            # Minimum of the parabola; a diverged trial gives none and is shortened as far as allowed.
+            excess = new - value - gamma * slope
+            shorter = 0.0
+            if np.isfinite(new) and excess > 0.0:
+                shorter = -0.5 * slope * gamma**2 / excess
+            gamma = float(np.clip(shorter, MIN_SHORTENING * gamma, self.beta * gamma))
+
         return None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Iterate(Generic[P]):
-    """One iterate of Algorithm 1. slope: |DJ.zeta| at this point; gamma: the step that led here; status: set on the last."""
+    """One iterate of Algorithm 1.
+
+    Attributes:
+        index: Number of accepted steps so far.
+        point: The point.
+        value: Cost J at the point.
+        slope: Magnitude of DJ.zeta at the point.
+        gamma: Length of the step that led to the point.
+        status: Why the algorithm ended; None except in the last iterate.
+    """
 
     index: int
     point: P
@@ -152,9 +212,15 @@ class Iterate(Generic[P]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Regulator:
-    """How K is made: weights Q, R, terminal (times dt) of the LQR along the trajectory, renewed every `period` iterates.
+    """Makes the gain K of the projection operator as a linear-quadratic regulator along the trajectory.
 
-    feedback_threshold: K is zero where no deviation grows more than this along the open-loop trajectory
+    Attributes:
+        Q: (nx, nx) weight of the state, multiplied by the sample period.
+        R: (nu, nu) weight of the control, multiplied by the sample period.
+        terminal: (nx, nx) weight of the last state.
+        period: Number of iterates after which K is renewed.
+        feedback_threshold: K is zero where no deviation is amplified by more than this along the open-loop trajectory, because
+            the projection needs no feedback there. 0 always gives feedback.
     """
 
     Q: Array
@@ -164,13 +230,19 @@ class Regulator:
     feedback_threshold: float = 0.0
 
     def gain(self, expansion: Expansion) -> Array:
-        """K: (N, nu, nx) about the expansion's trajectory."""
-        if (
-            self.feedback_threshold
-            and largest_amplification(expansion.A) <= self.feedback_threshold
-        ):
+        """Gain about the trajectory of an expansion.
+
+        Args:
+            expansion: Expansion at the trajectory.
+
+        Returns:
+            K: (N, nu, nx).
+        """
+        threshold = self.feedback_threshold
+        if threshold and largest_amplification(expansion.A) <= threshold:
             N, nx, nu = expansion.B.shape
             return np.zeros((N, nu, nx))
+
         return regulator(expansion.A, expansion.B, self.Q, self.R, self.terminal)
 
 
@@ -180,65 +252,77 @@ def optimize(
     direction: Direction,
     regulate: Regulator,
     armijo: Armijo,
+    *,
     tolerance: float,
     max_iterations: int,
 ) -> Iterator[Iterate[P]]:
-    """Algorithm 1. Yields every iterate; the last one carries a status. Stops at `|DJ.zeta| <= tolerance * size`."""
-    point, gamma, index = start, 0.0, 0
+    """Run Algorithm 1 from a point; the consumer decides when to stop earlier.
+
+    Args:
+        problem: Cost and dynamics.
+        start: First point.
+        direction: Chooses descent directions.
+        regulate: Makes the gain of the projection operator.
+        armijo: Line search.
+        tolerance: The algorithm has converged where `|DJ.zeta| <= tolerance * size`.
+        max_iterations: Largest number of accepted steps.
+
+    Yields:
+        Every iterate; the last one carries a status.
+    """
+    point = start
+    gamma = 0.0
+    index = 0
     expansion = problem.expand(point)
     K = regulate.gain(expansion)
+
     while True:
         zeta = direction(expansion, K)
         slope = expansion.slope(zeta)
-        value, size = problem.value(point), problem.size(point)
+        size = problem.size(point)
+        iterate = Iterate(
+            index=index, point=point, value=problem.value(point), slope=abs(slope), gamma=gamma
+        )
+
+        # Converged, unless more accurate derivatives show a further descent.
         if abs(slope) <= tolerance * size:
             better = problem.refine(point)
             if better is None:
-                yield Iterate(
-                    index=index,
-                    point=point,
-                    value=value,
-                    slope=abs(slope),
-                    gamma=gamma,
-                    status=Status.CONVERGED,
-                )
+                yield replace(iterate, status=Status.CONVERGED)
                 return
-            point, expansion = better, problem.expand(better)
+            point = better
+            expansion = problem.expand(point)
             continue
+
         if index >= max_iterations:
-            yield Iterate(
-                index=index,
-                point=point,
-                value=value,
-                slope=abs(slope),
-                gamma=gamma,
-                status=Status.MAX_ITERATIONS,
-            )
+            yield replace(iterate, status=Status.MAX_ITERATIONS)
             return
-        yield Iterate(index=index, point=point, value=value, slope=abs(slope), gamma=gamma)
-        first = min(
-            1.0, -2.0 * size / slope
-        )  # a step that promises to lose more than twice J is too long to try
-        found = armijo.search(problem, point, zeta, slope, K, first) if slope < 0.0 else None
+
+        yield iterate
+
+        # A step that promises to lose more than twice J is too long to try.
+        found = None
+        if slope < 0.0:
+            first = min(1.0, -MAX_PREDICTED_DECREASE * size / slope)
+            found = armijo.search(problem, point, zeta, slope, K, first)
+
+        # Without a shorter step that helps: refine the derivatives, then clear the memory, then give up.
         if found is None:
             better = problem.refine(point)
             if better is not None:
-                point, expansion = better, problem.expand(better)
+                point = better
+                expansion = problem.expand(point)
                 continue
             if direction.reset():
                 continue
-            yield Iterate(
-                index=index,
-                point=point,
-                value=value,
-                slope=abs(slope),
-                gamma=gamma,
-                status=Status.STALLED,
-            )
+            yield replace(iterate, status=Status.STALLED)
             return
-        old, (point, gamma) = point, found
+
+        previous = point
+        point, gamma = found
         expansion = problem.expand(point)
-        direction.accept(expansion, K, problem.difference(point, old))
+        direction.accept(expansion, K, problem.difference(point, previous))
+
         index += 1
         if index % regulate.period == 0:
             K = regulate.gain(expansion)

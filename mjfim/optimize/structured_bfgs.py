@@ -1,10 +1,10 @@
-"""The descent direction under hard limits: exact curvature of their barrier, learnt curvature of the cost. Arrays only."""
+"""Descent direction under hard limits: exact curvature of their barrier, learnt curvature of the remaining cost."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -13,173 +13,286 @@ from mjfim.arrays import Array
 from mjfim.optimize.barrier import BarrierExpansion
 from mjfim.optimize.lq import CurveCoordinates, RiccatiSolution, TangentCurve, Weights
 from mjfim.optimize.projection_operator import Expansion
+from mjfim.optimize.quasi_newton import CurvaturePair, inverse_hessian_product
 
-BENT = 1e-8  # relative curvature of a pair that still counts
-LEAST = 1e-4  # damping that is worth it, in units of mu
+# Smallest curvature of a pair that is used, relative to the norms of the step and of the change of the gradient.
+MIN_RELATIVE_CURVATURE = 1e-8
+
+# Smallest damping that is not zero, in units of mu.
+MIN_DAMPING = 1e-4
+
+# Largest number of dampings that are tried for one step.
+MAX_DAMPED_TRIALS = 5
+
+# The damping is multiplied by this times (length of the step / trusted length), clipped.
+DAMPING_GAIN = 1.5
+
+# Smallest and largest factor by which the damping rises after a step that is too long.
+RAISE_LIMITS = (2.0, 10.0)
+
+# Smallest and largest factor by which the damping falls after a step that was taken.
+LOWER_LIMITS = (0.1, 1.0)
+
+# Fraction of a step that the line search has to take, so that the damping does not rise.
+MIN_TAKEN_FRACTION = 0.3
+
+# Predicted decrease above which a shortened step raises the damping; with a smaller one it would look like convergence.
+SIGNIFICANT_DECREASE = 0.01
+
+# Smallest squared norm of a step; protects a division by zero.
+SMALLEST_SQUARE = 1e-300
 
 
-TRIES, RAISED, LOWERED = (
-    5,
-    (2.0, 10.0),
-    (0.1, 1.0),
-)  # dampings of a step at most, and factors between two of them
-
-
-AIM = 1.5  # factor of the damping, over how far a step goes
-CUT = 0.3  # share of a step that was taken below which the next one is damped more, else less if it did not go far
-WORTH = 0.01  # loss that a step promised from which on it is damped for having been cut; less would look like convergence
-
-
-TINY = 1e-300
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CurveMetric:
-    """The quadratic form of the barrier's Gauss-Newton Hessian and a ridge, on what the control may do: anything."""
+    """Metric on curve coordinates: a quadratic form on the tangent curves to which they lift.
 
-    chart: CurveCoordinates
+    Attributes:
+        coordinates: Curve coordinates of the trajectory.
+        weights: Quadratic form on tangent curves, positive on the controls.
+    """
+
+    coordinates: CurveCoordinates
     weights: Weights
 
     @cached_property
-    def _factored(self) -> RiccatiSolution:
-        return RiccatiSolution.solve(self.chart.A, self.chart.B, self.weights)
+    def _riccati(self) -> RiccatiSolution:
+        """Factored linear-quadratic problem of the form."""
+        return RiccatiSolution.solve(self.coordinates.A, self.coordinates.B, self.weights)
 
     def apply(self, s: Array) -> Array:
-        """The form's gradient at s: (N, nu)."""
-        return self.chart.gradient(*self.weights.half_gradient(self.chart.lift(s)))
+        """Product of the metric's matrix with a curve coordinate.
+
+        Args:
+            s: (N, nu) curve coordinate.
+
+        Returns:
+            (N, nu) half of the gradient of the form.
+        """
+        a, b = self.weights.half_gradient(self.coordinates.lift(s))
+        return self.coordinates.gradient(a, b)
 
     def solve(self, g: Array) -> Array:
-        """What apply undoes, by the Riccati equations."""
-        K = self.chart.K
+        """Product of the inverse of the metric's matrix with a vector, by the Riccati equations.
+
+        Args:
+            g: (N, nu) vector.
+
+        Returns:
+            (N, nu) curve coordinate s with `apply(s) = g`.
+        """
+        K = self.coordinates.K
         a = np.zeros((len(g) + 1, K.shape[2]))
         a[:-1] = -np.einsum("kui,ku->ki", K, g)
-        zeta = self._factored.descent(a, -g)
-        return np.asarray(zeta.v + np.einsum("kui,ki->ku", K, zeta.z[:-1]))
+        return self.coordinates.coordinate(self._riccati.descent(a, -g))
 
 
-@dataclass(frozen=True, eq=False)
-class Curves:
-    """What each coefficient of a basis: (N, M), of every control alike, does to the state: z (N+1, nx, M nu)."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BasisResponse:
+    """Change of the state by the coefficients of a basis of controls; the basis is the same for every control.
+
+    Attributes:
+        basis: (N, M) basis functions.
+        z: (N+1, nx, M nu) derivative of the state by the coefficients.
+    """
 
     basis: Array
     z: Array
 
     @staticmethod
-    def of(expansion: Expansion, basis: Array) -> Curves:
-        """Follow the linear recursion."""
-        A, B = expansion.A, expansion.B
-        N, nx, _ = B.shape
-        drive = np.einsum("km,kiu->kimu", basis, B).reshape(N, nx, -1)
-        z = np.zeros((N + 1, *drive.shape[1:]))
-        for k in range(N):
-            z[k + 1] = A[k] @ z[k] + drive[k]
-        return Curves(basis, z)
+    def simulate(expansion: Expansion, basis: Array) -> BasisResponse:
+        """Follow the linearised dynamics for every basis function and control.
 
-    def form(self, weights: Weights) -> Array:
-        """(M nu, M nu) the quadratic form on the coefficients, summed over the curves that they make."""
+        Args:
+            expansion: Expansion at a trajectory.
+            basis: (N, M) basis functions.
+
+        Returns:
+            The response.
+        """
+        A = expansion.A
+        B = expansion.B
+        N, nx, _ = B.shape
+
+        inputs = np.einsum("km,kiu->kimu", basis, B).reshape(N, nx, -1)
+        z = np.zeros((N + 1, *inputs.shape[1:]))
+        for k in range(N):
+            z[k + 1] = A[k] @ z[k] + inputs[k]
+
+        return BasisResponse(basis=basis, z=z)
+
+    def matrix(self, weights: Weights) -> Array:
+        """Matrix of a quadratic form on the coefficients.
+
+        Args:
+            weights: Quadratic form on tangent curves.
+
+        Returns:
+            (M nu, M nu) symmetric matrix.
+        """
         N, nu, nx = weights.S.shape
         M = self.basis.shape[1]
+
+        # Terms with the state: z'Qz + 2 v'Sz.
         Qz = (weights.Q @ self.z).reshape(-1, M * nu)
-        Qz[: N * nx] += 2.0 * np.einsum("km,kui->kimu", self.basis, weights.S).reshape(
-            N * nx, M * nu
-        )
+        coupling = np.einsum("km,kui->kimu", self.basis, weights.S)
+        Qz[: N * nx] += 2.0 * coupling.reshape(N * nx, M * nu)
         H = Qz.T @ self.z.reshape(-1, M * nu)
-        pairs = np.einsum("km,kn->kmn", self.basis, self.basis).reshape(N, -1)
-        own = (pairs.T @ weights.R.reshape(N, -1)).reshape(M, M, nu, nu)
-        stepped = np.diff(self.basis, axis=0, prepend=0.0, append=0.0)
+
+        # Terms with the control: v'Rv.
+        products = np.einsum("km,kn->kmn", self.basis, self.basis).reshape(N, -1)
+        control = (products.T @ weights.R.reshape(N, -1)).reshape(M, M, nu, nu)
+
+        # Terms with the changes of the control.
+        steps = np.diff(self.basis, axis=0, prepend=0.0, append=0.0)
         for u in range(nu):
-            own[:, :, u, u] += stepped.T @ (weights.W[:, u, None] * stepped)
-        return np.asarray(0.5 * (H + H.T) + own.swapaxes(1, 2).reshape(M * nu, M * nu))
+            control[:, :, u, u] += steps.T @ (weights.W[:, u, None] * steps)
+
+        control_matrix = control.swapaxes(1, 2).reshape(M * nu, M * nu)
+        return np.asarray(0.5 * (H + H.T) + control_matrix)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class BasisMetric:
-    """The same on the coefficients of a basis; dense.  H: (M nu, M nu)"""
+    """Metric on the coefficients of a basis of controls, as a dense matrix.
+
+    Attributes:
+        H: (M nu, M nu) symmetric positive definite matrix.
+    """
 
     H: Array
 
     @staticmethod
-    def of(expansion: Expansion, weights: Weights, basis: Array) -> BasisMetric:
-        """Of a form on curves."""
-        return BasisMetric(Curves.of(expansion, basis).form(weights))
+    def from_weights(expansion: Expansion, weights: Weights, basis: Array) -> BasisMetric:
+        """Metric of a quadratic form on tangent curves.
+
+        Args:
+            expansion: Expansion at a trajectory.
+            weights: Quadratic form on tangent curves.
+            basis: (N, M) basis functions.
+
+        Returns:
+            The metric on the coefficients.
+        """
+        return BasisMetric(H=BasisResponse.simulate(expansion, basis).matrix(weights))
 
     @cached_property
-    def factor(self) -> tuple[Array, bool]:
-        """Cholesky factor."""
+    def _factor(self) -> tuple[Array, bool]:
+        """Cholesky factor of H, and whether it is the lower one."""
         factor, lower = cho_factor(self.H, lower=True)
         return factor, bool(lower)
 
     def apply(self, s: Array) -> Array:
-        """The form's gradient at s: (M, nu)."""
+        """Product of the matrix with coefficients.
+
+        Args:
+            s: (M, nu) coefficients.
+
+        Returns:
+            (M, nu) product.
+        """
         return np.asarray((self.H @ s.reshape(-1)).reshape(s.shape))
 
     def solve(self, g: Array) -> Array:
-        """What apply undoes."""
-        return np.asarray(cho_solve(self.factor, g.reshape(-1)).reshape(g.shape))
+        """Product of the inverse of the matrix with a vector.
+
+        Args:
+            g: (M, nu) vector.
+
+        Returns:
+            (M, nu) coefficients s with `apply(s) = g`.
+        """
+        return np.asarray(cho_solve(self._factor, g.reshape(-1)).reshape(g.shape))
 
 
-@dataclass(frozen=True, eq=False)
-class Learnt:
-    """A step s and what its model left out of the change y of the cost's gradient, limits not in it; (N, nu) or (M, nu)."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _RemainderPair:
+    """A step, and the change of the cost's gradient along it that the model did not predict; limits are not included.
+
+    Attributes:
+        s: (N, nu) step of the curve coordinate, or (M, nu) of the coefficients of a basis.
+        y: Change of the gradient less the predicted change, shaped like s.
+    """
 
     s: Array
     y: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Local:
-    """What is known at a point, in the coordinates: (N, nu) controls or (M, nu) coefficients of a basis.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _LocalModel:
+    """Gradients and metrics at a point, in coordinates: (N, nu) curve coordinates or (M, nu) coefficients of a basis.
 
-    weights: the barrier's Gauss-Newton Hessian and the ridge
-    gradient: of all;  cost: of the cost without limits;  slopes: (m, ...) of the spectral model's coordinates
+    Attributes:
+        expansion: Expansion at the point.
+        coordinates: Curve coordinates of its trajectory.
+        weights: The barrier's Gauss-Newton Hessian and the ridge, as a form on tangent curves.
+        gradient: Gradient of cost and barrier.
+        cost_gradient: Gradient of the cost without the barrier.
+        eigenvalue_slopes: (m, ...) gradients of the coordinates of the eigenvalue model; m is 0 without one.
+        basis: (N, M) basis of the controls, or None.
     """
 
     expansion: Expansion
-    chart: CurveCoordinates
+    coordinates: CurveCoordinates
     weights: Weights
     gradient: Array
-    cost: Array
-    slopes: Array
+    cost_gradient: Array
+    eigenvalue_slopes: Array
     basis: Array | None
 
     def metric(self, damping: float) -> CurveMetric | BasisMetric:
-        """Of the weights, and a multiple of even ones."""
-        even = _barrier(self.expansion).uniform_weights
+        """Metric of the weights plus a multiple of the uniform weights.
+
+        Args:
+            damping: Factor of the uniform weights.
+
+        Returns:
+            The metric in these coordinates.
+        """
         if self.basis is None:
-            return CurveMetric(
-                self.chart, self.weights.plus(even, damping) if damping > 0.0 else self.weights
-            )
-        form, spread = self._forms
-        return BasisMetric(form + damping * spread if damping > 0.0 else form)
+            weights = self.weights
+            if damping > 0.0:
+                weights = weights.plus(_barrier(self.expansion).uniform_weights, damping)
+            return CurveMetric(coordinates=self.coordinates, weights=weights)
+
+        matrix, uniform_matrix = self._matrices
+        return BasisMetric(H=matrix + damping * uniform_matrix if damping > 0.0 else matrix)
 
     @cached_property
-    def _forms(self) -> tuple[Array, Array]:
-        """The weights' form and the even one, on the coefficients."""
+    def _matrices(self) -> tuple[Array, Array]:
+        """(M nu, M nu) matrices of the weights and of the uniform weights, on the coefficients of the basis."""
         if self.basis is None:
-            raise ValueError("no basis, no coefficients")
-        curves = Curves.of(self.expansion, self.basis)
-        return curves.form(self.weights), curves.form(_barrier(self.expansion).uniform_weights)
+            raise ValueError("without a basis there are no coefficients")
 
-    def modelled(self, s: Array) -> Array:
-        """Gradient of the cost that the model expects after a step s, over that at its start."""
+        response = BasisResponse.simulate(self.expansion, self.basis)
+        uniform = _barrier(self.expansion).uniform_weights
+        return response.matrix(self.weights), response.matrix(uniform)
+
+    def predicted_change(self, s: Array) -> Array:
+        """Change of the cost's gradient that the eigenvalue model predicts along a step s; zero without such a model."""
         model = self.expansion.eigenvalue_model
         if model is None:
             return np.zeros_like(s)
-        d = np.tensordot(self.slopes, s, axes=s.ndim)
-        return np.asarray(
-            np.tensordot(model.gradient(d) - model.gradient(np.zeros_like(d)), self.slopes, axes=1)
-        )
+
+        d = np.tensordot(self.eigenvalue_slopes, s, axes=s.ndim)
+        change = model.gradient(d) - model.gradient(np.zeros_like(d))
+        return np.asarray(np.tensordot(change, self.eigenvalue_slopes, axes=1))
 
 
 @dataclass
 class StructuredBFGS:
-    """BFGS of what remains of the cost, on top of the barrier's Gauss-Newton Hessian and the model of the criterion.
+    """BFGS of the remaining cost, on top of the barrier's Gauss-Newton Hessian and the eigenvalue model of the criterion.
 
-    Both are exact at every point; pairs hold the remainder alone, so what was learnt outlives a sharper barrier.
-    Steps that go too far are damped by `uniform_weights` (Levenberg & Marquardt): it shortens what nothing holds, and leaves
-    the way back inside as it is.
-    ridge: (nu,) weight of the control at every sample;  basis: (N, M) what controls may do, or None
-    reach: largest move of anything limited in one step, over half of its range;  damping: of the step to come
+    Both are exact at every point. The curvature pairs hold the remainder alone, so that they stay valid for a sharper barrier.
+    Steps that are too long are damped by `BarrierExpansion.uniform_weights` (Levenberg & Marquardt). That shortens directions
+    without curvature of their own and leaves the way back inside the limits as it is.
+
+    Attributes:
+        ridge: (nu,) weight of the control at every sample, which keeps the metric positive.
+        basis: (N, M) basis of the controls, or None where the controls are free.
+        memory: Largest number of stored pairs.
+        reach: Largest change of any limited quantity in one step, over half of its range.
+        damping: Factor of the uniform weights in the next step, in units of mu.
     """
 
     ridge: Array
@@ -187,111 +300,168 @@ class StructuredBFGS:
     memory: int = 30
     reach: float = 0.5
     damping: float = 0.0
-    _pairs: tuple[Learnt, ...] = ()
-    _last: Local | None = field(default=None, repr=False)
-    _told: TangentCurve | None = field(default=None, repr=False)
+    _pairs: tuple[_RemainderPair, ...] = ()
+    _last: _LocalModel | None = field(default=None, repr=False)
+    _proposed: TangentCurve | None = field(default=None, repr=False)
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
-        """zeta by the two-loop recursion and the model, damped until it does not move too far."""
-        here, barrier = self._local(expansion, K), _barrier(expansion)
-        for left in reversed(range(TRIES)):
-            step = self._step(here)
-            zeta = here.chart.lift(step if self.basis is None else self.basis @ step)
-            far = barrier.largest_relative_move(zeta) / self.reach
-            if far <= 1.0 or left == 0:
-                break
-            self.damping = max(self.damping, LEAST) * float(np.clip(AIM * far, *RAISED))
-        move = 1.0 / max(far, 1.0)
-        self._told = TangentCurve(z=move * zeta.z, v=move * zeta.v)
-        return self._told
+        """The direction, damped until no limited quantity changes too much.
 
-    def _step(self, here: Local) -> Array:
-        """The model's minimum, in the coordinates."""
-        undo = self._inverse(here.metric(self.damping))
+        Args:
+            expansion: Expansion of cost and barrier.
+            K: (N, nu, nx) gain of the projection operator.
+
+        Returns:
+            The direction.
+
+        Raises:
+            ValueError: The expansion has no barrier.
+        """
+        here = self._local_model(expansion, K)
+        zeta, relative_length = self._damped_curve(here)
+
+        for _ in range(MAX_DAMPED_TRIALS - 1):
+            if relative_length <= 1.0:
+                break
+            factor = float(np.clip(DAMPING_GAIN * relative_length, *RAISE_LIMITS))
+            self.damping = max(self.damping, MIN_DAMPING) * factor
+            zeta, relative_length = self._damped_curve(here)
+
+        # Whatever damping did not achieve is achieved by scaling.
+        fraction = 1.0 / max(relative_length, 1.0)
+        self._proposed = TangentCurve(z=fraction * zeta.z, v=fraction * zeta.v)
+        return self._proposed
+
+    def _damped_curve(self, here: _LocalModel) -> tuple[TangentCurve, float]:
+        """Tangent curve of the model's minimum with the present damping, and its length over the trusted length."""
+        step = self._step(here)
+        c = step if self.basis is None else self.basis @ step
+        zeta = here.coordinates.lift(c)
+        return zeta, _barrier(here.expansion).largest_relative_move(zeta) / self.reach
+
+    def _step(self, here: _LocalModel) -> Array:
+        """Minimum of the model, in its coordinates, with the present damping."""
+        inverse = self._inverse_hessian(here.metric(self.damping))
         model = here.expansion.eigenvalue_model
         if model is None:
-            return -undo(here.gradient)
-        m = len(here.slopes)
-        rest = here.gradient - np.tensordot(model.gradient(np.zeros(m)), here.slopes, axes=1)
-        away = -undo(rest)
-        moves = np.stack([undo(slope) for slope in here.slopes])
-        flat = here.slopes.reshape(m, -1)
-        spread = flat @ moves.reshape(m, -1).T
-        w = model.minimising_gradient(flat @ away.reshape(-1), 0.5 * (spread + spread.T))
-        return np.asarray(away - np.tensordot(w, moves, axes=1))
+            return -inverse(here.gradient)
 
-    def _inverse(self, metric: CurveMetric | BasisMetric) -> Callable[[Array], Array]:
-        """What undoes the Hessian of metric and pairs: BFGS, the two-loop recursion."""
-        used = []
-        for pair in self._pairs:
-            y = pair.y + metric.apply(pair.s)
-            curvature = float(np.vdot(pair.s, y))
-            if curvature > BENT * np.linalg.norm(pair.s) * np.linalg.norm(y):
-                used.append((pair.s, y, curvature))
+        # Step of all but the eigenvalue model.
+        slopes = here.eigenvalue_slopes
+        m = len(slopes)
+        rest = here.gradient - np.tensordot(model.gradient(np.zeros(m)), slopes, axes=1)
+        step = -inverse(rest)
 
-        def undo(g: Array) -> Array:
-            q, alphas = g, []
-            for s, y, curvature in reversed(used):
-                alphas.append(np.vdot(s, q) / curvature)
-                q = q - alphas[-1] * y
-            q = metric.solve(q)
-            for (s, y, curvature), alpha in zip(used, reversed(alphas), strict=True):
-                q = q + s * (alpha - np.vdot(y, q) / curvature)
-            return q
+        # The model depends on the step through m numbers d: solve for these, and correct the step.
+        responses = np.stack([inverse(slope) for slope in slopes])
+        flat = slopes.reshape(m, -1)
+        spread = flat @ responses.reshape(m, -1).T
+        w = model.minimising_gradient(flat @ step.reshape(-1), 0.5 * (spread + spread.T))
+        return np.asarray(step - np.tensordot(w, responses, axes=1))
 
-        return undo
+    def _inverse_hessian(self, metric: CurveMetric | BasisMetric) -> Callable[[Array], Array]:
+        """Product of the inverse Hessian of metric and stored pairs with a vector."""
+        pairs = []
+        for remainder in self._pairs:
+            y = remainder.y + metric.apply(remainder.s)
+            pair = CurvaturePair.where_convex(remainder.s, y, MIN_RELATIVE_CURVATURE)
+            if pair is not None:
+                pairs.append(pair)
+
+        return partial(inverse_hessian_product, pairs=pairs, initial=metric.solve)
 
     def accept(self, expansion: Expansion, K: Array, moved: TangentCurve) -> None:
-        """Learn from the step that led to this expansion what its model left out."""
-        before, told = self._last, self._told
-        if before is None or told is None:
+        """Adapt the damping to an accepted step and store the change of the gradient that the model did not predict.
+
+        Args:
+            expansion: Expansion at the new point.
+            K: (N, nu, nx) gain of the projection operator.
+            moved: Difference between the new and the old point.
+        """
+        before = self._last
+        proposed = self._proposed
+        if before is None or proposed is None:
             return
-        gamma = float(np.vdot(told.v, moved.v)) / max(float(np.vdot(told.v, told.v)), TINY)
-        if gamma > CUT:
-            far = _barrier(before.expansion).largest_relative_move(told) / self.reach
-            self.damping = (
-                self.damping * float(np.clip(AIM * far, *LOWERED)) if self.damping > LEAST else 0.0
-            )
-        elif before.expansion.slope(told) < -WORTH:
-            self.damping = RAISED[0] * max(self.damping, LEAST)
-        s = moved.v + np.einsum("kui,ki->ku", K, moved.z[:-1])
+
+        self._adapt_damping(before, proposed, moved)
+
+        after = self._local_model(expansion, K)
+        s: Array = after.coordinates.coordinate(moved)
         if self.basis is not None:
             s = np.linalg.lstsq(self.basis, s)[0]
-        after = self._local(expansion, K)
-        self._pairs = (*self._pairs, Learnt(s, after.cost - before.cost - before.modelled(s)))[
-            -self.memory :
-        ]
+
+        y = after.cost_gradient - before.cost_gradient - before.predicted_change(s)
+        self._pairs = (*self._pairs, _RemainderPair(s=s, y=y))[-self.memory :]
+
+    def _adapt_damping(
+        self, before: _LocalModel, proposed: TangentCurve, moved: TangentCurve
+    ) -> None:
+        """Lower the damping after a step that was taken, raise it after one that the line search shortened."""
+        square = max(float(np.vdot(proposed.v, proposed.v)), SMALLEST_SQUARE)
+        taken = float(np.vdot(proposed.v, moved.v)) / square
+
+        if taken > MIN_TAKEN_FRACTION:
+            barrier = _barrier(before.expansion)
+            relative_length = barrier.largest_relative_move(proposed) / self.reach
+            factor = float(np.clip(DAMPING_GAIN * relative_length, *LOWER_LIMITS))
+            self.damping = self.damping * factor if self.damping > MIN_DAMPING else 0.0
+
+        elif before.expansion.slope(proposed) < -SIGNIFICANT_DECREASE:
+            self.damping = RAISE_LIMITS[0] * max(self.damping, MIN_DAMPING)
 
     def reset(self) -> bool:
-        """Forget all pairs."""
-        had = bool(self._pairs)
-        self._pairs = ()
-        return had
+        """Clear the memory.
 
-    def _local(self, expansion: Expansion, K: Array) -> Local:
-        """Everything about an expansion, once."""
-        if (
-            self._last is None
-            or self._last.expansion is not expansion
-            or self._last.chart.K is not K
-        ):
-            barrier, w = _barrier(expansion), _barrier(expansion).weights
-            weights = Weights(Q=w.Q, S=w.S, R=w.R + np.diag(self.ridge), W=w.W)
-            chart = CurveCoordinates(A=expansion.A, B=expansion.B, K=K)
-            forms = [(expansion.a, expansion.b), (expansion.a - barrier.a, expansion.b - barrier.b)]
-            if expansion.eigenvalue_model is not None:
-                forms += list(
-                    zip(expansion.eigenvalue_model.a, expansion.eigenvalue_model.b, strict=True)
-                )
-            found = [chart.gradient(a, b) for a, b in forms]
-            if self.basis is not None:
-                found = [self.basis.T @ g for g in found]
-            slopes = np.stack(found[2:]) if len(found) > 2 else np.zeros((0, *found[0].shape))
-            self._last = Local(expansion, chart, weights, found[0], found[1], slopes, self.basis)
+        Returns:
+            True if there was something to clear.
+        """
+        had_pairs = bool(self._pairs)
+        self._pairs = ()
+        return had_pairs
+
+    def _local_model(self, expansion: Expansion, K: Array) -> _LocalModel:
+        """Gradients and weights at an expansion, computed once per expansion and regulator."""
+        last = self._last
+        if last is not None and last.expansion is expansion and last.coordinates.K is K:
+            return last
+
+        barrier = _barrier(expansion)
+        form = barrier.weights
+        weights = Weights(Q=form.Q, S=form.S, R=form.R + np.diag(self.ridge), W=form.W)
+        coordinates = CurveCoordinates(A=expansion.A, B=expansion.B, K=K)
+
+        gradient = self._gradient(coordinates, expansion.a, expansion.b)
+        cost_gradient = self._gradient(
+            coordinates, expansion.a - barrier.a, expansion.b - barrier.b
+        )
+        slopes: Array = np.zeros((0, *gradient.shape))
+        model = expansion.eigenvalue_model
+        if model is not None:
+            gradients = [
+                self._gradient(coordinates, a, b) for a, b in zip(model.a, model.b, strict=True)
+            ]
+            slopes = np.stack(gradients)
+
+        self._last = _LocalModel(
+            expansion=expansion,
+            coordinates=coordinates,
+            weights=weights,
+            gradient=gradient,
+            cost_gradient=cost_gradient,
+            eigenvalue_slopes=slopes,
+            basis=self.basis,
+        )
         return self._last
+
+    def _gradient(self, coordinates: CurveCoordinates, a: Array, b: Array) -> Array:
+        """Gradient by the coordinates of a linear cost: (N, nu), or (M, nu) with a basis. a: (N+1, nx);  b: (N, nu)."""
+        gradient = coordinates.gradient(a, b)
+        return gradient if self.basis is None else np.asarray(self.basis.T @ gradient)
 
 
 def _barrier(expansion: Expansion) -> BarrierExpansion:
+    """Expansion of the barrier. Raises ValueError where there is none."""
     if expansion.barrier is None:
         raise ValueError("a direction under hard limits needs their expansion")
+
     return expansion.barrier

@@ -160,7 +160,7 @@ def test_descent_is_the_dense_kkt_solution(sizes: tuple[int, int, int]) -> None:
     A, B = random_system(rng, N, nx, nu)
     a, b = rng.normal(size=(N + 1, nx)), rng.normal(size=(N, nu))
     Q, R, terminal = positive(rng, nx), positive(rng, nu), 3.0 * positive(rng, nx)
-    zeta = descent(A, B, a, b, Q, R, terminal)
+    zeta = descent(A, B, a, b, Q=Q, R=R, terminal=terminal)
     z, v = dense_solution(A, B, a, b, Q, R, terminal)
     np.testing.assert_allclose(zeta.z, z, rtol=0, atol=1e-9 * np.abs(z).max())
     np.testing.assert_allclose(zeta.v, v, rtol=0, atol=1e-9 * np.abs(v).max())
@@ -177,7 +177,7 @@ def test_descent_without_weight_on_the_state_is_the_dense_kkt_solution() -> None
         positive(rng, 2),
         np.zeros((3, 3)),
     )
-    zeta = descent(A, B, a, b, none, R, none)
+    zeta = descent(A, B, a, b, Q=none, R=R, terminal=none)
     z, v = dense_solution(A, B, a, b, none, R, none)
     np.testing.assert_allclose(zeta.z, z, rtol=0, atol=1e-10 * np.abs(z).max())
     np.testing.assert_allclose(zeta.v, v, rtol=0, atol=1e-10 * np.abs(v).max())
@@ -249,7 +249,7 @@ def test_descent_is_feasible_optimal_and_goes_down_by_its_own_metric() -> None:
             square + np.einsum("ki,ij,kj->", v, R, v)
         )
 
-    zeta = descent(A, B, a, b, Q, R, terminal)
+    zeta = descent(A, B, a, b, Q=Q, R=R, terminal=terminal)
     recursion = LinearRecursion(A)
     np.testing.assert_allclose(
         zeta.z,
@@ -271,7 +271,7 @@ def test_a_control_weight_that_is_not_positive_is_refused() -> None:
     with pytest.raises(np.linalg.LinAlgError, match="positive"):
         regulator(A, B, flat, np.array([[-1.0]]), flat)
     with pytest.raises(np.linalg.LinAlgError, match="positive"):
-        descent(A, B, np.zeros((4, 1)), np.zeros((3, 1)), flat, flat, flat)
+        descent(A, B, np.zeros((4, 1)), np.zeros((3, 1)), Q=flat, R=flat, terminal=flat)
 
 
 @pytest.mark.parametrize("wrong", ["A", "B", "a", "b", "Q", "R"])

@@ -405,7 +405,7 @@ def test_better_differences_are_used_before_a_stall_is_claimed() -> None:
 def test_the_consumer_may_stop_between_iterates() -> None:
     problem = Pendulum()
     loop: Iterator[Iterate[Curve]] = optimize(
-        problem, start(problem), METRIC, REGULATOR, Armijo(), 1e-12, 100
+        problem, start(problem), METRIC, REGULATOR, Armijo(), tolerance=1e-12, max_iterations=100
     )
     first, second = next(loop), next(loop)
     loop.close()

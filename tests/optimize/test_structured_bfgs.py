@@ -39,7 +39,9 @@ def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: b
     rng = np.random.default_rng(1)
     expansion, weights = random_expansion(rng)
     K = feedback * 0.3 * rng.normal(size=(N, NU, NX))
-    metric = CurveMetric(CurveCoordinates(A=expansion.A, B=expansion.B, K=K), weights)
+    metric = CurveMetric(
+        coordinates=CurveCoordinates(A=expansion.A, B=expansion.B, K=K), weights=weights
+    )
     H = dense(metric)
     np.testing.assert_allclose(H, H.T, rtol=0, atol=1e-9 * np.abs(H).max())
     assert np.linalg.eigvalsh(H)[0] > 0.0
@@ -60,9 +62,10 @@ def test_on_an_identity_basis_both_metrics_agree() -> None:
     rng = np.random.default_rng(2)
     expansion, weights = random_expansion(rng)
     free = CurveMetric(
-        CurveCoordinates(A=expansion.A, B=expansion.B, K=np.zeros((N, NU, NX))), weights
+        coordinates=CurveCoordinates(A=expansion.A, B=expansion.B, K=np.zeros((N, NU, NX))),
+        weights=weights,
     )
-    based = BasisMetric.of(expansion, weights, np.eye(N))
+    based = BasisMetric.from_weights(expansion, weights, np.eye(N))
     for _ in range(3):
         s = rng.normal(size=(N, NU))
         assert relative_error(based.apply(s), free.apply(s)) < 1e-8
@@ -81,12 +84,13 @@ def test_on_fewer_curves_the_metric_is_the_projected_one() -> None:
         wide.T
         @ dense(
             CurveMetric(
-                CurveCoordinates(A=expansion.A, B=expansion.B, K=np.zeros((N, NU, NX))), weights
+                coordinates=CurveCoordinates(A=expansion.A, B=expansion.B, K=np.zeros((N, NU, NX))),
+                weights=weights,
             )
         )
         @ wide
     )
-    based = BasisMetric.of(expansion, weights, basis)
+    based = BasisMetric.from_weights(expansion, weights, basis)
     assert relative_error(based.H, H) < 1e-9
     g = rng.normal(size=(5, NU))
     assert relative_error(based.solve(g).reshape(-1), np.linalg.solve(H, g.reshape(-1))) < 1e-7
@@ -235,7 +239,15 @@ def test_the_toy_is_driven_to_the_optimum_that_scipy_finds(kind: str, mu: float)
     direction = StructuredBFGS(np.full(NU, 1e-3), basis)
     regulate = FED_BACK if kind == "fed back" else CALM
     iterates = list(
-        optimize(toy, toy.point(np.zeros((N, NU))), direction, regulate, Armijo(), 1e-9, 150)
+        optimize(
+            toy,
+            toy.point(np.zeros((N, NU))),
+            direction,
+            regulate,
+            Armijo(),
+            tolerance=1e-9,
+            max_iterations=150,
+        )
     )
     values = [iterate.value for iterate in iterates]
     assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
@@ -253,7 +265,13 @@ def test_what_was_learnt_outlives_a_sharper_barrier() -> None:
     """Pairs hold the change of the cost's gradient alone: nothing of a barrier, blunt or sharp."""
     direction, blunt = StructuredBFGS(np.full(NU, 1e-3)), Toy(1e-1)
     for iterate in optimize(
-        blunt, blunt.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-6, 40
+        blunt,
+        blunt.point(np.zeros((N, NU))),
+        direction,
+        CALM,
+        Armijo(),
+        tolerance=1e-6,
+        max_iterations=40,
     ):
         point = iterate.point
     pairs = direction._pairs
@@ -308,7 +326,15 @@ def test_damping_fades_where_steps_are_short() -> None:
     toy = Toy(1e-2)
     direction = StructuredBFGS(np.full(NU, 1e-3), damping=10.0)
     iterates = list(
-        optimize(toy, toy.point(np.zeros((N, NU))), direction, CALM, Armijo(), 1e-9, 150)
+        optimize(
+            toy,
+            toy.point(np.zeros((N, NU))),
+            direction,
+            CALM,
+            Armijo(),
+            tolerance=1e-9,
+            max_iterations=150,
+        )
     )
     assert iterates[-1].status in (Status.CONVERGED, Status.STALLED)
     assert direction.damping < 1e-3

@@ -340,7 +340,7 @@ class Descent:
         ridge = RIDGE / N / self.arena.fence.control.scale**2
         if problem.costs and point.point is not None and point.point.cost > 0.0:
             ridge = ridge + setup.control_weight * setup.dt / point.point.cost
-        H = BasisMetric.of(
+        H = BasisMetric.from_weights(
             e, Weights(Q=w.Q, S=w.S, R=w.R + np.diag(ridge), W=w.W), self.series.basis
         ).H
         return np.asarray(cholesky(H + 1e-12 * np.trace(H) * np.eye(len(H)), lower=True))
