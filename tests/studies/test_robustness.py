@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
 import sys
 from collections.abc import Iterator
 from importlib import import_module
@@ -27,6 +26,7 @@ from mjfim.output import archive
 from mjfim.output.playback import design_columns, reference_columns, simulate_playback
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.playback import Playback
+from tests.support.cli import run_script
 from tests.support.numerics import Array, body_setup, cart_setup, filtered_setup
 from tests.support.paths import ROOT
 
@@ -519,15 +519,20 @@ def test_a_start_on_the_move_takes_no_latency(robots: ModuleType, tmp_path: Path
         robots.Bench(setup.experiment, path, robots.Conditions(latency=0.005))
 
 
-def script(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(ROOT / "scripts" / "playback.py"), *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-
-
 def test_the_script_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: Path) -> None:
     """Tables, sentences, JSON, a picture; in processes of its own."""
     experiment, path = cart
-    done = script(experiment.source, path.parent, "--runs", 6, "--jobs", 2, "-o", tmp_path / "out")
+    done = run_script(
+        "playback.py",
+        experiment.source,
+        path.parent,
+        "--runs",
+        6,
+        "--jobs",
+        2,
+        "-o",
+        tmp_path / "out",
+    )
     found = json.loads((tmp_path / "out" / "playback.json").read_text(encoding="utf-8"))
     assert done.returncode == (0 if found["ok"] else 1), done.stderr
     assert (tmp_path / "out" / "playback.png").read_bytes()[:4] == b"\x89PNG"
@@ -549,7 +554,7 @@ def test_misuse_is_one_sentence(
 ) -> None:
     experiment, path = cart
     folder = [path.parent] if "--latency" in words else []
-    done = script(experiment.source, *folder, *words, "-o", tmp_path)
+    done = run_script("playback.py", experiment.source, *folder, *words, "-o", tmp_path)
     assert done.returncode == 2
     assert said in done.stdout.replace("\n", " ")
     assert "Traceback" not in done.stderr

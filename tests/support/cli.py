@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 from typer.testing import CliRunner, Result
 
 from mjfim.cli import main as cli
-from tests.support.paths import MODELS
+from tests.support.paths import MODELS, ROOT, SCRIPTS
 
 # Files that `mjfim design` writes.
 DESIGN = {
@@ -45,6 +48,15 @@ STUDY = {
 def run(*words: object) -> Result:
     """Run `mjfim` with these words in this process."""
     return CliRunner().invoke(cli.app, [str(word) for word in words])
+
+
+def run_script(name: str, *words: object) -> subprocess.CompletedProcess[str]:
+    """Run a file of scripts/ in a new process that finds this package, installed or not."""
+    command = [sys.executable, str(SCRIPTS / name), *(str(word) for word in words)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        command, capture_output=True, text=True, env=environment, check=False, timeout=300
+    )
 
 
 def write_experiment(home: Path, **lines: str) -> Path:
