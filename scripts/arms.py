@@ -499,7 +499,7 @@ def described(e: Experiment) -> Iterator[tuple[str, str]]:
 def identifiable(e: Experiment) -> Iterator[tuple[str, str]]:
     """What can be identified along the starting motion, and what no motion shows, as `mjfim check` finds it."""
     setup = Setup(e)
-    told = setup.plant.sensitivity(setup.theta, setup.initial)
+    told = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     if told is None:
         raise SystemExit(
             f"{e.source}: the starting motion diverges when the parameters move a little"
@@ -551,7 +551,7 @@ def timesteps(name: str, friction: bool, horizon: float, folder: Path) -> Table:
     for step in (FINE, 0.001, 0.002, 0.004, 0.005):
         e = experiment(name, horizon, friction, folder / "timesteps", step)
         setup = Setup(e)
-        sensitivity = setup.plant.sensitivity(setup.theta, setup.initial)
+        sensitivity = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
         sigma = np.nan if sensitivity is None else _sigma(setup, sensitivity)
         q, v = setup.initial.qpos, setup.initial.qvel
         reference = (q, v) if reference is None else reference

@@ -23,7 +23,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import survey
 from mjfim.parallel import cores
-from mjfim.plant.plant import FORWARD_DIFFERENCES
+from mjfim.plant.derivatives import FORWARD_DIFFERENCES
 
 ARM = (
     Path(__file__).resolve().parents[2]
@@ -79,7 +79,7 @@ def measured(model: Path, p: int, iterations: int) -> Cost:
     seconds: list[float] = []
     mjfim.design(setup, monitor=lambda row: seconds.append(row.seconds))
     curve = setup.initial
-    sensitivity = setup.plant.sensitivity(setup.theta, curve)
+    sensitivity = setup.plant.derivatives.sensitivity(setup.theta, curve)
     if sensitivity is None:
         raise SystemExit("the arm diverges")
     problem = Stage(setup, survey(setup, curve, sensitivity).basis).problem

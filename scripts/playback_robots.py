@@ -404,7 +404,7 @@ class Bench:
     def predicted(self) -> Array:
         """(p,) standard deviations before any run: at the guess, along the plan, the delay as it is."""
         setup = self.setup
-        found = setup.plant.predict(
+        found = setup.plant.derivatives.predict(
             self._with_delay(setup.parameters.guess), np.repeat(self.plan.ctrl, self.every, axis=0)
         )
         if found is None:

@@ -23,7 +23,7 @@ from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import study_summary, write_design, write_json
 from mjfim.output.labels import Labels
-from mjfim.plant.plant import CENTRAL_DIFFERENCES
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.trajectory import Trajectory

@@ -26,7 +26,7 @@ from mjfim.information.identifiability import PROBES, Survey, survey
 from mjfim.information.marginal import shared
 from mjfim.information.smoothness import roughness
 from mjfim.plant.active_constraints import saturated
-from mjfim.plant.plant import CENTRAL_DIFFERENCES
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import ParameterGroup, join_names
 from mjfim.records.design import Design, HistoryRow, StartResult, Status
 

@@ -14,7 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import survey
 from mjfim.optimize.lq import largest_amplification, regulator
-from mjfim.plant.plant import CENTRAL_DIFFERENCES
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import Roughness
 from mjfim.records.design import Evaluation
 from mjfim.records.trajectory import Trajectory
@@ -38,7 +38,7 @@ def evaluate(stage: Stage, point: Point) -> Evaluation:
         or point.criterion is None
     ):
         raise SimulationDiverged("the trajectory diverges")
-    A, B, _, _ = setup.plant.jacobians(setup.theta, point.trajectory)
+    A, B, _, _ = setup.plant.derivatives.jacobians(setup.theta, point.trajectory)
     r = regulator_for(setup)
     return Evaluation(
         trajectory=point.trajectory,

@@ -73,7 +73,7 @@ class InteriorProblem:
         barrier = self.fence.value(sight, self.delta)
         if not self.costs:
             return InteriorPoint(sight, None, 0.0, barrier)
-        point = self.base.point(sight.trajectory, self.base.plant.quickest_accuracy)
+        point = self.base.point(sight.trajectory, self.base.plant.derivatives.quickest_accuracy)
         return (
             DIVERGED_POINT
             if point is DIVERGED
@@ -119,7 +119,7 @@ class InteriorProblem:
         sight = seen(point)
         sight = self.fence.sight(sight.trajectory, sight.observed, slopes=True)
         if point.point is None:
-            A, B, rise = self.base.plant.observation_jacobians(
+            A, B, rise = self.base.plant.derivatives.observation_jacobians(
                 self.base.theta, sight.trajectory, self.fence.observations
             )
             e = Expansion(

@@ -14,7 +14,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import survey
 from mjfim.information.marginal import shared
-from mjfim.plant.plant import CENTRAL_DIFFERENCES
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 
 

@@ -19,13 +19,13 @@ from mjfim.information.fisher import Information
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.plant import (
+from mjfim.plant.derivatives import (
     CENTRAL_DIFFERENCES,
     FORWARD_DIFFERENCES,
     Bilinear,
     DifferenceAccuracy,
-    Plant,
 )
+from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
@@ -158,7 +158,9 @@ class DesignProblem:
 
     def _sensed(self, theta: Array, trajectory: Trajectory, accuracy: DifferenceAccuracy) -> Point:
         """A trajectory of the model at theta with its information; its cost is left open."""
-        sensitivity = self.plant.sensitivity(theta, trajectory, central=not accuracy.shared)
+        sensitivity = self.plant.derivatives.sensitivity(
+            theta, trajectory, central=not accuracy.shared_origin
+        )
         if sensitivity is None:
             return DIVERGED
         information = self.information.matrix(sensitivity)
@@ -207,7 +209,7 @@ class DesignProblem:
         a_running, b_running = self.running.gradient(trajectory)
         extended = None
         if self.extended:
-            full = self.plant.bilinear(
+            full = self.plant.derivatives.bilinear(
                 self.theta, trajectory, sensitivity.psi, np.eye(len(self.theta)), point.accuracy
             )
             a_psi, a_h, b_h = self.information.partials(criterion, sensitivity, full)
@@ -227,7 +229,7 @@ class DesignProblem:
     ) -> tuple[Bilinear, Array, Array]:
         """Derivatives at a point, and those of phi by x (N+1, nx) and u (N, nu)."""
         trajectory, sensitivity, criterion = _computed(point)
-        bilinear = self.plant.bilinear(
+        bilinear = self.plant.derivatives.bilinear(
             theta, trajectory, sensitivity.psi, criterion.directions, point.accuracy, observations
         )
         return bilinear, *self.information.gradient(criterion, sensitivity, bilinear)

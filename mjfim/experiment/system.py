@@ -116,11 +116,17 @@ class Setup:
         )
         private = self._private(self.level.soft if self.level.softened else ())
         self._require_bodies(private)
-        common = (self.parameters, self.outputs, self._start(), self.substeps, threads)
+        common: dict[str, Any] = {
+            "parameters": self.parameters,
+            "outputs": self.outputs,
+            "nominal_initial_state": self._start(),
+            "substeps": self.substeps,
+            "threads": threads,
+        }
         smooth = None
         if self.level.soft and not self.level.softened:
-            smooth = Plant(self._private(self.level.soft), *common)
-        self.plant = Plant(private, *common, smooth)
+            smooth = Plant(source=self._private(self.level.soft), **common)
+        self.plant = Plant(source=private, smooth=smooth, **common)
         self.tracking = self._weights()
         self.control_weight = by_name("cost.control", e.cost.control, self.controls, "actuator")
         bounded = (

@@ -24,8 +24,8 @@ from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
 from mjfim.plant.delay import OutputDelay
+from mjfim.plant.derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.plant.noise import Noise
-from mjfim.plant.plant import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
@@ -447,8 +447,14 @@ class Fit:
             longest = max(self.pieces[i].samples for i in batch)
             ctrl = np.stack([self._control(i, longest) for i in batch])
             free = self.free if derivatives else None
-            for response in plant.responses(
-                theta, starts, ctrl, free, central, MAX_NUMBERS_AT_ONCE, step, sought
+            for response in plant.derivatives.responses(
+                theta,
+                starts,
+                ctrl,
+                start_directions=free,
+                central=central,
+                step=step,
+                wanted=sought,
             ):
                 if response is None:
                     yield None

@@ -29,8 +29,8 @@ from mjfim.information.criteria import (
 from mjfim.information.marginal import standard_deviations
 from mjfim.optimize.eigenvalue_model import EigenvalueModel, divided_log_differences
 from mjfim.optimize.lq import LinearRecursion
+from mjfim.plant.derivatives import Bilinear
 from mjfim.plant.noise import Noise
-from mjfim.plant.plant import Bilinear
 from mjfim.records.trajectory import Sensitivity
 
 ESTIMABLE = 1e-6  # squared share of a parameter outside the identifiable combinations that still counts as round-off

@@ -13,7 +13,7 @@ from mjfim.excitation.initial_controls import probes
 from mjfim.experiment.system import Setup
 from mjfim.information.fisher import Information
 from mjfim.information.null_space import BLIND, COARSER, SURE, Null, grouped, invisible
-from mjfim.plant.plant import SENSITIVITY_STEP
+from mjfim.plant.derivatives import SENSITIVITY_STEP
 from mjfim.records.combinations import ParameterGroup, combination_matrix
 from mjfim.records.design import CombinationAccuracy
 from mjfim.records.trajectory import Sensitivity, Trajectory
@@ -97,7 +97,7 @@ def _survey(
     stack, errors = [J], [error]
     if always is None or here.count > always.shape[1]:
         for probe in tried:
-            fine = setup.plant.sensitivity(setup.theta, probe)
+            fine = setup.plant.derivatives.sensitivity(setup.theta, probe)
             if fine is not None:
                 more, doubt = _pair(setup, probe, fine)
                 stack.append(more)
@@ -142,7 +142,8 @@ def _stepped(
         )
         try:
             first, second = (
-                setup.plant.one_step(setup.theta, trajectory, picked, step) for step in ONE_STEPS
+                setup.plant.derivatives.one_step(setup.theta, trajectory, picked, step)
+                for step in ONE_STEPS
             )
         except SimulationDiverged:
             continue
@@ -203,7 +204,9 @@ def _unseen_before(setup: Setup, directions: Array) -> Array:
 def _pair(setup: Setup, trajectory: Trajectory, fine: Sensitivity) -> tuple[Array, Array]:
     """Rows of G and their change with the longer step (all of them where that diverges)."""
     J = rows(setup, fine)
-    coarse = setup.plant.sensitivity(setup.theta, trajectory, COARSER * SENSITIVITY_STEP)
+    coarse = setup.plant.derivatives.sensitivity(
+        setup.theta, trajectory, COARSER * SENSITIVITY_STEP
+    )
     return J, np.zeros_like(J) if coarse is None else rows(setup, coarse) - J
 
 

@@ -8,7 +8,7 @@ from mjfim.arrays import Array
 from mjfim.experiment.system import Setup
 from mjfim.information.null_space import BLIND, FAINT
 from mjfim.plant.active_constraints import _active
-from mjfim.plant.plant import SENSITIVITY_STEP
+from mjfim.plant.derivatives import SENSITIVITY_STEP
 from mjfim.records.check import Roughness
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
@@ -31,9 +31,11 @@ def roughness(
 ) -> Roughness | None:
     """The worst disagreement along a trajectory, or None where it is below `TOLERANCE`. fine: by the first step, if known"""
     plant = setup.plant
-    fine = plant.sensitivity(theta, trajectory) if fine is None else fine
-    longer = np.maximum(LONGER * setup.parameters.magnitude / plant.parameter_scale, LEAST)
-    coarse = plant.sensitivity(theta, trajectory, longer * SENSITIVITY_STEP)
+    fine = plant.derivatives.sensitivity(theta, trajectory) if fine is None else fine
+    longer = np.maximum(
+        LONGER * setup.parameters.magnitude / plant.derivatives.parameter_scale, LEAST
+    )
+    coarse = plant.derivatives.sensitivity(theta, trajectory, longer * SENSITIVITY_STEP)
     names = setup.parameters.names
     if fine is None or coarse is None:
         causes = tuple(_active(setup.model_at(theta), trajectory, range(trajectory.samples)))
@@ -48,7 +50,9 @@ def roughness(
     worst = int(np.argmax(error.max(axis=0)))
     if not error[:, worst].max() > TOLERANCE:
         return None
-    between = plant.sensitivity(theta, trajectory, np.maximum(longer / 3.0, 1.5) * SENSITIVITY_STEP)
+    between = plant.derivatives.sensitivity(
+        theta, trajectory, np.maximum(longer / 3.0, 1.5) * SENSITIVITY_STEP
+    )
     if between is not None:
         less = disagreement(G, setup.noise.whiten(between.G))[:, kept]
         if (less.max(axis=0) * CURVED <= error.max(axis=0)).all():

@@ -15,7 +15,7 @@ from mjfim.identification.residuals import Fit
 from mjfim.information.fisher import Information
 from mjfim.information.identifiability import Survey, survey, survey_rows
 from mjfim.information.marginal import shared
-from mjfim.plant.plant import CENTRAL_DIFFERENCES
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
     CONFOUNDED_CORRELATION,
     Check,

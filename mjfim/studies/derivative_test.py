@@ -48,7 +48,7 @@ def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
 def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivity) -> float:
     """Largest difference between two ways to psi, relative to the largest entry of each parameter's psi."""
     try:
-        line = setup.plant.linearize(setup.theta, trajectory)
+        line = setup.plant.derivatives.linearize(setup.theta, trajectory)
     except SimulationDiverged:
         return np.inf
     psi = sensitivity.psi
@@ -70,7 +70,7 @@ def slope_error(setup: Setup, problem: DesignProblem, point: Point) -> float:
     expansion = problem.expand(point)
     K = regulator_for(setup).gain(expansion)
     zeta = LBFGS(np.diag(setup.control_weight) * setup.dt)(expansion, K)
-    size = setup.plant.difference_sizes(point.trajectory)
+    size = setup.plant.derivatives.difference_sizes(point.trajectory)
     relative = max(
         np.abs(zeta.z / size[: zeta.z.shape[1]]).max(),
         np.abs(zeta.v / size[zeta.z.shape[1] :]).max(),

@@ -157,7 +157,7 @@ def _trial_set(
 
 def _exact(setup: Setup, curve: Trajectory) -> tuple[Array, Array]:
     """Noise-free outputs (N+1, ny) at the true values and their derivative (N+1, ny, p)."""
-    exact = setup.plant.predict(setup.parameters.true, curve.ctrl)
+    exact = setup.plant.derivatives.predict(setup.parameters.true, curve.ctrl)
     if exact is None:
         raise SimulationDiverged(
             "the simulation diverges at the true parameters under this control"
@@ -172,7 +172,7 @@ def _shared(setup: Setup, trials: Trials) -> Shared:
     h = 1e-3 * setup.parameters.magnitude
 
     def jacobian(at: Array) -> Array:
-        predicted = setup.plant.predict(at, trials.ctrl)
+        predicted = setup.plant.derivatives.predict(at, trials.ctrl)
         if predicted is None:
             raise SimulationDiverged("the simulation diverges near the fit of the mean measurement")
         return setup.noise.rows(predicted[1])

@@ -139,7 +139,7 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     assert (w.W[1:-1] > 0.0).all()
     # its own: the squares of what every limited number moves by, times the curvature of its barrier
     sight, N = fence.sight(seen(point).trajectory, seen(point).observed, slopes=True), setup.samples
-    _, _, rise = setup.plant.observation_jacobians(
+    _, _, rise = setup.plant.derivatives.observation_jacobians(
         setup.theta, sight.trajectory, fence.observations
     )
     looked, ctrl = np.array(fence.observations.derivative_substeps) - 1, setup.control

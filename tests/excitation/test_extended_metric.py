@@ -16,8 +16,8 @@ from mjfim.information.fisher import Information
 from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, Bilinear
 from mjfim.plant.noise import Noise
-from mjfim.plant.plant import CENTRAL_DIFFERENCES, Bilinear
 from mjfim.records.trajectory import Sensitivity
 from tests.support.numerics import Array, Loop, body_setup, cart_setup, relative_error
 
@@ -92,14 +92,19 @@ def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None
     A, B = 0.5 * rng.normal(size=(N, nx, nx)), rng.normal(size=(N, nx, nu))
     C, D = rng.normal(size=(N + 1, ny, nx)), rng.normal(size=(N + 1, ny, nu))
     unit = Bilinear(
-        A, B, C, D, rng.normal(size=(p, N, nx + nu, nx)), rng.normal(size=(p, N + 1, nx + nu, ny))
+        A=A,
+        B=B,
+        C=C,
+        D=D,
+        F_mixed=rng.normal(size=(p, N, nx + nu, nx)),
+        h_mixed=rng.normal(size=(p, N + 1, nx + nu, ny)),
     )
     S = Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, ny, p)))
     noise = Noise.independent([0.3, 2.0])
     made = Information(noise, 20.0, np.array([1.0, 0.5, 3.0]), np.zeros((p, p)), criterion)
     found = made.evaluate(made.matrix(S))
     F, h = (np.einsum("rj,jkzx->rkzx", found.directions, m) for m in (unit.F_mixed, unit.h_mixed))
-    a, b = made.gradient(found, S, Bilinear(A, B, C, D, F, h))
+    a, b = made.gradient(found, S, Bilinear(A=A, B=B, C=C, D=D, F_mixed=F, h_mixed=h))
     a_psi, a_h, b_h = made.partials(found, S, unit)
     wide = extend(unit, a_h, b_h, a_psi)
     v = rng.normal(size=(N, nu))
@@ -155,7 +160,7 @@ def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_t
         np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v)
     )
     up, down = (setup.plant.simulate(setup.theta, setup.control + s * h * v) for s in (1, -1))
-    psi = [setup.plant.sensitivity(setup.theta, curve).psi for curve in (up, down)]
+    psi = [setup.plant.derivatives.sensitivity(setup.theta, curve).psi for curve in (up, down)]
     change = np.swapaxes(psi[0] - psi[1], 1, 2).reshape(setup.samples + 1, p, nx) / (2 * h)
     moved = full[:, nx:].reshape(setup.samples + 1, p, nx)
     for j in range(p):
@@ -175,7 +180,7 @@ def psi_step(
 def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tmp_path) -> None:
     setup = CASES[case](tmp_path)
     wide, nx, p, nu = expanded(setup).extended, setup.space.nx, len(setup.theta), setup.plant.nu
-    curve, S = setup.initial, setup.plant.sensitivity(setup.theta, setup.initial)
+    curve, S = setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     d = 1e-3
     for k, j in ((11, 0), (37, p - 1)):
         h = 1e-3 * abs(setup.theta[j])
@@ -216,7 +221,7 @@ def test_x_does_not_depend_on_psi_in_the_extended_system(tmp_path) -> None:
     setup = CASES["cart E"](tmp_path)
     wide = expanded(setup).extended
     np.testing.assert_array_equal(wide.A[:, :4, 4:], 0.0)
-    L = setup.plant.linearize(setup.theta, setup.initial)
+    L = setup.plant.derivatives.linearize(setup.theta, setup.initial)
     assert relative_error(wide.A[:, :4, :4], L.A) < 1e-5
     assert relative_error(wide.B[:, :4], L.B) < 1e-5
 

@@ -19,7 +19,7 @@ from mjfim.excitation.unconstrained import Stage
 from mjfim.experiment.system import Setup
 from mjfim.optimize.lq import TangentCurve, regulator
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.plant import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, DifferenceAccuracy
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, DifferenceAccuracy
 from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,
@@ -195,7 +195,7 @@ STEPS = {"dmc_cartpole": 2e-2}
 
 def gain(setup: Setup) -> Array:
     """Regulator with unit weights along the initial trajectory."""
-    A, B = (getattr(setup.plant.linearize(setup.theta, setup.initial), n) for n in "AB")
+    A, B = (getattr(setup.plant.derivatives.linearize(setup.theta, setup.initial), n) for n in "AB")
     Q, R = np.eye(setup.space.nx) * setup.dt, np.eye(setup.plant.nu) * setup.dt
     return regulator(A, B, Q, R, Q / setup.dt)
 
@@ -288,8 +288,8 @@ def test_leaving_out_what_psi_does_to_the_information_would_be_rejected(tmp_path
 @pytest.mark.parametrize(
     ("case", "term"),
     [
-        ("bias and delay unknown", "delay"),
-        ("delay wanted", "lag"),
+        ("bias and delay unknown", "delay_derivative"),
+        ("delay wanted", "output_delay"),
         ("quaternions measured", "h_mixed"),
     ],
 )
@@ -297,9 +297,12 @@ def test_leaving_out_a_term_of_the_measurement_would_be_rejected(
     case: str, term: str, tmp_path, monkeypatch
 ) -> None:
     setup = SETUPS[case](tmp_path)
-    K, whole = np.zeros((setup.samples, setup.plant.nu, setup.space.nx)), setup.plant.bilinear
+    K, whole = (
+        np.zeros((setup.samples, setup.plant.nu, setup.space.nx)),
+        setup.plant.derivatives.bilinear,
+    )
     monkeypatch.setattr(
-        setup.plant, "bilinear", lambda *given: replace(whole(*given), **{term: None})
+        setup.plant.derivatives, "bilinear", lambda *given: replace(whole(*given), **{term: None})
     )
     assert gradient_error(setup, K, CENTRAL_DIFFERENCES, 5e-3) > 1e-3
 

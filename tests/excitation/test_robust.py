@@ -158,7 +158,9 @@ def phis(setup: Setup, control: Array, thetas: Array) -> Array:
     """The criterion of the guess's experiment at other parameter values, each with its own trajectory."""
     found = []
     for theta in thetas:
-        sensitivity = setup.plant.sensitivity(theta, setup.plant.simulate(theta, control))
+        sensitivity = setup.plant.derivatives.sensitivity(
+            theta, setup.plant.simulate(theta, control)
+        )
         found.append(setup.information.evaluate(setup.information.matrix(sensitivity)).value)
     return np.array(found)
 

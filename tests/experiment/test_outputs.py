@@ -95,7 +95,7 @@ def test_four_components_hold_exactly_the_information_of_a_rotation_vector(
     q = {"ball": 7, "float": 3}[joint]
     v = {"ball": 6, "float": 3}[joint]
     assert [o.state for o in setup.outputs.outputs] == list(range(q, q + 4))
-    _, _, C, D = setup.plant.jacobians(setup.theta, trajectory)
+    _, _, C, D = setup.plant.derivatives.jacobians(setup.theta, trajectory)
     assert not D.any()
     for k in range(0, len(C), 10):
         by_hand = np.empty((4, 3))
@@ -114,7 +114,7 @@ def test_four_components_hold_exactly_the_information_of_a_rotation_vector(
 def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: Path) -> None:
     """Through the whole chain: from measured quaternions, against psi in the tangent space over sigma."""
     setup = body_setup(tmp_path, noise={"qpos:ball": 0.05})
-    found = setup.plant.sensitivity(setup.theta, setup.initial)
+    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     psi = found.psi[1:, 6:9] / 0.05
     wanted = np.einsum("kip,kiq->pq", psi, psi)
     np.testing.assert_allclose(
@@ -167,7 +167,7 @@ def test_rates_are_each_outputs_own(tmp_path: Path) -> None:
 def test_information_of_rates_is_the_sum_over_the_measured_samples(tmp_path: Path) -> None:
     """Output by output from G; twice the rate is not twice a weight."""
     setup = cart_setup(tmp_path, noise={"qpos:hinge": {"sigma": 0.05, "rate": 20.0}, "rate": 0.2})
-    found = setup.plant.sensitivity(setup.theta, setup.initial)
+    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     G = found.G
     assert setup.outputs.names == ("qpos:hinge", "rate")
     wanted = sum(np.outer(G[k, 0], G[k, 0]) / 0.05**2 for k in range(5, 51, 5))
@@ -259,7 +259,7 @@ def test_correlated_outputs_alone_are_a_measurement(tmp_path: Path) -> None:
 def test_the_joint_information_needs_the_correlation(tmp_path: Path) -> None:
     """G' Sigma^-1 G with the full inverse, sample by sample."""
     setup = cart_setup(tmp_path, measure_rate=50.0, noise={"acc": {"covariance": BLOCK.tolist()}})
-    found = setup.plant.sensitivity(setup.theta, setup.initial)
+    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     inverse = np.linalg.inv(BLOCK)
     wanted = sum(found.G[k].T @ inverse @ found.G[k] for k in range(2, 51, 2))
     np.testing.assert_allclose(

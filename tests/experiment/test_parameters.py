@@ -411,7 +411,7 @@ def test_a_function_edits_what_no_path_can(tmp_path: Path) -> None:
         True
     ] and second.parameters.needs_compile.tolist() == [False]
     np.testing.assert_allclose(first.initial.state, second.initial.state, rtol=0, atol=1e-12)
-    found = [s.plant.sensitivity(s.theta, s.initial).G for s in (first, second)]
+    found = [s.plant.derivatives.sensitivity(s.theta, s.initial).G for s in (first, second)]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-7, atol=1e-7)
     assert np.abs(found[0]).max() > 0.1
     p = first.parameters.parameters[0]

@@ -318,7 +318,7 @@ def test_the_stated_rate_divides_the_sum_so_that_weights_mean_the_same_at_every_
 
 def test_information_of_a_real_experiment_is_the_sum_with_its_noise_and_scale(tmp_path) -> None:
     setup = cart_setup(tmp_path, noise={"angle": 0.01, "acc": 0.3}, measure_rate=50.0)
-    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     sigma = np.array([0.01, 0.3, 0.3, 0.3])
     total = sum(S.G[k].T @ np.diag(sigma**-2) @ S.G[k] for k in range(2, 51, 2))
     evaluation = evaluate_trajectory(setup, setup.initial)

@@ -54,7 +54,9 @@ def two_setup(folder: Path, **tables: Any) -> Setup:
 
 def look(setup: Setup) -> Survey:
     """Survey along the initial control."""
-    return survey(setup, setup.initial, setup.plant.sensitivity(setup.theta, setup.initial))
+    return survey(
+        setup, setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    )
 
 
 def test_an_experiment_that_shows_everything_needs_no_random_controls(
@@ -101,7 +103,10 @@ def test_what_no_control_shows_is_the_same_here_and_always(tmp_path) -> None:
     assert (seen.here.count, seen.always.count) == (1, 1)
     assert seen.basis.shape == (3, 2)
     require_designable(setup, seen)  # a combination can be designed for
-    J = rows(setup, setup.plant.sensitivity(setup.theta, setup.initial)) * setup.parameters.scale
+    J = (
+        rows(setup, setup.plant.derivatives.sensitivity(setup.theta, setup.initial))
+        * setup.parameters.scale
+    )
     hidden = np.linalg.qr(seen.basis, mode="complete")[0][:, 2]
     assert np.linalg.norm(J @ hidden) < 1e-6 * np.linalg.norm(J)
 
@@ -195,7 +200,8 @@ def test_a_contact_shorter_than_a_sample_period_shows_its_stiffness(tmp_path) ->
         )
         assert np.sum(setup.initial.qpos[:, 0] < 0.1) <= 2
         assert (
-            np.abs(setup.plant.sensitivity(setup.theta, setup.initial).G[..., 0]).max() * 40000.0
+            np.abs(setup.plant.derivatives.sensitivity(setup.theta, setup.initial).G[..., 0]).max()
+            * 40000.0
             > 0.1
         )
         assert look(setup).here.count == 0
@@ -232,7 +238,7 @@ def test_the_seed_decides_the_random_controls(tmp_path) -> None:
 
 def test_random_controls_that_diverge_are_left_out(tmp_path, monkeypatch) -> None:
     setup = cart_setup(tmp_path, parameters=PRODUCT)
-    curve, found = setup.initial, setup.plant.sensitivity(setup.theta, setup.initial)
+    curve, found = setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
 
     def diverges(theta: Array, ctrl: Array) -> None:
         raise SimulationDiverged("too fast")
@@ -244,11 +250,13 @@ def test_random_controls_that_diverge_are_left_out(tmp_path, monkeypatch) -> Non
 
 def test_data_must_show_every_parameter_nuisance_and_prior_or_not(tmp_path) -> None:
     plain = cart_setup(tmp_path)
-    require_visible(plain, rows(plain, plain.plant.sensitivity(plain.theta, plain.initial)))
+    require_visible(
+        plain, rows(plain, plain.plant.derivatives.sensitivity(plain.theta, plain.initial))
+    )
     sure = {**PRODUCT, "gear": {**PRODUCT["gear"], "nuisance": True, "prior": 1e-6}}
     for parameters in (PRODUCT, sure):
         setup = cart_setup(tmp_path, parameters=parameters)
-        J = rows(setup, setup.plant.sensitivity(setup.theta, setup.initial))
+        J = rows(setup, setup.plant.derivatives.sensitivity(setup.theta, setup.initial))
         with pytest.raises(UnidentifiableError, match="gear and gain only as gear"):
             require_visible(setup, J)
 

@@ -225,7 +225,9 @@ def double_pendulum(folder: Path, coordinates: str) -> Setup:
 
 def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
     setup = double_pendulum(tmp_path, "barycentric")
-    seen = survey(setup, setup.initial, setup.plant.sensitivity(setup.theta, setup.initial))
+    seen = survey(
+        setup, setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    )
     assert (seen.here.count, seen.always.count) == (14, 14)
     assert seen.basis.shape == (20, 6)
     lumped, silent = seen.groups_always
@@ -245,7 +247,9 @@ def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_mot
     tmp_path,
 ) -> None:
     setup = double_pendulum(tmp_path, "logcholesky")
-    seen = survey(setup, setup.initial, setup.plant.sensitivity(setup.theta, setup.initial))
+    seen = survey(
+        setup, setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    )
     assert seen.basis.shape == (20, 6)
     # a step along an invisible direction moves nothing measured, to second order
     for n in (seen.always.directions / np.linalg.norm(seen.always.directions, axis=0)).T:

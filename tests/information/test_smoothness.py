@@ -213,12 +213,12 @@ def test_a_model_that_diverges_under_the_longer_step_is_rough_without_bound(
     tmp_path, monkeypatch
 ) -> None:
     setup = slider(tmp_path, 'frictionloss="1.5"')
-    whole = setup.plant.sensitivity
+    whole = setup.plant.derivatives.sensitivity
 
     def sensitivity(theta: Array, curve: object, step: object = None) -> object:
         return whole(theta, curve) if step is None else None
 
-    monkeypatch.setattr(setup.plant, "sensitivity", sensitivity)
+    monkeypatch.setattr(setup.plant.derivatives, "sensitivity", sensitivity)
     found = along(setup)
     assert found.error == np.inf
     assert found.parameter == "mass, drag"

@@ -1114,7 +1114,7 @@ def test_geoms_that_make_a_simple_bodys_inertia_are_followed(
         noise={"state": 0.01},
         horizon=0.2,
     )
-    found = setup.plant.sensitivity(setup.theta, setup.initial)
+    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     assert found is not None
     h, ends = 1e-4 * guess, []
     for sign in (1.0, -1.0):

@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.experiment.system import Setup
 from mjfim.model.smooth_friction import SMOOTHING_SPEED_FRACTION
 from mjfim.model.variants import FREE, STATED
-from mjfim.plant.plant import SHARED_ORIGIN, SHARED_ORIGIN_SHORT
+from mjfim.plant.derivatives import SHARED_ORIGIN, SHARED_ORIGIN_SHORT
 from mjfim.records.design import Status
 from tests.support.numerics import make_setup
 
@@ -65,7 +65,7 @@ def test_only_dry_plants_have_speeds_at_which_friction_turns_viscous(tmp_path: P
     smooth = arm(tmp_path, 0.0, parameters={name: DRY[name] for name in ("mass", "drag")}).free()
     assert smooth.level == FREE
     assert smooth.plant.smooth is smooth.plant
-    assert smooth.plant.quickest_accuracy is SHARED_ORIGIN
+    assert smooth.plant.derivatives.quickest_accuracy is SHARED_ORIGIN
     limits = {
         "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
         "velocity": {"elbow": 20.0},
@@ -74,7 +74,7 @@ def test_only_dry_plants_have_speeds_at_which_friction_turns_viscous(tmp_path: P
     fastest = np.abs(setup.initial.qvel[:, 0]).max()
     assert setup.level.soft[1] == pytest.approx(SMOOTHING_SPEED_FRACTION * 20.0)
     assert setup.level.soft[0] >= SMOOTHING_SPEED_FRACTION * fastest
-    assert setup.plant.quickest_accuracy is SHARED_ORIGIN_SHORT
+    assert setup.plant.derivatives.quickest_accuracy is SHARED_ORIGIN_SHORT
     assert not setup.plant.source.soft
     assert setup.plant.smooth.source.soft
     assert setup.softened().plant.source.soft
@@ -127,7 +127,9 @@ def test_steps_on_the_softened_copy_are_counted(tmp_path: Path) -> None:
     setup = arm(tmp_path).free()
     plant, psi = setup.plant, np.zeros((setup.samples + 1, setup.space.nx, 3))
     begun, own = plant.engine_steps, plant.simulator.steps
-    plant.bilinear(setup.theta, setup.initial, psi, np.eye(3)[:2], plant.quickest_accuracy)
+    plant.derivatives.bilinear(
+        setup.theta, setup.initial, psi, np.eye(3)[:2], plant.derivatives.quickest_accuracy
+    )
     batch = (setup.samples + 1) * setup.substeps * (setup.space.nx + len(setup.controls) + 1)
     assert plant.simulator.steps - own == batch  # A and B
     assert plant.engine_steps - begun == 4 * batch  # and on the copy the origin and two directions
@@ -142,12 +144,19 @@ def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(
         np.random.default_rng(0).normal(size=(setup.samples + 1, setup.space.nx, 3)),
     )
     found, soft, own = (
-        plant._paired(setup.theta, setup.initial, psi, np.eye(3)[:1], plant.quickest_accuracy, None)
+        plant.derivatives._symmetric_pairs(
+            setup.theta,
+            setup.initial,
+            psi,
+            np.eye(3)[:1],
+            plant.derivatives.quickest_accuracy,
+            None,
+        )
         for plant in (setup.plant, level.plant, setup.plant.smooth)
     )
     np.testing.assert_allclose(soft.F_mixed, own.F_mixed)
-    careful = replace(setup.plant.quickest_accuracy, shared=False)
-    both = setup.plant.bilinear(setup.theta, setup.initial, psi, np.eye(3)[:1], careful)
+    careful = replace(setup.plant.derivatives.quickest_accuracy, shared_origin=False)
+    both = setup.plant.derivatives.bilinear(setup.theta, setup.initial, psi, np.eye(3)[:1], careful)
     np.testing.assert_array_equal(both.A, found.A)
     np.testing.assert_array_equal(both.F_mixed, own.F_mixed)
     assert np.abs(found.A - own.A).max() > 1e-3
@@ -181,7 +190,7 @@ def test_and_of_the_stated_one_it_points_where_long_moves_lead(
 
 def slope(setup: Setup, wave: Array) -> float:
     """Change of log J per unit of a control's change."""
-    point = setup.problem.point(setup.initial, setup.plant.quickest_accuracy)
+    point = setup.problem.point(setup.initial, setup.plant.derivatives.quickest_accuracy)
     open_loop = np.zeros((setup.samples, len(setup.controls), setup.space.nx))
     return float(np.sum(setup.problem.expand(point).gradient(open_loop) * wave)) / point.cost
 
@@ -191,7 +200,7 @@ def difference(setup: Setup, wave: Array, h: float) -> float:
     there, back = (
         setup.problem.point(
             setup.plant.simulate(setup.theta, setup.control + s * wave),
-            setup.plant.quickest_accuracy,
+            setup.plant.derivatives.quickest_accuracy,
         ).cost
         for s in (h, -h)
     )

@@ -133,8 +133,8 @@ def test_the_sensitivity_to_a_delay_is_that_of_lagging_the_outputs(tmp_path: Pat
     theta = np.array(setup.parameters.guess)
     theta[-1] = 0.0137
     assert setup.parameters.names[-1] == "delay"
-    y, G = setup.plant.predict(theta, setup.control)
-    plain, _ = setup.plant.predict(setup.parameters.guess, setup.control)
+    y, G = setup.plant.derivatives.predict(theta, setup.control)
+    plain, _ = setup.plant.derivatives.predict(setup.parameters.guess, setup.control)
     inside = setup.t[4:] - 0.0137
     shifted = np.stack(
         [np.interp(inside, np.arange(len(plain)) * setup.dt, c) for c in plain.T], axis=1
@@ -149,4 +149,4 @@ def test_the_sensitivity_to_a_delay_is_that_of_lagging_the_outputs(tmp_path: Pat
 
         assert G[k, i, -1] == pytest.approx(richardson(at, 1e-4), rel=1e-6)
     short = cart_setup(tmp_path, horizon=0.02, nuisance={"delay": True})
-    assert np.isfinite(short.plant.predict(theta, short.control)[0]).all()
+    assert np.isfinite(short.plant.derivatives.predict(theta, short.control)[0]).all()

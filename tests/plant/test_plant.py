@@ -17,7 +17,7 @@ from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.variants import Source
 from mjfim.optimize.lq import LinearRecursion, TangentCurve, regulator
 from mjfim.output.mjcf.write import write_spec
-from mjfim.plant.plant import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
 from mjfim.records.trajectory import Linearization
 from tests.support.numerics import (
     CART_PARAMETERS,
@@ -38,7 +38,7 @@ SAMPLES = (0, 7, 23, 49)
 
 def linear(setup: Setup) -> Linearization:
     """Derivatives along the initial trajectory."""
-    return setup.plant.linearize(setup.theta, setup.initial)
+    return setup.plant.derivatives.linearize(setup.theta, setup.initial)
 
 
 def furuta(folder: Path) -> Setup:
@@ -202,7 +202,7 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
     tolerance = (
         1e-5 if make is furuta else 1e-6
     )  # its dampings are 1e-6, hardly above the round-off of a step
-    L, S = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial)
+    L, S = linear(setup), setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     psi = np.zeros((setup.space.nx, len(setup.theta)))
     for k in range(setup.samples):
         psi = L.A[k] @ psi + L.E[k]
@@ -225,8 +225,8 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
 
 def test_prediction_gives_the_same_outputs_and_derivative_as_the_sensitivity(tmp_path) -> None:
     setup = body_setup(tmp_path)
-    y, G = setup.plant.predict(setup.theta, setup.initial.ctrl)
-    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    y, G = setup.plant.derivatives.predict(setup.theta, setup.initial.ctrl)
+    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     assert relative_error(G, S.G) < 1e-6
     measured, finite = setup.plant.measure(setup.theta[None], setup.initial.ctrl)
     assert finite.all()
@@ -241,9 +241,9 @@ def test_prediction_gives_the_same_outputs_and_derivative_as_the_sensitivity(tmp
 )
 def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> None:
     setup = make(tmp_path)
-    L, psi = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial).psi
+    L, psi = linear(setup), setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi
     w = np.abs(setup.theta)[None] * np.linspace(0.5, 1.0, len(setup.theta))
-    found = setup.plant.bilinear(setup.theta, setup.initial, psi, w, accuracy)
+    found = setup.plant.derivatives.bilinear(setup.theta, setup.initial, psi, w, accuracy)
     tolerance = 1e-5 if accuracy.central else 1e-3
     for name in ("A", "B", "C", "D"):
         if np.abs(getattr(L, name)).max() > 0:
@@ -256,9 +256,9 @@ def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> Non
 def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, tmp_path) -> None:
     setup = make(tmp_path)
     theta, curve, nx = setup.theta, setup.initial, setup.space.nx
-    psi = setup.plant.sensitivity(theta, curve).psi
+    psi = setup.plant.derivatives.sensitivity(theta, curve).psi
     w = np.abs(theta) * np.linspace(1.0, 0.5, len(theta))
-    found = setup.plant.bilinear(theta, curve, psi, w[None], CENTRAL_DIFFERENCES)
+    found = setup.plant.derivatives.bilinear(theta, curve, psi, w[None], CENTRAL_DIFFERENCES)
     e, d = 3e-4, 3e-4
     rows, address = sensed(setup)
     plus, minus = (Loop(rebuilt(setup, theta + s * e * w), setup.substeps) for s in (1, -1))
@@ -429,8 +429,8 @@ def test_a_control_that_diverges_is_an_outcome_without_noise(tmp_path, monkeypat
     with pytest.raises(SimulationDiverged, match="diverges"):
         setup.plant.simulate(setup.theta, wild.v)
     ctrl = setup.plant.trajectory(setup.initial.state, wild.v)
-    assert setup.plant.sensitivity(setup.theta, ctrl) is None
-    assert setup.plant.predict(setup.theta, wild.v) is None
+    assert setup.plant.derivatives.sensitivity(setup.theta, ctrl) is None
+    assert setup.plant.derivatives.predict(setup.theta, wild.v) is None
     assert capfd.readouterr() == ("", "")
     assert sorted(p.name for p in tmp_path.iterdir()) == before  # no MUJOCO_LOG.TXT
 
@@ -469,8 +469,10 @@ def test_linearising_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_p
     setup = cart_setup(tmp_path)
     states = np.array(setup.initial.state)
     states[20, 2] = bad
-    with pytest.raises(SimulationDiverged, match="linearising"):
-        setup.plant.linearize(setup.theta, setup.plant.trajectory(states, setup.initial.ctrl))
+    with pytest.raises(SimulationDiverged, match="linearization"):
+        setup.plant.derivatives.linearize(
+            setup.theta, setup.plant.trajectory(states, setup.initial.ctrl)
+        )
 
 
 def test_quiet_blocks_may_overlap_in_threads() -> None:
@@ -500,13 +502,15 @@ def test_mujoco_itself_would_have_made_that_noise(tmp_path, monkeypatch, capfd) 
 
 def test_after_a_diverged_trial_the_plant_works_as_before(tmp_path) -> None:
     setup = cart_setup(tmp_path, noise=SENSED)
-    first = setup.plant.sensitivity(setup.theta, setup.initial)
+    first = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     L = linear(setup)
     wild = setup.plant.trajectory(setup.initial.state, np.full((setup.samples, 1), 9e9))
-    assert setup.plant.sensitivity(setup.theta, wild) is None
+    assert setup.plant.derivatives.sensitivity(setup.theta, wild) is None
     with pytest.raises(SimulationDiverged):
         setup.plant.simulate(setup.theta, wild.ctrl)
-    np.testing.assert_array_equal(setup.plant.sensitivity(setup.theta, setup.initial).G, first.G)
+    np.testing.assert_array_equal(
+        setup.plant.derivatives.sensitivity(setup.theta, setup.initial).G, first.G
+    )
     np.testing.assert_array_equal(linear(setup).A, L.A)
 
 
@@ -515,10 +519,10 @@ def test_results_do_not_depend_on_what_was_simulated_before_or_on_threads(tmp_pa
     setup, other = body_setup(tmp_path), body_setup(tmp_path / "b")
     other.plant.simulator.threads = 2
     other.plant.measure(1.3 * other.theta[None], -other.control)
-    other.plant.linearize(0.8 * other.theta, other.initial)
+    other.plant.derivatives.linearize(0.8 * other.theta, other.initial)
     np.testing.assert_array_equal(
-        setup.plant.sensitivity(setup.theta, setup.initial).G,
-        other.plant.sensitivity(other.theta, other.initial).G,
+        setup.plant.derivatives.sensitivity(setup.theta, setup.initial).G,
+        other.plant.derivatives.sensitivity(other.theta, other.initial).G,
     )
 
 
@@ -553,10 +557,10 @@ def test_every_mj_step_is_counted(tmp_path) -> None:
     setup = filtered_setup(tmp_path)
     engine, N, n = setup.plant.simulator, setup.samples, setup.substeps
     curve, count = setup.initial, engine.steps
-    setup.plant.linearize(setup.theta, curve)
+    setup.plant.derivatives.linearize(setup.theta, curve)
     assert engine.steps - count == (N + 1) * n * (2 * (3 + 1) + 2 * 2)
     count = engine.steps
-    setup.plant.sensitivity(setup.theta, curve)
+    setup.plant.derivatives.sensitivity(setup.theta, curve)
     assert engine.steps - count == 2 * 2 * (
         N * n + 1
     )  # one more for the sensors of the last sample
@@ -642,13 +646,13 @@ def test_the_solver_stays_on_where_friction_is_to_be_identified(tmp_path) -> Non
     loss = {"loss": {"target": "joint/slide:frictionloss", "guess": 0.2}}
     setup = cart_setup(tmp_path, parameters=loss)
     assert bits(setup.plant.source.model)[0] is False
-    assert np.abs(setup.plant.sensitivity(setup.theta, setup.initial).psi).max() > 1e-3
+    assert np.abs(setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi).max() > 1e-3
 
 
 def test_private_copies_leave_the_users_spec_and_model_alone(tmp_path) -> None:
     setup = body_setup(tmp_path)
     before = setup.spec.to_xml()
-    setup.plant.linearize(1.5 * setup.theta, setup.initial)
+    setup.plant.derivatives.linearize(1.5 * setup.theta, setup.initial)
     assert setup.spec.to_xml() == before
     assert setup.model.body("arm").mass[0] == pytest.approx(0.4)
     assert bits(setup.model) == (False, False)
@@ -660,7 +664,7 @@ START = {"initial": {"qpos:hinge": True, "qvel:slide": True}}
 
 def test_the_start_enters_the_sensitivity_as_its_own_initial_value(tmp_path) -> None:
     setup = cart_setup(tmp_path, **OUTSIDE, nuisance=START)
-    L, S = linear(setup), setup.plant.sensitivity(setup.theta, setup.initial)
+    L, S = linear(setup), setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     start = np.eye(4)[:, [1, 2]]  # (dq, dv): the hinge's angle, the slide's speed
     np.testing.assert_allclose(S.psi[0][:, 3:], start, rtol=0, atol=1e-9)
     for j in (0, 1):
@@ -673,7 +677,7 @@ def test_the_start_of_a_quaternion_moves_in_its_tangent_space(tmp_path) -> None:
     setup = body_setup(
         tmp_path, nuisance={"initial": {"qpos:ball[2]": True, "qvel:float[4]": True}}
     )
-    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     np.testing.assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)
     loop, h = Loop(setup.plant.model(setup.theta), 1), 1e-4
     ends = []
@@ -687,7 +691,7 @@ def test_the_start_of_a_quaternion_moves_in_its_tangent_space(tmp_path) -> None:
 
 def test_biases_add_to_their_own_output_and_to_nothing_else(tmp_path) -> None:
     setup = cart_setup(tmp_path, **OUTSIDE, nuisance={"bias": {"angle": True, "acc[2]": 0.1}})
-    S = setup.plant.sensitivity(setup.theta, setup.initial)
+    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     names = list(setup.outputs.names)
     for j, name in ((3, "angle"), (4, "acc[2]")):
         expected = np.zeros(len(names))
@@ -711,7 +715,9 @@ def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
         cart_setup(tmp_path, **OUTSIDE, parameters=parameters),
         cart_setup(tmp_path, **OUTSIDE),
     )
-    (y, G), (exact, exact_G) = (s.plant.predict(s.theta, s.control) for s in (late, plain))
+    (y, G), (exact, exact_G) = (
+        s.plant.derivatives.predict(s.theta, s.control) for s in (late, plain)
+    )
     t, states = (
         np.arange(51) * 0.01,
         slice(0, 4),
@@ -730,30 +736,30 @@ def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
     moved, _ = late.plant.measure(late.theta + np.outer([h, -h], np.eye(4)[3]), late.control)
     if delay:  # at a knot of the interpolation the two sides differ
         assert relative_error(G[..., 3], (moved[0] - moved[1]) / (2 * h)) < 1e-5
-    assert relative_error(late.plant.sensitivity(late.theta, late.initial).G, G) < 1e-6
+    assert relative_error(late.plant.derivatives.sensitivity(late.theta, late.initial).G, G) < 1e-6
 
 
 def test_faint_parameters_get_longer_differences_and_others_keep_theirs(tmp_path) -> None:
     faint = {"tiny": {"target": "body/bob:inertia[1]"}, **CART_PARAMETERS}
     setup = cart_setup(tmp_path, parameters=faint)
-    relative = setup.plant.parameter_scale / setup.parameters.magnitude
+    relative = setup.plant.derivatives.parameter_scale / setup.parameters.magnitude
     assert relative[0] > 5.0
     assert (relative >= 1.0).all() and (relative <= 100.0).all()
     np.testing.assert_array_equal(relative[1:3], 1.0)
     # what the longer step is for: less round-off, without a change of the derivative
-    S = setup.plant.sensitivity(setup.theta, setup.initial).psi[..., 0]
-    far = setup.plant.sensitivity(setup.theta, setup.initial, 1e-4).psi[..., 0]
+    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi[..., 0]
+    far = setup.plant.derivatives.sensitivity(setup.theta, setup.initial, 1e-4).psi[..., 0]
     assert relative_error(S, far) < 1e-6
 
 
 def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> None:
     setup = body_setup(tmp_path)
     picked, L = np.array([3, 20, 41]), linear(setup)
-    found = setup.plant.one_step(setup.theta, setup.initial, picked, 1e-5)
+    found = setup.plant.derivatives.one_step(setup.theta, setup.initial, picked, 1e-5)
     nx, ny, p = setup.space.nx, len(setup.outputs), len(setup.theta)
     states = (
         found[: 3 * nx].reshape(3, nx, p)
-        * (setup.dt * setup.plant.difference_sizes(setup.initial)[:nx])[:, None]
+        * (setup.dt * setup.plant.derivatives.difference_sizes(setup.initial)[:nx])[:, None]
     )
     assert relative_error(states, L.E[picked]) < 1e-6
     sensors = found[3 * nx :].reshape(3, ny, p)
@@ -834,7 +840,7 @@ def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> Non
 def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tmp_path) -> None:
     place = {"x": {"target": "body/near:pos[0]", "scale": 1.0}}
     setup = make_setup(CARRIED, tmp_path, parameters=place)
-    found = setup.plant.sensitivity(setup.theta, setup.initial)
+    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     assert found is not None
     ends = [setup.plant.simulate(setup.theta + h, setup.control).state[-1] for h in (1e-4, -1e-4)]
     slope = (ends[0] - ends[1]) / 2e-4

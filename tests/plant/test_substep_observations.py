@@ -12,7 +12,7 @@ import pytest
 from mjfim.excitation.constraints import fence_of, looked_at
 from mjfim.experiment.system import Setup
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.plant import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, SHARED_ORIGIN
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, SHARED_ORIGIN
 from tests.support.limits import FLOATING, floating_setup
 from tests.support.numerics import Array, Loop, relative_error
 
@@ -175,10 +175,12 @@ def test_derivatives_of_taps_are_differences_of_independent_simulations(
 ) -> None:
     setup = floating_setup(tmp_path, integrator).free()
     observations = observations_of(setup)
-    A, B, slopes = setup.plant.observation_jacobians(setup.theta, setup.initial, observations)
+    A, B, slopes = setup.plant.derivatives.observation_jacobians(
+        setup.theta, setup.initial, observations
+    )
     assert slopes.shape == (30, len(observations.derivative_substeps), len(SHOWN), 20)
     assert_slopes(slopes, setup, observations, 1e-3)
-    exact = setup.plant.jacobians(setup.theta, setup.initial)
+    exact = setup.plant.derivatives.jacobians(setup.theta, setup.initial)
     assert relative_error(A, exact[0]) < 1e-5
     assert relative_error(B, exact[1]) < 1e-3
 
@@ -202,16 +204,16 @@ def test_derivatives_beside_those_of_the_information_are_the_same(
     assert setup.plant.simulator.sensors is sensors
     observations, psi = (
         observations_of(setup),
-        setup.plant.sensitivity(setup.theta, setup.initial).psi,
+        setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi,
     )
     directions = np.array([[1.0, 0.3], [-0.2, 0.9]])
-    found = setup.plant.bilinear(
+    found = setup.plant.derivatives.bilinear(
         setup.theta, setup.initial, psi, directions, accuracy, observations
     )
     assert found.observation_jacobian is not None
     assert_slopes(found.observation_jacobian, setup, observations, 2e-3)
     assert (
-        setup.plant.bilinear(
+        setup.plant.derivatives.bilinear(
             setup.theta, setup.initial, psi, directions, accuracy
         ).observation_jacobian
         is None
@@ -223,15 +225,15 @@ def test_drafted_derivatives_are_the_careful_ones_to_a_hundredth(tmp_path: Path)
     setup = floating_setup(tmp_path).free()
     observations, psi = (
         observations_of(setup),
-        setup.plant.sensitivity(setup.theta, setup.initial).psi,
+        setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi,
     )
     directions = np.array([[1.0, 0.3], [-0.2, 0.9], [0.0, -1.0]])
     begun = setup.plant.simulator.steps
-    draft = setup.plant.bilinear(
+    draft = setup.plant.derivatives.bilinear(
         setup.theta, setup.initial, psi, directions, SHARED_ORIGIN, observations
     )
     spent, begun = setup.plant.simulator.steps - begun, setup.plant.simulator.steps
-    careful = setup.plant.bilinear(
+    careful = setup.plant.derivatives.bilinear(
         setup.theta, setup.initial, psi, directions, CENTRAL_DIFFERENCES, observations
     )
     assert spent < 0.4 * (setup.plant.simulator.steps - begun)

@@ -42,7 +42,7 @@ FINE = {"cart": 100.0, "body": 50.0, "filtered": 100.0}
 
 def gains(setup: Setup) -> Array:
     """(N, nu, nx) of a regulator about the initial trajectory."""
-    A, B, _, _ = setup.plant.jacobians(setup.theta, setup.initial)
+    A, B, _, _ = setup.plant.derivatives.jacobians(setup.theta, setup.initial)
     return regulator(A, B, np.eye(setup.space.nx), np.eye(B.shape[2]), np.eye(setup.space.nx))
 
 

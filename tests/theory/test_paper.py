@@ -15,7 +15,7 @@ import mjfim
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.plant import CENTRAL_DIFFERENCES
+from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Status
 from tests.support.paths import ROOT
 
@@ -56,7 +56,7 @@ def test_gradient_of_the_information_term() -> None:
     point = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
     assert point.sensitivity is not None
     assert point.criterion is not None
-    bilinear = setup.plant.bilinear(
+    bilinear = setup.plant.derivatives.bilinear(
         setup.theta,
         setup.initial,
         point.sensitivity.psi,

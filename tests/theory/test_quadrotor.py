@@ -68,7 +68,7 @@ def test_psi_of_a_tumbling_flight_is_that_of_re_simulation(name: str) -> None:
     curve, j = setup.initial, list(PARAMETERS).index(name)
     turned = np.abs(curve.qvel[:, 3:]).max()
     assert turned > 3.0  # [rad/s] it does tumble
-    found = setup.plant.sensitivity(setup.theta, curve)
+    found = setup.plant.derivatives.sensitivity(setup.theta, curve)
     assert found is not None
     start, value = curve.state[0], setup.theta[j]
 
