@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: written under a temporary name in the same folder, then renamed."""
+"""Files that are written completely or not at all: under a temporary name in the same folder, then renamed."""
 
 from __future__ import annotations
 
@@ -8,15 +8,32 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+# Permissions of a new file before the process's umask removes some of them.
+DEFAULT_PERMISSIONS = 0o666
+
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary path with the same ending; renamed to `path` if the block succeeds, removed if it does not."""
+    """Write a file under a temporary name and rename it at the end.
+
+    The file appears under its name if the block succeeds. If the block fails, the temporary file is removed and an existing
+    file stays as it was. Missing parent folders are created.
+
+    Args:
+        path: Name of the final file.
+
+    Yields:
+        Temporary path in the same folder, with the same suffix.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     os.close(handle)
-    os.chmod(name, 0o666 & ~_umask())
+
+    # mkstemp makes files that only their owner may read; give the usual permissions instead.
+    os.chmod(name, DEFAULT_PERMISSIONS & ~_umask())
+
     temporary = Path(name)
     try:
         yield temporary
@@ -26,6 +43,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 def _umask() -> int:
+    """Umask of the process, which can only be read by setting it."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

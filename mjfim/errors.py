@@ -1,4 +1,4 @@
-"""What can go wrong through misuse. Each message names the place, the fault and what would be right."""
+"""Errors that misuse causes. Each message names the place, the fault and what would be right."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class MjfimError(Exception):
 
 
 class ExperimentError(MjfimError):
-    """The experiment file (or its Python equivalent) asks for something impossible or unknown."""
+    """The experiment file, or its Python equivalent, asks for something impossible or unknown."""
 
 
 class ModelError(MjfimError):
@@ -27,12 +27,22 @@ class UnidentifiableError(MjfimError):
 
 
 class SimulationDiverged(MjfimError):
-    """MuJoCo reported a numerical warning (or a non-finite state) along a rollout that must not fail."""
+    """MuJoCo reported a numerical warning, or a state is not finite, along a rollout that must not fail."""
 
 
 def unknown(kind: str, name: str, valid: Iterable[str]) -> str:
-    """Sentence for a name that does not exist: says so, proposes the nearest one, lists all valid ones."""
+    """Sentence for a name that does not exist.
+
+    Args:
+        kind: Kind of thing that was named, e.g. "actuator".
+        name: The unknown name.
+        valid: All names that exist.
+
+    Returns:
+        A sentence that proposes the most similar name and lists all valid ones.
+    """
     names = sorted(str(v) for v in valid)
+
     near = get_close_matches(str(name), names, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
     listing = ", ".join(names) if names else "none"

@@ -386,9 +386,9 @@ class StructuredBFGS:
         self._adapt_damping(before, proposed, moved)
 
         after = self._local_model(expansion, K)
-        s: Array = after.coordinates.coordinate(moved)
+        s = after.coordinates.coordinate(moved)
         if self.basis is not None:
-            s = np.linalg.lstsq(self.basis, s)[0]
+            s = np.asarray(np.linalg.lstsq(self.basis, s)[0], dtype=np.float64)
 
         y = after.cost_gradient - before.cost_gradient - before.predicted_change(s)
         self._pairs = (*self._pairs, _RemainderPair(s=s, y=y))[-self.memory :]
