@@ -26,7 +26,7 @@ class UnidentifiableError(MjfimError):
     """The starting trajectory carries no information about some direction of the parameters."""
 
 
-class SimulationDiverged(MjfimError):
+class SimulationDivergedError(MjfimError):
     """MuJoCo reported a numerical warning, or a state is not finite, along a rollout that must not fail."""
 
 

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.constraints import SHOWN, fence_of
 from mjfim.excitation.limits import Limit
 from mjfim.experiment.schema import Experiment
@@ -215,7 +215,7 @@ class Bench:
         return np.asarray(self.rest + self.plan.gain[0] @ self._deviation(state, 0))
 
     def _start(self, model: Any, theta: Array, feedback: bool) -> Array:
-        """(ns,) where a robot stands still before the start. Raises SimulationDiverged where it stands nowhere near."""
+        """(ns,) where a robot stands still before the start. Raises SimulationDivergedError where it stands nowhere near."""
         space = self.stated.space
         if self.rest is None:
             return self.setup.plant.initial_state(theta)
@@ -246,7 +246,7 @@ class Bench:
             return state
         if self.late == 0:
             return np.array(self.stated.plant.nominal_initial_state)
-        raise SimulationDiverged(
+        raise SimulationDivergedError(
             f"a robot with other parameters does not stand still at the start (it accelerates by {left:.2g} per s²): "
             + (
                 "play without a latency"
@@ -292,7 +292,7 @@ class Bench:
             recording, margins, start = self.play(theta, noise, self.conditions.feedback)
             self._put_start(theta, start)
             estimate, again = self._identified(recording)
-        except SimulationDiverged as error:
+        except SimulationDivergedError as error:
             return replace(failed, trouble=str(error))
         fit = estimate.chi2 / estimate.dof
         words = "" if estimate.success else estimate.status
@@ -329,7 +329,7 @@ class Bench:
         for start in starts:
             try:
                 other = mjfim.identify(self.setup, [recording], "newton", start)
-            except SimulationDiverged:
+            except SimulationDivergedError:
                 continue
             best = other if other.success and other.chi2 < best.chi2 else best
             if not best.misfit:
@@ -339,7 +339,7 @@ class Bench:
     def play(self, theta: Array, noise: Array, feedback: bool) -> tuple[Recording, Array, Array]:
         """The recording of a robot, its margins (l,) over half of their ranges, and its start (ns,).
 
-        noise: (M+1, ny). Raises SimulationDiverged.
+        noise: (M+1, ny). Raises SimulationDivergedError.
         """
         setup, M = self.setup, len(self.plan.ctrl)
         model = setup.model_at(theta)
@@ -352,7 +352,7 @@ class Bench:
         )
         out = self._simulator.rollout([model], start[None], applied[None], self.fence.observations)
         if not out.finite[0] or out.observed is None:
-            raise SimulationDiverged("the robot's simulation diverges")
+            raise SimulationDivergedError("the robot's simulation diverges")
         last = M * self.every + 1
         y = setup.outputs(
             out.states[0, :last], None if out.sensors is None else out.sensors[0, :last]
@@ -408,7 +408,7 @@ class Bench:
             self._with_delay(setup.parameters.guess), np.repeat(self.plan.ctrl, self.every, axis=0)
         )
         if found is None:
-            raise SimulationDiverged("the plan diverges at the guess")
+            raise SimulationDivergedError("the plan diverges at the guess")
         J = setup.noise.rows(found[1])
         return standard_deviations(J.T @ J + setup.parameters.prior_information)
 

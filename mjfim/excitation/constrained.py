@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.constraints import Fence, basis_of, fence_of
 from mjfim.excitation.initial_controls import Start
 from mjfim.excitation.interior_point import Ladder, Rung, Rungs, seen
@@ -105,7 +105,7 @@ def _sound(rungs: Iterator[Rung], chase: Chase) -> Iterator[Rung]:
     """As far as numbers go: a start that leads beyond must not end the others."""
     try:
         yield from rungs
-    except (SimulationDiverged, np.linalg.LinAlgError):
+    except (SimulationDivergedError, np.linalg.LinAlgError):
         chase.status = Status.STALLED
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDiverged, UnidentifiableError
+from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.constrained import Chase
 from mjfim.excitation.constraints import Fence, fence_of
 from mjfim.excitation.evaluation import evaluate, fine_point, warnings_of
@@ -75,7 +75,7 @@ def design(
         why = "when the parameters move a little along the initial control"
         if setup.pool is not None:
             why += ", or at a parameter sample of [robust]; bounds keep samples where the model makes sense"
-        raise SimulationDiverged(f"the simulation diverges {why}")
+        raise SimulationDivergedError(f"the simulation diverges {why}")
     seen = survey(setup, begin.trajectory, begin.sensitivity)
     require_designable(setup, seen)
     stage = Stage(setup, seen.basis)
@@ -177,7 +177,7 @@ def _easier(fine: Stage) -> Stage | None:
     smooth = replace(fine, setup=fine.setup.softened()) if fine.setup.level.soft else fine
     try:
         begin = smooth.problem.point(smooth.setup.initial)
-    except SimulationDiverged:
+    except SimulationDivergedError:
         return None
     for factor in _factors(smooth.setup):
         coarse = _coarser(smooth, begin, factor)
@@ -240,7 +240,7 @@ def _conclude(
     best = min(runs, key=lambda run: (not run.inside, run.cost))
     interrupted = any(run.status is Status.INTERRUPTED for run in runs)
     if best.point is None and not interrupted:
-        raise SimulationDiverged("the simulation diverges from every start")
+        raise SimulationDivergedError("the simulation diverges from every start")
     chosen = (
         first
         if best.point is None or (best.cost > first.cost and not setup.enforced)
@@ -302,10 +302,10 @@ def _conclude(
 
 
 def designable(setup: Setup) -> Survey:
-    """Look along the initial control. Raises UnidentifiableError or SimulationDiverged where no design can begin there."""
+    """Look along the initial control. Raises UnidentifiableError or SimulationDivergedError where no design can begin there."""
     first = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
     if first.trajectory is None or first.sensitivity is None:
-        raise SimulationDiverged(
+        raise SimulationDivergedError(
             "the simulation diverges when the parameters move a little along the initial control"
         )
     seen = survey(setup, first.trajectory, first.sensitivity)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits import unwatched
 from mjfim.excitation.objective import Point
 from mjfim.excitation.unconstrained import Stage, regulator_for
@@ -24,7 +24,7 @@ def fine_point(stage: Stage, control: Array) -> Point | None:
     """A coarse level's control at the stated rate; None where it diverges."""
     try:
         return stage.problem.point(stage.setup.plant.simulate(stage.setup.theta, control))
-    except SimulationDiverged:
+    except SimulationDivergedError:
         return None
 
 
@@ -37,7 +37,7 @@ def evaluate(stage: Stage, point: Point) -> Evaluation:
         or point.information is None
         or point.criterion is None
     ):
-        raise SimulationDiverged("the trajectory diverges")
+        raise SimulationDivergedError("the trajectory diverges")
     A, B, _, _ = setup.plant.derivatives.jacobians(setup.theta, point.trajectory)
     r = regulator_for(setup)
     return Evaluation(
@@ -117,6 +117,6 @@ def evaluate_trajectory(experiment: Experiment | Setup, trajectory: Trajectory) 
         setup.plant.simulate(setup.theta, trajectory.ctrl), CENTRAL_DIFFERENCES
     )
     if point.trajectory is None or point.sensitivity is None:
-        raise SimulationDiverged("the trajectory diverges when the parameters move a little")
+        raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
     stage = Stage(setup, survey(setup, point.trajectory, point.sensitivity).basis)
     return evaluate(stage, stage.problem.judged(point))

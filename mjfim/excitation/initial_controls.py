@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.system import Setup
 from mjfim.recordings.control_table import read_control
 from mjfim.records.trajectory import Trajectory
@@ -146,5 +146,5 @@ def probes(setup: Setup, count: int) -> Iterator[Trajectory]:
     for _ in range(count):
         try:
             yield setup.plant.simulate(setup.theta, random_control(setup, rng, 1.0, 2.0))
-        except SimulationDiverged:
+        except SimulationDivergedError:
             continue

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.design import Monitor, design
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
@@ -64,7 +64,7 @@ def _data(setup: Setup) -> Array:
     """What the initial control tells about the parameters that all experiments share."""
     point = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
     if point.information is None or point.sensitivity is None:
-        raise SimulationDiverged(
+        raise SimulationDivergedError(
             "the simulation diverges when the parameters move a little along the initial control"
         )
     seen = survey(setup, setup.initial, point.sensitivity)

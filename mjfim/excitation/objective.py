@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.robust import Pool
 from mjfim.information.criteria import Criterion
 from mjfim.information.fisher import Information
@@ -135,7 +135,7 @@ class DesignProblem:
                 others.append(
                     self._sensed(theta, self.plant.simulate(theta, trajectory.ctrl), accuracy)
                 )
-            except SimulationDiverged:
+            except SimulationDivergedError:
                 return DIVERGED
         return self._priced(replace(point, others=tuple(others)))
 

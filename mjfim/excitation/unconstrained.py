@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.constraints import Fence
 from mjfim.excitation.objective import DIVERGED, DesignProblem, Point
 from mjfim.experiment.system import Setup
@@ -115,7 +115,7 @@ def borne(coarse: Stage, first: Point, size: float, share: float) -> bool:
     """Whether the initial cost of a coarse level is that of the first point, up to a share of its size."""
     try:
         there = coarse.problem.point(coarse.setup.initial)
-    except SimulationDiverged:
+    except SimulationDivergedError:
         return False
     return abs(there.cost - first.cost) <= share * size
 
@@ -230,7 +230,7 @@ class _Pass:
         ):
             trajectory, criterion = iterate.point.trajectory, iterate.point.criterion
             if trajectory is None or criterion is None:
-                raise SimulationDiverged("an iterate of Algorithm 1 diverged")
+                raise SimulationDivergedError("an iterate of Algorithm 1 diverged")
             self.control = np.repeat(trajectory.ctrl, level.coarsen, axis=0)
             self.eigenvalues = criterion.eigenvalues
             point = iterate.point if np.isinf(self.stage.power) else exact.judged(iterate.point)
@@ -254,7 +254,7 @@ class _Pass:
                 points.append(
                     self.problem.point(level.plant.simulate(level.theta, level.averaged(control)))
                 )
-            except SimulationDiverged:
+            except SimulationDivergedError:
                 continue
         return min(points, key=lambda point: point.cost, default=DIVERGED)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.records.recording import Recording
@@ -19,7 +19,7 @@ def simulate(
     rng = np.random.default_rng(seed)
     y, finite = setup.plant.measure(setup.parameters.true[None], trajectory.ctrl)
     if not finite[0]:
-        raise SimulationDiverged(
+        raise SimulationDivergedError(
             "the simulation diverges at the true parameters under this control"
         )
     noisy = y[0] + setup.noise.sample(len(y[0]), rng)

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, ModelError, SimulationDiverged, unknown
+from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError, unknown
 from mjfim.excitation.limits import limits_of
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.prior_information import information_of
@@ -547,7 +547,7 @@ class Setup:
     def _calibrate(self) -> None:
         try:
             self.plant = self.plant.calibrated(self.theta, self.initial)
-        except SimulationDiverged:
+        except SimulationDivergedError:
             return  # whoever needs the initial trajectory will say so
 
     def _control(self) -> Array:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import SimulationDivergedError
 from mjfim.identification.residual_tests import whiteness, worst_place
 from mjfim.identification.residuals import Fit
 from mjfim.optimize.levenberg_marquardt import Solution
@@ -40,10 +40,10 @@ class Left:
 
 
 def left(fit: Fit, solution: Solution) -> Left:
-    """Of a solution. Raises SimulationDiverged."""
+    """Of a solution. Raises SimulationDivergedError."""
     values, names = fit.predicted(solution.unknowns), fit.setup.outputs.names
     if values is None:
-        raise SimulationDiverged("the simulation diverges near the estimate")
+        raise SimulationDivergedError("the simulation diverges near the estimate")
     whitened = _whitened(fit, values)
     inside = _inside(fit, whitened)
     columns = [np.concatenate([z[:, j] for z in whitened]) for j in range(len(names))]

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget, stop_on_interrupt
-from mjfim.errors import ExperimentError, SimulationDiverged, unknown
+from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.identification.accuracy import Accuracy, accuracy
@@ -70,7 +70,7 @@ def identify(
     The stated std is formal: it is accuracy only if the model and the noise are right; `misfit` says when they are not, and
     `interval` is honest where residuals follow one another.
     held_out: recordings that are predicted, not fitted;  callback: called with every iterate (`FitEvent`)
-    Ctrl-C ends the search with the best so far. Raises RecordingError for unusable recordings, SimulationDiverged where the
+    Ctrl-C ends the search with the best so far. Raises RecordingError for unusable recordings, SimulationDivergedError where the
     model diverges at the start.
     """
     if method not in get_args(Method):
@@ -92,20 +92,20 @@ def identify(
 def least_squares(
     fit: Fit, start: Array, search: SearchSettings | None = None, budget: Budget | None = None
 ) -> Solution:
-    """Levenberg-Marquardt inside the bounds from theta: (p,). Raises SimulationDiverged where that diverges.
+    """Levenberg-Marquardt inside the bounds from theta: (p,). Raises SimulationDivergedError where that diverges.
 
     `interrupted` of the solution is True where the budget's token stopped the search.
     """
     found = minimise(fit, fit.begin(start), search or SearchSettings(), budget)
     if found is None:
-        raise SimulationDiverged("the simulation diverges at the start of the fit")
+        raise SimulationDivergedError("the simulation diverges at the start of the fit")
     return found
 
 
 def newton_raphson(fit: Fit, start: Array, budget: Budget | None = None) -> Solution:
     """The paper's iterator `theta - (J'J)^-1 J'r`, its step halved while the residual would grow. Bounds are not used.
 
-    Stops when a step is below 1e-5 standard deviations. Raises SimulationDiverged where the start diverges.
+    Stops when a step is below 1e-5 standard deviations. Raises SimulationDivergedError where the start diverges.
     """
     return least_squares(fit.unbounded(), start, NEWTON, budget)
 
@@ -145,7 +145,7 @@ class _Identification:
         fit, setup = self.fit, self.setup
         begin = fit.begin(self.theta0)
         if not np.isfinite(self._sample(fit).cost(self._sampled(begin))):
-            raise SimulationDiverged(
+            raise SimulationDivergedError(
                 f"the simulation diverges at the start {dict(zip(setup.parameters.names, self.theta0, strict=True))}"
             )
         null = self._null(fit)
@@ -209,10 +209,10 @@ class _Identification:
     def _minimise(
         self, fit: Fit, at: UnknownValues, search: SearchSettings, phase: str
     ) -> Solution:
-        """Solution of a search. Raises SimulationDiverged where its start diverges."""
+        """Solution of a search. Raises SimulationDivergedError where its start diverges."""
         found = minimise(fit, at, search, self.budget, self._reported(phase))
         if found is None:
-            raise SimulationDiverged(
+            raise SimulationDivergedError(
                 f"the simulation diverges next to the start of the fit ({phase})"
             )
         self.interrupted = self.interrupted or found.interrupted

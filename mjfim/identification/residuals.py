@@ -14,7 +14,7 @@ from itertools import pairwise, zip_longest
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, RecordingError, SimulationDiverged
+from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import Setup
 from mjfim.identification.aligned_recording import track_of
 from mjfim.identification.segments import cut, groups, whole
@@ -327,7 +327,7 @@ class Fit:
     def sensed(self, at: UnknownValues) -> list[tuple[Array, Array]]:
         """Whitened rows of G: (n, p) along each piece, and their change with a longer difference step; condensed, (2p, p).
 
-        Of pieces whose whole start is free, what that leaves of them. Raises SimulationDiverged.
+        Of pieces whose whole start is free, what that leaves of them. Raises SimulationDivergedError.
         """
         fine, coarse = (
             self._rows(at, derivatives=True, central=True, step=step, every=True)
@@ -337,7 +337,7 @@ class Fit:
         n = self.free.shape[1] if self.measured else 0
         for rows, other in zip_longest(fine, coarse):
             if rows is None:
-                raise SimulationDiverged(
+                raise SimulationDivergedError(
                     f"{self.tracks[0].name}: the simulation diverges under its control"
                 )
             J = self._columns(rows)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDiverged, UnidentifiableError
+from mjfim.errors import SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.initial_controls import probes
 from mjfim.experiment.system import Setup
 from mjfim.information.fisher import Information
@@ -145,7 +145,7 @@ def _stepped(
                 setup.plant.derivatives.one_step(setup.theta, trajectory, picked, step)
                 for step in ONE_STEPS
             )
-        except SimulationDiverged:
+        except SimulationDivergedError:
             continue
         stack.append(first)
         errors.append(second - first)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDiverged, unknown
+from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 
 Ids = NDArray[np.intp]
 
@@ -235,7 +235,9 @@ class GeomDistances:
         """Smallest distance [m] at any configuration however far, its row and its geoms. qpos: (n, nq), n > 0, finite."""
         bad = np.flatnonzero(~np.isfinite(qpos).all(axis=1))
         if bad.size:
-            raise SimulationDiverged(f"configuration {bad[0]} is not finite; it has no clearance")
+            raise SimulationDivergedError(
+                f"configuration {bad[0]} is not finite; it has no clearance"
+            )
         places, frames, _ = self._poses(qpos, False)
         bounds, _ = self._bounds(places, frames)
         best, row, pair = np.inf, 0, self.pairs[0]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.system import Setup
 from mjfim.model.coordinates import gain_names, state_components, state_names
 from mjfim.plant.active_constraints import forwarded
@@ -22,14 +22,14 @@ from mjfim.records.trajectory import Trajectory
 def simulate_playback(setup: Setup, trajectory: Trajectory, gain: Array) -> Playback:
     """A designed trajectory at `playback_rate`, simulated again at the design's theta. gain: (N, nu, nx)
 
-    Raises SimulationDiverged where it cannot be simulated.
+    Raises SimulationDivergedError where it cannot be simulated.
     """
     rows = setup.substeps // setup.playback_steps
     simulator = BatchSimulator(setup.plant.simulator.model, setup.playback_steps)
     held = np.repeat(trajectory.ctrl, rows, axis=0)
     out = simulator.rollout([setup.plant.model(setup.theta)], trajectory.state[:1], held[None])
     if not out.finite[0]:
-        raise SimulationDiverged("the designed control diverges when it is simulated again")
+        raise SimulationDivergedError("the designed control diverges when it is simulated again")
     t = np.arange(len(held) + 1, dtype=np.float64) * (setup.dt / rows)
     return Playback(t=t, state=out.states[0], ctrl=held, gain=np.repeat(gain, rows, axis=0))
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import SimulationDivergedError
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.delay import OutputDelay
 from mjfim.records.trajectory import Linearization, Sensitivity, Trajectory
@@ -470,7 +470,7 @@ class Derivatives:
             The first derivatives.
 
         Raises:
-            SimulationDiverged: A perturbed step diverges.
+            SimulationDivergedError: A perturbed step diverges.
         """
         outputs = self.plant.outputs
         states, ctrl = _all_samples(trajectory)
@@ -496,7 +496,7 @@ class Derivatives:
             A: (N, nx, nx), B: (N, nx, nu), C: (N+1, ny, nx) and D: (N+1, ny, nu), see `Linearization`.
 
         Raises:
-            SimulationDiverged: A perturbed step diverges.
+            SimulationDivergedError: A perturbed step diverges.
         """
         plant, nx = self.plant, self.plant.space.nx
         moved = self._move_samples(
@@ -529,7 +529,7 @@ class Derivatives:
             A: (N, nx, nx), B: (N, nx, nu), and (N, derivative substeps, w, nx+nu) derivatives of the observations.
 
         Raises:
-            SimulationDiverged: A perturbed step diverges.
+            SimulationDivergedError: A perturbed step diverges.
         """
         plant, nx = self.plant, self.plant.space.nx
         sizes = self.difference_sizes(trajectory)
@@ -562,7 +562,7 @@ class Derivatives:
             effect on a sensor.
 
         Raises:
-            SimulationDiverged: A perturbed step diverges.
+            SimulationDivergedError: A perturbed step diverges.
         """
         plant, p = self.plant, len(theta)
         states = trajectory.state[samples]
@@ -654,7 +654,7 @@ class Derivatives:
             The derivatives.
 
         Raises:
-            SimulationDiverged: MuJoCo cannot compile a perturbed model.
+            SimulationDivergedError: MuJoCo cannot compile a perturbed model.
         """
         given = (theta, trajectory, psi, directions, accuracy)
         # Derivatives of sensors would need the mean of both sides: one-sided differences leave sensors out.
@@ -857,7 +857,7 @@ def _tiled(curve: Array, count: int) -> Array:
 
 
 def _require_finite(derivative: Array) -> Array:
-    """The derivative itself. Raises SimulationDiverged where it is not finite."""
+    """The derivative itself. Raises SimulationDivergedError where it is not finite."""
     if not np.isfinite(derivative).all():
-        raise SimulationDiverged("a perturbed step diverged during linearization")
+        raise SimulationDivergedError("a perturbed step diverged during linearization")
     return derivative

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ModelError, SimulationDiverged
+from mjfim.errors import ModelError, SimulationDivergedError
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.variants import Source
 from mjfim.optimize.lq import TangentCurve
@@ -159,11 +159,11 @@ class Plant:
             m models.
 
         Raises:
-            SimulationDiverged: MuJoCo cannot compile one of them.
+            SimulationDivergedError: MuJoCo cannot compile one of them.
         """
         models, compiled = self.try_models(theta)
         if not compiled.all():
-            raise SimulationDiverged(
+            raise SimulationDivergedError(
                 "MuJoCo cannot compile the model when the parameters move a little"
             )
         return models
@@ -231,13 +231,13 @@ class Plant:
             The trajectory.
 
         Raises:
-            SimulationDiverged: The simulation diverges.
+            SimulationDivergedError: The simulation diverges.
         """
         out = self.simulator.rollout(
             [self.model(theta)], self.initial_state(theta)[None], np.asarray(ctrl)[None]
         )
         if not out.finite[0]:
-            raise SimulationDiverged(
+            raise SimulationDivergedError(
                 "the simulation diverges under this control; a smaller amplitude or timestep may help"
             )
         return self.trajectory(out.states[0], ctrl)

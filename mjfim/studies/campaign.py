@@ -12,7 +12,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, MjfimError, SimulationDiverged
+from mjfim.errors import ExperimentError, MjfimError, SimulationDivergedError
 from mjfim.excitation.design import Monitor, design
 from mjfim.excitation.target_accuracy import furthest, require_reachable, wanted_of
 from mjfim.experiment.schema import Experiment
@@ -205,18 +205,18 @@ class _Loop:
 def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Estimate:
     """Estimate from all recordings; where that is a misfit or fails, from the stated guess too, and the better one."""
     found: list[Estimate] = []
-    fault: SimulationDiverged | None = None
+    fault: SimulationDivergedError | None = None
     for begin in (start, base.parameters.guess):
         if found and (not found[0].misfit or np.array_equal(begin, start)):
             break
         try:
             found.append(identify(base, recordings, start=begin))
-        except SimulationDiverged as error:
+        except SimulationDivergedError as error:
             fault = fault or error
         if found and found[-1].interrupted:
             raise KeyboardInterrupt  # a round is complete or none
     if not found:
-        raise fault or SimulationDiverged("no start of the fit can be simulated")
+        raise fault or SimulationDivergedError("no start of the fit can be simulated")
     return min(found, key=lambda e: e.chi2)
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import RecordingError, SimulationDiverged
+from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
@@ -41,7 +41,7 @@ def check(
 ) -> Check:
     """Look at an experiment's initial trajectory, at a given one (a design), or at recordings, at the design's theta.
 
-    Raises SimulationDiverged where that cannot be simulated, RecordingError for unusable recordings.
+    Raises SimulationDivergedError where that cannot be simulated, RecordingError for unusable recordings.
     """
     setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
     if recordings and trajectory is not None:
@@ -66,7 +66,7 @@ def check(
     problem = replace(problem, running=replace(problem.running, desired=curve.state))
     point = problem.point(curve, CENTRAL_DIFFERENCES)
     if point.information is None or point.sensitivity is None:
-        raise SimulationDiverged("the simulation diverges when the parameters move a little")
+        raise SimulationDivergedError("the simulation diverges when the parameters move a little")
     if not recordings:
         seen = survey(setup, curve, point.sensitivity)
         tells, horizon = [point.information - setup.information.prior], float(curve.t[-1])

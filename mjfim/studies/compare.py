@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDiverged, unknown
+from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 from mjfim.excitation.design import design, designable
 from mjfim.excitation.evaluation import fine_point
 from mjfim.excitation.interior_point import SHRUNK
@@ -175,7 +175,7 @@ def _designed(
     meter = Meter(job, tell)
     try:
         found = design(Setup(stated, job.threads, added=job.added), meter, executor=executor)
-    except SimulationDiverged:
+    except SimulationDivergedError:
         return judge.row(DESIGN, OURS, Attempt(seconds=meter.seconds, steps=meter.steps)), False
     attempt = Attempt(
         found.trajectory.ctrl, found.final.cost, 0.0, found.found_by, found.seconds, found.steps

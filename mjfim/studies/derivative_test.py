@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.objective import DesignProblem, Point
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.system import Setup
@@ -24,7 +24,7 @@ def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
     """Test the derivatives about a point of a problem that was computed with central differences."""
     trajectory = point.trajectory
     if trajectory is None or point.sensitivity is None:
-        raise SimulationDiverged("the trajectory diverges when the parameters move a little")
+        raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
     found = SelfTest(
         roughness=roughness(setup, setup.theta, trajectory, point.sensitivity),
         recursion=recursion_error(setup, trajectory, point.sensitivity),
@@ -49,7 +49,7 @@ def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivi
     """Largest difference between two ways to psi, relative to the largest entry of each parameter's psi."""
     try:
         line = setup.plant.derivatives.linearize(setup.theta, trajectory)
-    except SimulationDiverged:
+    except SimulationDivergedError:
         return np.inf
     psi = sensitivity.psi
     recursion = LinearRecursion(line.A)

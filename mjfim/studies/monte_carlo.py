@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.identification.identify import least_squares, newton_raphson
@@ -159,7 +159,7 @@ def _exact(setup: Setup, curve: Trajectory) -> tuple[Array, Array]:
     """Noise-free outputs (N+1, ny) at the true values and their derivative (N+1, ny, p)."""
     exact = setup.plant.derivatives.predict(setup.parameters.true, curve.ctrl)
     if exact is None:
-        raise SimulationDiverged(
+        raise SimulationDivergedError(
             "the simulation diverges at the true parameters under this control"
         )
     return exact
@@ -174,7 +174,9 @@ def _shared(setup: Setup, trials: Trials) -> Shared:
     def jacobian(at: Array) -> Array:
         predicted = setup.plant.derivatives.predict(at, trials.ctrl)
         if predicted is None:
-            raise SimulationDiverged("the simulation diverges near the fit of the mean measurement")
+            raise SimulationDivergedError(
+                "the simulation diverges near the fit of the mean measurement"
+            )
         return setup.noise.rows(predicted[1])
 
     J = jacobian(theta)

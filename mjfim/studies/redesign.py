@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import MjfimError, SimulationDiverged
+from mjfim.errors import MjfimError, SimulationDivergedError
 from mjfim.excitation.design import Monitor, design
 from mjfim.excitation.evaluation import evaluate_trajectory
 from mjfim.experiment.schema import Experiment
@@ -62,7 +62,9 @@ def redesigned(
     found = [design(setup, monitor, executor=executor)]
     if past.last.shape == setup.control.shape and found[0].status is not Status.INTERRUPTED:
         alone = moved.replace(descent={"starts": 1, "previous": (), "fourier": (), "repeats": ()})
-        with suppress(SimulationDiverged):  # the old control may be too much for the new values
+        with suppress(
+            SimulationDivergedError
+        ):  # the old control may be too much for the new values
             found.append(design(Setup(alone, threads, added=told), monitor, past.last))
     if found[-1].status is Status.INTERRUPTED:
         return found[-1]
@@ -89,7 +91,7 @@ def _phi(setup: Setup, control: Array) -> float:
         raise ValueError(f"a control of {control.shape} instead of {setup.control.shape}")
     value = evaluate_trajectory(setup, setup.plant.simulate(setup.theta, control)).criterion
     if not (np.isfinite(value) and value > 0.0):
-        raise SimulationDiverged(f"criterion {value}")
+        raise SimulationDivergedError(f"criterion {value}")
     return value
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import mjfim
 from mjfim.cli import main as cli
-from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.shortest_horizon import OutOfReachError, Tried, fitted
 from mjfim.excitation.target_accuracy import furthest, wanted_of
 from mjfim.experiment.system import Setup
@@ -141,7 +141,7 @@ def test_a_duration_that_cannot_be_simulated_does_not_reach(
 
     def faulty(setup: Setup, *rest: object, **more: object) -> mjfim.Design:
         if setup.samples < 140:
-            raise SimulationDiverged("too short")
+            raise SimulationDivergedError("too short")
         return real(setup, *rest, **more)
 
     monkeypatch.setattr(mjfim.excitation.shortest_horizon, "design", faulty)
@@ -151,7 +151,7 @@ def test_a_duration_that_cannot_be_simulated_does_not_reach(
         and found.missed is not None
         and found.missed.why == "too short"
     )
-    with pytest.raises(SimulationDiverged):
+    with pytest.raises(SimulationDivergedError):
         mjfim.shortest(wanting(SIGMA, horizon=1.0))
 
 

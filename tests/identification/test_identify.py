@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 import mjfim
-from mjfim.errors import ExperimentError, RecordingError, SimulationDiverged
+from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate
 from mjfim.experiment.system import Setup
@@ -173,7 +173,7 @@ def test_unusable_recordings_are_named(setup: Setup, recording: Recording) -> No
 
 
 def test_divergence_at_the_start_is_an_error(setup: Setup, recording: Recording) -> None:
-    with pytest.raises(SimulationDiverged, match="diverges at the start"):
+    with pytest.raises(SimulationDivergedError, match="diverges at the start"):
         identify(setup, [recording], "newton", start=np.array([2.0, 1.0, -1e6]))
 
 

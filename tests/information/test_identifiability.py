@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.errors import SimulationDiverged, UnidentifiableError
+from mjfim.errors import SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.design import design, require_designable
 from mjfim.excitation.initial_controls import probes
 from mjfim.experiment.system import Setup
@@ -241,7 +241,7 @@ def test_random_controls_that_diverge_are_left_out(tmp_path, monkeypatch) -> Non
     curve, found = setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
 
     def diverges(theta: Array, ctrl: Array) -> None:
-        raise SimulationDiverged("too fast")
+        raise SimulationDivergedError("too fast")
 
     monkeypatch.setattr(setup.plant, "simulate", diverges)
     seen = survey(setup, curve, found)

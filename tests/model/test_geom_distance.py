@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.model import geom_distance as clearance
 from mjfim.model.geom_distance import GeomDistances, SignedDistances, find_geom_pairs
 from tests.support.numerics import Array, directional_check
@@ -506,7 +506,7 @@ def test_diverged_configurations_are_not_called_clear(value: float) -> None:
     qpos[3, 1] = value
     found = chosen(qpos, True)
     assert np.isnan(found.d[3]).all() and np.isfinite(np.delete(found.d, 3, axis=0)).all()
-    with pytest.raises(SimulationDiverged, match="configuration 3 is not finite"):
+    with pytest.raises(SimulationDivergedError, match="configuration 3 is not finite"):
         chosen.nearest(qpos)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from mjfim.errors import ExperimentError, SimulationDiverged
+from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.system import Setup
 from mjfim.model.loading import compile_spec, load_spec, unconstrained
 from mjfim.model.mujoco_log import silence_mujoco_log
@@ -426,7 +426,7 @@ def test_a_control_that_diverges_is_an_outcome_without_noise(tmp_path, monkeypat
     wild = TangentCurve(z=np.zeros((setup.samples + 1, 4)), v=np.full((setup.samples, 1), 9e9))
     assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, 0.0 * K) is None
     assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, K) is None
-    with pytest.raises(SimulationDiverged, match="diverges"):
+    with pytest.raises(SimulationDivergedError, match="diverges"):
         setup.plant.simulate(setup.theta, wild.v)
     ctrl = setup.plant.trajectory(setup.initial.state, wild.v)
     assert setup.plant.derivatives.sensitivity(setup.theta, ctrl) is None
@@ -469,7 +469,7 @@ def test_linearising_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_p
     setup = cart_setup(tmp_path)
     states = np.array(setup.initial.state)
     states[20, 2] = bad
-    with pytest.raises(SimulationDiverged, match="linearization"):
+    with pytest.raises(SimulationDivergedError, match="linearization"):
         setup.plant.derivatives.linearize(
             setup.theta, setup.plant.trajectory(states, setup.initial.ctrl)
         )
@@ -506,7 +506,7 @@ def test_after_a_diverged_trial_the_plant_works_as_before(tmp_path) -> None:
     L = linear(setup)
     wild = setup.plant.trajectory(setup.initial.state, np.full((setup.samples, 1), 9e9))
     assert setup.plant.derivatives.sensitivity(setup.theta, wild) is None
-    with pytest.raises(SimulationDiverged):
+    with pytest.raises(SimulationDivergedError):
         setup.plant.simulate(setup.theta, wild.ctrl)
     np.testing.assert_array_equal(
         setup.plant.derivatives.sensitivity(setup.theta, setup.initial).G, first.G

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDiverged, UnidentifiableError
+from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
 from mjfim.experiment.system import Setup
 from mjfim.identification.residual_tests import larger
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
@@ -286,7 +286,7 @@ def test_without_a_design_at_the_estimate_the_last_place_serves(
     def fails_once(base: Setup, past: object, theta: Array, *rest: object) -> Design:
         asked.append(theta)
         if len(asked) == 1:
-            raise SimulationDiverged("too fast")
+            raise SimulationDivergedError("too fast")
         return campaign.designs[1]
 
     monkeypatch.setattr(loop, "redesigned", fails_once)

@@ -15,7 +15,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from mjfim.arrays import Array
-from mjfim.errors import SimulationDiverged
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.constrained import Chase, Task, pursue, smoothed
 from mjfim.excitation.constraints import splines_of
 from mjfim.excitation.initial_controls import Start
@@ -319,7 +319,7 @@ class Descent:
             raise Settled
         try:
             slope = self.series.basis.T @ problem.expand(point).gradient(self.K)
-        except SimulationDiverged:
+        except SimulationDivergedError:
             return nothing
         return problem.value(point), slope.reshape(-1)
 
