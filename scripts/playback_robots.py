@@ -27,8 +27,7 @@ from mjfim.excitation.limits import Limit
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.information.marginal import standard_deviations
-from mjfim.model.coordinates import joint_names
-from mjfim.model.paths import joint_width
+from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.plant.batch import BatchSimulator
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.estimate import Estimate
@@ -177,7 +176,7 @@ class Bench:
             off = rng.choice([-1.0, 1.0], len(p)) * reach * 0.9 ** (attempt // len(p))
             theta = np.where(p.changes_model, p.guess + off, known * rng.standard_normal(len(p)))
             theta = self._with_delay(np.clip(theta, p.lower, p.upper))
-            if not p.unphysical_bodies(self.setup.plant.source, theta):
+            if not p.writer.unphysical_bodies(self.setup.plant.source, theta):
                 return theta
         raise ExperimentError(
             f"{wrong:.0%} wrong parameters make bodies that cannot exist; try less"
@@ -424,7 +423,7 @@ def _looked_at(setup: Setup) -> tuple[Limit, ...]:
 def _dof_labels(model: Any) -> Iterator[str]:
     """nv names of start deviations."""
     for j, name in enumerate(joint_names(model)):
-        width = joint_width(model, j)
+        width = joint_dofs(model, j)
         yield from (f"qpos:{name}" if width == 1 else f"qpos:{name}[{i}]" for i in range(width))
 
 

@@ -17,8 +17,8 @@ from mjfim.errors import ExperimentError, MjfimError, ModelError
 from mjfim.experiment.system import Setup
 from mjfim.identification.aligned_recording import Track, track_of
 from mjfim.model.mujoco_log import silence_mujoco_log
-from mjfim.model.paths import INERTIAL_FIELDS, PATH, SERVO
-from mjfim.model.spec_writer import settle
+from mjfim.model.paths import INERTIAL_FIELDS, SERVO_FIELDS, ParameterPath
+from mjfim.model.spec_writer import state_derived_values
 from mjfim.output.mjcf.write import same_dynamics, write_spec
 from mjfim.records.recording import Recording
 
@@ -26,7 +26,7 @@ REACH = 1e3  # sizes of a parameter from its guess to a bound that is not stated
 PROBE = 1e-2  # sizes by which parameters are moved to see whether a compile follows
 WHOLE = {
     *INERTIAL_FIELDS,
-    *SERVO,
+    *SERVO_FIELDS,
     "rot",
     "springlength",
 }  # fields that are written as a whole, as a model has them
@@ -132,8 +132,8 @@ def control_of(setup: Setup, track: Track) -> Any:
 def parameters_of(setup: Setup) -> Any:
     """ParameterDict at the guess. What belongs together is written as a whole, so the last modifier writes for all."""
     p, theta = setup.parameters, np.array(setup.parameters.guess)
-    matches = [PATH.match(target.path) for q in p.parameters for target in q.targets]
-    whole = any(match is not None and match["field"] in WHOLE for match in matches)
+    paths = [ParameterPath.parse(target.path) for q in p.parameters for target in q.targets]
+    whole = any(path.field in WHOLE for path in paths)
 
     def modifier(j: int) -> Callable[[Any, Any], None]:
         def write(spec: Any, parameter: Any) -> None:
@@ -174,7 +174,7 @@ def _require_followed(setup: Setup, parameters: Any, spec: Any) -> None:
     moved.update_from_vector(theta)
     for settled in (False, True):
         if settled:
-            settle(spec, setup.model)
+            state_derived_values(spec, setup.model)
         try:
             if same_dynamics(build(moved, spec), setup.model_at(theta)):
                 return

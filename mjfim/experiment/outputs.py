@@ -1,4 +1,4 @@
-"""What is measured: the experiment's `noise` and `correlated` tables resolved against the model's state and sensors."""
+"""The measured outputs of an experiment: its tables `noise` and `correlated` resolved against the state and the sensors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, unknown
+from mjfim.errors import ExperimentError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Correlated, NoiseSpec
 from mjfim.model.coordinates import (
@@ -16,166 +16,261 @@ from mjfim.model.coordinates import (
     measurable_columns,
     sensor_columns,
     state_components,
+    unknown_coordinate,
 )
-from mjfim.model.paths import names_of
+from mjfim.model.elements import names_of
 from mjfim.plant.noise import Noise
 from mjfim.plant.outputs import Output, OutputMap
 from mjfim.plant.state_space import StateSpace
+
+# Relative tolerance with which one rate has to divide another one.
+RATE_TOLERANCE = 1e-6
+
+# Smallest eigenvalue of a covariance over its largest entry, below which it counts as not positive definite.
+DEFINITENESS = 1e-12
 
 
 def resolve_outputs(
     experiment: Experiment, model: Any, space: StateSpace, stride: int
 ) -> tuple[OutputMap, Noise]:
-    """Outputs and their noise. stride: of measure_rate. Raises ExperimentError naming the key."""
-    everything = {c.name: c for c in state_components(model)}
+    """The measured outputs and their noise.
+
+    Args:
+        experiment: The experiment.
+        model: Its compiled model (`mujoco.MjModel`).
+        space: The state space of the model.
+        stride: Samples from one measurement to the next at `measure_rate`.
+
+    Raises:
+        ExperimentError: The tables ask for something impossible; the message names the key.
+    """
+    components = {component.name: component for component in state_components(model)}
     sensors = names_of(model, "sensor")
-    matches = _matches(everything, model, sensors)
-    stated = dict(experiment.noise) or _from_mjcf(
+    columns_of_key = _columns_of_keys(components, model, sensors)
+    stated = dict(experiment.noise) or _noise_of_mjcf(
         model, sensors, required=not experiment.correlated
     )
     for key in stated:
-        if key not in matches:
-            raise ExperimentError(f"noise: {unknown('sensor', key, list(matches))}")
-    order = [*everything, *(label for s in sensors for label in sensor_columns(model, s))]
-    covariance, strides, chosen = (
-        np.zeros((len(order), len(order))),
-        np.full(len(order), stride),
-        set[int](),
-    )
-    # what names fewer outputs wins over what names more of them
-    for key in sorted(stated, key=lambda k: -len(matches[k])):
-        rows = np.array([order.index(name) for name in matches[key]], dtype=np.intp)
-        if not len(rows):
+        if key not in columns_of_key:
+            raise ExperimentError(
+                f"noise: {unknown_coordinate('sensor', key, list(columns_of_key))}"
+            )
+
+    table = _NoiseTable(components, list(measurable_columns(model)), stride)
+
+    # A key that stands for fewer outputs overrules one that stands for more of them.
+    for key in sorted(stated, key=lambda k: -len(columns_of_key[k])):
+        table.set_key(key, stated[key], columns_of_key[key], experiment)
+    for block in experiment.correlated:
+        table.correlate(block)
+
+    measured = sorted(table.measured)
+    outputs = _outputs(model, sensors, components, table, measured)
+    noise = Noise(table.covariance[np.ix_(measured, measured)], table.strides[measured])
+    return OutputMap(outputs, space), noise
+
+
+def measurement_stride(experiment: Experiment) -> int:
+    """Samples from one measurement to the next at `measure_rate`."""
+    measure_rate = experiment.measure_rate or experiment.rate
+    return _stride("measure_rate", experiment.rate, measure_rate)
+
+
+class _NoiseTable:
+    """Noise of all n columns that can be measured, filled key by key.
+
+    Attributes:
+        columns: Names of the n columns.
+        covariance: (n, n) covariance of the noise; zero for columns that are not measured.
+        strides: (n,) samples from one measurement to the next.
+        measured: Places of the columns that are measured.
+    """
+
+    def __init__(
+        self, components: Mapping[str, StateComponent], columns: list[str], stride: int
+    ) -> None:
+        """Nothing is measured yet. stride: samples from one measurement to the next unless stated otherwise."""
+        n = len(columns)
+        self.columns = columns
+        self.covariance = np.zeros((n, n))
+        self.strides = np.full(n, stride)
+        self.measured: set[int] = set()
+
+        self._default_stride = stride
+        self._sigma_factors = np.array(
+            [components[name].sigma_factor if name in components else 1.0 for name in columns]
+        )
+
+    def places(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
+        """Places of columns by name."""
+        return np.array([self.columns.index(name) for name in names], dtype=np.intp)
+
+    def set_key(
+        self, key: str, value: float | NoiseSpec, names: list[str], experiment: Experiment
+    ) -> None:
+        """Enter one key of the table `noise`, which stands for the columns `names`."""
+        if not names:
             raise ExperimentError(
                 "noise.state: the model has no joint to measure; name sensors instead"
             )
-        value = stated[key]
+
         spec = value if isinstance(value, NoiseSpec) else NoiseSpec(sigma=value)
-        share = np.array(
-            [everything[order[i]].share if order[i] in everything else 1.0 for i in rows]
+        rows = self.places(names)
+        self.covariance[rows] = 0.0
+        self.covariance[:, rows] = 0.0
+        self.covariance[np.ix_(rows, rows)] = _key_covariance(
+            f"noise.{key}", spec, self._sigma_factors[rows]
         )
-        covariance[rows] = covariance[:, rows] = 0.0
-        covariance[np.ix_(rows, rows)] = _block(f"noise.{key}", spec, share)
-        strides[rows] = (
-            stride
-            if spec.rate is None
-            else _stride(f"noise.{key}.rate", experiment.rate, spec.rate)
-        )
-        if spec.rate is not None and spec.rate * experiment.horizon < 1.0 - 1e-6:
+        self.measured.update(rows.tolist())
+
+        self.strides[rows] = self._default_stride
+        if spec.rate is not None:
+            self.strides[rows] = _stride(f"noise.{key}.rate", experiment.rate, spec.rate)
+            _require_measurement(key, spec.rate, experiment.horizon)
+
+    def correlate(self, block: Correlated) -> None:
+        """Enter one block of the table `correlated`."""
+        for name in block.outputs:
+            if name not in self.columns:
+                fault = unknown_coordinate("output", name, self.columns)
+                raise ExperimentError(f"correlated.outputs: {fault}")
+
+        rows = self.places(block.outputs)
+        listed = ", ".join(block.outputs)
+        if len(set(rows.tolist())) < len(rows):
+            raise ExperimentError(f"correlated.outputs: an output stands there twice: {listed}")
+        if len(set(self.strides[rows].tolist())) > 1:
+            raise ExperimentError(f"correlated.outputs: {listed} are measured at different rates")
+
+        others = np.setdiff1d(np.arange(len(self.columns)), rows)
+        if np.any(self.covariance[np.ix_(rows, others)]):
             raise ExperimentError(
-                f"noise.{key}.rate: {spec.rate:g} Hz measures nothing within {experiment.horizon:g} s"
+                "correlated.outputs: one of them is already correlated with an output outside"
             )
-        chosen.update(rows.tolist())
-    for block in experiment.correlated:
-        _correlate(block, order, chosen, covariance, strides)
-    keep = sorted(chosen)
-    addresses = {
-        label: int(model.sensor(s).adr[0]) + i
-        for s in sensors
-        for i, label in enumerate(sensor_columns(model, s))
-    }
-    sigma = np.sqrt(np.diag(covariance))
-    made = []
-    for i in keep:
-        component = everything.get(order[i])
-        if component is None:
-            made.append(Output(order[i], float(sigma[i]), sensor=addresses[order[i]]))
-        else:
-            made.append(Output(order[i], float(sigma[i]), component.unit, state=component.state))
-    return OutputMap(tuple(made), space), Noise(covariance[np.ix_(keep, keep)], strides[keep])
+
+        self.covariance[np.ix_(rows, rows)] = _checked_covariance(
+            "correlated.covariance", block.covariance, len(rows)
+        )
+        self.measured.update(rows.tolist())
 
 
-def _matches(
-    everything: Mapping[str, StateComponent], model: Any, sensors: list[str]
+def _columns_of_keys(
+    components: Mapping[str, StateComponent], model: Any, sensors: list[str]
 ) -> dict[str, list[str]]:
-    """Outputs that each key of the noise table stands for."""
-    found: dict[str, list[str]] = {"state": list(everything)}
-    for c in everything.values():
-        found[c.name] = [c.name]
-        for key in c.keys:
-            found.setdefault(key, []).append(c.name)
+    """Columns that each valid key of the table `noise` stands for."""
+    found: dict[str, list[str]] = {"state": list(components)}
+    for component in components.values():
+        found[component.name] = [component.name]
+        for group in component.groups:
+            found.setdefault(group, []).append(component.name)
     for sensor in sensors:
         found.setdefault(sensor, sensor_columns(model, sensor))
     return found
 
 
-def _from_mjcf(model: Any, sensors: list[str], required: bool) -> dict[str, Any]:
-    """The MJCF's own noise where the experiment states none."""
-    stated = {n: float(model.sensor(n).noise[0]) for n in sensors if model.sensor(n).noise[0] > 0}
+def _noise_of_mjcf(model: Any, sensors: list[str], required: bool) -> dict[str, Any]:
+    """Standard deviation of the sensors whose `noise` the MJCF states, used where the experiment states none."""
+    sigmas = {name: float(model.sensor(name).noise[0]) for name in sensors}
+    stated = {name: sigma for name, sigma in sigmas.items() if sigma > 0}
     if required and not stated:
+        valid = ", ".join(["state", *measurable_columns(model)])
         raise ExperimentError(
-            "noise: nothing is measured: give `state`, or sensors by name, or `noise` in the MJCF; valid: "
-            + ", ".join(["state", *measurable_columns(model)])
+            "noise: nothing is measured: give `state`, or sensors by name, or `noise` in the MJCF; "
+            f"valid: {valid}"
         )
     return stated
 
 
-def _block(key: str, spec: NoiseSpec, share: Array) -> Array:
-    """(n, n) covariance of the n outputs that one key stands for."""
-    n = len(share)
+def _outputs(
+    model: Any,
+    sensors: list[str],
+    components: Mapping[str, StateComponent],
+    table: _NoiseTable,
+    measured: list[int],
+) -> tuple[Output, ...]:
+    """The measured outputs, in the order of the columns."""
+    addresses = {
+        column: int(model.sensor(sensor).adr[0]) + i
+        for sensor in sensors
+        for i, column in enumerate(sensor_columns(model, sensor))
+    }
+    sigma = np.sqrt(np.diag(table.covariance))
+
+    outputs = []
+    for i in measured:
+        name = table.columns[i]
+        component = components.get(name)
+        if component is None:
+            output = Output(name=name, sigma=float(sigma[i]), sensor=addresses[name])
+        else:
+            output = Output(
+                name=name, sigma=float(sigma[i]), unit=component.unit, state=component.address
+            )
+        outputs.append(output)
+    return tuple(outputs)
+
+
+def _key_covariance(key: str, spec: NoiseSpec, sigma_factors: Array) -> Array:
+    """(n, n) covariance of the n columns that one key stands for.
+
+    Args:
+        key: The key, for messages.
+        spec: What the table states.
+        sigma_factors: (n,) standard deviation of each column over the stated one.
+    """
+    n = len(sigma_factors)
     if spec.covariance is not None:
-        if (share != 1.0).any():
+        if (sigma_factors != 1.0).any():
             raise ExperimentError(f"{key}: orientations take one sigma [rad], no covariance")
-        return _covariance(f"{key}.covariance", spec.covariance, n)
+        return _checked_covariance(f"{key}.covariance", spec.covariance, n)
+
     sigma = np.asarray(spec.sigma, dtype=np.float64)
     if sigma.ndim and len(sigma) != n:
         raise ExperimentError(
             f"{key}.sigma: {len(sigma)} numbers, wanted one, or one for each of {n} components"
         )
-    return np.diag((sigma * share) ** 2)
+    return np.diag((sigma * sigma_factors) ** 2)
 
 
-def _covariance(key: str, rows: tuple[tuple[float, ...], ...], n: int) -> Array:
+def _checked_covariance(key: str, rows: tuple[tuple[float, ...], ...], n: int) -> Array:
+    """(n, n) stated covariance. Raises ExperimentError unless it is symmetric and positive definite."""
     if len(rows) != n or any(len(row) != n for row in rows):
         raise ExperimentError(f"{key}: wanted {n} rows of {n} numbers, one per output")
+
     matrix = np.array(rows, dtype=np.float64)
     if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
         raise ExperimentError(f"{key}: not symmetric")
-    if not np.linalg.eigvalsh(matrix)[0] > 1e-12 * np.abs(matrix).max():
+    if not np.linalg.eigvalsh(matrix)[0] > DEFINITENESS * np.abs(matrix).max():
         raise ExperimentError(
             f"{key}: not positive definite; variances must exceed what the correlations imply"
         )
     return matrix
 
 
-def _correlate(
-    block: Correlated, order: list[str], chosen: set[int], covariance: Array, strides: np.ndarray
-) -> None:
-    for name in block.outputs:
-        if name not in order:
-            raise ExperimentError(f"correlated.outputs: {unknown('output', name, order)}")
-    rows = np.array([order.index(name) for name in block.outputs], dtype=np.intp)
-    if len(set(rows.tolist())) < len(rows):
+def _require_measurement(key: str, rate: float, horizon: float | None) -> None:
+    """Raise where a rate [Hz] gives no measurement within a horizon [s]; None: the experiment has no horizon."""
+    if horizon is not None and rate * horizon < 1.0 - RATE_TOLERANCE:
         raise ExperimentError(
-            f"correlated.outputs: an output stands there twice: {', '.join(block.outputs)}"
+            f"noise.{key}.rate: {rate:g} Hz measures nothing within {horizon:g} s"
         )
-    if len(set(strides[rows].tolist())) > 1:
-        raise ExperimentError(
-            f"correlated.outputs: {', '.join(block.outputs)} are measured at different rates"
-        )
-    others = np.setdiff1d(np.arange(len(order)), rows)
-    if np.any(covariance[np.ix_(rows, others)]):
-        raise ExperimentError(
-            "correlated.outputs: one of them is correlated with an output outside already"
-        )
-    covariance[np.ix_(rows, rows)] = _covariance(
-        "correlated.covariance", block.covariance, len(rows)
-    )
-    chosen.update(rows.tolist())
 
 
-def _stride(key: str, rate: float, wanted: float) -> int:
-    """Samples from one measurement to the next. Raises ExperimentError where the rates do not fit."""
-    ratio = rate / wanted
+def _stride(key: str, rate: float, measure_rate: float) -> int:
+    """Samples from one measurement to the next.
+
+    Args:
+        key: The key that states the rate of measurements, for messages.
+        rate: Rate of the samples [Hz].
+        measure_rate: Rate of the measurements [Hz].
+
+    Raises:
+        ExperimentError: The rate of the measurements does not divide that of the samples.
+    """
+    ratio = rate / measure_rate
     stride = round(ratio)
-    if stride < 1 or abs(ratio - stride) > 1e-6 * stride:
+    if stride < 1 or abs(ratio - stride) > RATE_TOLERANCE * stride:
         valid = ", ".join(f"{rate / k:g}" for k in (1, 2, 4, 5, 10))
         raise ExperimentError(
-            f"{key}: {wanted:g} Hz does not divide rate {rate:g} Hz; valid: {valid}"
+            f"{key}: {measure_rate:g} Hz does not divide rate {rate:g} Hz; valid: {valid}"
         )
     return stride
-
-
-def measurement_stride(experiment: Experiment) -> int:
-    """Samples from one measurement to the next at measure_rate."""
-    return _stride("measure_rate", experiment.rate, experiment.measure_rate or experiment.rate)

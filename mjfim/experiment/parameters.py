@@ -1,205 +1,258 @@
-"""What is unknown: the experiment's `parameters` and `nuisance` tables resolved into `Parameter`s."""
+"""The unknowns of an experiment: its tables `parameters` and `nuisance` resolved into `Parameter`s."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import ParameterSpec
+from mjfim.model.coordinates import tangent_components, unknown_coordinate
+from mjfim.model.elements import identifier, names_of, unnamed_count
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.parameters import Parameter, Target
-from mjfim.model.paths import OBJECTS, joint_width, names_of, resolve
-from mjfim.model.targets import inertial
-from mjfim.model.units import unit_of
+from mjfim.model.paths import resolve, unit_of
+from mjfim.model.targets import body_inertia
 
-INITIAL_STATE_PREFIX = "initial "  # how names of the nuisance table's deviations of the start begin
-BARYCENTRIC = (
+# Prefix of the names of parameters that are nuisance deviations of the initial state.
+INITIAL_STATE_PREFIX = "initial "
+
+# Fields of a body that hold the ten barycentric coordinates of its inertia, in their order.
+BARYCENTRIC_FIELDS = (
     "mass",
     *(f"firstmoment[{i}]" for i in range(3)),
     *(f"origininertia[{i}]" for i in range(6)),
 )
 
+# Fields of a body that hold the ten log-Cholesky coordinates of its inertia, in their order.
+LOGCHOLESKY_FIELDS = tuple(f"logcholesky[{i}]" for i in range(10))
+
+# Magnitude of a nuisance delay of the outputs [s].
+DELAY_MAGNITUDE = 0.01
+
 
 def resolve_parameters(
     experiment: Experiment, model: Any, outputs: Sequence[str]
 ) -> list[Parameter]:
-    """All parameters in the order of theta: those of the file, then the nuisance table's.
+    """All parameters in the order of theta: those of the table `parameters`, then those of `nuisance`.
 
-    outputs: names of the measured columns. Raises ExperimentError naming the key.
+    Args:
+        experiment: The experiment.
+        model: Its compiled model (`mujoco.MjModel`).
+        outputs: Names of the measured columns.
+
+    Raises:
+        ExperimentError: A parameter cannot be resolved; the message names its key.
     """
-    built: list[Parameter] = []
+    resolved: list[Parameter] = []
     for name, spec in experiment.parameters.items():
-        built += (
-            _inertial(name, spec, model)
-            if spec.inertial is not None
-            else [_single(name, spec, model, outputs)]
-        )
-    built += _nuisance(experiment, model, outputs)
-    names = [p.name for p in built]
-    twice = next((n for n in names if names.count(n) > 1), None)
-    if twice is not None:
-        raise ExperimentError(
-            f"parameters.{twice}: two parameters have this name; call one of them otherwise"
-        )
-    if all(p.nuisance for p in built):
+        if spec.inertial is None:
+            resolved.append(_single_parameter(name, spec, model, outputs))
+        else:
+            resolved += _inertia_parameters(name, spec, model)
+    resolved += _nuisance_parameters(experiment, model, outputs)
+
+    names = [parameter.name for parameter in resolved]
+    duplicate = next((name for name in names if names.count(name) > 1), None)
+    if duplicate is not None:
+        raise ExperimentError(f"parameters.{duplicate}: duplicate parameter name; rename one")
+
+    if all(parameter.nuisance for parameter in resolved):
         raise ExperimentError(
             "parameters: all are nuisance; a design needs at least one that is wanted"
         )
-    return built
+    return resolved
 
 
-def _single(name: str, spec: ParameterSpec, model: Any, outputs: Sequence[str]) -> Parameter:
+def _single_parameter(
+    name: str, spec: ParameterSpec, model: Any, outputs: Sequence[str]
+) -> Parameter:
+    """A parameter with targets or a function. Its guess, magnitude and unit default to those of its first target."""
     targets = tuple(Target(t.path, t.scale, t.offset) for t in spec.all_targets)
-    guess, size, unit = spec.guess, 0.0, spec.unit
+    guess = spec.guess
+    magnitude = 0.0
+    unit = spec.unit
+
     if targets:
-        head = targets[0]
+        first = targets[0]
         try:
-            slot = resolve(model, head.path, outputs)
-            guess = (slot.read(model) - head.offset) / head.scale if guess is None else guess
-            size = slot.size(model) / abs(head.scale)
+            field = resolve(model, first.path, outputs)
+            if guess is None:
+                guess = (field.read(model) - first.offset) / first.scale
+            magnitude = field.magnitude(model) / abs(first.scale)
         except ExperimentError as error:
             raise ExperimentError(f"parameters.{name}: {error}") from None
-        unit = unit or (unit_of(model, head.path) if head.scale == 1.0 else "")
+        # The parameter has the unit of its target only where it is the target's number itself.
+        if not unit and first.scale == 1.0:
+            unit = unit_of(model, first.path)
+
     if guess is None:
         raise ExperimentError(f"parameters.{name}.guess: a function needs one")
+
     bounds = spec.bounds or (-np.inf, np.inf)
     if not bounds[0] <= guess <= bounds[1]:
         raise ExperimentError(
             f"parameters.{name}.guess: the model's own value {guess:g} is outside bounds {list(bounds)}"
         )
-    size = max(abs(guess), size)
-    scale = (
-        spec.scale
-        if isinstance(spec.scale, float)
-        else abs(guess)
-        if spec.scale == "guess"
-        else size
-    )
-    if scale == 0.0:
-        raise ExperimentError(
-            f"parameters.{name}.scale: the model's own value or guess is 0: state a guess, or a scale in the parameter's unit"
-        )
+
+    magnitude = max(abs(guess), magnitude)
     return Parameter(
-        name,
-        targets,
-        guess,
-        spec.true,
-        bounds,
-        scale,
-        spec.prior,
-        unit,
-        size,
-        spec.function,
-        spec.nuisance,
-        spec.wanted,
+        name=name,
+        targets=targets,
+        guess=guess,
+        true=spec.true,
+        bounds=bounds,
+        scale=_scale(name, spec, guess, magnitude),
+        prior=spec.prior,
+        unit=unit,
+        size=magnitude,
+        function=spec.function,
+        nuisance=spec.nuisance,
+        wanted=spec.wanted,
         per_recording=spec.per_recording,
     )
 
 
-def _inertial(name: str, spec: ParameterSpec, model: Any) -> Iterator[Parameter]:
-    """The ten coordinates of a body's inertia. prior: relative to the natural size of each."""
-    body = mujoco.mj_name2id(model, OBJECTS["body"], spec.inertial or "")
-    if body < 0:
+def _scale(name: str, spec: ParameterSpec, guess: float, magnitude: float) -> float:
+    """Unit in which information about a parameter is compared: the stated one, that of the guess, or its magnitude."""
+    if isinstance(spec.scale, float):
+        scale = spec.scale
+    elif spec.scale == "guess":
+        scale = abs(guess)
+    else:
+        scale = magnitude
+
+    if scale == 0.0:
         raise ExperimentError(
-            f"parameters.{name}.inertial: {unknown('body', spec.inertial or '', names_of(model, 'body'))}"
+            f"parameters.{name}.scale: the model's own value or guess is 0: state a guess, or a scale in the "
+            "parameter's unit"
         )
-    if not float(model.body_mass[body]) > 0.0:
-        raise ExperimentError(f"parameters.{name}.inertial: body {spec.inertial!r} has no mass")
-    coordinates = spec.coordinates or "logcholesky"
-    chart, now = INERTIA_PARAMETRISATIONS[coordinates], inertial(model, body)
-    try:
-        values, sizes = chart.of(now), chart.size(now)
-    except ValueError as error:
-        raise ExperimentError(
-            f'parameters.{name}.inertial: body {spec.inertial!r}: {error}; use coordinates = "barycentric"'
-        ) from None
-    fields = (
-        BARYCENTRIC if coordinates == "barycentric" else [f"logcholesky[{i}]" for i in range(10)]
-    )
-    for coordinate, path, unit, value, size in zip(
-        chart.names, fields, chart.units, values, sizes, strict=True
-    ):
-        scale = abs(float(value)) if spec.scale == "guess" else float(size)
+    return scale
+
+
+def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[Parameter]:
+    """The ten coordinates of a body's inertia. Their prior is relative to the natural magnitude of each."""
+    key = f"parameters.{name}.inertial"
+    kind = spec.coordinates or "logcholesky"
+    parametrisation = INERTIA_PARAMETRISATIONS[kind]
+    values, magnitudes = _inertia_coordinates(key, spec.inertial or "", kind, model)
+    fields = BARYCENTRIC_FIELDS if kind == "barycentric" else LOGCHOLESKY_FIELDS
+
+    for i, coordinate in enumerate(parametrisation.names):
+        value = float(values[i])
+        magnitude = float(magnitudes[i])
+        scale = abs(value) if spec.scale == "guess" else magnitude
         if scale == 0.0:
             raise ExperimentError(
                 f'parameters.{name}.scale: {coordinate} is 0; leave scale = "guess" out'
             )
+
         yield Parameter(
-            f"{name}.{coordinate}",
-            (Target(f"body/{spec.inertial}:{path}"),),
-            float(value),
+            name=f"{name}.{coordinate}",
+            targets=(Target(f"body/{spec.inertial}:{fields[i]}"),),
+            guess=value,
             scale=scale,
-            prior=None if spec.prior is None else spec.prior * float(size),
-            unit=unit,
-            size=float(size),
+            prior=None if spec.prior is None else spec.prior * magnitude,
+            unit=parametrisation.units[i],
+            size=magnitude,
             nuisance=spec.nuisance,
             group=name,
             per_recording=spec.per_recording,
         )
 
 
-def _nuisance(experiment: Experiment, model: Any, outputs: Sequence[str]) -> Iterator[Parameter]:
-    stated = experiment.nuisance
-    starts = dict(_starts(model))
-    nameless = model.njnt - len(names_of(model, "joint"))
-    if nameless and stated.initial is not None and not isinstance(stated.initial, Mapping):
+def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[Array, Array]:
+    """Coordinates (10,) of the inertia of the named body in a parametrisation, and their magnitudes (10,)."""
+    body = identifier(model, "body", name)
+    if body < 0:
+        raise ExperimentError(f"{key}: {unknown('body', name, names_of(model, 'body'))}")
+    if not float(model.body_mass[body]) > 0.0:
+        raise ExperimentError(f"{key}: body {name!r} has no mass")
+
+    inertia = body_inertia(model, body)
+    parametrisation = INERTIA_PARAMETRISATIONS[kind]
+    try:
+        return parametrisation.coordinates(inertia), parametrisation.magnitudes(inertia)
+    except ValueError as error:
         raise ExperimentError(
-            f"nuisance.initial: {nameless} joints have no name: give them one in the MJCF, or state deviations by name"
+            f'{key}: body {name!r}: {error}; use coordinates = "barycentric"'
+        ) from None
+
+
+def _nuisance_parameters(
+    experiment: Experiment, model: Any, outputs: Sequence[str]
+) -> Iterator[Parameter]:
+    """Parameters of the table `nuisance`: deviations of the initial state, biases of outputs, delay of all outputs."""
+    stated = experiment.nuisance
+
+    paths = {
+        component.name: component.path
+        for component in tangent_components(model)[: 2 * model.nv]
+        if component.path
+    }
+    unnamed = unnamed_count(model, "joint")
+    if unnamed and stated.initial is not None and not isinstance(stated.initial, Mapping):
+        raise ExperimentError(
+            f"nuisance.initial: {unnamed} joints have no name: give them one in the MJCF, or state deviations by name"
         )
-    for label, prior in _by_name("nuisance.initial", stated.initial, list(starts)):
-        yield _unwanted(
-            f"{INITIAL_STATE_PREFIX}{label}",
-            starts[label],
+    for name, prior in _priors_by_name("nuisance.initial", stated.initial, list(paths)):
+        yield _nuisance_parameter(
+            f"{INITIAL_STATE_PREFIX}{name}",
+            paths[name],
             prior,
-            unit_of(model, starts[label]),
-            1.0,
+            unit=unit_of(model, paths[name]),
         )
-    for label, prior in _by_name("nuisance.bias", stated.bias, outputs):
-        yield _unwanted(
-            f"bias {label}", f"output/{label}:bias", prior, "", 1.0, stated.per_recording
+
+    for name, prior in _priors_by_name("nuisance.bias", stated.bias, outputs):
+        yield _nuisance_parameter(
+            f"bias {name}", f"output/{name}:bias", prior, per_recording=stated.per_recording
         )
+
     if stated.delay is not None:
-        yield _unwanted("delay", "output:delay", stated.delay, "s", 0.01, stated.per_recording)
+        yield _nuisance_parameter(
+            "delay",
+            "output:delay",
+            stated.delay,
+            unit="s",
+            magnitude=DELAY_MAGNITUDE,
+            per_recording=stated.per_recording,
+        )
 
 
-def _starts(model: Any) -> Iterator[tuple[str, str]]:
-    """State components by label and path; `[i]` where a joint has several degrees of freedom."""
-    for field in ("qpos", "qvel"):
-        for joint in names_of(model, "joint"):
-            width = joint_width(model, mujoco.mj_name2id(model, OBJECTS["joint"], joint))
-            for i in range(width):
-                index = "" if width == 1 else f"[{i}]"
-                yield f"{field}:{joint}{index}", f"initial/{joint}:{field}{index}"
-
-
-def _by_name(key: str, stated: Any, names: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """(name, prior) of one value for all names or of a table by name."""
+def _priors_by_name(key: str, stated: Any, names: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """(name, prior) of one value that holds for all names, or of a table by name."""
     if stated is None:
         return
+
     table = stated if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
     for name, prior in table.items():
         if name not in names:
-            raise ExperimentError(f"{key}: {unknown('name', name, list(names))}")
+            raise ExperimentError(f"{key}: {unknown_coordinate('name', name, list(names))}")
         yield name, prior
 
 
-def _unwanted(
-    name: str, path: str, prior: Any, unit: str, size: float, per_recording: bool = False
+def _nuisance_parameter(
+    name: str,
+    path: str,
+    prior: Any,
+    *,
+    unit: str = "",
+    magnitude: float = 1.0,
+    per_recording: bool = False,
 ) -> Parameter:
-    known = None if prior is True else float(prior)
+    """A nuisance parameter whose guess is zero. prior: standard deviation, or True where none is known."""
     return Parameter(
-        name,
-        (Target(path),),
-        0.0,
-        scale=size,
-        prior=known,
+        name=name,
+        targets=(Target(path),),
+        guess=0.0,
+        scale=magnitude,
+        prior=None if prior is True else float(prior),
         unit=unit,
-        size=size,
+        size=magnitude,
         nuisance=True,
         per_recording=per_recording,
     )

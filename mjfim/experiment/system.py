@@ -22,11 +22,16 @@ from mjfim.experiment.parameters import resolve_parameters
 from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system_tables import Signal
 from mjfim.information.fisher import Information
-from mjfim.model.coordinates import control_names, joint_names, measurable_columns, scalar_joints
+from mjfim.model.coordinates import (
+    control_names,
+    joint_dofs,
+    joint_names,
+    measurable_columns,
+    scalar_joints,
+)
 from mjfim.model.loading import compile_spec, decoration, load_spec
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import ParameterSet, moved_bodies
-from mjfim.model.paths import joint_width
 from mjfim.model.smooth_friction import has_dry_friction, smoothing_speeds_of
 from mjfim.model.variants import STATED, Level, Lifted, Mocap, Source
 from mjfim.plant.batch import state_space
@@ -206,7 +211,7 @@ class Setup:
 
         placed: its mocap bodies where the keyframe has them, else where the MJCF has them
         """
-        model = self.parameters.model(self._whole, theta)
+        model = self.parameters.writer.model(self._whole, theta)
         if self._mocap is not None and not placed:
             self._mocap.put(model, self._mocap.compiled)
         return model
@@ -438,7 +443,7 @@ class Setup:
         """Raise where the guess or the true values make a body that cannot exist."""
         p = self.parameters
         for key, theta in (("guess", p.guess), ("true", p.true)):
-            for columns, fault in p.unphysical_bodies(source, theta):
+            for columns, fault in p.writer.unphysical_bodies(source, theta):
                 makers = dict.fromkeys(
                     p.parameters[j].group or f"{p.parameters[j].name}.{key}" for j in columns
                 )
@@ -450,7 +455,9 @@ class Setup:
             return sorted(
                 {
                     j
-                    for columns, _ in self.parameters.unphysical_bodies(self.plant.source, theta)
+                    for columns, _ in self.parameters.writer.unphysical_bodies(
+                        self.plant.source, theta
+                    )
                     for j in columns
                 }
             )
@@ -493,7 +500,7 @@ class Setup:
             q = int(model.jnt_qposadr[j]) + (
                 3 if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE) else 0
             )
-            if joint_width(model, j) > 1 and not np.linalg.norm(qpos[q : q + 4]) > NO_ROTATION:
+            if joint_dofs(model, j) > 1 and not np.linalg.norm(qpos[q : q + 4]) > NO_ROTATION:
                 raise ExperimentError(
                     f"initial.qpos: the quaternion of joint {name!r} (numbers {q} to {q + 3}) is zero; no rotation is 1, 0, 0, 0"
                 )
@@ -503,7 +510,7 @@ class Setup:
     def _weights(self) -> Array:
         """(nx,) diagonal of Q_tau: a joint's weight holds for each of its degrees of freedom."""
         cost, names = self.experiment.cost, joint_names(self.model)
-        widths = [joint_width(self.model, j) for j in range(self.model.njnt)]
+        widths = [joint_dofs(self.model, j) for j in range(self.model.njnt)]
         position = np.repeat(by_name("cost.tracking", cost.tracking, names, "joint"), widths)
         velocity = np.repeat(
             by_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint"), widths

@@ -1,44 +1,64 @@
-"""Names and units of the coordinates of a model: joints, activations, controls, measurable outputs."""
+"""Names and units of the coordinates of a model: the one place where names of columns and components are made.
+
+A coordinate of a slide or hinge joint is called `qpos:<joint>` and `qvel:<joint>`. Ball and free joints have parts,
+`qpos:<joint>.<part>`:
+
+- columns of the state hold the orientation as a quaternion: `x y z qw qx qy qz`;
+- deviations from a state (gains, deviations of the initial state, velocities) hold a rotation vector: `x y z rx ry rz`.
+
+Activations are called `act:<actuator>`. Sensors keep MuJoCo's indices, `gyro[0]`.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 
-from mjfim.model.paths import names_of
+from mjfim.errors import unknown
+from mjfim.model.elements import element_name, identifier, names_of, unique_names
+from mjfim.model.units import (
+    PART_UNITS,
+    control_unit,
+    joint_unit,
+    per_second,
+    sensor_unit,
+)
 
-JOINT_DOFS = {
-    mujoco.mjtJoint.mjJNT_SLIDE: (("", "m"),),
-    mujoco.mjtJoint.mjJNT_HINGE: (("", "rad"),),
-    mujoco.mjtJoint.mjJNT_BALL: ((".rx", "rad"), (".ry", "rad"), (".rz", "rad")),
-    mujoco.mjtJoint.mjJNT_FREE: (
-        *((f".{axis}", "m") for axis in "xyz"),
-        *((f".r{axis}", "rad") for axis in "xyz"),
-    ),
-}
+# Parts of the translation of a free joint.
+TRANSLATION = ("x", "y", "z")
+
+# Parts of the orientation of a ball or free joint in a state: a unit quaternion.
+QUATERNION = ("qw", "qx", "qy", "qz")
+
+# Parts of a deviation of the orientation and of the angular velocity: a rotation vector in the body's frame.
+ROTATION_VECTOR = ("rx", "ry", "rz")
+
+# Standard deviation of a quaternion's component over that of the orientation. The four components then hold exactly the
+# information of a rotation vector of the stated standard deviation [rad].
+QUATERNION_SIGMA_FACTOR = 0.5
+
+# A coordinate written with an index, as in `qpos:base[3]` or `initial/base:qpos[3]`.
+INDEXED_NAME = re.compile(r"^(?P<joint>.+)\[(?P<index>\d+)\]$")
+
+# A coordinate written with a part, as in `qpos:base.qw`.
+NAME_WITH_PART = re.compile(r"^(?P<joint>.+)\.(?P<part>\w+)$")
 
 
-SENSOR_UNITS = {
-    "m": ("JOINTLIMITPOS", "TENDONPOS", "RANGEFINDER", "FRAMEPOS", "SUBTREECOM"),
-    "m/s": ("VELOCIMETER", "TENDONVEL", "FRAMELINVEL", "SUBTREELINVEL"),
-    "m/s²": ("ACCELEROMETER", "FRAMELINACC"),
-    "rad/s": ("GYRO", "FRAMEANGVEL", "BALLANGVEL"),
-    "rad/s²": ("FRAMEANGACC",),
-    "N": ("FORCE", "TOUCH"),
-    "N m": ("TORQUE",),
-    "T": ("MAGNETOMETER",),
-}
-
-
-QUATERNION = (".qw", ".qx", ".qy", ".qz")
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ScalarJoint:
-    """A scalar joint: its name, unit and place. joint: id;  q: qpos address;  v: dof address."""
+    """A joint with one degree of freedom.
+
+    Attributes:
+        name: Name of the joint.
+        unit: Unit of its coordinate, m or rad.
+        joint: Number of the joint.
+        q: Address of its coordinate in qpos.
+        v: Address of its velocity in qvel.
+    """
 
     name: str
     unit: str
@@ -47,201 +67,269 @@ class ScalarJoint:
     v: int
 
 
-def scalar_joints(model: Any) -> tuple[ScalarJoint, ...]:
-    """All slide and hinge joints, in order."""
-    found, names = [], joint_names(model)
-    for j in range(model.njnt):
-        if int(model.jnt_type[j]) in (
-            int(mujoco.mjtJoint.mjJNT_SLIDE),
-            int(mujoco.mjtJoint.mjJNT_HINGE),
-        ):
-            unit = "m" if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
-            found.append(
-                ScalarJoint(names[j], unit, j, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
-            )
-    return tuple(found)
+@dataclass(frozen=True, kw_only=True)
+class StateComponent:
+    """One number of qpos or qvel, which can be measured and recorded.
+
+    Attributes:
+        name: Column of the number, `qpos:<joint>`, `qvel:<joint>`, or these with a part.
+        groups: Names of the groups of columns that it belongs to, for example `qpos:base.rot` and `qpos:base`.
+        address: Its place in the state vector (qpos, qvel, act).
+        unit: Its unit; empty for components of quaternions.
+        sigma_factor: Its standard deviation over the stated one of a group; 1/2 for components of quaternions.
+    """
+
+    name: str
+    groups: tuple[str, ...] = ()
+    address: int
+    unit: str
+    sigma_factor: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TangentComponent:
+    """One number of a deviation of the state, in the tangent space (dq, dv, da).
+
+    Attributes:
+        name: `qpos:<joint>`, `qvel:<joint>`, these with a part, or `act:<actuator>`.
+        path: Parameter path of the deviation of the initial state, `initial/<joint>:qpos`; empty where the joint or
+            actuator has no name in the MJCF.
+        address: Its place in the tangent space.
+        unit: Its unit; empty for activations.
+    """
+
+    name: str
+    path: str
+    address: int
+    unit: str
 
 
 def joint_names(model: Any) -> tuple[str, ...]:
-    """njnt names; unnamed joints are called by their number."""
-    return _names(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt, "joint")
+    """Names of the njnt joints; an unnamed joint is called by its number."""
+    return unique_names(model, "joint")
 
 
 def actuator_names(model: Any) -> tuple[str, ...]:
-    """nactuator names; unnamed actuators are called by their number."""
-    return _names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nactuator, "actuator")
-
-
-def _names(model: Any, kind: Any, count: int, fallback: str) -> tuple[str, ...]:
-    """Names of all objects of a kind, no two alike: a number that another one is called by gets underscores."""
-    given = [mujoco.mj_id2name(model, kind, i) for i in range(count)]
-    taken = {name for name in given if name}
-    for i in range(count):
-        if not given[i]:
-            name = f"{fallback}{i}"
-            while name in taken:
-                name += "_"
-            given[i] = name
-    return tuple(given)
+    """Names of the actuators; an unnamed actuator is called by its number."""
+    return unique_names(model, "actuator")
 
 
 def control_names(model: Any) -> tuple[str, ...]:
-    """nu names; an actuator with several controls gets one name per control."""
+    """Names of the nu controls; an actuator with several controls has one name for each, `<actuator>[<i>]`."""
     names: list[str] = []
     for i, name in enumerate(actuator_names(model)):
+        names += _indexed(name, int(model.actuator_ctrlnum[i]))
+    return tuple(names)
+
+
+def control_labels(model: Any) -> tuple[str, ...]:
+    """Labels of the nu controls for axes: with the unit where the model shows it, else with `(control)`."""
+    labels: list[str] = []
+    for i, name in enumerate(actuator_names(model)):
         count = int(model.actuator_ctrlnum[i])
-        names += [name] if count == 1 else [f"{name}[{c}]" for c in range(count)]
-    return tuple(names)
+        unit = control_unit(model, i) if count == 1 else ""
+        suffix = f"[{unit}]" if unit else "(control)"
+        labels += [f"{control} {suffix}" for control in _indexed(name, count)]
+    return tuple(labels)
 
 
-def _coordinates(model: mujoco.MjModel) -> tuple[str, ...]:
-    """One name per qpos of a model with quaternions."""
-    names: list[str] = []
-    for joint in range(model.njnt):
-        name, kind = _joint_name(model, joint), mujoco.mjtJoint(int(model.jnt_type[joint]))
-        if kind in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
-            names.append(f"{name} [{_joint_unit(model, joint)}]")
-            continue
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
-            names += [f"{name}.{axis} [m]" for axis in "xyz"]
-        names += [f"{name}{suffix} [1]" for suffix in QUATERNION]
-    return tuple(names)
-
-
-def _joint_name(model: mujoco.MjModel, joint: int) -> str:
-    return joint_names(model)[joint]
-
-
-def _joint_unit(model: mujoco.MjModel, joint: int) -> str:
-    return JOINT_DOFS[mujoco.mjtJoint(int(model.jnt_type[joint]))][0][1]
-
-
-def _control_labels(model: mujoco.MjModel, actuator: int) -> list[str]:
-    """One label per control of an actuator, with the unit where it is plain: direct drives and position servos."""
-    name, count = actuator_names(model)[actuator], int(model.actuator_ctrlnum[actuator])
-    if count != 1:
-        return [f"{name}[{c}] (control)" for c in range(count)]
-    gear = model.actuator_gear[int(model.actuator_outadr[actuator]), 0]
-    if int(model.actuator_trntype[actuator]) != int(mujoco.mjtTrn.mjTRN_JOINT) or gear != 1:
-        return [f"{name} (control)"]
-    unit = _joint_unit(model, int(model.actuator_trnid[actuator, 0]))
-    gain, bias = float(model.actuator_gainprm[actuator, 0]), model.actuator_biasprm[actuator]
-    if int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE):
-        return [f"{name} [{'N' if unit == 'm' else 'N m'}]" if gain == 1.0 else f"{name} (control)"]
-    return [f"{name} [{unit}]" if bias[1] == -gain else f"{name} (control)"]
-
-
-def output_label(model: mujoco.MjModel, output: str) -> str:
-    """A measured column (`qpos:<joint>`, `qvel:<joint>` or a sensor) with its unit where that is known."""
-    kind, _, joint = output.partition(":")
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
-    if kind in ("qpos", "qvel") and index >= 0:
-        return f"{output} [{_joint_unit(model, index)}{'/s' if kind == 'qvel' else ''}]"
-    sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, output.partition("[")[0])
-    if sensor < 0:
-        return output
-    short = mujoco.mjtSensor(int(model.sensor_type[sensor])).name.removeprefix("mjSENS_")
-    if short in ("JOINTPOS", "JOINTVEL"):
-        unit = _joint_unit(model, int(model.sensor_objid[sensor]))
-        return f"{output} [{unit}{'/s' if short == 'JOINTVEL' else ''}]"
-    return next(
-        (f"{output} [{unit}]" for unit, kinds in SENSOR_UNITS.items() if short in kinds), output
+def scalar_joints(model: Any) -> tuple[ScalarJoint, ...]:
+    """All slide and hinge joints, in the order of the model."""
+    return tuple(
+        ScalarJoint(
+            name=name,
+            unit=joint_unit(model, j),
+            joint=j,
+            q=int(model.jnt_qposadr[j]),
+            v=int(model.jnt_dofadr[j]),
+        )
+        for j, name in enumerate(joint_names(model))
+        if joint_dofs(model, j) == 1
     )
 
 
+def joint_dofs(model: Any, joint: int) -> int:
+    """Number of degrees of freedom of a joint: 6 (free), 3 (ball) or 1."""
+    return max(len(tangent_parts(model, joint)), 1)
+
+
+def tangent_parts(model: Any, joint: int) -> tuple[str, ...]:
+    """Parts of a deviation of a joint, in the order of its degrees of freedom; none for slide and hinge joints."""
+    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+    if kind == mujoco.mjtJoint.mjJNT_FREE:
+        return (*TRANSLATION, *ROTATION_VECTOR)
+    return ROTATION_VECTOR if kind == mujoco.mjtJoint.mjJNT_BALL else ()
+
+
+def state_components(model: Any) -> tuple[StateComponent, ...]:
+    """The nq + nv numbers of the state without activations: all of qpos, then all of qvel."""
+    positions: list[StateComponent] = []
+    velocities: list[StateComponent] = []
+
+    for j, name in enumerate(joint_names(model)):
+        q = int(model.jnt_qposadr[j])
+        v = model.nq + int(model.jnt_dofadr[j])
+        parts = tangent_parts(model, j)
+
+        if not parts:
+            unit = joint_unit(model, j)
+            positions.append(StateComponent(name=f"qpos:{name}", address=q, unit=unit))
+            velocities.append(StateComponent(name=f"qvel:{name}", address=v, unit=per_second(unit)))
+            continue
+
+        translation = tuple(part for part in parts if part in TRANSLATION)
+        positions += _joint_components(f"qpos:{name}", (*translation, *QUATERNION), q)
+        velocities += _joint_components(f"qvel:{name}", parts, v)
+
+    return (*positions, *velocities)
+
+
+def _joint_components(
+    joint_column: str, parts: Sequence[str], first_address: int
+) -> list[StateComponent]:
+    """Components of a ball or free joint. joint_column: `qpos:<joint>` or `qvel:<joint>`."""
+    found = []
+    for k, part in enumerate(parts):
+        group = "pos" if part in TRANSLATION else "rot"
+        unit = PART_UNITS[part]
+        found.append(
+            StateComponent(
+                name=f"{joint_column}.{part}",
+                groups=(f"{joint_column}.{group}", joint_column),
+                address=first_address + k,
+                unit=per_second(unit) if joint_column.startswith("qvel:") else unit,
+                sigma_factor=QUATERNION_SIGMA_FACTOR if part in QUATERNION else 1.0,
+            )
+        )
+    return found
+
+
+def tangent_components(model: Any) -> tuple[TangentComponent, ...]:
+    """The nx = 2 nv + na numbers of a deviation of the state, in the order (dq, dv, da)."""
+    found: list[TangentComponent] = []
+
+    for field in ("qpos", "qvel"):
+        for j, name in enumerate(joint_names(model)):
+            named = element_name(model, "joint", j) != ""
+            for part in tangent_parts(model, j) or ("",):
+                suffix = f".{part}" if part else ""
+                unit = PART_UNITS[part] if part else joint_unit(model, j)
+                component = TangentComponent(
+                    name=f"{field}:{name}{suffix}",
+                    path=f"initial/{name}:{field}{suffix}" if named else "",
+                    address=len(found),
+                    unit=unit if field == "qpos" else per_second(unit),
+                )
+                found.append(component)
+
+    return (*found, *_activation_components(model))
+
+
+def _activation_components(model: Any) -> tuple[TangentComponent, ...]:
+    """The na activations by their address: `act:<actuator>`, with `[i]` where an actuator has several."""
+    found: dict[int, TangentComponent] = {}
+    for i, name in enumerate(actuator_names(model)):
+        first = int(model.actuator_actadr[i])
+        count = int(model.actuator_actnum[i])
+        named = element_name(model, "actuator", i) != ""
+        columns = _indexed(f"act:{name}", count)
+        paths = _indexed(f"initial/{name}:act", count)
+
+        for k in range(count):
+            address = 2 * model.nv + first + k
+            found[address] = TangentComponent(
+                name=columns[k], path=paths[k] if named else "", address=address, unit=""
+            )
+    return tuple(found[address] for address in sorted(found))
+
+
+def activation_names(model: Any) -> tuple[str, ...]:
+    """Columns of the na activations: `act:<actuator>`, with `[i]` where an actuator has several."""
+    return tuple(component.name for component in _activation_components(model))
+
+
+def state_names(model: Any) -> tuple[str, ...]:
+    """Columns of the state (qpos, qvel, act): nq + nv + na names."""
+    return (*(component.name for component in state_components(model)), *activation_names(model))
+
+
+def tangent_names(model: Any) -> tuple[str, ...]:
+    """Names of the nx components of a deviation of the state."""
+    return tuple(component.name for component in tangent_components(model))
+
+
+def gain_names(model: Any, controls: Sequence[str]) -> tuple[str, ...]:
+    """Columns of the gain K: (nu, nx), row by row: `gain:<control>:<component of the deviation>`."""
+    components = tangent_names(model)
+    return tuple(f"gain:{control}:{component}" for control in controls for component in components)
+
+
+def sensor_columns(model: Any, sensor: str) -> list[str]:
+    """Columns of a named sensor: its name, with `[i]` where it has several components."""
+    return _indexed(sensor, int(model.sensor(sensor).dim[0]))
+
+
+def measurable_columns(model: Any) -> tuple[str, ...]:
+    """Columns of everything that a recording may hold: components of the state, then sensors."""
+    sensors = [
+        column for sensor in names_of(model, "sensor") for column in sensor_columns(model, sensor)
+    ]
+    return (*(component.name for component in state_components(model)), *sensors)
+
+
+def output_label(model: Any, output: str) -> str:
+    """Label `<column> [<unit>]` of a measured column; the column alone where no unit is known."""
+    units = {component.name: component.unit for component in state_components(model)}
+    unit = units.get(output, "")
+
+    sensor = identifier(model, "sensor", output.partition("[")[0])
+    if output not in units and sensor >= 0:
+        unit = sensor_unit(model, sensor)
+
+    return f"{output} [{unit}]" if unit else output
+
+
 def split_unit(label: str) -> tuple[str, str]:
-    """Name and unit of a column called `name [unit]`."""
+    """Name and unit of a label `<name> [<unit>]`; the unit is empty where the label has none."""
     plain, _, unit = label.partition(" [")
     return plain, unit.rstrip("]")
 
 
-def activation_names(model: Any) -> tuple[str, ...]:
-    """na columns `act:<actuator>`, with `[i]` where an actuator has several activations."""
-    names = [""] * model.na
-    for i, name in enumerate(actuator_names(model)):
-        first, count = int(model.actuator_actadr[i]), int(model.actuator_actnum[i])
-        for k in range(count):
-            names[first + k] = f"act:{name}" if count == 1 else f"act:{name}[{k}]"
-    return tuple(names)
+def unknown_coordinate(kind: str, name: str, valid: Sequence[str]) -> str:
+    """Sentence for a coordinate that does not exist, which names the right spelling where it is known.
 
-
-def state_names(model: Any) -> tuple[str, ...]:
-    """Columns of the state: `qpos:<joint>`, `qvel:<joint>` (with parts for ball and free joints), `act:<actuator>`."""
-    return (*(c.name for c in state_components(model)), *activation_names(model))
-
-
-def tangent_names(model: Any) -> tuple[str, ...]:
-    """nx components of a deviation from the plan: as the state's columns, but `.rx`, `.ry`, `.rz` [rad] for rotations."""
-    velocities = [c.name for c in state_components(model) if c.state >= model.nq]
-    positions = [name.replace("qvel:", "qpos:", 1) for name in velocities]
-    return (*positions, *velocities, *activation_names(model))
-
-
-def gain_names(model: Any, controls: Sequence[str]) -> tuple[str, ...]:
-    """Columns of K, row by row: `gain:<actuator>:<component>`."""
-    return tuple(f"gain:{control}:{name}" for control in controls for name in tangent_names(model))
-
-
-@dataclass(frozen=True)
-class StateComponent:
-    """One number of qpos or qvel that can be measured and recorded.
-
-    name: its column, `qpos:<joint>` or `qpos:<joint>.<part>`;  keys: names of wholes that it belongs to
-    state: address in the state vector (qpos, qvel, act)
-    share: its sigma over the stated one; 1/2 for quaternions, whose four components then hold exactly the information of a
-    rotation vector of the stated sigma [rad]
+    Args:
+        kind: What the name should have been, for the message.
+        name: The name that does not exist.
+        valid: All valid names, those of one joint in the order of its degrees of freedom.
     """
+    indexed = INDEXED_NAME.match(name)
+    if indexed:
+        right = _names_with_parts(indexed["joint"], valid)
+        index = int(indexed["index"])
+        if index < len(right):
+            return f"{name!r} is now written {right[index]!r}"
 
-    name: str
-    keys: tuple[str, ...]
-    state: int
-    unit: str
-    share: float = 1.0
+    with_part = NAME_WITH_PART.match(name)
+    if with_part and with_part["part"] in (*QUATERNION, *ROTATION_VECTOR):
+        right = _names_with_parts(with_part["joint"], valid)
+        orientation = [n for n in right if n.rpartition(".")[2] not in TRANSLATION]
+        if orientation:
+            wanted = "rotation vector" if with_part["part"] in QUATERNION else "quaternion"
+            return f"{name!r}: the orientation is a {wanted} here; valid: {', '.join(orientation)}"
 
-
-def state_components(model: Any) -> tuple[StateComponent, ...]:
-    """All of qpos, then all of qvel."""
-    positions, velocities = [], []
-    for j, name in enumerate(joint_names(model)):
-        q, v, kind = (
-            int(model.jnt_qposadr[j]),
-            model.nq + int(model.jnt_dofadr[j]),
-            int(model.jnt_type[j]),
-        )
-        qpos, qvel = f"qpos:{name}", f"qvel:{name}"
-        if kind in (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)):
-            unit = "m" if kind == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
-            positions.append(StateComponent(qpos, (), q, unit))
-            velocities.append(StateComponent(qvel, (), v, f"{unit}/s"))
-            continue
-        if kind == int(mujoco.mjtJoint.mjJNT_FREE):
-            for i, axis in enumerate("xyz"):
-                positions.append(
-                    StateComponent(f"{qpos}.{axis}", (f"{qpos}.pos", qpos), q + i, "m")
-                )
-                velocities.append(
-                    StateComponent(f"{qvel}.{axis}", (f"{qvel}.pos", qvel), v + i, "m/s")
-                )
-            q, v = q + 3, v + 3
-        for i, axis in enumerate("wxyz"):
-            positions.append(
-                StateComponent(f"{qpos}.q{axis}", (f"{qpos}.rot", qpos), q + i, "", 0.5)
-            )
-        for i, axis in enumerate("xyz"):
-            velocities.append(
-                StateComponent(f"{qvel}.r{axis}", (f"{qvel}.rot", qvel), v + i, "rad/s")
-            )
-    return (*positions, *velocities)
+    return unknown(kind, name, valid)
 
 
-def measurable_columns(model: Any) -> tuple[str, ...]:
-    """Everything that a recording may hold column by column: state components and sensors."""
-    return (
-        *(c.name for c in state_components(model)),
-        *(label for s in names_of(model, "sensor") for label in sensor_columns(model, s)),
-    )
+def _names_with_parts(joint_column: str, valid: Sequence[str]) -> list[str]:
+    """The valid names that consist of a joint's column, such as `qpos:base`, and a part."""
+    return [
+        name
+        for name in valid
+        if name.startswith(f"{joint_column}.") and name[len(joint_column) + 1 :] in PART_UNITS
+    ]
 
 
-def sensor_columns(model: Any, sensor: str) -> list[str]:
-    width = int(model.sensor(sensor).dim[0])
-    return [sensor] if width == 1 else [f"{sensor}[{i}]" for i in range(width)]
+def _indexed(name: str, count: int) -> list[str]:
+    """Names of the components of one thing: its own name where there is one, else `<name>[<i>]`."""
+    return [name] if count == 1 else [f"{name}[{i}]" for i in range(count)]

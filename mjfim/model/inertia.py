@@ -1,7 +1,7 @@
-"""Inertial parameters of a body in three charts: central (MuJoCo's), barycentric, log-Cholesky. Arrays only.
+"""The ten inertial parameters of a body in three parametrisations: central (MuJoCo's), barycentric and log-Cholesky.
 
-The pseudo-inertia `J = [[S, h], [h', m]]` holds the second moments S, the first moments h = m c and the mass about the body
-frame's origin; `I = tr(S) 1 - S`. A body is physical when J is positive definite, which `J = U U'` with
+The pseudo-inertia `J = [[S, h], [h', m]]` holds the second moments S, the first moments h = m c and the mass m about the
+origin of the body frame; `I = tr(S) 1 - S`. A body is physical when J is positive definite. `J = U U'` with
 `U = e^alpha [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]]` always is
 (Rucker & Wensing, Smooth parameterization of rigid-body inertia, RA-L 2022).
 """
@@ -16,143 +16,198 @@ from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
 
-PAIRS = (
-    (0, 0),
-    (1, 1),
-    (2, 2),
-    (0, 1),
-    (0, 2),
-    (1, 2),
-)  # xx yy zz xy xz yz, MJCF's order of fullinertia
+# Entries (row, column) of an inertia matrix in MJCF's order of `fullinertia`: xx yy zz xy xz yz.
+INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+# Rows and columns of these entries, (6,) each, for indexing a matrix.
+INERTIA_ROWS, INERTIA_COLUMNS = np.array(INERTIA_ENTRIES).T
+
+# Smallest over largest second moment per mass, up to which a body counts as a point, a rod or a plate.
+DEGENERATE_RATIO = 1e-9
 
 
-INERTIA_ROWS, INERTIA_COLUMNS = np.array(PAIRS).T
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BodyInertia:
+    """Mass, centre of mass and inertia of a rigid body, in the axes of the body frame.
 
-
-DEGENERATE = 1e-9
-
-
-@dataclass(frozen=True, eq=False)
-class Inertial:
-    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) about it [kg m²], in the axes of the body frame."""
+    Attributes:
+        mass: Mass [kg].
+        com: (3,) centre of mass [m].
+        inertia: (3, 3) inertia about the centre of mass [kg m²].
+    """
 
     mass: float
     com: Array
     inertia: Array
 
     @staticmethod
-    def principal(mass: float, com: Array, moments: Array, quaternion: Array) -> Inertial:
-        """From MuJoCo's principal moments (3,) and their frame (w, x, y, z)."""
-        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-        return Inertial(float(mass), np.array(com), R * np.asarray(moments) @ R.T)
+    def from_principal(mass: float, com: Array, moments: Array, quaternion: Array) -> BodyInertia:
+        """From MuJoCo's principal moments.
 
-    def axes(self) -> tuple[Array, Array]:
-        """Principal moments (3,), descending, and their frame as a quaternion (w, x, y, z)."""
+        Args:
+            mass: Mass [kg].
+            com: (3,) centre of mass [m].
+            moments: (3,) principal moments [kg m²].
+            quaternion: (4,) orientation (w, x, y, z) of the principal axes in the body frame.
+        """
+        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+        inertia = R * np.asarray(moments) @ R.T
+        return BodyInertia(mass=float(mass), com=np.array(com), inertia=inertia)
+
+    def principal_axes(self) -> tuple[Array, Array]:
+        """Principal moments (3,) [kg m²], descending, and the quaternion (w, x, y, z) of their right-handed axes."""
         moments, R = np.linalg.eigh(self.inertia)
-        moments, R = moments[::-1], R[:, ::-1]
+        moments = moments[::-1]
+        R = R[:, ::-1]
+
         if np.linalg.det(R) < 0.0:
             R = R * np.array([1.0, 1.0, -1.0])
+
         return moments, Rotation.from_matrix(R).as_quat(scalar_first=True)
 
     @property
-    def second(self) -> Array:
-        """(3, 3) central second moments, `tr(I)/2 1 - I` [kg m²]."""
+    def second_moments(self) -> Array:
+        """(3, 3) second moments about the centre of mass, `tr(I)/2 1 - I` [kg m²]."""
         return np.asarray(0.5 * np.trace(self.inertia) * np.eye(3) - self.inertia)
 
     @property
-    def radius(self) -> float:
-        """Radius of gyration about the body frame's origin [m]."""
-        return float(np.sqrt(np.trace(self.second) / self.mass + self.com @ self.com))
+    def gyration_radius(self) -> float:
+        """Radius of gyration about the origin of the body frame [m]."""
+        central = np.trace(self.second_moments) / self.mass
+        return float(np.sqrt(central + self.com @ self.com))
 
 
-def central(body: Inertial) -> Array:
-    """(10,) mass, centre of mass, fullinertia about it."""
-    return np.concatenate([[body.mass], body.com, body.inertia[INERTIA_ROWS, INERTIA_COLUMNS]])
+def to_central(body: BodyInertia) -> Array:
+    """(10,) mass, centre of mass, `fullinertia` about it."""
+    return np.concatenate([[body.mass], body.com, _entries(body.inertia)])
 
 
-def from_central(v: Array) -> Inertial:
-    """Inverse of `central`."""
-    return Inertial(float(v[0]), np.array(v[1:4]), _symmetric(v[4:]))
-
-
-def barycentric(body: Inertial) -> Array:
-    """(10,) mass, first moments m c, inertia about the body frame's origin: the dynamics are linear in them."""
-    about = body.inertia + body.mass * (
-        body.com @ body.com * np.eye(3) - np.outer(body.com, body.com)
+def from_central(values: Array) -> BodyInertia:
+    """Inverse of `to_central`. values: (10,)."""
+    return BodyInertia(
+        mass=float(values[0]), com=np.array(values[1:4]), inertia=_symmetric(values[4:])
     )
-    return np.concatenate([[body.mass], body.mass * body.com, about[INERTIA_ROWS, INERTIA_COLUMNS]])
 
 
-def from_barycentric(v: Array) -> Inertial:
-    """Inverse of `barycentric`."""
-    mass, com = float(v[0]), v[1:4] / v[0]
-    about = _symmetric(v[4:])
-    return Inertial(mass, com, about - mass * (com @ com * np.eye(3) - np.outer(com, com)))
+def to_barycentric(body: BodyInertia) -> Array:
+    """(10,) mass, first moments m c, inertia about the origin of the body frame; the dynamics are linear in them."""
+    about_origin = body.inertia + _steiner(body.mass, body.com)
+    return np.concatenate([[body.mass], body.mass * body.com, _entries(about_origin)])
 
 
-def logcholesky(body: Inertial) -> Array:
-    """(10,) alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3. Raises ValueError where the body is a point, a rod or a plate."""
-    per_mass = body.second / body.mass
+def from_barycentric(values: Array) -> BodyInertia:
+    """Inverse of `to_barycentric`. values: (10,)."""
+    mass = float(values[0])
+    com = values[1:4] / values[0]
+    inertia = _symmetric(values[4:]) - _steiner(mass, com)
+    return BodyInertia(mass=mass, com=com, inertia=inertia)
+
+
+def to_logcholesky(body: BodyInertia) -> Array:
+    """(10,) alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3.
+
+    Raises:
+        ValueError: The body is a point, a rod or a plate, whose pseudo-inertia is singular.
+    """
+    per_mass = body.second_moments / body.mass
     spread = np.linalg.eigvalsh(per_mass)
-    if not spread[0] > DEGENERATE * max(spread[2], 1e-300):
+    if not spread[0] > DEGENERATE_RATIO * max(spread[2], 1e-300):
         raise ValueError(
             "its inertia is that of a point, a rod or a plate (two principal moments add up to the third)"
         )
+
+    # An upper triangular factor, U U' = per_mass, is the flipped Cholesky factor of the flipped matrix.
     flipped = np.linalg.cholesky(per_mass[::-1, ::-1])
-    U = flipped[::-1, ::-1]  # upper triangular, U U' = per_mass
+    U = flipped[::-1, ::-1]
+
+    alpha = 0.5 * np.log(body.mass)
     d = np.log(np.diag(U))
-    return np.concatenate([[0.5 * np.log(body.mass)], d, [U[0, 1], U[1, 2], U[0, 2]], body.com])
+    s = [U[0, 1], U[1, 2], U[0, 2]]
+    return np.concatenate([[alpha], d, s, body.com])
 
 
-def from_logcholesky(v: Array) -> Inertial:
-    """Inverse of `logcholesky`; physical for every v."""
-    U = np.diag(np.exp(v[1:4]))
-    U[0, 1], U[1, 2], U[0, 2] = v[4], v[5], v[6]
-    mass = float(np.exp(2.0 * v[0]))
-    second = mass * (U @ U.T)
-    return Inertial(mass, np.array(v[7:]), np.trace(second) * np.eye(3) - second)
+def from_logcholesky(values: Array) -> BodyInertia:
+    """Inverse of `to_logcholesky`; physical for every values: (10,)."""
+    U = np.diag(np.exp(values[1:4]))
+    U[0, 1] = values[4]
+    U[1, 2] = values[5]
+    U[0, 2] = values[6]
+
+    mass = float(np.exp(2.0 * values[0]))
+    second_moments = mass * (U @ U.T)
+    inertia = np.trace(second_moments) * np.eye(3) - second_moments
+    return BodyInertia(mass=mass, com=np.array(values[7:]), inertia=inertia)
 
 
-def _symmetric(v: Array) -> Array:
-    out = np.empty((3, 3))
-    out[INERTIA_ROWS, INERTIA_COLUMNS] = out[INERTIA_COLUMNS, INERTIA_ROWS] = v
-    return out
+def _entries(matrix: Array) -> Array:
+    """(6,) entries xx yy zz xy xz yz of a symmetric matrix (3, 3)."""
+    return np.asarray(matrix[INERTIA_ROWS, INERTIA_COLUMNS])
 
 
-@dataclass(frozen=True)
+def _symmetric(entries: Array) -> Array:
+    """(3, 3) symmetric matrix of its entries (6,) xx yy zz xy xz yz."""
+    matrix = np.empty((3, 3))
+    matrix[INERTIA_ROWS, INERTIA_COLUMNS] = entries
+    matrix[INERTIA_COLUMNS, INERTIA_ROWS] = entries
+    return matrix
+
+
+def _steiner(mass: float, com: Array) -> Array:
+    """(3, 3) inertia [kg m²] about the origin of a point mass [kg] at com: (3,) [m], by the parallel axis theorem."""
+    return np.asarray(mass * (com @ com * np.eye(3) - np.outer(com, com)))
+
+
+@dataclass(frozen=True, kw_only=True)
 class InertiaParametrisation:
-    """Ten coordinates of a body's inertia: their names and units, and the way there and back."""
+    """Ten coordinates that describe the inertia of a body.
+
+    Attributes:
+        names: Names of the ten coordinates.
+        units: Their units.
+        coordinates: (10,) coordinates of a body's inertia.
+        inertia: Inverse of `coordinates`.
+    """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    of: Callable[[Inertial], Array]
-    back: Callable[[Array], Inertial]
+    coordinates: Callable[[BodyInertia], Array]
+    inertia: Callable[[Array], BodyInertia]
 
-    def size(self, body: Inertial) -> Array:
-        """(10,) magnitudes that a change of each coordinate is naturally compared with."""
-        m, r = body.mass, body.radius
-        powers = {"kg": m, "kg m": m * r, "kg m²": m * r**2, "m": r, "": 1.0}
-        return np.array([powers[unit] for unit in self.units])
+    def magnitudes(self, body: BodyInertia) -> Array:
+        """(10,) sizes with which a change of each coordinate is naturally compared [unit of the coordinate]."""
+        mass = body.mass
+        radius = body.gyration_radius
+        by_unit = {
+            "kg": mass,
+            "kg m": mass * radius,
+            "kg m²": mass * radius**2,
+            "m": radius,
+            "": 1.0,
+        }
+        return np.array([by_unit[unit] for unit in self.units])
 
 
-TENSOR = ("xx", "yy", "zz", "xy", "xz", "yz")
+# Names of the six entries of an inertia matrix, in the order of INERTIA_ENTRIES.
+ENTRY_NAMES = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+# All parametrisations by the name that experiment files and parameter paths use.
 INERTIA_PARAMETRISATIONS = {
     "central": InertiaParametrisation(
-        ("mass", "cx", "cy", "cz", *(f"I{t}" for t in TENSOR)),
-        ("kg", "m", "m", "m", *["kg m²"] * 6),
-        central,
-        from_central,
+        names=("mass", "cx", "cy", "cz", *(f"I{entry}" for entry in ENTRY_NAMES)),
+        units=("kg", "m", "m", "m", *["kg m²"] * 6),
+        coordinates=to_central,
+        inertia=from_central,
     ),
     "barycentric": InertiaParametrisation(
-        ("mass", "mx", "my", "mz", *(f"J{t}" for t in TENSOR)),
-        ("kg", "kg m", "kg m", "kg m", *["kg m²"] * 6),
-        barycentric,
-        from_barycentric,
+        names=("mass", "mx", "my", "mz", *(f"J{entry}" for entry in ENTRY_NAMES)),
+        units=("kg", "kg m", "kg m", "kg m", *["kg m²"] * 6),
+        coordinates=to_barycentric,
+        inertia=from_barycentric,
     ),
     "logcholesky": InertiaParametrisation(
-        ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3"),
-        ("", "", "", "", "m", "m", "m", "m", "m", "m"),
-        logcholesky,
-        from_logcholesky,
+        names=("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3"),
+        units=("", "", "", "", *["m"] * 6),
+        coordinates=to_logcholesky,
+        inertia=from_logcholesky,
     ),
 }

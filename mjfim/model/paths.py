@@ -1,15 +1,24 @@
-"""Parameter paths, `kind/name:field[index]` with MuJoCo's own field names, and the slots that they lead to."""
+"""Parameter paths `kind/name:field[index]` with MuJoCo's field names, and the fields of a model that they lead to."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError, unknown
+from mjfim.model.coordinates import (
+    joint_dofs,
+    tangent_components,
+    tangent_parts,
+    unknown_coordinate,
+)
+from mjfim.model.elements import identifier, names_of, unnamed_count
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.targets import (
     InertiaField,
     InitialStateField,
@@ -20,22 +29,15 @@ from mjfim.model.targets import (
     SpecField,
     TargetField,
 )
+from mjfim.model.units import ANGLE, FIELD_UNITS, JOINT_FIELD_UNITS, LENGTH
 
-PATH = re.compile(r"^(?P<kind>\w+)(?:/(?P<name>.+))?:(?P<field>\w+)(?:\[(?P<index>\d+)\])?$")
-OBJECTS = {
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-    "joint": mujoco.mjtObj.mjOBJ_JOINT,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "site": mujoco.mjtObj.mjOBJ_SITE,
-    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
-    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
-}
+# A parameter path: kind, name (absent for options and the delay), field, and an index or the part of a joint.
+PATH_PATTERN = re.compile(
+    r"^(?P<kind>\w+)(?:/(?P<name>.+))?:(?P<field>\w+)(?:\[(?P<index>\d+)\]|\.(?P<part>\w+))?$"
+)
 
-
-COUNTS = {"joint": "njnt", "actuator": "nactuator"}
-# Path field -> array of MjModel. A joint's dof fields are written to each of its degrees of freedom.
-FIELDS: dict[str, dict[str, str]] = {
+# Kind -> field of a path -> array of MjModel. The fields of a joint's degrees of freedom are written to each of them.
+MODEL_ARRAYS: dict[str, dict[str, str]] = {
     "body": {
         "mass": "body_mass",
         "pos": "body_pos",
@@ -73,8 +75,7 @@ FIELDS: dict[str, dict[str, str]] = {
     },
 }
 
-
-# Path field -> (chart, first of its coordinates, how many)
+# Field of a body -> (parametrisation of its inertia, first of its coordinates, how many).
 INERTIAL_FIELDS = {
     "fullinertia": ("central", 4, 6),
     "firstmoment": ("barycentric", 1, 3),
@@ -82,204 +83,318 @@ INERTIAL_FIELDS = {
     "logcholesky": ("logcholesky", 0, 10),
 }
 
+# Fields from which the compiler derives others, so that a change needs a compile.
+COMPILED_FIELDS = {"geom": ("size", "pos", "mass", "density")}
 
-COMPILED = {"geom": ("size", "pos", "mass", "density")}
-SERVO = ("kp", "kv")
-START_FIELDS = ("qpos", "qvel", "act")
+# Fields of an actuator that stand for the gains of a position or velocity servo.
+SERVO_FIELDS = ("kp", "kv")
+
+# Fields of the initial state.
+INITIAL_STATE_FIELDS = ("qpos", "qvel", "act")
+
+# Fields of the measurement.
+OUTPUT_FIELDS = ("bias", "delay")
+
+# All kinds of paths.
+KINDS = (*MODEL_ARRAYS, "initial", "output")
 
 
-def names_of(model: Any, kind: str) -> list[str]:
-    """Names of all objects of a kind that have one."""
-    count = getattr(model, COUNTS.get(kind, f"n{kind}"))
-    names = (mujoco.mj_id2name(model, OBJECTS[kind], i) for i in range(count))
-    return [n for n in names if n]
+@dataclass(frozen=True, kw_only=True)
+class ParameterPath:
+    """A parsed parameter path.
+
+    Attributes:
+        text: The path.
+        kind: Kind of the element: `body`, `joint`, `actuator`, `geom`, `site`, `tendon`, `option`, `initial`, `output`.
+        name: Name of the element; empty where the path has none.
+        field: Field of the element.
+        index: Index of the component; None where the path has none.
+        part: Part of a ball or free joint, such as `rx`; empty where the path has none.
+    """
+
+    text: str
+    kind: str
+    name: str
+    field: str
+    index: int | None
+    part: str
+
+    @classmethod
+    def parse(cls, text: str) -> ParameterPath:
+        """Parse a path.
+
+        Raises:
+            ExperimentError: The text is not of the form of a path.
+        """
+        match = PATH_PATTERN.match(text)
+        if match is None:
+            raise ExperimentError(
+                f"parameter path {text!r} is not of the form kind/name:field[index]"
+            )
+        return cls(
+            text=text,
+            kind=match["kind"],
+            name=match["name"] or "",
+            field=match["field"],
+            index=None if match["index"] is None else int(match["index"]),
+            part=match["part"] or "",
+        )
+
+    @property
+    def component(self) -> int:
+        """Index of the component, 0 where the path has none."""
+        return self.index or 0
+
+    def component_of(self, width: int) -> int:
+        """Index of the component among `width` ones.
+
+        Raises:
+            ExperimentError: The index is out of range.
+        """
+        if self.component >= width:
+            raise self.error(f"index {self.component} is out of range; valid: 0 to {width - 1}")
+        return self.component
+
+    def error(self, fault: str) -> ExperimentError:
+        """Exception that names the path and says what is wrong with it."""
+        return ExperimentError(f"in parameter path {self.text!r}: {fault}")
 
 
 def fields_of(kind: str) -> list[str]:
     """Fields that a path of this kind may name."""
-    extra = {
+    further = {
         "body": [*INERTIAL_FIELDS, "rot"],
         "site": ["rot"],
-        "geom": list(COMPILED["geom"]),
-        "actuator": list(SERVO),
-        "initial": list(START_FIELDS),
-        "output": ["bias", "delay"],
+        "geom": list(COMPILED_FIELDS["geom"]),
+        "actuator": list(SERVO_FIELDS),
+        "initial": list(INITIAL_STATE_FIELDS),
+        "output": list(OUTPUT_FIELDS),
     }
-    return [*FIELDS.get(kind, {}), *extra.get(kind, [])]
-
-
-KINDS = (*FIELDS, "initial", "output")
+    return [*MODEL_ARRAYS.get(kind, {}), *further.get(kind, [])]
 
 
 def resolve(
-    model: Any, path: str, outputs: Sequence[str] = (), decoration: Collection[str] = frozenset()
+    model: Any, text: str, outputs: Sequence[str] = (), decoration: Collection[str] = frozenset()
 ) -> TargetField:
-    """What a path leads to. Raises ExperimentError listing the valid kinds, names, fields or indices.
+    """The field that a parameter path leads to.
 
-    outputs: names of the measured columns, which `output/name:bias` may name
-    decoration: geoms that neither collide nor give their body its inertia, and so need no compile
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        text: The path.
+        outputs: Names of the measured columns, which `output/<name>:bias` may name.
+        decoration: Names of geoms that neither collide nor give their body its inertia, whose place and size can be
+            changed without a compile.
+
+    Raises:
+        ExperimentError: The path leads nowhere; the message lists the valid kinds, names, fields or indices.
     """
-    match = PATH.match(path)
-    if match is None:
-        raise ExperimentError(f"parameter path {path!r} is not of the form kind/name:field[index]")
-    kind, name, field = match["kind"], match["name"] or "", match["field"]
-    index = int(match["index"]) if match["index"] else 0
-    if kind not in KINDS:
-        raise ExperimentError(f"in parameter path {path!r}: {unknown('kind', kind, KINDS)}")
-    if field not in fields_of(kind):
-        raise ExperimentError(
-            f"in parameter path {path!r}: {unknown(f'{kind} field', field, fields_of(kind))}"
+    path = ParameterPath.parse(text)
+    if path.kind not in KINDS:
+        raise path.error(unknown("kind", path.kind, KINDS))
+    if path.field not in fields_of(path.kind):
+        raise path.error(unknown(f"{path.kind} field", path.field, fields_of(path.kind)))
+    if path.part and path.kind != "initial":
+        raise path.error(
+            f"only the initial state of a ball or free joint has parts such as '.rx', not {path.kind} {path.field}; "
+            f"write {path.field}[index]"
         )
-    if kind == "option":
-        width = np.size(getattr(model.opt, FIELDS[kind][field]))
-        return ModelField(
-            FIELDS[kind][field], (_checked(path, index, width),), None, in_options=True
-        )
-    if kind == "output":
-        return _output(path, name, field, outputs)
-    if kind == "initial":
-        return _initial(model, path, name, field, index)
-    ident = mujoco.mj_name2id(model, OBJECTS[kind], name)
-    if ident < 0:
-        raise ExperimentError(
-            f"in parameter path {path!r}: {unknown(kind, name, names_of(model, kind))}{_nameless(model, kind)}"
-        )
-    if field in INERTIAL_FIELDS:
-        chart, first, width = INERTIAL_FIELDS[field]
-        if not float(model.body_mass[ident]) > 0.0:
-            raise ExperimentError(f"in parameter path {path!r}: body {name!r} has no mass")
-        return InertiaField(ident, chart, first + _checked(path, index, width))
-    if field == "rot":
-        return RotationField(f"{kind}_quat", ident, _checked(path, index, 3))
-    if field in COMPILED.get(kind, ()):
-        index = _checked(path, index, 3 if field in ("size", "pos") else 1)
-        if field == "size" and int(model.geom_dataid[ident]) >= 0:
-            raise ExperimentError(
-                f"in parameter path {path!r}: the size of a mesh or height field is not a number of the geom"
-            )
-        plain = field in ("size", "pos") and name in decoration
-        return (
-            ModelField(f"geom_{field}", (ident,), index)
-            if plain
-            else SpecField(kind, name, field, index)
-        )
-    if field in SERVO and kind == "actuator":
-        return _servo(model, path, ident, field)
-    return _plain(model, path, kind, field, ident, index)
+
+    if path.kind == "option":
+        return _option_field(model, path)
+    if path.kind == "output":
+        return _output_field(path, outputs)
+    if path.kind == "initial":
+        return _initial_state_field(model, path)
+    return _element_field(model, path, decoration)
 
 
-def _nameless(model: Any, kind: str) -> str:
-    """A hint where objects have no name."""
-    nameless = int(getattr(model, COUNTS.get(kind, f"n{kind}"))) - len(names_of(model, kind))
-    return f"; {nameless} more have no name: give them one in the MJCF" if nameless else ""
+def unit_of(model: Any, text: str) -> str:
+    """Unit of the number that a valid path names; empty where it has none or depends on the model (gains, tendons)."""
+    path = ParameterPath.parse(text)
+
+    if path.field in INERTIAL_FIELDS:
+        parametrisation, first, _ = INERTIAL_FIELDS[path.field]
+        return INERTIA_PARAMETRISATIONS[parametrisation].units[first + path.component]
+
+    if path.kind == "initial":
+        # An index [0] may stand on coordinates that have one component.
+        plain = text.removesuffix("[0]")
+        return next((c.unit for c in tangent_components(model) if c.path == plain), "")
+
+    if path.kind == "joint":
+        joint = identifier(model, "joint", path.name)
+        # One number holds for all coordinates of a ball or free joint: it is labelled as that of a rotation.
+        slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
+        return JOINT_FIELD_UNITS.get(path.field, {}).get(LENGTH if slides else ANGLE, "")
+
+    return FIELD_UNITS.get(path.field, "")
 
 
-def _plain(model: Any, path: str, kind: str, field: str, ident: int, index: int) -> ModelField:
-    array = FIELDS[kind][field]
-    holder = getattr(model, array)
-    column = _checked(path, index, holder.shape[1]) if holder.ndim == 2 else None
-    if holder.ndim == 1:
-        _checked(path, index, 1)
-    if field == "springlength" and not path.endswith("]") and holder[ident, 0] == holder[ident, 1]:
-        return ModelField(
-            array, (ident,), 0, also=((array, ident, 1, 1.0),)
-        )  # a rest length, not a range
-    return ModelField(array, _rows(model, array, ident, path), column)
+def _option_field(model: Any, path: ParameterPath) -> ModelField:
+    """A number of the model's options, such as gravity."""
+    array = MODEL_ARRAYS["option"][path.field]
+    width = int(np.size(getattr(model.opt, array)))
+    return ModelField(array=array, rows=(path.component_of(width),), in_options=True)
 
 
-def _servo(model: Any, path: str, ident: int, field: str) -> ModelField:
-    """Gain of a position or velocity servo together with its bias: kp moves gainprm[0] and biasprm[1], kv biasprm[2]."""
-    gain, bias = float(model.actuator_gainprm[ident, 0]), model.actuator_biasprm[ident]
-    kinds = (int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_SO3))
-    affine = int(model.actuator_biastype[ident]) in kinds
-    if int(model.actuator_gaintype[ident]) == int(
-        mujoco.mjtGain.mjGAIN_PID
-    ):  # its own gain is the integral one
-        return ModelField("actuator_biasprm", (ident,), {"kp": 1, "kv": 2}[field], factor=-1.0)
-    if affine and field == "kp" and gain != 0.0 and bias[1] == -gain:
-        return ModelField(
-            "actuator_gainprm", (ident,), 0, also=(("actuator_biasprm", ident, 1, -1.0),)
-        )
-    if (
-        affine and field == "kv" and gain != 0.0 and bias[1] == 0.0 and bias[2] == -gain
-    ):  # a velocity servo
-        return ModelField(
-            "actuator_gainprm", (ident,), 0, also=(("actuator_biasprm", ident, 2, -1.0),)
-        )
-    if affine and field == "kv" and bias[1] == -gain:
-        return ModelField("actuator_biasprm", (ident,), 2, factor=-1.0)
-    raise ExperimentError(
-        f"in parameter path {path!r}: the actuator is no {'position' if field == 'kp' else 'position or velocity'} servo; "
-        "use gainprm[i] and biasprm[i]"
-    )
-
-
-def _output(path: str, name: str, field: str, outputs: Sequence[str]) -> TargetField:
-    if field == "delay":
-        if name:
-            raise ExperimentError(
-                f"in parameter path {path!r}: one delay lags all outputs; write 'output:delay'"
-            )
+def _output_field(path: ParameterPath, outputs: Sequence[str]) -> TargetField:
+    """Bias of one output, or the delay of all. outputs: names of the measured columns."""
+    if path.field == "delay":
+        if path.name:
+            raise path.error("one delay lags all outputs; write 'output:delay'")
         return OutputDelayField()
-    if name not in outputs:
-        raise ExperimentError(
-            f"in parameter path {path!r}: {unknown('output', name, list(outputs))}"
+
+    if path.name not in outputs:
+        raise path.error(unknown("output", path.name, list(outputs)))
+    return OutputBiasField(list(outputs).index(path.name))
+
+
+def _initial_state_field(model: Any, path: ParameterPath) -> InitialStateField:
+    """Deviation of a coordinate, velocity or activation of the initial state."""
+    if path.field == "act":
+        return _initial_activation_field(model, path)
+
+    joint = identifier(model, "joint", path.name)
+    if joint < 0:
+        raise path.error(unknown("joint", path.name, names_of(model, "joint")))
+
+    parts = tangent_parts(model, joint)
+    if parts:
+        written = [f"initial/{path.name}:{path.field}.{part}" for part in parts]
+        if path.text not in written:
+            raise path.error(unknown_coordinate("coordinate", path.text, written))
+        k = written.index(path.text)
+    elif path.part:
+        raise path.error(
+            f"a slide or hinge joint has no parts; write 'initial/{path.name}:{path.field}'"
         )
-    return OutputBiasField(list(outputs).index(name))
+    else:
+        k = path.component_of(1)
+
+    first = int(model.jnt_dofadr[joint])
+    return InitialStateField(first + k + (model.nv if path.field == "qvel" else 0))
 
 
-def _initial(model: Any, path: str, name: str, field: str, index: int) -> TargetField:
-    """Place of a start component in the tangent space (dq, dv, da)."""
-    if field == "act":
-        ident = mujoco.mj_name2id(model, OBJECTS["actuator"], name)
-        count = int(model.actuator_actnum[ident]) if ident >= 0 else 0
-        if count == 0:
-            stateful = [
-                n
-                for n in names_of(model, "actuator")
-                if model.actuator_actnum[model.actuator(n).id]
-            ]
-            raise ExperimentError(
-                f"in parameter path {path!r}: {unknown('actuator with a state', name, stateful)}"
-            )
-        return InitialStateField(
-            2 * model.nv + int(model.actuator_actadr[ident]) + _checked(path, index, count)
-        )
-    ident = mujoco.mj_name2id(model, OBJECTS["joint"], name)
-    if ident < 0:
-        raise ExperimentError(
-            f"in parameter path {path!r}: {unknown('joint', name, names_of(model, 'joint'))}"
-        )
-    dof = int(model.jnt_dofadr[ident]) + _checked(path, index, joint_width(model, ident))
-    return InitialStateField(dof + (model.nv if field == "qvel" else 0))
+def _initial_activation_field(model: Any, path: ParameterPath) -> InitialStateField:
+    """Deviation of an activation of the initial state."""
+    actuator = identifier(model, "actuator", path.name)
+    count = int(model.actuator_actnum[actuator]) if actuator >= 0 else 0
+    if count == 0:
+        with_state = [
+            name
+            for name in names_of(model, "actuator")
+            if model.actuator_actnum[model.actuator(name).id]
+        ]
+        raise path.error(unknown("actuator with a state", path.name, with_state))
+    if path.part:
+        raise path.error("an activation has no parts; write act[index]")
+
+    first = 2 * model.nv + int(model.actuator_actadr[actuator])
+    return InitialStateField(first + path.component_of(count))
 
 
-def joint_width(model: Any, joint: int) -> int:
-    """Degrees of freedom of a joint."""
-    return {int(mujoco.mjtJoint.mjJNT_FREE): 6, int(mujoco.mjtJoint.mjJNT_BALL): 3}.get(
-        int(model.jnt_type[joint]), 1
-    )
+def _element_field(model: Any, path: ParameterPath, decoration: Collection[str]) -> TargetField:
+    """A number of an element of the model."""
+    number = identifier(model, path.kind, path.name)
+    if number < 0:
+        fault = unknown(path.kind, path.name, names_of(model, path.kind))
+        unnamed = unnamed_count(model, path.kind)
+        hint = f"; {unnamed} more have no name: give them one in the MJCF" if unnamed else ""
+        raise path.error(f"{fault}{hint}")
+
+    if path.field in INERTIAL_FIELDS:
+        parametrisation, first, width = INERTIAL_FIELDS[path.field]
+        if not float(model.body_mass[number]) > 0.0:
+            raise path.error(f"body {path.name!r} has no mass")
+        return InertiaField(number, parametrisation, first + path.component_of(width))
+
+    if path.field == "rot":
+        return RotationField(f"{path.kind}_quat", number, path.component_of(3))
+
+    if path.field in COMPILED_FIELDS.get(path.kind, ()):
+        return _geom_field(model, path, number, decoration)
+
+    if path.kind == "actuator" and path.field in SERVO_FIELDS:
+        return _servo_field(model, path, number)
+
+    return _array_field(model, path, number)
 
 
-def _checked(path: str, index: int, width: int) -> int:
-    if index >= width:
-        raise ExperimentError(
-            f"in parameter path {path!r}: index {index} is out of range; valid: 0 to {width - 1}"
-        )
-    return index
+def _geom_field(
+    model: Any, path: ParameterPath, geom: int, decoration: Collection[str]
+) -> TargetField:
+    """Place, size, mass or density of a geom: it needs a compile unless the geom is decoration."""
+    index = path.component_of(3 if path.field in ("size", "pos") else 1)
+    if path.field == "size" and int(model.geom_dataid[geom]) >= 0:
+        raise path.error("the size of a mesh or height field is not a number of the geom")
+
+    if path.field in ("size", "pos") and path.name in decoration:
+        return ModelField(array=f"geom_{path.field}", rows=(geom,), column=index)
+    return SpecField(path.kind, path.name, path.field, index)
 
 
-def _rows(model: Any, array: str, ident: int, path: str) -> tuple[int, ...]:
+def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
+    """Gain of a position or velocity servo together with its bias: kp moves gainprm[0] and biasprm[1], kv biasprm[2]."""
+    gain = float(model.actuator_gainprm[actuator, 0])
+    bias = model.actuator_biasprm[actuator]
+    rows = (actuator,)
+
+    # The gain of a PID actuator itself is the integral one; kp and kv stand in its bias.
+    if int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_PID):
+        column = {"kp": 1, "kv": 2}[path.field]
+        return ModelField(array="actuator_biasprm", rows=rows, column=column, factor=-1.0)
+
+    affine_types = (int(mujoco.mjtBias.mjBIAS_AFFINE), int(mujoco.mjtBias.mjBIAS_SO3))
+    affine = int(model.actuator_biastype[actuator]) in affine_types
+    position_servo = affine and bias[1] == -gain
+    velocity_servo = affine and gain != 0.0 and bias[1] == 0.0 and bias[2] == -gain
+
+    if path.field == "kp" and position_servo and gain != 0.0:
+        follower = ("actuator_biasprm", actuator, 1, -1.0)
+        return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))
+    if path.field == "kv" and velocity_servo:
+        follower = ("actuator_biasprm", actuator, 2, -1.0)
+        return ModelField(array="actuator_gainprm", rows=rows, column=0, followers=(follower,))
+    if path.field == "kv" and position_servo:
+        return ModelField(array="actuator_biasprm", rows=rows, column=2, factor=-1.0)
+
+    wanted = "position" if path.field == "kp" else "position or velocity"
+    raise path.error(f"the actuator is no {wanted} servo; use gainprm[i] and biasprm[i]")
+
+
+def _array_field(model: Any, path: ParameterPath, number: int) -> ModelField:
+    """A number of an array of MjModel."""
+    array = MODEL_ARRAYS[path.kind][path.field]
+    holder = getattr(model, array)
+
+    column = None
+    if holder.ndim == 2:
+        column = path.component_of(holder.shape[1])
+    else:
+        path.component_of(1)
+
+    # A rest length without an index stands for both ends of the range where these are equal.
+    one_length = path.field == "springlength" and holder[number, 0] == holder[number, 1]
+    if one_length and path.index is None:
+        follower = (array, number, 1, 1.0)
+        return ModelField(array=array, rows=(number,), column=0, followers=(follower,))
+
+    return ModelField(array=array, rows=_rows(model, array, number, path), column=column)
+
+
+def _rows(model: Any, array: str, number: int, path: ParameterPath) -> tuple[int, ...]:
+    """Rows of an array that belong to an element: several for degrees of freedom and force outputs."""
     if array.startswith("dof_"):
-        first = int(model.jnt_dofadr[ident])
-        return tuple(range(first, first + joint_width(model, ident)))
+        first = int(model.jnt_dofadr[number])
+        return tuple(range(first, first + joint_dofs(model, number)))
+
     if array == "qpos_spring":
-        if int(model.jnt_type[ident]) < 2:
-            raise ExperimentError(
-                f"in parameter path {path!r}: springref exists on slide and hinge joints only"
-            )
-        return (int(model.jnt_qposadr[ident]),)
-    if array == "actuator_gear":  # one row per force output
-        first = int(model.actuator_outadr[ident])
-        return tuple(range(first, first + int(model.actuator_outnum[ident])))
-    return (ident,)
+        if joint_dofs(model, number) > 1:
+            raise path.error("springref exists on slide and hinge joints only")
+        return (int(model.jnt_qposadr[number]),)
+
+    if array == "actuator_gear":
+        first = int(model.actuator_outadr[number])
+        return tuple(range(first, first + int(model.actuator_outnum[number])))
+
+    return (number,)

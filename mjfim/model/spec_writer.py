@@ -9,62 +9,72 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.model.paths import INERTIAL_FIELDS, PATH, SERVO
+from mjfim.model.paths import INERTIAL_FIELDS, SERVO_FIELDS, ParameterPath
 
-INERTIAL = ("mass", "ipos", "inertia", *INERTIAL_FIELDS)
+# Fields of a body that need its inertia to be stated in the spec.
+INERTIA_FIELDS = ("mass", "ipos", "inertia", *INERTIAL_FIELDS)
 
 
-def write_element(spec: Any, compiled: Any, wanted: Any, path: str, value: float) -> None:
-    """Write what a path names into an MjSpec that the caller owns.
+def write_element(spec: Any, compiled: Any, wanted: Any, text: str, value: float) -> None:
+    """Write what a path names into an MjSpec that the caller owns, in place.
 
-    compiled: the model of the same spec; a body whose inertia came from geoms gets it spelled out before it is changed
-    wanted: the model at the values, from which inertias and orientations are taken as a whole
+    Args:
+        spec: The spec (`mujoco.MjSpec`).
+        compiled: The model of this spec. A body whose inertia came from geoms gets it stated before it is changed.
+        wanted: The model at the values, from which inertias and orientations are taken as a whole.
+        text: The parameter path. Paths of the initial state and of the measurement write nothing.
+        value: The value of the number.
+
+    Raises:
+        ExperimentError: The element cannot be moved in the spec.
     """
-    match = PATH.match(path)
-    if match is None:
-        raise ValueError(f"parameter path {path!r} is not of the form kind/name:field[index]")
-    kind, name, field, index = (
-        match["kind"],
-        match["name"],
-        match["field"],
-        int(match["index"] or 0),
-    )
-    if kind in ("initial", "output"):
+    path = ParameterPath.parse(text)
+    if path.kind in ("initial", "output"):
         return
-    element = spec.option if kind == "option" else getattr(spec, kind)(name)
-    if field in ("pos", "rot") and element.frame is not None:
-        leave_frame(element, getattr(compiled, kind)(name), path)
-    if field in INERTIAL_FIELDS:
-        spell_out_inertia(element, wanted)
-    elif field == "rot":
+
+    element = spec.option if path.kind == "option" else getattr(spec, path.kind)(path.name)
+    if path.field in ("pos", "rot") and element.frame is not None:
+        leave_frame(element, getattr(compiled, path.kind)(path.name), text)
+
+    if path.field in INERTIAL_FIELDS:
+        state_inertia(element, wanted)
+    elif path.field == "rot":
         element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-        element.quat = getattr(wanted, kind)(name).quat
-    elif field in SERVO and kind == "actuator":
-        element.gainprm, element.biasprm = (
-            wanted.actuator_gainprm[element.id],
-            wanted.actuator_biasprm[element.id],
-        )
-    elif field == "springlength":  # one rest length may stand for both ends of the range
+        element.quat = getattr(wanted, path.kind)(path.name).quat
+    elif path.kind == "actuator" and path.field in SERVO_FIELDS:
+        element.gainprm = wanted.actuator_gainprm[element.id]
+        element.biasprm = wanted.actuator_biasprm[element.id]
+    elif path.field == "springlength":
+        # One rest length may stand for both ends of the range.
         element.springlength = wanted.tendon_lengthspring[element.id]
     else:
-        if kind == "body" and field in INERTIAL and not element.explicitinertial:
-            spell_out_inertia(element, compiled)
-        if kind == "geom" and np.isfinite(element.fromto[0]):
-            spell_out_geom(element, compiled)
-        if (
-            kind == "geom" and field == "pos" and element.meshname
-        ):  # the compiler adds the mesh's own offset
-            value += float(element.pos[index] - compiled.geom(name).pos[index])
-        if (
-            field == "springref"
-            and element.type == mujoco.mjtJoint.mjJNT_HINGE
-            and spec.compiler.degree
-        ):
-            value = float(np.rad2deg(value))
-        _assign(element, field, index, value)
+        _write_number(spec, compiled, element, path, value)
+
+
+def _write_number(
+    spec: Any, compiled: Any, element: Any, path: ParameterPath, value: float
+) -> None:
+    """Write a number that the spec holds under the name of the path's field."""
+    if path.kind == "body" and path.field in INERTIA_FIELDS and not element.explicitinertial:
+        state_inertia(element, compiled)
+
+    if path.kind == "geom" and np.isfinite(element.fromto[0]):
+        state_geom(element, compiled)
+
+    # The compiler adds the offset of a mesh to the position.
+    if path.kind == "geom" and path.field == "pos" and element.meshname:
+        index = path.component
+        value += float(element.pos[index] - compiled.geom(path.name).pos[index])
+
+    in_degrees = spec.compiler.degree and path.field == "springref"
+    if in_degrees and element.type == mujoco.mjtJoint.mjJNT_HINGE:
+        value = float(np.rad2deg(value))
+
+    _assign(element, path.field, path.component, value)
 
 
 def _assign(element: Any, field: str, index: int, value: float) -> None:
+    """Set a field of an element of a spec: the scalar, or one entry of the array."""
     old = np.array(getattr(element, field), dtype=np.float64)
     if old.ndim:
         old[index] = value
@@ -73,63 +83,83 @@ def _assign(element: Any, field: str, index: int, value: float) -> None:
         setattr(element, field, value)
 
 
-def leave_frame(element: Any, found: Any, path: str) -> None:
-    """Say an element's place in its body's coordinates instead of those of a `<frame>`. found: it in the compiled model."""
+def leave_frame(element: Any, found: Any, text: str) -> None:
+    """Give the place of an element in the coordinates of its body instead of those of a `<frame>`.
+
+    Args:
+        element: The element of the spec, changed in place.
+        found: The element in the compiled model.
+        text: The parameter path, for the message.
+
+    Raises:
+        ExperimentError: The element is a mesh geom.
+    """
     if getattr(element, "meshname", ""):
         raise ExperimentError(
-            f"{path!r}: a mesh inside a <frame> cannot be moved; take the geom out of the frame"
+            f"{text!r}: a mesh inside a <frame> cannot be moved; take the geom out of the frame"
         )
     element.set_frame(element.parent.add_frame())
-    element.pos, element.quat, element.alt.type = (
-        found.pos,
-        found.quat,
-        mujoco.mjtOrientation.mjORIENTATION_QUAT,
-    )
+    element.pos = found.pos
+    element.quat = found.quat
+    element.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
-def spell_out_inertia(body: Any, compiled: Any) -> None:
-    """Give a body of a spec the inertia that it has in a model."""
+def state_inertia(body: Any, compiled: Any) -> None:
+    """State in a body of a spec the inertia that it has in a model."""
     found = compiled.body(body.id)
-    body.mass, body.ipos, body.iquat, body.inertia = (
-        float(found.mass[0]),
-        found.ipos,
-        found.iquat,
-        found.inertia,
-    )
-    body.fullinertia, body.explicitinertial = np.full(6, np.nan), True
+    body.mass = float(found.mass[0])
+    body.ipos = found.ipos
+    body.iquat = found.iquat
+    body.inertia = found.inertia
+    body.fullinertia = np.full(6, np.nan)
+    body.explicitinertial = True
 
 
-def spell_out_geom(geom: Any, compiled: Any) -> None:
-    """Replace a geom's end points by the place and size that they compile to."""
+def state_geom(geom: Any, compiled: Any) -> None:
+    """Replace the end points of a geom of a spec by the place and size that they compile to."""
     found = compiled.geom(geom.id)
     geom.fromto = np.full(6, np.nan)
-    geom.pos, geom.quat, geom.size = found.pos, found.quat, found.size
+    geom.pos = found.pos
+    geom.quat = found.quat
+    geom.size = found.size
 
 
-def settle(spec: Any, compiled: Any) -> None:
-    """Spell out what the compiler would resolve anew from the changed values: inertias, springs, servo gains, end points."""
+def state_derived_values(spec: Any, compiled: Any) -> None:
+    """State in a spec what the compiler would derive anew from changed values.
+
+    These are inertias, springs, servo gains and end points.
+
+    Args:
+        spec: The spec, changed in place.
+        compiled: The model from which the values are taken.
+    """
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     spec.compiler.settotalmass = -1.0
+
     for body in spec.bodies[1:]:
-        spell_out_inertia(body, compiled)
+        state_inertia(body, compiled)
+
     for geom in spec.geoms:
         if np.isfinite(geom.fromto[0]):
-            spell_out_geom(geom, compiled)
+            state_geom(geom, compiled)
+
     for joint in spec.joints:
         if np.any(np.asarray(joint.springdamper) > 0):
+            dof = compiled.jnt_dofadr[joint.id]
             joint.springdamper = np.zeros(2)
-            joint.stiffness = _first(joint.stiffness, float(compiled.jnt_stiffness[joint.id]))
-            joint.damping = _first(
-                joint.damping, float(compiled.dof_damping[compiled.jnt_dofadr[joint.id]])
-            )
+            joint.stiffness = _with_first(joint.stiffness, float(compiled.jnt_stiffness[joint.id]))
+            joint.damping = _with_first(joint.damping, float(compiled.dof_damping[dof]))
+
     for tendon in spec.tendons:
         tendon.springlength = compiled.tendon_lengthspring[tendon.id]
+
     for actuator in spec.actuators:
         actuator.biasprm = compiled.actuator_biasprm[actuator.id]
         actuator.gainprm = compiled.actuator_gainprm[actuator.id]
 
 
-def _first(polynomial: Any, value: float) -> Array:
+def _with_first(polynomial: Any, value: float) -> Array:
+    """The coefficients of a polynomial with another first one."""
     changed = np.array(polynomial, dtype=np.float64)
     changed[0] = value
     return changed

@@ -1,8 +1,13 @@
-"""What a parameter path leads to: a number inside a model, of the start, or of the measurement.
+"""Fields that a parameter writes: a number inside a model, of the initial state, or of the measurement.
 
-A number of an MjModel array (`ModelField`), a coordinate of a body's inertia (`InertiaField`), of an orientation
-(`RotationField`), something that only a compile can follow (`SpecField`), the initial state (`InitialStateField`) or the
-measurement itself (`OutputBiasField`, `OutputDelayField`).
+- `ModelField`: a number of an MjModel array;
+- `InertiaField`: one of the ten inertial parameters of a body;
+- `RotationField`: a component of the orientation of a body or site;
+- `SpecField`: a number of the MJCF from which the compiler derives others;
+- `InitialStateField`: a deviation of the initial state;
+- `OutputBiasField`, `OutputDelayField`: the measurement itself.
+
+Each has `read(model)`, its value in a model, and `magnitude(model)`, the size with which a change of it is compared.
 """
 
 from __future__ import annotations
@@ -14,118 +19,150 @@ import mujoco
 import numpy as np
 
 from mjfim.errors import ExperimentError
-from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, Inertial
+from mjfim.model.elements import element_name
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, BodyInertia
 
-SAME_FRAME = {
+# Array of MjModel -> array that says whether the element's frame coincides with its body's. MuJoCo skips the position of
+# elements whose frame coincides, so the flag is cleared when the position is written.
+SAME_FRAME_FLAGS = {
     "body_ipos": "body_sameframe",
     "site_pos": "site_sameframe",
     "geom_pos": "geom_sameframe",
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ModelField:
-    """One number of an MjModel array: its rows, and the column (None for one-dimensional arrays).
+    """One number of an MjModel array.
 
-    factor: the number is `factor * value`
-    also: further (array, row, column, factor) that follow it, as the bias of a servo follows its gain
+    Attributes:
+        array: Name of the array, a field of MjModel or of its options.
+        rows: Rows that all take the number. Scalar options ignore them.
+        column: Column of the number; None for arrays with one dimension.
+        in_options: Whether the array belongs to `model.opt`.
+        factor: What stands in the array is this times the value.
+        followers: Further numbers (array, row, column, factor) that are written with it, as the bias of a servo follows
+            its gain.
     """
 
     array: str
     rows: tuple[int, ...]
-    column: int | None
+    column: int | None = None
     in_options: bool = False
     factor: float = 1.0
-    also: tuple[tuple[str, int, int, float], ...] = ()
+    followers: tuple[tuple[str, int, int, float], ...] = ()
 
     @property
     def numbers(self) -> set[tuple[str, int, int]]:
-        """(array, row, column) of all that it writes."""
-        return {(self.array, row, self.column or 0) for row in self.rows} | {
-            entry[:3] for entry in self.also
-        }
-
-    def _holder(self, model: Any) -> Any:
-        return getattr(model.opt if self.in_options else model, self.array)
+        """(array, row, column) of all numbers that it writes."""
+        main = {(self.array, row, self.column or 0) for row in self.rows}
+        following = {follower[:3] for follower in self.followers}
+        return main | following
 
     def read(self, model: Any) -> float:
-        """Current value."""
+        """Value in a model."""
         holder = self._holder(model)
         if np.ndim(holder) == 0:
             return float(holder)
-        number = holder[self.rows[0]] if self.column is None else holder[self.rows[0], self.column]
+
+        row = holder[self.rows[0]]
+        number = row if self.column is None else row[self.column]
         return float(number) / self.factor
 
-    def size(self, model: Any) -> float:
-        """Magnitude that a change is compared with; 0 where only the value itself can tell."""
+    def magnitude(self, model: Any) -> float:
+        """The radius of gyration for a centre of mass; 0 for other numbers, whose own value is their magnitude."""
         if self.array == "body_ipos" and float(model.body_mass[self.rows[0]]) > 0.0:
-            return inertial(model, self.rows[0]).radius
+            return body_inertia(model, self.rows[0]).gyration_radius
         return 0.0
 
     def write(self, model: Any, value: float) -> None:
-        """Set the value in place."""
+        """Set the value in a model that the caller owns, in place."""
         holder = self._holder(model)
         if np.ndim(holder) == 0:
             setattr(model.opt, self.array, value)
             return
+
         for row in self.rows:
             if self.column is None:
                 holder[row] = self.factor * value
             else:
                 holder[row, self.column] = self.factor * value
-        for array, row, column, factor in self.also:
+        for array, row, column, factor in self.followers:
             getattr(model, array)[row, column] = factor * value
-        same = SAME_FRAME.get(self.array)
-        if same is not None:  # else MuJoCo would go on using the frame of the body itself
-            getattr(model, same)[self.rows[0]] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+
+        flag = SAME_FRAME_FLAGS.get(self.array)
+        if flag is not None:
+            getattr(model, flag)[self.rows[0]] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+
+    def _holder(self, model: Any) -> Any:
+        """The array, or the scalar option."""
+        return getattr(model.opt if self.in_options else model, self.array)
 
 
 @dataclass(frozen=True)
 class InertiaField:
-    """One coordinate of a body's inertia in a chart. Written together with its sisters (`ParameterSet.write`)."""
+    """One of the ten inertial parameters of a body; all that are varied are written together (`ParameterWriter.write`).
+
+    Attributes:
+        body: Number of the body.
+        parametrisation: Key of `INERTIA_PARAMETRISATIONS`.
+        component: Place among the ten.
+    """
 
     body: int
-    chart: str
+    parametrisation: str
     component: int
 
     def read(self, model: Any) -> float:
-        """Current value. Raises ExperimentError where the chart does not cover the body."""
+        """Value in a model.
+
+        Raises:
+            ExperimentError: The parametrisation cannot express the body's inertia.
+        """
+        parametrisation = INERTIA_PARAMETRISATIONS[self.parametrisation]
         try:
-            return float(
-                INERTIA_PARAMETRISATIONS[self.chart].of(inertial(model, self.body))[self.component]
-            )
+            values = parametrisation.coordinates(body_inertia(model, self.body))
         except ValueError as error:
-            name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, self.body)
+            name = element_name(model, "body", self.body)
             raise ExperimentError(
-                f"body {name!r} has no {self.chart} coordinates: {error}"
+                f"body {name!r} has no {self.parametrisation} coordinates: {error}"
             ) from None
+        return float(values[self.component])
 
-    def size(self, model: Any) -> float:
-        """Magnitude that a change is compared with."""
-        return float(
-            INERTIA_PARAMETRISATIONS[self.chart].size(inertial(model, self.body))[self.component]
-        )
+    def magnitude(self, model: Any) -> float:
+        """Natural magnitude of the component, from the body's mass and radius of gyration."""
+        parametrisation = INERTIA_PARAMETRISATIONS[self.parametrisation]
+        return float(parametrisation.magnitudes(body_inertia(model, self.body))[self.component])
 
 
-class FromOrigin:
-    """What is counted from the model as it is: its value there is zero. natural: magnitude that a change is compared with."""
+class DeviationField:
+    """A number that is counted from the stated model, so that its value there is zero.
 
-    natural: ClassVar[float]
+    Attributes:
+        natural_magnitude: Size with which a change is compared, in the unit of the number.
+    """
+
+    natural_magnitude: ClassVar[float] = 1.0
 
     def read(self, model: Any) -> float:
         """Zero."""
         return 0.0
 
-    def size(self, model: Any) -> float:
-        """Magnitude that a change is compared with."""
-        return self.natural
+    def magnitude(self, model: Any) -> float:
+        """The natural magnitude."""
+        return self.natural_magnitude
 
 
 @dataclass(frozen=True)
-class RotationField(FromOrigin):
-    """One component of a rotation vector [rad] by which a body or site is turned from its compiled orientation."""
+class RotationField(DeviationField):
+    """One component of a rotation vector [rad] by which a body or site is turned from its compiled orientation.
 
-    natural: ClassVar[float] = 1.0
+    Attributes:
+        array: Array of quaternions in MjModel.
+        row: Row of the body or site.
+        component: 0, 1 or 2 of the rotation vector.
+    """
+
     array: str
     row: int
     component: int
@@ -133,7 +170,14 @@ class RotationField(FromOrigin):
 
 @dataclass(frozen=True)
 class SpecField:
-    """A number of the MJCF from which the compiler derives others: it must compile anew."""
+    """A number of the MJCF from which the compiler derives others, so that a change needs a compile.
+
+    Attributes:
+        kind: Kind of the element.
+        name: Name of the element.
+        field: Field of the element in MjSpec.
+        index: Place in the field.
+    """
 
     kind: str
     name: str
@@ -141,40 +185,49 @@ class SpecField:
     index: int
 
     def read(self, model: Any) -> float:
-        """Current value. Raises ExperimentError where the compiled model no longer holds it."""
-        geom = model.geom(self.name)
+        """Value in a model.
+
+        Raises:
+            ExperimentError: The compiled model does not hold it.
+        """
         if self.field in ("size", "pos"):
-            return float(getattr(geom, self.field)[self.index])
+            return float(getattr(model.geom(self.name), self.field)[self.index])
         raise ExperimentError(
             f"the {self.field} of geom {self.name!r} is not in the compiled model: state `guess`"
         )
 
-    def size(self, model: Any) -> float:
-        """The geom's bounding radius for positions."""
+    def magnitude(self, model: Any) -> float:
+        """The geom's bounding radius for positions; 0 for other numbers, whose own value is their magnitude."""
         return float(model.geom_rbound[model.geom(self.name).id]) if self.field == "pos" else 0.0
 
 
 @dataclass(frozen=True)
-class InitialStateField(FromOrigin):
-    """Deviation of one component of the initial state, by its place in the tangent space."""
+class InitialStateField(DeviationField):
+    """Deviation of one component of the initial state.
 
-    natural: ClassVar[float] = 1.0
+    Attributes:
+        tangent: Its place in the tangent space (dq, dv, da).
+    """
+
     tangent: int
 
 
 @dataclass(frozen=True)
-class OutputBiasField(FromOrigin):
-    """Constant bias of one measured output."""
+class OutputBiasField(DeviationField):
+    """Constant bias of one measured output.
 
-    natural: ClassVar[float] = 1.0
+    Attributes:
+        output: Place of the output among the measured ones.
+    """
+
     output: int
 
 
 @dataclass(frozen=True)
-class OutputDelayField(FromOrigin):
+class OutputDelayField(DeviationField):
     """Time by which all outputs lag [s]."""
 
-    natural: ClassVar[float] = 0.01
+    natural_magnitude: ClassVar[float] = 0.01
 
 
 TargetField = (
@@ -188,9 +241,9 @@ TargetField = (
 )
 
 
-def inertial(model: Any, body: int) -> Inertial:
-    """A body's inertia in a model."""
-    return Inertial.principal(
+def body_inertia(model: Any, body: int) -> BodyInertia:
+    """Mass, centre of mass and inertia of a body in a model, by the body's number."""
+    return BodyInertia.from_principal(
         model.body_mass[body],
         model.body_ipos[body],
         model.body_inertia[body],

@@ -1,4 +1,7 @@
-"""Units of what parameter paths name."""
+"""Units of joints, sensors, controls and model fields: every unit table of the package.
+
+The units of the ten inertial parameters of a body stand with their definition in `mjfim.model.inertia`.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,33 @@ from typing import Any
 
 import mujoco
 
-from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
-from mjfim.model.paths import INERTIAL_FIELDS, OBJECTS, PATH
+# Unit of the coordinate of a slide joint and of every other translation.
+LENGTH = "m"
 
-UNITS = {
+# Unit of the coordinate of a hinge joint and of every other rotation.
+ANGLE = "rad"
+
+# Unit of each part of a ball or free joint: translation, rotation vector, quaternion (dimensionless).
+PART_UNITS = {
+    **dict.fromkeys(("x", "y", "z"), LENGTH),
+    **dict.fromkeys(("rx", "ry", "rz"), ANGLE),
+    **dict.fromkeys(("qw", "qx", "qy", "qz"), ""),
+}
+
+# Unit of the generalised force at a coordinate, by the unit of the coordinate.
+FORCE_UNITS = {LENGTH: "N", ANGLE: "N m"}
+
+# Units of the fields of a joint, by the unit of its coordinate.
+JOINT_FIELD_UNITS = {
+    "damping": {LENGTH: "N s/m", ANGLE: "N m s/rad"},
+    "frictionloss": FORCE_UNITS,
+    "armature": {LENGTH: "kg", ANGLE: "kg m²"},
+    "stiffness": {LENGTH: "N/m", ANGLE: "N m/rad"},
+    "springref": {LENGTH: LENGTH, ANGLE: ANGLE},
+}
+
+# Units of the other fields that a parameter path can name; fields that are absent have none or depend on the model.
+FIELD_UNITS = {
     "mass": "kg",
     "pos": "m",
     "ipos": "m",
@@ -23,48 +49,72 @@ UNITS = {
     "delay": "s",
 }
 
-
-# per coordinate of a slide and of any other joint
-JOINT_UNITS = {
-    "damping": ("N s/m", "N m s/rad"),
-    "frictionloss": ("N", "N m"),
-    "armature": ("kg", "kg m²"),
-    "stiffness": ("N/m", "N m/rad"),
-    "springref": ("m", "rad"),
+# Units of sensors whose unit does not depend on a joint; sensors that are absent have none or depend on the model.
+SENSOR_UNITS = {
+    mujoco.mjtSensor.mjSENS_TENDONPOS: "m",
+    mujoco.mjtSensor.mjSENS_RANGEFINDER: "m",
+    mujoco.mjtSensor.mjSENS_FRAMEPOS: "m",
+    mujoco.mjtSensor.mjSENS_SUBTREECOM: "m",
+    mujoco.mjtSensor.mjSENS_VELOCIMETER: "m/s",
+    mujoco.mjtSensor.mjSENS_TENDONVEL: "m/s",
+    mujoco.mjtSensor.mjSENS_FRAMELINVEL: "m/s",
+    mujoco.mjtSensor.mjSENS_SUBTREELINVEL: "m/s",
+    mujoco.mjtSensor.mjSENS_ACCELEROMETER: "m/s²",
+    mujoco.mjtSensor.mjSENS_FRAMELINACC: "m/s²",
+    mujoco.mjtSensor.mjSENS_GYRO: "rad/s",
+    mujoco.mjtSensor.mjSENS_FRAMEANGVEL: "rad/s",
+    mujoco.mjtSensor.mjSENS_BALLANGVEL: "rad/s",
+    mujoco.mjtSensor.mjSENS_FRAMEANGACC: "rad/s²",
+    mujoco.mjtSensor.mjSENS_FORCE: "N",
+    mujoco.mjtSensor.mjSENS_TOUCH: "N",
+    mujoco.mjtSensor.mjSENS_TORQUE: "N m",
+    mujoco.mjtSensor.mjSENS_MAGNETOMETER: "T",
 }
 
+# Sensors that measure the coordinate of a joint, and those that measure its velocity.
+JOINT_POSITION_SENSORS = (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTLIMITPOS)
+JOINT_VELOCITY_SENSORS = (mujoco.mjtSensor.mjSENS_JOINTVEL, mujoco.mjtSensor.mjSENS_JOINTLIMITVEL)
 
-def unit_of(model: Any, path: str) -> str:
-    """Unit of what a valid path names, empty where it depends on the model (gains, gears, tendons) or has none."""
-    match = PATH.match(path)
-    if match is None:
+
+def per_second(unit: str) -> str:
+    """Unit of the rate of change of a quantity with this unit."""
+    return f"{unit}/s"
+
+
+def joint_unit(model: Any, joint: int) -> str:
+    """Unit of the first coordinate of a joint: metres for slide and free joints, radians for hinge and ball joints."""
+    kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
+    translates = kind in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
+    return LENGTH if translates else ANGLE
+
+
+def sensor_unit(model: Any, sensor: int) -> str:
+    """Unit of a sensor by its number; empty where it is dimensionless or depends on the model."""
+    kind = mujoco.mjtSensor(int(model.sensor_type[sensor]))
+
+    if kind in JOINT_POSITION_SENSORS:
+        return joint_unit(model, int(model.sensor_objid[sensor]))
+    if kind in JOINT_VELOCITY_SENSORS:
+        return per_second(joint_unit(model, int(model.sensor_objid[sensor])))
+
+    return SENSOR_UNITS.get(kind, "")
+
+
+def control_unit(model: Any, actuator: int) -> str:
+    """Unit of the control of an actuator; empty where it is not evident from the model.
+
+    It is evident for actuators that act on one joint with a gear of 1: a direct drive (gain 1, no bias) takes a force, a
+    position servo (`biasprm[1] = -gain`) takes the joint's coordinate.
+    """
+    gear = model.actuator_gear[int(model.actuator_outadr[actuator]), 0]
+    at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
+    if not at_joint or gear != 1:
         return ""
-    kind, field, name, index = (
-        match["kind"],
-        match["field"],
-        match["name"] or "",
-        int(match["index"] or 0),
-    )
-    if field in INERTIAL_FIELDS:
-        chart, first, _ = INERTIAL_FIELDS[field]
-        return INERTIA_PARAMETRISATIONS[chart].units[first + index]
-    if kind == "initial":
-        ident = mujoco.mj_name2id(model, OBJECTS["joint"], name)
-        if field == "act" or ident < 0:
-            return ""
-        return _motion_unit(model, ident, index) + ("/s" if field == "qvel" else "")
-    if kind != "joint":
-        return UNITS.get(field, "")
-    ident = mujoco.mj_name2id(model, OBJECTS["joint"], name)
-    if ident < 0:
-        return ""
-    slide = int(model.jnt_type[ident]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
-    return JOINT_UNITS[field][0 if slide else 1] if field in JOINT_UNITS else ""
 
+    unit = joint_unit(model, int(model.actuator_trnid[actuator, 0]))
+    gain = float(model.actuator_gainprm[actuator, 0])
+    bias = model.actuator_biasprm[actuator]
 
-def _motion_unit(model: Any, joint: int, index: int) -> str:
-    kind = int(model.jnt_type[joint])
-    linear = kind == int(mujoco.mjtJoint.mjJNT_SLIDE) or (
-        kind == int(mujoco.mjtJoint.mjJNT_FREE) and index < 3
-    )
-    return "m" if linear else "rad"
+    if int(model.actuator_biastype[actuator]) == int(mujoco.mjtBias.mjBIAS_NONE):
+        return FORCE_UNITS[unit] if gain == 1.0 else ""
+    return unit if bias[1] == -gain else ""

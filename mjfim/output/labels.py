@@ -10,12 +10,12 @@ import mujoco
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import Setup
 from mjfim.model.coordinates import (
-    JOINT_DOFS,
-    _control_labels,
-    _coordinates,
-    _joint_name,
+    control_labels,
     output_label,
+    state_components,
+    tangent_components,
 )
+from mjfim.model.units import per_second
 
 
 @dataclass(frozen=True)
@@ -45,21 +45,18 @@ class Labels:
     @classmethod
     def of_model(cls, model: mujoco.MjModel) -> Labels:
         """Names of joints and actuators; rotations of ball and free joints are rotation vectors."""
-        dofs = [
-            (_joint_name(model, joint) + suffix, unit)
-            for joint in range(model.njnt)
-            for suffix, unit in JOINT_DOFS[mujoco.mjtJoint(int(model.jnt_type[joint]))]
-        ]
-        positions = tuple(f"{name} [{unit}]" for name, unit in dofs)
+        state = state_components(model)[: model.nq]
+        tangent = tangent_components(model)[: model.nv]
+        names = [component.name.removeprefix("qpos:") for component in tangent]
+
         return cls(
-            qpos=positions if model.nq == model.nv else _coordinates(model),
-            positions=positions,
-            velocities=tuple(f"{name} velocity [{unit}/s]" for name, unit in dofs),
-            controls=tuple(
-                label
-                for actuator in range(model.nactuator)
-                for label in _control_labels(model, actuator)
+            qpos=tuple(f"{c.name.removeprefix('qpos:')} [{c.unit or '1'}]" for c in state),
+            positions=tuple(f"{name} [{c.unit}]" for name, c in zip(names, tangent, strict=True)),
+            velocities=tuple(
+                f"{name} velocity [{per_second(c.unit)}]"
+                for name, c in zip(names, tangent, strict=True)
             ),
+            controls=control_labels(model),
         )
 
     @classmethod

@@ -146,7 +146,7 @@ class Plant:
         if key not in self._cached_models:
             if len(self._cached_models) > MAX_CACHED_MODELS:
                 self._cached_models.clear()
-            self._cached_models[key] = self.parameters.model(self.source, np.asarray(theta))
+            self._cached_models[key] = self.parameters.writer.model(self.source, np.asarray(theta))
         return self._cached_models[key]
 
     def models(self, theta: Array) -> list[Any]:
@@ -186,7 +186,7 @@ class Plant:
 
         models = self._reusable_models[: len(theta)]
         for model, row in zip(models, theta, strict=True):
-            self.parameters.write(model, row)
+            self.parameters.writer.write(model, row)
             self.source.settle(model)
         return models, np.ones(len(theta), dtype=bool)
 
@@ -196,7 +196,7 @@ class Plant:
         compiled = np.ones(len(theta), dtype=bool)
         for i, row in enumerate(theta):
             try:
-                models.append(self.parameters.model(self.source, row))
+                models.append(self.parameters.writer.model(self.source, row))
             except ModelError:
                 models.append(self.source.model)
                 compiled[i] = False

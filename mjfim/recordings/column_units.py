@@ -17,7 +17,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, unknown
 from mjfim.model.coordinates import state_components
-from mjfim.model.paths import names_of
+from mjfim.model.elements import names_of
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import ColumnSpec
 

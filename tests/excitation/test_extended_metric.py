@@ -186,7 +186,9 @@ def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tm
         h = 1e-3 * abs(setup.theta[j])
         shift = h * np.eye(p)[j]
         pair = tuple(
-            Loop(setup.parameters.model(setup.plant.source.model, setup.theta + s * shift), 1)
+            Loop(
+                setup.parameters.writer.model(setup.plant.source.model, setup.theta + s * shift), 1
+            )
             for s in (1, -1)
         )
         x, u, psi, loop = curve.state[k], curve.ctrl[k], S.psi[k][:, j], pair[0]

@@ -148,7 +148,7 @@ SETUPS: dict[str, Callable[[Path], Setup]] = {
     "activation": filtered_setup,
     "start unknown": cart(nuisance={"initial": 0.05}, cost={"criterion": "A"}),
     "ball joint, start unknown": lambda folder: body_setup(
-        folder, nuisance={"initial": {"qvel:ball[1]": True}}
+        folder, nuisance={"initial": {"qvel:ball.ry": True}}
     ),
     "bias and delay unknown": cart(nuisance={"bias": True, "delay": True}, cost={"criterion": "D"}),
     "delay wanted": cart(

@@ -244,5 +244,7 @@ def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     assert (moments > 0.0).all()
     assert (2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)).all()
     free = sample_parameters(setup.parameters, setup.theta, 8, 0)
-    assert any(setup.parameters.unphysical_bodies(setup.plant.source, theta) for theta in free)
+    assert any(
+        setup.parameters.writer.unphysical_bodies(setup.plant.source, theta) for theta in free
+    )
     assert len(np.unique(setup.pool.thetas, axis=0)) == 8

@@ -13,7 +13,7 @@ from mjfim.errors import ExperimentError, MjfimError, ModelError
 from mjfim.experiment.system import Setup
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.parameters import Parameter
-from mjfim.model.targets import inertial
+from mjfim.model.targets import body_inertia
 from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,
@@ -46,11 +46,16 @@ def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path
     assert setup.parameters.names == (*(f"arm.{n}" for n in chart.names), "d")
     ten = setup.parameters.parameters[:10]
     np.testing.assert_allclose(
-        [p.guess for p in ten], chart.of(inertial(setup.model, body)), rtol=1e-12, atol=1e-15
+        [p.guess for p in ten],
+        chart.coordinates(body_inertia(setup.model, body)),
+        rtol=1e-12,
+        atol=1e-15,
     )
-    np.testing.assert_array_equal([p.scale for p in ten], chart.size(inertial(setup.model, body)))
     np.testing.assert_array_equal(
-        setup.parameters.magnitude[:10], chart.size(inertial(setup.model, body))
+        [p.scale for p in ten], chart.magnitudes(body_inertia(setup.model, body))
+    )
+    np.testing.assert_array_equal(
+        setup.parameters.magnitude[:10], chart.magnitudes(body_inertia(setup.model, body))
     )
     assert tuple(p.unit for p in ten) == chart.units
     assert {p.group for p in ten} == {"arm"} and setup.parameters.parameters[10].group == ""
@@ -60,7 +65,10 @@ def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path
             getattr(own, field), getattr(setup.model, field), rtol=1e-9, atol=1e-12
         )
     np.testing.assert_allclose(
-        inertial(own, body).inertia, inertial(setup.model, body).inertia, rtol=1e-9, atol=1e-12
+        body_inertia(own, body).inertia,
+        body_inertia(setup.model, body).inertia,
+        rtol=1e-9,
+        atol=1e-12,
     )
 
 
@@ -71,7 +79,7 @@ def test_the_ten_are_written_together(coordinates: str, tmp_path: Path) -> None:
     chart, arm = INERTIA_PARAMETRISATIONS[coordinates], setup.model.body("arm").id
     rng = np.random.default_rng(0)
     theta = setup.parameters.guess + 0.05 * setup.parameters.scale * rng.standard_normal(10)
-    wanted, found = chart.back(theta), inertial(setup.model_at(theta), arm)
+    wanted, found = chart.inertia(theta), body_inertia(setup.model_at(theta), arm)
     assert found.mass == pytest.approx(wanted.mass, rel=1e-12)
     np.testing.assert_allclose(found.com, wanted.com, rtol=1e-12)
     np.testing.assert_allclose(found.inertia, wanted.inertia, rtol=1e-9, atol=1e-12)
@@ -175,7 +183,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "clash with a coordinate": (
         {"arm": ARM, "arm.d1": {"target": "joint/ball:damping"}},
-        r"parameters\.arm\.d1: two parameters have this name",
+        r"parameters\.arm\.d1: duplicate parameter name",
     ),
     "function without a guess": (
         {"f": {"function": print}},
@@ -222,10 +230,10 @@ def test_wrong_parameters_are_named(name: str, tmp_path: Path) -> None:
         ("joint/ball:damping", 0.05, "N m s/rad", 0.05),
         ("body/arm:mass", 0.4, "kg", 0.4),
         ("body/arm:rot[1]", 0.0, "rad", 1.0),
-        ("initial/float:qpos[1]", 0.0, "m", 1.0),
-        ("initial/float:qpos[4]", 0.0, "rad", 1.0),
-        ("initial/float:qvel[4]", 0.0, "rad/s", 1.0),
-        ("initial/ball:qvel[0]", 0.0, "rad/s", 1.0),
+        ("initial/float:qpos.y", 0.0, "m", 1.0),
+        ("initial/float:qpos.ry", 0.0, "rad", 1.0),
+        ("initial/float:qvel.ry", 0.0, "rad/s", 1.0),
+        ("initial/ball:qvel.rx", 0.0, "rad/s", 1.0),
         ("output/acc[1]:bias", 0.0, "", 1.0),
         ("output:delay", 0.0, "s", 0.01),
         ("option:gravity[2]", -0.5, "m/s²", 0.5),
@@ -242,7 +250,7 @@ def test_guess_unit_and_scale_come_from_what_is_named(
 def test_places_are_compared_with_the_size_of_the_body(tmp_path: Path) -> None:
     """A centre of mass at zero still has a scale: the radius of gyration; `scale = "guess"` asks for the value itself."""
     setup = body_setup(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]"}})
-    radius = inertial(setup.model, setup.model.body("arm").id).radius
+    radius = body_inertia(setup.model, setup.model.body("arm").id).gyration_radius
     assert setup.parameters.guess.tolist() == [0.0]
     assert setup.parameters.scale.tolist() == setup.parameters.magnitude.tolist() == [radius]
     with pytest.raises(ExperimentError, match=r"parameters\.y\.scale"):
@@ -271,8 +279,8 @@ def test_starts_of_all_components(tmp_path: Path) -> None:
     )
     found = setup.parameters.parameters
     assert len(found) == 1 + 9 + 9
-    names = [f"initial qpos:float[{i}]" for i in range(6)] + [
-        f"initial qpos:ball[{i}]" for i in range(3)
+    names = [f"initial qpos:float.{part}" for part in ("x", "y", "z", "rx", "ry", "rz")] + [
+        f"initial qpos:ball.{part}" for part in ("rx", "ry", "rz")
     ]
     assert list(setup.parameters.names[1:10]) == names
     assert list(setup.parameters.names[10:]) == [n.replace("qpos", "qvel") for n in names]
@@ -353,7 +361,7 @@ def test_what_the_nuisance_table_names_cannot_be_a_parameter_too(tmp_path: Path)
         cart_setup(tmp_path, parameters=own, nuisance={"initial": True})
     clash = {**CART_PARAMETERS, "delay": {"target": "joint/slide:damping"}}
     with pytest.raises(
-        ExperimentError, match=r"parameters\.delay: two parameters have this name; call one of them"
+        ExperimentError, match=r"parameters\.delay: duplicate parameter name; rename one"
     ):
         cart_setup(tmp_path, parameters=clash, nuisance={"delay": True})
     with pytest.raises(ExperimentError, match=r"parameters: all are nuisance"):

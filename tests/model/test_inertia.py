@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from mjfim.model.inertia import (
+    INERTIA_ENTRIES,
     INERTIA_PARAMETRISATIONS,
-    PAIRS,
-    Inertial,
-    barycentric,
+    BodyInertia,
     from_barycentric,
     from_logcholesky,
-    logcholesky,
+    to_barycentric,
+    to_logcholesky,
 )
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ CHAIN = """
 """
 
 
-def solids(count: int, seed: int) -> list[Inertial]:
+def solids(count: int, seed: int) -> list[BodyInertia]:
     """Bodies of random points: physical by construction."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(count):
@@ -52,7 +52,7 @@ def solids(count: int, seed: int) -> list[Inertial]:
         com = weights @ points / weights.sum()
         about = points - com
         found.append(
-            Inertial(
+            BodyInertia(
                 float(weights.sum()),
                 com,
                 sum(
@@ -64,9 +64,9 @@ def solids(count: int, seed: int) -> list[Inertial]:
     return found
 
 
-def compiled(body: Inertial) -> Any:
+def compiled(body: BodyInertia) -> Any:
     """The chain with this body at its end, compiled by MuJoCo, which refuses bodies that cannot be."""
-    tensor = [body.inertia[pair] for pair in PAIRS]
+    tensor = [body.inertia[pair] for pair in INERTIA_ENTRIES]
     text = CHAIN.format(com=spelled(body.com), mass=repr(body.mass), inertia=spelled(tensor))
     return mujoco.MjModel.from_xml_string(text)
 
@@ -76,7 +76,7 @@ def spelled(numbers: Any) -> str:
     return " ".join(repr(float(n)) for n in numbers)
 
 
-def dynamics(body: Inertial) -> Array:
+def dynamics(body: BodyInertia) -> Array:
     """Mass matrix, bias forces and energies of the chain in some pose and motion, as one vector."""
     model = compiled(body)
     data, M = mujoco.MjData(model), np.zeros((model.nv, model.nv))
@@ -94,14 +94,14 @@ def dynamics(body: Inertial) -> Array:
 def test_there_and_back(chart: str) -> None:
     """Ten numbers are the body, and the body is ten numbers."""
     for body in solids(20, 0):
-        v = INERTIA_PARAMETRISATIONS[chart].of(body)
-        again = INERTIA_PARAMETRISATIONS[chart].back(v)
+        v = INERTIA_PARAMETRISATIONS[chart].coordinates(body)
+        again = INERTIA_PARAMETRISATIONS[chart].inertia(v)
         assert v.shape == (10,)
         assert again.mass == pytest.approx(body.mass, rel=1e-12)
         np.testing.assert_allclose(again.com, body.com, rtol=1e-11, atol=1e-13)
         np.testing.assert_allclose(again.inertia, body.inertia, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(
-            INERTIA_PARAMETRISATIONS[chart].of(again), v, rtol=1e-9, atol=1e-11
+            INERTIA_PARAMETRISATIONS[chart].coordinates(again), v, rtol=1e-9, atol=1e-11
         )
 
 
@@ -109,7 +109,7 @@ def test_principal_axes_are_mujocos() -> None:
     """Descending moments in a right-handed frame, as the compiler writes them; and back."""
     for body in solids(20, 1):
         found = compiled(body).body("tip")
-        moments, quaternion = body.axes()
+        moments, quaternion = body.principal_axes()
         np.testing.assert_allclose(moments, found.inertia, rtol=1e-10)
         assert moments[0] >= moments[1] >= moments[2] > 0.0
         R = np.zeros(9)
@@ -117,7 +117,7 @@ def test_principal_axes_are_mujocos() -> None:
         R = R.reshape(3, 3)
         assert np.linalg.det(R) == pytest.approx(1.0)
         np.testing.assert_allclose(R @ np.diag(moments) @ R.T, body.inertia, rtol=1e-9, atol=1e-12)
-        again = Inertial.principal(found.mass[0], found.ipos, found.inertia, found.iquat)
+        again = BodyInertia.from_principal(found.mass[0], found.ipos, found.inertia, found.iquat)
         np.testing.assert_allclose(again.inertia, body.inertia, rtol=1e-9, atol=1e-12)
 
 
@@ -132,9 +132,9 @@ def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
     origin = sum(
         w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, points, strict=True)
     )
-    v = barycentric(Inertial(float(weights.sum()), com, about))
+    v = to_barycentric(BodyInertia(float(weights.sum()), com, about))
     np.testing.assert_allclose(
-        v, [weights.sum(), *(weights @ points), *(origin[p] for p in PAIRS)], rtol=1e-12
+        v, [weights.sum(), *(weights @ points), *(origin[p] for p in INERTIA_ENTRIES)], rtol=1e-12
     )
 
 
@@ -144,7 +144,9 @@ def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
     ends = dynamics(first), dynamics(second)
     errors = {}
     for name, chart in INERTIA_PARAMETRISATIONS.items():
-        mixed = dynamics(chart.back(0.4 * chart.of(first) + 0.6 * chart.of(second)))
+        mixed = dynamics(
+            chart.inertia(0.4 * chart.coordinates(first) + 0.6 * chart.coordinates(second))
+        )
         errors[name] = np.abs(mixed - (0.4 * ends[0] + 0.6 * ends[1])).max() / np.abs(mixed).max()
     assert errors["barycentric"] < 1e-12
     assert errors["logcholesky"] > 1e-3 and errors["central"] > 1e-3, "a weak test"
@@ -153,7 +155,7 @@ def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
 def test_every_barycentric_coordinate_has_a_regressor_of_its_own() -> None:
     """Eleven bodies tell the regressor; a twelfth is predicted to round-off."""
     bodies = solids(12, 4)
-    V = np.array([np.append(barycentric(b), 1.0) for b in bodies])
+    V = np.array([np.append(to_barycentric(b), 1.0) for b in bodies])
     Y = np.array([dynamics(b) for b in bodies])
     regressor = np.linalg.solve(V[:11], Y[:11])
     np.testing.assert_allclose(V[11] @ regressor, Y[11], rtol=0, atol=1e-9 * np.abs(Y).max())
@@ -165,11 +167,11 @@ def test_log_cholesky_is_physical_for_every_vector() -> None:
     failed = 0
     for v in rng.standard_normal((100, 10)):
         body = from_logcholesky(v)
-        moments, _ = body.axes()
+        moments, _ = body.principal_axes()
         assert body.mass > 0.0 and moments[2] > 0.0 and moments[1] + moments[2] > moments[0]
         assert compiled(body).body("tip").mass[0] == pytest.approx(body.mass)
         try:
-            compiled(INERTIA_PARAMETRISATIONS["central"].back(np.append(abs(v[0]), v[1:])))
+            compiled(INERTIA_PARAMETRISATIONS["central"].inertia(np.append(abs(v[0]), v[1:])))
         except ValueError:
             failed += 1
     assert failed > 90
@@ -190,7 +192,7 @@ def test_log_cholesky_is_the_factor_of_the_pseudo_inertia() -> None:
     )
     body = from_logcholesky(v)
     J, h = U @ U.T, body.mass * body.com
-    S = body.second + np.outer(h, h) / body.mass
+    S = body.second_moments + np.outer(h, h) / body.mass
     np.testing.assert_allclose(
         J, np.block([[S, h[:, None]], [h[None], np.array([[body.mass]])]]), rtol=1e-12, atol=1e-14
     )
@@ -208,17 +210,17 @@ def test_log_cholesky_is_the_factor_of_the_pseudo_inertia() -> None:
 )
 def test_points_rods_and_plates_have_no_log_cholesky(moments: tuple[float, ...]) -> None:
     """A singular pseudo-inertia, or one that nothing has; anything thicker is taken."""
-    turned = solids(1, 8)[0].axes()[1]
-    body = Inertial.principal(2.0, np.array([0.1, 0.2, 0.3]), np.array(moments), turned)
+    turned = solids(1, 8)[0].principal_axes()[1]
+    body = BodyInertia.from_principal(2.0, np.array([0.1, 0.2, 0.3]), np.array(moments), turned)
     with pytest.raises(ValueError, match=r"a point, a rod or a plate"):
-        logcholesky(body)
+        to_logcholesky(body)
     for chart in ("central", "barycentric"):
-        assert np.isfinite(INERTIA_PARAMETRISATIONS[chart].of(body)).all()
-    thick = Inertial.principal(
+        assert np.isfinite(INERTIA_PARAMETRISATIONS[chart].coordinates(body)).all()
+    thick = BodyInertia.from_principal(
         2.0, np.array([0.1, 0.2, 0.3]), np.array([0.3 * (1 - 1e-6), 0.2, 0.1]), turned
     )
     np.testing.assert_allclose(
-        from_logcholesky(logcholesky(thick)).inertia, thick.inertia, rtol=1e-8, atol=1e-12
+        from_logcholesky(to_logcholesky(thick)).inertia, thick.inertia, rtol=1e-8, atol=1e-12
     )
 
 
@@ -226,27 +228,31 @@ def test_magnitudes_follow_the_units() -> None:
     """In other units of mass and length they are the same magnitudes: a scale of comparison has no unit of its own."""
     body = solids(1, 9)[0]
     kilo, centi = 1000.0, 100.0
-    other = Inertial(kilo * body.mass, centi * body.com, kilo * centi**2 * body.inertia)
+    other = BodyInertia(kilo * body.mass, centi * body.com, kilo * centi**2 * body.inertia)
     factor = {"kg": kilo, "kg m": kilo * centi, "kg m²": kilo * centi**2, "m": centi, "": 1.0}
     for chart in INERTIA_PARAMETRISATIONS.values():
         assert len(chart.names) == len(set(chart.names)) == len(chart.units) == 10
         np.testing.assert_allclose(
-            chart.size(other), chart.size(body) * [factor[u] for u in chart.units], rtol=1e-12
+            chart.magnitudes(other),
+            chart.magnitudes(body) * [factor[u] for u in chart.units],
+            rtol=1e-12,
         )
-        assert (chart.size(body) > 0.0).all()
+        assert (chart.magnitudes(body) > 0.0).all()
 
 
 def test_radius_of_gyration_is_about_the_bodys_origin() -> None:
     """Of points: the root of the mean square distance."""
     points = np.random.default_rng(10).standard_normal((7, 3))
     com, about = points.mean(axis=0), points - points.mean(axis=0)
-    body = Inertial(7.0, com, sum(r @ r * np.eye(3) - np.outer(r, r) for r in about))
-    assert body.radius == pytest.approx(np.sqrt(np.mean(np.sum(points**2, axis=1))), rel=1e-12)
+    body = BodyInertia(7.0, com, sum(r @ r * np.eye(3) - np.outer(r, r) for r in about))
+    assert body.gyration_radius == pytest.approx(
+        np.sqrt(np.mean(np.sum(points**2, axis=1))), rel=1e-12
+    )
 
 
 def test_first_moments_at_the_origin_do_not_move_with_the_mass() -> None:
     """What makes the chart barycentric: mass alone changes the centre and the inertia about it, not about the origin."""
-    v = barycentric(solids(1, 11)[0])
+    v = to_barycentric(solids(1, 11)[0])
     heavier = from_barycentric(np.append(2.0 * v[0], v[1:]))
     np.testing.assert_allclose(heavier.com, 0.5 * v[1:4] / v[0], rtol=1e-13)
-    np.testing.assert_allclose(barycentric(heavier), np.append(2.0 * v[0], v[1:]), rtol=1e-12)
+    np.testing.assert_allclose(to_barycentric(heavier), np.append(2.0 * v[0], v[1:]), rtol=1e-12)

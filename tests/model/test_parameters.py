@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, MjfimError
+from mjfim.model.elements import names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.loading import decoration
 from mjfim.model.parameters import Parameter, ParameterSet, Target, moved_bodies
-from mjfim.model.paths import KINDS, PATH, fields_of, names_of, resolve
-from mjfim.model.targets import ModelField, RotationField, SpecField, inertial
+from mjfim.model.paths import KINDS, ParameterPath, fields_of, resolve
+from mjfim.model.targets import ModelField, RotationField, SpecField, body_inertia
 from mjfim.model.variants import Source
 from mjfim.output.mjcf.write import write_identified, write_spec
 from tests.support.numerics import Loop, make_setup
@@ -222,7 +223,7 @@ CHARTED = [
 
 def one(path: str, scale: float = 1.0, offset: float = 0.0) -> Parameter:
     """A parameter with one target."""
-    return Parameter("theta", (Target(path, scale, offset),), guess=1.0)
+    return Parameter(name="theta", targets=(Target(path, scale, offset),), guess=1.0)
 
 
 def compiled(xml: str, parameters: list[Parameter]) -> tuple[Any, Any]:
@@ -258,15 +259,16 @@ def both_ways(xml: str, path: str, value: float) -> tuple[Any, Any, Any]:
     spec, base = compiled(xml, parameters)
     resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
     theta, other = np.array([value]), spec.copy()
-    write_spec(other, base, resolved.model(base, theta), resolved, theta)
-    return base, resolved.model(base, theta), other.compile()
+    write_spec(other, base, resolved.writer.model(base, theta), resolved, theta)
+    return base, resolved.writer.model(base, theta), other.compile()
 
 
 def test_the_edits_below_cover_every_field_that_can_be_named() -> None:
     named = [
-        PATH.match(path) for path in (*(e[1] for e in EDITS), *(e[1] for e in COMPILES), *CHARTED)
+        ParameterPath.parse(path)
+        for path in (*(e[1] for e in EDITS), *(e[1] for e in COMPILES), *CHARTED)
     ]
-    covered = {(m["kind"], m["field"]) for m in named if m}
+    covered = {(path.kind, path.field) for path in named}
     outside = {("initial", f) for f in fields_of("initial")} | {
         ("output", f) for f in fields_of("output")
     }
@@ -305,8 +307,8 @@ def skew(v: np.ndarray) -> np.ndarray:
 
 def written_by_hand(spec: Any, base: Any, path: str, change: float) -> None:
     """The edit of an MjSpec that a chart's coordinate means, from its definition."""
-    match = PATH.match(path)
-    kind, name, field, i = match["kind"], match["name"], match["field"], int(match["index"])
+    parsed = ParameterPath.parse(path)
+    kind, name, field, i = parsed.kind, parsed.name, parsed.field, parsed.component
     element, found = getattr(spec, kind)(name), getattr(base, kind)(name)
     if field == "rot":
         turn, quat = np.zeros(4), np.zeros(4)
@@ -365,20 +367,22 @@ def test_charts_and_rotations_written_in_place_equal_a_compile_of_what_they_mean
     field = resolved.fields[0][0]
     value, change = (
         field.read(base),
-        0.01 * field.size(base) * (-1.0 if "firstmoment" in path else 1.0),
+        0.01 * field.magnitude(base) * (-1.0 if "firstmoment" in path else 1.0),
     )
     other = spec.copy()
     written_by_hand(other, base, path, change)
-    own, again = resolved.model(base, np.array([value + change])), other.compile()
+    own, again = resolved.writer.model(base, np.array([value + change])), other.compile()
     written = (
-        INERTIA_PARAMETRISATIONS[field.chart].of(inertial(own, field.body))[field.component]
+        INERTIA_PARAMETRISATIONS[field.parametrisation].coordinates(body_inertia(own, field.body))[
+            field.component
+        ]
         if "rot" not in path
         else value + change
     )
     assert written == pytest.approx(value + change, rel=1e-9, abs=1e-12)
     for mine, theirs in zip(*(states_and_mass_matrix(m) for m in (own, again)), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-10, atol=1e-10)
-    before = resolved.model(base, np.array([value]))
+    before = resolved.writer.model(base, np.array([value]))
     np.testing.assert_allclose(rollout(before, 50), rollout(base, 50), rtol=1e-10, atol=1e-10)
     # what of body a lies across its only hinge cannot be felt
     if not path.startswith(
@@ -428,9 +432,9 @@ def test_charts_of_simple_bodies_are_written_with_the_right_dynamics() -> None:
         spec, base = compiled(SIMPLE, [one(path)])
         resolved = ParameterSet.build([one(path)], base)
         field, other = resolved.fields[0][0], spec.copy()
-        change = 0.05 * field.size(base)
+        change = 0.05 * field.magnitude(base)
         written_by_hand(other, base, path, change)
-        own = resolved.model(base, np.array([field.read(base) + change]))
+        own = resolved.writer.model(base, np.array([field.read(base) + change]))
         np.testing.assert_allclose(
             rollout(own, 100), rollout(other.compile(), 100), rtol=1e-9, atol=1e-9
         )
@@ -453,9 +457,9 @@ def test_geoms_that_matter_are_compiled_anew(
         spec, Path("model.xml"), [b.name for b in spec.bodies[1:]], sensors=True, friction=True
     )
     before = arrays(source.model)
-    own, theirs = resolved.model(source, np.array([value])), spec.copy()
-    match = PATH.match(path)
-    geom, field, i = theirs.geom(match["name"]), match["field"], int(match["index"] or 0)
+    own, theirs = resolved.writer.model(source, np.array([value])), spec.copy()
+    parsed = ParameterPath.parse(path)
+    geom, field, i = theirs.geom(parsed.name), parsed.field, parsed.component
     if np.isfinite(geom.fromto[0]):  # the same capsule by middle, direction and half length
         middle, half = (
             0.5 * (geom.fromto[:3] + geom.fromto[3:]),
@@ -479,7 +483,7 @@ def test_geoms_that_matter_are_compiled_anew(
             f"{name} does not depend on {path}: a weak test"
         )
     # a direction by two points or by a vector rounds differently
-    if np.isfinite(spec.geom(match["name"]).fromto[0]):  # and a capsule is round
+    if np.isfinite(spec.geom(parsed.name).fromto[0]):  # and a capsule is round
         mine["geom_quat"], mine["body_iquat"] = wanted["geom_quat"], wanted["body_iquat"]
     unequal = [
         n
@@ -584,9 +588,9 @@ def test_a_mesh_moves_from_where_it_compiles_to() -> None:
     now = resolved.fields[0][0].read(base)
     assert abs(now - 0.2) > 0.01, "no offset: a weak test"
     np.testing.assert_allclose(
-        resolved.model(source, np.array([now])).geom_pos, base.geom_pos, rtol=0, atol=1e-14
+        resolved.writer.model(source, np.array([now])).geom_pos, base.geom_pos, rtol=0, atol=1e-14
     )
-    own = resolved.model(source, np.array([now + 0.1]))
+    own = resolved.writer.model(source, np.array([now + 0.1]))
     np.testing.assert_allclose(
         own.geom("h").pos - base.geom("h").pos, [0.0, 0.0, 0.1], rtol=0, atol=1e-14
     )
@@ -635,7 +639,7 @@ def test_servo_gains_mean_what_mjcf_means_by_them(kind: str, written: str, path:
     )
     resolved = ParameterSet.build([one(path)], base)
     assert resolved.fields[0][0].read(base) == 10.0
-    own = resolved.model(base, np.array([7.25]))
+    own = resolved.writer.model(base, np.array([7.25]))
     assert resolved.fields[0][0].read(own) == 7.25
     np.testing.assert_array_equal(own.actuator_gainprm, again.actuator_gainprm)
     np.testing.assert_array_equal(own.actuator_biasprm, again.actuator_biasprm)
@@ -651,7 +655,7 @@ def test_a_gain_by_two_names_is_one_number(first: str, second: str) -> None:
     with pytest.raises(ExperimentError, match=r"b: target .* already belongs to parameters\.a"):
         ParameterSet.build(
             [
-                Parameter(n, (Target(f"actuator/p:{field}"),), 1.0)
+                Parameter(name=n, targets=(Target(f"actuator/p:{field}"),), guess=1.0)
                 for n, field in (("a", first), ("b", second))
             ],
             base,
@@ -684,7 +688,7 @@ def test_servos_with_several_controls_have_gains_too(written: str, path: str) ->
     )
     resolved = ParameterSet.build([one(path)], base)
     assert resolved.fields[0][0].read(base) == 2.0
-    mine, theirs = arrays(resolved.model(base, np.array([3.5]))), arrays(again)
+    mine, theirs = arrays(resolved.writer.model(base, np.array([3.5]))), arrays(again)
     assert [n for n in theirs if not np.array_equal(mine[n], theirs[n])] == []
 
 
@@ -693,12 +697,15 @@ def test_gears_are_counted_by_force_outputs() -> None:
     resolved = ParameterSet.build([one("actuator/m:gear")], base)
     assert resolved.fields[0][0].read(base) == 1.5
     np.testing.assert_array_equal(
-        resolved.model(base, np.array([7.0])).actuator_gear[:, 0], [1.0, 1.0, 1.0, 7.0]
+        resolved.writer.model(base, np.array([7.0])).actuator_gear[:, 0], [1.0, 1.0, 1.0, 7.0]
     )
 
 
 def test_the_damping_of_a_servo_does_not_follow_its_gain() -> None:
-    parameters = [one("actuator/p:kp"), Parameter("kv", (Target("actuator/p:kv"),), 1.0)]
+    parameters = [
+        one("actuator/p:kp"),
+        Parameter(name="kv", targets=(Target("actuator/p:kv"),), guess=1.0),
+    ]
     _, base = compiled(ARM, [])
     own = ParameterSet.build(parameters, base).model(base, np.array([20.0, 3.0]))
     assert own.actuator("p").gainprm[0] == 20.0
@@ -711,14 +718,16 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
     xml = ARM.replace('pos=".3 .1 .5"', 'pos=".3 .1 .5" euler=".4 .1 -.2"').replace(
         'name="t" ', 'name="t" euler="1 0 .3" '
     )
-    parameters = [Parameter(f"r{i}", (Target(f"{thing}:rot[{i}]"),), 0.0) for i in range(3)]
+    parameters = [
+        Parameter(name=f"r{i}", targets=(Target(f"{thing}:rot[{i}]"),), guess=0.0) for i in range(3)
+    ]
     spec, base = compiled(xml, parameters)
     resolved, vector = ParameterSet.build(parameters, base), np.array([0.5, -0.9, 0.7])
     kind, name = thing.split("/")
     turn, quat = np.zeros(4), np.zeros(4)
     mujoco.mju_axisAngle2Quat(turn, vector / np.linalg.norm(vector), float(np.linalg.norm(vector)))
     mujoco.mju_mulQuat(quat, np.array(getattr(base, kind)(name).quat), turn)
-    own = resolved.model(base, vector)
+    own = resolved.writer.model(base, vector)
     assert abs(getattr(own, kind)(name).quat @ quat) == pytest.approx(1.0, abs=1e-14)
     element = getattr(spec, kind)(name)
     element.alt.type, element.quat = mujoco.mjtOrientation.mjORIENTATION_QUAT, quat
@@ -726,7 +735,7 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
         rollout(own, 100), rollout(spec.compile(), 100), rtol=1e-9, atol=1e-9
     )
     assert all(isinstance(s, RotationField) for row in resolved.fields for s in row)
-    again = resolved.model(base, np.zeros(3))  # nothing of the first value is left
+    again = resolved.writer.model(base, np.zeros(3))  # nothing of the first value is left
     np.testing.assert_allclose(rollout(again, 100), rollout(base, 100), rtol=1e-9, atol=1e-9)
 
 
@@ -749,7 +758,8 @@ def test_coordinates_of_one_body_that_do_not_go_together_are_refused(
     _, base = compiled(SOLID, [])
     for first, second in (fields, fields[::-1]):
         pair = [
-            Parameter(n, (Target(f"body/a:{f}"),), 1.0) for n, f in (("p", first), ("q", second))
+            Parameter(name=n, targets=(Target(f"body/a:{f}"),), guess=1.0)
+            for n, f in (("p", first), ("q", second))
         ]
         with pytest.raises(
             ExperimentError,
@@ -757,8 +767,8 @@ def test_coordinates_of_one_body_that_do_not_go_together_are_refused(
         ):
             ParameterSet.build(pair, base)
     apart = [
-        Parameter("p", (Target(f"body/a:{fields[0]}"),), 1.0),
-        Parameter("q", (Target(f"body/b:{fields[1]}"),), 1.0),
+        Parameter(name="p", targets=(Target(f"body/a:{fields[0]}"),), guess=1.0),
+        Parameter(name="q", targets=(Target(f"body/b:{fields[1]}"),), guess=1.0),
     ]
     assert len(ParameterSet.build(apart, base)) == 2
 
@@ -766,10 +776,15 @@ def test_coordinates_of_one_body_that_do_not_go_together_are_refused(
 def test_mass_beside_first_moments_keeps_them() -> None:
     """The barycentric mass: m c and the inertia about the origin stay while the mass changes; alone, the centre stays."""
     _, base = compiled(SOLID, [one("body/a:mass")])
-    before = INERTIA_PARAMETRISATIONS["barycentric"].of(inertial(base, base.body("a").id))
-    parameters = [one("body/a:mass"), Parameter("h", (Target("body/a:firstmoment[2]"),), 1.0)]
+    before = INERTIA_PARAMETRISATIONS["barycentric"].coordinates(
+        body_inertia(base, base.body("a").id)
+    )
+    parameters = [
+        one("body/a:mass"),
+        Parameter(name="h", targets=(Target("body/a:firstmoment[2]"),), guess=1.0),
+    ]
     own = ParameterSet.build(parameters, base).model(base, np.array([1.5, before[3] + 0.02]))
-    after = INERTIA_PARAMETRISATIONS["barycentric"].of(inertial(own, own.body("a").id))
+    after = INERTIA_PARAMETRISATIONS["barycentric"].coordinates(body_inertia(own, own.body("a").id))
     wanted = np.array(before)
     wanted[0], wanted[3] = 1.5, before[3] + 0.02
     np.testing.assert_allclose(after, wanted, rtol=1e-12, atol=1e-15)
@@ -794,7 +809,7 @@ def test_outputs_and_starts_are_no_part_of_the_model() -> None:
     """Linear maps of theta outside the model, by the scale of their targets."""
     paths = ["initial/k:qvel", "initial/j:qpos", "output/b:bias", "output:delay", "body/a:mass"]
     parameters = [
-        Parameter(p, (Target(p, s),), 1.0)
+        Parameter(name=p, targets=(Target(p, s),), guess=1.0)
         for p, s in zip(paths, (2.0, -1.0, 0.5, 3.0, 1.0), strict=True)
     ]
     _, base = compiled(ARM, [])
@@ -809,7 +824,7 @@ def test_outputs_and_starts_are_no_part_of_the_model() -> None:
     assert resolved.changes_model.tolist() == [False] * 4 + [True]
     assert resolved.changes_motion.tolist() == [True, True, False, False, True]
     assert not resolved.needs_compile.any()
-    own = resolved.model(base, np.array([9.0, 9.0, 9.0, 9.0, base.body("a").mass[0]]))
+    own = resolved.writer.model(base, np.array([9.0, 9.0, 9.0, 9.0, base.body("a").mass[0]]))
     np.testing.assert_array_equal(rollout(own, 20), rollout(base, 20))
 
 
@@ -852,10 +867,10 @@ def test_several_targets_follow_one_parameter_by_scale_and_offset() -> None:
         Target("body/b:mass", 2.0, 0.5),
         Target("joint/j:damping", -1.0, 3.0),
     )
-    parameters = [Parameter("m", targets, 1.0), one("option:gravity[1]")]
+    parameters = [Parameter(name="m", targets=targets, guess=1.0), one("option:gravity[1]")]
     spec, base = compiled(ARM, parameters)
     resolved = ParameterSet.build(parameters, base)
-    own = resolved.model(base, np.array([1.25, -0.5]))
+    own = resolved.writer.model(base, np.array([1.25, -0.5]))
     assert (own.body("a").mass[0], own.body("b").mass[0], own.joint("j").damping[0]) == (
         1.25,
         3.0,
@@ -887,9 +902,9 @@ def test_a_parameter_set_works_on_private_copies_and_leaves_the_base_model_alone
     parameters = [one("body/b:ipos[1]"), one("body/b:mass")]
     _, base = compiled(ARM, parameters)
     before, resolved = arrays(base), ParameterSet.build(parameters, base)
-    first = resolved.model(base, np.array([0.2, 3.0]))
+    first = resolved.writer.model(base, np.array([0.2, 3.0]))
     kept = arrays(first)
-    second = resolved.model(base, np.array([0.3, 4.0]))
+    second = resolved.writer.model(base, np.array([0.3, 4.0]))
     assert second.body("b").mass[0] == 4.0
     for name, value in arrays(base).items():
         np.testing.assert_array_equal(value, before[name], err_msg=name)
@@ -902,10 +917,10 @@ def test_writing_twice_leaves_no_trace_of_the_first_value() -> None:
     _, base = compiled(ARM, parameters)
     resolved = ParameterSet.build(parameters, base)
     own, fresh = (
-        resolved.model(base, np.array([0.4, 9.0])),
-        resolved.model(base, np.array([0.1, 2.0])),
+        resolved.writer.model(base, np.array([0.4, 9.0])),
+        resolved.writer.model(base, np.array([0.1, 2.0])),
     )
-    resolved.write(own, np.array([0.1, 2.0]))
+    resolved.writer.write(own, np.array([0.1, 2.0]))
     for name, value in arrays(own).items():
         np.testing.assert_array_equal(value, arrays(fresh)[name], err_msg=name)
 
@@ -1021,14 +1036,21 @@ def test_theta_of_the_wrong_length_is_refused() -> None:
     _, base = compiled(ARM, [])
     resolved = ParameterSet.build([one("body/a:mass")], base)
     with pytest.raises(ValueError, match=r"shorter|longer"):
-        resolved.model(base, np.array([1.0, 2.0]))
+        resolved.writer.model(base, np.array([1.0, 2.0]))
 
 
 def test_difference_steps_and_priors_follow_guess_and_scale() -> None:
     _, base = compiled(ARM, [])
-    large = Parameter("large", (Target("body/a:mass"),), guess=-3.0, scale=0.5, prior=0.1)
+    large = Parameter(
+        name="large", targets=(Target("body/a:mass"),), guess=-3.0, scale=0.5, prior=0.1
+    )
     zero = Parameter(
-        "zero", (Target("joint/j:damping"),), guess=0.0, scale=0.2, true=0.4, bounds=(0.0, 1.0)
+        name="zero",
+        targets=(Target("joint/j:damping"),),
+        guess=0.0,
+        scale=0.2,
+        true=0.4,
+        bounds=(0.0, 1.0),
     )
     resolved = ParameterSet.build([large, zero], base)
     np.testing.assert_array_equal(resolved.magnitude, [3.0, 0.2])
@@ -1118,7 +1140,9 @@ def test_geoms_that_make_a_simple_bodys_inertia_are_followed(
     assert found is not None
     h, ends = 1e-4 * guess, []
     for sign in (1.0, -1.0):
-        loop = Loop(setup.parameters.model(setup.plant.source, np.array([guess + sign * h])), 1)
+        loop = Loop(
+            setup.parameters.writer.model(setup.plant.source, np.array([guess + sign * h])), 1
+        )
         state = setup.initial.state[0]
         for u in setup.initial.ctrl:
             for _ in range(setup.substeps):

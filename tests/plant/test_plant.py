@@ -675,7 +675,7 @@ def test_the_start_enters_the_sensitivity_as_its_own_initial_value(tmp_path) -> 
 
 def test_the_start_of_a_quaternion_moves_in_its_tangent_space(tmp_path) -> None:
     setup = body_setup(
-        tmp_path, nuisance={"initial": {"qpos:ball[2]": True, "qvel:float[4]": True}}
+        tmp_path, nuisance={"initial": {"qpos:ball.rz": True, "qvel:float.ry": True}}
     )
     S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
     np.testing.assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)

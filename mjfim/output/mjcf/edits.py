@@ -10,8 +10,9 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ModelError
+from mjfim.model.elements import element_name
 from mjfim.model.parameters import ParameterSet, Target
-from mjfim.model.paths import OBJECTS, PATH
+from mjfim.model.paths import ParameterPath
 from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField, TargetField
 from mjfim.output.mjcf.actuators import ARRAYS, attribute_changes
 from mjfim.output.mjcf.document import MjcfDocument, all_digits, nearly_equal
@@ -124,12 +125,12 @@ class ParameterEdits:
             if np.allclose(found, wanted, rtol=DERIVED_TOLERANCE, atol=0.0):
                 continue
 
-            name = mujoco.mj_id2name(compiled, OBJECTS[kind], index)
+            name = element_name(compiled, kind, index)
             if not name:
                 raise ModelError(
                     f"MuJoCo derives the {field} of a {kind} that has no name from changed values"
                 )
-            self._write_number(kind, name, field, ModelField(array, (row,), None))
+            self._write_number(kind, name, field, ModelField(array=array, rows=(row,)))
             stated.append(f"{kind} {name!r}")
 
         return list(dict.fromkeys(stated))
@@ -300,9 +301,5 @@ def _derived_rows(model: Any) -> Iterator[tuple[str, str, str, int, int]]:
 
 def _parts(target: Target) -> tuple[str, str, str]:
     """Kind, name and field of a parameter's path."""
-    match = PATH.match(target.path)
-    if match is None:
-        raise ValueError(
-            f"parameter path {target.path!r} is not of the form kind/name:field[index]"
-        )
-    return match["kind"], match["name"] or "", match["field"]
+    path = ParameterPath.parse(target.path)
+    return path.kind, path.name, path.field

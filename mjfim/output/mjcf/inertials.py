@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mjfim.arrays import Array
 from mjfim.model.inertia import INERTIA_COLUMNS, INERTIA_ROWS
-from mjfim.model.targets import inertial
+from mjfim.model.targets import body_inertia
 from mjfim.output.mjcf.document import (
     ORIENTATIONS,
     MjcfDocument,
@@ -47,9 +47,9 @@ def write_inertial(
         ModelError: The body is not in the text.
     """
     body = int(old.body(name).id)
-    before, after = inertial(old, body), inertial(wanted, body)
+    before, after = body_inertia(old, body), body_inertia(wanted, body)
     trace = MAGNITUDE_FACTOR * float(np.trace(before.inertia))
-    radius = MAGNITUDE_FACTOR * before.radius if before.mass > 0.0 else 0.0
+    radius = MAGNITUDE_FACTOR * before.gyration_radius if before.mass > 0.0 else 0.0
 
     same_inertia = nearly_equal(before.inertia, after.inertia, trace).all()
     same_com = nearly_equal(before.com, after.com, radius).all()
@@ -85,7 +85,7 @@ def _write_inertia(
     document: MjcfDocument, tag: int, old: Any, wanted: Any, *, body: int, as_matrix: bool
 ) -> None:
     """Write the inertia matrix of an `<inertial>`, in its present form where that can express it."""
-    before, after = inertial(old, body).inertia, inertial(wanted, body).inertia
+    before, after = body_inertia(old, body).inertia, body_inertia(wanted, body).inertia
     magnitude = MAGNITUDE_FACTOR * float(np.trace(before))
     is_full = document.attribute(tag, "fullinertia") is not None
 

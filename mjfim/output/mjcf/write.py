@@ -16,8 +16,8 @@ from mjfim.errors import ModelError
 from mjfim.experiment.system import Setup
 from mjfim.model.loading import compile_spec, unconstrained
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.paths import FIELDS
-from mjfim.model.spec_writer import settle, write_element
+from mjfim.model.paths import MODEL_ARRAYS
+from mjfim.model.spec_writer import state_derived_values, write_element
 from mjfim.output.mjcf.asset_paths import relocate_assets
 from mjfim.output.mjcf.document import MjcfDocument
 from mjfim.output.mjcf.edits import ParameterEdits
@@ -146,7 +146,7 @@ def _write_printed(path: Path, setup: Setup, theta: Array, wanted: Any) -> None:
     for states_derived in (False, True):
         spec = setup.spec.copy()
         if states_derived:
-            settle(spec, setup.model)
+            state_derived_values(spec, setup.model)
 
         try:
             write_spec(spec, setup.model, wanted, setup.parameters, theta)
@@ -195,7 +195,7 @@ def _differences(a: Any, b: Any) -> list[str]:
     """Names of the arrays that determine the motion and differ between two models."""
     names = [n for n in dir(a) if n.startswith(COMPARED) and not n.startswith(NOT_DYNAMICS)]
     found = [name for name in names if not _equal(getattr(a, name), getattr(b, name))]
-    found += [n for n in FIELDS["option"] if not _equal(getattr(a.opt, n), getattr(b.opt, n))]
+    found += [n for n in MODEL_ARRAYS["option"] if not _equal(getattr(a.opt, n), getattr(b.opt, n))]
 
     # The weights of a body that is 'simple' in one model only are averaged differently.
     if found == [INVERSE_WEIGHT] and not _reweighted_bodies(a, b, same_class=True):

@@ -1,0 +1,67 @@
+"""Elements of a compiled MuJoCo model by kind and name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+
+# MuJoCo's object type of every kind of element that a parameter path can name.
+OBJECT_TYPES = {
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+    "joint": mujoco.mjtObj.mjOBJ_JOINT,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "site": mujoco.mjtObj.mjOBJ_SITE,
+    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
+    "sensor": mujoco.mjtObj.mjOBJ_SENSOR,
+}
+
+# Field of MjModel that counts the elements of a kind, where it is not called `n<kind>`.
+COUNT_FIELDS = {"joint": "njnt", "actuator": "nactuator"}
+
+
+def element_count(model: Any, kind: str) -> int:
+    """Number of elements of a kind, with and without a name."""
+    return int(getattr(model, COUNT_FIELDS.get(kind, f"n{kind}")))
+
+
+def names_of(model: Any, kind: str) -> list[str]:
+    """Names of all elements of a kind that have one, in the order of the model."""
+    count = element_count(model, kind)
+    names = (mujoco.mj_id2name(model, OBJECT_TYPES[kind], i) for i in range(count))
+    return [name for name in names if name]
+
+
+def unnamed_count(model: Any, kind: str) -> int:
+    """Number of elements of a kind that have no name."""
+    return element_count(model, kind) - len(names_of(model, kind))
+
+
+def unique_names(model: Any, kind: str) -> tuple[str, ...]:
+    """Names of all elements of a kind, no two alike.
+
+    An element without a name is called `<kind><number>`; underscores are appended where another element has that name.
+    """
+    count = element_count(model, kind)
+    names = [mujoco.mj_id2name(model, OBJECT_TYPES[kind], i) for i in range(count)]
+    taken = {name for name in names if name}
+
+    for i in range(count):
+        if not names[i]:
+            name = f"{kind}{i}"
+            while name in taken:
+                name += "_"
+            names[i] = name
+
+    return tuple(names)
+
+
+def identifier(model: Any, kind: str, name: str) -> int:
+    """Number of the element of a kind that has a name; -1 where none has it."""
+    return int(mujoco.mj_name2id(model, OBJECT_TYPES[kind], name))
+
+
+def element_name(model: Any, kind: str, number: int) -> str:
+    """Name of an element in the MJCF; empty where it has none."""
+    return mujoco.mj_id2name(model, OBJECT_TYPES[kind], number) or ""

@@ -1,0 +1,240 @@
+"""The only writer of parameter values into models.
+
+Values are written into private copies in place, followed by `mj_setConst`. What only a compile can follow (sizes of geoms,
+functions of an MjSpec) is compiled anew. Tests hold one against the other.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError
+from mjfim.model.elements import element_name
+from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
+from mjfim.model.mujoco_log import silence_mujoco_log
+from mjfim.model.spec_writer import write_element
+from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField
+from mjfim.model.variants import Source
+
+if TYPE_CHECKING:
+    from mjfim.model.parameters import ParameterSet
+
+# How much the largest principal moment of inertia may exceed the sum of the other two, relative to it: the moments of a
+# plate or rod are often typed with few digits.
+MOMENT_ROUNDING = 1e-6
+
+
+class ParameterWriter:
+    """Writes values theta: (p,) of a set of parameters into models."""
+
+    def __init__(self, parameters: ParameterSet) -> None:
+        """Prepare for a set of parameters."""
+        self._parameters = parameters
+        self._scratch: Any = None
+
+    def model(self, base: Source | Any, theta: Array) -> Any:
+        """A private copy of the base model with theta written into it.
+
+        Args:
+            base: A `Source`, or an MjModel where nothing needs a compile.
+            theta: (p,) values.
+
+        Raises:
+            ExperimentError: A function of the MjSpec fails.
+            ModelError: The values do not compile, or change the layout of the state.
+        """
+        model = copy.copy(self.base(base, theta))
+        self.write(model, theta)
+        return base.settle(model) if isinstance(base, Source) else model
+
+    def base(self, source: Source | Any, theta: Array) -> Any:
+        """The model into which theta is written in place: compiled anew where theta needs it, then kept."""
+        if not isinstance(source, Source):
+            return source
+
+        needs_compile = self._parameters.needs_compile
+        if not needs_compile.any():
+            return source.model
+
+        key = np.asarray(theta)[needs_compile].tobytes()
+        return source.edited(key, lambda spec: self._edit(spec, source, theta))
+
+    def write(self, model: Any, theta: Array) -> None:
+        """Write theta: (p,) into a model that the caller owns, in place, then recompute MuJoCo's derived constants.
+
+        What needs a compile is not written here (`model`).
+        """
+        mocap = self._parameters.mocap
+
+        # MuJoCo derives constants from the places at which mocap bodies compile.
+        if mocap is not None:
+            mocap.put(model, mocap.compiled)
+
+        for (kind, row), values in self._write_numbers(model, theta).items():
+            if kind in INERTIA_PARAMETRISATIONS:
+                _write_inertia(model, row, kind, values)
+            else:
+                self._write_orientation(model, kind, row, values)
+
+        if self._scratch is None:
+            self._scratch = mujoco.MjData(model)
+        with silence_mujoco_log():
+            mujoco.mj_setConst(model, self._scratch)
+
+        if mocap is not None:
+            mocap.put(model, mocap.start)
+
+    def unphysical_bodies(
+        self, base: Source | Any, theta: Array
+    ) -> list[tuple[tuple[int, ...], str]]:
+        """Bodies whose inertia at theta no body can have.
+
+        Args:
+            base: A `Source`, or an MjModel where nothing needs a compile.
+            theta: (p,) values.
+
+        Returns:
+            For each of these bodies the indices of the parameters that determine its inertia, and the fault in words.
+
+        Raises:
+            ModelError: MuJoCo refuses to compile the values.
+        """
+        columns_of_body: dict[int, list[int]] = {}
+        for j, fields in enumerate(self._parameters.fields):
+            for field in fields:
+                if isinstance(field, InertiaField):
+                    columns_of_body.setdefault(field.body, []).append(j)
+                elif isinstance(field, ModelField) and field.array in ("body_mass", "body_inertia"):
+                    columns_of_body.setdefault(field.rows[0], []).append(j)
+
+        model = copy.copy(self.base(base, theta))
+        parametrised = {
+            body: (kind, values)
+            for (kind, body), values in self._write_numbers(model, theta).items()
+            if kind in INERTIA_PARAMETRISATIONS
+        }
+
+        found = []
+        for body, columns in columns_of_body.items():
+            fault = _inertia_fault(model, body, *parametrised.get(body, ("", None)))
+            if fault:
+                name = element_name(model, "body", body)
+                found.append((tuple(dict.fromkeys(columns)), f"body {name!r} has {fault}"))
+        return found
+
+    def _write_numbers(self, model: Any, theta: Array) -> dict[tuple[str, int], Array]:
+        """Write every single number in place.
+
+        Returns:
+            What is written as a whole: (10,) coordinates of inertias by (parametrisation, body), and (3,) rotation vectors by
+            (array, row).
+        """
+        p = self._parameters
+        whole: dict[tuple[str, int], Array] = {}
+
+        for parameter, fields, value in zip(p.parameters, p.fields, theta, strict=True):
+            for target, field in zip(parameter.targets, fields, strict=True):
+                number = target.scale * float(value) + target.offset
+                if isinstance(field, ModelField):
+                    field.write(model, number)
+                elif isinstance(field, InertiaField):
+                    key = (field.parametrisation, field.body)
+                    whole.setdefault(key, np.array(p.nominal[key]))[field.component] = number
+                elif isinstance(field, RotationField):
+                    key = (field.array, field.row)
+                    whole.setdefault(key, np.zeros(3))[field.component] = number
+        return whole
+
+    def _write_orientation(self, model: Any, array: str, row: int, vector: Array) -> None:
+        """Turn a body or site from its nominal orientation by a rotation vector: (3,) [rad]."""
+        nominal = Rotation.from_quat(self._parameters.nominal[array, row], scalar_first=True)
+        turned = nominal * Rotation.from_rotvec(vector)
+        getattr(model, array)[row] = turned.as_quat(scalar_first=True)
+
+        # MuJoCo skips the orientation of sites whose frame coincides with their body's.
+        if array == "site_quat":
+            model.site_sameframe[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+
+    def _edit(self, spec: Any, source: Source, theta: Array) -> None:
+        """Write into an MjSpec, in place, what needs a compile."""
+        p = self._parameters
+        for j in np.flatnonzero(p.needs_compile):
+            parameter = p.parameters[j]
+            if parameter.function is not None:
+                try:
+                    parameter.function(spec, float(theta[j]))
+                except Exception as error:
+                    raise ExperimentError(
+                        f"parameters.{parameter.name}: its function failed: {error}"
+                    ) from error
+
+            for target, field in zip(parameter.targets, p.fields[j], strict=True):
+                if isinstance(field, SpecField):
+                    number = target.scale * float(theta[j]) + target.offset
+                    write_element(spec, source.model, source.model, target.path, number)
+
+
+def _write_inertia(model: Any, body: int, kind: str, values: Array) -> None:
+    """Set the inertia of a body from its coordinates: (10,) in a parametrisation, in place.
+
+    The central parametrisation leaves mass and centre of mass to their own fields.
+    """
+    inertia = INERTIA_PARAMETRISATIONS[kind].inertia(values)
+    moments, quaternion = inertia.principal_axes()
+
+    model.body_inertia[body] = moments
+    model.body_iquat[body] = quaternion
+    if kind != "central":
+        model.body_mass[body] = inertia.mass
+        model.body_ipos[body] = inertia.com
+
+    # MuJoCo skips the inertial frame of bodies where it coincides with the body's.
+    model.body_sameframe[body] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+
+
+def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> str:
+    """Words that say why no body can have this inertia; empty where a body can.
+
+    A body that is fixed to others with mass may itself have none.
+
+    Args:
+        model: The model with the numbers of theta.
+        body: Number of the body.
+        kind: Parametrisation of its inertia; empty where the model holds all of it.
+        values: (10,) its coordinates in the parametrisation; None where the model holds all of it.
+    """
+    if kind == "logcholesky":
+        return ""
+
+    mass = float(model.body_mass[body])
+    moments = np.sort(model.body_inertia[body])
+    excess = 0.0
+
+    welded = model.body_weldid == model.body_weldid[body]
+    welded[body] = False
+    may_be_massless = model.body_weldid[body] == 0 or model.body_mass[welded].any()
+    least = 0.0 if may_be_massless else mujoco.mjMINVAL
+
+    if values is not None and kind == "barycentric":
+        mass = float(values[0])
+        least = mujoco.mjMINVAL
+    if not mass >= least:
+        return f"mass {mass:g} kg; it must be > 0"
+
+    if values is not None:
+        moments = np.linalg.eigvalsh(INERTIA_PARAMETRISATIONS[kind].inertia(values).inertia)
+        excess = float(moments[2] - moments[0] - moments[1])
+    if moments[0] >= least and excess <= MOMENT_ROUNDING * moments[2]:
+        return ""
+
+    listed = ", ".join(f"{moment:.4g}" for moment in moments)
+    wanted = "all must be > 0"
+    if moments[0] >= least:
+        wanted = "the smaller two must add up to the largest at least (its pseudo-inertia is not positive semidefinite)"
+    return f"principal moments of inertia {listed} kg m²; {wanted}"
