@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -375,7 +376,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "correlated outside": (
         {"noise": {"acc": {"covariance": BLOCK.tolist()}}, "correlated": pair("acc[0]", "rate")},
-        r"correlated\.outputs: one of them is correlated with an output outside already",
+        r"correlated\.outputs: one of them is already correlated with an output outside",
     ),
     "correlated key": (
         {"correlated": [{"outputs": ["rate", "angle"], "matrix": square(2)}]},
@@ -390,6 +391,21 @@ def test_wrong_tables_are_named(name: str, tmp_path: Path) -> None:
     tables, message = WRONG[name]
     with pytest.raises(ExperimentError, match=rf"experiment: {message}"):
         cart_setup(tmp_path, **tables)
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ("qpos:float[4]", "noise: 'qpos:float[4]' is now written 'qpos:float.qx'"),
+        ("qpos:ball.rx", "the orientation is a quaternion here; valid: qpos:ball.qw, qpos:ball.qx"),
+    ],
+)
+def test_another_spelling_of_a_column_is_refused_with_its_name(
+    written: str, message: str, tmp_path: Path
+) -> None:
+    """Columns of the state hold quaternions, by part and not by index."""
+    with pytest.raises(ExperimentError, match=re.escape(message)):
+        body_setup(tmp_path, noise={written: 0.1})
 
 
 def test_a_covariance_of_an_orientation_is_refused(tmp_path: Path) -> None:

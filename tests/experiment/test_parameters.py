@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -289,6 +290,62 @@ def test_starts_of_all_components(tmp_path: Path) -> None:
     assert setup.parameters.interest.tolist() == [0]
     np.testing.assert_array_equal(setup.parameters.initial_state_derivative(18)[:, 1:], np.eye(18))
     np.testing.assert_allclose(np.diag(setup.parameters.prior_information)[1:], 2500.0)
+
+
+@pytest.mark.parametrize(
+    ("written", "right"),
+    [
+        ("qpos:float[3]", "qpos:float.rx"),
+        ("qvel:float[0]", "qvel:float.x"),
+        ("qpos:ball[2]", "qpos:ball.rz"),
+    ],
+)
+def test_an_indexed_deviation_is_refused_with_its_present_name(
+    written: str, right: str, tmp_path: Path
+) -> None:
+    """In the nuisance table."""
+    message = f"nuisance.initial: '{written}' is now written '{right}'"
+    with pytest.raises(ExperimentError, match=re.escape(message)):
+        body_setup(
+            tmp_path,
+            parameters={"m": {"target": "body/arm:mass"}},
+            nuisance={"initial": {written: 0.1}},
+        )
+
+
+@pytest.mark.parametrize(
+    ("written", "right"),
+    [
+        ("initial/float:qpos[3]", "initial/float:qpos.rx"),
+        ("initial/float:qvel[0]", "initial/float:qvel.x"),
+        ("initial/ball:qpos[2]", "initial/ball:qpos.rz"),
+    ],
+)
+def test_an_indexed_path_is_refused_with_its_present_spelling(
+    written: str, right: str, tmp_path: Path
+) -> None:
+    """In the paths of parameters."""
+    message = f"parameters.p: in parameter path '{written}': '{written}' is now written '{right}'"
+    with pytest.raises(ExperimentError, match=re.escape(message)):
+        body_setup(tmp_path, parameters={"p": {"target": written}})
+
+
+def test_a_deviation_of_an_orientation_is_a_rotation_vector(tmp_path: Path) -> None:
+    """A quaternion's component is refused with the names of the rotation vector."""
+    with pytest.raises(ExperimentError, match=r"rotation vector here; valid: qpos:ball\.rx, .*rz"):
+        body_setup(
+            tmp_path,
+            parameters={"m": {"target": "body/arm:mass"}},
+            nuisance={"initial": {"qpos:ball.qw": 0.1}},
+        )
+
+
+def test_a_deviation_of_a_free_joint_needs_a_part(tmp_path: Path) -> None:
+    """A path without a part names six numbers."""
+    with pytest.raises(
+        ExperimentError, match=r"initial/float:qpos'.*valid: .*initial/float:qpos\.rx"
+    ):
+        body_setup(tmp_path, parameters={"p": {"target": "initial/float:qpos"}})
 
 
 def test_starts_and_biases_by_name(tmp_path: Path) -> None:

@@ -53,9 +53,9 @@ def solids(count: int, seed: int) -> list[BodyInertia]:
         about = points - com
         found.append(
             BodyInertia(
-                float(weights.sum()),
-                com,
-                sum(
+                mass=float(weights.sum()),
+                com=com,
+                inertia=sum(
                     w * (r @ r * np.eye(3) - np.outer(r, r))
                     for w, r in zip(weights, about, strict=True)
                 ),
@@ -132,7 +132,7 @@ def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
     origin = sum(
         w * (r @ r * np.eye(3) - np.outer(r, r)) for w, r in zip(weights, points, strict=True)
     )
-    v = to_barycentric(BodyInertia(float(weights.sum()), com, about))
+    v = to_barycentric(BodyInertia(mass=float(weights.sum()), com=com, inertia=about))
     np.testing.assert_allclose(
         v, [weights.sum(), *(weights @ points), *(origin[p] for p in INERTIA_ENTRIES)], rtol=1e-12
     )
@@ -228,7 +228,9 @@ def test_magnitudes_follow_the_units() -> None:
     """In other units of mass and length they are the same magnitudes: a scale of comparison has no unit of its own."""
     body = solids(1, 9)[0]
     kilo, centi = 1000.0, 100.0
-    other = BodyInertia(kilo * body.mass, centi * body.com, kilo * centi**2 * body.inertia)
+    other = BodyInertia(
+        mass=kilo * body.mass, com=centi * body.com, inertia=kilo * centi**2 * body.inertia
+    )
     factor = {"kg": kilo, "kg m": kilo * centi, "kg m²": kilo * centi**2, "m": centi, "": 1.0}
     for chart in INERTIA_PARAMETRISATIONS.values():
         assert len(chart.names) == len(set(chart.names)) == len(chart.units) == 10
@@ -244,7 +246,9 @@ def test_radius_of_gyration_is_about_the_bodys_origin() -> None:
     """Of points: the root of the mean square distance."""
     points = np.random.default_rng(10).standard_normal((7, 3))
     com, about = points.mean(axis=0), points - points.mean(axis=0)
-    body = BodyInertia(7.0, com, sum(r @ r * np.eye(3) - np.outer(r, r) for r in about))
+    body = BodyInertia(
+        mass=7.0, com=com, inertia=sum(r @ r * np.eye(3) - np.outer(r, r) for r in about)
+    )
     assert body.gyration_radius == pytest.approx(
         np.sqrt(np.mean(np.sum(points**2, axis=1))), rel=1e-12
     )

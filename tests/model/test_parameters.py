@@ -611,10 +611,14 @@ def test_mass_and_density_of_geoms_are_not_in_the_compiled_model() -> None:
 def test_one_rest_length_stands_for_both_ends_of_the_range() -> None:
     """Else the lower end would pass the upper one, which MuJoCo refuses."""
     _, base = compiled(TENDON, [])
-    own = ParameterSet.build([one("tendon/t:springlength")], base).model(base, np.array([0.5]))
+    own = ParameterSet.build([one("tendon/t:springlength")], base).writer.model(
+        base, np.array([0.5])
+    )
     assert own.tendon_lengthspring.tolist() == [[0.5, 0.5]]
     _, ranged = compiled(TENDON.replace('springlength=".3"', 'springlength=".3 .4"'), [])
-    own = ParameterSet.build([one("tendon/t:springlength")], ranged).model(ranged, np.array([0.1]))
+    own = ParameterSet.build([one("tendon/t:springlength")], ranged).writer.model(
+        ranged, np.array([0.1])
+    )
     assert own.tendon_lengthspring.tolist() == [[0.1, 0.4]]
 
 
@@ -707,7 +711,7 @@ def test_the_damping_of_a_servo_does_not_follow_its_gain() -> None:
         Parameter(name="kv", targets=(Target("actuator/p:kv"),), guess=1.0),
     ]
     _, base = compiled(ARM, [])
-    own = ParameterSet.build(parameters, base).model(base, np.array([20.0, 3.0]))
+    own = ParameterSet.build(parameters, base).writer.model(base, np.array([20.0, 3.0]))
     assert own.actuator("p").gainprm[0] == 20.0
     assert own.actuator("p").biasprm[:3].tolist() == [0.0, -20.0, -3.0]
 
@@ -783,12 +787,12 @@ def test_mass_beside_first_moments_keeps_them() -> None:
         one("body/a:mass"),
         Parameter(name="h", targets=(Target("body/a:firstmoment[2]"),), guess=1.0),
     ]
-    own = ParameterSet.build(parameters, base).model(base, np.array([1.5, before[3] + 0.02]))
+    own = ParameterSet.build(parameters, base).writer.model(base, np.array([1.5, before[3] + 0.02]))
     after = INERTIA_PARAMETRISATIONS["barycentric"].coordinates(body_inertia(own, own.body("a").id))
     wanted = np.array(before)
     wanted[0], wanted[3] = 1.5, before[3] + 0.02
     np.testing.assert_allclose(after, wanted, rtol=1e-12, atol=1e-15)
-    alone = ParameterSet.build([one("body/a:mass")], base).model(base, np.array([1.5]))
+    alone = ParameterSet.build([one("body/a:mass")], base).writer.model(base, np.array([1.5]))
     np.testing.assert_array_equal(alone.body("a").ipos, base.body("a").ipos)
 
 
@@ -932,7 +936,7 @@ def test_joint_fields_reach_every_degree_of_freedom_of_the_joint_and_no_other(
     path: str, rows
 ) -> None:
     _, base = compiled(SIMPLE, [])
-    own = ParameterSet.build([one(path)], base).model(base, np.array([0.7]))
+    own = ParameterSet.build([one(path)], base).writer.model(base, np.array([0.7]))
     assert list(np.flatnonzero(own.dof_damping)) == list(rows)
 
 
@@ -994,6 +998,8 @@ def test_names_may_hold_slashes_and_spaces() -> None:
         ("geom/h:size[3]", ["index 3 is out of range", "valid: 0 to 2"]),
         ("option:density[1]", ["index 1 is out of range", "valid: 0 to 0"]),
         ("initial/q:qpos", ["unknown joint 'q'", "valid: j, k"]),
+        ("initial/j:qpos.rx", ["has no parts", "write 'initial/j:qpos'"]),
+        ("body/a:pos.x", ["has parts such as '.rx'", "write pos[index]"]),
         ("initial/j:qpos[1]", ["index 1 is out of range", "valid: 0 to 0"]),
         ("initial/p:act", ["unknown actuator with a state 'p'", "valid: none"]),
         ("initial/j:pos", ["unknown initial field 'pos'", "valid: act, qpos, qvel"]),
