@@ -47,6 +47,7 @@ def test_a_pool_s_processes_are_others_and_end_when_told() -> None:
     assert not workers.stopped()
 
 
+@pytest.mark.slow
 def test_a_pool_that_was_stopped_serves_again_once_nothing_runs() -> None:
     with mjfim.Pool(1) as pool:
         waiting = [pool.submit(until_told, 60.0) for _ in range(3)]

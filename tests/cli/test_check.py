@@ -73,6 +73,7 @@ def test_misuse(study: Path, tmp_path) -> None:
         assert "Traceback" not in result.stderr
 
 
+@pytest.mark.slow
 def test_the_picture_shows_parameters_that_are_not_known_alone() -> None:
     found = mjfim.check(mjfim.Experiment.from_file(MODELS / "double_pendulum.toml"))
     figure = check_figure(found)

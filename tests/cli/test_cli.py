@@ -207,6 +207,7 @@ def test_replay_of_a_lonely_archive(study: Path, archived: Path, tmp_path: Path)
     assert target.is_file()
 
 
+@pytest.mark.slow
 def test_second_run_into_the_same_folder(home: Path, study: Path, archived: Path) -> None:
     """Replaces the first; other files there are left alone."""
     (home / "out" / "notes.txt").write_text("mine", encoding="utf-8")
@@ -711,6 +712,7 @@ def test_version() -> None:
     assert (result.exit_code, result.stdout) == (0, f"{mjfim.__version__}\n")
 
 
+@pytest.mark.slow
 def test_stale_pictures_of_an_older_estimate_are_removed(
     study: Path, recorded: Path, tmp_path: Path
 ) -> None:

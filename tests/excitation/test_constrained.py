@@ -67,6 +67,7 @@ def paper() -> Design:
     return mjfim.design(experiment.replace(cost={"control": 0.0, "tracking": {}}, limits=hard))
 
 
+@pytest.mark.slow
 def test_the_paper_s_study_under_hard_limits_tells_more_than_a_solver_made_for_them(
     paper: Design,
 ) -> None:
@@ -101,6 +102,7 @@ def test_the_paper_s_study_under_hard_limits_tells_more_than_a_solver_made_for_t
     np.testing.assert_allclose(told, paper.final.eigenvalues, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_and_no_engine_step_leaves_them(paper: Design) -> None:
     model = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
     rows = played(model, (model.key("hanging").qpos.copy(), np.zeros(2)), paper.trajectory.ctrl, 1)
@@ -212,6 +214,7 @@ def assert_ends(setup: Setup, design: Design) -> None:
     assert_inside(setup, design.trajectory.ctrl)
 
 
+@pytest.mark.slow
 def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> None:
     """The relaxed barrier brings it there, and the cost has its say from the first iterate on."""
     setup = swinging_setup(tmp_path)
@@ -226,6 +229,7 @@ def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> N
     assert_ends(setup, mjfim.design(setup))
 
 
+@pytest.mark.slow
 def test_a_start_that_no_shrinking_brings_inside_is_steered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -376,7 +380,7 @@ def several(folder: Path, **tables: Any) -> Setup:
     return cart_inside(folder, horizon=0.6, **{"descent": descent, **tables})
 
 
-@pytest.mark.parametrize("criterion", ["E", "D"])
+@pytest.mark.parametrize("criterion", ["E", pytest.param("D", marks=pytest.mark.slow)])
 def test_starts_in_parallel_find_what_they_find_one_after_the_other(
     criterion: str, tmp_path: Path
 ) -> None:
@@ -577,7 +581,12 @@ def nearest(setup: Setup, ctrl: Array) -> float:
 
 
 @pytest.mark.parametrize(
-    ("proofs", "shrunk"), [(0, False), (0, True), (3, False)], ids=["unproved", "shrunk", "proved"]
+    ("proofs", "shrunk"),
+    [
+        pytest.param(0, False, id="unproved"),
+        pytest.param(0, True, id="shrunk"),
+        pytest.param(3, False, id="proved", marks=pytest.mark.slow),
+    ],
 )
 def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
     proofs: int, shrunk: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -612,7 +621,9 @@ def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor])
+@pytest.mark.parametrize(
+    "executor", [None, pytest.param(ThreadPoolExecutor, marks=pytest.mark.slow)]
+)
 def test_a_shorter_design_played_twice_is_a_start(
     tmp_path: Path, executor: type[ThreadPoolExecutor] | None
 ) -> None:
@@ -658,7 +669,14 @@ def test_and_where_weights_bound_the_design_or_samples_are_odd(
         {"cost": {"control": 0.0, "criterion": "A"}},
         {"cost": {"control": 0.0, "criterion": "D"}},
         {"cost": {"control": 0.0, "criterion": "c", "combination": {"m": 1.0, "c": -0.5}}},
-        {"cost": {"control": 0.0}, "robust": {"samples": 3}, "parameters": {"m": {"prior": 0.3}}},
+        pytest.param(
+            {
+                "cost": {"control": 0.0},
+                "robust": {"samples": 3},
+                "parameters": {"m": {"prior": 0.3}},
+            },
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["A", "D", "c", "robust"],
 )

@@ -184,7 +184,9 @@ def test_the_cost_is_the_pooled_criterion_of_separate_experiments_at_the_samples
     assert point.cost == pytest.approx(setup.pool.value(alone) + running, rel=1e-6)
 
 
-@pytest.mark.parametrize(("over", "pooled"), [("worst", np.max), ("mean", np.mean)])
+@pytest.mark.parametrize(
+    ("over", "pooled"), [("worst", np.max), pytest.param("mean", np.mean, marks=pytest.mark.slow)]
+)
 def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
     over: str, pooled: Callable[[Array], float], tmp_path
 ) -> None:

@@ -68,6 +68,7 @@ def test_a_tolerance_shorter_does_not(shorter: mjfim.Shortest) -> None:
     assert below.ratio > 1.0 and f"{below.horizon:g} s" in str(shorter)
 
 
+@pytest.mark.slow
 def test_longer_than_stated_where_it_takes_longer(shorter: mjfim.Shortest) -> None:
     """Begun from too short it ends at about the same."""
     seen: list[Tried] = []

@@ -73,6 +73,7 @@ def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
     )  # 80 of 100 rows
 
 
+@pytest.mark.slow
 def test_every_recording_has_its_own_bias(base: mjfim.Experiment) -> None:
     own = base.replace(nuisance={"bias": {"qpos:hinge": True}, "per_recording": True})
     setup, plain = Setup(own), Setup(base)

@@ -60,6 +60,7 @@ def lost(names: tuple[str, ...], std: np.ndarray) -> set[str]:
     return {name for name, value in zip(names, std, strict=True) if not np.isfinite(value)}
 
 
+@pytest.mark.slow
 def test_experiments_together_do_not_take_round_off_for_information(tmp_path) -> None:
     first = pendulum(tmp_path).experiment
     second = pendulum(tmp_path, initial={"qpos": (0.5, -0.4), "control": SINE}).experiment

@@ -243,6 +243,7 @@ def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
     assert silent.combinations == ()
 
 
+@pytest.mark.slow
 def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_motion(
     tmp_path,
 ) -> None:

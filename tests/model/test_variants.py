@@ -109,6 +109,7 @@ def test_a_longer_timestep_keeps_the_samples_and_stays_near(tmp_path: Path) -> N
         setup.stretched(3)
 
 
+@pytest.mark.slow
 def test_a_design_with_dry_joints_gains_and_keeps_its_limits(tmp_path: Path) -> None:
     limits = {
         "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},

@@ -161,7 +161,7 @@ DIRECTIONS: dict[str, Callable[[], Direction]] = {
 }
 
 
-@pytest.mark.parametrize("method", DIRECTIONS)
+@pytest.mark.parametrize("method", [pytest.param("metric", marks=pytest.mark.slow), "lbfgs"])
 def test_descent_reaches_the_optimum_that_scipy_finds(method: str, optimum: float) -> None:
     iterates = run(Pendulum(), DIRECTIONS[method]())
     assert iterates[-1].status is Status.CONVERGED

@@ -29,7 +29,8 @@ from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from tests.support.paths import ROOT
 
-SIZES = [(1, 1), (14, 30), (1, 70)]
+# Joints and parameters of the records that are drawn.
+SIZES = [(1, 1), (14, 30), pytest.param(1, 70, marks=pytest.mark.slow)]
 
 
 def make_labels(dofs: int, count: int) -> Labels:

@@ -37,6 +37,10 @@ from tests.support.baselines import pendulum, played
 from tests.support.paths import MODELS
 
 STEPS = 120_000
+
+# One method of each kind that runs without `-m slow`: a sweep, random steps, a series, a series refined by mjfim.
+FAST_METHODS = ("chirp", "steps", "fourier5", "fourier5-mjfim")
+
 FRAME = ExcitationSettings(
     t=np.arange(500) * 0.01, horizon=5.0, nu=2, min_frequency=0.1, max_frequency=5.0, may_jump=True
 )
@@ -131,7 +135,13 @@ def test_numbers_are_reflected_at_their_ends() -> None:
 # ---- limits and budgets
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(name, marks=[] if name in FAST_METHODS else pytest.mark.slow)
+        for name in METHODS
+    ],
+)
 def test_every_baseline_keeps_the_limits_and_its_budget(method: str) -> None:
     attempt = found(method)
     assert attempt.control is not None
@@ -179,7 +189,10 @@ def test_workers_share_the_steps() -> None:
     assert attempt.steps < 1.2 * 40_000 + 2 * 8_000
 
 
-@pytest.mark.parametrize("method", ["chirp", "steps", "fourier5"])
+@pytest.mark.parametrize(
+    "method",
+    ["steps", *(pytest.param(name, marks=pytest.mark.slow) for name in ("chirp", "fourier5"))],
+)
 def test_from_rest_to_rest_without_jolts(method: str) -> None:
     experiment = arm(bandwidth=6.0)
     setup = Setup(experiment)
@@ -208,6 +221,7 @@ def test_what_no_control_keeps_is_told_by_its_margin() -> None:
     assert attempt.control is not None
 
 
+@pytest.mark.slow
 def test_weights_are_part_of_the_cost() -> None:
     """Without limits the same J is lowered, effort included: as large as possible is not the best."""
     soft = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=2.0)

@@ -303,6 +303,7 @@ def test_without_a_design_at_the_estimate_the_last_place_serves(
     assert any("no design at the estimate" in w and "too fast" in w for w in found.warnings)
 
 
+@pytest.mark.slow
 def test_each_recording_has_its_own_start() -> None:
     """Deviations of the start are private: what one round learned about its own says nothing about the next's."""
     loose = STUDY.replace(
@@ -329,6 +330,7 @@ def test_each_recording_has_its_own_start() -> None:
     assert (np.abs(error) < 3.5 * last.attained[:3]).all()
 
 
+@pytest.mark.slow
 def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: Setup) -> None:
     limited = STUDY.replace(
         limits={"control": {"force": (-12.0, 12.0)}, "position": {"slide": (-1.0, 1.0)}},
@@ -398,6 +400,7 @@ def write_study(folder: Path) -> Path:
     return folder / "study.toml"
 
 
+@pytest.mark.slow
 def test_round_by_round_is_the_simulated_campaign(
     tmp_path: Path,
     script: ModuleType,

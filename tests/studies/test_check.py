@@ -204,6 +204,7 @@ def double_pendulum_groups(found: mjfim.Check) -> dict[str, dict[str, float]]:
     }
 
 
+@pytest.mark.slow
 def test_the_double_pendulum_names_its_base_parameters() -> None:
     found = check(mjfim.Experiment.from_file(MODELS / "double_pendulum.toml"))
     combinations = double_pendulum_groups(found)
@@ -212,6 +213,7 @@ def test_the_double_pendulum_names_its_base_parameters() -> None:
     assert all(np.isfinite(row.std) for row in found.rows if row.name in ("m2r2", "I2", "d1", "d2"))
 
 
+@pytest.mark.slow
 def test_recordings_of_the_real_double_pendulum_tell_the_same() -> None:
     file = RECORDED / "A0_00.csv.gz"
     if not file.is_file():

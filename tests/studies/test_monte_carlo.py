@@ -44,6 +44,7 @@ def test_study_of_the_paper_at_25_hz(experiment: Experiment, design: mjfim.Desig
     np.testing.assert_allclose(study.information["initial"][0, 0], 961, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_each_trial_is_its_own_least_squares_estimate(
     experiment: Experiment, design: mjfim.Design
 ) -> None:

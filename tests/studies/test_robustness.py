@@ -418,7 +418,7 @@ def test_a_robot_is_what_a_bare_loop_says(
 
 
 @pytest.mark.parametrize("feedback", [False, True])
-@pytest.mark.parametrize("latency", [0.0, 0.005, 0.02])
+@pytest.mark.parametrize("latency", [0.0, 0.005, pytest.param(0.02, marks=pytest.mark.slow)])
 def test_without_noise_the_truth_is_found(
     robots: ModuleType, cart: tuple[mjfim.Experiment, Path], feedback: bool, latency: float
 ) -> None:

@@ -72,7 +72,15 @@ def test_gradient_of_the_information_term() -> None:
 
 
 @pytest.mark.parametrize(
-    ("case", "starts"), [("a", 1), ("b", 1), ("c", 1), ("d", 1), ("e", 4), ("f", 1)]
+    ("case", "starts"),
+    [
+        ("a", 1),
+        ("b", 1),
+        ("c", 1),
+        ("d", 1),
+        pytest.param("e", 4, marks=pytest.mark.slow),
+        pytest.param("f", 1, marks=pytest.mark.slow),
+    ],
 )
 def test_reaches_the_best_known_cost(case: str, starts: int) -> None:
     design = mjfim.design(experiment(case, starts=starts))
@@ -145,7 +153,7 @@ def peer() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize("case", ["b", "c"])
+@pytest.mark.parametrize("case", [pytest.param("b", marks=pytest.mark.slow), "c"])
 def test_agrees_with_exact_derivatives_of_the_hand_derived_model(
     peer: ModuleType, case: str
 ) -> None:

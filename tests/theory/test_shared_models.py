@@ -55,7 +55,13 @@ def test_every_shared_model_loads() -> None:
     assert loaded == {folder.name for folder in SHARED_MODELS.iterdir() if folder.is_dir()}
 
 
-@pytest.mark.parametrize("name", list(EXPERIMENTS))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name == "so_arm100" else [])
+        for name in EXPERIMENTS
+    ],
+)
 def test_every_experiment_starts(name: str) -> None:
     start = mjfim.design(experiment(name).replace(descent={"max_iterations": 0}))
     assert start.final.eigenvalues[0] > 0.0
@@ -66,10 +72,9 @@ def test_every_experiment_starts(name: str) -> None:
     "name",
     [
         "cartpole",
-        "panda",
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("acrobot", "furuta", "so_arm100")
+            for name in ("acrobot", "furuta", "panda", "so_arm100")
         ),
     ],
 )
@@ -88,7 +93,13 @@ def test_design_knows_ten_times_more_than_the_chirp(name: str) -> None:
         assert design.status.success
 
 
-@pytest.mark.parametrize("name", list(EXPERIMENTS))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name == "so_arm100" else [])
+        for name in EXPERIMENTS
+    ],
+)
 def test_check_passes_or_names_the_sample(name: str) -> None:
     found = mjfim.check(experiment(name))
     assert not found.not_separable
