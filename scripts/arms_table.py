@@ -70,7 +70,7 @@ def run(arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: 
         found = mjfim.compare(experiment, args.seconds, methods=args.methods, executor=executor)
     for row in found.rows:
         console.print(
-            f"  {row.title}: {row.worst:.4g}, {row.outcome.value}, {row.seconds:.0f} s, {row.found_by}"
+            f"  {row.title}: {row.worst_relative_std:.4g}, {row.outcome.value}, {row.seconds:.0f} s, {row.found_by}"
         )
     ours = found.design
     if ours is None:
@@ -83,7 +83,7 @@ def run(arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: 
         len(found.parameters),
         best(found, FEW),
         best(found, MANY),
-        ours.worst if ours.sound else float("inf"),
+        ours.worst_relative_std if ours.sound else float("inf"),
         kind,
         share,
         ours.sound,
@@ -97,7 +97,7 @@ def best(found: Comparison, methods: tuple[str, ...]) -> float:
     """Smallest worst relative sigma of some methods."""
 
     def worth(row: MethodResult) -> float:
-        return row.worst if row.sound else float("inf")
+        return row.worst_relative_std if row.sound else float("inf")
 
     return min((worth(row) for row in found.rows if row.method in methods), default=float("inf"))
 

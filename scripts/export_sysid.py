@@ -33,10 +33,10 @@ from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
 from mjfim.experiment.system import Setup
-from mjfim.output.archive import write_json
 from mjfim.output.folders import check_folder
 from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
+from mjfim.records.serialization import write_json
 
 ITERATIONS = 200
 HEADINGS = (

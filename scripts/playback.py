@@ -34,8 +34,9 @@ import mjfim
 from mjfim.errors import ExperimentError, MjfimError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
-from mjfim.output.archive import write_design, write_json
+from mjfim.output.archive import write_design
 from mjfim.parallel import cores
+from mjfim.records.serialization import write_json
 
 MODEL = Path(__file__).resolve().parents[1] / "models" / "servo_arm.toml"
 KINDS = ("position", "velocity", "acceleration", "control", "control_rate", "force", "clearance")

@@ -21,11 +21,12 @@ from mjfim.arrays import Array
 from mjfim.experiment.system import Setup
 from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
-from mjfim.output.archive import study_summary, write_design, write_json
+from mjfim.output.archive import write_design
 from mjfim.output.labels import Labels
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.serialization import write_json
 from mjfim.records.trajectory import Trajectory
 
 EXPERIMENT = Path(__file__).resolve().parents[1] / "models" / "cart_pendulum.toml"
@@ -204,8 +205,8 @@ def main() -> None:
         console.print(efficiency_table(study))
     args.output.mkdir(parents=True, exist_ok=True)
     write_design(args.output, design, setup)
-    write_json(args.output / "montecarlo_25Hz.json", study_summary(studies[25.0]))
-    write_json(args.output / "montecarlo_100Hz.json", study_summary(studies[100.0]))
+    write_json(args.output / "montecarlo_25Hz.json", studies[25.0].summary())
+    write_json(args.output / "montecarlo_100Hz.json", studies[100.0].summary())
     write_figures(args.output, setup, design, studies[25.0])
     console.print(
         f"wrote {args.output}/: figures 2-6, tables, design.rrd (mjfim replay {args.output})"

@@ -15,13 +15,14 @@ from sequential_picture import figure
 from mjfim.errors import ModelError, RecordingError
 from mjfim.excitation.target_accuracy import wanted_of
 from mjfim.experiment.system import Setup
-from mjfim.output.archive import check_fits, estimate_summary, read_design, write_design, write_json
+from mjfim.output.archive import check_fits, read_design, write_design
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.plots import style
 from mjfim.output.plots.style import save
 from mjfim.recordings.read import read_recording
 from mjfim.records.campaign import Campaign, EarlierRound, Round
 from mjfim.records.design import Design
+from mjfim.records.serialization import write_json
 from mjfim.studies.redesign import restated
 
 told = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -112,9 +113,7 @@ class Folder:
     def report(self, now: Round) -> None:
         """Keep a round, and say what it told."""
         self.rounds.append(now)
-        write_json(
-            self.round(now.number) / "estimate.json", estimate_summary(now.estimate, self.setup)
-        )
+        write_json(self.round(now.number) / "estimate.json", now.estimate.summary())
         told.print(f"round {now.number}: {described(now, self.setup)}", markup=False)
         for sentence in now.warnings:
             told.print(f"  warning: {sentence}", style="yellow", markup=False)

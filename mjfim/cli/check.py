@@ -48,7 +48,7 @@ def check(
     if output is not None:
         with writing(output) as results:
             results.leave_check(output, result)
-    _say(as_json, archive.check_summary(result), report.check_report(result))
+    _say(as_json, result.summary(), report.check_report(result))
     if output is not None:
         errors.print(f"wrote {output}/")
     raise typer.Exit(0 if result.ok else 1)

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 
 import mjfim
 from mjfim.errors import MjfimError
-from mjfim.output import archive
+from mjfim.records.serialization import as_json as records_as_json
 
 app = typer.Typer(
     add_completion=False,
@@ -117,6 +117,6 @@ def progress() -> Iterator[Progress]:
 
 def _say(as_json: bool, summary: dict[str, Any], text: Any) -> None:
     if as_json:
-        typer.echo(archive.as_json(summary), nl=False)
+        typer.echo(records_as_json(summary), nl=False)
     else:
         out.print(text)

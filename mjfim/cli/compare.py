@@ -19,7 +19,6 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.experiment.system import Setup
-from mjfim.output import archive
 from mjfim.output import text as report
 from mjfim.output.folders import check_folder
 from mjfim.studies.baselines.methods import METHODS
@@ -73,7 +72,7 @@ def compare(
         raise KeyboardInterrupt
     with writing(output) as results:
         results.leave_comparison(output, result, setup)
-    _say(as_json, archive.comparison_summary(result), report.compare_report(result))
+    _say(as_json, result.summary(), report.compare_report(result))
     errors.print(f"wrote {output}/")
     if not result.ok:
         errors.print(f"mjfim: {' '.join(result.verdict)}", markup=False)

@@ -23,11 +23,11 @@ from mjfim.cli.common import (
 )
 from mjfim.excitation.shortest_horizon import OutOfReachError, Shortest
 from mjfim.experiment.system import Setup
-from mjfim.output import archive
 from mjfim.output import text as report
 from mjfim.output.folders import check_folder
 from mjfim.parallel import Pool
 from mjfim.records.design import HistoryRow
+from mjfim.records.serialization import write_json
 
 
 @contextmanager
@@ -80,11 +80,11 @@ def design(
     with writing(output) as results:
         results.leave_design(output, result, setup)
         if found is not None:
-            archive.write_json(output / "shortest.json", found.summary())
+            write_json(output / "shortest.json", found.summary())
     told = {} if found is None else {"shortest": found.summary()}
     _say(
         as_json,
-        {**archive.design_summary(result), **told},
+        {**result.summary(), **told},
         report.design_report(result, setup.units),
     )
     if found is not None:

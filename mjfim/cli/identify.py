@@ -22,7 +22,6 @@ from mjfim.cli.common import (
 )
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import Setup
-from mjfim.output import archive
 from mjfim.output import text as report
 from mjfim.output.folders import check_folder
 from mjfim.recordings.read import read_log
@@ -85,7 +84,7 @@ def identify(
             errors.print(f"warning: {sentence}", markup=False)
     _say(
         as_json,
-        archive.estimate_summary(result, setup),
+        result.summary(),
         report.estimate_report(result, setup.units),
     )
     errors.print(f"wrote {output}/")

@@ -73,7 +73,7 @@ def montecarlo(
         study = mjfim.monte_carlo(setup, named, trials, seed, progress=tell)
     with writing(output) as results:
         results.leave_study(output, study, setup)
-    _say(as_json, archive.study_summary(study), report.study_report(study, setup.units))
+    _say(as_json, study.summary(), report.study_report(study, setup.units))
     errors.print(f"wrote {output}/")
     if len(study.sets) < len(named):
         errors.print(f"mjfim: interrupted; only {', '.join(study.sets)} is finished")

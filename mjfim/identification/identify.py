@@ -317,6 +317,8 @@ class _Identification:
         at_bound = tuple(name for name, hit in zip(p.names, touch, strict=True) if hit)
         return Estimate(
             parameters=p.names,
+            units=setup.units,
+            prior=p.prior_information,
             theta=theta,
             std=known.std,
             covariance=known.covariance,

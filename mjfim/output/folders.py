@@ -1,8 +1,7 @@
-"""Where results may be written, and where earlier ones are found."""
+"""Folders of results: which files every verb leaves there, and how earlier ones are found."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from pathlib import Path
@@ -19,36 +18,68 @@ from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.serialization import read_json
 
 
 def recording_of(source: Path) -> Path:
-    """The .rrd that a folder or file names."""
+    """Find the Rerun file that a folder of results or a file names.
+
+    Args:
+        source: Folder of results, or an .rrd file.
+
+    Returns:
+        The .rrd file.
+
+    Raises:
+        RecordingError: There is none.
+    """
     if not source.exists():
         raise RecordingError(f"{source}: no such file or folder")
+
     if source.is_dir():
         for name in ("design.rrd", "estimate.rrd"):
             if (source / name).is_file():
                 return source / name
         raise RecordingError(f"{source}: no design.rrd or estimate.rrd in this folder")
+
     if source.suffix != ".rrd":
         raise RecordingError(f"{source}: give a folder of results, an .rrd file or a design .npz")
     return source
 
 
 def experiment_beside(source: Path) -> Path:
-    """Experiment file that the design.json beside an npz names."""
-    beside = source.parent / "design.json"
+    """Find the experiment file that the design.json beside a design.npz names.
+
+    Args:
+        source: The design.npz.
+
+    Returns:
+        The experiment file.
+
+    Raises:
+        RecordingError: There is no design.json beside it, or it names no experiment.
+    """
     try:
-        named = json.loads(beside.read_text(encoding="utf-8"))["experiment"]
-        return source.parent.resolve() / str(Path(named))
-    except (OSError, ValueError, KeyError, TypeError):
+        experiment = read_json(source.parent / "design.json").get("experiment")
+    except RecordingError:
+        experiment = None
+
+    if not isinstance(experiment, str):
         raise RecordingError(
             f"{source}: no usable design.json beside it; name the experiment with --experiment"
-        ) from None
+        )
+    return source.parent.resolve() / experiment
 
 
 def check_folder(folder: Path) -> None:
-    """Fail before the work, not after it, where results cannot be written."""
+    """Check before the work, not after it, that results can be written to a folder.
+
+    Args:
+        folder: The folder; it need not exist yet.
+
+    Raises:
+        RecordingError: It is a file, or writing is not permitted.
+    """
     existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
     if not existing.is_dir():
         raise RecordingError(f"{existing}: is a file; -o needs a folder")
@@ -57,38 +88,66 @@ def check_folder(folder: Path) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Fail before the work where a file cannot be written."""
+    """Check before the work that a file can be written.
+
+    Args:
+        path: The file; it need not exist yet.
+
+    Raises:
+        RecordingError: It is a folder, or writing is not permitted.
+    """
     if path.is_dir():
         raise RecordingError(f"{path}: is a folder; -o and --save need a file here")
     check_folder(path.parent)
 
 
 def leave_design(folder: Path, design: Design, setup: Setup) -> None:
-    """design.json, design.npz, design.csv, design.rrd and pictures."""
+    """Write a design's files, its Rerun file and its figures.
+
+    Args:
+        folder: Folder for the results.
+        design: The design.
+        setup: The experiment for which it was made.
+    """
     archive.write_design(folder, design, setup)
+
     labels = Labels.of_system(setup)
-    for name, figure in (
-        ("trajectories", plots.trajectories(design, labels)),
-        ("sensitivity_phase", plots.sensitivity_phase(design, labels)),
-        ("convergence", plots.convergence(design)),
-        ("standard_deviations", plots.std_bars(design, labels)),
-        ("table_eigenvalues", plots.design_table(design, labels)),
-        *((("limits", plots.limits(design)),) if design.usage else ()),
-    ):
+    figures = {
+        "trajectories": plots.trajectories(design, labels),
+        "sensitivity_phase": plots.sensitivity_phase(design, labels),
+        "convergence": plots.convergence(design),
+        "standard_deviations": plots.std_bars(design, labels),
+        "table_eigenvalues": plots.design_table(design, labels),
+    }
+    if design.usage:
+        figures["limits"] = plots.limits(design)
+    for name, figure in figures.items():
         plots.save(figure, folder / f"{name}.png")
+
     rerun_log.log_design(folder / "design.rrd", setup.model_at(setup.theta), design, labels)
 
 
 def leave_check(folder: Path, check: Check) -> None:
-    """check.json and a picture: accuracies and correlations."""
-    archive.write_json(folder / "check.json", archive.check_summary(check))
+    """Write check.json, check.npz and a figure of accuracies and correlations.
+
+    Args:
+        folder: Folder for the results.
+        check: The check.
+    """
+    check.save(folder)
     plots.save(plots.check_figure(check), folder / "check.png")
 
 
 def leave_comparison(folder: Path, comparison: Comparison, setup: Setup) -> None:
-    """compare.json, a picture, and the control that each method found, `initial.control` of a later experiment."""
+    """Write compare.json, compare.npz, a figure, and the control of each method for `initial.control` of an experiment.
+
+    Args:
+        folder: Folder for the results; controls of an earlier comparison are removed.
+        comparison: The comparison.
+        setup: The experiment that was compared.
+    """
     _clear(folder, r"control_[\w-]+\.csv")
-    archive.write_json(folder / "compare.json", archive.comparison_summary(comparison))
+    comparison.save(folder)
     for row in comparison.rows:
         if row.control is not None:
             archive.write_control(folder / f"control_{row.method}.csv", row.control, setup)
@@ -96,41 +155,63 @@ def leave_comparison(folder: Path, comparison: Comparison, setup: Setup) -> None
 
 
 def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
-    """estimate.json, identified.xml, estimate.rrd and pictures; returns sentences about what is not as it should be."""
+    """Write estimate.json, estimate.npz, identified.xml, estimate.rrd and figures.
+
+    Args:
+        folder: Folder for the results; those of an earlier estimate that are not overwritten are removed.
+        estimate: The estimate.
+        setup: The experiment that was identified.
+
+    Returns:
+        Sentences about results that could not be written completely.
+    """
     _clear(folder, r"fit(_\d+)?\.png|identified\.xml|predictions\.png")
-    archive.write_json(folder / "estimate.json", archive.estimate_summary(estimate, setup))
-    missing = []
+    estimate.save(folder)
+
+    remarks = []
     try:
-        said = write_identified(folder / "identified.xml", setup, estimate.theta)
-        missing += [said] if said else []
+        remark = write_identified(folder / "identified.xml", setup, estimate.theta)
+        remarks += [remark] if remark else []
     except ModelError as error:
-        missing.append(str(error))
+        remarks.append(str(error))
+
     labels = Labels.of_system(setup)
+    _leave_fit_figures(folder, estimate, labels)
+    if estimate.motion is not None:
+        measured = measured_trajectory(setup, estimate.recordings[0])
+        model = setup.model_at(estimate.theta)
+        target = folder / "estimate.rrd"
+        rerun_log.log_estimate(target, model, estimate, measured, estimate.motion, labels)
+    return remarks
+
+
+def _leave_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None:
+    """Write a figure of the fit of each recording, and those of parameters, residuals and predictions."""
+    sigma = list(estimate.sigma.values())
     for i in range(len(estimate.recordings)):
         name = "fit.png" if len(estimate.recordings) == 1 else f"fit_{i + 1}.png"
-        plots.save(plots.fit(estimate, i, labels, list(estimate.sigma.values())), folder / name)
+        plots.save(plots.fit(estimate, i, labels, sigma), folder / name)
+
     plots.save(plots.parameter_intervals(estimate, labels), folder / "parameters.png")
     plots.save(plots.residual_spectra(estimate, labels), folder / "spectra.png")
     if estimate.predictions:
         plots.save(plots.predictions(estimate, labels), folder / "predictions.png")
-    if estimate.motion is not None:
-        measured, model = (
-            measured_trajectory(setup, estimate.recordings[0]),
-            setup.model_at(estimate.theta),
-        )
-        rerun_log.log_estimate(
-            folder / "estimate.rrd", model, estimate, measured, estimate.motion, labels
-        )
-    return missing
 
 
 def leave_study(folder: Path, study: MonteCarloStudy, setup: Setup) -> None:
-    """montecarlo.json, a histogram per parameter, the tables."""
-    archive.write_json(folder / "montecarlo.json", archive.study_summary(study))
+    """Write montecarlo.json, montecarlo.npz, a histogram per parameter, and the tables as a figure.
+
+    Args:
+        folder: Folder for the results.
+        study: The Monte Carlo study.
+        setup: The experiment that was studied.
+    """
+    study.save(folder)
+
     labels = Labels.of_system(setup)
     for i, name in enumerate(study.parameters):
-        safe = re.sub(r"[^\w.-]", "_", name)
-        plots.save(plots.histogram(study, i, labels), folder / f"histogram_{safe}.png")
+        safe_name = re.sub(r"[^\w.-]", "_", name)
+        plots.save(plots.histogram(study, i, labels), folder / f"histogram_{safe_name}.png")
     plots.save(plots.study_table(study, labels), folder / "table_covariance.png")
 
 

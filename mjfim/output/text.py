@@ -328,7 +328,7 @@ def _compared(comparison: Comparison, row: MethodResult) -> list[str]:
         else f"{-100 * comparison.gain(row, ours):+.3g} %"
     )
     first = [*([row.cost] if comparison.weighted else []), row.criterion]
-    cells = [*(_number(n, 4) for n in first), against, _number(row.worst, 3)]
+    cells = [*(_number(n, 4) for n in first), against, _number(row.worst_relative_std, 3)]
     margin = (
         f"{100.0 * share:.2g} % {kind.replace('_', ' ')}" if kind and np.isfinite(share) else "-"
     )

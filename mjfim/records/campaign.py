@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -12,14 +13,15 @@ from mjfim.arrays import Array, freeze
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
+from mjfim.records.serialization import SavedRecord
 
 
 class CampaignStatus(Enum):
     """How a campaign ended; the value is a sentence for the user."""
 
-    REACHED = "reached: every parameter is known as well as wanted"
+    REACHED = "reached: every parameter is known as accurately as wanted"
     DOUBTFUL = "every wanted σ is reached formally, but the fit is in doubt (see warnings): formal σ is not accuracy"
-    EXHAUSTED = "the rounds are used up before every parameter is known as well as wanted"
+    EXHAUSTED = "all rounds are used up before every parameter is known as accurately as wanted"
     WAITING = "the next round is designed and waits for its recording"
     INFEASIBLE = "no design keeps the limits at the estimate; nothing more was recorded"
     INTERRUPTED = "interrupted by the user; the rounds so far are complete"
@@ -27,9 +29,13 @@ class CampaignStatus(Enum):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EarlierRound:
-    """Recordings that are there already: of an earlier session's round, or made without a design.
+    """Recordings that existed before a campaign began: of an earlier session's round, or made without a design.
 
-    theta: (p,) where the round was designed;  predicted: (p,) σ that was promised;  control: (N, nu) of the design
+    Attributes:
+        recordings: The recordings.
+        theta: (p,) parameters at which the round was designed [theta-unit], or None.
+        predicted: (p,) standard deviations that were predicted [theta-unit], or None.
+        control: (N, nu) control of the design [unit of the actuator], or None.
     """
 
     recordings: tuple[Recording, ...]
@@ -40,10 +46,17 @@ class EarlierRound:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Round:
-    """One round. number: from 1;  theta: (p,) where it was designed;  control: (N, nu) of the design
+    """One round of a campaign.
 
-    predicted: (p,) σ after the round as promised before it, NaN where there was no design;  design: None where it was played
-    earlier;  recordings: of this round;  estimate: from all recordings up to this round;  warnings: sentences for the user
+    Attributes:
+        number: Number of the round, from 1.
+        theta: (p,) parameters at which it was designed [theta-unit].
+        predicted: (p,) standard deviations predicted for the estimate after it [theta-unit]; NaN without a design.
+        control: (N, nu) control of the design [unit of the actuator].
+        recordings: Recordings of this round.
+        estimate: Estimate from all recordings up to this round.
+        design: The design; None where it was made in an earlier session.
+        warnings: Sentences for the user.
     """
 
     number: int
@@ -60,15 +73,36 @@ class Round:
 
     @property
     def attained(self) -> Array:
-        """(p,) formal σ of the estimate."""
+        """(p,) formal standard deviations of the estimate [theta-unit]."""
         return self.estimate.std
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of one entry of `rounds` in campaign.json."""
+        return {
+            "number": self.number,
+            "designed_at": self.theta,
+            "predicted": self.predicted,
+            "recordings": len(self.recordings),
+            "theta": self.estimate.theta,
+            "std": self.attained,
+            "chi2": self.estimate.chi2,
+            "dof": self.estimate.dof,
+            "misfit": self.estimate.misfit,
+            "warnings": list(self.warnings),
+        }
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Campaign:
-    """All rounds. wanted: (p,) σ aimed at, infinite where none is
+class Campaign(SavedRecord):
+    """Result of a campaign: all rounds.
 
-    pending: a design that is not recorded yet, or None;  warnings: those of all rounds, each with its round
+    Attributes:
+        parameters: Names of the p parameters.
+        wanted: (p,) standard deviations aimed at [theta-unit]; infinite where none is.
+        rounds: The rounds.
+        status: How the campaign ended.
+        pending: Design that is not recorded yet, or None.
+        warnings: Warnings of all rounds, each with its round.
     """
 
     parameters: tuple[str, ...]
@@ -78,40 +112,63 @@ class Campaign:
     pending: Design | None = None
     warnings: tuple[str, ...] = ()
 
+    file_stem: ClassVar[str] = "campaign"
+    made_by: ClassVar[str] = "Campaign.save"
+
     def __post_init__(self) -> None:
         freeze(self, "wanted")
 
     @property
     def reached(self) -> bool:
-        """Every parameter is known as well as wanted, and nothing speaks against the fit."""
+        """True where every parameter is known as accurately as wanted and the fit is not in doubt."""
         return self.status is CampaignStatus.REACHED
 
     @property
     def estimate(self) -> Estimate | None:
-        """The last one, from all recordings."""
+        """The last estimate, from all recordings."""
         return self.rounds[-1].estimate if self.rounds else None
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
-        """One a round."""
+        """The estimates after each round."""
         return tuple(r.estimate for r in self.rounds)
 
     @property
     def designs(self) -> tuple[Design, ...]:
-        """Those made in this session."""
+        """The designs made in this session."""
         return tuple(r.design for r in self.rounds if r.design is not None)
 
     @property
     def short(self) -> str:
-        """Parameters that are not known as well as wanted, in words; empty where all are."""
+        """Parameters that are not known as accurately as wanted, in words; empty where all are."""
         last = self.estimate
         return "" if last is None else missed_targets(self.parameters, last.std, self.wanted)
 
     def __str__(self) -> str:
-        return f"{self.status.value}{f': {self.short}' if self.short else ''}; {len(self.rounds)} rounds"
+        missed = f": {self.short}" if self.short else ""
+        return f"{self.status.value}{missed}; {len(self.rounds)} rounds"
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of campaign.json."""
+        return {
+            "status": self.status.name.lower(),
+            "message": str(self),
+            "reached": self.reached,
+            "parameters": list(self.parameters),
+            "wanted": self.wanted,
+            "rounds": [r.summary() for r in self.rounds],
+            "warnings": list(self.warnings),
+        }
 
 
 def missed_targets(names: Sequence[str], std: Array, wanted: Array) -> str:
-    """The parameters that are not known as well as wanted, the worst first: `m (σ 0.012, wanted 0.01)`."""
-    order = sorted(np.flatnonzero(~(std <= wanted)).tolist(), key=lambda j: -std[j] / wanted[j])
-    return ", ".join(f"{names[j]} (σ {std[j]:.3g}, wanted {wanted[j]:.3g})" for j in order)
+    """Return the parameters that miss their target accuracy, the worst first: `m (σ 0.012, wanted 0.01)`.
+
+    Args:
+        names: Names of the p parameters.
+        std: (p,) standard deviations [theta-unit].
+        wanted: (p,) standard deviations aimed at [theta-unit].
+    """
+    missed = np.flatnonzero(~(std <= wanted)).tolist()
+    worst_first = sorted(missed, key=lambda j: -std[j] / wanted[j])
+    return ", ".join(f"{names[j]} (σ {std[j]:.3g}, wanted {wanted[j]:.3g})" for j in worst_first)

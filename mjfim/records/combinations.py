@@ -1,42 +1,47 @@
-"""Records of parameter combinations that can be identified."""
+"""Records of parameter combinations that can be identified although the parameters cannot."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array
 
+# Coefficients that differ from one by less than this are not written out.
+UNIT_COEFFICIENT_TOLERANCE = 1e-6
+
 
 @dataclass(frozen=True, kw_only=True)
 class Combination:
-    """A visible combination `sum_i coefficients_i * parameter_i`, its first member with coefficient 1."""
+    """An identifiable linear combination `sum_i coefficients_i * parameter_i`.
+
+    Attributes:
+        members: Names of the parameters.
+        coefficients: Coefficient of each; the first one is 1.
+    """
 
     members: tuple[str, ...]
     coefficients: tuple[float, ...]
 
     def __str__(self) -> str:
-        head, *rest = zip(self.members, self.coefficients, strict=True)
-        return " ".join(
-            [head[0], *(f"{'+' if c > 0 else '-'} {_number(abs(c))}{name}" for name, c in rest)]
-        )
-
-
-def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -> Array:
-    """(c, t) coefficients of all combinations of the groups, over the named parameters."""
-    combinations = [c for group in groups for c in group.combinations]
-    rows = np.zeros((len(combinations), len(names)))
-    for row, combination in zip(rows, combinations, strict=True):
-        for member, coefficient in zip(combination.members, combination.coefficients, strict=True):
-            row[list(names).index(member)] = coefficient
-    return rows
+        terms = [self.members[0]]
+        for name, coefficient in zip(self.members[1:], self.coefficients[1:], strict=True):
+            sign = "+" if coefficient > 0 else "-"
+            terms.append(f"{sign} {_factor(abs(coefficient))}{name}")
+        return " ".join(terms)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterGroup:
-    """Parameters that are visible only together: as `combinations`, fewer than members; none where all are invisible."""
+    """Parameters that are identifiable only together.
+
+    Attributes:
+        members: Names of the parameters.
+        combinations: The identifiable combinations, fewer than members; none where no member has any effect.
+    """
 
     members: tuple[str, ...]
     combinations: tuple[Combination, ...]
@@ -47,11 +52,47 @@ class ParameterGroup:
             return f"{names}: no effect on anything that is measured"
         return f"{names} only as {', '.join(str(c) for c in self.combinations)}"
 
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of one group in check.json."""
+        identifiable = [
+            dict(zip(c.members, c.coefficients, strict=True)) for c in self.combinations
+        ]
+        return {
+            "members": list(self.members),
+            "identifiable": identifiable,
+            "words": str(self),
+        }
 
-def _number(value: float) -> str:
-    return "" if abs(value - 1.0) < 1e-6 else f"{value:.4g} "
+
+def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -> Array:
+    """Return the coefficients of all combinations of some groups as a matrix.
+
+    Args:
+        groups: Groups of parameters.
+        names: Names of the t parameters that the columns stand for.
+
+    Returns:
+        (c, t) coefficients, one row per combination.
+    """
+    combinations = [c for group in groups for c in group.combinations]
+    column_of = {name: j for j, name in enumerate(names)}
+
+    matrix = np.zeros((len(combinations), len(names)))
+    for row, combination in zip(matrix, combinations, strict=True):
+        for member, coefficient in zip(combination.members, combination.coefficients, strict=True):
+            row[column_of[member]] = coefficient
+    return matrix
 
 
 def join_names(names: Sequence[str]) -> str:
-    """`a, b and c`."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+    """Return names as a list in a sentence: `a, b and c`."""
+    if len(names) == 1:
+        return names[0]
+    return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _factor(coefficient: float) -> str:
+    """Return a coefficient in front of a name; empty where it is one."""
+    if abs(coefficient - 1.0) < UNIT_COEFFICIENT_TOLERANCE:
+        return ""
+    return f"{coefficient:.4g} "

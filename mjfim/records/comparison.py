@@ -1,37 +1,54 @@
-"""Records of a comparison: what each method found, and which of them is the better one."""
+"""Records of a comparison: the best control that each method found, and which method is the best."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.records.serialization import SavedRecord
 
+# Key of mjfim's own design among the methods.
 DESIGN = "design"
-TIE_TOLERANCE = 1e-3  # relative difference of J that is none
+
+# Relative difference of two costs J below which they count as equal.
+TIE_TOLERANCE = 1e-3
 
 
 class MethodOutcome(Enum):
     """How a method ended; the value is a verb phrase for the user."""
 
     INSIDE = "keeps all limits"
-    OUTSIDE = "leaves a limit"
-    NOTHING = "found nothing that keeps all limits"
-    CLAMPED = "rests on clamped forces"
-    NONE = "had no time for a single try"
+    OUTSIDE = "violates a limit"
+    NOTHING = "found no control that keeps all limits"
+    CLAMPED = "relies on saturated actuators"
+    NONE = "had no time for a single evaluation"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MethodResult:
-    """What a method found. The control is None, and numbers are NaN, where it has nothing to show.
+    """The best control that one method found. Without a control, numbers are NaN.
 
-    method, title: its key, its name;  control: (N, nu);  cost: J;  criterion: phi;  std: (p,) Cramer-Rao
-    smallest: eigenvalue of what the criterion sees, per second
-    worst: `(lambda_min(S I S))^-1/2`, standard deviation of the worst combination of parameters, relative to their scales S
-    seconds, steps: what it took;  margins, shares: worst of each kind of limit, in its unit and over half of its range
-    found_by: which of its tries;  note: a word about the result
+    Attributes:
+        method: Key of the method.
+        title: Its name for the user.
+        outcome: How it ended.
+        control: (N, nu) control, or None [unit of the actuator].
+        cost: J.
+        criterion: phi, the information term of the cost.
+        std: (p,) Cramér-Rao standard deviations [theta-unit].
+        min_eigenvalue: Smallest eigenvalue of the information per second that the criterion sees.
+        worst_relative_std: `(lambda_min(S I S))^-1/2`: standard deviation of the worst combination of parameters,
+            relative to their scales S.
+        seconds: Wall time [s].
+        steps: MuJoCo steps taken.
+        margins: Worst margin of each kind of limit [unit of the limit].
+        relative_margins: These margins over half of the limits' ranges.
+        found_by: Name of the attempt that led to the control.
+        note: Remark about the result; may be empty.
     """
 
     method: str
@@ -41,36 +58,68 @@ class MethodResult:
     cost: float
     criterion: float
     std: Array
-    smallest: float
-    worst: float
+    min_eigenvalue: float
+    worst_relative_std: float
     seconds: float
     steps: int
     margins: dict[str, float]
-    shares: dict[str, float]
+    relative_margins: dict[str, float]
     found_by: str = ""
     note: str = ""
 
     def __post_init__(self) -> None:
-        freeze(self, "std", *(() if self.control is None else ("control",)))
+        freeze(self, "std")
+        if self.control is not None:
+            freeze(self, "control")
 
     @property
     def sound(self) -> bool:
-        """It may be played: inside all limits, and what it promises is no artefact of clamps."""
+        """True where the control keeps all limits and its information is no artefact of saturated actuators."""
         return self.outcome is MethodOutcome.INSIDE
 
     @property
     def tightest(self) -> tuple[str, float]:
-        """Kind and share of the worst margin; an empty name where nothing is limited."""
-        return min(self.shares.items(), key=lambda item: item[1], default=("", np.inf))
+        """Kind and relative size of the smallest margin; an empty kind where nothing is limited."""
+        return min(self.relative_margins.items(), key=lambda item: item[1], default=("", np.inf))
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of one entry of `methods` in compare.json."""
+        return {
+            "method": self.method,
+            "title": self.title,
+            "outcome": self.outcome.name.lower(),
+            "message": self.outcome.value,
+            "cost": self.cost,
+            "criterion": self.criterion,
+            "smallest_eigenvalue": self.min_eigenvalue,
+            "worst_relative_sigma": self.worst_relative_std,
+            "std": self.std,
+            "seconds": self.seconds,
+            "steps": self.steps,
+            "limits": {"margins": self.margins, "shares": self.relative_margins},
+            "found_by": self.found_by,
+            "note": self.note,
+        }
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Comparison:
-    """Methods side by side, each with the same budget, in the order in which they ran.
+class Comparison(SavedRecord):
+    """Result of `mjfim.compare`: methods side by side, each with the same budget, in the order in which they ran.
 
-    criterion: E, A, D or c;  nats: of D-optimality, by which its J is divided to be that of a single parameter, else 0
-    parameters, units, scale: of the p parameters;  nuisance: names of those that nobody asks for
-    seconds, steps: the budget;  weighted: J has more terms than the criterion
+    Attributes:
+        source: Name of the experiment.
+        criterion: "E", "A", "D" or "c".
+        nats: Of D-optimality: number by which differences of J are divided, so that they mean a single parameter; else 0.
+        parameters: Names of the p parameters.
+        units: Unit of each.
+        scale: (p,) scale of each [theta-unit].
+        nuisance: Names of the parameters that the experiment does not aim at.
+        rows: Result of each method.
+        seconds: Time that each method had [s].
+        steps: MuJoCo steps that each method had; may be infinite.
+        seed: Seed of the random numbers.
+        weighted: True where J has more terms than the criterion.
+        interrupted: True where the user interrupted the comparison.
     """
 
     source: str
@@ -87,87 +136,129 @@ class Comparison:
     weighted: bool
     interrupted: bool = False
 
+    file_stem: ClassVar[str] = "compare"
+    made_by: ClassVar[str] = "`mjfim compare EXPERIMENT -o DIR`"
+
     def __post_init__(self) -> None:
         freeze(self, "scale")
 
     @property
     def wanted(self) -> tuple[int, ...]:
-        """Places of the parameters that are no nuisance."""
+        """Indices of the parameters that are no nuisance."""
         return tuple(j for j, name in enumerate(self.parameters) if name not in self.nuisance)
 
     @property
     def design(self) -> MethodResult | None:
-        """The design, if it was reached."""
+        """Result of mjfim's own design; None where the comparison ended before it."""
         return next((row for row in self.rows if row.method == DESIGN), None)
 
     @property
     def rival(self) -> MethodResult | None:
-        """The best baseline that may be played."""
-        others = (row for row in self.rows if row.method != DESIGN and row.sound)
-        return min(others, key=lambda row: row.cost, default=None)
+        """The best sound baseline."""
+        baselines = (row for row in self.rows if row.method != DESIGN and row.sound)
+        return min(baselines, key=lambda row: row.cost, default=None)
 
     @property
     def best(self) -> MethodResult | None:
-        """The best of all that may be played."""
+        """The best sound result of all."""
         return min((row for row in self.rows if row.sound), key=lambda row: row.cost, default=None)
 
     @property
     def beating(self) -> tuple[MethodResult, ...]:
-        """Baselines that are better than the design, the best first."""
-        ours = self.design
-        if ours is None:
+        """Sound baselines that are better than the design, the best first."""
+        design = self.design
+        if design is None:
             return ()
-        better = [
-            r
-            for r in self.rows
-            if r.sound and r is not ours and (not ours.sound or self.gain(r, ours) > TIE_TOLERANCE)
-        ]
+
+        better = []
+        for row in self.rows:
+            if row is design or not row.sound:
+                continue
+            if not design.sound or self.gain(row, design) > TIE_TOLERANCE:
+                better.append(row)
         return tuple(sorted(better, key=lambda row: row.cost))
 
     def gain(self, row: MethodResult, other: MethodResult) -> float:
-        """By what share of the other's J a row's is lower; of D-optimality, its geometric mean of variances."""
+        """Return the fraction by which the J of one result is lower than that of another.
+
+        Args:
+            row: The one result.
+            other: The other one.
+
+        Returns:
+            Fraction of the other's J; of D-optimality: fraction of its geometric mean of variances.
+        """
         if self.nats:
             return float(-np.expm1((row.cost - other.cost) / self.nats))
         return 1.0 - row.cost / other.cost
 
     @property
     def ok(self) -> bool:
-        """All ran, the design may be played, and nothing beats it."""
-        return (
-            not self.interrupted
-            and self.design is not None
-            and self.design.sound
-            and not self.beating
-        )
+        """True where all methods ran, the design is sound, and nothing beats it."""
+        design = self.design
+        return not self.interrupted and design is not None and design.sound and not self.beating
 
     @property
     def verdict(self) -> tuple[str, ...]:
-        """Sentences, the important one first."""
-        return (
-            _verdict(self),
-            *(("Interrupted: only the methods shown are finished.",) if self.interrupted else ()),
-        )
+        """Sentences for the user, the important one first."""
+        sentences = [_verdict(self)]
+        if self.interrupted:
+            sentences.append("Interrupted: only the methods shown are finished.")
+        return tuple(sentences)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of compare.json."""
+        return {
+            "ok": self.ok,
+            "verdict": list(self.verdict),
+            "interrupted": self.interrupted,
+            "criterion": self.criterion,
+            "budget": {"seconds": self.seconds, "steps": self.steps},
+            "seed": self.seed,
+            "parameters": list(self.parameters),
+            "units": list(self.units),
+            "scale": self.scale,
+            "nuisance": list(self.nuisance),
+            "best": None if self.best is None else self.best.method,
+            "beating": [row.method for row in self.beating],
+            "methods": [row.summary() for row in self.rows],
+        }
 
 
-def _verdict(c: Comparison) -> str:
-    ours, rival = c.design, c.rival
-    if ours is None:
-        return "The design was not reached: there is nothing to hold against it."
+def _verdict(comparison: Comparison) -> str:
+    """Return a sentence that says whether the design is the best."""
+    design, rival = comparison.design, comparison.rival
+
+    # Nothing to compare with, or nothing to compare.
+    if design is None:
+        return "The design was not run: there is nothing to compare the baselines with."
     if rival is None:
-        return f"No baseline found a control that may be played; the design {ours.outcome.value}."
-    sigmas = f"worst relative σ {ours.worst:.3g} against {rival.worst:.3g}"
-    if not ours.sound:
-        return f"The design {ours.outcome.value}; the best that may be played is {rival.title} ({sigmas})."
-    if c.beating:
-        told = ", ".join(
-            f"{row.title} (J {_percent(c.gain(row, ours))} lower)" for row in c.beating
+        return (
+            f"No baseline found a control that keeps all limits; the design {design.outcome.value}."
         )
-        return f"The design is beaten by {told}: {sigmas}."
-    won = c.gain(ours, rival)
-    if won <= TIE_TOLERANCE:
+
+    sigmas = (
+        f"worst relative σ {design.worst_relative_std:.3g} against {rival.worst_relative_std:.3g}"
+    )
+    if not design.sound:
+        return f"The design {design.outcome.value}; the best control that may be used is from {rival.title} ({sigmas})."
+
+    if comparison.beating:
+        better = ", ".join(
+            f"{row.title} (J {_percent(comparison.gain(row, design))} lower)"
+            for row in comparison.beating
+        )
+        return f"The design is beaten by {better}: {sigmas}."
+
+    gain = comparison.gain(design, rival)
+    if gain <= TIE_TOLERANCE:
         return f"The design is as good as the best baseline, {rival.title}: {sigmas}."
-    return f"The design is the best: J {_percent(won)} lower than that of the best baseline, {rival.title}; {sigmas}."
+    return (
+        f"The design is the best: J {_percent(gain)} lower than that of the best baseline, "
+        f"{rival.title}; {sigmas}."
+    )
 
 
-def _percent(share: float) -> str:
-    return f"{100.0 * share:.2g} %"
+def _percent(fraction: float) -> str:
+    """Return a fraction in percent, to two digits."""
+    return f"{100.0 * fraction:.2g} %"

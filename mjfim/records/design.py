@@ -2,28 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.records.serialization import SavedRecord
 from mjfim.records.trajectory import Trajectory
+
+# Arrays of a trajectory that design.npz holds under their own names.
+TRAJECTORY_ARRAYS = ("t", "qpos", "qvel", "act", "ctrl")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evaluation:
-    """A trajectory and what it tells about the parameters.
+    """A trajectory and the information that it carries about the parameters.
 
-    gain: (N, nu, nx) regulator K about the trajectory
-    sensitivity: psi, (N+1, nx, p)
-    information: (p, p) Fisher information, summed over the measured samples [1 / (theta_i theta_j unit)]
-    eigenvalues: (s,) ascending, of the information per second that the cost sees (scaled, nuisance removed, identifiable
-    combinations only)
-    std: (p,) Cramer-Rao standard deviations, infinite where a parameter cannot be told alone
-    min_eigenvalue: (N+1,) smallest eigenvalue of the information (per second) accumulated up to each sample
-    criterion: phi, the information term of the cost;  cost: J
-    growth: largest open-loop amplification of a small deviation along the trajectory (NaN: not computed)
+    Attributes:
+        trajectory: The trajectory.
+        gain: (N, nu, nx) regulator K about the trajectory [u-unit / x-unit].
+        sensitivity: (N+1, nx, p) psi [x-unit / theta-unit].
+        information: (p, p) Fisher information, summed over the measured samples [1 / (unit of theta_i times unit of theta_j)].
+        eigenvalues: (s,) ascending, of the information per second that the cost sees: scaled, nuisance marginalised,
+            identifiable combinations only.
+        std: (p,) Cramér-Rao standard deviations [theta-unit]; infinite where a parameter is not identifiable alone.
+        min_eigenvalue: (N+1,) smallest eigenvalue of the information per second, accumulated up to each sample.
+        criterion: phi, the information term of the cost.
+        cost: J.
+        growth: Largest open-loop amplification of a small deviation along the trajectory; NaN where it was not computed.
     """
 
     trajectory: Trajectory
@@ -40,6 +49,17 @@ class Evaluation:
     def __post_init__(self) -> None:
         freeze(self, "gain", "sensitivity", "information", "eigenvalues", "std", "min_eigenvalue")
 
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of `initial` and of `final` in design.json."""
+        return {
+            "cost": self.cost,
+            "criterion": self.criterion,
+            "growth": self.growth,
+            "information": self.information,
+            "eigenvalues": self.eigenvalues,
+            "std": self.std,
+        }
+
 
 class Status(Enum):
     """How an optimisation ended; the value is a sentence for the user."""
@@ -48,25 +68,44 @@ class Status(Enum):
     SMOOTHED = (
         "converged on a smooth λ_min, used because the smallest eigenvalues meet (a local optimum)"
     )
-    ROUGH = "ended where derivatives hardly exist (contact, dry friction or clamps): the numbers are indications, see warnings"
-    STALLED = "stalled: no step along the descent lowers the cost any more, at the accuracy of the differences"
+    ROUGH = (
+        "ended where derivatives hardly exist (contact, dry friction or saturated actuators): "
+        "the numbers are indications, see warnings"
+    )
+    STALLED = (
+        "stalled: no step along the descent direction lowers the cost any more, "
+        "within the accuracy of the finite differences"
+    )
     MAX_ITERATIONS = "stopped at max_iterations or seconds before convergence; raise them, or start from the result"
-    INFEASIBLE = "found nothing that keeps all limits; the margins say which is missed: widen it, or start more gently"
-    LEFT = "left behind for a start that promised more"
+    INFEASIBLE = (
+        "found no trajectory that keeps all limits; the margins show which limit is violated: "
+        "widen it, or begin with a gentler control"
+    )
+    LEFT = "discarded: another start was more promising"
     INTERRUPTED = "interrupted by the user; this is the best trajectory so far"
 
     @property
     def success(self) -> bool:
-        """True where the result is a (local) optimum to the wanted tolerance."""
+        """True where the result is a (local) optimum to the requested tolerance."""
         return self in (Status.CONVERGED, Status.SMOOTHED)
 
 
 @dataclass(frozen=True, kw_only=True)
 class HistoryRow:
-    """One iterate of a design: cost J, criterion phi, smallest eigenvalue, slope |DJ.zeta|, step length gamma.
+    """One iterate of a design.
 
-    seconds, steps: wall time and MuJoCo steps since the start;  rate: sample rate of this level [Hz] (coarse-to-fine)
-    mu: weight of the barrier of hard limits, 0 without;  margin: the worst one over half of its range, NaN without
+    Attributes:
+        iteration: Number of the iterate, from 0.
+        cost: J.
+        criterion: phi, the information term of the cost.
+        min_eigenvalue: Smallest eigenvalue of the information per second that the cost sees.
+        slope: |DJ . zeta|, predicted change of the cost for a full step.
+        gamma: Step length that led here.
+        seconds: Wall time since the optimisation began [s].
+        steps: MuJoCo steps since the optimisation began.
+        rate: Sample rate of the plant on which the optimisation ran [Hz] (coarse-to-fine).
+        mu: Weight of the barrier of hard limits; 0 without limits.
+        margin: Worst margin over half of its range; NaN without limits.
     """
 
     iteration: int
@@ -84,17 +123,40 @@ class HistoryRow:
 
 @dataclass(frozen=True, kw_only=True)
 class StartResult:
-    """One start of a multi-start design: its name, the cost it reached, how it ended."""
+    """Result of one initial control of a multistart design.
+
+    Attributes:
+        name: Name of the initial control.
+        cost: J that was reached.
+        status: How the optimisation from it ended.
+        iterations: Number of iterations.
+    """
 
     name: str
     cost: float
     status: Status
     iterations: int
 
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of one entry of `starts` in design.json."""
+        return {
+            "name": self.name,
+            "cost": self.cost,
+            "status": self.status.name.lower(),
+            "iterations": self.iterations,
+        }
+
 
 @dataclass(frozen=True, kw_only=True)
 class CombinationAccuracy:
-    """An identifiable combination of parameters that are not so alone: its words, value and standard deviations."""
+    """Accuracy of an identifiable combination of parameters that are not identifiable alone.
+
+    Attributes:
+        expression: The combination in words, for example `m + 2 l`.
+        value: Its value at the theta of the design.
+        std_initial: Its standard deviation after the initial experiment.
+        std_final: Its standard deviation after the designed experiment.
+    """
 
     expression: str
     value: float
@@ -104,9 +166,14 @@ class CombinationAccuracy:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LimitUsage:
-    """How much of a limit a trajectory uses. kind: of the limit;  name: of the joint, the actuator or the nearest pair
+    """Where a trajectory lies between the two bounds of one limit.
 
-    t: (n,) [s];  share: (n,) -1 at the lower bound, 1 at the upper one; of a clearance, the least one over what there is
+    Attributes:
+        kind: Kind of the limit: "position", "velocity", "control", "clearance", ...
+        name: Name of the joint, of the actuator or of the nearest pair of geoms.
+        t: (n,) times [s].
+        share: (n,) relative position between the bounds: -1 at the lower bound, 1 at the upper one. Of a clearance: the
+            required distance over the distance.
     """
 
     kind: str
@@ -118,18 +185,44 @@ class LimitUsage:
         freeze(self, "t", "share")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Design:
-    """Result of `mjfim.design`: the designed trajectory beside the one it started from.
+def _npz_names() -> dict[str, str]:
+    """Return the names of arrays in design.npz that users know, by path in the record."""
+    names = {}
+    for evaluation, prefix in (("final", ""), ("initial", "initial_")):
+        for array in TRAJECTORY_ARRAYS:
+            names[f"{evaluation}.trajectory.{array}"] = f"{prefix}{array}"
+        for array in ("gain", "sensitivity"):
+            names[f"{evaluation}.{array}"] = f"{prefix}{array}"
+    return names
 
-    parameters: p names;  theta: (p,) where the design was made
-    slope: last |DJ.zeta|;  steps: MuJoCo steps taken;  seconds: wall time
-    limits: worst margin per kind of limit (positive = inside), by kind;  usage: of every limit at every engine step
-    warnings: sentences for the user
-    found_by: name of the start that led here;  starts: all of them
-    nuisance: names of the parameters that the design did not look at
-    combinations: groups of parameters that are not identifiable alone, in words;  combined: what is identifiable of them
-    prior: (p, p) information put in;  data: (p, p) information of this experiment alone, its private nuisance marginalised
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Design(SavedRecord):
+    """Result of `mjfim.design`: the designed trajectory beside the initial one.
+
+    Saved as design.json and design.npz. The arrays of the designed trajectory are named t, qpos, qvel, act, ctrl, gain and
+    sensitivity in design.npz, those of the initial one likewise with the prefix `initial_`; `Design.load` reads design.npz.
+
+    Attributes:
+        status: How the optimisation ended.
+        parameters: Names of the p parameters.
+        theta: (p,) parameters at which the design was made [theta-unit].
+        initial: The initial trajectory and its information.
+        final: The designed trajectory and its information.
+        history: The iterates.
+        slope: Last |DJ . zeta|.
+        steps: MuJoCo steps taken.
+        seconds: Wall time [s].
+        limits: Worst margin per kind of limit, positive inside [unit of the limit].
+        usage: Usage of every limit at every engine step.
+        warnings: Sentences for the user.
+        found_by: Name of the initial control that led to the design.
+        starts: Results of all initial controls.
+        nuisance: Names of the parameters that the design did not aim at.
+        combinations: Groups of parameters that are not identifiable alone, in words.
+        combined: Accuracies of the identifiable combinations of these groups.
+        prior: (p, p) information put in before this experiment [1 / (unit of theta_i times unit of theta_j)].
+        data: (p, p) information of this experiment alone, its private nuisance parameters marginalised.
     """
 
     status: Status
@@ -152,20 +245,66 @@ class Design:
     prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
     data: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
+    file_stem: ClassVar[str] = "design"
+    made_by: ClassVar[str] = "`mjfim design EXPERIMENT -o DIR`"
+    array_names: ClassVar[Mapping[str, str]] = _npz_names()
+
     def __post_init__(self) -> None:
         freeze(self, "theta", "prior", "data")
 
     @property
     def wanted(self) -> tuple[int, ...]:
-        """Places of the parameters that are no nuisance."""
+        """Indices of the parameters that are no nuisance."""
         return tuple(j for j, name in enumerate(self.parameters) if name not in self.nuisance)
 
     @property
     def success(self) -> bool:
-        """Converged and inside all limits."""
-        return self.status.success and all(margin >= 0.0 for margin in self.limits.values())
+        """True where the optimisation converged and the trajectory keeps all limits."""
+        return self.status.success and self.within_limits
+
+    @property
+    def within_limits(self) -> bool:
+        """True where no margin is negative."""
+        return all(margin >= 0.0 for margin in self.limits.values())
+
+    @property
+    def iterations(self) -> int:
+        """Number of the last iterate; 0 where there is none."""
+        return self.history[-1].iteration if self.history else 0
 
     @property
     def trajectory(self) -> Trajectory:
         """The designed trajectory."""
         return self.final.trajectory
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of design.json, but for the name of the experiment file."""
+        return {
+            "status": self.status.name.lower(),
+            "message": self.status.value,
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "slope": self.slope,
+            "steps": self.steps,
+            "parameters": list(self.parameters),
+            "theta": self.theta,
+            "initial": self.initial.summary(),
+            "final": self.final.summary(),
+            "limits": {"margins": self.limits, "satisfied": self.within_limits},
+            "found_by": self.found_by,
+            "starts": [start.summary() for start in self.starts],
+            "warnings": list(self.warnings),
+            "nuisance": list(self.nuisance),
+            "combinations": list(self.combinations),
+            "combined": [
+                {
+                    "words": combination.expression,
+                    "value": combination.value,
+                    "std_initial": combination.std_initial,
+                    "std_final": combination.std_final,
+                }
+                for combination in self.combined
+            ],
+            "prior": self.prior,
+            "data": self.data,
+        }

@@ -1,35 +1,64 @@
-"""What an identification tells: the estimate, how far it may be off, and what speaks against it."""
+"""Records of an identification: the estimate, its uncertainty, and doubts about the fit."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mjfim.arrays import Array, freeze
 from mjfim.records.recording import Recording
+from mjfim.records.serialization import SavedRecord
 from mjfim.records.trajectory import Trajectory
+
+# Half width of a 95 % interval of a normal distribution [standard deviations].
+NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Estimate:
-    """Parameters from recordings.
+class Estimate(SavedRecord):
+    """Result of `mjfim.identify`: parameters from recordings.
 
-    theta, std: (p,);  covariance: (p, p) formal (Cramer-Rao at the estimate)
-    sandwich: (p,) standard deviations that allow for residuals which follow one another
-    interval: (p, 2) 95 %, the hull of formal, sandwich, bootstrap and what recordings disagree by
-    between: (p,) standard deviation from recording to recording beyond their own scatter
-    chi2: whitened squared residual sum; of a robust loss, of those that are no outliers, over what noise has there
-    dof: its degrees of freedom;  residual_rms, sigma: per output, in its unit; sigma is the noise that was stated or estimated
-    misfit: residuals are no noise of the stated size: the formal std is then not accuracy;  reasons: why, in sentences
-    predicted: per recording, (M, ny);  initial_theta: the start
-    combinations: groups of parameters that the recordings tell in combination only, in words
-    data: (p, p) information of the recordings, priors left out, private nuisance marginalised
-    each: of parameters that every recording has its own of, the values in turn; theta has the first
-    sloppy: names of wanted parameters whose interval is wide for their value
-    suspects: terms missing in the model that would explain the residuals
-    whiteness: of the residuals of each output;  worst: where they are largest
-    predictions: of what was not fitted, against the nominal model;  motion: of the first recording as fitted, or None
+    Attributes:
+        parameters: Names of the p parameters.
+        theta: (p,) estimate [theta-unit].
+        std: (p,) formal standard deviations: Cramér-Rao at the estimate [theta-unit].
+        covariance: (p, p) formal covariance.
+        initial_theta: (p,) initial guess [theta-unit].
+        chi2: Sum of squared whitened residuals. With a robust loss: of the residuals that are no outliers, scaled by what
+            noise would have there.
+        dof: Degrees of freedom of `chi2`.
+        status: How the fit ended, in words.
+        success: True where the fit converged and every parameter was determined inside its bounds.
+        misfit: True where the residuals are not noise of the stated size; the formal `std` is then not the accuracy.
+        iterations: Number of iterations.
+        residual_rms: Root mean square residual of each output [unit of the output].
+        at_bound: Names of the parameters that ended at a bound.
+        predicted: Outputs of the fitted model for each recording, (M, ny) [unit of the output].
+        recordings: The recordings as they were fitted.
+        warnings: Sentences for the user.
+        combinations: Groups of parameters that the recordings determine in combination only, in words.
+        data: (p, p) information of the recordings, priors left out, private nuisance parameters marginalised.
+        std_sandwich: (p,) standard deviations that allow for autocorrelated residuals [theta-unit].
+        interval: (p, 2) 95 % interval: the hull of formal, sandwich and bootstrap intervals and of the disagreement between
+            recordings [theta-unit].
+        between_recordings: (p,) standard deviation from recording to recording beyond their own scatter [theta-unit].
+        sigma: Noise of each output, stated or estimated [unit of the output].
+        reasons: Reasons for `misfit`, in sentences.
+        whiteness: Tests of the residuals of each output.
+        worst_residual: Interval in which the residuals are largest; None where the fit is good.
+        predictions: Prediction errors on data that were not fitted.
+        sloppy: Names of the parameters whose interval is wide for their value.
+        missing_terms: Terms missing in the model that would explain the residuals.
+        per_recording: Values in turn of parameters that every recording has for itself; `theta` holds the first.
+        robust_uncertainty: Robust uncertainty of the common unknowns, or None.
+        motion: The first recording's motion as fitted, or None.
+        interrupted: True where the user interrupted the fit.
+        seconds: Wall time [s].
+        steps: MuJoCo steps taken.
+        units: Unit of each parameter.
+        prior: (p, p) information of the parameters' priors.
     """
 
     parameters: tuple[str, ...]
@@ -66,31 +95,84 @@ class Estimate:
     interrupted: bool = False
     seconds: float = 0.0
     steps: int = 0
+    units: tuple[str, ...] = ()
+    prior: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    file_stem: ClassVar[str] = "estimate"
+    made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
 
     def __post_init__(self) -> None:
         count = len(self.parameters)
-        if len(self.interval) != count:  # none but the formal ones
-            theta, half = np.asarray(self.theta), 1.96 * np.asarray(self.std)
-            object.__setattr__(self, "interval", np.column_stack([theta - half, theta + half]))
-        for name, own in (("std_sandwich", self.std), ("between_recordings", np.zeros(count))):
-            if len(getattr(self, name)) != count:
-                object.__setattr__(self, name, own)
-        names = (
-            "theta",
-            "std",
-            "covariance",
-            "initial_theta",
-            "data",
-            "std_sandwich",
-            "interval",
-            "between_recordings",
-        )
-        freeze(self, *names)
+
+        # Formal values stand in for what was not computed.
+        if len(self.interval) != count:
+            theta, half_width = np.asarray(self.theta), NORMAL_95 * np.asarray(self.std)
+            interval = np.column_stack([theta - half_width, theta + half_width])
+            object.__setattr__(self, "interval", interval)
+        if len(self.std_sandwich) != count:
+            object.__setattr__(self, "std_sandwich", self.std)
+        if len(self.between_recordings) != count:
+            object.__setattr__(self, "between_recordings", np.zeros(count))
+        if len(self.prior) != count:
+            object.__setattr__(self, "prior", np.zeros((count, count)))
+        if len(self.units) != count:
+            object.__setattr__(self, "units", ("",) * count)
+
+        freeze(self, "theta", "std", "covariance", "initial_theta", "data", "prior")
+        freeze(self, "std_sandwich", "interval", "between_recordings")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of estimate.json."""
+        worst = None if self.worst_residual is None else self.worst_residual.summary()
+        return {
+            "parameters": list(self.parameters),
+            "units": list(self.units),
+            "theta": self.theta,
+            "std": self.std,
+            "covariance": self.covariance,
+            "initial_theta": self.initial_theta,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "status": self.status,
+            "success": self.success,
+            "interrupted": self.interrupted,
+            "iterations": self.iterations,
+            "residual_rms": self.residual_rms,
+            "sigma": self.sigma,
+            "misfit": self.misfit,
+            "reasons": list(self.reasons),
+            "worst": worst,
+            "whiteness": [test.summary() for test in self.whiteness],
+            "per_recording": self.per_recording,
+            "suspects": [term.summary() for term in self.missing_terms],
+            "std_sandwich": self.std_sandwich,
+            "interval": self.interval,
+            "between_recordings": self.between_recordings,
+            "predictions": [prediction.summary() for prediction in self.predictions],
+            "seconds": self.seconds,
+            "steps": self.steps,
+            "sloppy": list(self.sloppy),
+            "at_bound": list(self.at_bound),
+            "recordings": [recording.name for recording in self.recordings],
+            "warnings": list(self.warnings),
+            "prior": self.prior,
+            "data": self.data,
+            "combinations": list(self.combinations),
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorstResidual:
-    """Where residuals are worst. begin, end: [s];  size: their root mean square in sigmas;  share: of all squares"""
+    """Interval of a recording in which residuals are largest.
+
+    Attributes:
+        output: Name of the output.
+        recording: Name of the recording.
+        begin: Begin of the interval [s].
+        end: End of the interval [s].
+        size: Root mean square of the residuals in it [standard deviations of the noise].
+        share: Share of the sum of all squared residuals that lies in it, 0 to 1.
+    """
 
     output: str
     recording: str
@@ -103,12 +185,27 @@ class WorstResidual:
         when = f"{self.begin:.3g} to {self.end:.3g} s of {self.recording}"
         return f"worst in {self.output}, {when}: {self.size:.2g} sigmas, {100 * self.share:.0f} % of all squares"
 
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of `worst` in estimate.json."""
+        return {
+            "output": self.output,
+            "recording": self.recording,
+            "begin": self.begin,
+            "end": self.end,
+            "size": self.size,
+            "share": self.share,
+        }
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PredictionErrors:
-    """How far a model is from a recording. name: of it;  rms, mae: (ny,) root mean square and mean absolute errors
+    """Differences between a model's outputs and a recording.
 
-    NaN where nothing was measured or the model diverged.
+    Attributes:
+        name: Name of the recording.
+        outputs: Names of the ny outputs.
+        rms: (ny,) root mean square errors [unit of the output]; NaN where nothing was measured or the model diverged.
+        mae: (ny,) mean absolute errors, likewise.
     """
 
     name: str
@@ -119,12 +216,20 @@ class PredictionErrors:
     def __post_init__(self) -> None:
         freeze(self, "rms", "mae")
 
+    def by_output(self, errors: Array) -> dict[str, float]:
+        """Return `rms` or `mae` by name of the output."""
+        return dict(zip(self.outputs, errors.tolist(), strict=True))
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Prediction:
-    """How well something that was not fitted is predicted, by the identified and by the nominal model.
+    """Prediction errors on data that were not fitted, of the identified and of the nominal model.
 
-    held_out: stated as held out, not a part of the fitted data
+    Attributes:
+        name: Name of the recording, or of the part of one.
+        identified: Errors of the identified model.
+        nominal: Errors of the nominal model.
+        held_out: True where the data were stated as held out; False where they were left out of a further fit.
     """
 
     name: str
@@ -134,19 +239,40 @@ class Prediction:
 
     @property
     def ratio(self) -> float:
-        """Geometric mean over outputs of identified over nominal root mean square error."""
-        own, plain = self.identified.rms, self.nominal.rms
-        both = np.isfinite(own) & np.isfinite(plain) & (plain > 0.0) & (own > 0.0)
-        return (
-            float(np.exp(np.mean(np.log(own[both] / plain[both])))) if both.any() else float("nan")
-        )
+        """Geometric mean over outputs of identified over nominal root mean square error; NaN where none is comparable."""
+        identified, nominal = self.identified.rms, self.nominal.rms
+        finite = np.isfinite(identified) & np.isfinite(nominal)
+        comparable = finite & (nominal > 0.0) & (identified > 0.0)
+        if not comparable.any():
+            return float("nan")
+
+        log_ratios = np.log(identified[comparable] / nominal[comparable])
+        return float(np.exp(np.mean(log_ratios)))
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of one entry of `predictions` in estimate.json."""
+        return {
+            "name": self.name,
+            "held_out": self.held_out,
+            "rms": self.identified.by_output(self.identified.rms),
+            "mae": self.identified.by_output(self.identified.mae),
+            "nominal_rms": self.nominal.by_output(self.nominal.rms),
+            "nominal_mae": self.nominal.by_output(self.nominal.mae),
+            "ratio": self.ratio,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
 class MissingTerm:
-    """A term that would explain residuals. path: a parameter's target;  value: about how much of it there would be [unit]
+    """A physical term that the model lacks and that would explain residuals.
 
-    sigmas: its value over its standard deviation;  share: of all squared residuals that it explains
+    Attributes:
+        description: The term in words.
+        path: Target of a parameter that would add it.
+        value: Estimated value of that parameter [unit].
+        unit: Its unit; may be empty.
+        sigmas: `value` over its standard deviation.
+        share: Share of all squared residuals that the term explains, 0 to 1.
     """
 
     description: str
@@ -158,18 +284,33 @@ class MissingTerm:
 
     def __str__(self) -> str:
         amount = f"{self.value:.2g} {self.unit}".strip()
-        told = f"about {amount} ({self.sigmas:.0f} σ, {100 * self.share:.2g} % of all squares)"
-        return f'{self.description}, {told}; to find it out: target = "{self.path}"'
+        evidence = f"about {amount} ({self.sigmas:.0f} σ, {100 * self.share:.2g} % of all squares)"
+        return f'{self.description}, {evidence}; to estimate it, add: target = "{self.path}"'
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of one entry of `suspects` in estimate.json."""
+        return {
+            "words": self.description,
+            "path": self.path,
+            "value": self.value,
+            "unit": self.unit,
+            "sigmas": self.sigmas,
+            "share": self.share,
+        }
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Uncertainty:
-    """Of the c common unknowns.
+    """Uncertainty of the c common unknowns, robust to autocorrelated residuals and to recordings that disagree.
 
-    sandwich: (c,) standard deviations;  interval: (c, 2) 95 %, the hull of formal, sandwich and bootstrap intervals
-    between: (c,) standard deviation from recording to recording beyond what the data of each explain
-    apart: indices of unknowns on which recordings disagree;  each: (K, c) what every recording alone says, NaN where little
-    blocks: number;  draws: (n, c) of the bootstrap
+    Attributes:
+        sandwich: (c,) standard deviations that allow for autocorrelated residuals.
+        interval: (c, 2) 95 % intervals: the hull of formal, sandwich and bootstrap intervals.
+        between: (c,) standard deviation from recording to recording beyond the scatter that each explains.
+        apart: Indices of the unknowns on which recordings disagree.
+        each: (K, c) estimates from every recording alone; NaN where a recording says too little.
+        blocks: Number of blocks of the bootstrap.
+        draws: (n, c) draws of the bootstrap.
     """
 
     sandwich: Array
@@ -183,10 +324,16 @@ class Uncertainty:
 
 @dataclass(frozen=True, kw_only=True)
 class Whiteness:
-    """Of one output's whitened residuals. count: of them;  variance: their mean square;  correlation: of one with the next
+    """Tests whether the whitened residuals of one output are white noise of unit variance.
 
-    p: probability that white noise looks so, corrected for the number of looks;  inflation: largest variance of the mean of a
-    run over that of white noise;  time: rows over which residuals hang together (integrated autocorrelation)
+    Attributes:
+        output: Name of the output.
+        count: Number of residuals.
+        variance: Their mean square; 1 for noise of the stated size.
+        correlation: Lag-1 autocorrelation, -1 to 1.
+        p: Probability that white noise looks like this, corrected for the number of tests.
+        inflation: Largest variance of the mean of a run of residuals over that of white noise.
+        time: Integrated autocorrelation time [rows].
     """
 
     output: str
@@ -196,3 +343,15 @@ class Whiteness:
     p: float
     inflation: float
     time: float
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of one entry of `whiteness` in estimate.json."""
+        return {
+            "output": self.output,
+            "count": self.count,
+            "variance": self.variance,
+            "correlation": self.correlation,
+            "p": self.p,
+            "inflation": self.inflation,
+            "time": self.time,
+        }

@@ -1,19 +1,28 @@
-"""Records of a Monte Carlo study."""
+"""Records of a Monte Carlo study of the estimator."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from mjfim.arrays import Array, freeze
+from mjfim.records.serialization import SavedRecord
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrialStatistics:
-    """Monte-Carlo estimates along one trajectory, against theory.
+    """Estimates from simulated recordings along one trajectory, beside the Cramér-Rao bound.
 
-    estimates: (trials, p), NaN rows for failed trials;  mean: (p,);  covariance, crlb: (p, p)
-    efficiency: (p,) CRLB variance over observed variance (1 = the bound is reached)
-    efficiency_interval: (p, 2) 95 % confidence interval of each efficiency (chi-square on the variance)
+    Attributes:
+        estimates: (trials, p) estimated parameters; rows of NaN for failed trials.
+        mean: (p,) mean of the estimates.
+        covariance: (p, p) sample covariance of the estimates.
+        crlb: (p, p) Cramér-Rao lower bound of the covariance.
+        efficiency: (p,) variance of the bound over observed variance; 1 where the bound is reached.
+        efficiency_interval: (p, 2) 95 % confidence interval of each efficiency (chi-square on the variance).
+        trials: Number of trials.
+        failed: Number of trials whose fit failed.
+        seconds: Wall time [s].
     """
 
     estimates: Array
@@ -31,10 +40,15 @@ class TrialStatistics:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MonteCarloStudy:
-    """Monte-Carlo studies of trajectories by name (`initial`, `final`).
+class MonteCarloStudy(SavedRecord):
+    """Result of `mjfim.monte_carlo`: statistics of estimates along one or more trajectories.
 
-    theta: (p,) the true values; information: (p, p) by the same names
+    Attributes:
+        parameters: Names of the p parameters.
+        theta: (p,) true values.
+        measure_rate: Rate of the measurements [Hz].
+        sets: Statistics by name of the trajectory (`initial`, `final`).
+        information: (p, p) Fisher information of each trajectory, by the same names.
     """
 
     parameters: tuple[str, ...]
@@ -43,5 +57,29 @@ class MonteCarloStudy:
     sets: dict[str, TrialStatistics]
     information: dict[str, Array]
 
+    file_stem: ClassVar[str] = "montecarlo"
+    made_by: ClassVar[str] = "`mjfim montecarlo EXPERIMENT DESIGN.npz -o DIR`"
+
     def __post_init__(self) -> None:
         freeze(self, "theta")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of montecarlo.json."""
+        values: dict[str, Any] = {
+            "parameters": list(self.parameters),
+            "theta": self.theta,
+            "measure_rate": self.measure_rate,
+        }
+        for name, trials in self.sets.items():
+            values[name] = {
+                "mean": trials.mean,
+                "covariance": trials.covariance,
+                "crlb": trials.crlb,
+                "efficiency": trials.efficiency,
+                "efficiency_interval": trials.efficiency_interval,
+                "information": self.information[name],
+                "trials": trials.trials,
+                "failed": trials.failed,
+                "seconds": trials.seconds,
+            }
+        return values

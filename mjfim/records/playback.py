@@ -1,4 +1,4 @@
-"""Record of what a robot plays."""
+"""Record of a design at the rate of a robot's controller."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from mjfim.arrays import Array, freeze
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Playback:
-    """A design at the controller's rate, M rows and the end.
+    """A design at the controller's rate: M rows of control, and the final state.
 
-    t: (M+1,) [s];  state: (M+1, nq+nv+na) planned;  ctrl: (M, nu) held over each row
-    gain: (M, nu, nx) K, held over each sample of the design
+    Attributes:
+        t: (M+1,) times [s].
+        state: (M+1, nq+nv+na) planned positions, velocities and activations.
+        ctrl: (M, nu) controls, held over each row [unit of the actuator].
+        gain: (M, nu, nx) feedback gains K, held over each sample of the design [u-unit / x-unit].
     """
 
     t: Array
@@ -25,5 +28,5 @@ class Playback:
 
     @property
     def period(self) -> float:
-        """Of the controller [s]."""
+        """Sample period of the controller [s]."""
         return float(self.t[-1] - self.t[0]) / len(self.ctrl)

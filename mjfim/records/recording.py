@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 from mjfim.arrays import Array, freeze
+from mjfim.records.serialization import SavedRecord
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Recording:
+class Recording(SavedRecord):
     """Measured (or simulated) outputs under a known control, at the times at which they were logged.
 
-    t: (M,) [s], increasing, at any intervals;  ctrl: (M-1, nu) held from each row to the next
-    y: (M, ny) measured outputs in the order of `outputs`, NaN where an output was not measured at that time
-    outputs: ny column names (`qpos:<joint>`, `qvel:<joint>` or a sensor's name);  name: for messages
+    Attributes:
+        t: (M,) times [s], increasing, at any intervals.
+        ctrl: (M-1, nu) controls, held from each row to the next [unit of the actuator].
+        y: (M, ny) measured outputs in the order of `outputs` [unit of the output]; NaN where an output was not measured.
+        outputs: Names of the ny outputs: `qpos:<joint>`, `qvel:<joint>` or the name of a sensor.
+        name: Name of the recording in messages, usually its file.
     """
 
     t: Array
@@ -22,5 +27,17 @@ class Recording:
     outputs: tuple[str, ...]
     name: str = "recording"
 
+    file_stem: ClassVar[str] = "recording"
+    made_by: ClassVar[str] = "Recording.save"
+
     def __post_init__(self) -> None:
         freeze(self, "t", "ctrl", "y")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of recording.json."""
+        return {
+            "name": self.name,
+            "rows": len(self.t),
+            "outputs": list(self.outputs),
+            "nu": self.ctrl.shape[1],
+        }

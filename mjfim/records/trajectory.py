@@ -1,27 +1,31 @@
-"""Records that travel through the package. Arrays are read-only; shapes and units stand in each docstring.
+"""Records of a trajectory: the curve itself, its linearisation, and its sensitivity to the parameters.
 
 Letters are the paper's: `x` state, `u` control, `theta` parameters, `psi` sensitivity dx/dtheta, `I` Fisher
-information. Sizes: N samples, nq/nv/na MuJoCo's, `nx = 2 nv + na` (tangent space), nu controls, ny outputs, p parameters.
+information. Sizes: N samples; nq, nv, na, nu as in MuJoCo; `nx = 2 nv + na` (tangent space); ny outputs; p parameters.
+Arrays are read-only.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.records.serialization import SavedRecord
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Trajectory:
+class Trajectory(SavedRecord):
     """A feasible curve (x, u) of the plant: `x_{k+1} = F(x_k, u_k, theta)`.
 
-    t: (N+1,) [s]
-    qpos: (N+1, nq) [m or rad, unit quaternions for ball and free joints]
-    qvel: (N+1, nv) [m/s or rad/s]
-    act: (N+1, na) [actuator's own unit]
-    ctrl: (N, nu) [actuator's own unit], held over each sample
+    Attributes:
+        t: (N+1,) times [s].
+        qpos: (N+1, nq) positions [m or rad; unit quaternions for ball and free joints].
+        qvel: (N+1, nv) velocities [m/s or rad/s].
+        act: (N+1, na) activations [unit of the actuator].
+        ctrl: (N, nu) controls, held over each sample [unit of the actuator].
     """
 
     t: Array
@@ -30,12 +34,15 @@ class Trajectory:
     act: Array
     ctrl: Array
 
+    file_stem: ClassVar[str] = "trajectory"
+    made_by: ClassVar[str] = "Trajectory.save"
+
     def __post_init__(self) -> None:
         freeze(self, "t", "qpos", "qvel", "act", "ctrl")
 
     @property
     def samples(self) -> int:
-        """N, the number of control samples."""
+        """Number of control samples, N."""
         return len(self.ctrl)
 
     @property
@@ -45,16 +52,32 @@ class Trajectory:
 
     @property
     def state(self) -> Array:
-        """(N+1, nq+nv+na): qpos, qvel and act side by side."""
+        """(N+1, nq+nv+na) positions, velocities and activations side by side."""
         return np.concatenate([self.qpos, self.qvel, self.act], axis=1)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of trajectory.json."""
+        return {
+            "samples": self.samples,
+            "dt": self.dt,
+            "nq": self.qpos.shape[1],
+            "nv": self.qvel.shape[1],
+            "na": self.act.shape[1],
+            "nu": self.ctrl.shape[1],
+        }
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Linearization:
     """First derivatives along a trajectory, in the tangent space of the state.
 
-    A: (N, nx, nx) F_x;  B: (N, nx, nu) F_u [x-unit / u-unit];  E: (N, nx, p) F_theta [x-unit / theta-unit]
-    C: (N+1, ny, nx) h_x;  D: (N+1, ny, nu) h_u;  H: (N+1, ny, p) h_theta
+    Attributes:
+        A: (N, nx, nx) F_x.
+        B: (N, nx, nu) F_u [x-unit / u-unit].
+        E: (N, nx, p) F_theta [x-unit / theta-unit].
+        C: (N+1, ny, nx) h_x [y-unit / x-unit].
+        D: (N+1, ny, nu) h_u [y-unit / u-unit].
+        H: (N+1, ny, p) h_theta [y-unit / theta-unit].
     """
 
     A: Array
@@ -70,10 +93,11 @@ class Linearization:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sensitivity:
-    """What the parameters do to a trajectory at fixed control.
+    """First derivatives of a trajectory by the parameters, at fixed control.
 
-    psi: (N+1, nx, p) dx/dtheta [x-unit / theta-unit], zero at the start
-    G: (N+1, ny, p) dy/dtheta [y-unit / theta-unit], `G_k = C_k psi_k + H_k`
+    Attributes:
+        psi: (N+1, nx, p) dx/dtheta [x-unit / theta-unit]; zero at the initial state.
+        G: (N+1, ny, p) dy/dtheta [y-unit / theta-unit], `G_k = C_k psi_k + H_k`.
     """
 
     psi: Array

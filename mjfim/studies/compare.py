@@ -271,12 +271,14 @@ class Judge:
             cost=point.cost,
             criterion=point.criterion.value,
             std=self.stage.problem.information.std(point.information),
-            smallest=smallest,
-            worst=(smallest * setup.measure_rate) ** -0.5 if smallest > 0.0 else np.inf,
+            min_eigenvalue=smallest,
+            worst_relative_std=(smallest * setup.measure_rate) ** -0.5
+            if smallest > 0.0
+            else np.inf,
             seconds=attempt.seconds,
             steps=attempt.steps,
             margins=found.margins,
-            shares=found.shares,
+            relative_margins=found.shares,
             found_by=attempt.found_by,
             note=note,
         )
@@ -292,11 +294,11 @@ class Judge:
             cost=np.nan,
             criterion=np.nan,
             std=blank,
-            smallest=np.nan,
-            worst=np.nan,
+            min_eigenvalue=np.nan,
+            worst_relative_std=np.nan,
             seconds=attempt.seconds,
             steps=attempt.steps,
             margins={},
-            shares={},
+            relative_margins={},
             note=note,
         )

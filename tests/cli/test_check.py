@@ -32,7 +32,7 @@ def test_json_is_the_same_as_the_file(study: Path, tmp_path) -> None:
     result = run("check", study, "--json", "-o", tmp_path / "out")
     told = loads(result.stdout)
     assert told == read(tmp_path / "out" / "check.json")
-    assert names(tmp_path / "out") == {"check.json", "check.png"}
+    assert names(tmp_path / "out") == {"check.json", "check.npz", "check.png"}
     assert imread(tmp_path / "out" / "check.png").shape[0] > 300
     assert told["ok"] is True
     assert [row["name"] for row in told["parameters"]] == ["m", "l", "c"]

@@ -112,7 +112,7 @@ def test_an_estimate_holds_what_no_recording_shows_and_knows_the_rest(tmp_path) 
 def test_an_estimate_of_combinations_serves_as_earlier_information(tmp_path) -> None:
     setup = pendulum(tmp_path)
     estimate = mjfim.identify(setup, [mjfim.simulate(setup, setup.initial, seed=3)])
-    archive.write_json(tmp_path / "estimate.json", archive.estimate_summary(estimate, setup))
+    estimate.save(tmp_path)
     again = Setup(setup.experiment.replace(earlier=[str(tmp_path / "estimate.json")]))
     assert relative_error(again.earlier, estimate.data) < 1e-12
     assert {row.name for row in mjfim.check(again).rows if np.isfinite(row.std)} == {"m2r2", "d"}

@@ -24,6 +24,7 @@ from mjfim.output.mjcf.write import write_identified
 from mjfim.recordings import read as logs
 from mjfim.records.design import Design
 from mjfim.records.recording import Recording
+from mjfim.records.serialization import as_json
 from mjfim.records.trajectory import Trajectory
 from tests.support.paths import MODELS
 
@@ -77,9 +78,9 @@ def test_npz_holds_what_is_promised(folder: Path, design: Design) -> None:
     """Names and shapes of DESIGN.md, for the design and its start."""
     with np.load(folder / "design.npz", allow_pickle=False) as data:
         shapes = {key: data[key].shape for key in data.files}
-        kinds = {data[key].dtype for key in data.files}
+        kinds = {data[key].dtype for key in data.files if key != "record"}
         psi = data["initial_sensitivity"]
-    own = {
+    known = {
         "t": (N + 1,),
         "qpos": (N + 1, NQ),
         "qvel": (N + 1, NV),
@@ -88,7 +89,15 @@ def test_npz_holds_what_is_promised(folder: Path, design: Design) -> None:
         "gain": (N, NU, 2 * NV),
         "sensitivity": (N + 1, 2 * NV, P),
     }
-    assert shapes == {**own, **{f"initial_{key}": shape for key, shape in own.items()}}
+    further = {"information": (P, P), "eigenvalues": (P,), "std": (P,), "min_eigenvalue": (N + 1,)}
+    assert shapes == {
+        **known,
+        **{f"initial_{key}": shape for key, shape in known.items()},
+        **{f"final.{key}": shape for key, shape in further.items()},
+        **{f"initial.{key}": shape for key, shape in further.items()},
+        **{"theta": (P,), "prior": (P, P), "data": (P, P)},
+        "record": (),
+    }
     assert kinds == {np.dtype("float64")}
     assert np.array_equal(psi, design.initial.sensitivity)
 
@@ -206,9 +215,7 @@ def test_json_has_no_nan(design: Design) -> None:
         cost=float("inf"),
         information=np.full((3, 3), np.nan),
     )
-    text = archive.as_json(
-        archive.design_summary(dataclasses.replace(design, final=blank, slope=float("nan")))
-    )
+    text = as_json(dataclasses.replace(design, final=blank, slope=float("nan")).summary())
     data = strict_json(text)
     assert data["final"]["std"] == [None, None, 1.0]
     assert (data["final"]["cost"], data["slope"]) == (None, None)
@@ -217,9 +224,8 @@ def test_json_has_no_nan(design: Design) -> None:
 
 def test_unsatisfied_limits_are_said(design: Design) -> None:
     """One negative margin is enough."""
-    said = archive.design_summary(
-        dataclasses.replace(design, limits={"position": 0.5, "control": -0.1})
-    )["limits"]
+    outside = dataclasses.replace(design, limits={"position": 0.5, "control": -0.1})
+    said = outside.summary()["limits"]
     assert (said["margins"], said["satisfied"]) == ({"position": 0.5, "control": -0.1}, False)
 
 
@@ -685,7 +691,7 @@ def test_failing_model_keeps_the_old_file(setup: Setup, tmp_path: Path) -> None:
 def test_estimate_summary(setup: Setup, recording: Recording) -> None:
     """Keys of estimate.json, in standard JSON."""
     estimate = mjfim.identify(setup, [recording])
-    data = strict_json(archive.as_json(archive.estimate_summary(estimate, setup)))
+    data = strict_json(as_json(estimate.summary()))
     assert {"theta", "std", "covariance", "chi2", "dof", "status", "residual_rms", "misfit"} <= set(
         data
     )
@@ -701,9 +707,7 @@ def test_estimate_summary(setup: Setup, recording: Recording) -> None:
 def test_study_summary(setup: Setup, design: Design) -> None:
     """Keys of montecarlo.json, for each trajectory."""
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    data = strict_json(
-        archive.as_json(archive.study_summary(mjfim.monte_carlo(setup, curves, trials=4)))
-    )
+    data = strict_json(as_json(mjfim.monte_carlo(setup, curves, trials=4).summary()))
     for name in curves:
         assert {"mean", "covariance", "crlb", "efficiency", "trials", "failed"} <= set(data[name])
         assert (data[name]["trials"], np.array(data[name]["crlb"]).shape) == (4, (P, P))

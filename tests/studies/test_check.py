@@ -12,8 +12,8 @@ import mjfim
 from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
 from mjfim.information.fisher import Information
-from mjfim.output import archive
 from mjfim.records.recording import Recording
+from mjfim.records.serialization import as_json
 from mjfim.studies.check import check
 from tests.support.numerics import CART_PARAMETERS, Array, cart_setup, make_setup, relative_error
 from tests.support.paths import MODELS, SHARED_DATA
@@ -244,9 +244,7 @@ def test_recordings_of_the_real_double_pendulum_tell_the_same() -> None:
 
 def test_the_summary_is_strict_json(tmp_path) -> None:
     parameters = {**CART_PARAMETERS, **PRODUCT}
-    text = archive.as_json(
-        archive.check_summary(check(cart_setup(tmp_path, parameters=parameters)))
-    )
+    text = as_json(check(cart_setup(tmp_path, parameters=parameters)).summary())
     assert "NaN" not in text
     assert "Infinity" not in text
     assert '"identifiable"' in text

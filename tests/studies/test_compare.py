@@ -48,12 +48,12 @@ def row(method: str, cost: float, outcome: MethodOutcome = MethodOutcome.INSIDE)
         cost=cost,
         criterion=cost,
         std=std,
-        smallest=1.0 / cost,
-        worst=std[0],
+        min_eigenvalue=1.0 / cost,
+        worst_relative_std=std[0],
         seconds=1.0,
         steps=10,
         margins={},
-        shares={},
+        relative_margins={},
     )
 
 
@@ -113,7 +113,7 @@ def test_rows_say_what_their_controls_do() -> None:
         assert r.criterion == pytest.approx(told.criterion, rel=1e-5)
         scale = setup.parameters.scale
         worst = np.linalg.eigvalsh(told.information * np.outer(scale, scale))[0] ** -0.5
-        assert r.worst == pytest.approx(worst, rel=1e-5)
+        assert r.worst_relative_std == pytest.approx(worst, rel=1e-5)
         assert r.margins == audit(setup, trajectory).margins
         qpos, _, ctrl = played(pendulum(), r.control)
         assert np.abs(qpos[:, 0]).max() <= 0.5
@@ -169,7 +169,7 @@ def test_a_design_that_may_not_be_played_has_lost() -> None:
     c = made(row("a", 2.0), row(DESIGN, 1.0, MethodOutcome.OUTSIDE))
     assert not c.ok
     assert [r.method for r in c.beating] == ["a"]
-    assert "leaves a limit" in c.verdict[0]
+    assert "violates a limit" in c.verdict[0]
     assert not made(
         row("a", 2.0, MethodOutcome.NOTHING), row(DESIGN, 1.0, MethodOutcome.OUTSIDE)
     ).ok
@@ -250,7 +250,7 @@ def test_the_picture_has_a_row_per_method() -> None:
     np.testing.assert_allclose(shown[2], 1.0)
     np.testing.assert_allclose(shown[0], small().rows[0].std / small().rows[2].std)
     assert [bar.get_width() for bar in bars.patches] == pytest.approx(
-        [r.worst for r in small().rows]
+        [r.worst_relative_std for r in small().rows]
     )
 
 
@@ -263,7 +263,7 @@ def test_the_picture_has_a_row_per_method() -> None:
             replace(
                 row("a", 1.0, MethodOutcome.NONE),
                 control=None,
-                worst=np.nan,
+                worst_relative_std=np.nan,
                 std=np.full(2, np.nan),
             ),
         ),
@@ -302,7 +302,7 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     assert told["budget"] == {"seconds": 60.0, "steps": 60000.0}
     assert all(len(m["std"]) == 3 and m["limits"]["margins"] for m in told["methods"])
     controls = {f"control_{m}.csv" for m in ("chirp", "steps", DESIGN)}
-    assert names(out) == {"compare.json", "compare.png", *controls}
+    assert names(out) == {"compare.json", "compare.npz", "compare.png", *controls}
     assert imread(out / "compare.png").shape[0] > 300
     again = run(
         "compare", study, "-o", out, "--seconds", 60, "--steps", 20_000, "--methods", "chirp"
@@ -310,6 +310,7 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
     assert again.exit_code == 0, again.stderr
     assert names(out) == {
         "compare.json",
+        "compare.npz",
         "compare.png",
         "control_chirp.csv",
         f"control_{DESIGN}.csv",

@@ -31,13 +31,14 @@ DESIGN = {
 }
 
 # Files that `mjfim identify` writes.
-ESTIMATE = {"estimate.json", "identified.xml", "estimate.rrd"} | {
+ESTIMATE = {"estimate.json", "estimate.npz", "identified.xml", "estimate.rrd"} | {
     f"{name}.png" for name in ("fit", "parameters", "spectra", "predictions")
 }
 
 # Files that `mjfim montecarlo` writes for the cart-pendulum.
 STUDY = {
     "montecarlo.json",
+    "montecarlo.npz",
     "histogram_m.png",
     "histogram_l.png",
     "histogram_c.png",

@@ -51,7 +51,11 @@ def compare_figure(comparison: Comparison) -> Figure:
     ]
     used = {_colour(comparison, row) for row in rows if row.sound}
     kept = [h for h, c in zip(handles, (OPTIMIZED, INITIAL, OTHER), strict=False) if c in used]
-    kept += handles[3:] if any(not row.sound and np.isfinite(row.worst) for row in rows) else []
+    kept += (
+        handles[3:]
+        if any(not row.sound and np.isfinite(row.worst_relative_std) for row in rows)
+        else []
+    )
     budget = f"{comparison.seconds:g} s"
     if np.isfinite(comparison.steps):
         budget += f" or {number(comparison.steps / 1e6)} million MuJoCo steps"
@@ -132,7 +136,7 @@ def _cells(axes: Axes, comparison: Comparison) -> None:
 def _bars(axes: Axes, comparison: Comparison) -> None:
     """Worst relative standard deviation by method, and its tightest limit."""
     rows = comparison.rows
-    worst = np.array([row.worst for row in rows])
+    worst = np.array([row.worst_relative_std for row in rows])
     known = worst[np.isfinite(worst)]
     dress(axes, "standard deviation, relative to the parameters' scales [–]")
     axes.grid(False, axis="y")
@@ -152,7 +156,7 @@ def _bars(axes: Axes, comparison: Comparison) -> None:
     axes.set_xlim(low, room)
     axes.tick_params(which="both", labelsize=SMALL, color=MUTED, labelcolor=INK)
     for i, row in enumerate(rows):
-        if not np.isfinite(row.worst):
+        if not np.isfinite(row.worst_relative_std):
             axes.text(
                 low + 0.02 * (high - low),
                 i,
@@ -163,11 +167,18 @@ def _bars(axes: Axes, comparison: Comparison) -> None:
             )
             continue
         colour = _colour(comparison, row)
-        bar = axes.barh(i, row.worst - low, left=low, height=0.62, color=colour, linewidth=0.8)
+        bar = axes.barh(
+            i, row.worst_relative_std - low, left=low, height=0.62, color=colour, linewidth=0.8
+        )
         if not row.sound:
             bar[0].set(facecolor="white", edgecolor=MUTED, hatch="////")
         text = axes.text(
-            row.worst, i, f"  {number(row.worst)}", va="center", fontsize=SMALL, color=INK
+            row.worst_relative_std,
+            i,
+            f"  {number(row.worst_relative_std)}",
+            va="center",
+            fontsize=SMALL,
+            color=INK,
         )
         kind, share = row.tightest
         said = f"  {percent(share)} {kind.replace('_', ' ')}" if kind and np.isfinite(share) else ""

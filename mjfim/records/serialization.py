@@ -1,0 +1,458 @@
+"""Records on disk: a JSON file for people and an npz file from which the record is built again. No pickles.
+
+A saved record consists of two files with one stem, for example `design`:
+
+* `design.json` holds the record's summary: the keys that users and other programs read.
+* `design.npz` holds the record itself, complete. Every array has a name of its own; the text array `record` holds everything
+  else as JSON, and names the array wherever the record has one.
+
+JSON knows neither infinity nor NaN. Summaries say `null` instead; the text `record` says "inf", "-inf" or "nan", and the type
+of the field tells that this is a number.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, ClassVar, Self, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.atomic_io import replacing
+from mjfim.errors import RecordingError
+
+# Name of the text array in an npz file that holds everything of a record that is no array.
+RECORD = "record"
+
+# Words for the numbers that JSON cannot say.
+NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+
+
+# ---- JSON for people
+
+
+def as_json(values: Mapping[str, Any]) -> str:
+    """Render values as readable JSON.
+
+    Args:
+        values: Mappings, sequences, arrays, numbers, strings and None, nested at will.
+
+    Returns:
+        Standard JSON with a line break at its end. Non-finite numbers become null, because JSON has no name for them.
+    """
+    return json.dumps(_plain(values), indent=2, allow_nan=False) + "\n"
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write values as a JSON file, whole or not at all.
+
+    Args:
+        path: File to write; its folder is made if it does not exist.
+        values: Contents, as for `as_json`.
+    """
+    with replacing(path) as temporary:
+        temporary.write_text(as_json(values), encoding="utf-8")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that holds an object.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        The object's values by key.
+
+    Raises:
+        RecordingError: The file cannot be read, or does not hold a JSON object.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot read: {error.strerror}") from None
+    except ValueError:
+        raise RecordingError(f"{path}: not a JSON file") from None
+
+    if not isinstance(values, dict):
+        raise RecordingError(f"{path}: not a JSON object")
+    return values
+
+
+def _plain(value: Any) -> Any:
+    """Replace arrays and NumPy scalars by lists and numbers, and non-finite numbers by None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
+
+
+# ---- npz files
+
+
+def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
+    """Read all arrays of an npz file; pickled objects are refused.
+
+    Args:
+        path: File to read.
+        kind: The kind of file that is expected, for messages: "design", "estimate", ...
+
+    Returns:
+        Arrays by name.
+
+    Raises:
+        RecordingError: The file does not exist, is damaged, or holds pickles.
+    """
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such {kind} file")
+
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (
+        ValueError,
+        OSError,
+        EOFError,
+        AttributeError,
+        TypeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        reason = str(error)
+        if "pickle" in reason:
+            reason = "it is not NumPy's, or holds pickles, which are refused"
+        raise RecordingError(
+            f"{path}: not a {kind} archive (npz without pickles): {reason}"
+        ) from None
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write arrays as a compressed npz file, whole or not at all.
+
+    Args:
+        path: File to write; its folder is made if it does not exist.
+        arrays: Arrays of numbers or text by name.
+    """
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays)
+
+
+# ---- records to plain values, and back
+
+
+class MalformedRecord(ValueError):
+    """Plain values that do not fit the fields of a record; the message names the field."""
+
+
+class _Encoder:
+    """Turns a record into plain JSON values, and collects its arrays on the way.
+
+    Attributes:
+        arrays: The arrays by name.
+    """
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        """Start with no arrays.
+
+        Args:
+            names: Names of arrays that users know, by path in the record; other arrays are named by their path.
+        """
+        self.arrays: dict[str, np.ndarray] = {}
+        self._known_names = names
+        self._name_of: dict[int, tuple[str, np.ndarray]] = {}
+
+    def encode(self, hint: Any, value: Any, path: str) -> Any:
+        """Return plain values for one field.
+
+        Args:
+            hint: Type of the field.
+            value: Its value.
+            path: Names of the fields that lead here, joined by dots.
+        """
+        if _optional(hint) is not None:
+            return None if value is None else self.encode(_optional(hint), value, path)
+
+        origin = get_origin(hint)
+        if origin is np.ndarray:
+            return self._keep(value, path)
+        if origin is tuple:
+            entry_hint = get_args(hint)[0]
+            return [self.encode(entry_hint, entry, _join(path, i)) for i, entry in enumerate(value)]
+        if origin is dict:
+            entry_hint = get_args(hint)[1]
+            return {
+                str(key): self.encode(entry_hint, entry, _join(path, i))
+                for i, (key, entry) in enumerate(value.items())
+            }
+        if isinstance(hint, type) and is_dataclass(hint):
+            hints = _hints(hint)
+            return {
+                field.name: self.encode(
+                    hints[field.name], getattr(value, field.name), _join(path, field.name)
+                )
+                for field in fields(hint)
+            }
+        return _encode_scalar(hint, value, path)
+
+    def _keep(self, value: np.ndarray, path: str) -> str:
+        """Keep an array under a name, and return the name; an array that occurs twice is kept once."""
+        array = np.asarray(value)
+        if id(array) in self._name_of:
+            return self._name_of[id(array)][0]
+
+        name = self._known_names.get(path, path)
+        self.arrays[name] = array
+        self._name_of[id(array)] = (name, array)
+        return name
+
+
+def _encode_scalar(hint: Any, value: Any, path: str) -> Any:
+    """Return the JSON value of a single entry: a member of an enumeration, a truth value, a number or a text."""
+    if issubclass(hint, Enum):
+        return value.name
+    if hint in (bool, int, str):
+        return hint(value)
+    if hint is float:
+        number = float(value)
+        return number if math.isfinite(number) else str(number)
+    raise TypeError(f"{path}: values of type {hint} cannot be saved")
+
+
+def _decode(hint: Any, value: Any, arrays: Mapping[str, np.ndarray], path: str) -> Any:
+    """Build the value of one field from plain values and arrays; the inverse of `_Encoder.encode`.
+
+    Raises:
+        MalformedRecord: The plain value does not fit the type of the field.
+    """
+    if _optional(hint) is not None:
+        return None if value is None else _decode(_optional(hint), value, arrays, path)
+
+    origin = get_origin(hint)
+    if origin is np.ndarray:
+        return _array(value, arrays, path)
+    if origin is tuple:
+        entry_hint = get_args(hint)[0]
+        entries = _expect(list, value, path)
+        return tuple(
+            _decode(entry_hint, entry, arrays, _join(path, i)) for i, entry in enumerate(entries)
+        )
+    if origin is dict:
+        entry_hint = get_args(hint)[1]
+        table = _expect(dict, value, path)
+        return {
+            key: _decode(entry_hint, entry, arrays, _join(path, key))
+            for key, entry in table.items()
+        }
+    if is_dataclass(hint):
+        return _decode_record(hint, _expect(dict, value, path), arrays, path)
+    return _decode_scalar(hint, value, path)
+
+
+def _decode_record(
+    kind: Any, values: Mapping[str, Any], arrays: Mapping[str, np.ndarray], path: str
+) -> Any:
+    """Build a record from the plain values of its fields; fields with a default may be absent."""
+    hints = _hints(kind)
+    known = {field.name: field for field in fields(kind)}
+
+    for name in values:
+        if name not in known:
+            raise MalformedRecord(f"the field {_join(path, name)!r} is unknown")
+    for name, field in known.items():
+        if name not in values and not _has_default(field):
+            raise MalformedRecord(f"the field {_join(path, name)!r} is missing")
+
+    decoded = {
+        name: _decode(hints[name], value, arrays, _join(path, name))
+        for name, value in values.items()
+    }
+    return kind(**decoded)
+
+
+def _decode_scalar(hint: Any, value: Any, path: str) -> Any:
+    """Build a member of an enumeration, a truth value, a number or a text."""
+    if issubclass(hint, Enum):
+        if value not in hint.__members__:
+            raise MalformedRecord(f"the field {path!r} holds {value!r}, no {hint.__name__}")
+        return hint[value]
+    if hint is float:
+        if isinstance(value, str) and value in NOT_FINITE:
+            return NOT_FINITE[value]
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise MalformedRecord(f"the field {path!r} holds {value!r}, no number")
+        return float(value)
+    return _expect(hint, value, path)
+
+
+def _array(value: Any, arrays: Mapping[str, np.ndarray], path: str) -> Array:
+    """Look up the array of numbers that a field names."""
+    if not isinstance(value, str) or value not in arrays:
+        raise MalformedRecord(f"the array {value!r} of the field {path!r} is missing")
+    array = arrays[value]
+    if array.dtype.kind not in "fiub":
+        raise MalformedRecord(f"the array {value!r} does not hold numbers")
+    return array
+
+
+def _expect(kind: type, value: Any, path: str) -> Any:
+    """Return the value if it has the expected JSON type."""
+    if type(value) is not kind:
+        raise MalformedRecord(f"the field {path!r} holds {value!r}, no {kind.__name__}")
+    return value
+
+
+def _optional(hint: Any) -> Any:
+    """Return the type beside None of an optional field, or None where the field is not optional."""
+    if get_origin(hint) not in (Union, UnionType):
+        return None
+    others = [entry for entry in get_args(hint) if entry is not NoneType]
+    return others[0]
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    """Return the types of a record's fields by name."""
+    return get_type_hints(kind)
+
+
+def _has_default(field: Field[Any]) -> bool:
+    """Return whether a field may be left out when its record is built."""
+    return field.default is not MISSING or field.default_factory is not MISSING
+
+
+def _join(path: str, name: str | int) -> str:
+    """Return the path of a field inside another one."""
+    return f"{path}.{name}" if path else str(name)
+
+
+# ---- what a record inherits
+
+
+class SavedRecord:
+    """Saving and loading, for records that are dataclasses.
+
+    Attributes:
+        file_stem: Name of the record's files without their endings.
+        made_by: How a user makes the files: a command or a call.
+        array_names: Names of arrays in the npz file that users know, by path in the record.
+    """
+
+    file_stem: ClassVar[str]
+    made_by: ClassVar[str]
+    array_names: ClassVar[Mapping[str, str]] = {}
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of the record's JSON file: the values that users and other programs read."""
+        raise NotImplementedError
+
+    def save(self, folder: str | Path) -> None:
+        """Write the record's two files, each whole or not at all.
+
+        Args:
+            folder: Folder for `<file_stem>.json` and `<file_stem>.npz`; made if it does not exist.
+        """
+        self.save_archive(folder)
+        write_json(Path(folder) / f"{self.file_stem}.json", self.summary())
+
+    def save_archive(self, folder: str | Path) -> None:
+        """Write the npz file alone, from which `load` builds the record.
+
+        Args:
+            folder: Folder for `<file_stem>.npz`; made if it does not exist.
+        """
+        encoder = _Encoder(self.array_names)
+        kind = type(self)
+        values = encoder.encode(kind, self, "")
+
+        text = json.dumps({"type": kind.__name__, "fields": values}, allow_nan=False)
+        arrays = {**encoder.arrays, RECORD: np.array(text)}
+        write_arrays(Path(folder) / f"{self.file_stem}.npz", arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a record that was saved.
+
+        Args:
+            path: The folder of its files, or one of the two files.
+
+        Returns:
+            The record, equal to the one that was saved.
+
+        Raises:
+            RecordingError: The npz file is missing, damaged, of another record, or of a version of mjfim that did not save
+                whole records. The message says how to make it anew.
+        """
+        archive = cls._archive_of(Path(path))
+        arrays = read_arrays(archive, cls.file_stem)
+        values = cls._fields_in(archive, arrays)
+
+        try:
+            record: Self = _decode_record(cls, values, arrays, "")
+        except (MalformedRecord, TypeError, ValueError, IndexError) as error:
+            raise RecordingError(
+                f"{archive}: not a {cls.__name__} of this version of mjfim: {error}; {cls._cure()}"
+            ) from None
+        return record
+
+    @classmethod
+    def _archive_of(cls, path: Path) -> Path:
+        """Return the npz file that belongs to a folder or to a file."""
+        json_name, archive_name = f"{cls.file_stem}.json", f"{cls.file_stem}.npz"
+        if not path.exists():
+            raise RecordingError(f"{path}: no such file or folder")
+
+        if path.is_dir():
+            archive = path / archive_name
+        elif path.suffix in (".json", ".npz"):
+            archive = path.with_suffix(".npz")
+        else:
+            raise RecordingError(
+                f"{path}: {cls.__name__}.load takes a folder, a {json_name} or a {archive_name}"
+            )
+
+        if not archive.is_file():
+            raise RecordingError(
+                f"{archive}: this file is missing; {cls.__name__}.load needs it; {cls._cure()}"
+            )
+        return archive
+
+    @classmethod
+    def _fields_in(cls, archive: Path, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        """Return the plain values of the record that an npz file holds."""
+        if RECORD not in arrays:
+            raise RecordingError(
+                f"{archive}: the array {RECORD!r} is missing, from which {cls.__name__}.load builds the record: written by an "
+                f"older version of mjfim, or not by mjfim; {cls._cure()}"
+            )
+
+        try:
+            content = json.loads(str(arrays[RECORD]))
+            kind, values = content["type"], content["fields"]
+        except (ValueError, KeyError, TypeError):
+            raise RecordingError(
+                f"{archive}: the array {RECORD!r} is not mjfim's; {cls._cure()}"
+            ) from None
+
+        if kind != cls.__name__ or not isinstance(values, dict):
+            raise RecordingError(f"{archive}: holds a record of type {kind}, not {cls.__name__}")
+        return values
+
+    @classmethod
+    def _cure(cls) -> str:
+        """Return how the files of this record are made anew."""
+        return f"make it anew with {cls.made_by}"

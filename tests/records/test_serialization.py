@@ -1,0 +1,397 @@
+"""Records are saved and loaded without loss, and files that cannot be loaded are refused with one clear message."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from enum import Enum
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.errors import RecordingError
+from mjfim.experiment.system import Setup
+from mjfim.output import archive
+from mjfim.records.campaign import Campaign
+from mjfim.records.check import Check
+from mjfim.records.comparison import Comparison
+from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate
+from mjfim.records.monte_carlo import MonteCarloStudy
+from mjfim.records.recording import Recording
+from mjfim.records.serialization import RECORD, SavedRecord, as_json
+from mjfim.records.trajectory import Trajectory
+from tests.support.paths import MODELS
+
+SAVED: tuple[type[SavedRecord], ...] = (
+    Campaign,
+    Check,
+    Comparison,
+    Design,
+    Estimate,
+    MonteCarloStudy,
+    Recording,
+    Trajectory,
+)
+
+
+def assert_same(left: Any, right: Any, path: str = "record") -> None:
+    """Compare two records field by field; arrays bit by bit."""
+    assert type(left) is type(right), path
+    if isinstance(left, np.ndarray):
+        assert left.dtype == right.dtype and left.shape == right.shape, path
+        assert left.tobytes() == right.tobytes(), path
+    elif dataclasses.is_dataclass(left):
+        for field in dataclasses.fields(left):
+            name = field.name
+            assert_same(getattr(left, name), getattr(right, name), f"{path}.{name}")
+    elif isinstance(left, tuple):
+        assert len(left) == len(right), path
+        for i, (a, b) in enumerate(zip(left, right, strict=True)):
+            assert_same(a, b, f"{path}[{i}]")
+    elif isinstance(left, dict):
+        assert list(left) == list(right), path
+        for key in left:
+            assert_same(left[key], right[key], f"{path}[{key!r}]")
+    else:
+        assert left == right or (left != left and right != right), path
+
+
+# ---- values that files spoil easily
+
+NUMBERS = (
+    float("inf"),
+    float("-inf"),
+    float("nan"),
+    -0.0,
+    5e-324,
+    0.1 + 0.2,
+    1.7976931348623157e308,
+)
+TEXTS = (
+    "",
+    "Gelenk-Nullpunkt für „α₁“ 😀",
+    'a "quoted" \\ name\n',
+    "null",
+    "inf",
+    "../x/y",
+    "final.gain",
+)
+
+
+class AwkwardValues:
+    """Builds a value of any type that records have, from numbers and texts that are easily spoilt."""
+
+    def __init__(self, count: int, optional: bool) -> None:
+        """Build tuples, dictionaries and arrays with `count` entries; optional values are present or None."""
+        self.count, self.optional, self._turn = count, optional, 0
+
+    def next_of(self, values: Any) -> Any:
+        """Return the values in turn."""
+        self._turn += 1
+        return values[self._turn % len(values)]
+
+    def build(self, hint: Any) -> Any:
+        """Return a value of a type."""
+        origin = get_origin(hint)
+        if origin in (Union, UnionType):
+            inner = next(entry for entry in get_args(hint) if entry is not NoneType)
+            return self.build(inner) if self.optional else None
+        if origin is np.ndarray:
+            shape = (self.count, self.next_of((1, 2, 3)))
+            return np.array([self.next_of(NUMBERS) for _ in range(shape[0] * shape[1])]).reshape(
+                shape
+            )
+        if origin is tuple:
+            return tuple(self.build(get_args(hint)[0]) for _ in range(self.count))
+        if origin is dict:
+            return {
+                f"{text}{i}": self.build(get_args(hint)[1])
+                for i, text in enumerate(TEXTS[: self.count])
+            }
+        if dataclasses.is_dataclass(hint):
+            hints = get_type_hints(hint)
+            return hint(**{f.name: self.build(hints[f.name]) for f in dataclasses.fields(hint)})
+        if issubclass(hint, Enum):
+            return self.next_of(list(hint))
+        return self.next_of(
+            {bool: (True, False), int: (0, 7, 2**60), float: NUMBERS, str: TEXTS}[hint]
+        )
+
+
+@pytest.mark.parametrize("kind", SAVED, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize(("count", "optional"), [(0, False), (1, True), (2, False), (3, True)])
+def test_awkward_values_survive(
+    kind: type[SavedRecord], count: int, optional: bool, tmp_path: Path
+) -> None:
+    """Infinity, NaN, negative zero, empty tuples, names with quotes and dots, and every optional field."""
+    record = AwkwardValues(count, optional).build(kind)
+    record.save_archive(tmp_path / "new" / "folder")
+    assert_same(kind.load(tmp_path / "new" / "folder"), record)
+
+
+# ---- records of real runs
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    """The cart-pendulum for 0.4 s with limits."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return Setup(
+        experiment.replace(
+            horizon=0.4,
+            descent={"max_iterations": 2, "starts": 2},
+            limits={"position": {"slide": [-2.0, 2.0]}},
+            parameters={"c": {"nuisance": True}},
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def design(setup: Setup) -> Design:
+    """Two iterations from two initial controls."""
+    return mjfim.design(setup)
+
+
+@pytest.fixture(scope="module")
+def estimate(setup: Setup, design: Design) -> Estimate:
+    """An estimate from two recordings and one that is held out."""
+    recordings = [mjfim.simulate(setup, design.trajectory, seed=seed) for seed in range(3)]
+    return mjfim.identify(setup, recordings[:2], held_out=recordings[2:])
+
+
+def round_trip(record: SavedRecord, folder: Path) -> None:
+    """Save and load a record, by folder and by each of its files."""
+    record.save(folder)
+    stem = record.file_stem
+    assert {path.name for path in folder.iterdir()} == {f"{stem}.json", f"{stem}.npz"}
+    for path in (folder, str(folder), folder / f"{stem}.json", folder / f"{stem}.npz"):
+        assert_same(type(record).load(path), record)
+    loaded = type(record).load(folder)
+    assert as_json(loaded.summary()) == as_json(record.summary())
+    assert (folder / f"{stem}.json").read_text(encoding="utf-8") == as_json(record.summary())
+
+
+def test_a_design_is_loaded_as_it_was(design: Design, tmp_path: Path) -> None:
+    """With its history, its starts and the usage of its limits."""
+    assert design.usage and len(design.starts) == 2 and design.nuisance
+    round_trip(design, tmp_path)
+
+
+def test_the_files_of_the_design_verb_are_loaded(
+    design: Design, setup: Setup, tmp_path: Path
+) -> None:
+    """design.json has the experiment's name as well."""
+    archive.write_design(tmp_path, design, setup)
+    loaded = Design.load(tmp_path)
+    assert_same(loaded, design)
+    assert loaded.success == design.success and loaded.wanted == design.wanted
+    assert not loaded.theta.flags.writeable
+
+
+def test_a_design_goes_on_from_its_file(design: Design, setup: Setup, tmp_path: Path) -> None:
+    """A loaded trajectory is simulated as the design's own."""
+    design.save(tmp_path)
+    again = mjfim.simulate(setup, Design.load(tmp_path).trajectory, seed=3)
+    assert np.array_equal(again.y, mjfim.simulate(setup, design.trajectory, seed=3).y)
+
+
+def test_an_estimate_is_loaded_as_it_was(estimate: Estimate, tmp_path: Path) -> None:
+    """With recordings, predictions, tests of residuals, units and priors."""
+    assert estimate.predictions and estimate.whiteness and estimate.motion is not None
+    round_trip(estimate, tmp_path)
+
+
+def test_a_check_is_loaded_as_it_was(setup: Setup, tmp_path: Path) -> None:
+    """With its self-test."""
+    round_trip(mjfim.check(setup), tmp_path)
+
+
+def test_a_study_is_loaded_as_it_was(setup: Setup, design: Design, tmp_path: Path) -> None:
+    """With all estimates."""
+    curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+    round_trip(mjfim.monte_carlo(setup, curves, trials=3), tmp_path)
+
+
+def test_a_comparison_is_loaded_as_it_was(setup: Setup, tmp_path: Path) -> None:
+    """With the control of each method."""
+    round_trip(mjfim.compare(setup.experiment, seconds=0.5), tmp_path)
+
+
+def test_a_campaign_is_loaded_as_it_was(setup: Setup, tmp_path: Path) -> None:
+    """One round with its design, recording and estimate, and a design that waits for its recording."""
+    wanted = setup.experiment.replace(parameters={"m": {"wanted": 1e-6}})
+
+    def measure(design: Design, number: int) -> Recording | None:
+        return mjfim.simulate(wanted, design.trajectory, seed=0) if number == 1 else None
+
+    campaign = mjfim.sequential(wanted, measure, rounds=2)
+    assert len(campaign.rounds) == 1 and campaign.pending is not None
+    round_trip(campaign, tmp_path)
+
+
+def test_recordings_and_trajectories_are_loaded_as_they_were(
+    estimate: Estimate, design: Design, tmp_path: Path
+) -> None:
+    """A recording with rows that were not measured."""
+    recording = estimate.recordings[0]
+    gaps = np.array(recording.y)
+    gaps[1::2] = np.nan
+    round_trip(dataclasses.replace(recording, y=gaps), tmp_path / "recording")
+    round_trip(design.trajectory, tmp_path / "trajectory")
+
+
+# ---- files that cannot be loaded
+
+
+@pytest.fixture
+def saved(design: Design, tmp_path: Path) -> Path:
+    """Folder of a saved design."""
+    design.save(tmp_path / "saved")
+    return tmp_path / "saved"
+
+
+def rewritten(path: Path, change: Callable[[dict[str, np.ndarray]], None]) -> None:
+    """Change the arrays of an npz file."""
+    with np.load(path, allow_pickle=False) as archived:
+        arrays = {name: archived[name] for name in archived.files}
+    change(arrays)
+    np.savez(path, **arrays)
+
+
+def with_fields(
+    change: Callable[[dict[str, Any]], None],
+) -> Callable[[dict[str, np.ndarray]], None]:
+    """Return a change of the record's plain values."""
+
+    def apply(arrays: dict[str, np.ndarray]) -> None:
+        content = json.loads(str(arrays[RECORD]))
+        change(content)
+        arrays[RECORD] = np.array(json.dumps(content))
+
+    return apply
+
+
+ANEW = r"make it anew with `mjfim design EXPERIMENT -o DIR`"
+
+FAULTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], None], str]] = {
+    "an older version": (
+        lambda arrays: arrays.pop(RECORD),
+        rf"design\.npz: the array 'record' is missing, .* older version of mjfim, .*{ANEW}",
+    ),
+    "another text": (
+        lambda arrays: arrays.update({RECORD: np.array("hello")}),
+        rf"design\.npz: the array 'record' is not mjfim's; {ANEW}",
+    ),
+    "another list": (
+        lambda arrays: arrays.update({RECORD: np.array("[1]")}),
+        r"design\.npz: the array 'record' is not mjfim's",
+    ),
+    "a missing array": (
+        lambda arrays: arrays.pop("initial_qpos"),
+        rf"the array 'initial_qpos' of the field 'initial\.trajectory\.qpos' is missing; {ANEW}",
+    ),
+    "an array of texts": (
+        lambda arrays: arrays.update(theta=np.array(["a"])),
+        r"the array 'theta' does not hold numbers",
+    ),
+    "another record": (
+        with_fields(lambda content: content.update(type="Check")),
+        r"design\.npz: holds a record of type Check, not Design",
+    ),
+    "a missing field": (
+        with_fields(lambda content: content["fields"]["final"].pop("cost")),
+        r"the field 'final\.cost' is missing",
+    ),
+    "a field of a newer version": (
+        with_fields(lambda content: content["fields"].update(colour="red")),
+        r"the field 'colour' is unknown",
+    ),
+    "an unknown status": (
+        with_fields(lambda content: content["fields"].update(status="BORED")),
+        r"the field 'status' holds 'BORED', no Status",
+    ),
+    "a text for a number": (
+        with_fields(lambda content: content["fields"].update(slope="steep")),
+        r"the field 'slope' holds 'steep', no number",
+    ),
+    "a number for a text": (
+        with_fields(lambda content: content["fields"].update(parameters=[1])),
+        r"the field 'parameters\.0' holds 1, no str",
+    ),
+    "a truth value for a count": (
+        with_fields(lambda content: content["fields"].update(steps=True)),
+        r"the field 'steps' holds True, no int",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_damaged_files_are_described(name: str, saved: Path) -> None:
+    """The file, what is wrong, and how to make it anew."""
+    change, message = FAULTS[name]
+    rewritten(saved / "design.npz", change)
+    with pytest.raises(RecordingError, match=message):
+        Design.load(saved)
+
+
+def test_fields_with_a_default_may_be_missing(saved: Path, design: Design) -> None:
+    """A later version can add a field."""
+    rewritten(saved / "design.npz", with_fields(lambda content: content["fields"].pop("found_by")))
+    assert_same(Design.load(saved), dataclasses.replace(design, found_by="initial control"))
+
+
+def test_missing_files_are_named(saved: Path, tmp_path: Path) -> None:
+    """Each with what the call takes."""
+    with pytest.raises(RecordingError, match=r"gone: no such file or folder"):
+        Design.load(tmp_path / "gone")
+    with pytest.raises(
+        RecordingError, match=r"estimate\.npz: this file is missing; Estimate\.load needs it; make"
+    ):
+        Estimate.load(saved)
+    (saved / "design.npz").unlink()
+    with pytest.raises(RecordingError, match=rf"design\.npz: this file is missing; .*{ANEW}"):
+        Design.load(saved / "design.json")
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(
+        RecordingError, match=r"notes\.txt: Design\.load takes a folder, a design\.json or a design"
+    ):
+        Design.load(tmp_path / "notes.txt")
+
+
+def test_files_of_others_are_refused(tmp_path: Path) -> None:
+    """A text, and an archive with pickles, which are not even looked at."""
+    path = tmp_path / "design.npz"
+    path.write_text("hello", encoding="utf-8")
+    with pytest.raises(RecordingError, match=r"design\.npz: not a design archive"):
+        Design.load(path)
+    np.savez(path, record=np.array([{}], dtype=object))
+    with pytest.raises(RecordingError, match=r"design\.npz: not a design archive .*pickles"):
+        Design.load(path)
+
+
+def test_a_failing_disk_keeps_the_old_files(
+    design: Design, saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither file is half written."""
+    before = {path.name: path.read_bytes() for path in saved.iterdir()}
+
+    def fail(*args: Any, **kwargs: Any) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="no space"):
+        dataclasses.replace(design, seconds=1.0).save(saved)
+    assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
+
+
+def test_records_may_be_moved(saved: Path, design: Design, tmp_path: Path) -> None:
+    """The npz file alone is enough, under any name."""
+    shutil.copy(saved / "design.npz", tmp_path / "best.npz")
+    assert_same(Design.load(tmp_path / "best.npz"), design)
