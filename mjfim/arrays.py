@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# Smallest diagonal entry of a matrix that is scaled to unit diagonal; protects a division by zero.
+SMALLEST_DIAGONAL = 1e-300
+
 
 def freeze(record: object, *names: str) -> None:
     """Replace named fields of a frozen record by read-only float64 arrays.
@@ -32,3 +35,35 @@ def evenly_spread_indices(count: int, limit: int) -> NDArray[np.intp]:
         (min(count, limit),) ascending indices.
     """
     return np.unique(np.linspace(0, count - 1, min(count, limit)).astype(np.intp))
+
+
+def scaled_to_unit_diagonal(matrix: Array) -> tuple[Array, Array]:
+    """Scale rows and columns of a symmetric positive semidefinite matrix so that its diagonal is 1.
+
+    Eigenvalues, rank and condition of the scaled matrix do not depend on the units of the unknowns.
+
+    Args:
+        matrix: (..., n, n) symmetric positive semidefinite matrices.
+
+    Returns:
+        The scaled matrices: (..., n, n), and the square roots of their diagonals: (..., n), by which rows and columns were
+        divided. Rows that are zero stay zero.
+    """
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    scale = np.asarray(np.sqrt(np.maximum(diagonal, SMALLEST_DIAGONAL)), dtype=np.float64)
+    return matrix / (scale[..., :, None] * scale[..., None, :]), scale
+
+
+def scaled_pseudo_inverse(matrix: Array, tolerance: float) -> Array:
+    """Pseudo-inverse of a symmetric positive semidefinite matrix, independent of the units of the unknowns.
+
+    Args:
+        matrix: (n, n) symmetric positive semidefinite matrix.
+        tolerance: Eigenvalues of the matrix scaled to unit diagonal below this share of the largest one count as zero.
+
+    Returns:
+        (n, n) pseudo-inverse.
+    """
+    scaled, scale = scaled_to_unit_diagonal(matrix)
+    inverse = np.linalg.pinv(scaled, rcond=tolerance, hermitian=True)
+    return np.asarray(inverse / np.outer(scale, scale))

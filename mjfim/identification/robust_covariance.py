@@ -13,11 +13,15 @@ import numpy as np
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, scaled_pseudo_inverse, scaled_to_unit_diagonal
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 
 LEVEL = 0.95
+
+# Eigenvalues of an information scaled to unit diagonal below this share of the largest one count as zero.
+INVERSE_TOLERANCE = 1e-14
+
 APART = 1e-3  # probability below which recordings disagree
 TIMES = 4.0  # a block is that many times as long as residuals hang together
 MOST_SHARE = (
@@ -50,7 +54,7 @@ def uncertainty(
     known = condensed.reduced_private_rows
     prior = np.concatenate([condensed.common_rows, known.reshape(-1, c + 1)])[:, :-1]
     H = grams.sum(axis=0) + prior.T @ prior
-    inverse = _inverse(H)
+    inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
     about = scores - scores.mean(axis=0)
     S = about.T @ about * (count / max(count - 1, 1)) + prior.T @ prior
     sandwich = np.sqrt(np.maximum(np.diag(inverse @ S @ inverse), 0.0))
@@ -145,7 +149,7 @@ def _recordings(
         g = scores[mine].sum(axis=0) + rows[:, :-1].T @ rows[:, -1]
         if _condition(H) > ALONE:
             continue
-        inverse = _inverse(H)
+        inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
         # at its own estimate: what sets recordings apart is no scatter
         own = scores[mine] - grams[mine] @ (inverse @ g)
         own = own - own.mean(axis=0)
@@ -171,25 +175,12 @@ def _recordings(
 def _inflation(H: Array, scores: Array, recordings: int) -> tuple[Array, int]:
     """(c,) variances from the scatter of scores within recordings over formal ones, at least 1; its degrees of freedom."""
     free = max(len(scores) - recordings, 1)
-    inverse = _inverse(H)
+    inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
     S = scores.T @ scores * (len(scores) / free)
     formal = np.maximum(np.diag(inverse), 1e-300)
     return np.asarray(np.maximum(np.diag(inverse @ S @ inverse) / formal, 1.0)), free
 
 
-def _inverse(H: Array) -> Array:
-    """Pseudo-inverse of an information, whatever the units of the unknowns."""
-    unit = _unit(H)
-    return np.asarray(
-        np.linalg.pinv(H / np.outer(unit, unit), rcond=1e-14, hermitian=True) / np.outer(unit, unit)
-    )
-
-
 def _condition(H: Array) -> Array:
-    """(...) condition of informations (..., c, c), whatever the units of the unknowns."""
-    unit = _unit(H)
-    return np.asarray(np.linalg.cond(H / (unit[..., :, None] * unit[..., None, :])))
-
-
-def _unit(H: Array) -> Array:
-    return np.asarray(np.sqrt(np.maximum(np.diagonal(H, axis1=-2, axis2=-1), 1e-300)))
+    """(...) condition of informations: (..., c, c), independent of the units of the unknowns."""
+    return np.asarray(np.linalg.cond(scaled_to_unit_diagonal(H)[0]))

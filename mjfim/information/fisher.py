@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, scaled_to_unit_diagonal
 from mjfim.information.criteria import (
     CRITERIA,
     NEGLIGIBLE,
@@ -138,8 +138,8 @@ class Information:
         if not basis.shape[1]:
             return np.full((len(t), len(t)), np.nan), basis
         R, _ = replace(self, basis=basis).reduced(information)
-        size = np.sqrt(np.maximum(np.diag(R), np.finfo(float).tiny))
-        values, vectors = np.linalg.eigh(R / np.outer(size, size))
+        scaled, size = scaled_to_unit_diagonal(R)
+        values, vectors = np.linalg.eigh(scaled)
         if values[0] <= SINGULAR * values[-1]:
             return np.full((len(t), len(t)), np.nan), basis
         known = basis @ (vectors / size[:, None])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, scaled_to_unit_diagonal
 
 
 def marginal(information: Array, prior: Array, kept: np.ndarray) -> Array:
@@ -32,8 +32,8 @@ def shared(information: Array, prior: Array, private: np.ndarray) -> Array:
 
 def standard_deviations(information: Array) -> Array:
     """(p,) Cramer-Rao standard deviations; infinite where the information is singular."""
-    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    scaled, scale = scaled_to_unit_diagonal(information)
+    values, vectors = np.linalg.eigh(scaled)
     if values[0] <= 1e-14 * values[-1]:
         return np.full(len(scale), np.inf)
     return np.asarray(np.sqrt(np.sum(vectors**2 / values, axis=1)) / scale)

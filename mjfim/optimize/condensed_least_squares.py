@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from mjfim.arrays import Array
+from mjfim.arrays import Array, scaled_to_unit_diagonal
 
 # Rows of one batch in the first pass of a tall QR decomposition; a batch stays in the cache.
 QR_BATCH_ROWS = 128
@@ -164,8 +164,7 @@ class Condensed:
         common_rank = 0
         H = self.information()
         if len(H):
-            unit = np.sqrt(np.maximum(np.diag(H), SMALLEST_NORM))
-            scaled = H / np.outer(unit, unit)
+            scaled, _ = scaled_to_unit_diagonal(H)
             common_rank = int(
                 np.linalg.matrix_rank(scaled, tol=COMMON_RANK_COUNT_TOLERANCE, hermitian=True)
             )

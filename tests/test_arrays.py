@@ -1,0 +1,51 @@
+"""Helpers on arrays: scaling to unit diagonal, the pseudo-inverse on top of it, evenly spread indices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mjfim.arrays import evenly_spread_indices, scaled_pseudo_inverse, scaled_to_unit_diagonal
+
+UNITS = np.array([1e-8, 1.0, 1e6])
+
+
+def semidefinite(rank: int) -> np.ndarray:
+    """A random symmetric positive semidefinite (3, 3) matrix of a rank."""
+    root = np.random.default_rng(rank).normal(size=(3, rank))
+    return root @ root.T
+
+
+def test_scaling_gives_a_unit_diagonal_whatever_the_units() -> None:
+    """Stacks of matrices too; a zero row stays zero."""
+    plain, _ = scaled_to_unit_diagonal(semidefinite(3))
+    stacked = np.stack([semidefinite(3) * np.outer(UNITS, UNITS), np.diag([4.0, 0.0, 9.0])])
+    scaled, scale = scaled_to_unit_diagonal(stacked)
+    np.testing.assert_allclose(scaled[0], plain, rtol=1e-12)
+    np.testing.assert_array_equal(scaled[1], np.diag([1.0, 0.0, 1.0]))
+    assert scale[1, [0, 2]].tolist() == [2.0, 3.0]
+
+
+def test_the_pseudo_inverse_of_a_regular_matrix_is_its_inverse_in_any_units() -> None:
+    H = semidefinite(3)
+    inverse = np.linalg.inv(H)
+    found = scaled_pseudo_inverse(H * np.outer(UNITS, UNITS), 1e-14)
+    np.testing.assert_allclose(found * np.outer(UNITS, UNITS), inverse, rtol=1e-8)
+
+
+@pytest.mark.parametrize("rank", [1, 2])
+def test_the_pseudo_inverse_of_a_singular_matrix_is_a_generalised_inverse(rank: int) -> None:
+    H = semidefinite(rank)
+    inverse = scaled_pseudo_inverse(H, 1e-12)
+    np.testing.assert_allclose(H @ inverse @ H, H, atol=1e-10)
+    np.testing.assert_allclose(inverse, inverse.T, atol=1e-12)
+    assert np.linalg.matrix_rank(inverse, tol=1e-8) == rank
+
+
+@pytest.mark.parametrize(("count", "limit"), [(10, 4), (3, 8), (1, 1), (1000, 1000)])
+def test_spread_indices_reach_from_the_first_to_the_last_row(count: int, limit: int) -> None:
+    indices = evenly_spread_indices(count, limit)
+    assert len(indices) == min(count, limit)
+    assert indices[0] == 0
+    assert indices[-1] == (count - 1 if len(indices) > 1 else 0)
+    assert (np.diff(indices) > 0).all()
