@@ -1,8 +1,8 @@
-"""Turn pydantic's validation errors into one line per fault: file, key, what was wrong, what would be right."""
+"""Validation errors of pydantic as one line per fault: file, key, what is wrong and what would be right."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
@@ -10,14 +10,17 @@ from pydantic import BaseModel, ValidationError
 
 from mjfim.errors import unknown
 
+# Endings of pydantic's names for faults that say that a value has the wrong type or is none of the stated words.
+WRONG_TYPE = ("_type", "literal_error")
+
 
 def explain(
     error: ValidationError, source: str, table: type[BaseModel], hidden: Sequence[str] = ()
 ) -> str:
-    """Explain every fault of an experiment in the user's own keys.
+    """Explain every fault of an experiment by the keys that the user wrote.
 
     Args:
-        error: What pydantic found.
+        error: Faults that pydantic found.
         source: Name of the file, first on every line.
         table: The model that was validated.
         hidden: Keys that are never suggested, because a file cannot state them.
@@ -26,6 +29,7 @@ def explain(
         One line per fault.
     """
     faults_by_key: dict[str, list[Any]] = {}
+
     for fault in error.errors(include_url=False):
         keys, _ = _walk(table, fault["loc"])
         faults_by_key.setdefault(".".join(keys), []).append(fault)
@@ -56,9 +60,7 @@ def valid_keys(table: Any, hidden: Sequence[str] = ()) -> list[str]:
 def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) -> str:
     """Say what is wrong with one key, about which every branch of a union complains."""
     # A branch whose type fits but whose value does not is the one that the user meant.
-    fault = next(
-        (f for f in faults if not f["type"].endswith(("_type", "literal_error"))), faults[0]
-    )
+    fault = next((f for f in faults if not f["type"].endswith(WRONG_TYPE)), faults[0])
 
     if fault["type"] == "extra_forbidden":
         keys, _ = _walk(table, fault["loc"])
@@ -71,15 +73,40 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
 
         return unknown("key", keys[-1], valid_keys(parent, hidden))
 
+    if fault["type"] == "missing":
+        return "this key is required"
+
     # Where no branch has the right type, all of them are offered; else only the faults of the chosen kind.
-    only_types = fault is faults[0]
+    only_types = fault["type"].endswith(WRONG_TYPE)
     shown_faults = [f for f in faults if only_types or f["type"] == fault["type"]]
-    messages = [f["msg"].removeprefix("Value error, ") for f in shown_faults]
+    first, *others = dict.fromkeys(_message(f) for f in shown_faults)
+    alternatives = [first, *(message.removeprefix("should be ") for message in others)]
 
     given = fault.get("input")
     shown = f" (got {given!r})" if isinstance(given, (str, int, float, bool)) else ""
 
-    return " or ".join(dict.fromkeys(messages)) + shown
+    return " or ".join(alternatives) + shown
+
+
+def _message(fault: Mapping[str, Any]) -> str:
+    """The sentence of pydantic about one fault, in the words of the experiment file."""
+    kind = fault["type"]
+
+    if kind in ("dict_type", "model_type"):
+        return "should be a table"
+    if kind == "tuple_type":
+        return "should be a list"
+    if kind in ("bool_type", "bool_parsing"):
+        return "should be true or false"
+    if kind == "too_short":
+        return f"needs {fault['ctx']['min_length']} or more entries"
+
+    message: str = fault["msg"]
+    return (
+        message.removeprefix("Value error, ")
+        .replace("Input should be a valid ", "should be a ")
+        .replace("Input should", "should")
+    )
 
 
 def _walk(table: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], Any]:

@@ -85,7 +85,7 @@ class Robust(Section):
 
 
 class Descent(Section):
-    """How the cost is minimised, and from which initial controls."""
+    """Method, tolerance and initial controls with which the cost is minimised."""
 
     method: Literal["lbfgs", "metric"] = Field(
         default="lbfgs",
@@ -216,7 +216,7 @@ class Boundary(Section):
 
 
 class FitSpec(Section):
-    """How parameters are estimated from recordings."""
+    """Segments, loss, noise and initial guesses with which parameters are fitted to recordings."""
 
     segments: Positive | None = Field(
         default=None,

@@ -1,4 +1,4 @@
-"""The experiment file: DESIGN.md's contract parses, and every fault names the file, the key and what would be right."""
+"""The experiment file: all keys are read, and every fault names the file, the key and what would be right."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ velocity = { hinge = 8.0 }
 control = { force = [-5.0, 5.0] }
 """
 
-# The least that makes an experiment.
-LEAST = """
+# A short complete experiment, which the faulty files below change in one place.
+SHORT = """
 model = "cart_pendulum.xml"
 rate = 100.0
 horizon = 1.0
@@ -138,24 +138,24 @@ def resolve(folder: Path) -> Callable[[str], Setup]:
 
 
 def edited(old: str, new: str) -> str:
-    """LEAST with one change."""
-    if LEAST.count(old) != 1:
+    """SHORT with one change."""
+    if SHORT.count(old) != 1:
         raise ValueError(f"{old!r} does not stand exactly once in the text")
-    return LEAST.replace(old, new)
+    return SHORT.replace(old, new)
 
 
 def parameter(lines: str) -> str:
-    """LEAST with other lines in its parameter table."""
+    """SHORT with other lines in its parameter table."""
     return edited('target = "body/bob:mass"', lines)
 
 
 def target(path: str) -> str:
-    """LEAST with another parameter path."""
+    """SHORT with another parameter path."""
     return parameter(f'target = "{path}"')
 
 
 def control(value: str) -> str:
-    """LEAST with another initial control."""
+    """SHORT with another initial control."""
     return edited('{ kind = "sine" }', value)
 
 
@@ -197,7 +197,7 @@ def test_contract_parses(folder: Path) -> None:
     assert (e.directory, e.source) == (folder, str(path))
 
 
-# What a file can say beyond the paper: correlated noise, rates, nuisance, inertial groups, other criteria.
+# Keys beyond those of the paper: correlated noise, rates, nuisance, whole inertias, other criteria.
 EXTENDED = """
 model = "cart_pendulum.xml"
 rate = 100.0
@@ -307,8 +307,8 @@ def test_contract_resolves(resolve: Callable[[str], Setup]) -> None:
 
 
 def test_defaults(resolve: Callable[[str], Setup]) -> None:
-    """What a file need not say, as DESIGN.md promises it."""
-    setup = resolve(LEAST)
+    """Keys that a file leaves out have the defaults of DESIGN.md."""
+    setup = resolve(SHORT)
     e = setup.experiment
     assert (e.cost.criterion, e.cost.information, e.cost.control, e.cost.linearize_at) == (
         "E",
@@ -341,7 +341,7 @@ def test_mjcf_noise_is_the_default(resolve: Callable[[str], Setup]) -> None:
 
 
 def test_start_from_qpos(resolve: Callable[[str], Setup]) -> None:
-    """Positions and velocities stand for themselves, what is missing is the model's."""
+    """Stated positions and velocities are used; the others are those of the model."""
     setup = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
     assert setup.plant.nominal_initial_state.tolist() == [0.5, 3.0, 0.0, -1.0]
     assert resolve(edited('keyframe = "hanging"', "")).plant.nominal_initial_state.tolist() == [
@@ -353,14 +353,14 @@ def test_start_from_qpos(resolve: Callable[[str], Setup]) -> None:
 
 
 def test_rate_below_the_timestep(resolve: Callable[[str], Setup]) -> None:
-    """Several engine steps per sample."""
+    """A sample has several engine steps."""
     setup = resolve(edited("rate = 100.0", "rate = 20.0"))
     assert (setup.substeps, setup.samples) == (5, 20)
     assert setup.dt == pytest.approx(0.05)
 
 
 def test_python_says_what_toml_says(folder: Path) -> None:
-    """The same names, the same experiment."""
+    """The keys of the file make an equal experiment in Python."""
     (folder / "contract.toml").write_text(CONTRACT, encoding="utf-8")
     e = Experiment.from_file(folder / "contract.toml")
     again = Experiment(**e.model_dump(), directory=folder, source=e.source)
@@ -368,7 +368,7 @@ def test_python_says_what_toml_says(folder: Path) -> None:
 
 
 def test_replace_merges_and_checks(folder: Path) -> None:
-    """Tables merge, the rest is kept, the old experiment too; faults are caught as in a file."""
+    """Tables merge, other keys and the old experiment stay, and faults are refused as in a file."""
     e = Experiment.from_file(folder / "cart_pendulum.toml")
     new = e.replace(horizon=1.0, cost={"control": 1e-2}, initial={"control": {"kind": "chirp"}})
     assert (new.horizon, new.cost.control, new.initial.control) == (1.0, 1e-2, Signal(kind="chirp"))
@@ -392,7 +392,7 @@ def test_experiments_are_immutable(folder: Path) -> None:
 
 @pytest.mark.parametrize("name", ["cart_pendulum.toml", "cart_pendulum_guess.toml"])
 def test_shipped_experiments_resolve(name: str) -> None:
-    """They are the paper's study: at the true values, and as a user meets it."""
+    """They are the study of the paper, designed at the true values and at a guess."""
     setup = Setup(Experiment.from_file(MODELS / name))
     assert setup.samples == 400
     assert setup.parameters.true.tolist() == [2.0, 1.0, 1.0]
@@ -404,11 +404,11 @@ def test_shipped_experiments_resolve(name: str) -> None:
 E, M, R = ExperimentError, ModelError, RecordingError
 HOME = "bad.toml"
 
-# name: text, error, what the message must hold. The first fragment is the file.
+# By name: text of the file, kind of the error, fragments of the message. The first fragment is the file.
 FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     # keys
     "top-level key": (
-        "modle = 1\n" + LEAST,
+        "modle = 1\n" + SHORT,
         E,
         [HOME, "modle", "unknown key", "'model'", "valid:", "horizon"],
     ),
@@ -438,7 +438,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         [HOME, "parameters.m.targets.0.scal", "offset, path, scale"],
     ),
     "limits key": (
-        LEAST + "[limits]\nspeed = 1\n",
+        SHORT + "[limits]\nspeed = 1\n",
         E,
         [
             HOME,
@@ -447,16 +447,16 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         ],
     ),
     "boundary key": (
-        LEAST + "[boundary]\nbegin = 1\n",
+        SHORT + "[boundary]\nbegin = 1\n",
         E,
         [HOME, "boundary.begin", "end, keyframe, position, start, velocity"],
     ),
     "descent key": (
-        LEAST + "[descent]\niterations = 1\n",
+        SHORT + "[descent]\niterations = 1\n",
         E,
         [HOME, "descent.iterations", "unknown key", "max_iterations"],
     ),
-    "reserved key": ('source = "x"\n' + LEAST, E, [HOME, "source", "valid:", "model"]),
+    "reserved key": ('source = "x"\n' + SHORT, E, [HOME, "source", "valid:", "model"]),
     "missing key": (edited("rate = 100.0", ""), E, [HOME, "rate", "required"]),
     # names
     "tracking joint": (
@@ -470,12 +470,12 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         [HOME, "cost.tracking_velocity", "'slid'", "hinge, slide"],
     ),
     "limit joint": (
-        LEAST + "[limits]\nposition = { slid = [-1, 1] }\n",
+        SHORT + "[limits]\nposition = { slid = [-1, 1] }\n",
         E,
         [HOME, "limits.position", "joint 'slid'", "hinge, slide"],
     ),
     "limit actuator": (
-        LEAST + "[limits]\ncontrol = { motor = [-1, 1] }\n",
+        SHORT + "[limits]\ncontrol = { motor = [-1, 1] }\n",
         E,
         [HOME, "limits.control", "actuator 'motor'", "force"],
     ),
@@ -576,12 +576,12 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         [HOME, "rate", "greater than 0", "-1.0"],
     ),
     "measure rate": (
-        "measure_rate = 30.0" + LEAST,
+        "measure_rate = 30.0" + SHORT,
         E,
         [HOME, "measure_rate: 30 Hz", "100 Hz", "50, 25"],
     ),
     "measure rate above": (
-        "measure_rate = 200.0" + LEAST,
+        "measure_rate = 200.0" + SHORT,
         E,
         [HOME, "measure_rate: 200 Hz", "100 Hz", "50, 25"],
     ),
@@ -727,12 +727,12 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         [HOME, "cost.subset", "empty", "valid: m"],
     ),
     "metric weight without the metric": (
-        LEAST + "[descent]\npsi_weight = 1\n",
+        SHORT + "[descent]\npsi_weight = 1\n",
         E,
         [HOME, "descent", "psi_weight belongs to method"],
     ),
     "coarse word": (
-        LEAST + '[descent]\ncoarse = "no"\n',
+        SHORT + '[descent]\ncoarse = "no"\n',
         E,
         [HOME, "descent.coarse", "integer", "'no'"],
     ),
@@ -763,59 +763,59 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         [HOME, "noise.hinge_angle.covariance.0.0", "finite"],
     ),
     "correlated key": (
-        LEAST + "[[correlated]]\noutput = []\n",
+        SHORT + "[[correlated]]\noutput = []\n",
         E,
         [HOME, "correlated.0.output", "covariance, outputs"],
     ),
     "nuisance key": (
-        LEAST + "[nuisance]\nstart = true\n",
+        SHORT + "[nuisance]\nstart = true\n",
         E,
         [HOME, "nuisance.start", "bias, delay, initial"],
     ),
-    "nuisance false": (LEAST + "[nuisance]\ndelay = false\n", E, [HOME, "nuisance.delay", "True"]),
+    "nuisance false": (SHORT + "[nuisance]\ndelay = false\n", E, [HOME, "nuisance.delay", "True"]),
     "robust key": (
-        LEAST + "[robust]\ncount = 3\n",
+        SHORT + "[robust]\ncount = 3\n",
         E,
         [HOME, "robust.count", "over, samples, seed"],
     ),
     "robust over": (
-        LEAST + '[robust]\nover = "best"\n',
+        SHORT + '[robust]\nover = "best"\n',
         E,
         [HOME, "robust.over", "'mean' or 'worst'", "'best'"],
     ),
     "robust of one": (
-        LEAST + "[robust]\nsamples = 1\n",
+        SHORT + "[robust]\nsamples = 1\n",
         E,
         [HOME, "robust.samples", "greater than or equal to 2"],
     ),
     "robust without knowledge": (
-        LEAST + "[robust]\n",
+        SHORT + "[robust]\n",
         E,
         [HOME, "robust", "state `prior` or `bounds`"],
     ),
     "earlier": (
-        'earlier = ["gone.json"]\n' + LEAST,
+        'earlier = ["gone.json"]\n' + SHORT,
         E,
         [HOME, "earlier", "gone.json", "cannot read"],
     ),
     "earlier that is no file of ours": (
-        'earlier = ["cart_pendulum.csv"]\n' + LEAST,
+        'earlier = ["cart_pendulum.csv"]\n' + SHORT,
         E,
         [HOME, "earlier", "cart_pendulum.csv", "neither a design.json"],
     ),
     # limits
     "position limits inverted": (
-        LEAST + "[limits]\nposition = { slide = [1, -1] }\n",
+        SHORT + "[limits]\nposition = { slide = [1, -1] }\n",
         E,
         [HOME, "limits.position.slide", "[1, -1]", "lower < upper"],
     ),
     "control limits inverted": (
-        LEAST + "[limits]\ncontrol = { force = [1, -1] }\n",
+        SHORT + "[limits]\ncontrol = { force = [1, -1] }\n",
         E,
         [HOME, "limits.control.force", "[1, -1]", "lower < upper"],
     ),
     "velocity limit negative": (
-        LEAST + "[limits]\nvelocity = { hinge = -8 }\n",
+        SHORT + "[limits]\nvelocity = { hinge = -8 }\n",
         E,
         [HOME, "limits.velocity.hinge", "greater than 0", "-8"],
     ),
@@ -846,7 +846,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "table columns": (
         control('"columns.csv"'),
         R,
-        ["columns.csv", "'force'", "wanted columns: t, force", "t, forc"],
+        ["columns.csv", "'force'", "expected columns: t, force", "t, forc"],
     ),
     "table stray column": (control('"stray.csv"'), R, ["stray.csv", "'torque'", "force, t"]),
     "table without t": (control('"timeless.csv"'), R, ["timeless.csv", "'t' is missing", "force"]),
@@ -867,7 +867,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_faults_are_named(name: str, resolve: Callable[[str], Setup]) -> None:
-    """File, key, what was wrong, the valid choices."""
+    """The message names the file, the key, the fault and the valid choices."""
     text, kind, fragments = FAULTS[name]
     with pytest.raises(kind) as caught:
         resolve(text)
@@ -877,14 +877,14 @@ def test_faults_are_named(name: str, resolve: Callable[[str], Setup]) -> None:
 
 
 def test_a_free_control_is_named_by_its_actuator(resolve: Callable[[str], Setup]) -> None:
-    """At the latest where the cost is built."""
+    """An unknown actuator in cost.control_about is refused when the cost is built."""
     with pytest.raises(ExperimentError, match=r"cost\.control_about: .*actuator 'motor'.*force"):
         _ = resolve(edited("[cost]", "[cost]\ncontrol_about = { motor = 1 }")).problem
 
 
-def test_least_is_sound(resolve: Callable[[str], Setup]) -> None:
+def test_the_short_experiment_has_no_fault(resolve: Callable[[str], Setup]) -> None:
     """Every fault above is the only one in its file."""
-    assert resolve(LEAST).samples == 100
+    assert resolve(SHORT).samples == 100
 
 
 @pytest.mark.parametrize(
@@ -906,7 +906,7 @@ def test_not_toml(data: bytes, fragment: str, tmp_path: Path) -> None:
 
 
 def test_no_file(tmp_path: Path) -> None:
-    """A path to nothing, a path to a folder."""
+    """A missing file and a folder are refused."""
     with pytest.raises(
         ExperimentError, match=r"gone\.toml: cannot read the experiment file: No such file"
     ):
@@ -916,7 +916,7 @@ def test_no_file(tmp_path: Path) -> None:
 
 
 def test_all_faults_at_once(resolve: Callable[[str], Setup]) -> None:
-    """One line per fault, each with the file and the key."""
+    """Every fault is reported on a line with the file and the key."""
     with pytest.raises(ExperimentError) as caught:
         resolve(
             edited("rate = 100.0", "rate = -1.0")
@@ -933,14 +933,14 @@ ONE_LINE: dict[str, str] = {
     "signal kind": control('{ kind = "noise" }'),
     "signal key": control('{ kind = "sine", amp = 1 }'),
     "control weight": edited("[cost]", "[cost]\ncontrol = -1"),
-    "velocity limit": LEAST + "[limits]\nvelocity = { hinge = -8 }\n",
+    "velocity limit": SHORT + "[limits]\nvelocity = { hinge = -8 }\n",
     "scale": parameter('target = "body/bob:mass"\nscale = 0.0'),
 }
 
 
 @pytest.mark.parametrize("name", ONE_LINE)
 def test_one_fault_one_line(name: str, resolve: Callable[[str], Setup]) -> None:
-    """The branches of a union are the program's business, not the user's."""
+    """A key that may have several types is reported once, not once per type."""
     with pytest.raises(ExperimentError) as caught:
         resolve(ONE_LINE[name])
     assert len(str(caught.value).splitlines()) == 1
@@ -952,14 +952,14 @@ MISUSE: dict[str, tuple[str, list[str]]] = {
         ["parameters.m", "scale 0 never changes"],
     ),
     "two parameters for one number": (
-        LEAST + '[parameters.n]\ntarget = "body/bob:mass"\n',
+        SHORT + '[parameters.n]\ntarget = "body/bob:mass"\n',
         ["parameters.n", "body/bob:mass"],
     ),
     "negative signal seed": (
         control('{ kind = "multisine", seed = -1 }'),
         ["initial.control.seed", "-1"],
     ),
-    "negative descent seed": (LEAST + "[descent]\nseed = -1\n", ["descent.seed", "-1"]),
+    "negative descent seed": (SHORT + "[descent]\nseed = -1\n", ["descent.seed", "-1"]),
     "column twice": (control('"twice.csv"'), ["twice.csv", "force"]),
     "table not UTF-8": (control('"latin.csv"'), ["latin.csv"]),
 }
@@ -1009,7 +1009,7 @@ def test_json_schema_states_the_keys_of_a_file() -> None:
 
 
 @pytest.mark.parametrize("values", [{}, {"parameters": {}}, {"model": 3}])
-def test_python_faults_are_the_same_kind(values: dict[str, Any]) -> None:
+def test_faults_in_python_are_experiment_errors(values: dict[str, Any]) -> None:
     """Without a file the message names the experiment."""
     with pytest.raises(ExperimentError, match=r"^experiment: model: "):
         Experiment(**values)
