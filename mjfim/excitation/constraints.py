@@ -12,7 +12,8 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.limits import Limit
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
-from mjfim.model.geom_distance import GeomDistances, find_geom_pairs
+from mjfim.model.geom_distance import GeomDistances
+from mjfim.model.geom_pairs import find_geom_pairs
 from mjfim.optimize.barrier import BarrierExpansion, Bounds
 from mjfim.optimize.lq import Weights
 from mjfim.plant.batch import SubstepObservations

@@ -9,24 +9,35 @@ from typing import Any
 
 import mujoco
 
+# Guards the settings of MuJoCo's log, which all threads share.
 _lock = Lock()
-_blocks: list[
-    Any
-] = []  # settings from before, one per block that is open in any thread; those of the first count
+
+# One entry for each block that is open in any thread: the settings from before the first of them.
+_open_blocks: list[Any] = []
 
 
 @contextmanager
 def silence_mujoco_log() -> Iterator[None]:
-    """No MuJoCo message inside the block; the settings from before it come back after it, after the last one of threads."""
+    """No MuJoCo message inside the block.
+
+    The settings from before come back when the last open block of all threads ends.
+
+    Yields:
+        Nothing.
+    """
     with _lock:
-        before, config = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
-        config.logto_console = config.logto_file = False
-        _blocks.append(before if not _blocks else _blocks[0])
-        mujoco.MjLogConfig.set(config)
+        current = mujoco.MjLogConfig.get()
+        _open_blocks.append(_open_blocks[0] if _open_blocks else current)
+
+        silent = mujoco.MjLogConfig.get()
+        silent.logto_console = False
+        silent.logto_file = False
+        mujoco.MjLogConfig.set(silent)
+
     try:
         yield
     finally:
         with _lock:
-            before = _blocks.pop()
-            if not _blocks:
+            before = _open_blocks.pop()
+            if not _open_blocks:
                 mujoco.MjLogConfig.set(before)

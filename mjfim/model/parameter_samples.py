@@ -10,10 +10,16 @@ from scipy.stats import qmc
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.model.parameters import ParameterSet
+from mjfim.model.parameters import Parameter, ParameterSet
 
-HALVINGS = 20  # of a sample's distance from the guess, until its bodies can exist
-SAME_SIGN = 0.05  # least share of a scalar's value that a normal sample keeps
+# Standard deviations within which samples of a prior keep.
+MAX_DEVIATION = 2.5
+
+# How often the distance of a sample from the guess is halved until its bodies are physical; then it is set to zero.
+MAX_HALVINGS = 20
+
+# Smallest share of a scalar's value that a sample of its prior keeps, so that it does not change its sign.
+MIN_SHARE_OF_VALUE = 0.05
 
 
 def sample_parameters(
@@ -21,56 +27,85 @@ def sample_parameters(
     theta: Array,
     count: int,
     seed: int,
-    impossible: Callable[[Array], Sequence[int]] | None = None,
+    unphysical: Callable[[Array], Sequence[int]] | None = None,
 ) -> Array:
-    """(count, p) parameter values: theta itself, then a Latin hypercube over the priors (normal) or the bounds (uniform).
+    """Sample the parameters: theta itself, then a Latin hypercube over priors (normal) or bounds (uniform).
 
     Normal samples keep within the bounds, within 2.5 standard deviations, and do not change the sign of a scalar (a mass, a
-    damping). Parameters with neither prior nor bounds, and those outside the model, stay at theta; raises ExperimentError
-    where that holds for all. Where bodies of a sample cannot exist, the parameters that make them go half of their way back
-    to theta, again and again (at most `HALVINGS` times, then all the way).
+    damping). Parameters with neither prior nor bounds, and those outside the model, stay at theta. Where bodies of a sample
+    are unphysical, the parameters that determine them go half of their way back to theta until they are physical.
 
-    impossible: indices of the parameters that make bodies which cannot exist; nobody looks where it is left out
+    Args:
+        parameters: The parameters.
+        theta: (p,) values about which priors are centred.
+        count: Number of samples, theta included.
+        seed: Seed of the random numbers.
+        unphysical: Gives for a sample (p,) the indices of the parameters that determine unphysical bodies; None for no check.
+
+    Returns:
+        (count, p) samples.
+
+    Raises:
+        ExperimentError: No parameter has a prior or bounds.
     """
-    p, outside = len(parameters), parameters.outside_model
-    stated = [
-        q.prior is not None or bool(np.isfinite(q.bounds).all()) for q in parameters.parameters
+    free = [
+        j
+        for j, parameter in enumerate(parameters.parameters)
+        if _has_distribution(parameter) and not parameters.outside_model[j]
     ]
-    free = [j for j in range(p) if stated[j] and not outside[j]]
     if not free:
         raise ExperimentError(
             "robust: no parameter has a prior or bounds to sample from; state `prior` or `bounds`"
         )
-    out = np.tile(theta, (count, 1))
+
+    samples = np.tile(theta, (count, 1))
     if count > 1:
-        u = qmc.LatinHypercube(len(free), rng=np.random.default_rng(seed)).random(count - 1)
+        generator = np.random.default_rng(seed)
+        quantiles = qmc.LatinHypercube(len(free), rng=generator).random(count - 1)
         for column, j in enumerate(free):
-            q = parameters.parameters[j]
-            low, high = q.bounds
-            if q.prior is not None:
-                drawn = theta[j] + q.prior * np.clip(ndtri(u[:, column]), -2.5, 2.5)
-                if q.size == abs(q.guess) and theta[j] > 0.0:
-                    low = max(low, SAME_SIGN * theta[j])
-                elif q.size == abs(q.guess) and theta[j] < 0.0:
-                    high = min(high, SAME_SIGN * theta[j])
-                out[1:, j] = np.clip(drawn, low, high)
-            else:
-                out[1:, j] = low + (high - low) * u[:, column]
-    if impossible is not None:
-        for row in out[1:]:
-            _tame(row, theta, impossible)
-    return out
+            parameter = parameters.parameters[j]
+            samples[1:, j] = _values(parameter, float(theta[j]), quantiles[:, column])
+
+    if unphysical is not None:
+        for sample in samples[1:]:
+            _make_physical(sample, theta, unphysical)
+    return samples
 
 
-def _tame(sample: Array, theta: Array, impossible: Callable[[Array], Sequence[int]]) -> None:
-    """Move a sample: (p,) in place towards theta: (p,) until its bodies can exist."""
-    columns: list[int] = []
-    for _ in range(HALVINGS):
-        columns = list(impossible(sample))
+def _has_distribution(parameter: Parameter) -> bool:
+    """Whether a parameter has a prior or finite bounds."""
+    return parameter.prior is not None or bool(np.isfinite(parameter.bounds).all())
+
+
+def _values(parameter: Parameter, value: float, quantiles: Array) -> Array:
+    """Values of a parameter (n,) at quantiles (n,) of its distribution about a value."""
+    low, high = parameter.bounds
+    if parameter.prior is None:
+        return np.asarray(low + (high - low) * quantiles)
+
+    # A parameter whose magnitude is that of its guess is a scalar, which keeps its sign.
+    is_scalar = parameter.size == abs(parameter.guess)
+    if is_scalar and value > 0.0:
+        low = max(low, MIN_SHARE_OF_VALUE * value)
+    elif is_scalar and value < 0.0:
+        high = min(high, MIN_SHARE_OF_VALUE * value)
+
+    deviations = np.clip(ndtri(quantiles), -MAX_DEVIATION, MAX_DEVIATION)
+    return np.asarray(np.clip(value + parameter.prior * deviations, low, high))
+
+
+def _make_physical(
+    sample: Array, theta: Array, unphysical: Callable[[Array], Sequence[int]]
+) -> None:
+    """Move a sample: (p,) in place towards theta: (p,) until its bodies are physical."""
+    for _ in range(MAX_HALVINGS):
+        columns = list(unphysical(sample))
         if not columns:
             return
         sample[columns] = 0.5 * (sample[columns] + theta[columns])
-    while columns := list(impossible(sample)):
+
+    while columns := list(unphysical(sample)):
+        # At theta itself nothing is left to move.
         if np.array_equal(sample[columns], theta[columns]):
             return
         sample[columns] = theta[columns]

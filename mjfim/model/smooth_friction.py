@@ -1,20 +1,48 @@
-"""Dry friction as a viscous force that saturates: nearly the same where joints move, and smooth where they turn round.
+"""Dry friction, smoothed near zero velocity so that derivatives of a trajectory exist.
 
-The engine's friction changes sign from one step to the next and sticks for some. What a trajectory tells then jumps by what
-such a step tells, and no small difference sees it. `f clip(v / s, -1, 1)`, at a speed s that takes several steps to cross,
-averages over them.
+The engine's dry friction changes its sign from one step to the next, and sticks for some steps. The information of a
+trajectory then jumps by that of such a step, and no small difference shows it. Smoothed friction is the viscous force that
+saturates, `f clip(v / s, -1, 1)`. It is nearly the engine's where joints move, and smooth where they reverse: at a speed s
+that takes several steps to cross it averages over them.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array
 
-SMOOTHING_SPEED_FRACTION = 0.02  # s over the fastest speed
-SOFT = 1e-3  # impedance of the softened constraint: it answers velocities, not accelerations
+# Smoothing speed s of a degree of freedom over its fastest speed.
+SMOOTHING_SPEED_FRACTION = 0.02
+
+# Impedance of the smoothed friction constraint, so low that it answers velocities and not accelerations.
+SMOOTHED_IMPEDANCE = 1e-3
+
+# Smallest impedance that MuJoCo uses.
+MIN_IMPEDANCE = 1e-4
+
+# Smallest damping of a friction constraint for which a sticking speed is computed [1/s].
+MIN_DAMPING = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _FrictionArrays:
+    """Arrays of MjModel that hold the friction constraints of n joints' degrees of freedom, or of n tendons.
+
+    Attributes:
+        loss: (n,) friction loss [N or N m].
+        inverse_weight: (n,) inverse inertia at the constraint.
+        impedance: (n, 5) `solimp`.
+        reference: (n, 2) `solref`.
+    """
+
+    loss: Array
+    inverse_weight: Array
+    impedance: Array
+    reference: Array
 
 
 def has_dry_friction(model: Any) -> bool:
@@ -23,51 +51,71 @@ def has_dry_friction(model: Any) -> bool:
 
 
 def smoothing_speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
-    """s of every degree of freedom, then of every tendon, no less than the speed at which the engine's own friction sticks.
+    """Smoothing speeds s of every degree of freedom, then of every tendon [m/s or rad/s].
 
-    fastest: (nv,) speeds of the degrees of freedom
+    None is below the speed at which the engine's friction sticks.
+
+    Args:
+        model: The model (`mujoco.MjModel`).
+        fastest: (nv,) fastest speeds of the degrees of freedom [m/s or rad/s].
     """
-    own = np.concatenate([_sticking(*rows) for rows in _frictions(model)])
-    return tuple(
-        np.maximum(
-            own, np.concatenate([SMOOTHING_SPEED_FRACTION * fastest, np.zeros(model.ntendon)])
-        ).tolist()
-    )
+    sticking = np.concatenate([_sticking_speeds(arrays) for arrays in _friction_arrays(model)])
+    proportional = np.concatenate([SMOOTHING_SPEED_FRACTION * fastest, np.zeros(model.ntendon)])
+    return tuple(np.maximum(sticking, proportional).tolist())
 
 
 def smooth_dry_friction(model: Any, speeds: tuple[float, ...]) -> None:
-    """Write the softened law into a model that the caller owns, for the friction that it has, in place."""
-    rest = np.asarray(speeds)
-    for loss, weight, impedance, reference in _frictions(model):
-        s, rest = rest[: len(loss)], rest[len(loss) :]
-        on = (loss > 0.0) & (s > 0.0)
-        s = np.maximum(
-            s, loss * weight * model.opt.timestep
-        )  # a longer timestep bears no steeper law
-        resistance = (1.0 - SOFT) / SOFT * weight
-        impedance[on] = (SOFT, SOFT, 1e-3, 0.5, 2.0)
-        reference[on, 0] = -1.0
-        reference[on, 1] = -SOFT * (loss * resistance)[on] / s[on]
+    """Write smoothed friction into a model that the caller owns, in place, wherever it has dry friction.
+
+    Args:
+        model: The model (`mujoco.MjModel`).
+        speeds: Smoothing speeds of every degree of freedom, then of every tendon; 0 keeps the engine's friction.
+    """
+    remaining = np.asarray(speeds)
+    for arrays in _friction_arrays(model):
+        loss = arrays.loss
+        weight = arrays.inverse_weight
+        s, remaining = remaining[: len(loss)], remaining[len(loss) :]
+        smoothed = (loss > 0.0) & (s > 0.0)
+
+        # A longer timestep bears no steeper law.
+        s = np.maximum(s, loss * weight * model.opt.timestep)
+
+        resistance = (1.0 - SMOOTHED_IMPEDANCE) / SMOOTHED_IMPEDANCE * weight
+        damping = SMOOTHED_IMPEDANCE * (loss * resistance)[smoothed] / s[smoothed]
+        arrays.impedance[smoothed] = (SMOOTHED_IMPEDANCE, SMOOTHED_IMPEDANCE, 1e-3, 0.5, 2.0)
+        arrays.reference[smoothed, 0] = -1.0
+        arrays.reference[smoothed, 1] = -damping
 
 
-def _frictions(model: Any) -> tuple[tuple[Array, Array, Array, Array], ...]:
-    """Loss, inverse weight, impedance and reference of the friction of joints, and of tendons."""
-    return (
-        (model.dof_frictionloss, model.dof_invweight0, model.dof_solimp, model.dof_solref),
-        (
-            model.tendon_frictionloss,
-            model.tendon_invweight0,
-            model.tendon_solimp_fri,
-            model.tendon_solref_fri,
-        ),
+def _friction_arrays(model: Any) -> tuple[_FrictionArrays, _FrictionArrays]:
+    """Views of the friction constraints of joints, and of tendons."""
+    joints = _FrictionArrays(
+        loss=model.dof_frictionloss,
+        inverse_weight=model.dof_invweight0,
+        impedance=model.dof_solimp,
+        reference=model.dof_solref,
     )
+    tendons = _FrictionArrays(
+        loss=model.tendon_frictionloss,
+        inverse_weight=model.tendon_invweight0,
+        impedance=model.tendon_solimp_fri,
+        reference=model.tendon_solref_fri,
+    )
+    return joints, tendons
 
 
-def _sticking(loss: Array, weight: Array, impedance: Array, reference: Array) -> Array:
-    """Speed from which the engine's friction, as strong as it may be, decelerates as it wants to."""
-    most = np.maximum(impedance[:, 1], 1e-4)
+def _sticking_speeds(arrays: _FrictionArrays) -> Array:
+    """(n,) speeds below which the engine's friction brakes with less than its full force, and so sticks.
+
+    The constraint asks for a deceleration of damping times speed; its force cannot exceed the friction loss.
+    """
+    impedance = np.maximum(arrays.impedance[:, 1], MIN_IMPEDANCE)
+    reference = arrays.reference
+
+    # A positive first reference is a time constant (MuJoCo's standard form); else the second one is the damping itself.
     standard = reference[:, 0] > 0.0
-    damping = np.where(
-        standard, 2.0 / np.where(standard, most * reference[:, 0], 1.0), -reference[:, 1] / most
-    )
-    return np.asarray(loss * weight / np.maximum(damping, 1e-9))
+    time_constant = np.where(standard, impedance * reference[:, 0], 1.0)
+    damping = np.where(standard, 2.0 / time_constant, -reference[:, 1] / impedance)
+
+    return np.asarray(arrays.loss * arrays.inverse_weight / np.maximum(damping, MIN_DAMPING))

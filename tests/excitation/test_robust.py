@@ -33,7 +33,9 @@ def pool(kind: str, count: int = 4) -> Pool:
 
 def unknowns(*parameters: dict) -> ParameterSet:
     """Parameters without targets."""
-    built = tuple(Parameter(f"p{i}", (), **{"guess": 0.0, **p}) for i, p in enumerate(parameters))
+    built = tuple(
+        Parameter(name=f"p{i}", targets=(), **{"guess": 0.0, **p}) for i, p in enumerate(parameters)
+    )
     return ParameterSet(built, ((),) * len(built))
 
 

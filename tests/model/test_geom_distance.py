@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.model import geom_distance as clearance
-from mjfim.model.geom_distance import GeomDistances, SignedDistances, find_geom_pairs
+from mjfim.model import geom_distance
+from mjfim.model.geom_distance import GeomDistances, SignedDistances
+from mjfim.model.geom_pairs import find_geom_pairs
+from mjfim.model.pair_distance import BOX, CAPSULE
 from tests.support.numerics import Array, directional_check
 
 ROCK = " ".join(f"{v:.3f}" for v in np.random.default_rng(5).normal(scale=0.1, size=60))
@@ -256,9 +258,7 @@ def test_nothing_within_reach_is_lost(reach: float) -> None:
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-10, 200
     d, expected = chosen(qpos, False).d, asked(model, chosen, qpos, reach)
     shapes = [{int(model.geom_type[g]) for g in (p.first, p.second)} for p in chosen.pairs]
-    trusted = (d > -0.05) | np.array(
-        [s != {clearance.CAPSULE, clearance.BOX} for s in shapes]
-    )  # see below
+    trusted = (d > -0.05) | np.array([s != {CAPSULE, BOX} for s in shapes])  # see below
     assert trusted.mean() > 0.99
     np.testing.assert_allclose(d[trusted], expected[trusted], rtol=0, atol=1e-8)
     assert (d[expected == reach] == reach).all()
@@ -273,7 +273,7 @@ def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, 0.3), scattered(model, 11, 0.4)
     whole = chosen(qpos, True)
-    monkeypatch.setattr(clearance, "BLOCK", 3 * len(chosen.pairs))
+    monkeypatch.setattr(geom_distance, "MAX_BOUNDS_AT_ONCE", 3 * len(chosen.pairs))
     cut, none = chosen(qpos, True), chosen(qpos[:0], True)
     np.testing.assert_array_equal(cut.d, whole.d)
     np.testing.assert_array_equal(cut.slope, whole.slope)
@@ -386,7 +386,9 @@ def test_the_check_of_slopes_can_fail() -> None:
 
     def wrong(change: Callable[[Array], Array]) -> float:
         return slope_errors(
-            model, lambda q: SignedDistances(chosen(q, True).d, change(chosen(q, True).slope)), qpos
+            model,
+            lambda q: SignedDistances(d=chosen(q, True).d, slope=change(chosen(q, True).slope)),
+            qpos,
         ).min()
 
     assert wrong(lambda s: s) < 1e-6

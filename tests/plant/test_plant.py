@@ -848,7 +848,7 @@ def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tm
     np.testing.assert_allclose(found.psi[-1, :, 0], slope, rtol=1e-4, atol=1e-6)
     initial = {"keyframe": "moved", "control": {"kind": "sine"}}
     with pytest.raises(
-        ExperimentError, match=r"parameters\.x: the keyframe says where mocap body 'near' is"
+        ExperimentError, match=r"parameters\.x: the keyframe states where mocap body 'near' is"
     ):
         make_setup(CARRIED, tmp_path, parameters=place, initial=initial)
 

@@ -1,0 +1,147 @@
+"""Pairs of geoms of a model that can come near each other, selected as MuJoCo selects them for collisions."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import mujoco
+
+from mjfim.errors import ExperimentError, unknown
+from mjfim.model.elements import element_name, unique_names
+
+# Types of geoms to which MuJoCo has no reliable distance, in words.
+REFUSED_TYPES = {
+    int(mujoco.mjtGeom.mjGEOM_HFIELD): "height field",
+    int(mujoco.mjtGeom.mjGEOM_SDF): "signed distance field",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeomPair:
+    """Two geoms that can come near each other.
+
+    Attributes:
+        first: Number of a geom that can move.
+        second: Number of the other geom; one that cannot move stands here.
+        name: Name of the pair, `<geom> - <geom>`.
+    """
+
+    first: int
+    second: int
+    name: str
+
+
+def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[GeomPair, ...]:
+    """All pairs of geoms that move relative to each other and that MuJoCo would let collide, contacts enabled or not.
+
+    As MuJoCo selects: no geoms of bodies welded together, of parent and child (unless the parent is fixed in the world or the
+    flag filterparent is off) or of an `<exclude>`; contype and conaffinity must match. An explicit `<pair>` overrules all of
+    these. Flexes have no geoms and are left out.
+
+    Args:
+        model: The model (`mujoco.MjModel`).
+        ignored: Pairs of names of bodies whose geoms are left out.
+
+    Raises:
+        ExperimentError: A body is unknown, or a height field or signed distance field remains.
+    """
+    bodies = unique_names(model, "body")
+    _check_ignored(ignored, bodies)
+
+    selection = _Selection(model)
+    body_of = model.geom_bodyid.tolist()
+    found = []
+    for one, other in combinations(range(model.ngeom), 2):
+        first, second = (one, other) if selection.can_move(one) else (other, one)
+        names = frozenset((bodies[body_of[first]], bodies[body_of[second]]))
+        if names in ignored or not selection.can_come_near(first, second):
+            continue
+
+        labels = []
+        for geom in (first, second):
+            body = bodies[body_of[geom]]
+            label = element_name(model, "geom", geom) or f"{body} geom {geom}"
+            _check_type(model, geom, label, bodies[body_of[first]], bodies[body_of[second]])
+            labels.append(label)
+        found.append(GeomPair(first=first, second=second, name=" - ".join(labels)))
+    return tuple(found)
+
+
+def _check_ignored(ignored: Collection[frozenset[str]], bodies: tuple[str, ...]) -> None:
+    """Raise where an ignored pair does not consist of two bodies of the model."""
+    for names in ignored:
+        for name in sorted(names):
+            if name not in bodies:
+                raise ExperimentError(f"ignored: {unknown('body', name, bodies)}")
+        if len(names) != 2:
+            raise ExperimentError(
+                f"ignored: {sorted(names)} is no pair of bodies; needs two different names"
+            )
+
+
+def _check_type(model: Any, geom: int, label: str, first_body: str, second_body: str) -> None:
+    """Raise where MuJoCo has no reliable distance to a geom. first_body, second_body: bodies of its pair."""
+    refused = REFUSED_TYPES.get(int(model.geom_type[geom]))
+    if refused is not None:
+        raise ExperimentError(
+            f"clearance: {label} is a {refused}, to which MuJoCo knows no reliable distance; ignore the bodies "
+            f"{first_body!r} and {second_body!r}, or use boxes or meshes"
+        )
+
+
+class _Selection:
+    """MuJoCo's selection of pairs of geoms that may collide."""
+
+    def __init__(self, model: Any) -> None:
+        """Read what the selection rests on from a model."""
+        self._model = model
+        self._body = model.geom_bodyid.tolist()
+        self._tree = model.body_treeid.tolist()
+        self._weld = model.body_weldid.tolist()
+        self._parent_weld = model.body_weldid[model.body_parentid].tolist()
+        self._contype = model.geom_contype.tolist()
+        self._conaffinity = model.geom_conaffinity.tolist()
+
+        explicit = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+        self._explicit = {frozenset(pair) for pair in explicit}
+
+        # The signature of an <exclude> holds the numbers of both bodies, 16 bits each.
+        signatures = model.exclude_signature.tolist()
+        self._excluded = {frozenset(divmod(signature, 1 << 16)) for signature in signatures}
+
+        filterparent_off = int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
+        self._filters_parents = not model.opt.disableflags & filterparent_off
+
+    def can_move(self, geom: int) -> bool:
+        """Whether a geom belongs to a kinematic tree."""
+        return bool(self._tree[self._body[geom]] >= 0)
+
+    def can_come_near(self, first: int, second: int) -> bool:
+        """Whether two geoms, of which the first moves if one does, move relative to each other and may collide."""
+        a = self._body[first]
+        b = self._body[second]
+        if not self.can_move(first) or self._weld[a] == self._weld[b]:
+            return False
+        if frozenset((first, second)) in self._explicit:
+            return True
+        if frozenset((a, b)) in self._excluded or self._are_parent_and_child(a, b):
+            return False
+        return self._bits_match(first, second)
+
+    def _are_parent_and_child(self, a: int, b: int) -> bool:
+        """Whether MuJoCo filters two bodies as parent and child; what is fixed in the world is nobody's parent."""
+        if not self._filters_parents:
+            return False
+        a = self._weld[a]
+        b = self._weld[b]
+        related = a == self._parent_weld[b] or b == self._parent_weld[a]
+        return bool(a and b and related)
+
+    def _bits_match(self, first: int, second: int) -> bool:
+        """Whether the collision bits of two geoms match."""
+        forward = self._contype[first] & self._conaffinity[second]
+        backward = self._contype[second] & self._conaffinity[first]
+        return bool(forward or backward)

@@ -1,0 +1,257 @@
+"""Distances of single pairs of geoms, asked of MuJoCo only in the ways in which its answers are right.
+
+Where `mj_geomDistance` is wrong it is not asked:
+
+- planes are exact here (MuJoCo takes a wrong corner of a box that stands on its edge);
+- capsules in boxes are asked about their axis (the primitive collider reports deep penetration as separation);
+- geoms that touch are parted a little to see the normal of their surfaces.
+
+Height fields and signed distance fields are refused (`mjfim.model.geom_pairs`).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from mjfim.arrays import Array
+from mjfim.model.geom_pairs import GeomPair
+
+# Array of indices.
+Indices = NDArray[np.intp]
+
+# MuJoCo's types of geoms as numbers.
+PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
+CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+ELLIPSOID = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
+CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
+
+# Types of geoms whose distance to a plane is exact here.
+PRIMITIVES = (SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX)
+
+# Tolerance and iterations of the convex collider; MuJoCo's 1e-6 and 35 blur the slopes of curved geoms.
+CCD_TOLERANCE = 1e-10
+CCD_ITERATIONS = 200
+
+# Distance that is larger than any between geoms [m].
+INFINITE_DISTANCE = 1e6
+
+# Radius of a capsule's axis [m]; with radius 0 the collider now and then reports deep penetration as touching.
+AXIS_RADIUS = 1e-9
+
+# Distance below which the nearest points of two surfaces do not show their normal [m].
+TOUCHING_DISTANCE = 1e-8
+
+# Distance by which touching geoms are parted to see the normal [m].
+PARTING_DISTANCE = 1e-5
+
+
+class PairDistances:
+    """Distances of p pairs of geoms at poses of all geoms.
+
+    Attributes:
+        first: (p,) numbers of the first geoms.
+        second: (p,) numbers of the second geoms.
+        planes: Numbers of the pairs whose second geom is a plane.
+        exact: (p,) True where `lower_bounds` gives the distance itself: a primitive over a plane.
+    """
+
+    def __init__(self, model: Any, pairs: Sequence[GeomPair]) -> None:
+        """Prepare for pairs of a model, which is copied."""
+        self._model = copy.copy(model)
+        self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+        self._model.opt.ccd_tolerance = min(self._model.opt.ccd_tolerance, CCD_TOLERANCE)
+        self._model.opt.ccd_iterations = max(self._model.opt.ccd_iterations, CCD_ITERATIONS)
+        self._data = mujoco.MjData(self._model)
+
+        self.first = np.array([pair.first for pair in pairs])
+        self.second = np.array([pair.second for pair in pairs])
+        types = self._model.geom_type
+        kinds = np.stack([types[self.first], types[self.second]])
+
+        self.planes = np.flatnonzero(kinds[1] == PLANE)
+        self.exact = (kinds[1] == PLANE) & np.isin(kinds[0], PRIMITIVES)
+        bounding_radii = self._model.geom_rbound
+        self._radii = bounding_radii[self.first] + bounding_radii[self.second]
+
+        # A capsule and a box are asked about the capsule's axis; its radius is taken off the answer.
+        by_axis = (np.sort(kinds, axis=0) == [[CAPSULE], [BOX]]).all(axis=0)
+        capsule = np.where(kinds[0] == CAPSULE, self.first, self.second)
+        self._axis_offset = np.where(by_axis, self._model.geom_size[capsule, 0], 0.0)
+        axis_model = _with_capsule_axes(self._model)
+
+        # All that a call of MuJoCo needs, pair by pair.
+        self._calls = [
+            (axis_model if axis else self._model, pair.first, pair.second, float(offset))
+            for pair, axis, offset in zip(pairs, by_axis, self._axis_offset, strict=True)
+        ]
+
+    def lower_bounds(self, positions: Array, frames: Array) -> tuple[Array, Array]:
+        """Lower bounds of the distances from bounding spheres; the distances themselves of `exact` pairs.
+
+        Args:
+            positions: (n, ngeom, 3) positions of the geoms [m].
+            frames: (n, ngeom, 3, 3) frames of the geoms.
+
+        Returns:
+            (n, p) bounds [m], and (n, number of planes, 3) points of the first geoms nearest to the planes [m].
+        """
+        between = positions[:, self.second] - positions[:, self.first]
+        bounds = np.sqrt(np.einsum("npi,npi->np", between, between)) - self._radii
+
+        size = self._model.geom_size
+        kind = self._model.geom_type
+        points = np.empty((len(positions), len(self.planes), 3))
+        for i, p in enumerate(self.planes):
+            first = self.first[p]
+            second = self.second[p]
+            normal = frames[:, second, :, 2]
+            frame = frames[:, first]
+
+            points[:, i] = positions[:, first]
+            if self.exact[p]:
+                downwards = -np.einsum("nij,ni->nj", frame, normal)
+                local = _farthest_points(int(kind[first]), size[first], downwards)
+                points[:, i] += np.einsum("nij,nj->ni", frame, local)
+
+            height = points[:, i] - positions[:, second]
+            bounds[:, p] = np.einsum("ni,ni->n", height, normal)
+            if not self.exact[p]:
+                bounds[:, p] -= self._radii[p]
+        return bounds, points
+
+    def set_pose(self, positions: Array, frames: Array) -> None:
+        """Put all geoms in one pose for `distance`. positions: (ngeom, 3) [m], frames: (ngeom, 3, 3)."""
+        self._data.geom_xpos[:] = positions
+        self._data.geom_xmat[:] = frames.reshape(-1, 9)
+
+    def distance(self, p: int, limit: float, segment: Array | None = None) -> float:
+        """Distance of pair p in the pose that was set [m]; at least `limit` where it is not below it.
+
+        Args:
+            p: Number of the pair.
+            limit: Distance beyond which MuJoCo does not look [m].
+            segment: (6,) overwritten by the nearest points of the first and of the second geom [m].
+        """
+        model, first, second, offset = self._calls[p]
+        found = mujoco.mj_geomDistance(model, self._data, first, second, limit + offset, segment)
+        return float(found) - offset
+
+    def measure(
+        self, rows: Indices, pairs: Indices, positions: Array, frames: Array, reach: float
+    ) -> tuple[Array, Array]:
+        """Distances of h pairs, each in one of n poses.
+
+        Args:
+            rows: (h,) numbers of the poses, ascending.
+            pairs: (h,) numbers of the pairs.
+            positions: (n, ngeom, 3) positions of the geoms [m].
+            frames: (n, ngeom, 3, 3) frames of the geoms.
+            reach: Distance beyond which nothing is measured [m].
+
+        Returns:
+            (h,) distances, at most reach [m], and (h, 6) the nearest points of the geoms [m].
+        """
+        found = np.full(len(rows), reach)
+        segments = np.zeros((len(rows), 6))
+        data = self._data
+        posed = -1
+
+        for i, (k, p) in enumerate(zip(rows.tolist(), pairs.tolist(), strict=True)):
+            if k != posed:
+                self.set_pose(positions[k], frames[k])
+                posed = k
+            model, first, second, offset = self._calls[p]
+            limit = reach + offset
+            distance = mujoco.mj_geomDistance(model, data, first, second, limit, segments[i])
+            if distance < limit:
+                found[i] = distance - offset
+        return found, segments
+
+    def normals(
+        self,
+        rows: Indices,
+        pairs: Indices,
+        *,
+        distances: Array,
+        segments: Array,
+        positions: Array,
+        frames: Array,
+        reach: float,
+    ) -> Array:
+        """Unit vectors (h, 3) from the first to the second geoms along which `measure` measured.
+
+        Args:
+            rows: (h,) numbers of the poses.
+            pairs: (h,) numbers of the pairs.
+            distances: (h,) distances by `measure` [m].
+            segments: (h, 6) nearest points by `measure` [m].
+            positions: (n, ngeom, 3) positions of the geoms [m].
+            frames: (n, ngeom, 3, 3) frames of the geoms.
+            reach: Distance beyond which nothing is measured [m].
+        """
+        signed = distances + self._axis_offset[pairs]
+        sign = np.where(signed < 0.0, -1.0, 1.0)
+        normals = (segments[:, 3:] - segments[:, :3]) * sign[:, None]
+
+        for i in np.flatnonzero(np.abs(signed) < TOUCHING_DISTANCE):
+            pose = positions[rows[i]], frames[rows[i]]
+            normals[i] = self._normal_when_parted(pairs[i], *pose, reach)
+
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.asarray(normals / np.where(length > 0.0, length, 1.0))
+
+    def _normal_when_parted(self, p: int, positions: Array, frames: Array, reach: float) -> Array:
+        """(3,) vector from the first to the second geom of a touching pair, after they are parted a little."""
+        model, first, second, offset = self._calls[p]
+        parted = positions.copy()
+        between = parted[second] - parted[first]
+        parted[second] += PARTING_DISTANCE * between / (np.linalg.norm(between) or 1.0)
+        self.set_pose(parted, frames)
+
+        segment = np.zeros(6)
+        limit = reach + offset
+        distance = mujoco.mj_geomDistance(model, self._data, first, second, limit, segment)
+        sign = -1.0 if distance < 0.0 else 1.0
+        return np.asarray((segment[3:] - segment[:3]) * sign)
+
+
+def _with_capsule_axes(model: Any) -> Any:
+    """A copy of a model in which capsules are thin cylinders: their axes."""
+    axes = copy.copy(model)
+    capsules = axes.geom_type == CAPSULE
+    axes.geom_type[capsules] = CYLINDER
+    axes.geom_size[capsules, 0] = AXIS_RADIUS
+    return axes
+
+
+def _farthest_points(kind: int, size: Array, direction: Array) -> Array:
+    """Points (n, 3) of a primitive that lie farthest along unit vectors (n, 3), in its own frame [m].
+
+    Args:
+        kind: Type of the geom.
+        size: (3,) its size [m].
+        direction: (n, 3) unit vectors in its frame.
+    """
+    if kind == BOX:
+        return np.asarray(size * np.sign(direction))
+
+    if kind == ELLIPSOID:
+        stretched = np.linalg.norm(size * direction, axis=1, keepdims=True)
+        return np.asarray(size**2 * direction / stretched)
+
+    point = np.asarray(size[0] * direction)
+    if kind == CYLINDER:
+        radial = np.linalg.norm(direction[:, :2], axis=1, keepdims=True)
+        point[:, :2] /= np.where(radial > 0.0, radial, 1.0)
+        point[:, 2] = 0.0
+    if kind != SPHERE:
+        point[:, 2] += size[1] * np.sign(direction[:, 2])
+    return point
