@@ -117,7 +117,9 @@ class Bench:
         self.limits = _looked_at(self.stated)
         self.rest = self._rest()
         self._simulator = BatchSimulator(
-            self.stated.model_at(self.stated.theta), 1, self.stated.outputs.needs_sensors, threads=1
+            self.stated.model_at(self.stated.theta),
+            sensors=self.stated.outputs.needs_sensors,
+            threads=1,
         )
         self.setup, self.sensed = self.stated, _sensed(self.stated)
         if conditions.feedback and (self.sensed < 0).all():
@@ -408,7 +410,7 @@ class Bench:
         )
         if found is None:
             raise SimulationDivergedError("the plan diverges at the guess")
-        J = setup.noise.rows(found[1])
+        J = setup.noise.whitened_rows(found[1])
         return standard_deviations(J.T @ J + setup.parameters.prior_information)
 
 

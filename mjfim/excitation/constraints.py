@@ -328,7 +328,7 @@ class Fence:
             ended = self._ended(sight.trajectory)
             barrier, moved = (
                 self.end.barrier(ended, delta, END_WEIGHT),
-                self.space.minus_slope(ended),
+                self.space.minus_derivative(ended),
             )
             a[-1] += moved.T @ barrier.slope
             Q[-1] += moved.T @ (barrier.curvature[:, None] * moved)

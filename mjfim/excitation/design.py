@@ -25,7 +25,7 @@ from mjfim.experiment.system import Setup
 from mjfim.information.identifiability import PROBES, Survey, survey
 from mjfim.information.marginal import shared
 from mjfim.information.smoothness import roughness
-from mjfim.plant.active_constraints import saturated
+from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import ParameterGroup, join_names
 from mjfim.records.design import Design, HistoryRow, StartResult, Status
@@ -252,7 +252,7 @@ def _conclude(
         stage.problem.information,
     )
     found = audit(setup, final.trajectory)
-    clamped = saturated(setup.model_at(setup.theta), final.trajectory)
+    clamped = saturated_actuators(setup.model_at(setup.theta), final.trajectory)
     rough = (
         None if interrupted else roughness(setup, setup.theta, final.trajectory, chosen.sensitivity)
     )

@@ -49,7 +49,7 @@ def audit(setup: Setup, trajectory: Trajectory) -> Audit:
         else {"clearance", *(limit.kind for limit in setup.limits)}
     )
     model = setup.model_at(setup.theta)
-    simulator = BatchSimulator(model, setup.substeps)
+    simulator = BatchSimulator(model, substeps=setup.substeps)
     out = simulator.rollout(
         [model],
         setup.plant.initial_state(setup.theta)[None],
@@ -104,7 +104,7 @@ def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
 
 def _positions(setup: Setup, simulator: BatchSimulator, played: Trajectory) -> Array:
     """(N * substeps, nq) positions at every engine step."""
-    fine = BatchSimulator(simulator.model, 1)
+    fine = BatchSimulator(simulator.model)
     held = np.repeat(played.ctrl, setup.substeps, axis=0)
     return np.asarray(
         fine.rollout([simulator.model], played.state[:1], held[None]).states[0][

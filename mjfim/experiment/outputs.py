@@ -20,7 +20,7 @@ from mjfim.model.coordinates import (
 )
 from mjfim.model.elements import names_of
 from mjfim.plant.noise import Noise
-from mjfim.plant.outputs import Output, OutputMap
+from mjfim.plant.outputs import Output, Outputs
 from mjfim.plant.state_space import StateSpace
 
 # Relative tolerance with which one rate has to divide another one.
@@ -32,7 +32,7 @@ DEFINITENESS = 1e-12
 
 def resolve_outputs(
     experiment: Experiment, model: Any, space: StateSpace, stride: int
-) -> tuple[OutputMap, Noise]:
+) -> tuple[Outputs, Noise]:
     """The measured outputs and their noise.
 
     Args:
@@ -66,8 +66,10 @@ def resolve_outputs(
 
     measured = sorted(table.measured)
     outputs = _outputs(model, sensors, components, table, measured)
-    noise = Noise(table.covariance[np.ix_(measured, measured)], table.strides[measured])
-    return OutputMap(outputs, space), noise
+    noise = Noise(
+        covariance=table.covariance[np.ix_(measured, measured)], strides=table.strides[measured]
+    )
+    return Outputs(outputs=outputs, space=space), noise
 
 
 def measurement_stride(experiment: Experiment) -> int:

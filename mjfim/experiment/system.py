@@ -109,7 +109,7 @@ class Setup:
         self.outputs, noise = resolve_outputs(
             e, self.model, state_space(self.model), measured_every
         )
-        self.noise = noise if self.coarsen == 1 else noise.every_sample(measured_every)
+        self.noise = noise if self.coarsen == 1 else noise.at_every_sample(measured_every)
         self._mocap = Mocap.of(self.model, self._keyframe())
         self.limits = limits_of(self.model, self.coordinates, self.controls, e.limits)
         self.parameters = ParameterSet.build(

@@ -14,7 +14,7 @@ import numpy as np
 from mjfim.arrays import Array, freeze
 from mjfim.errors import RecordingError, unknown
 from mjfim.experiment.system import Setup
-from mjfim.plant.outputs import states_shown
+from mjfim.plant.outputs import outputs_by_state
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
@@ -143,7 +143,7 @@ def measured_trajectory(setup: Setup, recording: Recording) -> Trajectory | None
 
     Gaps are bridged linearly; velocities are zero. For pictures, not for estimation.
     """
-    shown, nq = states_shown(setup.model, setup.outputs), setup.model.nq
+    shown, nq = outputs_by_state(setup.model, setup.outputs), setup.model.nq
     names = [setup.outputs.names[shown[q]] if q in shown else "" for q in range(nq)]
     if any(name not in recording.outputs for name in names):
         return None

@@ -278,7 +278,9 @@ class _Identification:
                 break
             before = self.fit.noise.sigma
             sigma = self._sigma(solution.unknowns)
-            self.fit = self.fit.reweighted(Noise(np.diag(sigma**2), self.fit.noise.strides))
+            self.fit = self.fit.reweighted(
+                Noise(covariance=np.diag(sigma**2), strides=self.fit.noise.strides)
+            )
             change = float(np.abs(sigma / before - 1.0).max())
             solution = self._minimise(
                 self.fit, solution.unknowns, self._search, "all data, sigmas estimated"

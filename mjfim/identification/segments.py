@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import Setup
 from mjfim.identification.aligned_recording import Track
-from mjfim.plant.outputs import states_shown
+from mjfim.plant.outputs import outputs_by_state
 
 NEAR = 12  # rows to either side from which a start is read off
 FEWEST = 4  # samples of a piece
@@ -140,7 +140,7 @@ def _shown(setup: Setup, track: Track) -> dict[int, int]:
     """Output that shows a component of the state, by its address, where the track has values of it."""
     return {
         state: i
-        for state, i in states_shown(setup.model, setup.outputs).items()
+        for state, i in outputs_by_state(setup.model, setup.outputs).items()
         if len(track.seen[i])
     }
 

@@ -64,7 +64,7 @@ class Information:
 
     def matrix(self, sensitivity: Sensitivity) -> Array:
         """(p, p) sum over the measured samples, prior included [1 / (theta_i theta_j unit)]."""
-        flat = self.noise.rows(sensitivity.G)
+        flat = self.noise.whitened_rows(sensitivity.G)
         return np.asarray(flat.T @ flat + self.prior)
 
     def accumulated(self, sensitivity: Sensitivity) -> Array:

@@ -65,7 +65,7 @@ class Survey:
 
 def rows(setup: Setup, sensitivity: Sensitivity) -> Array:
     """(n, p) whitened rows of G at the measured samples."""
-    return setup.noise.rows(sensitivity.G)
+    return setup.noise.whitened_rows(sensitivity.G)
 
 
 def survey(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivity) -> Survey:

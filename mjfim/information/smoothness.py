@@ -7,7 +7,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.experiment.system import Setup
 from mjfim.information.null_space import BLIND, FAINT
-from mjfim.plant.active_constraints import _active
+from mjfim.plant.active_constraints import active_constraints
 from mjfim.plant.derivatives import SENSITIVITY_STEP
 from mjfim.records.check import Roughness
 from mjfim.records.trajectory import Sensitivity, Trajectory
@@ -38,7 +38,7 @@ def roughness(
     coarse = plant.derivatives.sensitivity(theta, trajectory, longer * SENSITIVITY_STEP)
     names = setup.parameters.names
     if fine is None or coarse is None:
-        causes = tuple(_active(setup.model_at(theta), trajectory, range(trajectory.samples)))
+        causes = active_constraints(setup.model_at(theta), trajectory, range(trajectory.samples))
         return Roughness(
             error=np.inf, parameter=", ".join(names), sample=0, time=0.0, causes=causes
         )
@@ -61,7 +61,7 @@ def roughness(
             )
     first = int(np.argmax(error[:, worst] > TOLERANCE))
     near = range(max(first - 2, 0), min(first + 1, trajectory.samples))
-    causes = tuple(_active(setup.model_at(theta), trajectory, near))
+    causes = active_constraints(setup.model_at(theta), trajectory, near)
     return Roughness(
         error=float(error[:, worst].max()),
         parameter=names[kept[worst]],

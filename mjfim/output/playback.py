@@ -13,7 +13,7 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.system import Setup
 from mjfim.model.coordinates import gain_names, state_components, state_names
-from mjfim.plant.active_constraints import forwarded
+from mjfim.plant.active_constraints import forward_samples
 from mjfim.plant.batch import BatchSimulator
 from mjfim.records.playback import Playback
 from mjfim.records.trajectory import Trajectory
@@ -25,7 +25,7 @@ def simulate_playback(setup: Setup, trajectory: Trajectory, gain: Array) -> Play
     Raises SimulationDivergedError where it cannot be simulated.
     """
     rows = setup.substeps // setup.playback_steps
-    simulator = BatchSimulator(setup.plant.simulator.model, setup.playback_steps)
+    simulator = BatchSimulator(setup.plant.simulator.model, substeps=setup.playback_steps)
     held = np.repeat(trajectory.ctrl, rows, axis=0)
     out = simulator.rollout([setup.plant.model(setup.theta)], trajectory.state[:1], held[None])
     if not out.finite[0]:
@@ -58,7 +58,7 @@ def reference_columns(playback: Playback, setup: Setup) -> dict[str, Array]:
     qpos, qvel, act = setup.space.split(playback.state)
     rows = Trajectory(t=playback.t, qpos=qpos, qvel=qvel, act=act, ctrl=held)
     qacc, force = np.empty_like(qvel), np.empty_like(qvel)
-    for k, data in forwarded(setup.model_at(setup.theta), rows, range(len(held))):
+    for k, data in forward_samples(setup.model_at(setup.theta), rows, range(len(held))):
         qacc[k], force[k] = data.qacc, data.qfrc_actuator
     names = [c.name for c in state_components(setup.model)]
     dofs = [name.removeprefix("qvel:") for name in names[setup.space.nq :]]

@@ -1,4 +1,4 @@
-"""Contacts, joint limits and actuator clamps that are active along a trajectory."""
+"""Contacts, joint limits, dry friction and actuator clamps that are active along a trajectory."""
 
 from __future__ import annotations
 
@@ -11,92 +11,142 @@ import numpy as np
 from mjfim.model.coordinates import actuator_names, joint_names
 from mjfim.records.trajectory import Trajectory
 
-CLAMPED = 1e-12  # relative distance from its bound at which a force counts as clamped
+# Relative distance from its bound at which the norm of several forces counts as clamped.
+CLAMP_TOLERANCE = 1e-12
 
 
-def forwarded(
+def forward_samples(
     model: Any, trajectory: Trajectory, samples: Iterable[int]
 ) -> Iterator[tuple[int, Any]]:
-    """Each sample k with MjData at which everything is computed; one MjData serves them all."""
+    """Evaluate the forward dynamics at samples of a trajectory.
+
+    Args:
+        model: Compiled MuJoCo model.
+        trajectory: The trajectory.
+        samples: Indices of the samples.
+
+    Yields:
+        The sample and its MjData after `mj_forward`; the next sample overwrites it.
+    """
     data = mujoco.MjData(model)
     for k in samples:
-        data.qpos[:], data.qvel[:], data.act[:] = (
-            trajectory.qpos[k],
-            trajectory.qvel[k],
-            trajectory.act[k],
-        )
+        data.qpos[:] = trajectory.qpos[k]
+        data.qvel[:] = trajectory.qvel[k]
+        data.act[:] = trajectory.act[k]
         data.ctrl[:] = trajectory.ctrl[k]
         mujoco.mj_forward(model, data)
         yield k, data
 
 
-def clamped(model: Any, data: Any) -> list[int]:
-    """Ids of actuators whose force is clamped by forcerange at this moment."""
-    return [
-        i for i in np.flatnonzero(model.actuator_forcelimited).tolist() if _clamped(model, data, i)
-    ]
+def clamped_actuators(model: Any, data: Any) -> list[int]:
+    """Actuators whose force is clamped by forcerange.
+
+    Args:
+        model: Compiled MuJoCo model.
+        data: Its MjData after `mj_forward`.
+
+    Returns:
+        Ids of the actuators.
+    """
+    limited = np.flatnonzero(model.actuator_forcelimited).tolist()
+    return [actuator for actuator in limited if _is_clamped(model, data, actuator)]
 
 
-def saturated(model: Any, trajectory: Trajectory) -> tuple[str, ...]:
-    """Names of actuators whose force is clamped by forcerange at some sample. model: at the design's theta."""
+def saturated_actuators(model: Any, trajectory: Trajectory) -> tuple[str, ...]:
+    """Actuators whose force is clamped by forcerange at some sample.
+
+    Args:
+        model: Compiled MuJoCo model at the parameters of the design.
+        trajectory: The trajectory.
+
+    Returns:
+        Names of the actuators.
+    """
     if not model.actuator_forcelimited.any():
         return ()
-    names, every = actuator_names(model), range(trajectory.samples)
-    hit = {i for _, data in forwarded(model, trajectory, every) for i in clamped(model, data)}
-    return tuple(names[i] for i in sorted(hit))
+    found = set[int]()
+    for _, data in forward_samples(model, trajectory, range(trajectory.samples)):
+        found.update(clamped_actuators(model, data))
+    names = actuator_names(model)
+    return tuple(names[actuator] for actuator in sorted(found))
 
 
-def _clamped(model: Any, data: Any, actuator: int) -> bool:
-    """True where forcerange acts: on the force, or on the norm of an actuator's several forces."""
-    first, count = int(model.actuator_outadr[actuator]), int(model.actuator_outnum[actuator])
-    force, (low, high) = (
-        data.actuator_force[first : first + count],
-        model.actuator_forcerange[actuator],
-    )
-    if count == 1:
-        return bool(force[0] <= low or force[0] >= high)
-    return bool(np.linalg.norm(force) >= high * (1.0 - CLAMPED))
+def first_active_constraint(
+    model: Any, trajectory: Trajectory
+) -> tuple[int, tuple[str, ...]] | None:
+    """First sample at which a contact, friction, limit or clamp acts.
 
+    Args:
+        model: Compiled MuJoCo model.
+        trajectory: The trajectory.
 
-def first_active(model: Any, trajectory: Trajectory) -> tuple[int, tuple[str, ...]] | None:
-    """First sample at which a contact, friction, limit or clamp acts, and what; None where none ever does."""
-    for k, data in forwarded(model, trajectory, range(trajectory.samples)):
-        causes = (*sorted(set(_at(model, data))), *_ranges(model, clamped(model, data)))
-        if causes:
-            return k, causes
+    Returns:
+        The sample and descriptions of everything that acts there, or None if nothing ever acts.
+    """
+    for k, data in forward_samples(model, trajectory, range(trajectory.samples)):
+        constraints = sorted(set(_constraints(model, data)))
+        clamps = _force_ranges(model, clamped_actuators(model, data))
+        if constraints or clamps:
+            return k, (*constraints, *clamps)
     return None
 
 
-def _active(model: Any, trajectory: Trajectory, samples: range) -> Iterator[str]:
-    """Contacts, frictions, limits and clamps that act at these samples, each once."""
-    told, hit = set[str](), set[int]()
-    for _, data in forwarded(model, trajectory, samples):
-        told.update(_at(model, data))
-        hit.update(clamped(model, data))
-    yield from sorted(told)
-    yield from _ranges(model, hit)
+def active_constraints(
+    model: Any, trajectory: Trajectory, samples: Iterable[int]
+) -> tuple[str, ...]:
+    """Contacts, frictions, limits and clamps that act at some samples.
+
+    Args:
+        model: Compiled MuJoCo model.
+        trajectory: The trajectory.
+        samples: Indices of the samples.
+
+    Returns:
+        Descriptions, each once.
+    """
+    constraints, clamped = set[str](), set[int]()
+    for _, data in forward_samples(model, trajectory, samples):
+        constraints.update(_constraints(model, data))
+        clamped.update(clamped_actuators(model, data))
+    return (*sorted(constraints), *_force_ranges(model, clamped))
 
 
-def _ranges(model: Any, actuators: Iterable[int]) -> Iterator[str]:
+def _is_clamped(model: Any, data: Any, actuator: int) -> bool:
+    """True if forcerange acts: on the force, or on the norm of the several forces of an actuator."""
+    first = int(model.actuator_outadr[actuator])
+    count = int(model.actuator_outnum[actuator])
+    force = data.actuator_force[first : first + count]
+    low, high = model.actuator_forcerange[actuator]
+    if count == 1:
+        return bool(force[0] <= low or force[0] >= high)
+    return bool(np.linalg.norm(force) >= high * (1.0 - CLAMP_TOLERANCE))
+
+
+def _force_ranges(model: Any, actuators: Iterable[int]) -> list[str]:
+    """Descriptions of the force ranges of actuators."""
     names = actuator_names(model)
-    yield from (f"force range of {names[i]}" for i in sorted(actuators))
+    return [f"force range of {names[actuator]}" for actuator in sorted(actuators)]
 
 
-def _at(model: Any, data: Any) -> Iterator[str]:
+def _constraints(model: Any, data: Any) -> Iterator[str]:
+    """Descriptions of the contacts, and of the frictions and limits among the active constraints."""
     for contact in data.contact[: data.ncon]:
-        names = (
-            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) or f"geom{g}"
-            for g in contact.geom
-        )
+        names = [
+            mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"geom{geom}"
+            for geom in contact.geom
+        ]
         yield f"contact {' - '.join(names)}"
+
     joints = joint_names(model)
+    tendon_kinds = (
+        int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON),
+        int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON),
+    )
     for kind, ident in zip(data.efc_type, data.efc_id, strict=True):
         if kind == int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF):
             yield f"dry friction of {joints[model.dof_jntid[ident]]}"
         elif kind == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT):
             yield f"limit of {joints[ident]}"
-        elif kind in (
-            int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON),
-            int(mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON),
-        ):
-            yield f"friction or limit of tendon {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, ident) or ident}"
+        elif kind in tendon_kinds:
+            tendon = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, ident) or ident
+            yield f"friction or limit of tendon {tendon}"

@@ -1,4 +1,4 @@
-"""The batch: many MuJoCo simulations in one call, Python never in the inner loop. Counts every step it takes."""
+"""Many MuJoCo simulations in one call, Python never in the inner loop. Every engine step is counted."""
 
 from __future__ import annotations
 
@@ -15,29 +15,37 @@ from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.parallel import cores
 from mjfim.plant.state_space import StateSpace
 
+# Components of MuJoCo's state that a rollout records after every engine step: time, then (qpos, qvel, act).
 RECORDED_STATE = int(
     mujoco.mjtState.mjSTATE_TIME
     | mujoco.mjtState.mjSTATE_QPOS
     | mujoco.mjtState.mjSTATE_QVEL
     | mujoco.mjtState.mjSTATE_ACT
 )
-
-
-# MuJoCo resets a state it finds bad, time included: starting late makes that visible at any sample.
+# Time at which simulations start [s]. MuJoCo resets a diverged state and its time to zero: a late start shows that.
 START_TIME = 1.0
-# Larger controls MuJoCo replaces by zero.
+# Magnitude above which MuJoCo replaces controls by zero.
 MAX_CONTROL = float(mujoco.mjMAXVAL)
+# Type of the sensors that show the time.
 CLOCK_SENSOR = int(mujoco.mjtSensor.mjSENS_CLOCK)
-SMALL_BATCH = (
-    64  # rollouts of a handful of models keep their own batch beside those of a Monte-Carlo study
-)
+# Up to so many rollouts share a small batch; a Monte Carlo study has a large one besides.
+SMALL_BATCH = 64
 
 
 def state_space(model: Any) -> StateSpace:
-    """Layout of a model's state."""
+    """Layout of a model's state.
+
+    Args:
+        model: Compiled MuJoCo model.
+
+    Returns:
+        The layout.
+    """
     scalar_q, scalar_v, quaternions = [], [], []
     for j in range(model.njnt):
-        q, v, kind = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]), int(model.jnt_type[j])
+        q = int(model.jnt_qposadr[j])
+        v = int(model.jnt_dofadr[j])
+        kind = int(model.jnt_type[j])
         if kind == int(mujoco.mjtJoint.mjJNT_FREE):
             scalar_q += [q, q + 1, q + 2]
             scalar_v += [v, v + 1, v + 2]
@@ -47,23 +55,29 @@ def state_space(model: Any) -> StateSpace:
         else:
             scalar_q.append(q)
             scalar_v.append(v)
+
     return StateSpace(
-        model.nq,
-        model.nv,
-        model.na,
-        np.array(scalar_q, np.intp),
-        np.array(scalar_v, np.intp),
-        tuple(quaternions),
+        nq=model.nq,
+        nv=model.nv,
+        na=model.na,
+        scalar_q=np.array(scalar_q, np.intp),
+        scalar_v=np.array(scalar_v, np.intp),
+        quaternions=tuple(quaternions),
     )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SubstepObservations:
-    """What is looked at between the samples, w numbers per engine step: addresses or dofs of each kind, side by side.
+    """Quantities that are observed at the engine steps within a sample: w numbers per step, in the order of the fields.
 
-    q: positions, v: velocities after the step;  a: change of velocity over the step, per second
-    f: actuator forces, j: joint forces of the actuators, during the step
-    substeps: engine steps of a sample that derivatives look at, counted from 1;  timestep: [s]
+    Attributes:
+        positions: Addresses in qpos, after the step.
+        velocities: Addresses in qvel, after the step.
+        accelerations: Addresses in qvel whose change over the step, divided by the timestep, is observed.
+        actuator_forces: Addresses in actuator_force, during the step.
+        joint_forces: Addresses in qfrc_actuator, during the step.
+        derivative_substeps: Engine steps of a sample, counted from 1, at which derivatives are taken.
+        timestep: Engine timestep [s].
     """
 
     positions: np.ndarray
@@ -76,20 +90,30 @@ class SubstepObservations:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """MjData fields that are recorded beside the state."""
-        return ("actuator_force",) * bool(len(self.actuator_forces)) + ("qfrc_actuator",) * bool(
-            len(self.joint_forces)
-        )
+        """MjData fields that have to be recorded beside the state."""
+        names = []
+        if len(self.actuator_forces):
+            names.append("actuator_force")
+        if len(self.joint_forces):
+            names.append("qfrc_actuator")
+        return tuple(names)
 
     def values(
-        self, qpos: Array, qvel: Array, before: Array, read: Callable[[str], Array]
+        self, qpos: Array, qvel: Array, qvel_before: Array, read: Callable[[str], Array]
     ) -> Array:
-        """(..., w) from states after a step, velocities before it, and a reader of MjData fields."""
-        parts = [
-            qpos[..., self.positions],
-            qvel[..., self.velocities],
-            (qvel[..., self.accelerations] - before[..., self.accelerations]) / self.timestep,
-        ]
+        """Observed values of engine steps.
+
+        Args:
+            qpos: (..., nq) positions after the steps.
+            qvel: (..., nv) velocities after the steps.
+            qvel_before: (..., nv) velocities before the steps; needed only for accelerations.
+            read: Returns an MjData field of the steps, (..., size), by its name.
+
+        Returns:
+            (..., w) observed values.
+        """
+        change = qvel[..., self.accelerations] - qvel_before[..., self.accelerations]
+        parts = [qpos[..., self.positions], qvel[..., self.velocities], change / self.timestep]
         if len(self.actuator_forces):
             parts.append(read("actuator_force")[..., self.actuator_forces])
         if len(self.joint_forces):
@@ -97,12 +121,15 @@ class SubstepObservations:
         return np.concatenate(parts, axis=-1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Rollouts:
     """Many simulated curves.
 
-    states: (m, N+1, ns);  sensors: (m, N+1, nsensordata) or None;  finite: (m,) False = diverged
-    observed: (m, N, substeps, w) at every engine step, or None
+    Attributes:
+        states: (m, N+1, ns) states.
+        sensors: (m, N+1, nsensordata) sensor data that belong to the states, or None if not requested.
+        finite: (m,) False where a simulation diverged.
+        observed: (m, N, substeps, w) observations at every engine step, or None if not requested.
     """
 
     states: Array
@@ -111,11 +138,14 @@ class Rollouts:
     observed: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Stepped:
-    """One sample of many simulations. states: (n, ns) after it;  sensors: (n, nsensordata) before it, or None
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampleSteps:
+    """One sample of many simulations.
 
-    observed: (n, looked-at substeps, w), or None
+    Attributes:
+        states: (n, ns) states after the sample, NaN where a simulation diverged.
+        sensors: (n, nsensordata) sensor data that belong to the states before the sample, or None if not requested.
+        observed: (n, derivative substeps, w) observations within the sample, or None if not requested.
     """
 
     states: Array
@@ -124,15 +154,33 @@ class Stepped:
 
 
 class BatchSimulator:
-    """Steps many simulations of models that share one layout.
+    """Steps many simulations of models that share one memory layout.
 
-    model: the caller's private copy;  substeps: `mj_step` calls per sample;  sensors: whether sensor data is wanted
-    steps: `mj_step` calls so far
+    Attributes:
+        model: Model copy of the caller with which batches are made.
+        space: Layout of the state.
+        substeps: `mj_step` calls per sample.
+        sensors: True if sensor data are requested.
+        threads: Number of threads.
+        steps: `mj_step` calls so far.
     """
 
     def __init__(
-        self, model: Any, substeps: int = 1, sensors: bool = False, threads: int | None = None
+        self,
+        model: Any,
+        *,
+        substeps: int = 1,
+        sensors: bool = False,
+        threads: int | None = None,
     ) -> None:
+        """Build the simulator.
+
+        Args:
+            model: Model copy that nobody else changes.
+            substeps: `mj_step` calls per sample.
+            sensors: True if sensor data are requested.
+            threads: Number of threads; None takes all cores.
+        """
         self.model = model
         self.space = state_space(model)
         self.substeps = substeps
@@ -142,36 +190,9 @@ class BatchSimulator:
         self._batches: dict[str, Batch] = {}
         self._data = mujoco.MjData(model)
         self._clocks = model.sensor_adr[model.sensor_type == CLOCK_SENSOR]
-        self._mocap = np.flatnonzero(model.body_mocapid >= 0)[
-            np.argsort(model.body_mocapid[model.body_mocapid >= 0])
-        ]
 
-    def _batch(self, kind: str, count: int) -> Batch:
-        """A batch of at least `count` simulations; making one costs milliseconds, so it grows and is kept."""
-        batch = self._batches.get(kind)
-        if batch is None or batch.nsim < count:
-            batch = self._batches[kind] = Batch(self.model, count, min(self.threads, count))
-        return batch
-
-    def _load(self, batch: Batch, states: Array, models: Sequence[Any]) -> np.ndarray | None:
-        """Write states into the first simulations of a batch; returns their ids, None for all of them."""
-        n = len(states)
-        qpos, qvel, act = self.space.split(states)
-        batch.bind("qpos")[:n] = qpos
-        batch.bind("qvel")[:n] = qvel
-        if self.space.na:
-            batch.bind("act")[:n] = act
-        batch.bind("qacc_warmstart")[:n] = 0.0
-        batch.bind("time")[:n] = START_TIME
-        if len(self._mocap):  # a batch keeps the places of the model that it was made with
-            mocap_pos, mocap_quat = batch.bind("mocap_pos"), batch.bind("mocap_quat")
-            for i, model in enumerate(models):
-                own = slice(None, n) if len(models) == 1 else i
-                mocap_pos[own], mocap_quat[own] = (
-                    model.body_pos[self._mocap],
-                    model.body_quat[self._mocap],
-                )
-        return None if n == batch.nsim else np.arange(n)
+        mocap_bodies = np.flatnonzero(model.body_mocapid >= 0)
+        self._mocap_bodies = mocap_bodies[np.argsort(model.body_mocapid[mocap_bodies])]
 
     def step(
         self,
@@ -179,77 +200,31 @@ class BatchSimulator:
         states: Array,
         ctrl: Array,
         observations: SubstepObservations | None = None,
-    ) -> Stepped:
-        """One sample of every simulation.
+    ) -> SampleSteps:
+        """Advance every simulation by one sample.
 
-        states: (n, ns);  ctrl: (n, nu), held. Each model steps its equal, contiguous share. Diverged simulations are NaN.
+        Args:
+            models: Models; each steps an equal, contiguous share of the simulations.
+            states: (n, ns) states before the sample.
+            ctrl: (n, nu) controls, held over the sample.
+            observations: Quantities to observe within the sample, or None.
+
+        Returns:
+            The sample of every simulation.
         """
         share = len(states) // len(models)
-        parts = [
-            self._share(
-                model,
-                states[i * share : (i + 1) * share],
-                ctrl[i * share : (i + 1) * share],
-                observations,
-            )
-            for i, model in enumerate(models)
-        ]
-        sensed = (
-            np.concatenate([p.sensors for p in parts if p.sensors is not None])
-            if self.sensors
-            else None
-        )
-        observed = (
-            None
-            if observations is None
-            else np.concatenate([p.observed for p in parts if p.observed is not None])
-        )
-        return Stepped(np.concatenate([p.states for p in parts]), sensed, observed)
+        parts = []
+        for i, model in enumerate(models):
+            mine = slice(i * share, (i + 1) * share)
+            parts.append(self._step_model(model, states[mine], ctrl[mine], observations))
 
-    def _share(
-        self, model: Any, states: Array, ctrl: Array, observations: SubstepObservations | None
-    ) -> Stepped:
-        count = len(states)
-        batch = self._batch("step", count)
-        batch.set_models(model)
-        ids = self._load(batch, states, [model])
-        batch.bind("ctrl")[:count] = ctrl
-        looks = () if observations is None else observations.derivative_substeps
-        sensed, done, observed = None, 0, []
-        if self.sensors:
-            batch.bind("sensordata")
-        for name in () if observations is None else observations.fields:
-            batch.bind(name)
-        with silence_mujoco_log():
-            for stop in sorted({*looks, *((1,) if self.sensors else ()), self.substeps}):
-                if stop - done > 1 and stop in looks:
-                    batch.step(ids, nstep=stop - done - 1)
-                    done = stop - 1
-                before = (
-                    np.array(batch.bind("qvel")[:count])
-                    if observations is not None and len(observations.accelerations)
-                    else np.empty((0, 0))
-                )
-                batch.step(ids, nstep=stop - done)
-                done = stop
-                if self.sensors and stop == 1:
-                    sensed = self._sensed(batch.bind("sensordata")[:count])
-                if observations is not None and stop in looks:
-                    before = (
-                        before if len(observations.accelerations) else batch.bind("qvel")[:count]
-                    )
-                    now = (batch.bind("qpos")[:count], batch.bind("qvel")[:count], before)
-                    observed.append(
-                        observations.values(*now, lambda name: batch.bind(name)[:count])
-                    )
-        self.steps += self.substeps * count
-        names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
-        out = np.concatenate([batch.bind(name)[:count] for name in names], axis=1)
-        timestep = float(self.model.opt.timestep)
-        elapsed = batch.bind("time").reshape(-1)[:count] - START_TIME
-        bad = np.abs(elapsed - self.substeps * timestep) > 0.5 * timestep
-        out[bad | ~_acceptable(ctrl).all(axis=1)] = np.nan
-        return Stepped(out, sensed, np.stack(observed, axis=1) if observed else None)
+        sensors = [part.sensors for part in parts if part.sensors is not None]
+        observed = [part.observed for part in parts if part.observed is not None]
+        return SampleSteps(
+            states=np.concatenate([part.states for part in parts]),
+            sensors=np.concatenate(sensors) if sensors else None,
+            observed=np.concatenate(observed) if observed else None,
+        )
 
     def rollout(
         self,
@@ -258,91 +233,227 @@ class BatchSimulator:
         ctrl: Array,
         observations: SubstepObservations | None = None,
     ) -> Rollouts:
-        """Open-loop simulations from start: (m, ns) under ctrl: (m, N, nu), each sample held over its substeps."""
-        count, N, _ = ctrl.shape
-        batch = self._batch("rollout" if count <= SMALL_BATCH else "rollouts", count)
-        batch.set_models(
-            models[0] if len(models) == 1 else [*models, *[models[-1]] * (batch.nsim - count)]
-        )
+        """Simulate many curves in open loop.
+
+        Args:
+            models: One model for all simulations, or one for each.
+            start: (m, ns) initial states.
+            ctrl: (m, N, nu) controls, each held over its sample.
+            observations: Quantities to observe at every engine step, or None.
+
+        Returns:
+            The simulated curves.
+        """
+        count = len(ctrl)
+        batch = self._batch("small rollout" if count <= SMALL_BATCH else "large rollout", count)
+        padding = [models[-1]] * (batch.nsim - count)
+        batch.set_models(models[0] if len(models) == 1 else [*models, *padding])
         ids = self._load(batch, start, models)
+
         held = np.repeat(ctrl, self.substeps, axis=1)
         record: tuple[Any, ...] = (RECORDED_STATE,)
-        if self.sensors:  # one more step: sensor data belongs to the state before a step
-            held, record = (
-                np.concatenate([held, held[:, -1:]], axis=1),
-                (RECORDED_STATE, "sensordata"),
-            )
+        if self.sensors:
+            # Sensor data belong to the state before a step: one more step gives those of the last state.
+            held = np.concatenate([held, held[:, -1:]], axis=1)
+            record = (*record, "sensordata")
         if observations is not None:
             record = (*record, *observations.fields)
         with silence_mujoco_log():
             out = batch.rollout(held.shape[1], np.ascontiguousarray(held), record=record, ids=ids)
         self.steps += count * held.shape[1]
-        last = N * self.substeps
-        rows = out[RECORDED_STATE][:, self.substeps - 1 : last : self.substeps]
+
+        # Engine step i is recorded after the step: sample k ends with step k * substeps.
+        engine_steps = ctrl.shape[1] * self.substeps
+        rows = out[RECORDED_STATE][:, self.substeps - 1 : engine_steps : self.substeps]
         states = np.concatenate([start[:, None], rows[:, :, 1:]], axis=1)
-        on_time = (
-            np.abs(rows[:, -1, 0] - START_TIME - last * self.model.opt.timestep)
-            < 0.5 * self.model.opt.timestep
-        )
-        finite = on_time & np.isfinite(states).all(axis=(1, 2)) & _acceptable(ctrl).all(axis=(1, 2))
-        sensed = self._sensed(out["sensordata"][:, :: self.substeps]) if self.sensors else None
-        return Rollouts(
-            states,
-            sensed,
-            finite,
-            None if observations is None else self._observed(observations, start, out, last),
-        )
+        finite = self._on_time(rows[:, -1, 0], engine_steps)
+        finite &= np.isfinite(states).all(axis=(1, 2))
+        finite &= _is_accepted(ctrl).all(axis=(1, 2))
 
-    def _observed(
-        self, observations: SubstepObservations, start: Array, out: dict[Any, Array], last: int
-    ) -> Array:
-        """(m, N, substeps, w) from the records of a rollout of `last` engine steps."""
-        qpos, qvel, _ = self.space.split(out[RECORDED_STATE][:, :last, 1:])
-        before = np.concatenate([self.space.split(start)[1][:, None], qvel[:, :-1]], axis=1)
-        rows = observations.values(qpos, qvel, before, lambda name: out[name][:, :last])
-        return np.asarray(
-            rows.reshape(len(start), last // self.substeps, self.substeps, rows.shape[-1])
-        )
-
-    def _sensed(self, data: Array) -> Array:
-        """A copy of sensor data: (..., nsensordata), its clocks as if time had begun at zero."""
-        out = np.array(data)
-        out[..., self._clocks] -= START_TIME
-        return out
+        sensors = observed = None
+        if self.sensors:
+            sensors = self._sensor_data(out["sensordata"][:, :: self.substeps])
+        if observations is not None:
+            observed = self._observed(observations, start, out, engine_steps)
+        return Rollouts(states=states, sensors=sensors, finite=finite, observed=observed)
 
     def closed_loop(
         self, model: Any, reference: Array, mu: Array, K: Array
     ) -> tuple[Array, Array, bool]:
-        """Projection: `u = mu + K (alpha - x)`. Returns states (N+1, ns), ctrl (N, nu), and False if it diverged.
+        """Simulate one curve under `u = mu + K (alpha - x)`, the projection of the curve (alpha, mu).
 
-        reference: alpha, (N+1, ns);  mu: (N, nu);  K: (N, nu, nx)
+        Args:
+            model: The model.
+            reference: (N+1, ns) states alpha; the simulation starts at the first.
+            mu: (N, nu) controls of the curve.
+            K: (N, nu, nx) feedback gains [u-unit / x-unit].
+
+        Returns:
+            (N+1, ns) states, (N, nu) controls, and False if the simulation diverged.
         """
         space, N, substeps = self.space, len(mu), self.substeps
-        scalar = not space.quaternions
+        subtracts = not space.quaternions
         data = self._data
         mujoco.mj_resetData(model, data)
         data.time = START_TIME
         data.qpos[:], data.qvel[:], data.act[:] = space.split(reference[0])
-        states, used = np.empty((N + 1, reference.shape[1])), np.empty_like(mu)
+
+        states = np.empty((N + 1, reference.shape[1]))
         states[0] = reference[0]
+        used = np.empty_like(mu)
+
+        # The loop runs over views: this is the only place where Python steps MuJoCo sample by sample.
         ctrl, qpos, qvel, act = data.ctrl, data.qpos, data.qvel, data.act
+        next_qpos, next_qvel, next_act = space.split(states[1:])
+        curves = (states, next_qpos, next_qvel, next_act, reference, used, mu, K)
         with np.errstate(over="ignore", invalid="ignore"), silence_mujoco_log():
-            for now, q, v, a, alpha, u, open_loop, gain in zip(
-                states, *space.split(states[1:]), reference, used, mu, K, strict=False
-            ):
-                u[:] = gain.dot(alpha - now if scalar else space.minus(alpha, now))
-                u += open_loop
+            for now, q, v, a, alpha, u, feedforward, gain in zip(*curves, strict=False):
+                u[:] = gain.dot(alpha - now if subtracts else space.minus(alpha, now))
+                u += feedforward
                 ctrl[:] = u
                 mujoco.mj_step(model, data, substeps)
                 q[:], v[:], a[:] = qpos, qvel, act
         self.steps += N * substeps
-        on_time = (
-            abs(data.time - START_TIME - N * substeps * model.opt.timestep)
-            < 0.5 * model.opt.timestep
+
+        finite = (
+            np.isfinite(states).all()
+            and _is_accepted(used).all()
+            and self._on_time(np.array(data.time), N * substeps, model)
         )
-        return states, used, bool(on_time and np.isfinite(states).all() and _acceptable(used).all())
+        return states, used, bool(finite)
+
+    def _batch(self, kind: str, count: int) -> Batch:
+        """A batch of at least `count` simulations; making one costs milliseconds, so it grows and is kept."""
+        batch = self._batches.get(kind)
+        if batch is None or batch.nsim < count:
+            batch = Batch(self.model, count, min(self.threads, count))
+            self._batches[kind] = batch
+        return batch
+
+    def _load(self, batch: Batch, states: Array, models: Sequence[Any]) -> np.ndarray | None:
+        """Write states: (n, ns) into the first simulations of a batch; returns their ids, or None for all of them."""
+        n = len(states)
+        qpos, qvel, act = self.space.split(states)
+        batch.bind("qpos")[:n] = qpos
+        batch.bind("qvel")[:n] = qvel
+        if self.space.na:
+            batch.bind("act")[:n] = act
+        batch.bind("qacc_warmstart")[:n] = 0.0
+        batch.bind("time")[:n] = START_TIME
+
+        # A batch keeps the mocap poses of the model that it was made with.
+        if len(self._mocap_bodies):
+            self._load_mocap(batch, models, n)
+        return None if n == batch.nsim else np.arange(n)
+
+    def _load_mocap(self, batch: Batch, models: Sequence[Any], count: int) -> None:
+        """Write the poses of the mocap bodies of each model into its simulations."""
+        mocap_pos = batch.bind("mocap_pos")
+        mocap_quat = batch.bind("mocap_quat")
+        for i, model in enumerate(models):
+            mine = slice(None, count) if len(models) == 1 else i
+            mocap_pos[mine] = model.body_pos[self._mocap_bodies]
+            mocap_quat[mine] = model.body_quat[self._mocap_bodies]
+
+    def _step_model(
+        self, model: Any, states: Array, ctrl: Array, observations: SubstepObservations | None
+    ) -> SampleSteps:
+        """Advance all simulations of one model by one sample, see `step`."""
+        count = len(states)
+        batch = self._batch("step", count)
+        batch.set_models(model)
+        ids = self._load(batch, states, [model])
+        batch.bind("ctrl")[:count] = ctrl
+
+        # Fields have to be bound before the step that fills them.
+        if self.sensors:
+            batch.bind("sensordata")
+        if observations is not None:
+            for name in observations.fields:
+                batch.bind(name)
+
+        with silence_mujoco_log():
+            sensors, observed = self._advance(batch, ids, count, observations)
+        self.steps += self.substeps * count
+
+        names = ("qpos", "qvel", "act") if self.space.na else ("qpos", "qvel")
+        after = np.concatenate([batch.bind(name)[:count] for name in names], axis=1)
+        on_time = self._on_time(batch.bind("time").reshape(-1)[:count], self.substeps)
+        after[~on_time | ~_is_accepted(ctrl).all(axis=1)] = np.nan
+        return SampleSteps(
+            states=after, sensors=sensors, observed=np.stack(observed, axis=1) if observed else None
+        )
+
+    def _advance(
+        self,
+        batch: Batch,
+        ids: np.ndarray | None,
+        count: int,
+        observations: SubstepObservations | None,
+    ) -> tuple[Array | None, list[Array]]:
+        """Step a batch over one sample, with a stop wherever something is read.
+
+        Returns sensor data (count, nsensordata) or None, and (count, w) observations at every derivative substep.
+        """
+        looked = () if observations is None else observations.derivative_substeps
+        accelerations = observations is not None and len(observations.accelerations) > 0
+        sensors = None
+        observed = []
+
+        # Sensor data are those of the state before the sample: the first step computes them.
+        stops = {*looked, self.substeps}
+        if self.sensors:
+            stops.add(1)
+
+        done = 0
+        for stop in sorted(stops):
+            # An acceleration is the change of velocity over one engine step.
+            if stop - done > 1 and stop in looked:
+                batch.step(ids, nstep=stop - done - 1)
+                done = stop - 1
+            qvel_before = np.array(batch.bind("qvel")[:count]) if accelerations else None
+
+            batch.step(ids, nstep=stop - done)
+            done = stop
+            if self.sensors and stop == 1:
+                sensors = self._sensor_data(batch.bind("sensordata")[:count])
+            if observations is not None and stop in looked:
+                qpos = batch.bind("qpos")[:count]
+                qvel = batch.bind("qvel")[:count]
+                before = qvel if qvel_before is None else qvel_before
+                observed.append(
+                    observations.values(qpos, qvel, before, lambda name: batch.bind(name)[:count])
+                )
+        return sensors, observed
+
+    def _observed(
+        self,
+        observations: SubstepObservations,
+        start: Array,
+        out: dict[Any, Array],
+        engine_steps: int,
+    ) -> Array:
+        """(m, N, substeps, w) observations from the records of a rollout that starts at start: (m, ns)."""
+        _, first_qvel, _ = self.space.split(start)
+        qpos, qvel, _ = self.space.split(out[RECORDED_STATE][:, :engine_steps, 1:])
+        before = np.concatenate([first_qvel[:, None], qvel[:, :-1]], axis=1)
+        rows = observations.values(qpos, qvel, before, lambda name: out[name][:, :engine_steps])
+
+        samples = engine_steps // self.substeps
+        return np.asarray(rows.reshape(len(start), samples, self.substeps, rows.shape[-1]))
+
+    def _sensor_data(self, data: Array) -> Array:
+        """A copy of sensor data: (..., nsensordata), its clocks as if time had begun at zero."""
+        copied = np.array(data)
+        copied[..., self._clocks] -= START_TIME
+        return copied
+
+    def _on_time(self, time: Array, engine_steps: int, model: Any = None) -> np.ndarray:
+        """True where a simulation ends at the expected time; MuJoCo resets the time of one that diverges."""
+        timestep = float((self.model if model is None else model).opt.timestep)
+        return np.asarray(np.abs(time - START_TIME - engine_steps * timestep) < 0.5 * timestep)
 
 
-def _acceptable(ctrl: Array) -> np.ndarray:
-    """Which controls MuJoCo takes as they are."""
+def _is_accepted(ctrl: Array) -> np.ndarray:
+    """True for controls that MuJoCo applies unchanged."""
     return np.asarray(np.abs(ctrl) <= MAX_CONTROL)

@@ -1,4 +1,4 @@
-"""Outputs that lag by a time delay: interpolation between samples as a linear operator, and its derivative by the delay."""
+"""Time delay of the outputs: interpolation between samples as a linear operator, and its derivative by the delay."""
 
 from __future__ import annotations
 
@@ -10,74 +10,132 @@ from scipy.sparse import csr_array
 
 from mjfim.arrays import Array
 
+NODES = 4  # samples between which a value is interpolated: a cubic
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class OutputDelay:
-    """`y(t_k - d)` from samples y_k by cubic Lagrange interpolation (of lower order below 4 samples).
+    """Values `y(t - d)` from samples y_k by cubic Lagrange interpolation, of lower order below four samples.
 
-    What was before the start is the start.
+    Before the first sample the first value is held, after the last sample the last one.
 
-    shift: (M, N+1) sparse;  slope: (M, N+1) sparse, its derivative by d [1/s];  M = N+1 where every sample is wanted
+    Attributes:
+        weights: (M, N+1) sparse interpolation weights; M = N+1 if values are wanted at the samples themselves.
+        weight_slopes: (M, N+1) sparse derivative of the weights by d [1/s].
     """
 
-    shift: Any
-    slope: Any
+    weights: Any
+    weight_slopes: Any
 
     @staticmethod
     def on_grid(samples: int, delay: float, dt: float) -> OutputDelay:
-        """samples: N+1;  delay: d [s];  dt: sample period [s]"""
-        return OutputDelay.at(np.arange(samples, dtype=np.float64) - delay / dt, samples, dt)
+        """Delayed values at the samples themselves.
+
+        Args:
+            samples: Number of samples N+1.
+            delay: Delay d [s].
+            dt: Sample period [s].
+
+        Returns:
+            The operator.
+        """
+        wanted = np.arange(samples, dtype=np.float64) - delay / dt
+        return OutputDelay.at(wanted, samples, dt)
 
     @staticmethod
     def at(wanted: Array, samples: int, dt: float) -> OutputDelay:
-        """Of outputs that were read at other times. wanted: (M,) t/dt - d/dt in samples;  samples: N+1"""
+        """Values at any times, for outputs that are read between the samples.
+
+        Args:
+            wanted: (M,) places `(t - d) / dt` in samples.
+            samples: Number of samples N+1.
+            dt: Sample period [s].
+
+        Returns:
+            The operator.
+        """
         place = np.clip(wanted, 0.0, samples - 1.0)
-        count = min(4, samples)
+        count = min(NODES, samples)
+
+        # The nodes lie around the place, moved inwards at both ends.
         first = np.clip(np.floor(place).astype(int) - 1, 0, samples - count)
         nodes = first[:, None] + np.arange(count)
         value, slope = _lagrange(place[:, None] - first[:, None], count)
+
+        # Where the first or last value is held, a change of the delay changes nothing.
         inside = (wanted >= 0.0) & (wanted <= samples - 1.0)
         slope *= np.where(inside, -1.0 / dt, 0.0)[:, None]
+
         rows = np.repeat(np.arange(len(wanted)), count)
+        places = (rows, nodes.ravel())
+        shape = (len(wanted), samples)
         return OutputDelay(
-            *(
-                csr_array((w.ravel(), (rows, nodes.ravel())), shape=(len(wanted), samples))
-                for w in (value, slope)
-            )
+            weights=csr_array((value.ravel(), places), shape=shape),
+            weight_slopes=csr_array((slope.ravel(), places), shape=shape),
         )
 
     def apply(self, values: Array) -> Array:
-        """Lagged values, (M, ...). values: (N+1, ...)"""
-        return _apply(self.shift, values)
+        """Delayed values.
+
+        Args:
+            values: (N+1, ...) samples.
+
+        Returns:
+            (M, ...) delayed values.
+        """
+        return _apply(self.weights, values)
 
     def derivative(self, values: Array) -> Array:
-        """Derivative of the lagged values by the delay. values: (N+1, ...)"""
-        return _apply(self.slope, values)
+        """Derivative of the delayed values by the delay.
+
+        Args:
+            values: (N+1, ...) samples.
+
+        Returns:
+            (M, ...) derivative [unit of the values / s].
+        """
+        return _apply(self.weight_slopes, values)
 
     def apply_transposed(self, values: Array) -> Array:
-        """Adjoint of `apply`."""
-        return _apply(self.shift.T, values)
+        """Adjoint of `apply`.
+
+        Args:
+            values: (M, ...) covector of the delayed values.
+
+        Returns:
+            (N+1, ...) covector of the samples.
+        """
+        return _apply(self.weights.T, values)
 
     def derivative_transposed(self, values: Array) -> Array:
-        """Adjoint of `derivative`."""
-        return _apply(self.slope.T, values)
+        """Adjoint of `derivative`.
+
+        Args:
+            values: (M, ...) covector of the derivative.
+
+        Returns:
+            (N+1, ...) covector of the samples.
+        """
+        return _apply(self.weight_slopes.T, values)
 
 
 def _apply(operator: Any, values: Array) -> Array:
-    return np.asarray(operator @ values.reshape(len(values), -1)).reshape(
-        operator.shape[0], *values.shape[1:]
-    )
+    """Apply a sparse operator (M, N+1) to the first axis of values: (N+1, ...)."""
+    flat = operator @ values.reshape(len(values), -1)
+    return np.asarray(flat.reshape(operator.shape[0], *values.shape[1:]))
 
 
 def _lagrange(s: Array, count: int) -> tuple[Array, Array]:
     """Weights of the nodes 0, 1, ..., count - 1 at s: (n, 1), and their derivatives by s, both (n, count)."""
-    value, slope = np.ones((len(s), count)), np.zeros((len(s), count))
+    value = np.ones((len(s), count))
+    slope = np.zeros((len(s), count))
     for i in range(count):
         others = [j for j in range(count) if j != i]
         scale = np.prod([i - j for j in others])
         factors = np.concatenate([s - j for j in others], axis=1)
         value[:, i] = factors.prod(axis=1) / scale
-        slope[:, i] = (
-            sum(np.delete(factors, k, axis=1).prod(axis=1) for k in range(count - 1)) / scale
-        )
+
+        # Product rule: the sum over the factors that are left out.
+        products = [np.delete(factors, k, axis=1).prod(axis=1) for k in range(count - 1)]
+        slope[:, i] = sum(products) / scale
     return value, slope

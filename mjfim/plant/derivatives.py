@@ -819,7 +819,9 @@ class Derivatives:
         h_mixed = None
         if sensor_mixed or plant.outputs.curved:
             bends = [
-                plant.outputs.bend(states, unit, psi @ w, sensor_mixed[r] if sensor_mixed else None)
+                plant.outputs.mixed_change(
+                    states, unit, psi @ w, sensor_mixed[r] if sensor_mixed else None
+                )
                 for r, w in enumerate(directions)
             ]
             h_mixed = np.moveaxis(np.array(bends), 1, 2)

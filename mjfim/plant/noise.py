@@ -1,4 +1,4 @@
-"""Measurement noise: its covariance over the outputs, when each output is sampled, and the whitening by both."""
+"""Measurement noise: its covariance over the outputs, the samples at which outputs are measured, and whitening."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from scipy.linalg import solve_triangular
 from mjfim.arrays import Array
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Noise:
-    """Gaussian, white in time, correlated between outputs of one sample.
+    """Gaussian noise, white in time, correlated between the outputs of one sample.
 
-    covariance: (ny, ny);  strides: (ny,) every strides[i]-th sample holds output i (k = 0, the start, is not measured)
-    Outputs that are correlated share their stride.
+    Attributes:
+        covariance: (ny, ny) covariance [y-unit y-unit].
+        strides: (ny,) strides; every strides[i]-th sample measures output i, except the initial state k = 0. Correlated
+            outputs share their stride.
     """
 
     covariance: Array
@@ -25,66 +27,125 @@ class Noise:
 
     @staticmethod
     def independent(sigma: Sequence[float] | Array, stride: int = 1) -> Noise:
-        """Uncorrelated outputs of standard deviations sigma: (ny,), all sampled alike."""
-        return Noise(np.diag(np.asarray(sigma, dtype=np.float64) ** 2), np.full(len(sigma), stride))
+        """Noise of uncorrelated outputs that are measured at the same samples.
+
+        Args:
+            sigma: (ny,) standard deviations [y-unit].
+            stride: Stride of all outputs.
+
+        Returns:
+            The noise.
+        """
+        covariance = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
+        return Noise(covariance=covariance, strides=np.full(len(sigma), stride))
 
     @cached_property
     def sigma(self) -> Array:
-        """(ny,) standard deviations."""
+        """(ny,) standard deviations [y-unit]."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @cached_property
     def correlated(self) -> bool:
-        """True where outputs are correlated."""
+        """True if any two outputs are correlated."""
         return bool(np.count_nonzero(self.covariance) > len(self.covariance))
 
     @cached_property
     def factor(self) -> Array:
-        """(ny, ny) lower L with `L L' = covariance`."""
+        """(ny, ny) lower triangular L with `L L' = covariance` [y-unit]."""
         return np.asarray(np.linalg.cholesky(self.covariance))
 
     @cached_property
     def precision(self) -> Array:
-        """(ny, ny) inverse of the covariance."""
+        """(ny, ny) inverse of the covariance [1 / y-unit y-unit]."""
         return np.asarray(np.linalg.inv(self.covariance))
 
-    def every_sample(self, stride: int) -> Noise:
-        """The same information per second on another grid, where every output is measured at every sample.
+    def at_every_sample(self, stride: int) -> Noise:
+        """Noise with equal information per second on another grid that measures every output at every sample.
 
-        stride: of the measurement rate to which information is related
+        Args:
+            stride: Stride of the measurement rate to which information is related.
+
+        Returns:
+            The noise on the other grid.
         """
-        slower = np.sqrt(self.strides / stride)
-        return Noise(self.covariance * np.outer(slower, slower), np.ones_like(self.strides))
+        scale = np.sqrt(self.strides / stride)
+        return Noise(
+            covariance=self.covariance * np.outer(scale, scale), strides=np.ones_like(self.strides)
+        )
 
     def measured(self, N: int) -> Array:
-        """(N+1, ny) 1 where an output is measured, else 0."""
+        """Mask of the measured samples.
+
+        Args:
+            N: Number of control samples.
+
+        Returns:
+            (N+1, ny) 1 where an output is measured, else 0.
+        """
         k = np.arange(N + 1)[:, None]
         return np.asarray((k % self.strides == 0) & (k > 0), dtype=np.float64)
 
     def whiten(self, values: Array) -> Array:
-        """`L^-1 y` over the axis of outputs. values: (N+1, ny, ...)"""
+        """Whitened values `L^-1 y`.
+
+        Args:
+            values: (N+1, ny, ...) values [y-unit].
+
+        Returns:
+            (N+1, ny, ...) whitened values.
+        """
         if not self.correlated:
             return np.asarray(values / self.sigma.reshape(-1, *[1] * (values.ndim - 2)))
+
         rows = np.moveaxis(values, 1, 0)
         flat = solve_triangular(self.factor, rows.reshape(len(rows), -1), lower=True)
         return np.asarray(np.moveaxis(flat.reshape(rows.shape), 0, 1))
 
-    def rows(self, values: Array) -> Array:
-        """Whitened measured values one after the other, (n, ...), from (N+1, ny, ...)."""
+    def whitened_rows(self, values: Array) -> Array:
+        """Whitened values of all measurements, one after the other.
+
+        Args:
+            values: (N+1, ny, ...) values [y-unit].
+
+        Returns:
+            (n, ...) whitened values of the n measurements.
+        """
         return np.asarray(self.whiten(values)[self.measured(len(values) - 1) > 0])
 
     def whiten_present(self, values: Array, present: np.ndarray) -> Array:
-        """Whitened values where present: (N+1, ny), (n, ...); what is missing is marginalised out."""
+        """Whitened values of the measurements that are present; missing ones are marginalised out.
+
+        Args:
+            values: (N+1, ny, ...) values [y-unit].
+            present: (N+1, ny) True where a measurement is present.
+
+        Returns:
+            (n, ...) whitened values of the n measurements that are present.
+        """
         if not self.correlated:
             return np.asarray(self.whiten(values)[present])
-        out = np.zeros(values.shape)
+
+        # Samples at which different outputs are present have different factors of their marginal covariance.
+        whitened = np.zeros(values.shape)
         for pattern in np.unique(present, axis=0):
-            hit = (present == pattern).all(axis=1)
-            if pattern.any():
-                some = Noise(self.covariance[np.ix_(pattern, pattern)], self.strides[pattern])
-                out[np.ix_(hit, pattern)] = some.whiten(values[np.ix_(hit, pattern)])
-        return np.asarray(out[present])
+            if not pattern.any():
+                continue
+            samples = (present == pattern).all(axis=1)
+            marginal = Noise(
+                covariance=self.covariance[np.ix_(pattern, pattern)], strides=self.strides[pattern]
+            )
+            block = np.ix_(samples, pattern)
+            whitened[block] = marginal.whiten(values[block])
+        return np.asarray(whitened[present])
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
-        """(count, ny) noise."""
+        """Draw noise.
+
+        Args:
+            count: Number of samples.
+            rng: Random generator.
+
+        Returns:
+            (count, ny) noise [y-unit].
+        """
         return np.asarray(rng.standard_normal((count, len(self.factor))) @ self.factor.T)

@@ -1,7 +1,8 @@
-"""Measured outputs: which components of the state and which sensors are recorded."""
+"""Measured outputs `y = h(x, u, theta)`: which components of the state and which sensors are recorded."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,13 +14,16 @@ from mjfim.arrays import Array
 from mjfim.plant.state_space import StateSpace, quaternion_product
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Output:
-    """One measured scalar.
+    """One measured scalar: a component of the state or of the sensor data.
 
-    name: column name in recordings;  sigma: 1-sigma noise in its unit
-    state: address in the state vector (qpos, qvel, act) of a measured component, or None
-    sensor: address in sensordata, or None
+    Attributes:
+        name: Column name in recordings.
+        sigma: Standard deviation of its noise, in its unit.
+        unit: Unit, empty if not known.
+        state: Address in the state vector (qpos, qvel, act), or None.
+        sensor: Address in sensordata, or None.
     """
 
     name: str
@@ -29,70 +33,83 @@ class Output:
     sensor: int | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class OutputMap:
-    """The vector `y = h(x, u, theta)`: (ny,) in the order of `outputs`.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outputs:
+    """The output map h without bias and delay.
 
     States are scalar coordinates or components of quaternions, for which h and its derivatives are known exactly.
+
+    Attributes:
+        outputs: The ny outputs in the order of y.
+        space: Layout of the state.
     """
 
     outputs: tuple[Output, ...]
     space: StateSpace
-
-    @cached_property
-    def _states(self) -> np.ndarray:
-        """Rows: output, address in the state vector."""
-        return _table([(i, o.state) for i, o in enumerate(self.outputs) if o.state is not None], 2)
-
-    @cached_property
-    def _sensors(self) -> np.ndarray:
-        """Rows: output, address in sensordata."""
-        return _table(
-            [(i, o.sensor) for i, o in enumerate(self.outputs) if o.sensor is not None], 2
-        )
-
-    @cached_property
-    def _scalar(self) -> np.ndarray:
-        """Rows: output, tangent index, of state components that are no quaternion's."""
-        tangent = dict(zip(self.space.scalar_q.tolist(), self.space.scalar_v.tolist(), strict=True))
-        nq, shift = self.space.nq, self.space.nv - self.space.nq
-        plain = [(i, s) for i, s in self._states.T.tolist() if s in tangent or s >= nq]
-        return _table([(i, tangent[s] if s < nq else s + shift) for i, s in plain], 2)
-
-    @cached_property
-    def _turned(self) -> np.ndarray:
-        """Rows: output, component, qpos and dof address of its quaternion."""
-        joints = self.space.quaternions
-        return _table(
-            [
-                (i, s - q, q, v)
-                for i, s in self._states.T.tolist()
-                for q, v in joints
-                if q <= s < q + 4
-            ],
-            4,
-        )
 
     def __len__(self) -> int:
         return len(self.outputs)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """ny column names."""
-        return tuple(o.name for o in self.outputs)
+        """The ny column names."""
+        return tuple(output.name for output in self.outputs)
 
     @property
     def needs_sensors(self) -> bool:
-        """True where a MuJoCo sensor is among the outputs."""
-        return any(o.sensor is not None for o in self.outputs)
+        """True if a MuJoCo sensor is among the outputs."""
+        return any(output.sensor is not None for output in self.outputs)
 
     @property
     def curved(self) -> bool:
-        """True where components of quaternions are measured, whose second derivative is not zero."""
-        return bool(self._turned.shape[1])
+        """True if components of quaternions are measured: their second derivative is not zero."""
+        return bool(self._quaternions.shape[1])
+
+    @cached_property
+    def _states(self) -> np.ndarray:
+        """(2, n) output and address in the state vector of every measured state component."""
+        rows = [(i, o.state) for i, o in enumerate(self.outputs) if o.state is not None]
+        return _columns(rows, 2)
+
+    @cached_property
+    def _sensors(self) -> np.ndarray:
+        """(2, n) output and address in sensordata of every measured sensor."""
+        rows = [(i, o.sensor) for i, o in enumerate(self.outputs) if o.sensor is not None]
+        return _columns(rows, 2)
+
+    @cached_property
+    def _scalars(self) -> np.ndarray:
+        """(2, n) output and tangent index of every measured state component that belongs to no quaternion."""
+        space = self.space
+        tangent = dict(zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True))
+        rows = []
+        for i, address in self._states.T.tolist():
+            if address >= space.nq:
+                rows.append((i, address + space.nv - space.nq))
+            elif address in tangent:
+                rows.append((i, tangent[address]))
+        return _columns(rows, 2)
+
+    @cached_property
+    def _quaternions(self) -> np.ndarray:
+        """(4, n) output, component, and addresses in qpos and qvel of every measured quaternion component."""
+        rows = []
+        for i, address in self._states.T.tolist():
+            for q, v in self.space.quaternions:
+                if q <= address < q + 4:
+                    rows.append((i, address - q, q, v))
+        return _columns(rows, 4)
 
     def __call__(self, states: Array, sensors: Array | None) -> Array:
-        """(..., ny) from states (..., ns) and sensordata (..., nsensordata); NaN for sensors where that is None."""
+        """Outputs of states and sensor data.
+
+        Args:
+            states: (..., ns) states.
+            sensors: (..., nsensordata) sensor data, or None.
+
+        Returns:
+            (..., ny) outputs [y-unit], NaN for sensors without sensor data.
+        """
         y = np.full((*states.shape[:-1], len(self.outputs)), np.nan)
         y[..., self._states[0]] = states[..., self._states[1]]
         if sensors is not None:
@@ -100,54 +117,85 @@ class OutputMap:
         return y
 
     def tangent(self, states: Array, dx: Array, dsensors: Array | None) -> Array:
-        """(..., ny) change of the outputs from a tangent step dx (..., nx) at states (..., ns), and that of sensordata."""
+        """First-order change of the outputs.
+
+        Args:
+            states: (..., ns) states.
+            dx: (..., nx) tangent vectors at the states.
+            dsensors: (..., nsensordata) changes of the sensor data, or None for zero.
+
+        Returns:
+            (..., ny) changes [y-unit].
+        """
         dy = np.zeros((*dx.shape[:-1], len(self.outputs)))
-        dy[..., self._scalar[0]] = dx[..., self._scalar[1]]
-        for output, component, q, v in self._turned.T:
-            rate = quaternion_product(states[..., q : q + 4], _pure(0.5 * dx[..., v : v + 3]))
+        dy[..., self._scalars[0]] = dx[..., self._scalars[1]]
+        for output, component, q, v in self._quaternions.T:
+            rate = _turned(states[..., q : q + 4], dx[..., v : v + 3])
             dy[..., output] = rate[..., component]
         if dsensors is not None:
             dy[..., self._sensors[0]] = dsensors[..., self._sensors[1]]
         return dy
 
-    def bend(self, states: Array, first: Array, second: Array, dsensors: Array | None) -> Array:
-        """(..., ny) mixed second change of the outputs: along `first`, then `second` from there, both (..., nx)."""
-        dy = np.zeros((*np.broadcast_shapes(first.shape, second.shape)[:-1], len(self.outputs)))
-        for output, component, q, v in self._turned.T:
-            moved = quaternion_product(states[..., q : q + 4], _pure(0.5 * first[..., v : v + 3]))
-            dy[..., output] = quaternion_product(moved, _pure(0.5 * second[..., v : v + 3]))[
-                ..., component
-            ]
+    def mixed_change(
+        self, states: Array, first: Array, second: Array, dsensors: Array | None
+    ) -> Array:
+        """Mixed second-order change of the outputs along two tangent vectors, the second taken where the first leads.
+
+        Args:
+            states: (..., ns) states.
+            first: (..., nx) tangent vectors at the states.
+            second: (..., nx) tangent vectors at the moved states.
+            dsensors: (..., nsensordata) mixed changes of the sensor data, or None for zero.
+
+        Returns:
+            (..., ny) mixed changes [y-unit].
+        """
+        shape = np.broadcast_shapes(first.shape, second.shape)[:-1]
+        dy = np.zeros((*shape, len(self.outputs)))
+        for output, component, q, v in self._quaternions.T:
+            moved = _turned(states[..., q : q + 4], first[..., v : v + 3])
+            dy[..., output] = _turned(moved, second[..., v : v + 3])[..., component]
         if dsensors is not None:
             dy[..., self._sensors[0]] = dsensors[..., self._sensors[1]]
         return dy
 
 
-def _table(rows: list[tuple[int, ...]], width: int) -> np.ndarray:
-    """Integer columns of a list of rows that may be empty."""
+def outputs_by_state(model: Any, outputs: Outputs) -> dict[int, int]:
+    """Outputs that measure a component of the state: the component itself, or a sensor of its joint.
+
+    Args:
+        model: Compiled MuJoCo model.
+        outputs: The outputs.
+
+    Returns:
+        Index of the output by the address of the component in the state vector.
+    """
+    found = {
+        output.state: i for i, output in enumerate(outputs.outputs) if output.state is not None
+    }
+
+    sensors = {}  # address in sensordata to address in the state vector
+    for s in range(model.nsensor):
+        joint = int(model.sensor_objid[s])
+        kind = int(model.sensor_type[s])
+        if kind == int(mujoco.mjtSensor.mjSENS_JOINTPOS):
+            sensors[int(model.sensor_adr[s])] = int(model.jnt_qposadr[joint])
+        elif kind == int(mujoco.mjtSensor.mjSENS_JOINTVEL):
+            sensors[int(model.sensor_adr[s])] = model.nq + int(model.jnt_dofadr[joint])
+
+    # A component that is measured itself counts more than a sensor of it.
+    for i, output in enumerate(outputs.outputs):
+        if output.sensor in sensors:
+            found.setdefault(sensors[output.sensor], i)
+    return found
+
+
+def _columns(rows: Sequence[tuple[int, ...]], width: int) -> np.ndarray:
+    """(width, n) integer columns of n rows, of which there may be none."""
     return np.array(rows, np.intp).reshape(-1, width).T
 
 
-def _pure(v: Array) -> Array:
-    """Quaternion without a real part."""
-    return np.concatenate([np.zeros((*v.shape[:-1], 1)), v], axis=-1)
-
-
-def states_shown(model: Any, outputs: OutputMap) -> dict[int, int]:
-    """Output that shows a component of the state, by its address: itself, or a sensor of the joint's position or velocity."""
-    shown = {}
-    kinds = {
-        int(mujoco.mjtSensor.mjSENS_JOINTPOS): model.jnt_qposadr,
-        int(mujoco.mjtSensor.mjSENS_JOINTVEL): model.jnt_dofadr,
-    }
-    for i, output in enumerate(outputs.outputs):
-        if output.state is not None:
-            shown[output.state] = i
-    for i, output in enumerate(outputs.outputs):
-        for s in range(model.nsensor if output.sensor is not None else 0):
-            kind = int(model.sensor_type[s])
-            if kind in kinds and int(model.sensor_adr[s]) == output.sensor:
-                address = int(kinds[kind][int(model.sensor_objid[s])])
-                velocity = kind == int(mujoco.mjtSensor.mjSENS_JOINTVEL)
-                shown.setdefault(address + (model.nq if velocity else 0), i)
-    return shown
+def _turned(quaternion: Array, rotation: Array) -> Array:
+    """(..., 4) first-order change of quaternions (..., 4) along rotation vectors (..., 3) in the body frame."""
+    real = np.zeros((*rotation.shape[:-1], 1))
+    return quaternion_product(quaternion, np.concatenate([real, 0.5 * rotation], axis=-1))

@@ -18,7 +18,7 @@ from mjfim.optimize.lq import TangentCurve
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
 from mjfim.plant.delay import OutputDelay
 from mjfim.plant.derivatives import Derivatives
-from mjfim.plant.outputs import OutputMap
+from mjfim.plant.outputs import Outputs
 from mjfim.records.trajectory import Trajectory
 
 MAX_CACHED_MODELS = 64  # models at single parameter values that a plant keeps
@@ -46,7 +46,7 @@ class Plant:
         *,
         source: Source,
         parameters: ParameterSet,
-        outputs: OutputMap,
+        outputs: Outputs,
         nominal_initial_state: Array,
         substeps: int,
         threads: int | None = None,

@@ -1,7 +1,7 @@
-"""Differences and steps on MuJoCo's configuration space, for many states at once.
+"""Differences and moves on MuJoCo's configuration space, for many states at once.
 
-The vectorised counterpart of `mj_differentiatePos` and `mj_integratePos` (tests hold it against both):
-scalar joints subtract, ball joints and the rotation of free joints use the quaternion logarithm in the body frame.
+This is the vectorised counterpart of `mj_differentiatePos` and `mj_integratePos` (tests compare it with both): scalar
+joints subtract, ball joints and the rotation of free joints use the quaternion logarithm in the body frame.
 """
 
 from __future__ import annotations
@@ -13,13 +13,22 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 
+SMALL_ANGLE = (
+    1e-3  # [rad] below which the logarithm's derivative takes the limit of its second-order term
+)
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class StateSpace:
-    """Layout of states (qpos, qvel, act) and of their tangent vectors (dq, dv, da).
+    """Layout of states (qpos, qvel, act), ns numbers, and of their tangent vectors (dq, dv, da), nx numbers.
 
-    quaternions: pairs (qpos address, dof address), one per ball or free joint
-    scalar_q, scalar_v: addresses of every other coordinate, in the same order
+    Attributes:
+        nq: Length of qpos.
+        nv: Length of qvel.
+        na: Length of act.
+        scalar_q: (n,) addresses in qpos of the coordinates that belong to no quaternion.
+        scalar_v: (n,) addresses in qvel of these coordinates.
+        quaternions: Pairs (address in qpos, address in qvel), one per ball or free joint.
     """
 
     nq: int
@@ -35,75 +44,141 @@ class StateSpace:
         return 2 * self.nv + self.na
 
     def split(self, state: Array) -> tuple[Array, Array, Array]:
-        """(..., nq+nv+na) -> qpos, qvel, act (views)."""
-        nq, nv = self.nq, self.nv
-        return state[..., :nq], state[..., nq : nq + nv], state[..., nq + nv :]
+        """Components of a state.
+
+        Args:
+            state: (..., ns) states.
+
+        Returns:
+            qpos (..., nq), qvel (..., nv) and act (..., na), views of the state.
+        """
+        velocity = self.nq
+        activation = self.nq + self.nv
+        return state[..., :velocity], state[..., velocity:activation], state[..., activation:]
 
     def plus(self, state: Array, dx: Array) -> Array:
-        """State moved along a tangent vector; broadcasts. state: (..., nq+nv+na), dx: (..., nx)."""
+        """State moved along a tangent vector; leading axes broadcast.
+
+        Args:
+            state: (..., ns) states.
+            dx: (..., nx) tangent vectors.
+
+        Returns:
+            (..., ns) moved states.
+        """
         if not self.quaternions:
             return state + dx
-        nq, nv = self.nq, self.nv
+
         shape = np.broadcast_shapes(state.shape[:-1], dx.shape[:-1])
         out = np.array(np.broadcast_to(state, (*shape, state.shape[-1])))
         out[..., self.scalar_q] += dx[..., self.scalar_v]
-        out[..., nq:] += dx[..., nv:]
+        out[..., self.nq :] += dx[..., self.nv :]
         for q, v in self.quaternions:
-            out[..., q : q + 4] = quaternion_product(
-                out[..., q : q + 4], exponential(dx[..., v : v + 3])
-            )
+            turn = exponential(dx[..., v : v + 3])
+            out[..., q : q + 4] = quaternion_product(out[..., q : q + 4], turn)
         return out
 
     def minus(self, state: Array, origin: Array) -> Array:
-        """Tangent vector dx with `origin plus dx = state`; broadcasts. Returns (..., nx)."""
+        """Tangent vector dx with `origin plus dx = state`; leading axes broadcast.
+
+        Args:
+            state: (..., ns) states.
+            origin: (..., ns) states from which the difference is taken.
+
+        Returns:
+            (..., nx) tangent vectors.
+        """
         if not self.quaternions:
             return state - origin
-        nq, nv = self.nq, self.nv
+
         shape = np.broadcast_shapes(state.shape[:-1], origin.shape[:-1])
         out = np.empty((*shape, self.nx))
         out[..., self.scalar_v] = state[..., self.scalar_q] - origin[..., self.scalar_q]
-        out[..., nv:] = state[..., nq:] - origin[..., nq:]
+        out[..., self.nv :] = state[..., self.nq :] - origin[..., self.nq :]
         for q, v in self.quaternions:
             conjugate = origin[..., q : q + 4] * np.array([1.0, -1.0, -1.0, -1.0])
             out[..., v : v + 3] = logarithm(quaternion_product(conjugate, state[..., q : q + 4]))
         return out
 
-    def minus_slope(self, dx: Array) -> Array:
-        """(nx, nx) derivative of `minus` by a move of its state along the tangent space there, where it is dx: (nx,)."""
+    def minus_derivative(self, dx: Array) -> Array:
+        """Derivative of `minus` by a move of its first argument along the tangent space there.
+
+        Args:
+            dx: (nx,) value of `minus`.
+
+        Returns:
+            (nx, nx) derivative.
+        """
         out = np.eye(self.nx)
         for _, v in self.quaternions:
-            out[v : v + 3, v : v + 3] = logarithm_slope(dx[v : v + 3])
+            out[v : v + 3, v : v + 3] = logarithm_derivative(dx[v : v + 3])
         return out
 
 
 def quaternion_product(a: Array, b: Array) -> Array:
-    """Hamilton product of (w, x, y, z) quaternions, (..., 4)."""
-    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
-    scalar = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
-    return np.concatenate([scalar, aw * bv + bw * av + np.cross(av, bv)], axis=-1)
+    """Hamilton product of quaternions.
+
+    Args:
+        a: (..., 4) quaternions (w, x, y, z).
+        b: (..., 4) quaternions (w, x, y, z).
+
+    Returns:
+        (..., 4) products a b.
+    """
+    a_real, a_vector = a[..., :1], a[..., 1:]
+    b_real, b_vector = b[..., :1], b[..., 1:]
+    real = a_real * b_real - np.sum(a_vector * b_vector, axis=-1, keepdims=True)
+    vector = a_real * b_vector + b_real * a_vector + np.cross(a_vector, b_vector)
+    return np.concatenate([real, vector], axis=-1)
 
 
 def exponential(rotation: Array) -> Array:
-    """Unit quaternion of a rotation vector [rad], (..., 3) -> (..., 4)."""
-    half = 0.5 * np.linalg.norm(rotation, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(half), 0.5 * rotation * np.sinc(half / np.pi)], axis=-1)
+    """Unit quaternion of a rotation vector.
+
+    Args:
+        rotation: (..., 3) rotation vectors [rad].
+
+    Returns:
+        (..., 4) unit quaternions (w, x, y, z).
+    """
+    half_angle = 0.5 * np.linalg.norm(rotation, axis=-1, keepdims=True)
+    vector = 0.5 * rotation * np.sinc(half_angle / np.pi)
+    return np.concatenate([np.cos(half_angle), vector], axis=-1)
 
 
 def logarithm(quaternion: Array) -> Array:
-    """Rotation vector [rad], at most pi long, of a unit quaternion, (..., 4) -> (..., 3)."""
-    w, v = quaternion[..., :1], quaternion[..., 1:]
-    length = np.linalg.norm(v, axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(length, np.abs(w))
-    safe = np.where(length > 0.0, length, 1.0)
-    return np.where(w < 0.0, -1.0, 1.0) * v * np.where(length > 0.0, angle / safe, 2.0)
+    """Rotation vector of a unit quaternion, at most pi long.
+
+    Args:
+        quaternion: (..., 4) unit quaternions (w, x, y, z).
+
+    Returns:
+        (..., 3) rotation vectors [rad].
+    """
+    real, vector = quaternion[..., :1], quaternion[..., 1:]
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(length, np.abs(real))
+
+    # A quaternion and its negative are the same rotation: the one with a positive real part is the shorter way.
+    sign = np.where(real < 0.0, -1.0, 1.0)
+    safe_length = np.where(length > 0.0, length, 1.0)
+    return sign * vector * np.where(length > 0.0, angle / safe_length, 2.0)
 
 
-def logarithm_slope(rotation: Array) -> Array:
-    """(3, 3) derivative by e of the rotation vector of `exponential(rotation) * exponential(e)`; rotation: (3,), below pi."""
+def logarithm_derivative(rotation: Array) -> Array:
+    """Derivative by e of the rotation vector of `exponential(rotation) * exponential(e)` at e = 0.
+
+    Args:
+        rotation: (3,) rotation vector shorter than pi [rad].
+
+    Returns:
+        (3, 3) derivative.
+    """
     x, y, z = rotation
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     angle = float(np.linalg.norm(rotation))
-    bend = 1.0 / 12.0
-    if angle > 1e-3:
-        bend = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
-    return np.asarray(np.eye(3) + 0.5 * cross + bend * cross @ cross)
+
+    second_order = 1.0 / 12.0
+    if angle > SMALL_ANGLE:
+        second_order = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+    return np.asarray(np.eye(3) + 0.5 * cross + second_order * cross @ cross)

@@ -19,7 +19,7 @@ from mjfim.excitation.verification import SAME, audit, require_inside
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import Setup
 from mjfim.parallel import salvaged, workers_of
-from mjfim.plant.active_constraints import saturated
+from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import HistoryRow, Status
 from mjfim.studies.baselines.budget import Attempt, Job
@@ -257,7 +257,7 @@ class Judge:
         outcome = MethodOutcome.INSIDE if found.kept else MethodOutcome.OUTSIDE
         if outcome is MethodOutcome.OUTSIDE and not np.isfinite(attempt.cost):
             outcome = MethodOutcome.NOTHING
-        clamped = saturated(setup.model_at(setup.theta), point.trajectory)
+        clamped = saturated_actuators(setup.model_at(setup.theta), point.trajectory)
         if outcome is MethodOutcome.INSIDE and clamped:
             outcome, note = MethodOutcome.CLAMPED, f"forcerange clamps {', '.join(clamped)}"
         elif found.deviation > SAME:

@@ -15,7 +15,7 @@ from mjfim.information.smoothness import roughness, visible_columns
 from mjfim.optimize.directions import LBFGS
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.active_constraints import first_active
+from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.records.check import SelfTest
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
@@ -32,7 +32,7 @@ def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
     )
     if found.passed or found.roughness is not None:
         return found
-    active = first_active(setup.model_at(setup.theta), trajectory)
+    active = first_active_constraint(setup.model_at(setup.theta), trajectory)
     if active is None:
         return replace(
             found,

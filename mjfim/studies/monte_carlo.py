@@ -102,7 +102,7 @@ class Trials:
     def outputs(self, theta: Array) -> tuple[Array, np.ndarray]:
         """Whitened predictions (m, n) at theta: (m, p), and which of them are finite."""
         y, finite = self.setup.plant.measure(theta, self.ctrl)
-        return self.setup.noise.rows(np.moveaxis(y, 0, -1)).T, finite
+        return self.setup.noise.whitened_rows(np.moveaxis(y, 0, -1)).T, finite
 
     def recording(self, measured: Array) -> Recording:
         """One trial, (n,) whitened, as a recording."""
@@ -139,14 +139,14 @@ def _trial_set(
 ) -> tuple[TrialStatistics, Array]:
     clock = time.perf_counter()
     y, G = _exact(setup, curve)
-    J = setup.noise.rows(G)
+    J = setup.noise.whitened_rows(G)
     information = np.asarray(J.T @ J)
     require_visible(setup, J)
     estimates = []
     chunk = max(64, int(CHUNK_BYTES / (8 * J.size)))
     for first in range(0, count, chunk):
         m = min(chunk, count - first)
-        whitened = setup.noise.rows(y) + rng.standard_normal((m, J.shape[0]))
+        whitened = setup.noise.whitened_rows(y) + rng.standard_normal((m, J.shape[0]))
         trials = Trials(setup, curve.ctrl, whitened)
         estimates.append(_solve(trials, _shared(setup, trials), tell))
     every = np.concatenate(estimates)
@@ -177,7 +177,7 @@ def _shared(setup: Setup, trials: Trials) -> Shared:
             raise SimulationDivergedError(
                 "the simulation diverges near the fit of the mean measurement"
             )
-        return setup.noise.rows(predicted[1])
+        return setup.noise.whitened_rows(predicted[1])
 
     J = jacobian(theta)
     bend = np.stack(

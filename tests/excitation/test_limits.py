@@ -14,7 +14,7 @@ from mjfim.excitation.limits import Limit, limits_of
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names, scalar_joints
 from mjfim.output.labels import Labels
-from mjfim.plant.active_constraints import saturated
+from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.trajectory import Trajectory
 from tests.support.numerics import make_setup
 
@@ -290,7 +290,7 @@ def test_clamped_forces_are_found_beside_actuators_with_several(
         act=np.zeros((3, 0)),
         ctrl=np.array([ctrl] * 2),
     )
-    assert saturated(model, still) == names
+    assert saturated_actuators(model, still) == names
 
 
 def test_every_control_has_its_label_also_where_an_actuator_has_several() -> None:

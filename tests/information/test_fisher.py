@@ -227,10 +227,10 @@ def test_correlated_noise_at_several_rates_weighs_every_sample_with_its_own_cova
     for k in range(1, 13):
         rows = np.flatnonzero(k % strides == 0)
         total += S.G[k][rows].T @ np.linalg.inv(covariance[np.ix_(rows, rows)]) @ S.G[k][rows]
-    made = replace(information(), noise=Noise(covariance, strides))
+    made = replace(information(), noise=Noise(covariance=covariance, strides=strides))
     assert relative_error(made.matrix(S), total) < 1e-13
     assert made.accumulated(S)[-1] == pytest.approx(made.evaluate(total).eigenvalues[0], rel=1e-9)
-    alone = replace(made, noise=Noise(np.diag(np.diag(covariance)), strides))
+    alone = replace(made, noise=Noise(covariance=np.diag(np.diag(covariance)), strides=strides))
     assert relative_error(alone.matrix(S), total) > 0.1
 
 

@@ -68,7 +68,7 @@ def test_an_experiment_that_shows_everything_needs_no_random_controls(
     def look_without_simulations(setup: Setup) -> Survey:
         """Survey along the initial control on a plant that simulates no further control."""
         curve = setup.initial
-        found = setup.plant.sensitivity(setup.theta, curve)
+        found = setup.plant.derivatives.sensitivity(setup.theta, curve)
         monkeypatch.setattr(setup.plant, "simulate", refused)
         return survey(setup, curve, found)
 

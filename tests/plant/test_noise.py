@@ -19,7 +19,7 @@ FULL = ROOT @ ROOT.T  # the last output is uncorrelated with the others
 
 def correlated(strides: tuple[int, ...] = (1, 1, 1, 1)) -> Noise:
     """Four outputs, three of them correlated."""
-    return Noise(FULL, np.array(strides))
+    return Noise(covariance=FULL, strides=np.array(strides))
 
 
 def half_square(rows: Array) -> float:
@@ -49,7 +49,7 @@ def test_independent_outputs_are_the_special_case() -> None:
     assert not plain.correlated
     np.testing.assert_allclose(plain.whiten(values), values / sigma[:, None], rtol=1e-15)
     np.testing.assert_allclose(plain.factor, np.diag(sigma), rtol=1e-15)
-    faint = Noise(plain.covariance + 1e-300 * (1 - np.eye(3)), plain.strides)
+    faint = Noise(covariance=plain.covariance + 1e-300 * (1 - np.eye(3)), strides=plain.strides)
     assert faint.correlated
     np.testing.assert_allclose(faint.whiten(values), plain.whiten(values), rtol=1e-14)
     assert plain.strides.tolist() == [2, 2, 2]
@@ -63,7 +63,7 @@ def test_jacobians_are_whitened_like_residuals() -> None:
     for j in range(3):
         np.testing.assert_allclose(white[..., j], noise.whiten(G[..., j]), rtol=1e-13, atol=1e-13)
     wanted = sum(G[k].T @ np.linalg.inv(FULL) @ G[k] for k in range(1, 5))
-    rows = noise.rows(G)
+    rows = noise.whitened_rows(G)
     assert rows.shape == (16, 3)
     np.testing.assert_allclose(rows.T @ rows, wanted, rtol=1e-11)
     np.testing.assert_allclose(noise.precision, np.linalg.inv(FULL), rtol=1e-11, atol=1e-13)
@@ -77,7 +77,7 @@ def test_strides_say_which_samples_hold_which_output() -> None:
     assert measured[:, 3].tolist() == [0, 0, 0, 1, 0, 0, 1, 0]
     assert np.array_equal(measured[:, 0], measured[:, 2])
     G = np.random.default_rng(3).standard_normal((8, 4, 2))
-    rows = correlated((2, 2, 2, 3)).rows(G)
+    rows = correlated((2, 2, 2, 3)).whitened_rows(G)
     joint, alone = np.linalg.inv(FULL[:3, :3]), 1.0 / FULL[3, 3]
     wanted = sum(G[k, :3].T @ joint @ G[k, :3] for k in (2, 4, 6)) + sum(
         alone * np.outer(G[k, 3], G[k, 3]) for k in (3, 6)
@@ -142,10 +142,10 @@ def test_every_sample_keeps_the_information_per_second(coarsen: int) -> None:
     """Of each output at its own rate, on a grid `coarsen` times longer, related to the measurement rate of that grid."""
     strides, stride, N, rate = np.array([4, 4, 4, 6]), 2, 72, 100.0
     G = np.array([[1.0, 0.2], [-0.5, 1.0], [0.3, 0.3], [2.0, -1.0]])  # the same at all samples
-    fine = Noise(FULL, strides)
-    before = fine.rows(np.broadcast_to(G, (N + 1, *G.shape)))
-    coarse = fine.every_sample(stride)
-    after = coarse.rows(np.broadcast_to(G, (N // coarsen + 1, *G.shape)))
+    fine = Noise(covariance=FULL, strides=strides)
+    before = fine.whitened_rows(np.broadcast_to(G, (N + 1, *G.shape)))
+    coarse = fine.at_every_sample(stride)
+    after = coarse.whitened_rows(np.broadcast_to(G, (N // coarsen + 1, *G.shape)))
     assert coarse.strides.tolist() == [1] * 4
     np.testing.assert_allclose(
         after.T @ after / (rate / coarsen), before.T @ before / (rate / stride), rtol=1e-11

@@ -161,6 +161,6 @@ def test_the_slope_of_a_difference_is_that_of_nearby_differences(model) -> None:
         moved = space.plus(state, h * np.eye(space.nx)), space.plus(state, -h * np.eye(space.nx))
         slope = (space.minus(moved[0], origin) - space.minus(moved[1], origin)).T / (2 * h)
         np.testing.assert_allclose(
-            space.minus_slope(space.minus(state, origin)), slope, rtol=0, atol=1e-7
+            space.minus_derivative(space.minus(state, origin)), slope, rtol=0, atol=1e-7
         )
     assert np.abs(slope - np.eye(space.nx)).max() > 0.1

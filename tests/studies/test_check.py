@@ -170,13 +170,13 @@ def test_dry_friction_is_flagged_with_its_sample_and_cause(tmp_path) -> None:
 
 def test_a_wrong_sensitivity_is_caught_by_the_recursion(tmp_path, monkeypatch) -> None:
     setup = cart_setup(tmp_path)
-    right = setup.plant.sensitivity
+    right = setup.plant.derivatives.sensitivity
 
     def wrong(*arguments, **options):
         found = right(*arguments, **options)
         return replace(found, psi=found.psi * 1.01)
 
-    monkeypatch.setattr(setup.plant, "sensitivity", wrong)
+    monkeypatch.setattr(setup.plant.derivatives, "sensitivity", wrong)
     tested = check(setup).self_test
     assert tested.recursion == pytest.approx(0.01, rel=0.05)
     assert not tested.passed
