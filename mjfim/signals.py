@@ -136,7 +136,7 @@ def _power_derivatives(t: Array, horizon: float, powers: np.ndarray, order: int)
 
 
 def independent_curves(curves: Array) -> Array:
-    """Linearly independent curves with the same span.
+    """Linearly independent curves with equal span.
 
     Curves may be nearly dependent: splines with more knots than there are samples, or waves that resemble polynomials.
 

@@ -70,7 +70,7 @@ def smallest_feasible(
 ) -> tuple[int | None, int | None]:
     """Find the smallest number of samples whose ratio is at most 1.
 
-    The ratio of what is reached to what is required is assumed to fall at least like the inverse square root of the number of
+    The ratio, e.g. of a reached to a required standard deviation, is assumed to fall at least like the inverse square root of the number of
     samples, as standard deviations do. The search brackets the place where it is 1 and narrows the bracket by secants.
 
     Args:
@@ -178,7 +178,7 @@ class _Bracket:
 
 
 def _factor(margin: float, evaluations: int) -> float:
-    """Factor to the next number of samples: what the square root law asks for, but steps that grow with every evaluation.
+    """Factor to the next number of samples: as the square root law demands, but with steps that grow with every evaluation.
 
     margin: 1 over the ratio; 0 where the ratio is infinite
     """

@@ -121,7 +121,7 @@ class Direction(Protocol):
         ...
 
     def reset(self) -> bool:
-        """Clear what was learnt; True if there was something to clear."""
+        """Clear the memory; True if there was something to clear."""
         ...
 
 

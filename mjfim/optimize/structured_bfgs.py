@@ -1,4 +1,4 @@
-"""Descent direction under hard limits: exact curvature of their barrier, learnt curvature of the remaining cost."""
+"""Descent direction under hard limits: exact curvature of their barrier, estimated curvature of the remaining cost."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class CurveMetric:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BasisResponse:
-    """Change of the state by the coefficients of a basis of controls; the basis is the same for every control.
+    """Change of the state by the coefficients of a basis of controls; all controls share the basis.
 
     Attributes:
         basis: (N, M) basis functions.
@@ -285,7 +285,7 @@ class StructuredBFGS:
 
     Both are exact at every point. The curvature pairs hold the remainder alone, so that they stay valid for a sharper barrier.
     Steps that are too long are damped by `BarrierExpansion.uniform_weights` (Levenberg & Marquardt). That shortens directions
-    without curvature of their own and leaves the way back inside the limits as it is.
+    that have little curvature, and not the way back inside the limits.
 
     Attributes:
         ridge: (nu,) weight of the control at every sample, which keeps the metric positive.

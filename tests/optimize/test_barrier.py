@@ -1,4 +1,4 @@
-"""The relaxed barrier: twice differentiable, defined outside, by hand on bands of every kind; the moves that a barrier sees."""
+"""The relaxed barrier: twice differentiable, defined outside the bounds, and checked by hand on bounds of every kind."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ S = np.array([-3.0, -0.2, 0.0, 0.04, 0.0499, 0.0501, 0.06, 0.4, 1.0, 3.0])
 
 @pytest.mark.parametrize("delta", [0.1, 1e-4])
 def test_the_barrier_is_twice_continuous_where_it_relaxes(delta: float) -> None:
-    """Value, slope and curvature from both sides; further inside the curvature falls, outside it does not."""
+    """Value, slope and curvature agree from both sides; the curvature falls towards the inside and is constant outside."""
     h = 1e-9
     below, above = (
         relaxed_log_barrier(np.array([delta * (1.0 + sign * h)]), delta) for sign in (-1.0, 1.0)
@@ -30,7 +30,7 @@ def test_the_barrier_is_twice_continuous_where_it_relaxes(delta: float) -> None:
 
 
 @pytest.mark.parametrize("delta", [0.05, 0.3])
-def test_its_derivatives_are_its_slopes_on_either_side(delta: float) -> None:
+def test_derivatives_agree_with_differences_on_both_sides(delta: float) -> None:
     h = 1e-6
     value, slope, curvature = relaxed_log_barrier(S, delta)
     up, down = relaxed_log_barrier(S + h, delta), relaxed_log_barrier(S - h, delta)
@@ -41,7 +41,7 @@ def test_its_derivatives_are_its_slopes_on_either_side(delta: float) -> None:
     assert (slope < 0.0).all() and (curvature > 0.0).all()
 
 
-def test_inside_it_is_the_logarithm_and_outside_it_rises_without_end() -> None:
+def test_the_barrier_is_the_logarithm_inside_and_grows_without_limit_outside() -> None:
     inside = np.array([0.2, 0.7, 1.0, 2.5])
     np.testing.assert_array_equal(relaxed_log_barrier(inside, 0.1)[0], -np.log(inside))
     outside = relaxed_log_barrier(np.array([-1e6, -10.0, -1.0, 0.0, 0.1]), 0.1)[0]
@@ -55,8 +55,8 @@ LOWER = np.array([-1.0, -INF, 2.0, -INF, -0.5, -INF])
 UPPER = np.array([3.0, 0.5, INF, INF, INF, -40.0])
 
 
-def test_a_band_is_scaled_by_half_of_its_range_or_by_its_only_bound() -> None:
-    """At least 1 where the bound alone says nothing about the size; 1 where there is none."""
+def test_the_scale_is_half_of_the_range_or_the_magnitude_of_the_only_bound() -> None:
+    """It is at least 1 with a single bound, and 1 without bounds."""
     np.testing.assert_array_equal(
         Bounds.from_range(LOWER, UPPER).scale, [2.0, 1.0, 2.0, 1.0, 1.0, 40.0]
     )
@@ -68,31 +68,31 @@ def test_margins_are_distances_to_the_nearer_bound() -> None:
     np.testing.assert_allclose(Bounds.from_range(LOWER, UPPER).margin(r), expected, atol=1e-12)
 
 
-def test_a_tightened_band_has_both_bounds_moved_inwards_and_its_scale_kept() -> None:
-    band = Bounds.from_range(LOWER, UPPER)
+def test_tightening_moves_both_bounds_inwards_and_keeps_the_scale() -> None:
+    bounds = Bounds.from_range(LOWER, UPPER)
     shares = np.array([0.1, 0.2, 0.5, 0.3, 0.0, 0.01])
-    inner = band.tightened(shares)
+    inner = bounds.tightened(shares)
     np.testing.assert_allclose(inner.lower, [-0.8, -INF, 3.0, -INF, -0.5, -INF])
     np.testing.assert_allclose(inner.upper, [2.8, 0.3, INF, INF, INF, -40.4])
-    np.testing.assert_array_equal(inner.scale, band.scale)
+    np.testing.assert_array_equal(inner.scale, bounds.scale)
 
 
 @pytest.mark.parametrize("delta", [0.1, 1e-3])
-def test_a_wall_is_the_sum_of_the_barriers_of_its_bounds(delta: float) -> None:
-    """Of both where there are two; its derivatives by every number, inside and outside, are differences of it."""
-    band, weight = Bounds.from_range(LOWER, UPPER), 0.25
+def test_the_barrier_of_bounds_is_the_sum_over_both_bounds(delta: float) -> None:
+    """Its derivatives by every number, inside and outside, agree with differences."""
+    bounds, weight = Bounds.from_range(LOWER, UPPER), 0.25
     r = np.array([[2.4, 0.2, 2.7, 5.0, 0.3, -60.0], [3.3, 0.8, 1.1, -5.0, -0.9, -35.0]])
 
     def value(numbers: Array) -> float:
         total = 0.0
         for i, (low, high, scale) in enumerate(
-            zip(band.lower, band.upper, band.scale, strict=True)
+            zip(bounds.lower, bounds.upper, bounds.scale, strict=True)
         ):
             for s in ((numbers[:, i] - low) / scale, (high - numbers[:, i]) / scale):
                 total += weight * float(np.sum(relaxed_log_barrier(s[np.isfinite(s)], delta)[0]))
         return total
 
-    barrier = band.barrier(r, delta, weight)
+    barrier = bounds.barrier(r, delta, weight)
     assert barrier.value == pytest.approx(value(r), rel=1e-12)
     assert (barrier.slope[:, 3] == 0.0).all() and (barrier.curvature[:, 3] == 0.0).all()  # free
     h = 1e-5
@@ -104,21 +104,21 @@ def test_a_wall_is_the_sum_of_the_barriers_of_its_bounds(delta: float) -> None:
             (value(r + e) - value(r - e)) / (2 * h), abs=1e-6 * size
         )
         up, down = (
-            band.barrier(r + e, delta, weight).slope,
-            band.barrier(r - e, delta, weight).slope,
+            bounds.barrier(r + e, delta, weight).slope,
+            bounds.barrier(r - e, delta, weight).slope,
         )
         np.testing.assert_allclose((up - down)[k, i] / (2 * h), barrier.curvature[k, i], rtol=1e-4)
 
 
-def test_the_middle_of_a_range_costs_nothing_and_the_gradient_leads_there() -> None:
-    band = Bounds.from_range(np.array([-1.0]), np.array([3.0]))
-    middle, right, outside = (band.barrier(np.array([[r]]), 0.1, 1.0) for r in (1.0, 2.0, 3.5))
+def test_the_middle_of_a_range_costs_nothing_and_the_gradient_points_there() -> None:
+    bounds = Bounds.from_range(np.array([-1.0]), np.array([3.0]))
+    middle, right, outside = (bounds.barrier(np.array([[r]]), 0.1, 1.0) for r in (1.0, 2.0, 3.5))
     assert (middle.value, float(middle.slope[0, 0])) == (0.0, 0.0)
     assert right.slope[0, 0] > 0.0
     assert outside.slope[0, 0] > right.slope[0, 0]
 
 
-def test_a_hedge_tells_the_largest_move_of_anything_over_its_range() -> None:
+def test_the_largest_relative_move_is_over_observations_and_controls() -> None:
     N, nx, nu = 4, 2, 1
     observations = np.zeros((N, 1, 2, nx + nu))
     observations[2, 0, 1] = [0.0, 3.0, 1.0]  # what is shown there moves by 3 z_1 + v over its scale

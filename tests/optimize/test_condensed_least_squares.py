@@ -1,4 +1,4 @@
-"""Condensed least squares against the full stacked Jacobian, brought to its answer by dense linear algebra."""
+"""Condensed least squares against dense linear algebra on the full stacked Jacobian."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.numerics import Array
 
 @dataclass(frozen=True, eq=False)
 class Dense:
-    """The same problem twice. J: (rows, P n + c), r: (rows,) of everything;  blocks: rows `[private, common, r]` of each"""
+    """A problem in condensed and in dense form. J: (rows, P n + c), r: (rows,) all rows;  blocks: rows `[private, common, r]`."""
 
     condensed: Condensed
     J: Array
@@ -42,7 +42,7 @@ class Dense:
 
 
 def condense(rows: Array) -> Array:
-    """(m, m) with the inner products of (k, m) rows, by singular values where the package takes QR."""
+    """(m, m) matrix with the inner products of (k, m) rows, by singular values; the package uses QR."""
     m = rows.shape[1]
     _, s, V = np.linalg.svd(rows, full_matrices=True)
     out = np.zeros((m, m))
@@ -52,7 +52,7 @@ def condense(rows: Array) -> Array:
 
 
 def spread(rows: Array, piece: int, P: int, n: int) -> Array:
-    """(k, P n + c) of rows `[private, common]` of one piece among all unknowns."""
+    """(k, P n + c) of rows `[private, common]` of one segment among the columns of all unknowns."""
     wide = np.zeros((len(rows), P * n + rows.shape[1] - n))
     wide[:, piece * n : (piece + 1) * n] = rows[:, :n]
     wide[:, P * n :] = rows[:, n:]
@@ -68,7 +68,7 @@ def problem(
     outer: int = 2,
     lame: bool = False,
 ) -> Dense:
-    """Random pieces of one to three blocks in shuffled order, with priors. lame: the last private unknown is never seen"""
+    """Random segments of one to three blocks in shuffled order, with priors. lame: no row depends on the last private unknown."""
     rng = np.random.default_rng(seed)
     m = n + c + 1
     owner = rng.permutation(np.concatenate([np.full(rng.integers(1, 4), i) for i in range(P)]))
@@ -110,10 +110,10 @@ def close(value: Array, wanted: Array, rtol: float = 1e-7) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 10.0])
-def test_a_step_is_that_of_the_full_stacked_problem(
+def test_a_step_solves_the_full_stacked_problem(
     shape: tuple[int, int, int], damping: float
 ) -> None:
-    """`min |J d + r|^2 + damping |scale d|^2`, the damping a further row of each unknown."""
+    """`min |J d + r|^2 + damping |scale d|^2`, with the damping as one further row per unknown."""
     for seed in range(6):
         dense = problem(seed, *shape, inner=shape[1] + 1, outer=shape[2] + 1)
         scale = np.random.default_rng(seed).uniform(0.5, 2.0, dense.n + dense.c)
@@ -167,8 +167,8 @@ def test_bounds_hold_and_the_bounded_step_is_the_best(shape: tuple[int, int, int
     assert active > 5, "bounds that never bind show nothing"
 
 
-def test_many_bounds_are_sorted_out() -> None:
-    """The conditions of optimality, with strongly correlated unknowns of which most end at a bound."""
+def test_many_active_bounds_satisfy_the_optimality_conditions() -> None:
+    """Strongly correlated unknowns, most of which end at a bound."""
     for seed in (
         4,
         1188,
@@ -199,8 +199,8 @@ def test_many_bounds_are_sorted_out() -> None:
         assert slope[d < upper - 1e-12].min(initial=0.0) > -1e-8, "could go further up"
 
 
-def test_a_common_unknown_that_cannot_move_stays() -> None:
-    """Both bounds at zero; the others go where they would without its column."""
+def test_a_common_unknown_with_equal_bounds_stays() -> None:
+    """Both bounds are zero; the other unknowns solve the problem without its column."""
     dense = problem(3, inner=3, outer=4)
     lower, upper = np.array([-FREE, 0.0, -FREE]), np.array([FREE, 0.0, FREE])
     step = dense.condensed.step(0.0, np.ones(5), lower, upper)
@@ -217,8 +217,8 @@ def test_a_common_unknown_that_cannot_move_stays() -> None:
 
 @pytest.mark.parametrize("lame", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_what_is_left_of_the_private_unknowns(shape: tuple[int, int, int], lame: bool) -> None:
-    """Elimination, information, profile: the Schur complement of the full normal matrix."""
+def test_elimination_gives_the_schur_complement(shape: tuple[int, int, int], lame: bool) -> None:
+    """Response, information and reduced rows against the full normal matrix."""
     for seed in range(4):
         dense = problem(seed, *shape, lame=lame)
         C, P, n, c = dense.condensed, dense.P, dense.n, dense.c
@@ -239,8 +239,8 @@ def test_what_is_left_of_the_private_unknowns(shape: tuple[int, int, int], lame:
             close(C.private_response, follow.reshape(P, n, c), rtol=1e-6)
 
 
-def test_lengths_are_those_of_the_columns() -> None:
-    """Of private ones the root mean square over pieces, of common ones the norm, priors with them."""
+def test_column_norms() -> None:
+    """Root mean square over segments for private unknowns, norm with priors for common ones."""
     dense = problem(1)
     norms = np.linalg.norm(dense.J, axis=0)
     own = np.sqrt(np.mean(norms[: dense.P * dense.n].reshape(dense.P, dense.n) ** 2, axis=0))
@@ -248,10 +248,10 @@ def test_lengths_are_those_of_the_columns() -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_scores_and_grams_of_the_blocks_sum_to_gradient_and_information(
+def test_scores_and_information_of_blocks_sum_to_the_whole(
     shape: tuple[int, int, int],
 ) -> None:
-    """Block by block against the rows themselves; all together with the priors, against the full problem."""
+    """Each block is compared with its rows, and the sum with the full problem including priors."""
     for seed in range(4):
         dense = problem(seed, *shape, inner=shape[1] + 1)
         C, n = dense.condensed, dense.n
@@ -282,8 +282,8 @@ def test_scores_and_grams_of_the_blocks_sum_to_gradient_and_information(
         )
 
 
-def test_the_gradient_is_the_slope_of_the_squares_with_the_private_unknowns_following() -> None:
-    """By differences of the minimum over the private unknowns."""
+def test_the_gradient_lets_the_private_unknowns_follow() -> None:
+    """Compared with differences of the minimum over the private unknowns."""
     dense = problem(5, inner=3)
     C = dense.condensed
 
@@ -300,8 +300,8 @@ def test_the_gradient_is_the_slope_of_the_squares_with_the_private_unknowns_foll
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-6])
-def test_pieces_that_do_not_tell_their_start_do_not_break_the_step(damping: float) -> None:
-    """One private unknown is in no row at all; one piece has fewer rows than unknowns."""
+def test_undetermined_private_unknowns_do_not_break_the_step(damping: float) -> None:
+    """No row depends on one private unknown, and one segment has fewer rows than unknowns."""
     for seed in range(5):
         dense = problem(seed, P=3, n=3, c=2, inner=0, outer=3, lame=True)
         scale = np.maximum(dense.condensed.column_norms, 0.0)
@@ -314,8 +314,8 @@ def test_pieces_that_do_not_tell_their_start_do_not_break_the_step(damping: floa
         assert np.isfinite(dense.condensed.information()).all()
 
 
-def test_only_private_unknowns() -> None:
-    """No common one: every piece goes its own way."""
+def test_a_problem_without_common_unknowns() -> None:
+    """Every segment is solved for itself."""
     dense = problem(2, P=3, n=2, c=0, inner=2, outer=0)
     none = np.zeros(0)
     step = dense.condensed.step(0.0, np.ones(2), none, none)
@@ -325,8 +325,8 @@ def test_only_private_unknowns() -> None:
     assert dense.condensed.block_scores.shape == (len(dense.blocks), 0)
 
 
-def test_size_and_each_are_standard_deviations() -> None:
-    """A common step by the information that is left of it; private steps by what fixes them at a held theta."""
+def test_step_lengths_are_standard_deviations() -> None:
+    """Common steps by the marginal information, private steps by the information at constant theta."""
     dense = problem(4, inner=3)
     C = dense.condensed
     step = C.step(0.0, np.ones(5), np.full(3, -FREE), np.full(3, FREE))

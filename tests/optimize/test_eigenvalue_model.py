@@ -1,4 +1,4 @@
-"""The model of the smooth E-criterion: its derivatives, where it comes from, and its proximal step."""
+"""The model of the smooth E-criterion: its derivatives, its derivation and its proximal step."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def test_coordinates_keep_scalar_products() -> None:
 
 
 @pytest.mark.parametrize("values", VALUES)
-def test_the_model_is_the_criterion_of_moved_information(values: str) -> None:
-    """`log phi` of an information whose logarithm moves by B; its share of the cost."""
+def test_the_model_is_the_criterion_of_changed_information(values: str) -> None:
+    """`log phi` of an information whose logarithm changes by B, times its weight in the cost."""
     rng, model = np.random.default_rng(1), model_of(VALUES[values])
 
     def wanted(d: Array) -> float:
@@ -64,7 +64,7 @@ def test_the_model_is_the_criterion_of_moved_information(values: str) -> None:
 
 
 @pytest.mark.parametrize("values", VALUES)
-def test_its_gradient_is_its_slope_and_it_is_convex(values: str) -> None:
+def test_the_gradient_agrees_with_differences_and_the_model_is_convex(values: str) -> None:
     rng, h, model = np.random.default_rng(2), 1e-5, model_of(VALUES[values])
     for size in (0.0, 0.05, 1.0):
         d = size * rng.normal(size=6)
@@ -75,8 +75,8 @@ def test_its_gradient_is_its_slope_and_it_is_convex(values: str) -> None:
 
 
 @pytest.mark.parametrize("values", VALUES)
-def test_the_settled_gradient_belongs_to_the_minimum_of_the_proximal_problem(values: str) -> None:
-    """Also where the spread is singular: coordinates that no step can move stay where they are put."""
+def test_the_minimising_gradient_solves_the_proximal_problem(values: str) -> None:
+    """Also with a singular spread: coordinates that no step can change keep their values."""
     rng, model = np.random.default_rng(3), model_of(VALUES[values][:2])
     for rank in (3, 1):
         root = rng.normal(size=(3, rank))
@@ -90,7 +90,7 @@ def test_the_settled_gradient_belongs_to_the_minimum_of_the_proximal_problem(val
         np.testing.assert_allclose(d0 - spread @ w, d0 + root @ best.x, rtol=0, atol=1e-5)
 
 
-def test_divided_differences_turn_a_change_into_one_of_the_logarithm() -> None:
+def test_divided_differences_give_the_derivative_of_the_matrix_logarithm() -> None:
     values, rng = np.array([0.5, 0.5 * (1 + 1e-9), 2.0]), np.random.default_rng(4)
     change = rng.normal(size=(3, 3))
     change = 1e-6 * (change + change.T)
@@ -101,10 +101,10 @@ def test_divided_differences_turn_a_change_into_one_of_the_logarithm() -> None:
 
 
 @pytest.mark.parametrize("information", ["plain", "nuisance", "delay and sensors"])
-def test_slopes_are_those_of_the_logarithm_of_simulated_information(
+def test_slopes_agree_with_the_logarithm_of_simulated_information(
     information: str, tmp_path: Path
 ) -> None:
-    """Off the diagonal too: along random controls, in the eigenvectors of the point."""
+    """Along random controls, in the eigenvectors of the point, off the diagonal too."""
     tables = {
         "plain": {},
         "nuisance": {"nuisance": {"initial": {"qpos:slide": 0.05}}},
@@ -148,7 +148,7 @@ def test_slopes_are_those_of_the_logarithm_of_simulated_information(
         assert whole == pytest.approx(expansion.slope(zeta) / point.cost, rel=1e-6, abs=1e-9)
 
 
-def test_other_criteria_and_plain_expansions_have_no_model(tmp_path: Path) -> None:
+def test_other_criteria_and_expansions_without_limits_have_no_model(tmp_path: Path) -> None:
     setup = cart_setup(tmp_path, limits={"control": {"force": (-9.0, 9.0)}}).free()
     point = setup.problem.point(setup.initial)
     assert (

@@ -1,4 +1,4 @@
-"""The bounded Levenberg-Marquardt search against scipy's on small analytic problems, and what it says when it fails."""
+"""The bounded Levenberg-Marquardt search against SciPy's on small analytic problems, and its status where it fails."""
 
 from __future__ import annotations
 
@@ -27,12 +27,14 @@ SHARP = SearchSettings(max_iterations=200, tolerance=1e-9)
 
 @dataclass(eq=False)
 class Analytic:
-    """Residuals of each piece as a function of (theta, its start), by complex steps; every point that is looked at is kept.
+    """Residuals of each segment as a function of (theta, its private unknowns); derivatives by complex steps.
 
-    prior: standard deviation of theta about 0;  spoil: of the Jacobian, (k, n + c) of a piece
+    Every evaluated point is kept.
+
+    spoil: changes the Jacobian of a segment, (k, n + c);  stop: number of the evaluation that sets the stop token
     """
 
-    pieces: tuple[Rows, ...]
+    segments: tuple[Rows, ...]
     lower: Array
     upper: Array
     spoil: Callable[[Array], Array] = np.asarray
@@ -41,7 +43,7 @@ class Analytic:
     seen: list[UnknownValues] = field(default_factory=list)
 
     def residuals(self, at: UnknownValues) -> list[Array]:
-        return [rows(at.theta, own) for rows, own in zip(self.pieces, at.private, strict=True)]
+        return [rows(at.theta, own) for rows, own in zip(self.segments, at.private, strict=True)]
 
     def cost(self, at: UnknownValues) -> float:
         self.seen.append(at)
@@ -53,8 +55,8 @@ class Analytic:
 
     def condense(self, at: UnknownValues) -> Condensed | None:
         n, c = at.private.shape[1], len(at.theta)
-        blocks = np.zeros((len(self.pieces), n + c + 1, n + c + 1))
-        for i, (rows, r) in enumerate(zip(self.pieces, self.residuals(at), strict=True)):
+        blocks = np.zeros((len(self.segments), n + c + 1, n + c + 1))
+        for i, (rows, r) in enumerate(zip(self.segments, self.residuals(at), strict=True)):
             both = np.concatenate([at.private[i], at.theta]).astype(complex)
             J = np.stack(
                 [rows(*_split(both + 1e-30j * e, n)).imag / 1e-30 for e in np.eye(n + c)], axis=1
@@ -63,7 +65,7 @@ class Analytic:
             blocks[i, : len(R)] = R
         if not np.isfinite(blocks).all():
             return None
-        owners = np.arange(len(self.pieces))
+        owners = np.arange(len(self.segments))
         return Condensed(
             blocks=blocks,
             segment_of_block=owners,
@@ -84,15 +86,15 @@ def _split(both: Array, n: int) -> tuple[Array, Array]:
 
 
 def problem(
-    *pieces: Rows, lower: list[float], upper: list[float] | None = None, **more: object
+    *segments: Rows, lower: list[float], upper: list[float] | None = None, **more: object
 ) -> Analytic:
-    """Bounds of the common unknowns; none above where not stated."""
+    """A problem with bounds of the common unknowns; without upper bounds where none are given."""
     top = np.full(len(lower), FREE) if upper is None else np.array(upper)
-    return Analytic(pieces, np.array(lower), top, **more)  # type: ignore[arg-type]
+    return Analytic(segments, np.array(lower), top, **more)  # type: ignore[arg-type]
 
 
 def reference(p: Analytic, start: UnknownValues) -> tuple[Array, Array, float]:
-    """theta, starts and half of the squares by scipy, all unknowns in one vector."""
+    """theta, private unknowns and half of the squares by SciPy, with all unknowns in one vector."""
     c, shape = len(start.theta), start.private.shape
 
     def f(z: Array) -> Array:
@@ -108,14 +110,14 @@ def reference(p: Analytic, start: UnknownValues) -> tuple[Array, Array, float]:
 
 
 def solved(p: Analytic, start: UnknownValues, search: SearchSettings = SHARP) -> Solution:
-    """What `minimise` finds."""
+    """Solution of `minimise`."""
     found = minimise(p, start, search, Budget(stop=p.token))
     assert found is not None
     return found
 
 
 def decays(sigma: float = 0.01) -> tuple[Rows, ...]:
-    """Exponential decays with one rate and one offset, each piece with an amplitude of its own."""
+    """Exponential decays with one rate and one offset, each segment with its amplitude as private unknown."""
     rng = np.random.default_rng(0)
     t = np.linspace(0.0, 2.0, 25)
     found = []
@@ -184,8 +186,8 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_minimum_is_that_of_scipy(name: str) -> None:
-    """Within bounds that no evaluated point leaves; the cost falls from iterate to iterate."""
+def test_the_minimum_agrees_with_scipy(name: str) -> None:
+    """No evaluated point leaves the bounds, and the cost falls from iterate to iterate."""
     build, start = CASES[name]
     p = build()
     told: list[IterationReport] = []
@@ -207,8 +209,8 @@ def test_the_minimum_is_that_of_scipy(name: str) -> None:
     assert found.cost == pytest.approx(p.cost(found.unknowns), rel=1e-12)
 
 
-def test_gauss_newton_goes_where_damped_steps_go_and_ignores_bounds() -> None:
-    """Undamped from nearby; steps that would raise the cost are halved."""
+def test_gauss_newton_finds_the_minimum_and_ignores_bounds() -> None:
+    """Steps that would raise the cost are halved."""
     p = problem(*decays(), lower=[0.0, 0.35], upper=[1.2, 2.0])
     start = UnknownValues(theta=np.array([1.0, 0.4]), private=np.ones((3, 1)))
     p.lower, p.upper = np.full(2, -FREE), np.full(2, FREE)
@@ -230,15 +232,15 @@ def test_gauss_newton_goes_where_damped_steps_go_and_ignores_bounds() -> None:
 
 
 def cliff(theta: Array, own: Array) -> Array:
-    """Nothing left of 0.2, where the minimum is close; the first steps from the right overshoot into it."""
+    """Diverges for theta below 0.2, close to the minimum; the first steps from the right overshoot into that region."""
     bad = np.real(theta[0]) < 0.2
     x = np.linspace(0.0, 1.0, 12)
     y = 1.0 / (0.25 + x)
     return np.where(bad, np.nan, 100.0 * (1.0 / (theta[0] + x) - y))
 
 
-def test_places_that_diverge_are_survived() -> None:
-    """Steps into a region without a cost are shortened; a start there gives nothing."""
+def test_diverging_trials_shorten_the_step() -> None:
+    """A search that starts where the simulation diverges has no solution."""
     p = problem(cliff, lower=[-10.0])
     found = solved(p, alone(3.0))
     assert any(at.theta[0] < 0.2 for at in p.seen), "no step led off the cliff"
@@ -254,7 +256,7 @@ def test_places_that_diverge_are_survived() -> None:
 
 
 def test_a_minimum_at_a_cliff_is_not_called_converged() -> None:
-    """The cost falls all the way to where nothing can be simulated any more."""
+    """The cost falls up to the border of the region that cannot be simulated."""
 
     def rows(theta: Array, own: Array) -> Array:
         bad = np.real(theta[0]) < 1.0
@@ -266,8 +268,8 @@ def test_a_minimum_at_a_cliff_is_not_called_converged() -> None:
     assert "converged" not in found.status.replace("not converged", "")
 
 
-def test_a_neighbourhood_that_diverges_is_said() -> None:
-    """Where the linearisation fails after a step, the best is returned, with the linearisation before."""
+def test_a_diverging_neighbourhood_is_reported() -> None:
+    """Where the linearisation fails after a step, the best point is returned with the previous linearisation."""
 
     class Once(Analytic):
         def condense(self, at: UnknownValues) -> Condensed | None:
@@ -284,7 +286,7 @@ def test_a_neighbourhood_that_diverges_is_said() -> None:
 @pytest.mark.parametrize("damped", [True, False])
 @pytest.mark.parametrize("fault", ["sign", "swapped", "noise"])
 def test_a_wrong_jacobian_is_noticed(damped: bool, fault: str) -> None:
-    """No step helps, though the linearisation promises much: that is no convergence, however short damping makes steps."""
+    """No step helps although the linearisation predicts a decrease: not converged, however short the damped steps are."""
     rng = np.random.default_rng(3)
     spoils = {
         "sign": lambda J: -J,
@@ -300,8 +302,8 @@ def test_a_wrong_jacobian_is_noticed(damped: bool, fault: str) -> None:
     assert found.status.startswith(("stopped", "not converged"))
 
 
-def test_the_noise_of_a_simulation_does_not_hinder_convergence() -> None:
-    """A cost with round-off far above the machine's: the search ends with success next to the minimum."""
+def test_numerical_noise_does_not_prevent_convergence() -> None:
+    """With round-off far above machine precision the search still succeeds close to the minimum."""
     for seed in range(10):
 
         def rough(theta: Array, own: Array, seed: int = seed) -> Array:
@@ -319,8 +321,8 @@ def test_the_noise_of_a_simulation_does_not_hinder_convergence() -> None:
         np.testing.assert_allclose(found.unknowns.theta, theta, rtol=1e-3)
 
 
-def test_a_start_at_the_minimum_ends_at_once() -> None:
-    """Also where residuals vanish there, and where they do not."""
+def test_a_search_from_the_minimum_ends_at_once() -> None:
+    """With and without residuals that vanish at the minimum."""
     exact = solved(problem(rosenbrock, lower=[-5.0, -5.0]), alone(1.0, 1.0))
     assert exact.success
     assert exact.iterations == 1
@@ -331,8 +333,8 @@ def test_a_start_at_the_minimum_ends_at_once() -> None:
     np.testing.assert_allclose(again.unknowns.theta, theta, rtol=1e-6)
 
 
-def test_a_flat_valley_is_not_mistaken_for_its_end() -> None:
-    """On the floor of a narrow valley first steps are short; the minimum lies ten standard deviations on."""
+def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
+    """The first steps on the floor of a narrow valley are short; the minimum is ten standard deviations away."""
     for thin in (1e-2, 1e-3, 1e-4, 1e-5):
 
         def rows(theta: Array, own: Array, thin: float = thin) -> Array:
@@ -393,8 +395,8 @@ def test_an_exhausted_time_is_not_an_interruption() -> None:
     assert "the time is used up" in found.status
 
 
-def test_the_limit_of_iterations_is_kept_and_said() -> None:
-    """And the cost of what is returned is that of its unknowns."""
+def test_the_limit_of_iterations_is_kept_and_reported() -> None:
+    """The returned cost belongs to the returned unknowns."""
     p = problem(rosenbrock, lower=[-5.0, -5.0])
     found = solved(p, alone(-1.2, 1.0), SearchSettings(max_iterations=3))
     assert found.iterations == 3
@@ -404,7 +406,7 @@ def test_the_limit_of_iterations_is_kept_and_said() -> None:
 
 
 def test_the_last_linearisation_is_at_the_solution() -> None:
-    """Unless that was not wanted; then it is the one before."""
+    """Without `relinearise_at_end` it is the previous one."""
     start = UnknownValues(theta=np.array([0.3, 0.0]), private=np.ones((3, 1)))
     p = problem(*decays(), lower=[0.0, -5.0])
     found = solved(p, start, SearchSettings())

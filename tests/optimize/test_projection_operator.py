@@ -52,9 +52,9 @@ def jacobians(x: Array) -> tuple[Array, Array]:
 
 @dataclass
 class Pendulum:
-    """Swing towards upright at quadratic cost. Remembers every value that was asked for.
+    """Swing towards upright with quadratic cost. Keeps every value that was evaluated.
 
-    shift: subtracted from the cost;  sign: of the gradient that `expand` tells;  wall: |u| beyond which a trial diverges
+    shift: subtracted from the cost;  sign: of the gradient of `expand`;  wall: |u| beyond which a trial diverges
     refinements: how often `refine` has something better
     """
 
@@ -143,7 +143,7 @@ def run(problem: Any, direction: Direction, **changes: Any) -> list[Iterate[Curv
 
 @pytest.fixture(scope="module")
 def optimum() -> float:
-    """The least cost over controls, by SciPy with its own differences."""
+    """The smallest cost over controls, by SciPy with finite differences."""
     problem = Pendulum()
 
     def cost(u: Array) -> float:
@@ -162,7 +162,7 @@ DIRECTIONS: dict[str, Callable[[], Direction]] = {
 
 
 @pytest.mark.parametrize("method", [pytest.param("metric", marks=pytest.mark.slow), "lbfgs"])
-def test_descent_reaches_the_optimum_that_scipy_finds(method: str, optimum: float) -> None:
+def test_the_optimum_agrees_with_scipy(method: str, optimum: float) -> None:
     iterates = run(Pendulum(), DIRECTIONS[method]())
     assert iterates[-1].status is Status.CONVERGED
     assert iterates[-1].value == pytest.approx(optimum, rel=1e-7)
@@ -180,7 +180,7 @@ def test_the_optimum_does_not_depend_on_how_often_the_regulator_is_renewed(
 
 
 @pytest.mark.parametrize("method", DIRECTIONS)
-def test_iterates_go_down_and_are_numbered_and_only_the_last_has_a_status(method: str) -> None:
+def test_the_cost_of_iterates_falls_and_only_the_last_has_a_status(method: str) -> None:
     iterates = run(Pendulum(), DIRECTIONS[method]())
     assert all(b.value < a.value for a, b in pairwise(iterates))
     assert [i.index for i in iterates] == list(range(len(iterates)))
@@ -206,7 +206,7 @@ def test_the_expansion_of_this_problem_is_exact(method: str) -> None:
     assert directional_check([1.001 * expansion.slope(short)], [J], 1.0) > 5e-4
 
 
-def test_slope_decides_convergence_and_is_relative_to_the_cost() -> None:
+def test_convergence_compares_the_slope_with_the_cost() -> None:
     for tolerance in (1e-2, 1e-5):
         iterates = run(Pendulum(), METRIC, tolerance=tolerance)
         assert iterates[-1].status is Status.CONVERGED
@@ -257,7 +257,7 @@ def test_a_gradient_that_is_wrong_in_part_of_the_horizon_is_not_called_converged
 
 @dataclass
 class Upwards:
-    """A direction that climbs although the expansion is right."""
+    """An ascent direction with a correct expansion."""
 
     def __call__(self, expansion: Expansion, K: Array) -> TangentCurve:
         zeta = METRIC(expansion, K)
@@ -271,7 +271,7 @@ class Upwards:
         return False
 
 
-def test_a_direction_that_climbs_is_not_called_converged() -> None:
+def test_an_ascent_direction_is_not_called_converged() -> None:
     iterates = run(Pendulum(), Upwards(), max_iterations=5)
     assert iterates[-1].status is not Status.CONVERGED
     assert iterates[-1].value <= iterates[0].value
@@ -280,7 +280,7 @@ def test_a_direction_that_climbs_is_not_called_converged() -> None:
 def searched(
     problem: Pendulum, factor: float, armijo: Armijo, first: float = 1.0
 ) -> tuple[Any, float, float]:
-    """(what the line search found, J at the start, slope) along the metric direction times a factor."""
+    """Result of the line search, J at the start and slope, along the metric direction times a factor."""
     point = start(problem)
     expansion = problem.expand(point)
     K = REGULATOR.gain(expansion)
@@ -353,7 +353,7 @@ def test_armijo_backtracks_from_trials_that_diverge() -> None:
     assert problem.value(trial) < value
 
 
-def test_descent_goes_on_past_trials_that_diverge(optimum: float) -> None:
+def test_descent_continues_after_diverged_trials(optimum: float) -> None:
     free = run(Pendulum(), LBFGS(R * DT))
     peak = np.abs(free[-1].point.u).max()
     problem = Pendulum(wall=1.02 * peak)
@@ -361,7 +361,7 @@ def test_descent_goes_on_past_trials_that_diverge(optimum: float) -> None:
     assert iterates[-1].value == pytest.approx(optimum, rel=1e-6)
 
 
-def test_armijo_never_gets_longer_than_it_is_asked_to_begin_with() -> None:
+def test_armijo_never_exceeds_its_first_step() -> None:
     (_, gamma), _, _ = searched(Pendulum(), 1.0, Armijo(), first=0.125)
     assert gamma <= 0.125
 
@@ -377,7 +377,7 @@ def test_armijo_refuses_settings_that_cannot_work(settings: dict[str, float]) ->
 
 @pytest.mark.parametrize("method", DIRECTIONS)
 @pytest.mark.parametrize("share", [0.0, 0.9, 1.0, 1.5])
-def test_a_constant_added_to_the_cost_does_not_keep_the_descent_from_the_optimum(
+def test_a_constant_in_the_cost_does_not_change_the_optimum(
     method: str, share: float, optimum: float
 ) -> None:
     begin = Pendulum()
@@ -463,7 +463,7 @@ def test_lbfgs_without_memory_is_steepest_descent_in_the_control_metric() -> Non
     np.testing.assert_allclose(c, -expansion.gradient(K) / (R * DT), rtol=1e-10)
 
 
-def test_lbfgs_refuses_pairs_of_negative_curvature_and_forgets_on_demand() -> None:
+def test_lbfgs_refuses_pairs_of_negative_curvature_and_can_be_reset() -> None:
     problem, direction = Pendulum(), LBFGS(R * DT)
     expansion = problem.expand(start(problem))
     K = REGULATOR.gain(expansion)
@@ -480,7 +480,7 @@ def test_lbfgs_refuses_pairs_of_negative_curvature_and_forgets_on_demand() -> No
     assert direction._pairs == ()
 
 
-def test_lbfgs_carried_to_a_finer_grid_keeps_its_curvature_and_its_direction() -> None:
+def test_lbfgs_on_a_finer_grid_keeps_its_curvature_and_direction() -> None:
     direction, _, _ = learned(memory=6)
     fine = direction.refined(R * DT / 4, 4)
     assert len(fine._pairs) == len(direction._pairs) == 6
@@ -503,7 +503,7 @@ def test_lbfgs_carried_to_a_finer_grid_keeps_its_curvature_and_its_direction() -
     assert direction._pairs[0].s.shape == (N, 1)  # the coarse memory is left alone
 
 
-def test_feedback_only_where_the_plant_is_not_calm() -> None:
+def test_feedback_only_above_the_threshold_of_amplification() -> None:
     expansion = Pendulum().expand(start(Pendulum()))
     amplification = largest_amplification(expansion.A)
     assert not replace(REGULATOR, feedback_threshold=1.01 * amplification).gain(expansion).any()

@@ -25,12 +25,12 @@ def points(seed: int) -> Array:
 
 
 def residuals(x: Array, y: Array) -> Array:
-    """Of a line."""
+    """Residuals of a line."""
     return np.asarray(x[0] + x[1] * T - y)
 
 
 def reweighted(loss: RobustLoss, y: Array) -> Array:
-    """The line by rows multiplied with their weights, again and again."""
+    """The line by iteratively reweighted least squares."""
     A, x = np.column_stack([np.ones_like(T), T]), np.zeros(2)
     for _ in range(2000):
         w = loss.weight(residuals(x, y))
@@ -40,8 +40,8 @@ def reweighted(loss: RobustLoss, y: Array) -> Array:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("scale", [0.7, 3.0])
-def test_the_optimum_is_that_of_scipy(kind: Kind, scale: float) -> None:
-    """And so is the value there."""
+def test_the_optimum_agrees_with_scipy(kind: Kind, scale: float) -> None:
+    """The value at the optimum agrees as well."""
     loss, y = RobustLoss(kind=kind, scale=scale), points(0)
     x = reweighted(loss, y)
     wanted = least_squares(
@@ -68,7 +68,7 @@ def test_the_weight_follows_from_the_value(kind: Kind) -> None:
     np.testing.assert_array_equal(loss.weight(np.zeros(3)), 1.0)
 
 
-def test_outliers_count_less_and_less_and_small_residuals_fully() -> None:
+def test_outliers_count_less_than_small_residuals() -> None:
     """All losses agree with squares near zero; far away they are in the order of scipy's table."""
     small, large = np.full(5, 1e-4), np.full(5, 1e3)
     for kind in KINDS:
@@ -82,8 +82,8 @@ def test_outliers_count_less_and_less_and_small_residuals_fully() -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0, 4.5])
-def test_the_mean_square_of_what_is_no_outlier(scale: float) -> None:
-    """Of a million normal numbers; a linear loss knows no outliers."""
+def test_the_mean_square_of_inliers(scale: float) -> None:
+    """Compared with a million normal numbers; a linear loss has no outliers."""
     r = np.random.default_rng(2).standard_normal(1_000_000)
     for kind in KINDS:
         loss = RobustLoss(kind=kind, scale=scale)
@@ -94,7 +94,7 @@ def test_the_mean_square_of_what_is_no_outlier(scale: float) -> None:
 
 
 def test_outliers_hardly_move_a_robust_line() -> None:
-    """Against many draws: squares are pulled away, the robust ones stay within a few deviations."""
+    """Over many draws the ordinary fit is biased, and robust fits stay within a few standard deviations."""
     found = {
         kind: np.array(
             [reweighted_few(RobustLoss(kind=kind, scale=1.5), points(seed)) for seed in range(30)]

@@ -1,4 +1,4 @@
-"""Directions under hard limits: metrics against dense matrices and each other, a toy with a barrier against SciPy's optimum."""
+"""Directions under hard limits: metrics against dense matrices, and a small problem with a barrier against SciPy's optimum."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def random_expansion(rng: np.random.Generator) -> tuple[Expansion, Weights]:
 
 
 def dense(metric: CurveMetric) -> Array:
-    """(N*nu, N*nu) matrix of a metric: what it makes of each unit step."""
+    """(N*nu, N*nu) matrix of a metric, applied to every unit step."""
     units = np.eye(N * NU).reshape(-1, N, NU)
     return np.stack([metric.apply(e).reshape(-1) for e in units], axis=1)
 
 
 @pytest.mark.parametrize("feedback", [False, True])
-def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: bool) -> None:
+def test_a_metric_is_symmetric_positive_and_its_solve_inverts_it(feedback: bool) -> None:
     rng = np.random.default_rng(1)
     expansion, weights = random_expansion(rng)
     K = feedback * 0.3 * rng.normal(size=(N, NU, NX))
@@ -58,7 +58,7 @@ def test_a_metric_is_symmetric_positive_and_undone_by_its_recursions(feedback: b
     )
 
 
-def test_on_an_identity_basis_both_metrics_agree() -> None:
+def test_both_metrics_agree_on_an_identity_basis() -> None:
     rng = np.random.default_rng(2)
     expansion, weights = random_expansion(rng)
     free = CurveMetric(
@@ -73,8 +73,8 @@ def test_on_an_identity_basis_both_metrics_agree() -> None:
     assert relative_error(based.H, dense(free)) < 1e-10
 
 
-def test_on_fewer_curves_the_metric_is_the_projected_one() -> None:
-    """Also where some weights are zero, as far as every curve is weighed by something."""
+def test_the_metric_of_a_basis_is_the_projected_metric() -> None:
+    """Also with some weights equal to zero, as long as every basis function has some weight."""
     rng = np.random.default_rng(3)
     expansion, weights = random_expansion(rng)
     weights.Q[4:9], weights.S[4:9], weights.W[::2] = 0.0, 0.0, 0.0
@@ -99,7 +99,7 @@ def test_on_fewer_curves_the_metric_is_the_projected_one() -> None:
 
 @dataclass(frozen=True, eq=False)
 class ToyPoint:
-    """A control of the toy with its curve."""
+    """A control of the toy problem with its states."""
 
     u: Array
     x: Array
@@ -107,7 +107,7 @@ class ToyPoint:
 
 @dataclass(frozen=True, eq=False)
 class Toy:
-    """A linear plant, a convex quadratic cost that wants to leave, and a barrier on its first state and its control.
+    """A linear plant, a convex quadratic cost with its minimum outside the limits, and a barrier on first state and control.
 
     mu: of the barrier;  steps: also on the steps of the control
     """
@@ -215,7 +215,7 @@ FED_BACK = Regulator(Q=np.eye(NX), R=np.eye(NU), terminal=np.eye(NX))
 
 @pytest.mark.parametrize("mu", [1e-1, 1e-3])
 @pytest.mark.parametrize("kind", ["free", "fed back", "with steps", "on a basis"])
-def test_the_toy_is_driven_to_the_optimum_that_scipy_finds(kind: str, mu: float) -> None:
+def test_the_optimum_of_the_toy_problem_agrees_with_scipy(kind: str, mu: float) -> None:
     toy, basis = Toy(mu, steps=kind == "with steps"), None
     if kind == "on a basis":
         t = np.linspace(-1.0, 1.0, N)
@@ -261,8 +261,8 @@ def test_the_toy_is_driven_to_the_optimum_that_scipy_finds(kind: str, mu: float)
         assert 0.0 < toy.shown.margin(iterates[-1].point.x[:, :1]).min() < 0.05
 
 
-def test_what_was_learnt_outlives_a_sharper_barrier() -> None:
-    """Pairs hold the change of the cost's gradient alone: nothing of a barrier, blunt or sharp."""
+def test_stored_pairs_do_not_contain_the_barrier() -> None:
+    """They hold the change of the cost's gradient alone, so that they stay valid for a sharper barrier."""
     direction, blunt = StructuredBFGS(np.full(NU, 1e-3)), Toy(1e-1)
     for iterate in optimize(
         blunt,
@@ -287,7 +287,7 @@ def test_what_was_learnt_outlives_a_sharper_barrier() -> None:
     assert direction.reset() is False
 
 
-def test_no_step_moves_anything_limited_too_far() -> None:
+def test_no_step_changes_a_limited_quantity_by_more_than_the_reach() -> None:
     toy = Toy(1e-4)
     e = toy.expand(toy.point(np.zeros((N, NU))))
     assert e.barrier is not None
@@ -303,8 +303,8 @@ def test_no_step_moves_anything_limited_too_far() -> None:
     )  # a short step stays as it is
 
 
-def test_damping_shortens_what_nothing_holds_and_leaves_the_way_back_inside() -> None:
-    """From outside a bound, with a cost that pulls far elsewhere: the damped step gains more than the one scaled down."""
+def test_damping_keeps_the_step_back_inside_the_limits() -> None:
+    """From outside a bound, with a cost that pulls elsewhere, the damped step returns further than the scaled one."""
     toy, outside = Toy(1e-4), np.zeros((N, NU))
     outside[3, 0] = toy.control.upper[0] + 0.2 * toy.control.scale[0]
     e = toy.expand(toy.point(outside))
@@ -322,7 +322,7 @@ def test_damping_shortens_what_nothing_holds_and_leaves_the_way_back_inside() ->
     assert damped.v[3, 0] < 2.0 * long.v[3, 0] / far < 0.0
 
 
-def test_damping_fades_where_steps_are_short() -> None:
+def test_damping_falls_where_steps_are_short() -> None:
     toy = Toy(1e-2)
     direction = StructuredBFGS(np.full(NU, 1e-3), damping=10.0)
     iterates = list(
@@ -348,8 +348,8 @@ def test_an_expansion_without_limits_is_refused() -> None:
 
 
 @pytest.mark.parametrize("based", [False, True])
-def test_the_direction_goes_down_on_a_real_design(based: bool, tmp_path: Path) -> None:
-    """Its slope along the expansion is that of simulated trials."""
+def test_the_direction_descends_on_a_simulated_design(based: bool, tmp_path: Path) -> None:
+    """Its slope agrees with differences of simulated trials."""
     from mjfim.excitation.constraints import fence_of
     from mjfim.excitation.interior_point import InteriorProblem
     from mjfim.signals import spline_basis

@@ -1,0 +1,144 @@
+"""Generated controls keep their amplitude, their frequencies and their seed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjfim.errors import ExperimentError
+from mjfim.experiment.control_signal import generate
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import Setup
+from mjfim.experiment.system_tables import Signal
+from tests.support.paths import MODELS
+
+NAMES = ("left", "right")
+REST = np.zeros(2)
+T = np.arange(400) * 0.01
+
+
+@pytest.mark.parametrize("kind", ["constant", "sine", "chirp", "multisine"])
+def test_amplitude_bounds_the_signal(kind: str) -> None:
+    """|u - offset| <= amplitude, per actuator, and nearly reached."""
+    signal = Signal(
+        kind=kind,
+        amplitude={"left": 2.0, "right": 0.5},
+        offset={"left": -1.0, "right": 3.0},
+        frequency=1.0,
+    )
+    u = generate(signal, T, NAMES, REST)
+    assert u.shape == (400, 2)
+    peak = np.abs(u - [-1.0, 3.0]).max(axis=0)
+    assert np.all(peak <= np.array([2.0, 0.5]) * (1 + 1e-12))
+    assert np.all(peak >= np.array([2.0, 0.5]) * 0.99)
+
+
+def test_one_amplitude_for_all_and_none_for_the_unnamed() -> None:
+    """A number holds for every actuator; a table leaves the others at rest."""
+    u = generate(Signal(kind="constant", amplitude=2.0, offset=1.0), T, NAMES, REST)
+    assert np.array_equal(u, np.full((400, 2), 3.0))
+    u = generate(Signal(kind="sine", amplitude={"right": 2.0}), T, NAMES, REST)
+    assert not u[:, 0].any()
+    assert u[:, 1].any()
+
+
+def test_sine_has_its_frequency() -> None:
+    """Each actuator is 17 % faster than the one before, so that no two have equal frequencies."""
+    u = generate(Signal(kind="sine", amplitude=3.0, frequency=0.5), T, NAMES, REST)
+    assert np.allclose(u[:, 0], 3.0 * np.sin(np.pi * T), rtol=0, atol=1e-12)
+    assert np.allclose(u[:, 1], 3.0 * np.sin(1.17 * np.pi * T), rtol=0, atol=1e-12)
+
+
+def test_chirp_sweeps_its_frequencies() -> None:
+    """Starts at zero, its frequency grows linearly to the end; the next actuator sweeps 17 % higher."""
+    u = generate(
+        Signal(kind="chirp", amplitude=2.0, frequency=1.0, frequency_end=5.0), T, NAMES, REST
+    )
+    turns = 1.0 * T + 0.5 * (5.0 - 1.0) * T**2 / T[-1]
+    assert np.allclose(u[:, 0], 2.0 * np.sin(2 * np.pi * turns), rtol=0, atol=1e-9)
+    assert np.allclose(u[:, 1], 2.0 * np.sin(2 * np.pi * 1.17 * turns), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["sine", "chirp"])
+def test_signals_begin_without_a_jump(kind: str) -> None:
+    """Without an offset they oscillate about the control at rest; a stated offset replaces it."""
+    rest = np.array([4.0, -7.0])
+    u = generate(Signal(kind=kind, amplitude=2.0), T, NAMES, rest)
+    assert u[0] == pytest.approx(rest, abs=1e-12)
+    assert np.array_equal(u, rest + generate(Signal(kind=kind, amplitude=2.0), T, NAMES, REST))
+    stated = generate(Signal(kind=kind, amplitude=2.0, offset={"right": 1.0}), T, NAMES, rest)
+    assert stated[0] == pytest.approx([0.0, 1.0], abs=1e-12)
+    assert rest.tolist() == [4.0, -7.0]
+
+
+def test_chirp_ends_at_five_times_its_start_by_default() -> None:
+    """The end of the sweep may be left out."""
+    default = generate(Signal(kind="chirp", frequency=0.5), T, ("u",), REST[:1])
+    assert np.array_equal(
+        default,
+        generate(Signal(kind="chirp", frequency=0.5, frequency_end=2.5), T, ("u",), REST[:1]),
+    )
+
+
+def test_multisine_contains_its_harmonics_only() -> None:
+    """Over whole periods all power is at f, 2 f, ..., n f."""
+    u = generate(Signal(kind="multisine", frequency=0.5, harmonics=4, seed=2), T, ("u",), REST[:1])[
+        :, 0
+    ]
+    spectrum = np.abs(np.fft.rfft(u))  # bins of 0.25 Hz
+    expected = {2, 4, 6, 8}
+    assert set(np.flatnonzero(spectrum > 1e-9 * spectrum.max())) == expected
+
+
+def test_multisine_seed() -> None:
+    """Equal seeds give equal signals, other seeds and other actuators do not."""
+    first, again, other = (
+        generate(Signal(kind="multisine", amplitude=1.0, seed=seed), T, NAMES, REST)
+        for seed in (1, 1, 2)
+    )
+    assert np.array_equal(first, again)
+    assert np.abs(first - other).max() > 0.1
+    assert np.abs(first[:, 0] - first[:, 1]).max() > 0.1
+
+
+@pytest.mark.parametrize("key", ["amplitude", "offset"])
+def test_unknown_actuator(key: str) -> None:
+    """The message names the key, the unknown actuator and the valid names."""
+    signal = Signal(kind="sine", **{key: {"lift": 1.0}})
+    with pytest.raises(ExperimentError, match=rf"initial\.control\.{key}: .*'lift'.*left, right"):
+        generate(signal, T, NAMES, REST)
+
+
+def test_setup_samples_the_signal_at_its_rate() -> None:
+    """At 20 Hz it has every fifth sample of 100 Hz; a coarser setup has the mean over its longer samples."""
+    e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
+        horizon=2.0, initial={"control": {"kind": "sine", "frequency": 0.7}}
+    )
+    fine, slow = Setup(e), Setup(e.replace(rate=20.0, measure_rate=20.0))
+    assert np.allclose(slow.control, fine.control[::5], rtol=0, atol=1e-12)
+    coarse = fine.coarser(4)
+    assert coarse.dt == pytest.approx(4 * fine.dt)
+    assert np.allclose(
+        coarse.control[:, 0], fine.control.reshape(-1, 4).mean(axis=1), rtol=0, atol=1e-12
+    )
+
+
+def test_the_signal_oscillates_about_the_control_of_the_keyframe(tmp_path: Path) -> None:
+    """The signal starts at the keyframe's control; an offset in the file replaces it."""
+    model = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
+    held = model.replace('name="hanging"', 'name="hanging" ctrl="1.5"')
+    assert held != model
+    (tmp_path / "held.xml").write_text(held, encoding="utf-8")
+    e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
+        model=str(tmp_path / "held.xml"),
+        horizon=1.0,
+        initial={"control": {"kind": "sine", "amplitude": 0.5}},
+    )
+    control = Setup(e).control[:, 0]
+    assert (control[0], control.max(), control.min()) == pytest.approx((1.5, 2.0, 1.5), abs=1e-2)
+    stated = Setup(
+        e.replace(initial={"control": {"kind": "sine", "amplitude": 0.5, "offset": -1.0}})
+    )
+    assert stated.control[:, 0] == pytest.approx(control - 2.5, abs=1e-12)

@@ -1,0 +1,125 @@
+"""Control tables are held from row to row and keep every digit."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjfim.arrays import Array
+from mjfim.errors import RecordingError
+from mjfim.recordings.control_table import read_control
+from mjfim.recordings.formats.read import read_table
+
+Read = Callable[..., Array]
+
+NAMES = ("left", "right")
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Read:
+    """Write columns as CSV and read the control back on a grid of period dt."""
+
+    def run(
+        columns: Mapping[str, object], N: int, dt: float, names: tuple[str, ...] = ("u",)
+    ) -> Array:
+        path = tmp_path / "table.csv"
+        rows = zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True)
+        lines = [
+            ",".join(columns),
+            *(",".join("" if v != v else repr(v) for v in row) for row in rows),
+        ]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return read_control(path, np.arange(N) * dt, dt, names)
+
+    return run
+
+
+def held(stamps: Array, values: Array, t: Array) -> Array:
+    """Zero-order hold by a plain search."""
+    return np.array([values[max(i for i, s in enumerate(stamps) if s <= now + 1e-9)] for now in t])
+
+
+def test_coarse_table_is_held(read: Read) -> None:
+    """Ten samples per row, each with the row's value; the last row is held for one period."""
+    u = read({"t": [0.0, 0.1, 0.2], "u": [1.0, -2.0, 5.0]}, 30, 0.01)
+    assert u.shape == (30, 1)
+    assert u[:, 0].tolist() == [1.0] * 10 + [-2.0] * 10 + [5.0] * 10
+
+
+def test_fine_table_is_sampled(read: Read) -> None:
+    """A sample has the value of the row at its time, not a mean."""
+    t = np.arange(41) * 0.0025
+    u = read({"t": t, "u": t**2}, 10, 0.01)
+    assert u[:, 0].tolist() == (t[:40:4] ** 2).tolist()
+
+
+def test_rounded_stamps_hit_their_samples(read: Read) -> None:
+    """Round-off of stamps such as 0.1 + 0.2 must not shift the control by a sample."""
+    t = np.cumsum(np.full(300, 0.01)) - 0.01
+    u = read({"t": [round(float(x), 4) for x in t], "u": np.arange(300.0)}, 300, 0.01)
+    assert u[:, 0].tolist() == list(range(300))
+    u = read({"t": t, "u": np.arange(300.0)}, 300, 0.01)
+    assert u[:, 0].tolist() == list(range(300))
+
+
+def test_irregular_table_agrees_with_a_plain_search(read: Read) -> None:
+    """Random stamps, some before the start of the experiment."""
+    rng = np.random.default_rng(3)
+    stamps = np.concatenate([[-0.3, -0.1], np.sort(rng.uniform(0.0, 1.0, 25)), [1.0]])
+    values = rng.standard_normal(len(stamps))
+    u = read({"t": stamps, "u": values}, 100, 0.01)
+    assert u[:, 0].tolist() == held(stamps, values, np.arange(100) * 0.01).tolist()
+
+
+def test_columns_are_found_by_name(read: Read) -> None:
+    """The order of columns is free; `ctrl:` before the name is accepted."""
+    t = [0.0, 0.5, 1.0]
+    u = read({"right": [1.0, 2.0, 3.0], "t": t, "left": [4.0, 5.0, 6.0]}, 10, 0.1, NAMES)
+    assert u[0].tolist() == [4.0, 1.0]
+    u = read({"t": t, "ctrl:right": [1.0, 2.0, 3.0], "ctrl:left": [4.0, 5.0, 6.0]}, 10, 0.1, NAMES)
+    assert u[0].tolist() == [4.0, 1.0]
+
+
+def test_a_design_table_is_a_control_table(read: Read) -> None:
+    """design.csv has states beside the controls, and no control in its last row."""
+    nan = float("nan")
+    u = read({"t": [0.0, 0.1, 0.2], "qpos:j": [0.0, 1.0, 2.0], "ctrl:u": [3.0, 4.0, nan]}, 2, 0.1)
+    assert u.tolist() == [[3.0], [4.0]]
+
+
+def test_a_missing_control_within_a_design_is_refused(read: Read) -> None:
+    """Only the last row may have no control."""
+    nan = float("nan")
+    with pytest.raises(RecordingError, match="row 2"):
+        read({"t": [0.0, 0.1, 0.2, 0.3], "ctrl:u": [3.0, nan, 4.0, nan]}, 3, 0.1)
+
+
+def test_table_must_cover_the_horizon(read: Read) -> None:
+    """A row is held for one period, no longer."""
+    columns = {"t": [0.0, 0.1, 0.2], "u": [1.0, 2.0, 3.0]}
+    assert len(read(columns, 30, 0.01)) == 30
+    with pytest.raises(RecordingError, match="too few rows"):
+        read(columns, 31, 0.01)
+
+
+def test_compressed_tables(tmp_path: Path) -> None:
+    """A gzip file is recognised by its suffix."""
+    path = tmp_path / "table.csv.gz"
+    path.write_bytes(gzip.compress(b"t,u\n0,1.5\n1,2.5\n"))
+    table = read_table(path)
+    assert {name: column.tolist() for name, column in table.items()} == {
+        "t": [0.0, 1.0],
+        "u": [1.5, 2.5],
+    }
+
+
+def test_table_keeps_every_digit(tmp_path: Path) -> None:
+    """The nearest float64 to what is written."""
+    path = tmp_path / "table.csv"
+    values = np.random.default_rng(0).standard_normal(50) * 10.0 ** np.arange(-25, 25)
+    path.write_text("u\n" + "\n".join(repr(float(v)) for v in values) + "\n", encoding="utf-8")
+    assert read_table(path)["u"].tolist() == values.tolist()
