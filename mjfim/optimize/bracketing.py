@@ -70,8 +70,8 @@ def smallest_feasible(
 ) -> tuple[int | None, int | None]:
     """Find the smallest number of samples whose ratio is at most 1.
 
-    The ratio, e.g. of a reached to a required standard deviation, is assumed to fall at least like the inverse square root of the number of
-    samples, as standard deviations do. The search brackets the place where it is 1 and narrows the bracket by secants.
+    The ratio, e.g. of a reached to a required standard deviation, is assumed to fall at least like the inverse square root of the
+    number of samples. The search brackets the place where the ratio is 1 and narrows the bracket by secants.
 
     Args:
         ratio: Ratio of a number of samples; infinite where nothing is known, None where its evaluation was stopped.
