@@ -274,7 +274,8 @@ class Nuisance(Section):
     initial: PriorOrUnknown | dict[str, PriorOrUnknown] | None = Field(
         default=None,
         description="Deviation of the initial state [m, rad, m/s or rad/s]: one value for all of qpos and qvel, or a table by "
-        "coordinate, `qpos:<joint>` and `qvel:<joint>`. Default: the initial state is known.",
+        "coordinate, `qpos:<joint>` and `qvel:<joint>`, with the parts `.x .y .z .rx .ry .rz` of ball and free joints. "
+        "Default: the initial state is known.",
     )
     bias: PriorOrUnknown | dict[str, PriorOrUnknown] | None = Field(
         default=None,

@@ -18,6 +18,7 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.system import Setup
 from mjfim.identification.residuals import Fit
 from mjfim.model.coordinates import scalar_joints
+from mjfim.model.units import JOINT_FIELD_UNITS
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.estimate import MissingTerm
 from mjfim.records.recording import Recording
@@ -111,15 +112,14 @@ def _candidates(setup: Setup, measured: bool) -> Iterator[Candidate]:
     sought = {t.path.removesuffix("[0]") for p in setup.parameters.parameters for t in p.targets}
     model: Any = setup.model
     for c in scalar_joints(model):
-        force, inertia = ("N", "kg") if c.unit == "m" else ("N m", "kg m²")
         dof = c.v
-        for field, words, unit, now in (
-            ("frictionloss", "dry friction", force, model.dof_frictionloss[dof]),
-            ("damping", "viscous damping", f"{force} s/{c.unit}", model.dof_damping[dof]),
-            ("armature", "rotor inertia", inertia, model.dof_armature[dof]),
-            ("stiffness", "a spring", f"{force}/{c.unit}", model.jnt_stiffness[c.joint]),
+        for field, words, now in (
+            ("frictionloss", "dry friction", model.dof_frictionloss[dof]),
+            ("damping", "viscous damping", model.dof_damping[dof]),
+            ("armature", "rotor inertia", model.dof_armature[dof]),
+            ("stiffness", "a spring", model.jnt_stiffness[c.joint]),
         ):
-            path = f"joint/{c.name}:{field}"
+            path, unit = f"joint/{c.name}:{field}", JOINT_FIELD_UNITS[field][c.unit]
             if path not in sought:
                 yield Candidate(
                     f"{words} of {c.name}", path, unit, True, float(now), float(now) or FAINT

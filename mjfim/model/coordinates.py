@@ -260,8 +260,10 @@ def tangent_names(model: Any) -> tuple[str, ...]:
 
 def gain_names(model: Any, controls: Sequence[str]) -> tuple[str, ...]:
     """Columns of the gain K: (nu, nx), row by row: `gain:<control>:<component of the deviation>`."""
-    components = tangent_names(model)
-    return tuple(f"gain:{control}:{component}" for control in controls for component in components)
+    names: list[str] = []
+    for control in controls:
+        names += [f"gain:{control}:{component}" for component in tangent_names(model)]
+    return tuple(names)
 
 
 def sensor_columns(model: Any, sensor: str) -> list[str]:

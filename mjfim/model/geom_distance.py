@@ -17,7 +17,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.model.elements import unique_names
 from mjfim.model.geom_pairs import GeomPair
-from mjfim.model.pair_distance import INFINITE_DISTANCE, PairDistances
+from mjfim.model.pair_distance import INFINITE_DISTANCE, Indices, PairDistances
 
 # Bounds of distances that are held in memory at a time; more configurations are taken in blocks.
 MAX_BOUNDS_AT_ONCE = 1 << 18
@@ -168,8 +168,40 @@ class GeomDistances:
         if screws is None:
             return SignedDistances(d=d, slope=None)
 
-        # Normals and nearest points of the first geoms: measured pairs, then exact ones.
-        normals = distances.normals(
+        plane_rows, plane_pairs = np.nonzero(near & distances.exact)
+        slope = self._slopes(
+            d,
+            every,
+            measured=(rows, pairs, found, segments),
+            exact=(plane_rows, plane_pairs, points),
+            poses=(positions, frames, screws),
+        )
+        return SignedDistances(d=d, slope=slope)
+
+    def _slopes(
+        self,
+        d: Array,
+        every: Array,
+        *,
+        measured: tuple[Indices, Indices, Array, Array],
+        exact: tuple[Indices, Indices, Array],
+        poses: tuple[Array, Array, Array],
+    ) -> Array:
+        """(n, m, nv) slopes of the distances of all columns: each is that of the nearest pair of its column.
+
+        Args:
+            d: (n, m) distances of the columns [m].
+            every: (n, p) distances of the pairs [m].
+            measured: Rows and pairs (h,) that MuJoCo measured, their distances (h,) and nearest points (h, 6).
+            exact: Rows and pairs (e,) over planes, and points (n, number of planes, 3) nearest to the planes.
+            poses: Positions, frames and screws by `_poses`.
+        """
+        positions, frames, screws = poses
+        rows, pairs, found, segments = measured
+        plane_rows, plane_pairs, plane_points = exact
+
+        # Normals and nearest points of the first geoms: of measured pairs, then of those over planes.
+        normals = self._distances.normals(
             rows,
             pairs,
             distances=found,
@@ -178,22 +210,24 @@ class GeomDistances:
             frames=frames,
             reach=self.reach,
         )
-        k, p = np.nonzero(near & distances.exact)
-        normals = np.concatenate([normals, -frames[k, distances.second[p], :, 2]])
-        plane_points = points[k, np.searchsorted(distances.planes, p)]
-        nearest_points = np.concatenate([segments[:, :3], plane_points])
-        rows = np.concatenate([rows, k])
-        pairs = np.concatenate([pairs, p])
+        planes = self._distances.second[plane_pairs]
+        plane_normals = -frames[plane_rows, planes, :, 2]
+        plane_places = np.searchsorted(self._distances.planes, plane_pairs)
+        normals = np.concatenate([normals, plane_normals])
+        nearest_points = np.concatenate([segments[:, :3], plane_points[plane_rows, plane_places]])
+        rows = np.concatenate([rows, plane_rows])
+        pairs = np.concatenate([pairs, plane_pairs])
 
-        # The slope of a column is that of its nearest pair: the normal as a line (moment, direction) times the screws.
+        # Which of these pairs are the nearest of their column, and within reach.
         column = self._column[pairs]
         value = every[rows, pairs]
         least = (value == d[rows, column]) & (value < self.reach)
+
+        # The normal as a line (moment about the origin, direction); its product with a screw is the rate of the distance.
         lines = np.zeros((*d.shape, 6))
         lines[rows[least], column[least], :3] = np.cross(nearest_points[least], normals[least])
         lines[rows[least], column[least], 3:] = normals[least]
-        slope = (lines @ screws.transpose(0, 2, 1)) * self._dof_sign
-        return SignedDistances(d=d, slope=slope)
+        return np.asarray((lines @ screws.transpose(0, 2, 1)) * self._dof_sign)
 
     def _poses(self, qpos: Array, slopes: bool) -> tuple[Array, Array, Array | None]:
         """Poses of all geoms, and motions of the degrees of freedom, at configurations.

@@ -91,8 +91,9 @@ def from_central(values: Array) -> BodyInertia:
 
 def to_barycentric(body: BodyInertia) -> Array:
     """(10,) mass, first moments m c, inertia about the origin of the body frame; the dynamics are linear in them."""
+    first_moments = body.mass * body.com
     about_origin = body.inertia + _steiner(body.mass, body.com)
-    return np.concatenate([[body.mass], body.mass * body.com, _entries(about_origin)])
+    return np.concatenate([[body.mass], first_moments, _entries(about_origin)])
 
 
 def from_barycentric(values: Array) -> BodyInertia:

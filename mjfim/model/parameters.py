@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -220,27 +220,30 @@ class ParameterSet:
     def initial_state_derivative(self, nx: int) -> Array:
         """(nx, p) derivative of the initial state, in the tangent space."""
 
-        def row(target_field: TargetField) -> int | None:
-            return target_field.tangent if isinstance(target_field, InitialStateField) else None
-
-        return self._linear_map(nx, row)
+        matrix = np.zeros((nx, len(self)))
+        for j, target, target_field in self._targets():
+            if isinstance(target_field, InitialStateField):
+                matrix[target_field.tangent, j] += target.scale
+        return matrix
 
     def bias_derivative(self, ny: int) -> Array:
         """(ny, p) derivative of every output by constant biases."""
 
-        def row(target_field: TargetField) -> int | None:
-            return target_field.output if isinstance(target_field, OutputBiasField) else None
-
-        return self._linear_map(ny, row)
+        matrix = np.zeros((ny, len(self)))
+        for j, target, target_field in self._targets():
+            if isinstance(target_field, OutputBiasField):
+                matrix[target_field.output, j] += target.scale
+        return matrix
 
     @cached_property
     def delay_derivative(self) -> Array:
         """(p,) derivative of the time by which outputs lag [s / theta-unit]."""
 
-        def row(target_field: TargetField) -> int | None:
-            return 0 if isinstance(target_field, OutputDelayField) else None
-
-        return np.asarray(self._linear_map(1, row)[0])
+        derivative = np.zeros(len(self))
+        for j, target, target_field in self._targets():
+            if isinstance(target_field, OutputDelayField):
+                derivative[j] += target.scale
+        return derivative
 
     @cached_property
     def outside_model(self) -> np.ndarray:
@@ -288,15 +291,11 @@ class ParameterSet:
         """(p,) True where a parameter has a field of one of these kinds."""
         return np.array([any(isinstance(f, kinds) for f in row) for row in self.fields], dtype=bool)
 
-    def _linear_map(self, rows: int, row_of: Callable[[TargetField], int | None]) -> Array:
-        """(rows, p) matrix of the targets that act linearly outside the model. row_of: row of a field, or None."""
-        matrix = np.zeros((rows, len(self)))
+    def _targets(self) -> Iterator[tuple[int, Target, TargetField]]:
+        """Every target with the index of its parameter and the field that it leads to."""
         for j, (parameter, fields) in enumerate(zip(self.parameters, self.fields, strict=True)):
             for target, target_field in zip(parameter.targets, fields, strict=True):
-                row = row_of(target_field)
-                if row is not None:
-                    matrix[row, j] += target.scale
-        return matrix
+                yield j, target, target_field
 
 
 def _parameter_error(parameter: Parameter, fault: str) -> ExperimentError:

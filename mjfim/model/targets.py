@@ -55,9 +55,10 @@ class ModelField:
     @property
     def numbers(self) -> set[tuple[str, int, int]]:
         """(array, row, column) of all numbers that it writes."""
-        main = {(self.array, row, self.column or 0) for row in self.rows}
-        following = {follower[:3] for follower in self.followers}
-        return main | following
+        numbers = {(self.array, row, self.column or 0) for row in self.rows}
+        for array, row, column, _ in self.followers:
+            numbers.add((array, row, column))
+        return numbers
 
     def read(self, model: Any) -> float:
         """Value in a model."""

@@ -16,8 +16,9 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, unknown
-from mjfim.model.coordinates import state_components
-from mjfim.model.elements import names_of
+from mjfim.model.coordinates import sensor_columns, state_components
+from mjfim.model.elements import identifier, names_of
+from mjfim.model.units import sensor_unit
 from mjfim.recordings.formats.table import Table
 from mjfim.recordings.spec import ColumnSpec
 
@@ -35,21 +36,6 @@ FACTORS = {
 # Factor to the model's unit of every unit that a log may have.
 UNIT_FACTORS = {unit: factor for table in FACTORS.values() for unit, factor in table.items()}
 
-# Unit of the sensors whose type determines it.
-SENSOR_UNITS = {
-    mujoco.mjtSensor.mjSENS_GYRO: "rad/s",
-    mujoco.mjtSensor.mjSENS_BALLANGVEL: "rad/s",
-    mujoco.mjtSensor.mjSENS_FRAMEANGVEL: "rad/s",
-    mujoco.mjtSensor.mjSENS_VELOCIMETER: "m/s",
-    mujoco.mjtSensor.mjSENS_FRAMELINVEL: "m/s",
-    mujoco.mjtSensor.mjSENS_SUBTREELINVEL: "m/s",
-    mujoco.mjtSensor.mjSENS_TENDONVEL: "m/s",
-    mujoco.mjtSensor.mjSENS_FRAMEPOS: "m",
-    mujoco.mjtSensor.mjSENS_SUBTREECOM: "m",
-    mujoco.mjtSensor.mjSENS_RANGEFINDER: "m",
-    mujoco.mjtSensor.mjSENS_TENDONPOS: "m",
-}
-
 # Sensors that may measure an angle as well as a length: any unit is accepted.
 SENSORS_OF_ANY_UNIT = (
     mujoco.mjtSensor.mjSENS_ACTUATORPOS,
@@ -65,32 +51,22 @@ def units_of(model: Any) -> dict[str, str]:
         model: The compiled MuJoCo model.
 
     Returns:
-        By column name `rad`, `rad/s`, `m` or `m/s`; `any` where each of them is possible, `none` where no unit
-        can be stated.
+        By column name the unit; `any` where each of rad, rad/s, m and m/s is possible, `none` where there is none.
     """
     units = {component.name: component.unit or "none" for component in state_components(model)}
 
     for name in names_of(model, "sensor"):
-        sensor = model.sensor(name)
-        width = int(sensor.dim[0])
-        columns = [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
-        units.update(dict.fromkeys(columns, _sensor_unit(model, sensor)))
+        unit = _sensor_unit(model, identifier(model, "sensor", name))
+        units.update(dict.fromkeys(sensor_columns(model, name), unit))
 
     return units
 
 
-def _sensor_unit(model: Any, sensor: Any) -> str:
-    """Unit of a sensor, with the values of `units_of`."""
-    kind = mujoco.mjtSensor(int(sensor.type[0]))
-
-    if kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL):
-        joint_type = int(model.jnt_type[int(sensor.objid[0])])
-        unit = "m" if joint_type == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
-        return unit if kind == mujoco.mjtSensor.mjSENS_JOINTPOS else f"{unit}/s"
-
-    if kind in SENSORS_OF_ANY_UNIT:
+def _sensor_unit(model: Any, sensor: int) -> str:
+    """Unit of a sensor by its number, with the values of `units_of`."""
+    if mujoco.mjtSensor(int(model.sensor_type[sensor])) in SENSORS_OF_ANY_UNIT:
         return "any"
-    return SENSOR_UNITS.get(kind, "none")
+    return sensor_unit(model, sensor) or "none"
 
 
 def check_unit(where: str, spec: ColumnSpec, unit: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, unknown
-from mjfim.model.coordinates import state_components
+from mjfim.model.coordinates import state_components, unknown_coordinate
 from mjfim.recordings.angle_units import check_angles
 from mjfim.recordings.channels import Channels
 from mjfim.recordings.column_units import check_unit, convert, units_of
@@ -123,7 +123,7 @@ def check_spec(channels: Channels) -> None:
 
     for name, source in channels.spec.sources.items():
         if name not in units:
-            raise ExperimentError(f"{where}: {unknown('column', name, units)}")
+            raise ExperimentError(f"{where}: {unknown_coordinate('column', name, list(units))}")
         check_unit(f"{where}.{name}", source, units[name])
 
 
@@ -162,10 +162,10 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
 
 def _check_names(table: Table, channels: Channels) -> None:
     """Refuse a column that looks like one of mjfim's but is none of this model, such as a misspelled joint."""
-    known = {*channels.control_columns, *channels.measurable}
+    known = (*channels.control_columns, *channels.measurable)
     for name in table.names:
         if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
-            fault = unknown("column", name, ["t", *sorted(known)])
+            fault = unknown_coordinate("column", name, ["t", *known])
             raise RecordingError(f"{table.source}: {fault}")
 
 

@@ -357,7 +357,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "correlated alone": (
         {"correlated": pair("rate")},
-        r"correlated\.0\.outputs: .*at least 2 items",
+        r"correlated\.0\.outputs: needs 2 or more entries",
     ),
     "correlated size": (
         {"correlated": pair("rate", "angle", covariance=square(3))},
