@@ -81,7 +81,8 @@ class _Loop:
         """The whole loop."""
         try:
             for played in done:
-                self._record(played)
+                if not self._record(played):
+                    return self._concluded(CampaignStatus.INTERRUPTED)
             while not self._formally() and len(self.rounds) < count:
                 ended = self._play(measure)
                 if ended is not None:
@@ -107,7 +108,7 @@ class _Loop:
         recordings = (answer,) if isinstance(answer, Recording) else tuple(answer or ())
         if not recordings:
             return CampaignStatus.WAITING
-        self._record(
+        recorded = self._record(
             EarlierRound(
                 recordings=recordings,
                 theta=found.theta,
@@ -117,6 +118,8 @@ class _Loop:
             found,
             told,
         )
+        if not recorded:
+            return CampaignStatus.INTERRUPTED
         self.pending = None
         return None
 
@@ -139,13 +142,15 @@ class _Loop:
 
     def _record(
         self, played: EarlierRound, found: Design | None = None, told: tuple[str, ...] = ()
-    ) -> None:
-        """Identify from all recordings and keep the round."""
+    ) -> bool:
+        """Identify from all recordings and keep the round; False where the identification was interrupted."""
         p, last = self.base.parameters, self.rounds[-1] if self.rounds else None
         theta = p.guess if played.theta is None else played.theta
         blank = np.full(len(p), np.nan)
         recordings = [*(r for each in self.rounds for r in each.recordings), *played.recordings]
         estimate = identified(self.base, recordings, theta if last is None else last.estimate.theta)
+        if estimate is None:
+            return False
         warnings = [
             *told,
             *(f"design: {sentence}" for sentence in (found.warnings if found is not None else ())),
@@ -165,6 +170,7 @@ class _Loop:
         )
         if self.report is not None:
             self.report(self.rounds[-1])
+        return True
 
     def _suspicions(self, now: Estimate) -> Iterator[str]:
         """What the step from the last round to this one says against the model, or against going on."""
@@ -202,8 +208,11 @@ class _Loop:
         )
 
 
-def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Estimate:
-    """Estimate from all recordings; where that is a misfit or fails, from the stated guess too, and the better one."""
+def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Estimate | None:
+    """Estimate from all recordings; where that is a misfit or fails, from the stated guess too, and the better one.
+
+    None where it was interrupted: a round is complete or it is not kept.
+    """
     found: list[Estimate] = []
     fault: SimulationDivergedError | None = None
     for begin in (start, base.parameters.guess):
@@ -214,7 +223,7 @@ def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Es
         except SimulationDivergedError as error:
             fault = fault or error
         if found and found[-1].interrupted:
-            raise KeyboardInterrupt  # a round is complete or none
+            return None
     if not found:
         raise fault or SimulationDivergedError("no start of the fit can be simulated")
     return min(found, key=lambda e: e.chi2)
