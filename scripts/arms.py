@@ -40,9 +40,8 @@ from rich.console import Console
 from rich.table import Table
 
 from mjfim.arrays import Array
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
-from mjfim.information.identifiability import survey
 from mjfim.parallel import cores
 from mjfim.records.trajectory import Sensitivity
 from mjfim.signals import multisine
@@ -480,8 +479,8 @@ def described(e: Experiment) -> Iterator[tuple[str, str]]:
         if light.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         else "on (dry friction)"
     )
-    steps = round(e.horizon / model.opt.timestep)
-    yield "parameters, samples", f"{len(e.parameters)}, {round(e.horizon * RATE)}"
+    steps = round(float(e.horizon or 0.0) / model.opt.timestep)
+    yield "parameters, samples", f"{len(e.parameters)}, {round(float(e.horizon or 0.0) * RATE)}"
     yield "pairs of geoms looked at", f"{len(pairs(model))}"
     yield "clearance at home", f"{100 * near:.1f} cm ({whose[0]}, {whose[1]})"
     yield "hold minus home, largest", f"{np.abs(hold - start).max():.4f} rad"
@@ -498,16 +497,16 @@ def described(e: Experiment) -> Iterator[tuple[str, str]]:
 
 def identifiable(e: Experiment) -> Iterator[tuple[str, str]]:
     """What can be identified along the starting motion, and what no motion shows, as `mjfim check` finds it."""
-    setup = Setup(e)
-    told = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = DesignTask.resolve(e)
+    told = task.plant.derivatives.sensitivity(task.theta, task.initial)
     if told is None:
         raise SystemExit(
             f"{e.source}: the starting motion diverges when the parameters move a little"
         )
     names, scale, information = (
-        setup.parameters.names,
-        setup.parameters.scale,
-        setup.information.matrix(told),
+        task.parameters.names,
+        task.parameters.scale,
+        task.information.matrix(told),
     )
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     yield "worst relative sigma", f"{worst_relative_sigma(information, scale):.3g}"
@@ -521,14 +520,14 @@ def identifiable(e: Experiment) -> Iterator[tuple[str, str]]:
             f"weakest combination {j + 1}",
             " ".join(f"{vectors[i, j]:+.2f} {names[i]}" for i in largest),
         )
-    relative = setup.information.std(information) / scale
+    relative = task.information.std(information) / scale
     order = np.argsort(-relative)
     yield (
         "worst parameters, sigma / scale",
         ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[:3]),
     )
     yield "best", ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[-2:])
-    seen = survey(setup, setup.initial, told)
+    seen = task.observer.identifiability(task.initial, told)
     yield "never identifiable", "; ".join(str(group) for group in seen.groups_always) or "none"
     yield "not along this motion", "; ".join(str(group) for group in seen.groups_here) or "none"
 
@@ -550,10 +549,10 @@ def timesteps(name: str, friction: bool, horizon: float, folder: Path) -> Table:
     reference: tuple[Array, Array] | None = None
     for step in (FINE, 0.001, 0.002, 0.004, 0.005):
         e = experiment(name, horizon, friction, folder / "timesteps", step)
-        setup = Setup(e)
-        sensitivity = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
-        sigma = np.nan if sensitivity is None else _sigma(setup, sensitivity)
-        q, v = setup.initial.qpos, setup.initial.qvel
+        task = DesignTask.resolve(e)
+        sensitivity = task.plant.derivatives.sensitivity(task.theta, task.initial)
+        sigma = np.nan if sensitivity is None else _sigma(task, sensitivity)
+        q, v = task.initial.qpos, task.initial.qvel
         reference = (q, v) if reference is None else reference
         _, start, _, control = prepared(e)
         light = lifted(mujoco.MjModel.from_xml_path(str(e.directory / e.model)))
@@ -569,8 +568,8 @@ def timesteps(name: str, friction: bool, horizon: float, folder: Path) -> Table:
     return table
 
 
-def _sigma(setup: Setup, sensitivity: Sensitivity) -> float:
-    return worst_relative_sigma(setup.information.matrix(sensitivity), setup.parameters.scale)
+def _sigma(task: DesignTask, sensitivity: Sensitivity) -> float:
+    return worst_relative_sigma(task.information.matrix(sensitivity), task.parameters.scale)
 
 
 def main() -> None:

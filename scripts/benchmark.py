@@ -33,8 +33,9 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.parallel import cores
 from mjfim.records.design import Design
 
@@ -50,7 +51,7 @@ for use_c in (True, False):
         for solve in (p.ipopt, p.lbfgs):
             r = min((solve(p.CASES[case], use_c) for _ in range(int(sys.argv[1]))), key=lambda r: r.seconds)
             found.append(dict(case=case, solver=r.name + ("" if use_c else " (VM)"), cost=r.J, seconds=r.seconds,
-                iterations=r.iterations, setup=r.setup_seconds + built.build_seconds, history=r.history))
+                iterations=r.iterations, task=r.setup_seconds + built.build_seconds, history=r.history))
 """
 CLOSE = 1e-6
 CASES: dict[str, dict[str, Any]] = {
@@ -63,14 +64,14 @@ CASES: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """One solver on one case. history: (seconds, J) of every iterate; setup: seconds before the first of them."""
+    """One solver on one case. history: (seconds, J) of every iterate; task: seconds before the first of them."""
 
     case: str
     solver: str
     cost: float
     iterations: int
     seconds: float
-    setup: float
+    task: float
     history: tuple[tuple[float, float], ...]
 
     def time_to(self, cost: float) -> float:
@@ -87,9 +88,9 @@ def experiment(case: str, **descent: Any) -> Experiment:
     return Experiment.from_file(EXPERIMENT).replace(cost=CASES[case], descent=descent)
 
 
-def step_seconds(setup: Setup, trajectory: mjfim.Trajectory) -> float:
+def step_seconds(task: DesignTask, trajectory: mjfim.Trajectory) -> float:
     """Seconds of one `mj_step` in C: the user's model, stepped many times per call along the designed motion."""
-    model, data = setup.model_at(setup.theta), mujoco.MjData(setup.model)
+    model, data = task.system.model_at(task.theta), mujoco.MjData(task.system.model)
     best = np.inf
     for k in range(0, trajectory.samples, 20):
         data.qpos[:], data.qvel[:], data.ctrl[:] = (
@@ -113,9 +114,9 @@ def fastest(repeats: int, case: str, name: str, **descent: Any) -> tuple[Run, De
 def mjfim_run(case: str, name: str, **descent: Any) -> tuple[Run, Design]:
     """One design."""
     clock = time.perf_counter()
-    setup = Setup(experiment(case, **descent))
+    task = DesignTask.resolve(experiment(case, **descent))
     prepared = time.perf_counter() - clock
-    design = mjfim.design(setup)
+    design = design_task(task)
     fine = design.history[-1].rate
     history = tuple(
         (row.seconds, row.cost if row.rate == fine else np.inf) for row in design.history
@@ -161,7 +162,7 @@ def engine_table(designs: list[tuple[Run, Design]], threads: int) -> Table:
         "ratio",
     )
     for run, design in designs:
-        step = step_seconds(Setup(experiment(run.case)), design.trajectory)
+        step = step_seconds(DesignTask.resolve(experiment(run.case)), design.trajectory)
         engine = design.steps * step / threads
         rows.add_row(
             run.case,
@@ -202,7 +203,7 @@ def peer_table(runs: list[Run]) -> Table:
                 str(run.iterations),
                 seconds,
                 ratio,
-                f"{run.setup:.2f} s",
+                f"{run.task:.2f} s",
             )
     return rows
 
@@ -256,7 +257,7 @@ def engine_verdict(designs: list[tuple[Run, Design]], threads: int) -> str:
     """What (a) comes to."""
     ratios: dict[str, list[float]] = {}
     for run, design in designs:
-        step = step_seconds(Setup(experiment(run.case)), design.trajectory)
+        step = step_seconds(DesignTask.resolve(experiment(run.case)), design.trajectory)
         ratios.setdefault(run.solver, []).append(run.seconds * threads / (design.steps * step))
     told = [
         f"{name} {min(r):.2f} to {max(r):.2f}, {judged(max(r), 1.3)}" for name, r in ratios.items()

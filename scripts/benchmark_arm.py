@@ -17,11 +17,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-import mjfim
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
-from mjfim.information.identifiability import survey
 from mjfim.parallel import cores
 from mjfim.plant.derivatives import FORWARD_DIFFERENCES
 
@@ -75,14 +74,14 @@ def experiment(model: Path, p: int, iterations: int) -> Experiment:
 
 def measured(model: Path, p: int, iterations: int) -> Cost:
     """Run the design for some iterations, then time its parts."""
-    setup = Setup(experiment(model, p, iterations))
+    task = DesignTask.resolve(experiment(model, p, iterations))
     seconds: list[float] = []
-    mjfim.design(setup, monitor=lambda row: seconds.append(row.seconds))
-    curve = setup.initial
-    sensitivity = setup.plant.derivatives.sensitivity(setup.theta, curve)
+    design_task(task, monitor=lambda row: seconds.append(row.seconds))
+    curve = task.initial
+    sensitivity = task.plant.derivatives.sensitivity(task.theta, curve)
     if sensitivity is None:
         raise SystemExit("the arm diverges")
-    problem = Stage(setup, survey(setup, curve, sensitivity).basis).problem
+    problem = Stage(task, task.observer.identifiability(curve, sensitivity).basis).problem
     clock = time.perf_counter()
     point = problem.point(curve, FORWARD_DIFFERENCES)
     value = time.perf_counter() - clock

@@ -416,10 +416,10 @@ def ipopt_solver(
 
 def ipopt(case: Case, use_c: bool = True, max_iterations: int = 500) -> PeerRun:
     """Solve by IPOPT from u_ref with the exact Hessian of single shooting."""
-    functions, setup = problem(use_c), Recorder()
+    functions, task = problem(use_c), Recorder()
     p, watch = parameters(case), IterateWatch()
     solver = ipopt_solver(case, functions, watch, max_iterations)
-    setup_seconds, watch.recorder.begin = setup.seconds(), time.perf_counter()
+    setup_seconds, watch.recorder.begin = task.seconds(), time.perf_counter()
     solution = solver(x0=reference_control(), p=p)
     seconds, stats, u = watch.recorder.seconds(), solver.stats(), solution["x"].full().ravel()
     j, eigenvalues = objective(case, u, use_c)
@@ -442,7 +442,7 @@ def ipopt(case: Case, use_c: bool = True, max_iterations: int = 500) -> PeerRun:
 
 def lbfgs(case: Case, use_c: bool = True, max_iterations: int = 2000) -> PeerRun:
     """Solve by SciPy's L-BFGS-B from u_ref, on J / (R dt)."""
-    functions, setup = problem(use_c), Recorder()
+    functions, task = problem(use_c), Recorder()
     p, scale = parameters(case), 1 / (case.r_tau * DT)
     options = {
         "maxcor": MEMORY,
@@ -451,7 +451,7 @@ def lbfgs(case: Case, use_c: bool = True, max_iterations: int = 2000) -> PeerRun
         "ftol": 1e-12,
         "gtol": 1e-5,
     }
-    setup_seconds, recorder = setup.seconds(), Recorder()
+    setup_seconds, recorder = task.seconds(), Recorder()
 
     def scaled(u: Array) -> tuple[float, Array]:
         j, slope = functions.gradient(u, p)
@@ -493,7 +493,7 @@ def main() -> None:
     print(
         f"built in {built.build_seconds:.1f} s, {'compiled C' if built.compiled else 'virtual machine'}"
     )
-    counts = f"{'iter':>4}  {'eval':>4}  {'setup s':>7}  {'solve s':>7}"
+    counts = f"{'iter':>4}  {'eval':>4}  {'task s':>7}  {'solve s':>7}"
     print(f"{'case':4}  {'solver':15}  {'J':>15}  {'lambda':>35}  {counts}")
     for name in arguments.cases:
         for solve in (ipopt, lbfgs):

@@ -6,7 +6,7 @@
 sysid runs twice: weighted by the noise that the experiment states, and as is, where each signal counts relative to the
 norm of what was measured. DIR gets comparison.json and sysid_report.html (of the weighted fit; a browser loads its plotting
 library from the network). To go on with sysid in Python,
-take `sysid_sequences.export(setup, recordings)`. Exit code 0, or 2 for misuse.
+take `sysid_sequences.export(task, recordings)`. Exit code 0, or 2 for misuse.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
+from mjfim.identification.identify import identify_system
 from mjfim.output.folders import check_folder
 from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
@@ -109,7 +110,7 @@ def report(exported: Exported, fit: Fitted) -> str:
     )
 
 
-def table(setup: Setup, estimate: Estimate, weighted: Fitted, default: Fitted) -> Table:
+def table(task: DesignTask, estimate: Estimate, weighted: Fitted, default: Fitted) -> Table:
     """Both estimators, parameter by parameter."""
     rows = Table(
         title="The same data, two estimators",
@@ -118,18 +119,15 @@ def table(setup: Setup, estimate: Estimate, weighted: Fitted, default: Fitted) -
         padding=(0, 1, 0, 0),
     )
     for heading in HEADINGS:
-        folds, side = (
-            heading in ("parameter", "95 % interval"),
-            "left" if heading == "parameter" else "right",
-        )
+        folds = heading in ("parameter", "95 % interval")
         rows.add_column(
             heading,
-            justify=side,
+            justify="left" if heading == "parameter" else "right",
             no_wrap=not folds,
             min_width=9 if folds else None,
             overflow="fold",
-        )  # type: ignore[arg-type]
-    for j, p in enumerate(setup.parameters.parameters):
+        )
+    for j, p in enumerate(task.parameters.parameters):
         low, high = estimate.interval[j]
         rows.add_row(
             escape(p.name),
@@ -154,11 +152,11 @@ def summary(
     exported: Exported, estimate: Estimate, weighted: Fitted, default: Fitted
 ) -> dict[str, Any]:
     """Contents of comparison.json."""
-    setup = exported.setup
+    task = exported.task
     return {
         "parameters": list(estimate.parameters),
-        "units": list(setup.units),
-        "true": [p.true for p in setup.parameters.parameters],
+        "units": list(task.system.units),
+        "true": [p.true for p in task.parameters.parameters],
         "start": estimate.initial_theta,
         "recordings": [r.name for r in estimate.recordings],
         "dof": estimate.dof,
@@ -185,13 +183,13 @@ def run(experiment: Path, recordings: Sequence[Path], folder: Path) -> None:
     """Read, fit three times, print and write. Raises MjfimError."""
     require_extra()
     check_folder(folder)
-    setup = Setup(mjfim.Experiment.from_file(experiment))
-    read = [read_recording(path, setup.channels) for path in recordings]
-    exported = export(setup, read)
-    estimate = mjfim.identify(setup, read)
+    task = DesignTask.resolve(mjfim.Experiment.from_file(experiment))
+    read = [read_recording(path, task.system.channels) for path in recordings]
+    exported = export(task, read)
+    estimate = identify_system(task.system, read)
     weighted, default = fitted(exported, weighted=True), fitted(exported, weighted=False)
     page = report(exported, weighted)
-    say.print(table(setup, estimate, weighted, default))
+    say.print(table(task, estimate, weighted, default))
     for sentence in (*exported.notes, *estimate.warnings):
         told.print(f"warning: {sentence}", style="yellow", markup=False)
     write_json(folder / "comparison.json", summary(exported, estimate, weighted, default))

@@ -13,7 +13,8 @@ import argparse
 from pathlib import Path
 
 import mjfim
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
+from mjfim.identification.identify import identify_system
 from mjfim.output.mjcf.write import write_identified
 from mjfim.recordings.read import read_recording
 
@@ -28,14 +29,16 @@ def main() -> int:
     args = parser.parse_args()
 
     # The experiment file says what is unknown, where to start, and how noisy each output is.
-    setup = Setup(mjfim.Experiment.from_file(args.experiment))
-    recordings = [read_recording(path, setup.channels) for path in args.recordings]
+    task = DesignTask.resolve(mjfim.Experiment.from_file(args.experiment))
+    recordings = [read_recording(path, task.system.channels) for path in args.recordings]
 
     # Weighted least squares in MuJoCo over all recordings at once.
-    estimate = mjfim.identify(setup, recordings)
+    estimate = identify_system(task.system, recordings)
 
     # 95 % intervals that allow for residuals which are no white noise
-    rows = zip(estimate.parameters, estimate.theta, estimate.interval, setup.units, strict=True)
+    rows = zip(
+        estimate.parameters, estimate.theta, estimate.interval, task.system.units, strict=True
+    )
     for name, value, (low, high), unit in rows:
         print(f"{name:>12s} = {value:.5g} ({low:.5g} ... {high:.5g}) {unit}")
     print(f"chi2 / dof = {estimate.chi2 / estimate.dof:.3f}; {estimate.status}")
@@ -43,7 +46,7 @@ def main() -> int:
         print(f"warning: {warning}")
 
     target = args.recordings[0].with_name("identified.xml")
-    remark = write_identified(target, setup, estimate.theta)
+    remark = write_identified(target, task.system, estimate.theta)
     print(f"wrote {target}{f' ({remark})' if remark else ''}")
     return 0 if estimate.success and not estimate.misfit else 1
 

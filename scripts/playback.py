@@ -30,10 +30,10 @@ from playback_verdict import conclusions, judge, limit_table, parameter_table, p
 from rich.console import Console
 from rich.markup import escape
 
-import mjfim
 from mjfim.errors import ExperimentError, MjfimError, unknown
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.output.archive import write_design
 from mjfim.parallel import cores
 from mjfim.records.serialization import write_json
@@ -79,7 +79,7 @@ def example() -> Experiment:
 def tightened(experiment: Experiment, reserve: Mapping[str, float]) -> Experiment:
     """The experiment with limits tightened by shares of half of their ranges, by kind."""
     tables: dict[str, dict[str, tuple[float, float]]] = {}
-    for limit in Setup(experiment).limits:
+    for limit in DesignTask.resolve(experiment).limits:
         if reserve.get(limit.kind):
             inner = reserve[limit.kind] * limit.scale
             tables.setdefault(limit.kind, {})[limit.name] = (
@@ -93,15 +93,15 @@ def tightened(experiment: Experiment, reserve: Mapping[str, float]) -> Experimen
 
 def made(experiment: Experiment, folder: Path, console: Console) -> Path:
     """Design, and leave it in a folder; returns its table."""
-    setup = Setup(experiment)
+    task = DesignTask.resolve(experiment)
     with console.status("designing") as status:
-        design = mjfim.design(
-            setup,
+        design = design_task(
+            task,
             monitor=lambda row: status.update(
                 f"designing: iteration {row.iteration}, {row.seconds:.0f} s"
             ),
         )
-    write_design(folder, design, setup)
+    write_design(folder, design, task.system)
     margins = ", ".join(f"{kind} {margin:.3g}" for kind, margin in design.limits.items())
     console.print(
         f"designed in {design.seconds:.0f} s: {design.status.value}\nmargins, reserve taken off: {margins}"
@@ -182,7 +182,7 @@ def main() -> int:
 def played(args: argparse.Namespace, console: Console) -> int:
     """The work of `main`. Raises MjfimError for misuse."""
     experiment = example() if args.experiment is None else Experiment.from_file(args.experiment)
-    step = float(Setup(experiment).model.opt.timestep)
+    step = float(DesignTask.resolve(experiment).system.model.opt.timestep)
     latency = np.ceil(LATENCY / step - 1e-6) * step if args.latency is None else args.latency
     conditions = Conditions(args.wrong, float(latency), args.feedback, args.noise, args.seed)
     if args.design is None:

@@ -19,13 +19,13 @@ from rich.console import Console
 from rich.progress import track
 from threadpoolctl import threadpool_limits
 
-import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.constraints import SHOWN, fence_of
 from mjfim.excitation.limits import Limit
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
+from mjfim.identification.identify import identify_system
 from mjfim.information.marginal import standard_deviations
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.plant.batch import BatchSimulator
@@ -90,16 +90,16 @@ class Run:
 class Bench:
     """A design, and robots to play it on.
 
-    stated: the experiment as it is;  setup: as its recordings are read: on the engine's grid, where a delay is exact, with delay
+    stated: the experiment as it is;  task: as its recordings are read: on the engine's grid, where a delay is exact, with delay
     and start unknown
     plan: rows of design.csv;  limits: all that are looked at
     """
 
     def __init__(self, experiment: Experiment, table: Path, conditions: Conditions) -> None:
         self.conditions = conditions
-        self.stated = Setup(experiment, threads=1)
-        self.plan = read_playback(table, self.stated.channels)
-        e, timestep = experiment, float(self.stated.model.opt.timestep)
+        self.stated = DesignTask.resolve(experiment, threads=1)
+        self.plan = read_playback(table, self.stated.system.channels)
+        e, timestep = experiment, float(self.stated.system.model.opt.timestep)
         if abs(self.plan.t[-1] - e.horizon) > 0.5 * timestep:
             raise ExperimentError(
                 f"{table}: it lasts {self.plan.t[-1]:g} s, the experiment {e.horizon:g} s"
@@ -117,21 +117,21 @@ class Bench:
         self.limits = _looked_at(self.stated)
         self.rest = self._rest()
         self._simulator = BatchSimulator(
-            self.stated.model_at(self.stated.theta),
-            sensors=self.stated.outputs.needs_sensors,
+            self.stated.system.model_at(self.stated.theta),
+            sensors=self.stated.system.outputs.needs_sensors,
             threads=1,
         )
-        self.setup, self.sensed = self.stated, _sensed(self.stated)
+        self.task, self.sensed = self.stated, _sensed(self.stated)
         if conditions.feedback and (self.sensed < 0).all():
             raise ExperimentError(
                 "--feedback: no position or velocity of a joint is measured, the gains have nothing to act on"
             )
-        self.setup = Setup(self._read_as(e), threads=1)
+        self.task = DesignTask.resolve(self._read_as(e), threads=1)
 
     def _rest(self) -> Array | None:
         """(nu,) control before the start, None where the experiment begins on the move."""
         try:
-            return self.stated.hold
+            return self.stated.initial_hold
         except ExperimentError as error:
             if self.late:
                 raise ExperimentError(
@@ -156,21 +156,23 @@ class Bench:
 
     def _movable(self) -> list[str]:
         """Positions at which a robot may stand still elsewhere than the model, because its parameters differ."""
-        setup, moved = self.stated, np.zeros(self.stated.space.nv, dtype=bool)
+        task, moved = self.stated, np.zeros(self.stated.space.nv, dtype=bool)
         for theta in (
-            self._drawn(np.random.default_rng(i)) for i in range(2 * len(setup.parameters))
+            self._drawn(np.random.default_rng(i)) for i in range(2 * len(task.parameters))
         ):
-            start = self._start(setup.model_at(theta), theta, self.conditions.feedback)
-            deviation = setup.space.minus(start, setup.plant.nominal_initial_state)
-            moved |= np.abs(deviation[: setup.space.nv]) > MOVED
-        return [label for label, hit in zip(_dof_labels(setup.model), moved, strict=True) if hit]
+            start = self._start(task.system.model_at(theta), theta, self.conditions.feedback)
+            deviation = task.space.minus(start, task.plant.nominal_initial_state)
+            moved |= np.abs(deviation[: task.space.nv]) > MOVED
+        return [
+            label for label, hit in zip(_dof_labels(task.system.model), moved, strict=True) if hit
+        ]
 
     def _drawn(self, rng: np.random.Generator) -> Array:
         """(p,) parameters of a robot that can exist, its delay and biases too; its start comes later.
 
         No parameter is off by more than its prior, which says how well it is known, or than bodies can be.
         """
-        p, wrong = self.setup.parameters, self.conditions.wrong
+        p, wrong = self.task.parameters, self.conditions.wrong
         size = np.where(p.guess == 0.0, p.scale, np.abs(p.guess))
         known = np.array([0.0 if q.prior is None else q.prior for q in p.parameters])
         reach = np.where(known > 0.0, np.minimum(wrong * size, known), wrong * size)
@@ -178,7 +180,7 @@ class Bench:
             off = rng.choice([-1.0, 1.0], len(p)) * reach * 0.9 ** (attempt // len(p))
             theta = np.where(p.changes_model, p.guess + off, known * rng.standard_normal(len(p)))
             theta = self._with_delay(np.clip(theta, p.lower, p.upper))
-            if not p.writer.unphysical_bodies(self.setup.plant.source, theta):
+            if not p.writer.unphysical_bodies(self.task.plant.source, theta):
                 return theta
         raise ExperimentError(
             f"{wrong:.0%} wrong parameters make bodies that cannot exist; try less"
@@ -187,9 +189,7 @@ class Bench:
     def _with_delay(self, theta: Array) -> Array:
         """theta with the true delay."""
         return np.asarray(
-            np.where(
-                self.setup.parameters.delay_derivative != 0.0, self.late * self.timestep, theta
-            )
+            np.where(self.task.parameters.delay_derivative != 0.0, self.late * self.timestep, theta)
         )
 
     def _command(self, state: Array, row: int, feedback: bool) -> Array:
@@ -219,7 +219,7 @@ class Bench:
         """(ns,) where a robot stands still before the start. Raises SimulationDivergedError where it stands nowhere near."""
         space = self.stated.space
         if self.rest is None:
-            return self.setup.plant.initial_state(theta)
+            return self.task.plant.initial_state(theta)
         data, state = mujoco.MjData(model), np.array(self.stated.plant.nominal_initial_state)
         moves = np.delete(np.eye(space.nx), np.arange(space.nv, 2 * space.nv), axis=0)
 
@@ -279,7 +279,7 @@ class Bench:
         """Play on one robot, look at its limits, identify it."""
         rng = np.random.default_rng([self.conditions.seed, number])
         theta = self._drawn(rng)
-        noise = self.conditions.loudness * self.setup.noise.sample(len(self.plan.t), rng)
+        noise = self.conditions.loudness * self.task.system.noise.sample(len(self.plan.t), rng)
         blank = np.full(len(theta), np.nan)
         failed = Run(
             theta,
@@ -306,19 +306,19 @@ class Bench:
 
         Activations are none: they follow from the control that was sent before the start.
         """
-        setup, na = self.setup, self.setup.space.na
-        setup.plant.nominal_initial_state[len(start) - na :] = start[len(start) - na :]
-        matrix = setup.parameters.initial_state_derivative(setup.space.nx)
+        task, na = self.task, self.task.space.na
+        task.plant.nominal_initial_state[len(start) - na :] = start[len(start) - na :]
+        matrix = task.parameters.initial_state_derivative(task.space.nx)
         used = matrix.any(axis=0)
-        deviation = setup.space.minus(start, setup.plant.nominal_initial_state)
+        deviation = task.space.minus(start, task.plant.nominal_initial_state)
         theta[used] = np.linalg.lstsq(matrix[:, used], deviation)[0]
 
     def _identified(self, recording: Recording) -> tuple[Estimate, bool]:
         """The estimate from the guess, and whether it took another start: where one ends in a misfit, others are tried."""
-        best = mjfim.identify(self.setup, [recording])
+        best = identify_system(self.task.system, [recording])
         if not best.misfit:
             return best, False
-        p = self.setup.parameters
+        p = self.task.parameters
         starts = [
             p.guess,
             *(
@@ -329,7 +329,7 @@ class Bench:
         ]
         for start in starts:
             try:
-                other = mjfim.identify(self.setup, [recording], "newton", start)
+                other = identify_system(self.task.system, [recording], "newton", start)
             except SimulationDivergedError:
                 continue
             best = other if other.success and other.chi2 < best.chi2 else best
@@ -342,11 +342,11 @@ class Bench:
 
         noise: (M+1, ny). Raises SimulationDivergedError.
         """
-        setup, M = self.setup, len(self.plan.ctrl)
-        model = setup.model_at(theta)
+        task, M = self.task, len(self.plan.ctrl)
+        model = task.system.model_at(theta)
         start = self._start(model, theta, feedback)
         before = self._before(start, feedback)
-        noise = noise + setup.parameters.bias_derivative(len(setup.outputs)) @ theta
+        noise = noise + task.parameters.bias_derivative(len(task.system.outputs)) @ theta
         sent = self._sent(model, start, before, noise, feedback)
         applied = np.concatenate(
             [np.tile(before, (self.late, 1)), np.repeat(sent, self.every, axis=0)]
@@ -355,21 +355,21 @@ class Bench:
         if not out.finite[0] or out.observed is None:
             raise SimulationDivergedError("the robot's simulation diverges")
         last = M * self.every + 1
-        y = setup.outputs(
+        y = task.system.outputs(
             out.states[0, :last], None if out.sensors is None else out.sensors[0, :last]
         )
         y[:: self.every] += noise
-        y[setup.noise.measured(last - 1) == 0.0] = np.nan
+        y[task.system.noise.measured(last - 1) == 0.0] = np.nan
         t = np.arange(last, dtype=np.float64) * self.timestep
         recording = Recording(
             t=t,
             ctrl=np.repeat(sent, self.every, axis=0),
             y=y,
-            outputs=setup.outputs.names,
+            outputs=task.system.outputs.names,
             name="robot",
         )
         margins = self._margins(
-            out.observed[0, :, 0], sent, before, out.states[0][:, : setup.space.nq], feedback
+            out.observed[0, :, 0], sent, before, out.states[0][:, : task.space.nq], feedback
         )
         return recording, margins, start
 
@@ -399,27 +399,27 @@ class Bench:
 
     def planned(self) -> Array:
         """(l,) margins of the plan: on the model, without noise and feedback."""
-        silence = np.zeros((len(self.plan.t), len(self.setup.outputs)))
-        return self.play(self._with_delay(self.setup.parameters.guess), silence, False)[1]
+        silence = np.zeros((len(self.plan.t), len(self.task.system.outputs)))
+        return self.play(self._with_delay(self.task.parameters.guess), silence, False)[1]
 
     def predicted(self) -> Array:
         """(p,) standard deviations before any run: at the guess, along the plan, the delay as it is."""
-        setup = self.setup
-        found = setup.plant.derivatives.predict(
-            self._with_delay(setup.parameters.guess), np.repeat(self.plan.ctrl, self.every, axis=0)
+        task = self.task
+        found = task.plant.derivatives.predict(
+            self._with_delay(task.parameters.guess), np.repeat(self.plan.ctrl, self.every, axis=0)
         )
         if found is None:
             raise SimulationDivergedError("the plan diverges at the guess")
-        J = setup.noise.whitened_rows(found[1])
-        return standard_deviations(J.T @ J + setup.parameters.prior_information)
+        J = task.system.noise.whitened_rows(found[1])
+        return standard_deviations(J.T @ J + task.parameters.prior_information)
 
 
-def _looked_at(setup: Setup) -> tuple[Limit, ...]:
+def _looked_at(task: DesignTask) -> tuple[Limit, ...]:
     """All limits, those that are held within samples first, in the order of the observations."""
-    within = [limit for kind in SHOWN for limit in setup.limits if limit.kind == kind]
-    least = setup.experiment.limits.clearance
+    within = [limit for kind in SHOWN for limit in task.limits if limit.kind == kind]
+    least = task.experiment.limits.clearance
     near = [] if least is None else [Limit("clearance", "nearest pair", 0, least, np.inf)]
-    return (*within, *(limit for limit in setup.limits if limit.kind not in SHOWN), *near)
+    return (*within, *(limit for limit in task.limits if limit.kind not in SHOWN), *near)
 
 
 def _dof_labels(model: Any) -> Iterator[str]:
@@ -429,12 +429,12 @@ def _dof_labels(model: Any) -> Iterator[str]:
         yield from (f"qpos:{name}" if width == 1 else f"qpos:{name}[{i}]" for i in range(width))
 
 
-def _sensed(setup: Setup) -> np.ndarray:
+def _sensed(task: DesignTask) -> np.ndarray:
     """(ns,) output that measures each number of the state, -1 where none does."""
-    model, found = setup.model, np.full(setup.space.nq + setup.space.nv + setup.space.na, -1)
+    model, found = task.system.model, np.full(task.space.nq + task.space.nv + task.space.na, -1)
     kinds = {
         int(mujoco.mjtSensor.mjSENS_JOINTPOS): 0,
-        int(mujoco.mjtSensor.mjSENS_JOINTVEL): setup.space.nq,
+        int(mujoco.mjtSensor.mjSENS_JOINTVEL): task.space.nq,
     }
     encoders = {}
     for i in range(model.nsensor):
@@ -442,7 +442,7 @@ def _sensed(setup: Setup) -> np.ndarray:
             joint, shift = int(model.sensor_objid[i]), kinds[int(model.sensor_type[i])]
             address = model.jnt_dofadr[joint] if shift else model.jnt_qposadr[joint]
             encoders[int(model.sensor_adr[i])] = shift + int(address)
-    for i, output in enumerate(setup.outputs.outputs):
+    for i, output in enumerate(task.system.outputs.outputs):
         place = output.state if output.sensor is None else encoders.get(output.sensor)
         if place is not None:
             found[place] = i

@@ -111,8 +111,8 @@ class Verdict:
 
 def judge(bench: Bench, runs: Sequence[Run]) -> Verdict:
     """Put all runs side by side."""
-    setup, stated = bench.setup, set(bench.stated.parameters.names)
-    names, shape = setup.parameters.names, (-1, len(setup.parameters))
+    task, stated = bench.task, set(bench.stated.parameters.names)
+    names, shape = task.parameters.names, (-1, len(task.parameters))
     good = [run for run in runs if np.isfinite(run.estimate).all()]
     error = np.array([run.estimate - run.theta for run in good]).reshape(shape)
     std = np.array([run.std for run in good]).reshape(shape)
@@ -127,8 +127,8 @@ def judge(bench: Bench, runs: Sequence[Run]) -> Verdict:
     return Verdict(
         bench=bench,
         names=names,
-        units=setup.units,
-        wrong=np.sqrt(np.mean([(run.theta - setup.parameters.guess) ** 2 for run in runs], axis=0)),
+        units=task.system.units,
+        wrong=np.sqrt(np.mean([(run.theta - task.parameters.guess) ** 2 for run in runs], axis=0)),
         z=error / std,
         error=error,
         std=std,

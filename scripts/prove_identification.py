@@ -28,7 +28,8 @@ from rich.table import Table
 import mjfim
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
+from mjfim.identification.identify import identify_system
 from mjfim.parallel import cores
 from mjfim.records.recording import Recording
 
@@ -59,48 +60,52 @@ class Outcome:
 
 
 @cache
-def prepared() -> tuple[Setup, Array]:
+def prepared() -> tuple[DesignTask, Array]:
     """The experiment as the user states it, and the designed control."""
     base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     control = mjfim.design(base).trajectory.ctrl
     nuisance = {"initial": OFF, "bias": dict.fromkeys(BIAS, True), "delay": True}
-    return Setup(base.replace(nuisance=nuisance, fit={"noise": "estimated"}), 1), control
+    return DesignTask.resolve(
+        base.replace(nuisance=nuisance, fit={"noise": "estimated"}), threads=1
+    ), control
 
 
 def robot(
-    setup: Setup, control: Array, friction: float, rng: np.random.Generator
+    task: DesignTask, control: Array, friction: float, rng: np.random.Generator
 ) -> tuple[Array, Recording]:
     """True theta and what the robot logged."""
-    p = setup.parameters
+    p = task.parameters
     theta, names = np.array(p.true), list(p.names)
     starts = [i for i, name in enumerate(names) if name.startswith("initial")]
     theta[starts] = rng.normal(0.0, OFF, len(starts))
     for output, bias in BIAS.items():
         theta[names.index(f"bias {output}")] = bias
     theta[names.index("delay")] = LATE
-    model = setup.model_at(theta)
+    model = task.system.model_at(theta)
     model.opt.timestep = STEP
     model.dof_frictionloss[int(model.joint("slide").dofadr[0])] = friction
     N = len(control)
-    ticks = np.arange(N + 1) * setup.dt
-    ticks[1:] += np.clip(rng.normal(0.0, JITTER, N), -0.45 * setup.dt, 0.45 * setup.dt)
+    ticks = np.arange(N + 1) * task.dt
+    ticks[1:] += np.clip(rng.normal(0.0, JITTER, N), -0.45 * task.dt, 0.45 * task.dt)
     ticks = np.rint(ticks / STEP) * STEP
-    states = stepped(model, setup, theta, control, ticks)
+    states = stepped(model, task, theta, control, ticks)
     read = np.clip(np.rint((ticks - LATE) / STEP).astype(int), 0, len(states) - 1)
     y = (
         states[read]
-        + p.bias_derivative(len(setup.outputs)) @ theta
-        + rng.normal(0.0, SIGMA, (N + 1, len(setup.outputs)))
+        + p.bias_derivative(len(task.system.outputs)) @ theta
+        + rng.normal(0.0, SIGMA, (N + 1, len(task.system.outputs)))
     )
-    return theta, Recording(t=ticks, ctrl=control, y=y, outputs=setup.outputs.names, name="robot")
+    return theta, Recording(
+        t=ticks, ctrl=control, y=y, outputs=task.system.outputs.names, name="robot"
+    )
 
 
 def stepped(
-    model: mujoco.MjModel, setup: Setup, theta: Array, control: Array, ticks: Array
+    model: mujoco.MjModel, task: DesignTask, theta: Array, control: Array, ticks: Array
 ) -> Array:
     """States at every step; the control changes at the controller's own ticks."""
     data = mujoco.MjData(model)
-    qpos, qvel, _ = setup.space.split(setup.plant.initial_state(theta))
+    qpos, qvel, _ = task.space.split(task.plant.initial_state(theta))
     data.qpos[:], data.qvel[:] = qpos, qvel
     count = round(ticks[-1] / STEP)
     tick = np.clip(
@@ -117,12 +122,12 @@ def stepped(
     return states
 
 
-def run(task: tuple[int, int, float]) -> Outcome:
+def run(job: tuple[int, int, float]) -> Outcome:
     """One run: (seed, number, friction)."""
-    seed, number, friction = task
-    setup, control = prepared()
-    theta, recording = robot(setup, control, friction, np.random.default_rng([seed, number]))
-    found = mjfim.identify(setup, [recording])
+    seed, number, friction = job
+    task, control = prepared()
+    theta, recording = robot(task, control, friction, np.random.default_rng([seed, number]))
+    found = identify_system(task.system, [recording])
     error = (found.theta - theta) / found.std
     inside = (found.interval[:, 0] <= theta) & (theta <= found.interval[:, 1])
     named = bool(found.missing_terms) and found.missing_terms[0].path == "joint/slide:frictionloss"

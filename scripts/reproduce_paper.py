@@ -18,7 +18,8 @@ from rich.table import Table
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.experiment.system import Setup
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
 from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_design
@@ -68,9 +69,9 @@ TITLES = {"initial": "initial", "final": "optimized"}
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))
 
 
-def information_at(setup: Setup, trajectory: Trajectory, measure_rate: float) -> Array:
+def information_at(task: DesignTask, trajectory: Trajectory, measure_rate: float) -> Array:
     """(p, p) Fisher information of a trajectory sampled at another rate [Hz]."""
-    other = Setup(setup.experiment.replace(measure_rate=measure_rate))
+    other = DesignTask.resolve(task.experiment.replace(measure_rate=measure_rate))
     point = other.problem.point(trajectory, CENTRAL_DIFFERENCES)
     assert point.information is not None
     return point.information
@@ -163,9 +164,9 @@ def efficiency_table(study: MonteCarloStudy) -> Table:
     return table
 
 
-def write_figures(folder: Path, setup: Setup, design: Design, study: MonteCarloStudy) -> None:
+def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCarloStudy) -> None:
     """Figures 2-6 and the tables as PNG, and the Rerun file."""
-    names = Labels.of_system(setup)
+    names = Labels.of_system(task.system)
     plots.save(plots.trajectories(design, names), folder / "figure_2.png")
     plots.save(plots.sensitivity_phase(design, names), folder / "figure_3.png")
     for figure, parameter in ((4, "c"), (5, "m"), (6, "l")):
@@ -174,7 +175,7 @@ def write_figures(folder: Path, setup: Setup, design: Design, study: MonteCarloS
     plots.save(plots.design_table(design, names), folder / "table_1.png")
     plots.save(plots.study_table(study, names), folder / "table_2_3.png")
     plots.save(plots.convergence(design), folder / "convergence.png")
-    rerun_log.log_design(folder / "design.rrd", setup.model_at(setup.theta), design, names)
+    rerun_log.log_design(folder / "design.rrd", task.system.model_at(task.theta), design, names)
 
 
 def main() -> None:
@@ -187,16 +188,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     console = Console(highlight=False, width=125)
-    setup = Setup(mjfim.Experiment.from_file(EXPERIMENT))
-    design = mjfim.design(setup)
+    task = DesignTask.resolve(mjfim.Experiment.from_file(EXPERIMENT))
+    design = design_task(task)
     console.print(table_one(design))
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     studies = {
-        rate: mjfim.monte_carlo(setup, curves, args.trials, args.seed, measure_rate=rate)
+        rate: mjfim.monte_carlo(task.experiment, curves, args.trials, args.seed, measure_rate=rate)
         for rate in (25.0, 100.0)
     }
     for name in PAPER:
-        information = information_at(setup, curves[name], 25.0)
+        information = information_at(task, curves[name], 25.0)
         console.print(
             matrix_table(name, args.trials, studies[25.0].sets[name].covariance, information)
         )
@@ -204,10 +205,10 @@ def main() -> None:
     for study in studies.values():
         console.print(efficiency_table(study))
     args.output.mkdir(parents=True, exist_ok=True)
-    write_design(args.output, design, setup)
+    write_design(args.output, design, task.system)
     write_json(args.output / "montecarlo_25Hz.json", studies[25.0].summary())
     write_json(args.output / "montecarlo_100Hz.json", studies[100.0].summary())
-    write_figures(args.output, setup, design, studies[25.0])
+    write_figures(args.output, task, design, studies[25.0])
     console.print(
         f"wrote {args.output}/: figures 2-6, tables, design.rrd (mjfim replay {args.output})"
     )

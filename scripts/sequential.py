@@ -29,8 +29,9 @@ import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, RecordingError
 from mjfim.excitation.target_accuracy import wanted_of
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
+from mjfim.experiment.simulate import simulate_system
 from mjfim.output.archive import write_recording
 from mjfim.output.folders import check_folder
 from mjfim.records.campaign import Campaign, CampaignStatus
@@ -40,7 +41,7 @@ from mjfim.records.recording import Recording
 say = Console(highlight=False, soft_wrap=True)
 
 
-def table(campaign: Campaign, setup: Setup, simulated: bool) -> Table:
+def table(campaign: Campaign, task: DesignTask, simulated: bool) -> Table:
     """The last round."""
     rows = Table(title=str(campaign), title_justify="left")
     for heading in (
@@ -53,14 +54,14 @@ def table(campaign: Campaign, setup: Setup, simulated: bool) -> Table:
     ):
         rows.add_column(heading, justify="left" if heading == "parameter" else "right")
     e = campaign.estimate
-    for j in setup.parameters.interest.tolist() if e is not None else []:
+    for j in task.parameters.interest.tolist() if e is not None else []:
         if e is None:
             continue
         std, aim = float(e.std[j]), float(campaign.wanted[j])
-        off = [f"{(e.theta[j] - setup.parameters.true[j]) / std:+.1f} σ"] if simulated else []
+        off = [f"{(e.theta[j] - task.parameters.true[j]) / std:+.1f} σ"] if simulated else []
         words = [
             e.parameters[j],
-            f"{setup.parameters.guess[j]:.5g}",
+            f"{task.parameters.guess[j]:.5g}",
             f"{e.theta[j]:.5g}",
             f"{std:.2g}",
         ]
@@ -75,7 +76,7 @@ def table(campaign: Campaign, setup: Setup, simulated: bool) -> Table:
 
 def simulated(folder: Folder, rounds: int, seed: int) -> Campaign:
     """A campaign on a robot that is the model at its true values; the noise of round k has the seed `seed + k - 1`."""
-    experiment = folder.setup.experiment
+    experiment = folder.task.experiment
     if all(spec.true is None for spec in experiment.parameters.values()):
         raise ExperimentError(
             f"{experiment.source}: no parameter states a `true` value, at which a robot could be simulated; state some, or "
@@ -88,11 +89,11 @@ def simulated(folder: Folder, rounds: int, seed: int) -> Campaign:
 
     def measure(design: Design, number: int) -> Recording:
         folder.leave_design(design, number)
-        recording = mjfim.simulate(folder.setup, design.trajectory, seed + number - 1)
-        write_recording(folder.round(number) / "recording.csv", recording, folder.setup)
+        recording = simulate_system(folder.task.system, design.trajectory, seed + number - 1)
+        write_recording(folder.round(number) / "recording.csv", recording, folder.task.system)
         return recording
 
-    threads = folder.setup.plant.simulator.threads
+    threads = folder.task.plant.simulator.threads
     return mjfim.sequential(experiment, measure, rounds, threads=threads, report=folder.report)
 
 
@@ -101,15 +102,15 @@ def real(folder: Folder, rounds: int, files: Sequence[Path]) -> Campaign:
     folder.take(files)
     done = list(folder.done())
     waits = folder.designed > folder.recorded
-    experiment, threads = folder.setup.experiment, folder.setup.plant.simulator.threads
+    experiment, threads = folder.task.experiment, folder.task.plant.simulator.threads
 
     def measure(design: Design, number: int) -> None:
         folder.leave_design(design, number)
 
     if waits and not done:
         return Campaign(
-            parameters=folder.setup.parameters.names,
-            wanted=wanted_of(folder.setup),
+            parameters=folder.task.parameters.names,
+            wanted=wanted_of(folder.task),
             rounds=(),
             status=CampaignStatus.WAITING,
         )
@@ -172,11 +173,11 @@ def main() -> int:
     args = parser.parse_args()
     try:
         stated = mjfim.Experiment.from_file(args.experiment)
-        first = Setup(stated, args.threads)
+        first = DesignTask.resolve(stated, threads=args.threads)
         stated = with_wanted(stated, args.wanted, first.parameters.names, first.parameters.guess)
         check_folder(args.output)
-        folder = Folder(args.output, Setup(stated, args.threads))
-        wanted_of(folder.setup)
+        folder = Folder(args.output, DesignTask.resolve(stated, threads=args.threads))
+        wanted_of(folder.task)
         truth = not (args.real or args.recordings)
         campaign = (
             simulated(folder, args.rounds, args.seed)
@@ -190,7 +191,7 @@ def main() -> int:
     except KeyboardInterrupt:
         told.print(f"sequential: interrupted; {args.output}/ holds the rounds that are complete")
         return 1
-    say.print(table(campaign, folder.setup, truth))
+    say.print(table(campaign, folder.task, truth))
     if campaign.status is CampaignStatus.WAITING:
         waiting = folder.round(folder.designed)
         say.print(

@@ -14,7 +14,7 @@ from sequential_picture import figure
 
 from mjfim.errors import ModelError, RecordingError
 from mjfim.excitation.target_accuracy import wanted_of
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.output.archive import check_fits, read_design, write_design
 from mjfim.output.mjcf.write import write_identified
 from mjfim.output.plots import style
@@ -29,10 +29,10 @@ told = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 class Folder:
-    """A campaign on disk. setup: of the experiment as stated"""
+    """A campaign on disk. task: of the experiment as stated"""
 
-    def __init__(self, path: Path, setup: Setup) -> None:
-        self.path, self.setup = path, setup
+    def __init__(self, path: Path, task: DesignTask) -> None:
+        self.path, self.task = path, task
         self.rounds: list[Round] = []
 
     def round(self, number: int) -> Path:
@@ -64,7 +64,7 @@ class Folder:
         """Copy recordings that are not here yet to the round that waits for them."""
         known = {path.read_bytes() for k in range(self.designed) for path in self.recordings(k + 1)}
         for file in files:
-            read_recording(file, self.setup.channels)
+            read_recording(file, self.task.system.channels)
         new = [file for file in dict.fromkeys(files) if file.read_bytes() not in known]
         waiting = self.recorded + 1
         if new and waiting > self.designed:
@@ -78,7 +78,7 @@ class Folder:
 
     def done(self) -> Iterator[EarlierRound]:
         """The rounds that are recorded."""
-        names = self.setup.parameters.names
+        names = self.task.parameters.names
         for k in range(1, self.recorded + 1):
             file = self.round(k) / "design.json"
             try:
@@ -93,9 +93,9 @@ class Folder:
                     f"{file}: designed for {', '.join(own)}; the experiment has {', '.join(names)}"
                 )
             trajectory = read_design(self.round(k) / "design.npz")["final"]
-            check_fits(self.round(k) / "design.npz", trajectory, self.setup)
+            check_fits(self.round(k) / "design.npz", trajectory, self.task.system)
             recordings = tuple(
-                read_recording(path, self.setup.channels) for path in self.recordings(k)
+                read_recording(path, self.task.system.channels) for path in self.recordings(k)
             )
             yield EarlierRound(
                 recordings=recordings,
@@ -107,32 +107,34 @@ class Folder:
     def leave_design(self, design: Design, number: int) -> None:
         """What the robot needs."""
         last = self.rounds[-1].estimate if self.rounds else None
-        made = Setup(restated(self.setup, design.theta, last), self.setup.plant.simulator.threads)
-        write_design(self.round(number), design, made)
+        made = self.task.restated(restated(self.task, design.theta, last))
+        write_design(self.round(number), design, made.system)
 
     def report(self, now: Round) -> None:
         """Keep a round, and say what it told."""
         self.rounds.append(now)
         write_json(self.round(now.number) / "estimate.json", now.estimate.summary())
-        told.print(f"round {now.number}: {described(now, self.setup)}", markup=False)
+        told.print(f"round {now.number}: {described(now, self.task)}", markup=False)
         for sentence in now.warnings:
             told.print(f"  warning: {sentence}", style="yellow", markup=False)
 
     def leave(self, campaign: Campaign, simulated: bool) -> None:
         """campaign.json, campaign.png and identified.xml."""
-        write_json(self.path / "campaign.json", summary(campaign, self.setup, simulated))
+        write_json(self.path / "campaign.json", summary(campaign, self.task, simulated))
         if campaign.estimate is None:
             return
-        save(figure(campaign, self.setup, simulated), self.path / "campaign.png")
+        save(figure(campaign, self.task, simulated), self.path / "campaign.png")
         try:
-            write_identified(self.path / "identified.xml", self.setup, campaign.estimate.theta)
+            write_identified(
+                self.path / "identified.xml", self.task.system, campaign.estimate.theta
+            )
         except ModelError as error:
             told.print(f"warning: {error}", markup=False)
 
 
-def described(now: Round, setup: Setup) -> str:
+def described(now: Round, task: DesignTask) -> str:
     """The wanted parameters after a round."""
-    aims = wanted_of(setup)
+    aims = wanted_of(task)
     e, parts = now.estimate, []
     for j, name in enumerate(e.parameters):
         if np.isfinite(aims[j]):
@@ -142,7 +144,7 @@ def described(now: Round, setup: Setup) -> str:
     return ", ".join(parts)
 
 
-def summary(campaign: Campaign, setup: Setup, simulated: bool) -> dict[str, Any]:
+def summary(campaign: Campaign, task: DesignTask, simulated: bool) -> dict[str, Any]:
     """Contents of campaign.json."""
     return {
         "status": campaign.status.name.lower(),
@@ -150,9 +152,9 @@ def summary(campaign: Campaign, setup: Setup, simulated: bool) -> dict[str, Any]
         "reached": campaign.reached,
         "simulated": simulated,
         "parameters": list(campaign.parameters),
-        "units": list(setup.units),
+        "units": list(task.system.units),
         "wanted": campaign.wanted,
-        "true": setup.parameters.true if simulated else None,
+        "true": task.parameters.true if simulated else None,
         "rounds": [
             {
                 "number": r.number,

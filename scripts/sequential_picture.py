@@ -8,16 +8,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.output.plots import style
 from mjfim.records.campaign import Campaign
 
 SHOWN = 8  # parameters, the wanted ones first
 
 
-def figure(campaign: Campaign, setup: Setup, simulated: bool) -> Figure:
+def figure(campaign: Campaign, task: DesignTask, simulated: bool) -> Figure:
     """Of each parameter: σ over the rounds against the wanted one, and the estimate, against the truth where it is known."""
-    p = setup.parameters
+    p = task.parameters
     order = sorted(p.interest.tolist(), key=lambda j: not np.isfinite(campaign.wanted[j]))[:SHOWN]
     new = style.new_figure(9.0, 1.2 + 1.75 * len(order))
     panels = new.subplots(len(order), 2, squeeze=False, sharex=True)

@@ -14,7 +14,7 @@ from sysid_signals import Compared, Layout
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, ModelError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.identification.aligned_recording import Track, track_of
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.paths import INERTIAL_FIELDS, SERVO_FIELDS, ParameterPath
@@ -59,7 +59,7 @@ class Exported:
     notes: sentences about what of the experiment sysid does not get
     """
 
-    setup: Setup
+    task: DesignTask
     sequences: Any
     parameters: Any
     layout: Layout
@@ -67,7 +67,10 @@ class Exported:
 
     def residual(self, weighted: bool) -> Callable[..., Any]:
         """Residual function. weighted: by the stated noise, priors at the end; else as sysid does, without priors"""
-        h, noise = float(self.setup.model.opt.timestep), self.setup.noise if weighted else None
+        h, noise = (
+            float(self.task.system.model.opt.timestep),
+            self.task.system.noise if weighted else None,
+        )
         of: Callable[..., Any] = sysid.build_residual_fn
         data = of(
             models_sequences=[self.sequences],
@@ -75,7 +78,7 @@ class Exported:
             modify_residual=Compared(self.layout, h, noise),
             resample_true=False,
         )
-        p = self.setup.parameters
+        p = self.task.parameters
         weight = np.sqrt(np.diag(p.prior_information))
 
         def whole(x: Array, parameters: Any, **options: Any) -> tuple[list[Array], Any, Any]:
@@ -93,45 +96,47 @@ def build(parameters: Any, spec: Any) -> Any:
     return sysid.apply_param_modifiers(parameters, spec.copy())
 
 
-def export(setup: Setup, recordings: Sequence[Recording]) -> Exported:
+def export(task: DesignTask, recordings: Sequence[Recording]) -> Exported:
     """An experiment and its recordings. Raises MjfimError for what sysid cannot express."""
     require_extra()
-    _require_alike(setup)
-    parameters, layout, spec = parameters_of(setup), Layout.of(setup), setup.spec.copy()
-    _require_followed(setup, parameters, spec)
-    tracks = [track_of(setup, recording) for recording in recordings]
-    nq, nv = setup.model.nq, setup.model.nv
-    start = setup.plant.initial_state(setup.parameters.guess)
+    _require_alike(task)
+    parameters, layout, spec = parameters_of(task), Layout.of(task), task.system.source.spec.copy()
+    _require_followed(task, parameters, spec)
+    tracks = [track_of(task.system, recording) for recording in recordings]
+    nq, nv = task.system.model.nq, task.system.model.nv
+    start = task.plant.initial_state(task.parameters.guess)
     state = sysid.create_initial_state(
-        setup.model, start[:nq], start[nq : nq + nv], start[nq + nv :]
+        task.system.model, start[:nq], start[nq : nq + nv], start[nq + nv :]
     )
     with hushed():  # it counts state signals among sensors
         sequences = sysid.ModelSequences(
-            setup.model_path.stem,
+            task.system.model_path.stem,
             spec,
             [track.name for track in tracks],
             [state] * len(tracks),
-            [control_of(setup, track) for track in tracks],
+            [control_of(task, track) for track in tracks],
             [layout.series(track.t, track.y) for track in tracks],
             allow_missing_sensors=True,
         )
-    return Exported(setup, sequences, parameters, layout, _notes(setup))
+    return Exported(task, sequences, parameters, layout, _notes(task))
 
 
-def control_of(setup: Setup, track: Track) -> Any:
+def control_of(task: DesignTask, track: Track) -> Any:
     """TimeSeries of the control at every engine step, held over each sample.
 
     sysid drops the last row; another one makes it step past the end, so that sensors there are seen.
     """
-    steps = np.repeat(track.ctrl, setup.substeps, axis=0)
+    steps = np.repeat(track.ctrl, task.system.grid.substeps, axis=0)
     held = np.concatenate([steps, steps[-1:], steps[-1:]])
-    t = np.arange(len(held)) * float(setup.model.opt.timestep)
-    return sysid.TimeSeries(t, held, sysid.TimeSeries.compute_all_control_mapping(setup.model))
+    t = np.arange(len(held)) * float(task.system.model.opt.timestep)
+    return sysid.TimeSeries(
+        t, held, sysid.TimeSeries.compute_all_control_mapping(task.system.model)
+    )
 
 
-def parameters_of(setup: Setup) -> Any:
+def parameters_of(task: DesignTask) -> Any:
     """ParameterDict at the guess. What belongs together is written as a whole, so the last modifier writes for all."""
-    p, theta = setup.parameters, np.array(setup.parameters.guess)
+    p, theta = task.parameters, np.array(task.parameters.guess)
     paths = [ParameterPath.parse(target.path) for q in p.parameters for target in q.targets]
     whole = any(path.field in WHOLE for path in paths)
 
@@ -140,7 +145,11 @@ def parameters_of(setup: Setup) -> Any:
             theta[j] = float(parameter.value[0])
             if j == len(p) - 1:
                 write_spec(
-                    spec, setup.model, setup.model_at(theta) if whole else setup.model, p, theta
+                    spec,
+                    task.system.model,
+                    task.system.model_at(theta) if whole else task.system.model,
+                    p,
+                    theta,
                 )
 
         return write
@@ -153,9 +162,9 @@ def parameters_of(setup: Setup) -> Any:
     return found
 
 
-def _require_alike(setup: Setup) -> None:
+def _require_alike(task: DesignTask) -> None:
     """Raise ExperimentError where sysid could not fit the same problem."""
-    e, p = setup.experiment, setup.parameters
+    e, p = task.experiment, task.parameters
     if p.outside_model.any():
         name = p.names[int(np.argmax(p.outside_model))]
         raise ExperimentError(
@@ -167,29 +176,29 @@ def _require_alike(setup: Setup) -> None:
         )
 
 
-def _require_followed(setup: Setup, parameters: Any, spec: Any) -> None:
+def _require_followed(task: DesignTask, parameters: Any, spec: Any) -> None:
     """Make sure that the compile of moved parameters is the model that mjfim simulates. Raises ModelError."""
-    p, moved = setup.parameters, parameters.copy()
+    p, moved = task.parameters, parameters.copy()
     theta = np.clip(p.guess + PROBE * p.magnitude, p.lower, p.upper)
     moved.update_from_vector(theta)
     for settled in (False, True):
         if settled:
-            state_derived_values(spec, setup.model)
+            state_derived_values(spec, task.system.model)
         try:
-            if same_dynamics(build(moved, spec), setup.model_at(theta)):
+            if same_dynamics(build(moved, spec), task.system.model_at(theta)):
                 return
         except ValueError as error:
             if settled:
                 raise ModelError(
-                    f"{setup.model_path}: MuJoCo refuses the parameters a little off: {error}"
+                    f"{task.system.model_path}: MuJoCo refuses the parameters a little off: {error}"
                 ) from None
     raise ModelError(
-        f"{setup.model_path}: a compile with other parameters gives another model than mjfim simulates"
+        f"{task.system.model_path}: a compile with other parameters gives another model than mjfim simulates"
     )
 
 
-def _notes(setup: Setup) -> tuple[str, ...]:
-    fit, p = setup.experiment.fit, setup.parameters
+def _notes(task: DesignTask) -> tuple[str, ...]:
+    fit, p = task.experiment.fit, task.parameters
     told = [q.name for q in p.parameters if q.prior is not None]
     unbounded = [
         n

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.plant.noise import Noise
 
 ON_STEP = 1e-6  # of an engine step: times that close to it are meant to be on it
@@ -39,20 +39,20 @@ class Layout:
     shown: dict[str, tuple[Any, np.ndarray]]
 
     @staticmethod
-    def of(setup: Setup) -> Layout:
+    def of(task: DesignTask) -> Layout:
         """Whole signals, also where some of their components are not measured. Raises ExperimentError."""
-        qpos, qvel, act, _ = sysid.TimeSeries.compute_all_state_mappings(setup.model)
+        qpos, qvel, act, _ = sysid.TimeSeries.compute_all_state_mappings(task.system.model)
         wholes = {
             False: qpos | qvel | act,
-            True: sysid.TimeSeries.compute_all_sensor_mapping(setup.model),
+            True: sysid.TimeSeries.compute_all_sensor_mapping(task.system.model),
         }
         mapping: dict[str, tuple[Any, np.ndarray]] = {}
         columns: list[tuple[bool, int]] = []
         sought = [
             (o.sensor is not None, o.state if o.sensor is None else o.sensor)
-            for o in setup.outputs.outputs
+            for o in task.system.outputs.outputs
         ]
-        for output, (sensed, place) in zip(setup.outputs.outputs, sought, strict=True):
+        for output, (sensed, place) in zip(task.system.outputs.outputs, sought, strict=True):
             hits = [name for name, (_, indices) in wholes[sensed].items() if place in indices]
             if not hits or hits[0] in ("_qpos", "_qvel"):
                 raise ExperimentError(

@@ -19,6 +19,7 @@ import pytest
 import mjfim
 from mjfim import parallel as workers
 from mjfim.excitation import constrained as enclosed
+from mjfim.excitation.design import design_task
 from mjfim.excitation.interior_point import Ladder, Rung
 from mjfim.records.design import HistoryRow, Status
 from tests.support.cli import names, read, write_experiment
@@ -78,13 +79,13 @@ def test_what_has_ended_is_salvaged_in_order_and_the_rest_is_left(
 @pytest.mark.slow
 def test_interrupted_among_workers_a_design_keeps_what_they_found(tmp_path: Path) -> None:
     """SIGINT while two of hundreds of starts are under way."""
-    setup = cart_inside(tmp_path, horizon=2.0, descent={"starts": 400, "max_iterations": 100_000})
+    task = cart_inside(tmp_path, horizon=2.0, descent={"starts": 400, "max_iterations": 100_000})
     with mjfim.Pool(2) as pool:
         assert pool.submit(identity).result()
         timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGINT))
         timer.start()
         try:
-            design = mjfim.design(setup, executor=pool)
+            design = design_task(task, executor=pool)
         finally:
             timer.cancel()
     assert design.status is Status.INTERRUPTED
@@ -93,13 +94,13 @@ def test_interrupted_among_workers_a_design_keeps_what_they_found(tmp_path: Path
 
 
 def test_interrupted_by_what_watches_it_keeps_the_others_too(tmp_path: Path) -> None:
-    setup = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 30})
+    task = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 30})
 
     def stop(row: HistoryRow) -> None:
         raise KeyboardInterrupt
 
     with mjfim.Pool(2) as pool:
-        design = mjfim.design(setup, stop, executor=pool)
+        design = design_task(task, stop, executor=pool)
     assert design.status is Status.INTERRUPTED
     assert len(design.starts) >= 2
     assert design.final.cost < design.initial.cost
@@ -139,13 +140,13 @@ def test_a_start_that_breaks_does_not_end_the_others(
     climb = Ladder.climb
 
     def broken(self: Ladder, control: np.ndarray, *rest: float) -> Iterator[Rung]:
-        if np.abs(control - setup.control).max() > 1e-9:
+        if np.abs(control - task.control).max() > 1e-9:
             raise np.linalg.LinAlgError("singular")
         yield from climb(self, control, *rest)
 
-    setup = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 20, "coarse": 1})
+    task = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 20, "coarse": 1})
     monkeypatch.setattr(enclosed.Ladder, "climb", broken)
-    design = mjfim.design(setup)
+    design = design_task(task)
     assert [start.status is Status.INFEASIBLE for start in design.starts] == [False, True, True]
     assert design.final.cost < design.initial.cost
 
@@ -154,9 +155,9 @@ def test_a_start_that_breaks_does_not_end_the_others(
 def test_seconds_end_a_design(tmp_path: Path, limits: dict[str, object]) -> None:
     descent = {"seconds": 1.5, "starts": 500, "max_iterations": 100_000, "tolerance": 1e-14}
     cost = {"control": 0.0 if limits else 1e-3}
-    setup = cart_inside(tmp_path, limits=limits, cost=cost, descent=descent)
+    task = cart_inside(tmp_path, limits=limits, cost=cost, descent=descent)
     clock = time.perf_counter()
-    design = mjfim.design(setup)
+    design = design_task(task)
     assert time.perf_counter() - clock < 12.0
     assert len(design.starts) < 500
     assert design.status is not Status.INTERRUPTED

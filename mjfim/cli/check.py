@@ -9,7 +9,7 @@ import typer
 
 import mjfim
 from mjfim.cli.common import AsJson, ExperimentFile, Threads, _say, errors, progress, verb, writing
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output import text as report
 from mjfim.output.folders import check_folder
@@ -34,17 +34,18 @@ def check(
     threads: Threads = None,
 ) -> None:
     """Say what can be identified, how well, and what only in combination; before any fit."""
-    setup = Setup(mjfim.Experiment.from_file(experiment), threads)
-    loaded = [read_recording(path, setup.channels) for path in recordings or []]
+    stated = mjfim.Experiment.from_file(experiment)
+    system = System.resolve(stated, threads=threads)
+    loaded = [read_recording(path, system.channels) for path in recordings or []]
     trajectory = None
     if design_file is not None:
         trajectory = archive.read_design(design_file)["final"]
-        archive.check_fits(design_file, trajectory, setup)
+        archive.check_fits(design_file, trajectory, system)
     if output is not None:
         check_folder(output)
     with progress() as bar:
         bar.add_task("looking", total=None)
-        result = mjfim.check(setup, loaded, trajectory)
+        result = mjfim.check(stated, loaded, trajectory, threads)
     if output is not None:
         with writing(output) as results:
             results.leave_check(output, result)

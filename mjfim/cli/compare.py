@@ -18,11 +18,11 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.output import text as report
 from mjfim.output.folders import check_folder
 from mjfim.studies.baselines.methods import METHODS
-from mjfim.studies.compare import Glance
+from mjfim.studies.compare import Glance, compare_task
 
 
 @verb
@@ -44,19 +44,19 @@ def compare(
     threads: Threads = None,
 ) -> None:
     """Hold the design against chirps, multisines, Fourier series, splines with the same budget; exit code 1 if one is better."""
-    setup = Setup(mjfim.Experiment.from_file(experiment), threads)
+    task = DesignTask.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     chosen = (
         None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
     )
     check_folder(output)
     with progress() as bar:
-        task = bar.add_task("comparing", total=None)
+        progress_task = bar.add_task("comparing", total=None)
         told = [-1]
 
         def monitor(glance: Glance) -> None:
             text = f"{glance.place + 1}/{glance.count} {glance.title}  best J {glance.cost:.5g}"
             bar.update(
-                task,
+                progress_task,
                 description=text,
                 total=glance.count,
                 completed=glance.place + min(glance.used, 1.0),
@@ -65,13 +65,11 @@ def compare(
                 told[0] = glance.place
                 errors.print(f"{glance.place + 1}/{glance.count} {glance.title}", markup=False)
 
-        result = mjfim.compare(
-            setup, seconds, steps, seed, chosen, monitor=monitor, threads=threads
-        )
+        result = compare_task(task, seconds, steps, seed, chosen, monitor=monitor)
     if not result.rows:
         raise KeyboardInterrupt
     with writing(output) as results:
-        results.leave_comparison(output, result, setup)
+        results.leave_comparison(output, result, task.system)
     _say(as_json, result.summary(), report.compare_report(result))
     errors.print(f"wrote {output}/")
     if not result.ok:

@@ -21,8 +21,9 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
+from mjfim.excitation.design import design_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, Shortest
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.output import text as report
 from mjfim.output.folders import check_folder
 from mjfim.parallel import Pool
@@ -31,14 +32,14 @@ from mjfim.records.serialization import write_json
 
 
 @contextmanager
-def several(setup: Setup) -> Iterator[Executor | None]:
+def several(task: DesignTask) -> Iterator[Executor | None]:
     """Processes for the starts of a design under hard limits; None where one start has all threads to itself."""
-    d = setup.experiment.descent
+    d = task.experiment.descent
     count = d.starts + len(d.previous) + len(d.fourier) + len(d.repeats)
-    if count == 1 or not setup.enforced:
+    if count == 1 or not task.is_limited:
         yield None
         return
-    with Pool(min(count, setup.plant.simulator.threads)) as pool:
+    with Pool(min(count, task.plant.simulator.threads)) as pool:
         yield pool
 
 
@@ -62,30 +63,30 @@ def design(
     stated = mjfim.Experiment.from_file(experiment)
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})
-    setup = Setup(stated, threads)
+    task = DesignTask.resolve(stated, threads=threads)
     check_folder(output)
-    with several(setup) as executor, progress() as bar:
-        task = bar.add_task("designing", total=None)
+    with several(task) as executor, progress() as bar:
+        progress_task = bar.add_task("designing", total=None)
 
         def monitor(row: HistoryRow) -> None:
             text = f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}  slope {row.slope:.1e}"
-            bar.update(task, description=text)
+            bar.update(progress_task, description=text)
             if not errors.is_terminal and row.iteration % 10 == 0:
                 errors.print(text)
 
-        found = _shortest(setup, monitor, executor) if shortest else None
-        result = mjfim.design(setup, monitor, executor=executor) if found is None else found.design
+        found = _shortest(task, monitor, executor) if shortest else None
+        result = design_task(task, monitor, executor=executor) if found is None else found.design
     if found is not None:
-        setup = Setup(found.experiment, threads)
+        task = DesignTask.resolve(found.experiment, threads=threads)
     with writing(output) as results:
-        results.leave_design(output, result, setup)
+        results.leave_design(output, result, task.system)
         if found is not None:
             write_json(output / "shortest.json", found.summary())
     told = {} if found is None else {"shortest": found.summary()}
     _say(
         as_json,
         {**result.summary(), **told},
-        report.design_report(result, setup.units),
+        report.design_report(result, task.system.units),
     )
     if found is not None:
         errors.print(
@@ -99,14 +100,14 @@ def design(
 
 
 def _shortest(
-    setup: Setup, monitor: Callable[[HistoryRow], None], executor: Executor | None
+    task: DesignTask, monitor: Callable[[HistoryRow], None], executor: Executor | None
 ) -> Shortest:
     """The shortest design, every duration told on the way; exit code 1 where none is long enough."""
     try:
         return mjfim.shortest(
-            setup.experiment,
+            task.experiment,
             monitor=monitor,
-            threads=setup.plant.simulator.threads,
+            threads=task.plant.simulator.threads,
             report=lambda tried: errors.print(str(tried), markup=False),
             executor=executor,
         )

@@ -21,7 +21,8 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.errors import ExperimentError
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
+from mjfim.identification.identify import identify_system
 from mjfim.output import text as report
 from mjfim.output.folders import check_folder
 from mjfim.recordings.read import read_log
@@ -52,12 +53,12 @@ def identify(
     """Estimate the parameters from recordings, and say how far that is to be trusted."""
     if method not in ("least_squares", "newton"):
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
-    setup = Setup(mjfim.Experiment.from_file(experiment), threads)
+    system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     check_folder(output)
     with progress() as bar:
         task = bar.add_task("reading", total=None)
         loaded, kept = (
-            [read_log(path, setup.channels) for path in paths]
+            [read_log(path, system.channels) for path in paths]
             for paths in (recordings, held_out or [])
         )
         if not as_json:
@@ -72,20 +73,20 @@ def identify(
             if not errors.is_terminal and event.iteration % 5 == 0:
                 errors.print(text, markup=False)
 
-        result = mjfim.identify(
-            setup,
+        result = identify_system(
+            system,
             [log.recording for log in loaded],
             "newton" if method == "newton" else "least_squares",
             held_out=[log.recording for log in kept],
             callback=show,
         )
     with writing(output) as results:
-        for sentence in results.leave_estimate(output, result, setup):
+        for sentence in results.leave_estimate(output, result, system):
             errors.print(f"warning: {sentence}", markup=False)
     _say(
         as_json,
         result.summary(),
-        report.estimate_report(result, setup.units),
+        report.estimate_report(result, system.units),
     )
     errors.print(f"wrote {output}/")
     raise typer.Exit(0 if result.success and not result.misfit and not result.interrupted else 1)

@@ -13,7 +13,7 @@ import mjfim
 from mjfim.atomic_io import replacing
 from mjfim.cli.common import errors, verb
 from mjfim.errors import RecordingError
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import check_file, experiment_beside, recording_of
 from mjfim.output.labels import Labels
@@ -42,12 +42,12 @@ def replay(
     if save is not None:
         check_file(save)
     if source.suffix == ".npz":
-        setup = Setup(mjfim.Experiment.from_file(experiment or experiment_beside(source)))
+        system = System.resolve(mjfim.Experiment.from_file(experiment or experiment_beside(source)))
         named = archive.read_design(source)
         for trajectory in named.values():
-            archive.check_fits(source, trajectory, setup)
+            archive.check_fits(source, trajectory, system)
         rerun_log.log_trajectories(
-            target, setup.model_at(setup.theta), named, Labels.of_system(setup)
+            target, system.model_at(system.theta), named, Labels.of_system(system)
         )
     else:
         found = recording_of(source)

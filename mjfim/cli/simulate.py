@@ -19,10 +19,12 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
-from mjfim.experiment.system import Setup
+from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output import text as report
 from mjfim.output.folders import check_file, check_folder
+from mjfim.studies.monte_carlo import monte_carlo_system
 
 
 @verb
@@ -35,11 +37,11 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
 ) -> None:
     """Play a design on the model at its `true` values, with noise: a synthetic recording."""
-    setup = Setup(mjfim.Experiment.from_file(experiment))
+    system = System.resolve(mjfim.Experiment.from_file(experiment))
     check_file(output)
     trajectory = archive.read_design(design_file)["final"]
-    archive.check_fits(design_file, trajectory, setup)
-    archive.write_recording(output, mjfim.simulate(setup, trajectory, seed), setup)
+    archive.check_fits(design_file, trajectory, system)
+    archive.write_recording(output, simulate_system(system, trajectory, seed), system)
     errors.print(f"wrote {output}")
 
 
@@ -57,10 +59,12 @@ def montecarlo(
 ) -> None:
     """Hold the estimator against the Cramér-Rao bound, on the initial and the designed trajectory."""
     stated = mjfim.Experiment.from_file(experiment)
-    setup = Setup(stated if measure_rate is None else stated.replace(measure_rate=measure_rate))
+    system = System.resolve(
+        stated if measure_rate is None else stated.replace(measure_rate=measure_rate)
+    )
     named = archive.read_design(design_file)
     for trajectory in named.values():
-        archive.check_fits(design_file, trajectory, setup)
+        archive.check_fits(design_file, trajectory, system)
     check_folder(output)
     with progress() as bar:
         tasks = {name: bar.add_task(f"{trials} trials, {name}", total=1.0) for name in named}
@@ -70,10 +74,10 @@ def montecarlo(
             if not errors.is_terminal:
                 errors.print(f"{name}: {100 * share:.0f} %")
 
-        study = mjfim.monte_carlo(setup, named, trials, seed, progress=tell)
+        study = monte_carlo_system(system, named, trials, seed, tell)
     with writing(output) as results:
-        results.leave_study(output, study, setup)
-    _say(as_json, study.summary(), report.study_report(study, setup.units))
+        results.leave_study(output, study, system)
+    _say(as_json, study.summary(), report.study_report(study, system.units))
     errors.print(f"wrote {output}/")
     if len(study.sets) < len(named):
         errors.print(f"mjfim: interrupted; only {', '.join(study.sets)} is finished")

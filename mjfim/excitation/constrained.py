@@ -15,10 +15,10 @@ from mjfim.excitation.constraints import Fence, basis_of, fence_of
 from mjfim.excitation.initial_controls import Start
 from mjfim.excitation.interior_point import Ladder, Rung, Rungs, seen
 from mjfim.excitation.objective import DesignProblem, Point
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, regulator_for
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
-from mjfim.model.variants import FREE, Level
+from mjfim.model.variants import RELAXED, ModelVariant
 from mjfim.parallel import stopped
 from mjfim.records.design import HistoryRow, Status
 from mjfim.signals import independent_curves
@@ -33,10 +33,10 @@ FAINT = (
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class ConstrainedSearch:
     """A descent under hard limits. seconds: time it may take;  combinations: (t, s) identifiable ones, or None
 
-    added: (p, p) information of other experiments, or None;  level: of the plant;  held: shares held back
+    added_information: (p, p) of other experiments, or None;  variant: of the plant;  held: shares held back
     begun: when the design began, by `time.time`
     """
 
@@ -46,8 +46,8 @@ class Task:
     budget: int
     seconds: float = np.inf
     combinations: Array | None = None
-    added: Array | None = None
-    level: Level = FREE
+    added_information: Array | None = None
+    variant: ModelVariant = RELAXED
     threads: int | None = None
     held: Mapping[str, float] = field(default_factory=dict)
     begun: float = field(default_factory=time.time)
@@ -55,7 +55,7 @@ class Task:
 
 @dataclass
 class Chase:
-    """Where a task has come to. control: (N, nu) the best inside all limits, else the last;  cost: J there, infinite outside"""
+    """Where a search has come to. control: (N, nu) the best inside all limits, else the last;  cost: J there, infinite outside"""
 
     name: str
     control: Array | None = None
@@ -66,33 +66,43 @@ class Chase:
     steps: int = 0
 
 
-def pursue(task: Task, chase: Chase, setup: Setup | None = None) -> Iterator[HistoryRow]:
-    """Every iterate of a task, keeping `chase` up to date. setup: of the experiment on its lifted plant, if there is one"""
+def pursue(
+    search: ConstrainedSearch, chase: Chase, task: DesignTask | None = None
+) -> Iterator[HistoryRow]:
+    """Every iterate of a search, keeping `chase` up to date. task: of the experiment on its lifted plant, if there is one"""
     clock = time.perf_counter()
-    repeats = task.start.repeats
-    if setup is None or repeats > 1:
-        experiment = task.experiment.replace(horizon=task.experiment.horizon / repeats)
-        setup = Setup(experiment, task.threads, task.added, task.level)
-    begun = setup.plant.engine_steps
-    exact, smooth = Stage(setup, task.combinations).problem, smoothed(setup, task.combinations)
-    fine = task.start.basis if task.start.basis is not None else basis_of(setup, setup.stated_times)
-    basis = None if fine is None else independent_curves(setup.averaged(fine))
-    regulate = replace(regulator_for(setup), feedback_threshold=CALM if basis is None else np.inf)
-    fence = fence_of(setup).tightened(task.held)
-    ladder = Ladder(smooth, fence, setup.centre, basis, regulate, task.rungs)
-    control = setup.averaged(task.start.control)
-    for rung in _sound(ladder.climb(control, task.budget, clock + task.seconds), chase):
+    repeats = search.start.repeats
+    if task is None:
+        task = DesignTask.resolve(
+            search.experiment,
+            threads=search.threads,
+            added_information=search.added_information,
+            variant=search.variant,
+        )
+    if repeats > 1:
+        task = task.with_horizon(task.horizon / repeats)
+    begun = task.plant.engine_steps
+    exact, smooth = Stage(task, search.combinations).problem, smoothed(task, search.combinations)
+    fine = (
+        search.start.basis if search.start.basis is not None else basis_of(task, task.stated_times)
+    )
+    basis = None if fine is None else independent_curves(task.averaged(fine))
+    regulate = replace(regulator_for(task), feedback_threshold=CALM if basis is None else np.inf)
+    fence = fence_of(task).tightened(search.held)
+    ladder = Ladder(smooth, fence, task.centre, basis, regulate, search.rungs)
+    control = task.averaged(search.start.control)
+    for rung in _sound(ladder.climb(control, search.budget, clock + search.seconds), chase):
         own = rung.iterate.point
         point = None if own.point is None else exact.judged(_repeated(own.point, repeats))
         chase.slope, chase.status = rung.iterate.slope, rung.status or Status.INTERRUPTED
-        chase.steps = setup.plant.engine_steps - begun
+        chase.steps = task.plant.engine_steps - begun
         cost = np.inf if point is None or not rung.feasible else point.cost
         if cost <= chase.cost:
-            chase.control, chase.cost = np.tile(_stated(setup, own.ctrl, fine), (repeats, 1)), cost
+            chase.control, chase.cost = np.tile(_stated(task, own.ctrl, fine), (repeats, 1)), cost
         if rung.mended:
             continue
-        row = _row(rung, point, 1.0 / setup.dt, fence)
-        row = replace(row, seconds=time.time() - task.begun, steps=chase.steps)
+        row = _row(rung, point, 1.0 / task.dt, fence)
+        row = replace(row, seconds=time.time() - search.begun, steps=chase.steps)
         chase.history += (row,)
         yield row
     if chase.status is Status.INTERRUPTED and chase.history:  # the rungs asked for are done
@@ -117,19 +127,19 @@ def _repeated(point: Point, count: int) -> Point:
     return replace(point, information=count * point.information, others=others)
 
 
-def smoothed(setup: Setup, combinations: Array | None) -> DesignProblem:
+def smoothed(task: DesignTask, combinations: Array | None) -> DesignProblem:
     """The cost as it is descended under hard limits: smooth where it is E's, without faint directions."""
-    power = POWER if setup.experiment.cost.criterion == "E" else np.inf
-    smooth = Stage(setup, combinations, power).problem
+    power = POWER if task.experiment.cost.criterion == "E" else np.inf
+    smooth = Stage(task, combinations, power).problem
     return replace(smooth, information=replace(smooth.information, faint=FAINT))
 
 
-def _stated(setup: Setup, ctrl: Array, fine: Array | None) -> Array:
+def _stated(task: DesignTask, ctrl: Array, fine: Array | None) -> Array:
     """A level's control on the stated grid of samples, made of the curves fine: (N * coarsen, M) there, or of anything."""
-    if setup.coarsen == 1 or fine is None:
-        return np.repeat(ctrl, setup.coarsen, axis=0)
+    if task.system.variant.sample_factor == 1 or fine is None:
+        return np.repeat(ctrl, task.system.variant.sample_factor, axis=0)
     return np.asarray(
-        setup.centre + fine @ np.linalg.lstsq(setup.averaged(fine), ctrl - setup.centre)[0]
+        task.centre + fine @ np.linalg.lstsq(task.averaged(fine), ctrl - task.centre)[0]
     )
 
 
@@ -155,12 +165,12 @@ def _row(rung: Rung, point: Point | None, rate: float, fence: Fence) -> HistoryR
     )
 
 
-def perform(task: Task) -> Chase:
-    """A task from beginning to end, for an executor; Ctrl-C, or its pool's word, ends it with the best so far."""
-    chase = Chase(task.start.name)
+def perform(search: ConstrainedSearch) -> Chase:
+    """A search from beginning to end, for an executor; Ctrl-C, or its pool's word, ends it with the best so far."""
+    chase = Chase(search.start.name)
     try:
         with threadpool_limits(1, user_api="blas"):
-            for _ in pursue(task, chase):
+            for _ in pursue(search, chase):
                 if stopped():
                     raise KeyboardInterrupt
     except KeyboardInterrupt:

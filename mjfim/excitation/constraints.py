@@ -10,8 +10,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.limits import Limit
-from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.model.geom_distance import GeomDistances
 from mjfim.model.geom_pairs import find_geom_pairs
 from mjfim.optimize.barrier import BarrierExpansion, Bounds
@@ -53,13 +52,13 @@ def _dense(limits: list[Limit], count: int) -> Bounds | None:
     return Bounds.from_range(lower, upper)
 
 
-def fence_of(setup: Setup, every: bool = False) -> Fence:
+def fence_of(task: DesignTask, every: bool = False) -> Fence:
     """The limits that hold a design, or every stated one. Raises ExperimentError for what cannot be.
 
     Without limits.enforce only its boundary holds a design.
     """
-    e, nu = setup.experiment, len(setup.controls)
-    limits = setup.limits if every or e.limits.enforce else ()
+    e, nu = task.experiment, len(task.controls)
+    limits = task.limits if every or e.limits.enforce else ()
     rows = {kind: _of(limits, kind) for kind in SHOWN}
     flat = [limit for kind in SHOWN for limit in rows[kind]]
     q, v, a, f, j = (
@@ -71,79 +70,80 @@ def fence_of(setup: Setup, every: bool = False) -> Fence:
         accelerations=a,
         actuator_forces=f,
         joint_forces=j,
-        derivative_substeps=looked_at(setup.substeps),
-        timestep=float(setup.plant.simulator.model.opt.timestep),
+        derivative_substeps=looked_at(task.system.grid.substeps),
+        timestep=float(task.plant.simulator.model.opt.timestep),
     )
     shown = Bounds.from_range(
         np.array([limit.lower for limit in flat]), np.array([limit.upper for limit in flat])
     )
     free = np.full(nu, np.inf)
     control = _dense(_of(limits, "control"), nu) or Bounds(
-        lower=-free, upper=free, scale=_sizes(setup)
+        lower=-free, upper=free, scale=_sizes(task)
     )
     clearance, least = None, 0.0
     if e.limits.clearance is not None and (every or e.limits.enforce):
         least = e.limits.clearance
-        clearance = _kept_clear(setup, least + REACH)
+        clearance = _kept_clear(task, least + REACH)
     return Fence(
-        space=setup.space,
-        dt=setup.dt,
+        space=task.space,
+        dt=task.dt,
         observations=observations,
         shown=shown,
         kinds=tuple(limit.kind for limit in flat),
         names=tuple(limit.name for limit in flat),
         control=control,
         rate=_dense(_of(limits, "control_rate"), nu),
-        before=setup.hold if e.boundary.start == "rest" else None,
-        after=setup.final_hold if e.boundary.end == "rest" else None,
+        before=task.initial_hold if e.boundary.start == "rest" else None,
+        after=task.final_hold if e.boundary.end == "rest" else None,
         seam=e.boundary.end == "periodic",
-        end=None if e.boundary.end == "free" else _end(setup),
-        target=setup.target,
+        end=None if e.boundary.end == "free" else _end(task),
+        target=task.target,
         clearance=clearance,
         least=least,
     )
 
 
-def _kept_clear(setup: Setup, reach: float) -> GeomDistances:
+def _kept_clear(task: DesignTask, reach: float) -> GeomDistances:
     """Distances of all pairs that are not ignored. Raises ExperimentError where there are none, or unknown bodies."""
     try:
         near = find_geom_pairs(
-            setup.model, [frozenset(pair) for pair in setup.experiment.limits.ignored]
+            task.system.model, [frozenset(pair) for pair in task.experiment.limits.ignored]
         )
-        return GeomDistances(setup.model_at(setup.theta), near, reach)
+        return GeomDistances(task.system.model_at(task.theta), near, reach)
     except ExperimentError as error:
         raise ExperimentError(f"limits.{error}") from None
 
 
-def _sizes(setup: Setup) -> Array:
+def _sizes(task: DesignTask) -> Array:
     """(nu,) how large a control is where nothing bounds it: as large as the initial one is."""
-    size = np.abs(setup.control - setup.rest).max(axis=0)
+    size = np.abs(task.control - task.system.rest).max(axis=0)
     return np.where(size > 0.0, size, 1.0)
 
 
-def _end(setup: Setup) -> Bounds:
-    b, nv, na = setup.experiment.boundary, setup.space.nv, setup.space.na
+def _end(task: DesignTask) -> Bounds:
+    b, nv, na = task.experiment.boundary, task.space.nv, task.space.na
     width = np.concatenate([np.full(nv, b.position), np.full(nv, b.velocity), np.full(na, np.inf)])
     return Bounds.from_range(-width, width)
 
 
-def basis_of(setup: Setup, t: Array) -> Array | None:
+def basis_of(task: DesignTask, t: Array) -> Array | None:
     """(N, M) splines at times t: (N,) of which the control minus its centre is made, where its bandwidth is limited."""
-    e = setup.experiment
+    e = task.experiment
     if e.limits.bandwidth is None:
         return None
     if e.limits.bandwidth > 0.5 * e.rate:
         raise ExperimentError(
             f"limits.bandwidth: {e.limits.bandwidth:g} Hz; a control at {e.rate:g} Hz has {0.5 * e.rate:g} Hz at most"
         )
-    return splines_of(e, t, e.limits.bandwidth)
+    return splines_of(task, t, e.limits.bandwidth)
 
 
-def splines_of(e: Experiment, t: Array, bandwidth: float) -> Array:
+def splines_of(task: DesignTask, t: Array, bandwidth: float) -> Array:
     """(N, M) splines of a bandwidth [Hz] at times t: (N,) that begin and end as the experiment does."""
+    e = task.experiment
     begins, periodic = e.boundary.start == "rest", e.boundary.end == "periodic"
     ends = e.boundary.end == "rest" or (periodic and begins)
-    return spline_basis(t, e.horizon, bandwidth, begins, ends, periodic and not begins)
+    return spline_basis(t, task.horizon, bandwidth, begins, ends, periodic and not begins)
 
 
 END_WEIGHT = 0.1  # of a condition at the end, over that of one that is held all the time

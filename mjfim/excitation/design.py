@@ -18,11 +18,11 @@ from mjfim.excitation.evaluation import evaluate, fine_point, warnings_of
 from mjfim.excitation.initial_controls import Start, starts_of
 from mjfim.excitation.multistart import Contest
 from mjfim.excitation.objective import Point
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import COARSEST, Run, Stage, borne, coarse_level, descend
 from mjfim.excitation.verification import audit, require_inside
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
-from mjfim.information.identifiability import PROBES, Survey, survey
+from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.information.marginal import shared
 from mjfim.information.smoothness import roughness
 from mjfim.plant.active_constraints import saturated_actuators
@@ -42,7 +42,7 @@ TOLERATED = 0.5  # relative change of the initial cost that it may make: all is 
 
 
 def design(
-    experiment: Experiment | Setup,
+    experiment: Experiment,
     monitor: Monitor | None = None,
     start: Array | None = None,
     threads: int | None = None,
@@ -55,30 +55,40 @@ def design(
     The initial control stays the reference x_d of the tracking term. Ctrl-C returns the best trajectory so far.
     Raises UnidentifiableError where the initial control excites nothing, ExperimentError for a faulty experiment.
     """
-    setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
-    require_inside(setup)
-    clock, begun = time.perf_counter(), setup.plant.engine_steps
-    first = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
+    task = DesignTask.resolve(experiment, threads=threads)
+    return design_task(task, monitor, start, executor)
+
+
+def design_task(
+    task: DesignTask,
+    monitor: Monitor | None = None,
+    start: Array | None = None,
+    executor: Executor | None = None,
+) -> Design:
+    """Design the control of a resolved task. See `design`."""
+    require_inside(task)
+    clock, begun = time.perf_counter(), task.plant.engine_steps
+    first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if start is not None:
         start = np.asarray(start, dtype=np.float64)
-        if start.shape != setup.control.shape:
+        if start.shape != task.control.shape:
             raise ExperimentError(
-                f"start: shape {start.shape}, wanted (samples, actuators) = {setup.control.shape}"
+                f"start: shape {start.shape}, wanted (samples, actuators) = {task.control.shape}"
             )
-    starts = starts_of(setup, start)
+    starts = starts_of(task, start)
     begin = (
         first
         if start is None
-        else setup.problem.point(setup.plant.simulate(setup.theta, start), CENTRAL_DIFFERENCES)
+        else task.problem.point(task.plant.simulate(task.theta, start), CENTRAL_DIFFERENCES)
     )
     if first.information is None or begin.trajectory is None or begin.sensitivity is None:
         why = "when the parameters move a little along the initial control"
-        if setup.pool is not None:
+        if task.samples_of_parameters is not None:
             why += ", or at a parameter sample of [robust]; bounds keep samples where the model makes sense"
         raise SimulationDivergedError(f"the simulation diverges {why}")
-    seen = survey(setup, begin.trajectory, begin.sensitivity)
-    require_designable(setup, seen)
-    stage = Stage(setup, seen.basis)
+    seen = task.observer.identifiability(begin.trajectory, begin.sensitivity)
+    require_designable(task, seen)
+    stage = Stage(task, seen.basis)
     first = stage.problem.judged(first)
     runs: list[Run] = []
     with threadpool_limits(
@@ -86,7 +96,7 @@ def design(
     ):  # small matrices: threads of BLAS only wait for each other
         rows = (
             _enclosed(stage, first, starts, executor, runs, clock)
-            if setup.enforced
+            if task.is_limited
             else _free(stage, first, starts, runs, clock)
         )
         try:
@@ -97,7 +107,7 @@ def design(
             rows.close()  # what a monitor interrupts is not yet told
             for run in runs[-1:]:
                 run.status = Status.INTERRUPTED
-    spent = setup.plant.engine_steps - begun + sum(run.steps for run in runs)
+    spent = task.plant.engine_steps - begun + sum(run.steps for run in runs)
     return _conclude(stage, seen, first, runs, time.perf_counter() - clock, spent)
 
 
@@ -110,10 +120,10 @@ def _free(
     fence: Fence | None = None,
 ) -> Generator[HistoryRow, None, None]:
     """Descents without a barrier, from every start while there is time; with a fence, until one leaves it."""
-    setup = stage.setup
-    until = clock + (setup.experiment.descent.seconds or np.inf)
-    coarse = coarse_level(setup, first, stage.basis)
-    levels = (setup,) if coarse is None else (coarse, setup)
+    task = stage.task
+    until = clock + (task.experiment.descent.seconds or np.inf)
+    coarse = coarse_level(task, first, stage.basis)
+    levels = (task,) if coarse is None else (coarse, task)
     begun = sum(level.plant.engine_steps for level in levels)
     for begin in starts:
         runs.append(Run(begin.name))
@@ -143,16 +153,16 @@ def _enclosed(
     clock: float,
 ) -> Generator[HistoryRow, None, None]:
     """Descents inside the limits. Where soft weights alone keep them, there is no barrier to begin with."""
-    setup, starts, elsewhere = stage.setup, list(starts), 0
-    if _weighted(setup):
-        yield from _free(stage, first, starts, runs, clock, fence_of(setup))
+    task, starts, elsewhere = stage.task, list(starts), 0
+    if _weighted(task):
+        yield from _free(stage, first, starts, runs, clock, fence_of(task))
         if not runs[-1].outside:
             return
         left = runs.pop()
         starts, elsewhere = starts[len(runs) :], left.steps
         if left.control is not None:  # as far as it came without a barrier
             starts[0] = Start(starts[0].name, left.control)
-    free = setup.free()
+    free = task.relaxed()
     chases: list[Chase] = []
     contest = Contest(Stage(free, stage.basis), _easier(Stage(free, stage.basis)), executor, clock)
     try:
@@ -165,54 +175,57 @@ def _enclosed(
             runs[0].steps += elsewhere
 
 
-def _weighted(setup: Setup) -> bool:
+def _weighted(task: DesignTask) -> bool:
     """The weights alone bound the design, and nothing but ranges is asked for."""
-    e = setup.experiment
-    hard = setup.shaped or bool(e.limits.control_rate) or e.limits.clearance is not None
-    return not hard and bool((setup.control_weight > 0.0).all())
+    e = task.experiment
+    hard = task.is_shaped or bool(e.limits.control_rate) or e.limits.clearance is not None
+    return not hard and bool((task.control_weight > 0.0).all())
 
 
 def _easier(fine: Stage) -> Stage | None:
     """A level with softened friction, with a longer timestep, or with longer samples where they are one timestep."""
-    smooth = replace(fine, setup=fine.setup.softened()) if fine.setup.level.soft else fine
+    smooth = (
+        replace(fine, task=fine.task.smoothed())
+        if fine.task.system.variant.smoothing_speeds
+        else fine
+    )
     try:
-        begin = smooth.problem.point(smooth.setup.initial)
+        begin = smooth.problem.point(smooth.task.initial)
     except SimulationDivergedError:
         return None
-    for factor in _factors(smooth.setup):
+    for factor in _factors(smooth.task):
         coarse = _coarser(smooth, begin, factor)
         if coarse is not None:
             return coarse
     return None if smooth is fine else smooth
 
 
-def _factors(setup: Setup) -> tuple[int, ...]:
+def _factors(task: DesignTask) -> tuple[int, ...]:
     """Candidates for the timestep of a coarse level, the longest first."""
-    stated = setup.experiment.descent.coarse
+    stated = task.experiment.descent.coarse
     if stated != "auto":
-        if setup.substeps % stated and setup.samples % stated:
+        substeps = task.system.grid.substeps
+        if substeps % stated and task.samples % stated:
             raise ExperimentError(
-                f"{setup.experiment.source}: descent.coarse: {stated} divides neither the {setup.substeps} engine steps of a "
-                f"sample nor the {setup.samples} samples"
+                f"{task.experiment.source}: descent.coarse: {stated} divides neither the {substeps} engine steps of a "
+                f"sample nor the {task.samples} samples"
             )
         return () if stated == 1 else (stated,)
-    return tuple(k for k in LONGER if setup.substeps % k == 0) or (HALF,)
+    return tuple(k for k in LONGER if task.system.grid.substeps % k == 0) or (HALF,)
 
 
 def _coarser(stage: Stage, begin: Point, factor: int) -> Stage | None:
     """A level so many times coarser, if the model bears it. begin: the stage's initial point"""
-    setup = stage.setup
-    stretch = setup.substeps % factor == 0
-    parts = [setup.samples // count for count in (1, *setup.experiment.descent.repeats)]
-    if not (
-        stretch or (all(N % factor == 0 for N in parts) and setup.samples >= COARSEST * factor)
-    ):
+    task = stage.task
+    stretch = task.system.grid.substeps % factor == 0
+    parts = [task.samples // count for count in (1, *task.experiment.descent.repeats)]
+    if not (stretch or (all(N % factor == 0 for N in parts) and task.samples >= COARSEST * factor)):
         return None
     try:
-        coarse = Stage(setup.stretched(factor) if stretch else setup.coarser(factor), stage.basis)
+        coarse = Stage(task.stretched(factor) if stretch else task.coarser(factor), stage.basis)
     except ExperimentError:
         return None
-    return coarse if borne(coarse, begin, setup.problem.size(begin), TOLERATED) else None
+    return coarse if borne(coarse, begin, task.problem.size(begin), TOLERATED) else None
 
 
 def _settled(stage: Stage, chase: Chase, cut: bool) -> Run:
@@ -225,14 +238,14 @@ def _settled(stage: Stage, chase: Chase, cut: bool) -> Run:
     run.inside = np.isfinite(chase.cost)
     if cut:
         found = None if run.point is None else run.point.trajectory
-        run.inside = found is not None and audit(stage.setup, found).kept
+        run.inside = found is not None and audit(stage.task, found).kept
     return run
 
 
 def _conclude(
-    stage: Stage, seen: Survey, first: Point, runs: list[Run], seconds: float, steps: int
+    stage: Stage, seen: Identifiability, first: Point, runs: list[Run], seconds: float, steps: int
 ) -> Design:
-    setup = stage.setup
+    task = stage.task
     if not runs:
         runs = [Run("initial control", status=Status.INTERRUPTED)]
     if runs[-1].point is None and runs[-1].control is not None:  # interrupted on the coarse level
@@ -243,7 +256,7 @@ def _conclude(
         raise SimulationDivergedError("the simulation diverges from every start")
     chosen = (
         first
-        if best.point is None or (best.cost > first.cost and not setup.enforced)
+        if best.point is None or (best.cost > first.cost and not task.is_limited)
         else best.point
     )
     initial, final, information = (
@@ -251,20 +264,29 @@ def _conclude(
         evaluate(stage, chosen),
         stage.problem.information,
     )
-    found = audit(setup, final.trajectory)
-    clamped = saturated_actuators(setup.model_at(setup.theta), final.trajectory)
+    found = audit(task, final.trajectory)
+    clamped = saturated_actuators(task.system.model_at(task.theta), final.trajectory)
     rough = (
-        None if interrupted else roughness(setup, setup.theta, final.trajectory, chosen.sensitivity)
+        None
+        if interrupted
+        else roughness(
+            task.plant,
+            task.system.noise,
+            task.system.model_at(task.theta),
+            task.theta,
+            final.trajectory,
+            chosen.sensitivity,
+        )
     )
     status = Status.INTERRUPTED if interrupted else best.status
     if status.success and (rough is not None or clamped):
         status = Status.ROUGH
-    if setup.enforced and not found.kept and not interrupted:
+    if task.is_limited and not found.kept and not interrupted:
         status = Status.INFEASIBLE
     return Design(
         status=status,
-        parameters=setup.parameters.names,
-        theta=setup.theta,
+        parameters=task.parameters.names,
+        theta=task.theta,
         initial=initial,
         final=final,
         history=best.history,
@@ -273,7 +295,7 @@ def _conclude(
         seconds=seconds,
         limits=found.margins,
         usage=found.usage,
-        warnings=tuple(warnings_of(final, found, setup, clamped, rough)),
+        warnings=tuple(warnings_of(final, found, task, clamped, rough)),
         found_by=best.name,
         starts=tuple(
             StartResult(
@@ -284,41 +306,41 @@ def _conclude(
             )
             for r in runs
         ),
-        nuisance=tuple(p.name for p in setup.parameters.parameters if p.nuisance),
+        nuisance=tuple(p.name for p in task.parameters.parameters if p.nuisance),
         combinations=tuple(str(group) for group in seen.groups_always),
-        combined=seen.combined(
+        combined=seen.combinations(
             information,
-            setup.theta[setup.parameters.interest],
+            task.theta[task.parameters.interest],
             initial.information,
             final.information,
         ),
-        prior=setup.prior,
+        prior=task.prior,
         data=shared(
-            information.visible(final.information - setup.prior),
-            setup.parameters.prior_information,
-            setup.parameters.recording_specific,
+            information.visible(final.information - task.prior),
+            task.parameters.prior_information,
+            task.parameters.recording_specific,
         ),
     )
 
 
-def designable(setup: Setup) -> Survey:
+def designable(task: DesignTask) -> Identifiability:
     """Look along the initial control. Raises UnidentifiableError or SimulationDivergedError where no design can begin there."""
-    first = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
+    first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if first.trajectory is None or first.sensitivity is None:
         raise SimulationDivergedError(
             "the simulation diverges when the parameters move a little along the initial control"
         )
-    seen = survey(setup, first.trajectory, first.sensitivity)
-    require_designable(setup, seen)
+    seen = task.observer.identifiability(first.trajectory, first.sensitivity)
+    require_designable(task, seen)
     return seen
 
 
-def require_designable(setup: Setup, seen: Survey) -> None:
+def require_designable(task: DesignTask, seen: Identifiability) -> None:
     """Raise UnidentifiableError where a parameter changes nothing at all, or the start does not excite what others would.
 
     Members of a declared inertia may be invisible: the design then works on what is visible of them.
     """
-    p = setup.parameters
+    p = task.parameters
     wanted = [p.parameters[j] for j in p.interest]
     dead = [wanted[i].name for i in seen.always.silent if not wanted[i].group]
     if dead:
@@ -326,9 +348,9 @@ def require_designable(setup: Setup, seen: Survey) -> None:
             f"{_parameters(dead)} nothing in the measured outputs, neither along the initial control nor along "
             f"{PROBES} random ones; take {'it' if len(dead) == 1 else 'them'} out, or measure what shows the effect"
         )
-    if setup.contrast is not None:
-        information = replace(setup.information, basis=seen.basis)
-        if not information.estimable(setup.contrast).all():
+    if task.contrast is not None:
+        information = replace(task.information, basis=seen.basis)
+        if not information.estimable(task.contrast).all():
             raise UnidentifiableError(
                 "cost.combination or cost.subset asks for what cannot be identified; what can is: "
                 + "; ".join(str(group) for group in seen.groups_always)

@@ -8,11 +8,10 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.limits import unwatched
 from mjfim.excitation.objective import Point
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, regulator_for
 from mjfim.excitation.verification import SAME, Audit
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
-from mjfim.information.identifiability import survey
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import Roughness
@@ -23,14 +22,14 @@ from mjfim.records.trajectory import Trajectory
 def fine_point(stage: Stage, control: Array) -> Point | None:
     """A coarse level's control at the stated rate; None where it diverges."""
     try:
-        return stage.problem.point(stage.setup.plant.simulate(stage.setup.theta, control))
+        return stage.problem.point(stage.task.plant.simulate(stage.task.theta, control))
     except SimulationDivergedError:
         return None
 
 
 def evaluate(stage: Stage, point: Point) -> Evaluation:
     """Everything that a trajectory tells, with the regulator about it."""
-    setup, information = stage.setup, stage.problem.information
+    task, information = stage.task, stage.problem.information
     if (
         point.trajectory is None
         or point.sensitivity is None
@@ -38,8 +37,8 @@ def evaluate(stage: Stage, point: Point) -> Evaluation:
         or point.criterion is None
     ):
         raise SimulationDivergedError("the trajectory diverges")
-    A, B, _, _ = setup.plant.derivatives.jacobians(setup.theta, point.trajectory)
-    r = regulator_for(setup)
+    A, B, _, _ = task.plant.derivatives.jacobians(task.theta, point.trajectory)
+    r = regulator_for(task)
     return Evaluation(
         trajectory=point.trajectory,
         gain=regulator(A, B, r.Q, r.R, r.terminal),
@@ -58,7 +57,11 @@ UNSTABLE = 1e3
 
 
 def warnings_of(
-    final: Evaluation, found: Audit, setup: Setup, clamped: tuple[str, ...], rough: Roughness | None
+    final: Evaluation,
+    found: Audit,
+    task: DesignTask,
+    clamped: tuple[str, ...],
+    rough: Roughness | None,
 ) -> Iterator[str]:
     """What a user must know about a design before running it. found: its limits at every engine step"""
     if rough is not None:
@@ -83,22 +86,22 @@ def warnings_of(
                     "this on hardware"
                 )
             yield f"{kind} limits are exceeded by {-margin:.3g}: {advice}"
-    yield from left_open(setup)
+    yield from left_open(task)
     if found.deviation > SAME:
         yield (
             f"played on the untouched model, the design deviates by up to {found.deviation:.2g}: a clamp, stop or contact acts"
         )
 
 
-def left_open(setup: Setup) -> Iterator[str]:
+def left_open(task: DesignTask) -> Iterator[str]:
     """What the limits and boundaries that an experiment states leave open."""
-    e, model = setup.experiment, setup.model
+    e, model = task.experiment, task.system.model
     rates = (
-        {limit.name for limit in setup.limits if limit.kind == "control_rate"}
+        {limit.name for limit in task.limits if limit.kind == "control_rate"}
         if e.limits.enforce
         else set()
     )
-    jumps = e.limits.bandwidth is None and not rates.issuperset(setup.controls)
+    jumps = e.limits.bandwidth is None and not rates.issuperset(task.controls)
     if "rest" in (e.boundary.start, e.boundary.end) and jumps:
         yield (
             "the control may jump where the design begins and ends at rest: for a smooth start state limits.control_rate or "
@@ -110,13 +113,17 @@ def left_open(setup: Setup) -> Iterator[str]:
             yield f"the MJCF's ranges of {', '.join(unseen)} are no limits of the design: the simulation runs into them as it is"
 
 
-def evaluate_trajectory(experiment: Experiment | Setup, trajectory: Trajectory) -> Evaluation:
-    """What a given trajectory's control tells about the parameters at the experiment's theta."""
-    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
-    point = setup.problem.point(
-        setup.plant.simulate(setup.theta, trajectory.ctrl), CENTRAL_DIFFERENCES
+def evaluate_trajectory(experiment: Experiment, trajectory: Trajectory) -> Evaluation:
+    """Evaluate the information and the cost along the control of a given trajectory, at the experiment's theta."""
+    return evaluate_task(DesignTask.resolve(experiment), trajectory)
+
+
+def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
+    """Evaluate the control of a trajectory in a resolved task. See `evaluate_trajectory`."""
+    point = task.problem.point(
+        task.plant.simulate(task.theta, trajectory.ctrl), CENTRAL_DIFFERENCES
     )
     if point.trajectory is None or point.sensitivity is None:
         raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
-    stage = Stage(setup, survey(setup, point.trajectory, point.sensitivity).basis)
+    stage = Stage(task, task.observer.identifiability(point.trajectory, point.sensitivity).basis)
     return evaluate(stage, stage.problem.judged(point))

@@ -9,11 +9,10 @@ from itertools import chain
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.experiment.system import Setup
+from mjfim.errors import ExperimentError
+from mjfim.excitation.task import DesignTask
 from mjfim.recordings.control_table import read_control
-from mjfim.records.trajectory import Trajectory
-from mjfim.signals import fourier_basis, multisine
+from mjfim.signals import fourier_basis
 
 HARMONICS = 10  # of random multisines
 SERIES = 15  # harmonics of a Fourier series that is optimised first
@@ -38,15 +37,14 @@ class Start:
         return np.tile(self.control, (self.repeats, 1))
 
 
-def starts_of(setup: Setup, given: Array | None) -> Iterator[Start]:
+def starts_of(task: DesignTask, given: Array | None) -> Iterator[Start]:
     """The given or initial control, then what the experiment's [descent] asks for. Raises for what is not there at once."""
-    e, d = setup.experiment, setup.experiment.descent
+    e, d = task.experiment, task.experiment.descent
     found = [
-        Start("initial control", setup.control) if given is None else Start("given control", given)
+        Start("initial control", task.control) if given is None else Start("given control", given)
     ]
     found += [
-        Start(f"previous design {path}", previous(setup, path))
-        for path in dict.fromkeys(d.previous)
+        Start(f"previous design {path}", previous(task, path)) for path in dict.fromkeys(d.previous)
     ]
     begins, ends = e.boundary.start == "rest", e.boundary.end == "rest"
     rng = np.random.default_rng(d.seed)
@@ -57,94 +55,49 @@ def starts_of(setup: Setup, given: Array | None) -> Iterator[Start]:
             raise ExperimentError(
                 f"{e.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of {most:g} Hz"
             )
-        series = fourier_basis(setup.t, e.horizon, frequency, harmonics, begins, ends)
-        fitted = series @ np.linalg.lstsq(series, _random(setup, rng) - setup.centre)[0]
-        found.append(Start(f"Fourier series of {frequency:g} Hz", setup.centre + fitted, series))
+        series = fourier_basis(task.t, task.horizon, frequency, harmonics, begins, ends)
+        fitted = series @ np.linalg.lstsq(series, _random(task, rng) - task.centre)[0]
+        found.append(Start(f"Fourier series of {frequency:g} Hz", task.centre + fitted, series))
     for count in dict.fromkeys(d.repeats):
         found.append(
             Start(
-                f"{count} times a design of {e.horizon / count:g} s",
-                _part(setup, count),
+                f"{count} times a design of {task.horizon / count:g} s",
+                _part(task, count),
                 repeats=count,
             )
         )
     multisines = (
-        Start(f"multisine {i} of {d.starts - 1}", _random(setup, rng)) for i in range(1, d.starts)
+        Start(f"multisine {i} of {d.starts - 1}", _random(task, rng)) for i in range(1, d.starts)
     )
     return chain(found, multisines)
 
 
-def previous(setup: Setup, path: str) -> Array:
+def previous(task: DesignTask, path: str) -> Array:
     """(N, nu) control of an earlier design's design.csv, repeated where it is shorter."""
-    file = setup.experiment.directory / path
-    return read_control(file, setup.t, setup.dt, setup.controls, repeat=True)
+    file = task.experiment.directory / path
+    return read_control(file, task.t, task.dt, task.controls, repeat=True)
 
 
-def _part(setup: Setup, count: int) -> Array:
+def _part(task: DesignTask, count: int) -> Array:
     """(N / count, nu) first part of the initial control. Raises ExperimentError where it is no part."""
-    source = setup.experiment.source
-    samples = setup.samples // count
-    if setup.samples % count:
+    source = task.experiment.source
+    samples = task.samples // count
+    if task.samples % count:
         raise ExperimentError(
-            f"{source}: descent.repeats: {count} does not divide the {setup.samples} samples"
+            f"{source}: descent.repeats: {count} does not divide the {task.samples} samples"
         )
-    if samples < max(2, setup.stride):
+    fewest = max(2, task.system.grid.stride)
+    if samples < fewest:
         raise ExperimentError(
-            f"{source}: descent.repeats: {count} leaves {samples} of {setup.samples} samples; needs {max(2, setup.stride)}"
+            f"{source}: descent.repeats: {count} leaves {samples} of {task.samples} samples; needs {fewest}"
         )
-    if not setup.enforced:
+    if not task.is_limited:
         raise ExperimentError(
             f"{source}: descent.repeats needs hard limits; without, start from a shorter design (previous)"
         )
-    return np.asarray(
-        setup.centre + swell(setup, samples) * (setup.control[:samples] - setup.centre)
-    )
+    return np.asarray(task.centre + task.fade(samples) * (task.control[:samples] - task.centre))
 
 
-def _random(setup: Setup, rng: np.random.Generator) -> Array:
+def _random(task: DesignTask, rng: np.random.Generator) -> Array:
     """A multisine about the middle of the initial control, up to six times its size, inside the controls' ranges."""
-    return random_control(setup, rng, 1.0, 6.0)
-
-
-def random_control(setup: Setup, rng: np.random.Generator, least: float, most: float) -> Array:
-    """(N, nu) multisine about the initial control's mean, of `least` to `most` times its size, within the controls' ranges.
-
-    It swells from what holds the start, and fades, where the experiment begins and ends at rest.
-    """
-    mean = setup.control.mean(axis=0)
-    peak = np.abs(setup.control - mean).max(axis=0)
-    peak = np.where(peak > 0.0, peak, 1.0)
-    wave = multisine(setup.t, len(setup.controls), 1.0 / setup.experiment.horizon, HARMONICS, rng)
-    swing = peak * rng.uniform(least, most) * wave
-    control = (setup.hold if setup.experiment.boundary.start == "rest" else mean) + swell(
-        setup
-    ) * swing
-    for limit in setup.limits:
-        if limit.kind == "control":
-            control[:, limit.index] = np.clip(control[:, limit.index], limit.lower, limit.upper)
-    return np.asarray(control)
-
-
-def swell(setup: Setup, samples: int | None = None) -> Array:
-    """(N, 1) by which a swing about the hold rises from rest and fades to it, where the experiment begins and ends so.
-
-    samples: N, default: all
-    """
-    boundary, N = setup.experiment.boundary, setup.samples if samples is None else samples
-    share = np.arange(N)[:, None] / N
-    window = np.ones_like(share)
-    if boundary.start == "rest":
-        window = window * np.clip(share / SWELL, 0.0, 1.0)
-    if boundary.end == "rest":
-        window = window * np.clip((1.0 - share) / SWELL - 1.0, 0.0, 1.0)
-    return np.asarray(window)
-
-
-def probes(setup: Setup, count: int) -> Iterator[Trajectory]:
-    """Trajectories of random controls, one or two times the size of the initial one; those that diverge are left out."""
-    rng = np.random.default_rng(setup.experiment.descent.seed)
-    for _ in range(count):
-        try:
-            yield setup.plant.simulate(setup.theta, random_control(setup, rng, 1.0, 2.0))
-        except SimulationDivergedError:
-            continue
+    return task.random_control(rng, 1.0, 6.0)

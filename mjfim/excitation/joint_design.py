@@ -9,10 +9,9 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.design import Monitor, design
+from mjfim.excitation.design import Monitor, design_task
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
-from mjfim.information.identifiability import survey
 from mjfim.information.marginal import shared
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
@@ -32,24 +31,26 @@ def design_together(
     each experiment's own, all other nuisance is common. The experiments state the same parameters in the same order;
     raises ExperimentError where they do not. See also `design`.
     """
-    setups = [Setup(experiment, threads) for experiment in experiments]
-    names = [setup.parameters.names for setup in setups]
-    if len(setups) < 2 or any(own != names[0] for own in names):
+    tasks = [DesignTask.resolve(experiment, threads=threads) for experiment in experiments]
+    names = [task.parameters.names for task in tasks]
+    if len(tasks) < 2 or any(own != names[0] for own in names):
         told = "; ".join(", ".join(own) for own in names)
         raise ExperimentError(
             f"design_together takes two or more experiments with the same parameters in one order: {told}"
         )
-    tells = [_data(setup) for setup in setups]
-    controls: list[Array | None] = [None] * len(setups)
+    tells = [_data(task) for task in tasks]
+    controls: list[Array | None] = [None] * len(tasks)
     designs: list[Design] = []
     last = np.inf
     for _ in range(rounds):
         designs = []
-        for i, setup in enumerate(setups):
+        for i, task in enumerate(tasks):
             others = sum(
-                (tells[j] for j in range(len(setups)) if j != i), start=np.zeros_like(tells[0])
+                (tells[j] for j in range(len(tasks)) if j != i), start=np.zeros_like(tells[0])
             )
-            found = design(Setup(setup.experiment, threads, added=others), monitor, controls[i])
+            found = design_task(
+                task.restated(task.experiment, added_information=others), monitor, controls[i]
+            )
             controls[i] = found.trajectory.ctrl
             tells[i] = found.data
             designs.append(found)
@@ -60,18 +61,18 @@ def design_together(
     return tuple(designs)
 
 
-def _data(setup: Setup) -> Array:
+def _data(task: DesignTask) -> Array:
     """What the initial control tells about the parameters that all experiments share."""
-    point = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
+    point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError(
             "the simulation diverges when the parameters move a little along the initial control"
         )
-    seen = survey(setup, setup.initial, point.sensitivity)
-    information = replace(setup.information, basis=seen.here.basis if seen.here.count else None)
-    p = setup.parameters
+    seen = task.observer.identifiability(task.initial, point.sensitivity)
+    information = replace(task.information, basis=seen.here.basis if seen.here.count else None)
+    p = task.parameters
     return shared(
-        information.visible(point.information - setup.information.prior),
+        information.visible(point.information - task.information.prior),
         p.prior_information,
         p.recording_specific,
     )

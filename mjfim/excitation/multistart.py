@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.constrained import Chase, Task, perform, pursue
+from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform, pursue
 from mjfim.excitation.constraints import Fence, fence_of
 from mjfim.excitation.initial_controls import Start
 from mjfim.excitation.interior_point import SHRUNK, Rungs, held_back
@@ -70,12 +70,12 @@ class Contest:
     @cached_property
     def _fence(self) -> Fence:
         """The limits on the plant without clamps."""
-        return fence_of(self.fine.setup)
+        return fence_of(self.fine.task)
 
     @property
     def _seconds(self) -> float:
         """That are left."""
-        stated = self.fine.setup.experiment.descent.seconds
+        stated = self.fine.task.experiment.descent.seconds
         return np.inf if stated is None else max(self.begun + stated - time.perf_counter(), 0.0)
 
     @property
@@ -83,12 +83,12 @@ class Contest:
         """The coarse level differs by its timestep alone: its minima are nearly those of the stated one."""
         if self.coarse is None:
             return True
-        level = self.coarse.setup.level
-        return replace(level, stretch=1) == self.fine.setup.level
+        level = self.coarse.task.system.variant
+        return replace(level, timestep_factor=1) == self.fine.task.system.variant
 
     def run(self, starts: Sequence[Start], chases: list[Chase]) -> Iterator[HistoryRow]:
         """Every iterate; `chases` gets one entry per start, the winners' ones after the second round."""
-        d = self.fine.setup.experiment.descent
+        d = self.fine.task.experiment.descent
         reserve = SPARE * (d.seconds or 0.0)
         first = self.coarse or self.fine
         if (
@@ -183,8 +183,8 @@ class Contest:
         i = min(range(len(chases)), key=lambda i: chases[i].cost)
         if chases[i].control is None or not np.isfinite(chases[i].cost):
             return None
-        setup = self.fine.setup
-        found = audit(setup, setup.plant.simulate(setup.theta, np.asarray(chases[i].control)))
+        task = self.fine.task
+        found = audit(task, task.plant.simulate(task.theta, np.asarray(chases[i].control)))
         return None if found.kept or not np.isfinite(found.deviation) else (i, found.shares)
 
     def _judge(self, chase: Chase, start: Start) -> Lead:
@@ -204,23 +204,23 @@ class Contest:
 
     def _worth(self, control: Array) -> float:
         """J on the stated model, infinite outside the limits, also where a clamp alone keeps a force inside."""
-        setup, fence = self.fine.setup, self._fence
-        watched = setup.plant.observe(setup.theta, control, fence.observations)
+        task, fence = self.fine.task, self._fence
+        watched = task.plant.observe(task.theta, control, fence.observations)
         if watched is None:
             return np.inf
         sight = fence.sight(*watched, slopes=False)
         if (
             min(fence.margins(sight).values(), default=0.0) < 0.0
-            or not audit(setup, sight.trajectory).kept
+            or not audit(task, sight.trajectory).kept
         ):
             return np.inf
         return self.fine.problem.point(sight.trajectory).cost
 
     def _shrink(self, chase: Chase) -> None:
         """Shrink a control about the centre until no limit is left, if it ever is."""
-        setup = self.fine.setup
+        task = self.fine.task
         for share in SHRUNK:
-            control = setup.centre + share * (np.asarray(chase.control) - setup.centre)
+            control = task.centre + share * (np.asarray(chase.control) - task.centre)
             cost = self._worth(control)
             if np.isfinite(cost):
                 chase.control, chase.cost = control, cost
@@ -241,34 +241,34 @@ class Contest:
         held: Mapping[str, float] | None = None,
     ) -> Iterator[HistoryRow]:
         """Every iterate of one descent per start, at most `budget` each."""
-        level, combinations = stage.setup, stage.basis
+        level, combinations = stage.task, stage.basis
         stated = level.experiment.descent.tolerance
-        common = Task(
+        common = ConstrainedSearch(
             level.experiment,
             starts[0],
             replace(rungs, tolerance=max(rungs.tolerance, stated)),
             max(budget, 1),
             seconds,
             combinations,
-            level.added,
-            level.level,
+            level.added_information,
+            level.system.variant,
             max(workers_of(self.executor) // len(starts), 1)
             if self.executor is not None
-            else level.plant.simulator.threads,
+            else level.system.threads,
             held or {},
             time.time() - (time.perf_counter() - self.begun),
         )
-        tasks = [replace(common, start=start) for start in starts]
+        searches = [replace(common, start=start) for start in starts]
         if self.executor is None:
-            for task in tasks:
+            for search in searches:
                 if chases and self._seconds == 0.0:
                     return
-                chases.append(Chase(task.start.name))
-                yield from pursue(task, chases[-1], level)
+                chases.append(Chase(search.start.name))
+                yield from pursue(search, chases[-1], level)
             return
         futures: list[Future[Chase]] = []
         try:
-            futures += [self.executor.submit(perform, task) for task in tasks]
+            futures += [self.executor.submit(perform, search) for search in searches]
             for future in futures:
                 if chases and self._seconds == 0.0 and future.cancel():
                     continue

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.robust import Pool
+from mjfim.excitation.robust import ParameterSamples
 from mjfim.information.criteria import Criterion
 from mjfim.information.fisher import Information
 from mjfim.optimize.lq import TangentCurve
@@ -120,7 +120,7 @@ class DesignProblem:
     running: RunningCost
     extended: bool = False
     draft: bool = False
-    pool: Pool | None = None
+    pool: ParameterSamples | None = None
 
     def point(
         self, trajectory: Trajectory, accuracy: DifferenceAccuracy = FORWARD_DIFFERENCES

@@ -19,7 +19,7 @@ SHARPNESS = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Pool:
+class ParameterSamples:
     """How phi at several parameter values becomes one number.
 
     thetas: (S, p), the guess first;  over: mean or worst;  logarithmic: True for D-optimality

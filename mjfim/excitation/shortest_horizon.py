@@ -16,11 +16,11 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError
-from mjfim.excitation.design import Monitor, design
+from mjfim.excitation.design import Monitor, design_task
 from mjfim.excitation.target_accuracy import furthest, require_reachable, wanted_of
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import AUTO, COARSEST
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
 from mjfim.recordings.formats.read import read_table
@@ -76,7 +76,7 @@ class Shortest:
     @property
     def horizon(self) -> float:
         """[s]"""
-        return self.experiment.horizon
+        return float(self.experiment.horizon or 0.0)
 
     def summary(self) -> dict[str, Any]:
         """Contents of shortest.json."""
@@ -144,7 +144,7 @@ class _Hunt:
             raise ExperimentError(f"shortest: tolerance {tolerance:g} s; it must be > 0")
         self.experiment, self.tolerance = experiment, tolerance
         self.monitor, self.threads, self.report, self.executor = monitor, threads, report, executor
-        self.base = Setup(experiment, threads)
+        self.base = DesignTask.resolve(experiment, threads=threads)
         self.wanted = wanted_of(self.base)
         self.grid = _grid(self.base)
         self.longest = _longest(self.base) if longest is None else longest
@@ -210,12 +210,12 @@ class _Hunt:
         """One design of so many samples, its control begun from another one's; kept where it is the best of them."""
         horizon = samples / self.experiment.rate
         try:
-            setup = Setup(self.at(samples), self.threads)
-            begin = None if near is None else fitted(setup, self.designs[near].trajectory.ctrl)
-            found = design(setup, self.monitor, begin, executor=self.executor)
+            task = self.base.restated(self.at(samples))
+            begin = None if near is None else fitted(task, self.designs[near].trajectory.ctrl)
+            found = design_task(task, self.monitor, begin, self.executor)
             if found.status is Status.INTERRUPTED:
                 return None
-            require_reachable(setup, found, self.wanted)
+            require_reachable(task, found, self.wanted)
         except MjfimError as error:
             if not self.tried:
                 raise  # as stated, there is no design
@@ -228,7 +228,7 @@ class _Hunt:
             or ratio < furthest(self.designs[samples].final.std, self.wanted)[0]
         ):
             self.designs[samples] = found
-        return Tried(horizon, ratio, setup.parameters.names[j])
+        return Tried(horizon, ratio, task.parameters.names[j])
 
     def _fail(self, samples: int) -> NoReturn:
         last, found = self.tried[samples], self.designs.get(samples)
@@ -252,22 +252,22 @@ def _outside(design: Design) -> str:
     )
 
 
-def fitted(setup: Setup, control: Array) -> Array:
+def fitted(task: DesignTask, control: Array) -> Array:
     """(N, nu) from the control of another duration: cut or repeated, stretched where it has to keep its end or limits."""
-    N, n = setup.samples, len(control)
+    N, n = task.samples, len(control)
     if n == N:
         return control
-    if n > N and setup.experiment.boundary.end == "free":
+    if n > N and task.experiment.boundary.end == "free":
         return control[:N]
-    if n < N and not setup.enforced:
+    if n < N and not task.is_limited:
         return np.asarray(np.resize(control, (N, control.shape[1])))
     middle, wanted = (np.arange(n) + 0.5) / n, (np.arange(N) + 0.5) / N
     return np.stack([np.interp(wanted, middle, column) for column in control.T], axis=1)
 
 
-def _grid(setup: Setup) -> SampleGrid:
+def _grid(task: DesignTask) -> SampleGrid:
     """What coarse levels need: samples that they divide, where they are used."""
-    d = setup.experiment.descent
+    d = task.experiment.descent
     if d.method != "lbfgs":
         return SampleGrid(unit=1, first_multiple=0)
     if d.coarse == "auto":
@@ -275,13 +275,13 @@ def _grid(setup: Setup) -> SampleGrid:
     return SampleGrid(unit=d.coarse, first_multiple=0, minimum=max(d.coarse, 2))
 
 
-def _longest(setup: Setup) -> float:
+def _longest(task: DesignTask) -> float:
     """[s] that an experiment may last where nobody says it: no longer than its table of the initial control."""
-    e = setup.experiment
-    wanted = LONGER * e.horizon
+    e, horizon = task.experiment, task.horizon
+    wanted = LONGER * horizon
     if isinstance(e.initial.control, Signal):
         return wanted
-    columns = read_table(e.directory / e.initial.control)
-    name = setup.controls[0]
+    columns = read_table(e.directory / str(e.initial.control))
+    name = task.controls[0]
     t = columns["t"][np.isfinite(columns[name if name in columns else f"ctrl:{name}"])]
-    return max(e.horizon, min(wanted, float(t[-1] + np.median(np.diff(t)))))
+    return max(horizon, min(wanted, float(t[-1] + np.median(np.diff(t)))))

@@ -12,7 +12,7 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.constraints import Fence
 from mjfim.excitation.objective import DIVERGED, DesignProblem, Point
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
 from mjfim.records.design import HistoryRow, Status
@@ -25,16 +25,18 @@ class Stage:
     basis: identifiable combinations, or None;  power: of the smooth E-criterion, infinite for 1/lambda_min itself
     """
 
-    setup: Setup
+    task: DesignTask
     basis: Array | None
     power: float = np.inf
 
     @cached_property
     def problem(self) -> DesignProblem:
         """The cost."""
-        problem = self.setup.problem
+        problem = self.task.problem
         information = replace(problem.information, basis=self.basis, power=self.power)
-        return replace(problem, information=information, draft=self.setup.coarsen > 1)
+        return replace(
+            problem, information=information, draft=self.task.system.variant.sample_factor > 1
+        )
 
 
 @dataclass
@@ -64,14 +66,14 @@ class Run:
 
 def direction_for(stage: Stage) -> tuple[Direction, DesignProblem]:
     """The descent direction that the experiment asks for, and the problem that feeds it."""
-    setup = stage.setup
-    d, dt = setup.experiment.descent, setup.dt
-    R, Q = np.diag(setup.control_weight) * dt, np.diag(setup.tracking) * dt
+    task = stage.task
+    d, dt = task.experiment.descent, task.dt
+    R, Q = np.diag(task.control_weight) * dt, np.diag(task.tracking) * dt
     if d.method == "lbfgs":
         return LBFGS(R), stage.problem
     if d.psi_weight == 0.0:
         return MetricDescent(Q, R, Q), stage.problem
-    nx, p = len(Q), len(setup.parameters)
+    nx, p = len(Q), len(task.parameters)
     wide = np.diag(np.concatenate([np.diag(Q), np.full(nx * p, d.psi_weight * dt)]))
     return ExtendedMetricDescent(wide, R, wide), replace(stage.problem, extended=True)
 
@@ -79,10 +81,10 @@ def direction_for(stage: Stage) -> tuple[Direction, DesignProblem]:
 CALM = 10.0
 
 
-def regulator_for(setup: Setup) -> Regulator:
+def regulator_for(task: DesignTask) -> Regulator:
     """Unit weights on state and control along the trajectory; no feedback where the plant is calm without."""
-    Q, R = np.eye(setup.space.nx) * setup.dt, np.eye(len(setup.controls)) * setup.dt
-    return Regulator(Q=Q, R=R, terminal=Q / setup.dt, feedback_threshold=CALM)
+    Q, R = np.eye(task.space.nx) * task.dt, np.eye(len(task.controls)) * task.dt
+    return Regulator(Q=Q, R=R, terminal=Q / task.dt, feedback_threshold=CALM)
 
 
 AUTO = 4  # how many times longer the samples of a coarse level are, where the experiment leaves it open
@@ -90,31 +92,31 @@ COARSEST = 50  # samples of a coarse level, at least
 BORNE = 0.05  # relative change of the initial cost that it may make
 
 
-def coarse_level(setup: Setup, first: Point, basis: Array | None) -> Setup | None:
+def coarse_level(task: DesignTask, first: Point, basis: Array | None) -> DesignTask | None:
     """The coarse level, where the experiment wants it and the model bears it (the initial cost agrees within 5 %).
 
     Raises ExperimentError where a stated factor does not divide the samples.
     """
-    d = setup.experiment.descent
+    d = task.experiment.descent
     factor = AUTO if d.coarse == "auto" else d.coarse
     if factor == 1 or d.method != "lbfgs":
         return None
-    if d.coarse != "auto" and setup.samples % factor:
-        valid = ", ".join(str(k) for k in range(1, 17) if setup.samples % k == 0)
+    if d.coarse != "auto" and task.samples % factor:
+        valid = ", ".join(str(k) for k in range(1, 17) if task.samples % k == 0)
         raise ExperimentError(
-            f"{setup.experiment.source}: descent.coarse: {factor} does not divide the {setup.samples} samples; "
+            f"{task.experiment.source}: descent.coarse: {factor} does not divide the {task.samples} samples; "
             f"valid for example: {valid}"
         )
-    if setup.samples % factor or setup.samples < COARSEST * factor:
+    if task.samples % factor or task.samples < COARSEST * factor:
         return None
-    coarse = setup.coarser(factor)
-    return coarse if borne(Stage(coarse, basis), first, setup.problem.size(first), BORNE) else None
+    coarse = task.coarser(factor)
+    return coarse if borne(Stage(coarse, basis), first, task.problem.size(first), BORNE) else None
 
 
 def borne(coarse: Stage, first: Point, size: float, share: float) -> bool:
     """Whether the initial cost of a coarse level is that of the first point, up to a share of its size."""
     try:
-        there = coarse.problem.point(coarse.setup.initial)
+        there = coarse.problem.point(coarse.task.initial)
     except SimulationDivergedError:
         return False
     return abs(there.cost - first.cost) <= share * size
@@ -144,7 +146,7 @@ def descend(
             stage = replace(level, power=power)
             pass_ = _Pass(stage, (control, given), run, memory)
             for row in pass_.rows():
-                margin = np.inf if fence is None else _margin(level.setup, fence, pass_.control)
+                margin = np.inf if fence is None else _margin(level.task, fence, pass_.control)
                 clamped = clamped + 1 if margin == 0.0 else 0
                 if margin < 0.0 or clamped > CLAMPED:
                     run.outside = True
@@ -162,9 +164,9 @@ def descend(
     run.outside = clamped > 0
 
 
-def _margin(setup: Setup, fence: Fence, control: Array) -> float:
+def _margin(task: DesignTask, fence: Fence, control: Array) -> float:
     """Sign of the worst margin at any engine step of the level, for a control at the stated rate; 0 where a force is clamped."""
-    watched = setup.plant.observe(setup.theta, setup.averaged(control), fence.observations)
+    watched = task.plant.observe(task.theta, task.averaged(control), fence.observations)
     if watched is None:
         return -1.0
     margins = fence.margins(fence.sight(*watched, slopes=False))
@@ -176,13 +178,13 @@ def _margin(setup: Setup, fence: Fence, control: Array) -> float:
 def _sharper(stage: Stage, done: _Pass) -> tuple[float, bool]:
     """Power of the E-criterion from here on, and whether this level has to be done again with it."""
     values, power = done.eigenvalues, stage.power
-    if stage.setup.experiment.cost.criterion != "E" or len(values) < 2:
+    if stage.task.experiment.cost.criterion != "E" or len(values) < 2:
         return power, False
     if np.isinf(power):
         meet = done.met or (done.run.status is Status.STALLED and values[1] < NEAR * values[0])
         return (POWERS[0], True) if meet else (power, False)
     gap = float(np.sum((values[0] / values) ** power) ** (1.0 / power))
-    if gap > CLOSE and power < POWERS[-1] and stage.setup.coarsen == 1:
+    if gap > CLOSE and power < POWERS[-1] and stage.task.system.variant.sample_factor == 1:
         return POWERS[-1], True
     return power, False
 
@@ -200,16 +202,20 @@ class _Pass:
         self.control = controls[0]
         self.direction, self.problem = direction_for(stage)
         if isinstance(memory, LBFGS) and run.rate:
-            setup = stage.setup
-            factor = round(1.0 / (setup.dt * run.rate))
-            self.direction = memory.refined(np.diag(setup.control_weight) * setup.dt, factor)
+            task = stage.task
+            factor = round(1.0 / (task.dt * run.rate))
+            self.direction = memory.refined(np.diag(task.control_weight) * task.dt, factor)
         self.met = self.failed = False
         self.eigenvalues = np.zeros(0)
 
     def rows(self) -> Iterator[HistoryRow]:
         """Every iterate as a row of the history."""
-        level, run = self.stage.setup, self.run
-        d, fine, rate = level.experiment.descent, level.coarsen == 1, 1.0 / level.dt
+        level, run = self.stage.task, self.run
+        d, fine, rate = (
+            level.experiment.descent,
+            level.system.variant.sample_factor == 1,
+            1.0 / level.dt,
+        )
         start = self._start()
         if not np.isfinite(start.cost):
             self.failed = True
@@ -231,7 +237,7 @@ class _Pass:
             trajectory, criterion = iterate.point.trajectory, iterate.point.criterion
             if trajectory is None or criterion is None:
                 raise SimulationDivergedError("an iterate of Algorithm 1 diverged")
-            self.control = np.repeat(trajectory.ctrl, level.coarsen, axis=0)
+            self.control = np.repeat(trajectory.ctrl, level.system.variant.sample_factor, axis=0)
             self.eigenvalues = criterion.eigenvalues
             point = iterate.point if np.isinf(self.stage.power) else exact.judged(iterate.point)
             run.slope, run.status = iterate.slope, iterate.status or Status.INTERRUPTED
@@ -248,7 +254,7 @@ class _Pass:
 
     def _start(self) -> Point:
         """The cheapest point of the controls; infinite where all diverge."""
-        level, points = self.stage.setup, []
+        level, points = self.stage.task, []
         for control in {id(c): c for c in self.controls}.values():
             try:
                 points.append(
@@ -261,7 +267,7 @@ class _Pass:
     def _meets(self) -> bool:
         """The smallest eigenvalues are about to cross while the exact E-criterion is descended."""
         values = self.eigenvalues
-        wanted = self.stage.setup.experiment.cost.criterion == "E" and np.isinf(self.stage.power)
+        wanted = self.stage.task.experiment.cost.criterion == "E" and np.isinf(self.stage.power)
         return bool(wanted and len(values) > 1 and values[1] < MEETING * values[0])
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import Fence, Sight, basis_of, fence_of
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage
 from mjfim.records.trajectory import Trajectory
@@ -40,105 +40,103 @@ class Audit:
         return all(margin >= 0.0 for kind, margin in self.margins.items() if kind not in self.told)
 
 
-def audit(setup: Setup, trajectory: Trajectory) -> Audit:
+def audit(task: DesignTask, trajectory: Trajectory) -> Audit:
     """Play a trajectory's control open loop on the untouched model at the design's theta."""
-    fence = fence_of(setup, every=True)
+    fence = fence_of(task, every=True)
     told = (
         frozenset()
-        if setup.experiment.limits.enforce
-        else {"clearance", *(limit.kind for limit in setup.limits)}
+        if task.experiment.limits.enforce
+        else {"clearance", *(limit.kind for limit in task.limits)}
     )
-    model = setup.model_at(setup.theta)
-    simulator = BatchSimulator(model, substeps=setup.substeps)
+    model = task.system.model_at(task.theta)
+    simulator = BatchSimulator(model, substeps=task.system.grid.substeps)
     out = simulator.rollout(
         [model],
-        setup.plant.initial_state(setup.theta)[None],
+        task.plant.initial_state(task.theta)[None],
         trajectory.ctrl[None],
         fence.observations,
     )
     if not out.finite[0] or out.observed is None:
         lost = dict.fromkeys((*fence.kinds, "simulation"), -np.inf)
         return Audit(lost, lost, np.inf, frozenset(told))
-    played = setup.plant.trajectory(out.states[0], trajectory.ctrl)
+    played = task.plant.trajectory(out.states[0], trajectory.ctrl)
     sight = replace(fence, clearance=None).sight(played, out.observed[0], slopes=False)
     margins, shares = fence.margins(sight), fence.shares(sight)
-    usage = [*_usage(setup, fence, sight)]
+    usage = [*_usage(task, fence, sight)]
     if fence.clearance is not None:
-        positions = _positions(setup, simulator, played)
+        positions = _positions(task, simulator, played)
         distance, _, pair = fence.clearance.nearest(positions)
         margins["clearance"] = distance - fence.least
         over = np.maximum(fence.clearance(positions, slopes=False).d.min(axis=1), 1e-9)
-        t = np.arange(1, len(positions) + 1) * setup.dt / setup.substeps
+        t = np.arange(1, len(positions) + 1) * task.dt / task.system.grid.substeps
         usage.append(LimitUsage(kind="clearance", name=pair.name, t=t, share=fence.least / over))
         shares["clearance"] = margins["clearance"] / fence.least
-    deviation = float(np.abs(setup.space.minus(played.state, trajectory.state)).max())
+    deviation = float(np.abs(task.space.minus(played.state, trajectory.state)).max())
     return Audit(margins, shares, deviation, frozenset(told), tuple(usage))
 
 
-def _usage(setup: Setup, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
+def _usage(task: DesignTask, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
     """Of whatever has a range, within samples at every engine step."""
     N, substeps, w = sight.observed.shape
     observed, ctrl = sight.observed.reshape(N * substeps, w), sight.trajectory.ctrl
-    t = np.arange(1, len(observed) + 1) * setup.dt / setup.substeps
+    t = np.arange(1, len(observed) + 1) * task.dt / task.system.grid.substeps
     for kind, name, share in zip(
         fence.kinds, fence.names, fence.shown.relative_position(observed).T, strict=True
     ):
         yield LimitUsage(kind=kind, name=name, t=t, share=share)
-    bands = [("control", fence.control, ctrl, setup.t)]
+    bands = [("control", fence.control, ctrl, task.t)]
     if fence.rate is not None:
         bands.append(
             (
                 "control_rate",
                 fence.rate,
                 fence.rates(ctrl),
-                np.append(setup.t, setup.t[-1] + setup.dt),
+                np.append(task.t, task.t[-1] + task.dt),
             )
         )
     for kind, band, values, times in bands:
-        for i, name in enumerate(setup.controls):
+        for i, name in enumerate(task.controls):
             if np.isfinite(band.lower[i]) or np.isfinite(band.upper[i]):
                 yield LimitUsage(
                     kind=kind, name=name, t=times, share=band.relative_position(values)[:, i]
                 )
 
 
-def _positions(setup: Setup, simulator: BatchSimulator, played: Trajectory) -> Array:
+def _positions(task: DesignTask, simulator: BatchSimulator, played: Trajectory) -> Array:
     """(N * substeps, nq) positions at every engine step."""
     fine = BatchSimulator(simulator.model)
-    held = np.repeat(played.ctrl, setup.substeps, axis=0)
+    held = np.repeat(played.ctrl, task.system.grid.substeps, axis=0)
     return np.asarray(
-        fine.rollout([simulator.model], played.state[:1], held[None]).states[0][
-            1:, : setup.space.nq
-        ]
+        fine.rollout([simulator.model], played.state[:1], held[None]).states[0][1:, : task.space.nq]
     )
 
 
-def require_inside(setup: Setup) -> None:
+def require_inside(task: DesignTask) -> None:
     """Raise ExperimentError where limits cannot be, exclude the start or the end, or either cannot be held at rest."""
     try:
-        fence = fence_of(setup, every=True)
-        basis_of(setup, setup.stated_times)
-        places = {"the start": setup.plant.initial_state(setup.theta)}
-        if setup.experiment.boundary.end == "rest":
-            places["the end"] = setup.target
-        if setup.experiment.limits.enforce:
+        fence = fence_of(task, every=True)
+        basis_of(task, task.stated_times)
+        places = {"the start": task.plant.initial_state(task.theta)}
+        if task.experiment.boundary.end == "rest":
+            places["the end"] = task.target
+        if task.experiment.limits.enforce:
             for where, state in places.items():
-                _require_inside(setup, fence, where, state)
-            start, end = setup.plant.initial_state(setup.theta), setup.target
+                _require_inside(task, fence, where, state)
+            start, end = task.plant.initial_state(task.theta), task.target
             for where, state, hold in (
                 ("boundary.start", start, fence.before),
                 ("boundary.end", end, fence.after),
             ):
                 if hold is not None:
-                    _require_held(setup, where, state, hold)
+                    _require_held(task, where, state, hold)
     except ExperimentError as error:
-        raise ExperimentError(f"{setup.experiment.source}: {error}") from None
+        raise ExperimentError(f"{task.experiment.source}: {error}") from None
 
 
-def _require_inside(setup: Setup, fence: Fence, where: str, state: Array) -> None:
-    qpos, qvel, _ = setup.space.split(state)
-    units = {c.name: c.unit for c in setup.coordinates}
-    for limit in setup.limits:
+def _require_inside(task: DesignTask, fence: Fence, where: str, state: Array) -> None:
+    qpos, qvel, _ = task.space.split(state)
+    units = {c.name: c.unit for c in task.system.coordinates}
+    for limit in task.limits:
         if limit.kind in ("position", "velocity"):
             value = float((qpos if limit.kind == "position" else qvel)[limit.index])
             if not limit.lower <= value <= limit.upper:
@@ -148,7 +146,7 @@ def _require_inside(setup: Setup, fence: Fence, where: str, state: Array) -> Non
                     f"[{limit.lower:g}, {limit.upper:g}]; widen the limit (where it is the MJCF's, there) or move {where}"
                 )
     if fence.clearance is not None:
-        distance, _, pair = fence.clearance.nearest(state[None, : setup.space.nq])
+        distance, _, pair = fence.clearance.nearest(state[None, : task.space.nq])
         if distance < fence.least:
             what = "in collision" if distance < 0.0 else "too close"
             raise ExperimentError(
@@ -157,14 +155,14 @@ def _require_inside(setup: Setup, fence: Fence, where: str, state: Array) -> Non
             )
 
 
-def _require_held(setup: Setup, where: str, state: Array, hold: Array) -> None:
-    model = setup.plant.model(setup.theta)
+def _require_held(task: DesignTask, where: str, state: Array, hold: Array) -> None:
+    model = task.plant.model(task.theta)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:], data.act[:] = setup.space.split(state)
+    data.qpos[:], data.qvel[:], data.act[:] = task.space.split(state)
     data.ctrl[:] = hold
     mujoco.mj_forward(model, data)
     needed = {"control": hold, "force": data.actuator_force, "joint_force": data.qfrc_actuator}
-    for limit in setup.limits:
+    for limit in task.limits:
         if (
             limit.kind in needed
             and not limit.lower <= needed[limit.kind][limit.index] <= limit.upper

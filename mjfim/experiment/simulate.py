@@ -6,30 +6,54 @@ import numpy as np
 
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
 
 def simulate(
-    experiment: Experiment | Setup, trajectory: Trajectory, seed: int | np.random.Generator = 0
+    experiment: Experiment, trajectory: Trajectory, seed: int | np.random.Generator = 0
 ) -> Recording:
-    """A synthetic recording at the `true` values: the trajectory's control played open loop, noise on measured samples."""
-    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
+    """Simulate a recording at the `true` parameter values.
+
+    The trajectory's control is played open loop; noise is added to the measured samples.
+
+    Args:
+        experiment: The experiment.
+        trajectory: The trajectory whose control is played.
+        seed: Seed of the noise, or a generator of random numbers.
+
+    Returns:
+        The recording; what is not measured at a sample is NaN.
+
+    Raises:
+        SimulationDiverged: The simulation diverges under this control.
+    """
+    return simulate_system(System.resolve(experiment), trajectory, seed)
+
+
+def simulate_system(
+    system: System, trajectory: Trajectory, seed: int | np.random.Generator = 0
+) -> Recording:
+    """Simulate a recording of a resolved system. See `simulate`."""
     rng = np.random.default_rng(seed)
-    y, finite = setup.plant.measure(setup.parameters.true[None], trajectory.ctrl)
+    outputs, finite = system.plant.measure(system.parameters.true[None], trajectory.ctrl)
     if not finite[0]:
         raise SimulationDivergedError(
             "the simulation diverges at the true parameters under this control"
         )
-    noisy = y[0] + setup.noise.sample(len(y[0]), rng)
-    measured = setup.noise.measured(trajectory.samples)
+
+    noisy = outputs[0] + system.noise.sample(len(outputs[0]), rng)
+
+    # The initial state is always recorded; the other samples at the rates of their sensors.
+    measured = system.noise.measured(trajectory.samples)
     measured[0] = 1.0
     noisy[measured == 0.0] = np.nan
+
     return Recording(
-        t=np.arange(len(noisy), dtype=np.float64) * setup.dt,
+        t=np.arange(len(noisy), dtype=np.float64) * system.dt,
         ctrl=trajectory.ctrl,
         y=noisy,
-        outputs=setup.outputs.names,
+        outputs=system.outputs.names,
         name="simulated",
     )

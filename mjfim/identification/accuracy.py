@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.identification.residuals import Fit
 from mjfim.identification.robust_covariance import together, uncertainty
 from mjfim.information.marginal import marginal, standard_deviations
@@ -47,7 +47,7 @@ class Accuracy:
 
 def accuracy(fit: Fit, solution: Solution, null: Null, times: Sequence[float]) -> Accuracy:
     """Of a solution. null: what no recording shows;  times: rows over which the residuals of each output hang together"""
-    p, theta = fit.setup.parameters, fit.theta(solution.unknowns)
+    p, theta = fit.system.parameters, fit.theta(solution.unknowns)
     covariance, std = _formal(fit, solution)
     groups = grouped(null, p.names, p.magnitude, [q.unit for q in p.parameters])
     lumped = np.isin(p.names, [name for group in groups for name in group.members])
@@ -65,7 +65,7 @@ def accuracy(fit: Fit, solution: Solution, null: Null, times: Sequence[float]) -
         groups,
         not np.isfinite(std[~lumped]).all(),
         bool(lost.any()),
-        tuple(_sloppy(fit.setup, theta, interval, covariance)),
+        tuple(_sloppy(fit.system, theta, interval, covariance)),
         _data(fit, solution.condensed),
         detail,
     )
@@ -78,7 +78,7 @@ def _formal(fit: Fit, solution: Solution) -> tuple[Array, Array]:
     std = standard_deviations(H)
     singular = not np.isfinite(std).all()
     whole = np.full_like(H, np.inf) if singular else np.linalg.inv(H)
-    p, first = len(fit.setup.parameters), layout.first
+    p, first = len(fit.system.parameters), layout.first
     places = layout.places[first]
     covariance, spread = np.zeros((p, p)), np.zeros(p)
     covariance[np.ix_(places, places)], spread[places] = whole[np.ix_(first, first)], std[first]
@@ -99,7 +99,7 @@ def _formal(fit: Fit, solution: Solution) -> tuple[Array, Array]:
 
 def _honest(fit: Fit, solution: Solution, times: Sequence[float]) -> Uncertainty | None:
     """What the blocks of the last linearisation say; None where a common unknown is not determined."""
-    spec = fit.setup.experiment.fit
+    spec = fit.system.experiment.fit
     if not np.isfinite(standard_deviations(solution.condensed.information())).all():
         return None
     recording, rows = fit.blocks
@@ -118,7 +118,7 @@ def _spread(
     """(p,) sandwich deviations, (p, 2) intervals, (p,) deviations between recordings; formal ones where there are none."""
     sandwich, between = np.array(std), np.zeros(len(std))
     interval = np.column_stack([theta - 1.96 * std, theta + 1.96 * std])
-    layout, p = fit.layout, fit.setup.parameters
+    layout, p = fit.layout, fit.system.parameters
     if honest is not None:
         columns = layout.first
         places = layout.places[columns]
@@ -133,7 +133,7 @@ def _spread(
 
 def _data(fit: Fit, condensed: Condensed) -> Array:
     """(p, p) information of the recordings alone about what they share, everything else marginalised."""
-    p, layout = fit.setup.parameters, fit.layout
+    p, layout = fit.system.parameters, fit.layout
     H, places = condensed.information(with_common_rows=False), layout.places
     kept, out = np.arange(len(layout.shared)), np.zeros((len(p), len(p)))
     prior = p.prior_information[np.ix_(places, places)] * np.eye(len(places))
@@ -142,10 +142,10 @@ def _data(fit: Fit, condensed: Condensed) -> Array:
 
 
 def _sloppy(
-    setup: Setup, theta: Array, interval: Array, covariance: Array
+    system: System, theta: Array, interval: Array, covariance: Array
 ) -> Iterator[tuple[str, str]]:
     """Wanted parameters that the data hardly tell, and in words what they may be traded for."""
-    p = setup.parameters
+    p = system.parameters
     told = np.isfinite(np.diag(covariance))
     spread = np.sqrt(np.maximum(np.where(told, np.diag(covariance), 1.0), 1e-300))
     for j in p.interest:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjfim.arrays import Array, freeze
 from mjfim.errors import RecordingError, unknown
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.plant.outputs import outputs_by_state
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
@@ -51,9 +51,9 @@ class Track:
         return tuple(np.flatnonzero(column) for column in self.measured.T)
 
 
-def track_of(setup: Setup, recording: Recording) -> Track:
+def track_of(system: System, recording: Recording) -> Track:
     """A recording on the experiment's grid. Raises RecordingError where time, control or columns do not fit."""
-    names, where, dt = setup.outputs.names, recording.name, setup.dt
+    names, where, dt = system.outputs.names, recording.name, system.dt
     if len(recording.t) < 3:
         raise RecordingError(
             f"{where}: too few rows ({len(recording.t)}); an identification needs at least 3"
@@ -63,9 +63,9 @@ def track_of(setup: Setup, recording: Recording) -> Track:
         row = int(np.argmin(np.diff(t) > 0.0)) + 2
         raise RecordingError(f"{where}: column 't' does not increase in data row {row}")
     ctrl = recording.ctrl[: len(t) - 1]
-    if ctrl.shape != (len(t) - 1, len(setup.controls)):
+    if ctrl.shape != (len(t) - 1, len(system.controls)):
         raise RecordingError(
-            f"{where}: the control has shape {recording.ctrl.shape}, wanted {len(t) - 1} rows of {len(setup.controls)}"
+            f"{where}: the control has shape {recording.ctrl.shape}, wanted {len(t) - 1} rows of {len(system.controls)}"
         )
     if not np.isfinite(ctrl).all():
         row = int(np.argmax(~np.isfinite(ctrl).all(axis=1)))
@@ -85,7 +85,7 @@ def track_of(setup: Setup, recording: Recording) -> Track:
     t = place * dt if even else t
     if not even or not np.array_equal(place, np.arange(len(t))):
         ctrl = held(t, ctrl, dt)
-    return Track(where, t, _continuous(setup, ctrl, y), ctrl, dt, even)
+    return Track(where, t, _continuous(system, ctrl, y), ctrl, dt, even)
 
 
 def held(t: Array, ctrl: Array, dt: float) -> Array:
@@ -108,12 +108,12 @@ def held(t: Array, ctrl: Array, dt: float) -> Array:
     return np.asarray(np.where((first == last)[:, None], ctrl[first], mean))
 
 
-def _continuous(setup: Setup, ctrl: Array, y: Array) -> Array:
+def _continuous(system: System, ctrl: Array, y: Array) -> Array:
     """Measured quaternions with the sign that follows from the model's start: q and -q are one orientation."""
-    quaternions = _quaternions(setup)
+    quaternions = _quaternions(system)
     if not quaternions:
         return y
-    predicted, _ = setup.plant.measure(setup.parameters.guess[None], ctrl[:4])
+    predicted, _ = system.plant.measure(system.parameters.guess[None], ctrl[:4])
     for at in quaternions:
         last = predicted[0, 0, at]
         for row in y:
@@ -123,28 +123,28 @@ def _continuous(setup: Setup, ctrl: Array, y: Array) -> Array:
     return y
 
 
-def _quaternions(setup: Setup) -> list[list[int]]:
+def _quaternions(system: System) -> list[list[int]]:
     """Outputs that are the components of one quaternion, of a joint or of a sensor."""
-    outputs, model = setup.outputs.outputs, setup.model
+    outputs, model = system.outputs.outputs, system.model
     kinds = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
     first = [
         int(model.sensor_adr[i]) for i in range(model.nsensor) if int(model.sensor_type[i]) in kinds
     ]
     joints = [
         [i for i, o in enumerate(outputs) if o.state in range(q, q + 4)]
-        for q, _ in setup.space.quaternions
+        for q, _ in system.space.quaternions
     ]
     sensors = [[i for i, o in enumerate(outputs) if o.sensor in range(a, a + 4)] for a in first]
     return [found for found in (*joints, *sensors) if len(found) == 4]
 
 
-def measured_trajectory(setup: Setup, recording: Recording) -> Trajectory | None:
+def measured_trajectory(system: System, recording: Recording) -> Trajectory | None:
     """The recorded motion as a trajectory, where every position was measured at most samples; else None.
 
     Gaps are bridged linearly; velocities are zero. For pictures, not for estimation.
     """
-    shown, nq = outputs_by_state(setup.model, setup.outputs), setup.model.nq
-    names = [setup.outputs.names[shown[q]] if q in shown else "" for q in range(nq)]
+    shown, nq = outputs_by_state(system.model, system.outputs), system.model.nq
+    names = [system.outputs.names[shown[q]] if q in shown else "" for q in range(nq)]
     if any(name not in recording.outputs for name in names):
         return None
     qpos = np.empty((len(recording.t), nq))
@@ -154,7 +154,7 @@ def measured_trajectory(setup: Setup, recording: Recording) -> Trajectory | None
         if not seen.any():
             return None
         qpos[:, q] = np.interp(recording.t, recording.t[seen], column[seen])
-    for q, _ in setup.space.quaternions:
+    for q, _ in system.space.quaternions:
         qpos[:, q : q + 4] /= np.maximum(
             np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True), 1e-12
         )
@@ -162,7 +162,7 @@ def measured_trajectory(setup: Setup, recording: Recording) -> Trajectory | None
     return Trajectory(
         t=recording.t,
         qpos=qpos,
-        qvel=np.zeros((n, setup.model.nv)),
-        act=np.zeros((n, setup.model.na)),
+        qvel=np.zeros((n, system.model.nv)),
+        act=np.zeros((n, system.model.na)),
         ctrl=recording.ctrl,
     )

@@ -14,7 +14,7 @@ import numpy as np
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.identification.residuals import Fit
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.records.estimate import Prediction, PredictionErrors
@@ -27,14 +27,14 @@ STEPS = 8  # Levenberg-Marquardt steps of a fit without a part, and of a start
 
 
 def predict(
-    experiment: Experiment | Setup, theta: Array, recordings: Sequence[Recording]
+    experiment: Experiment, theta: Array, recordings: Sequence[Recording]
 ) -> tuple[PredictionErrors, ...]:
     """Errors of a model at theta: (p,) on recordings; only what belongs to a recording alone is found from it.
 
     Raises RecordingError for unusable recordings.
     """
-    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
-    fit = Fit(setup, recordings)
+    system = System.resolve(experiment)
+    fit = Fit(system, recordings)
     return tuple(
         _errors(fit, np.asarray(theta), _alone(fit.masks, i), fit.tracks[i].name)
         for i in range(len(fit.tracks))
@@ -49,7 +49,7 @@ def predicted(
     Where the budget is exhausted, parts that were not predicted by then are missing.
     """
     budget = Budget() if budget is None else budget
-    nominal = fit.setup.parameters.guess
+    nominal = fit.system.parameters.guess
     if held_out is not None:
         masks = held_out.masks
         return tuple(
@@ -122,7 +122,7 @@ def _errors(
     Unknown starts are found from what else a piece measures, or from those values where they are all it has.
     """
     fit = fit.part(fit.masked(masks).occupied)
-    now, nominal = fit.begin(theta), fit.setup.parameters.guess[fit.layout.private]
+    now, nominal = fit.begin(theta), fit.system.parameters.guess[fit.layout.private]
     if fit.size > len(fit.layout.shared):
         # a nuisance start of the fitted recordings says nothing of this one's
         starts = (
@@ -133,7 +133,7 @@ def _errors(
             fit.masked(_learned(fit, masks)).frozen(), replace(now, private=starts), search, budget
         )
         now = now if found is None else found.unknowns
-    values, outputs = fit.predicted(now), fit.setup.outputs.names
+    values, outputs = fit.predicted(now), fit.system.outputs.names
     rms, mae = np.full(len(outputs), np.nan), np.full(len(outputs), np.nan)
     for j, error in enumerate([] if values is None else fit.masked(masks).errors(values)):
         if len(error):

@@ -41,7 +41,7 @@ class Left:
 
 def left(fit: Fit, solution: Solution) -> Left:
     """Of a solution. Raises SimulationDivergedError."""
-    values, names = fit.predicted(solution.unknowns), fit.setup.outputs.names
+    values, names = fit.predicted(solution.unknowns), fit.system.outputs.names
     if values is None:
         raise SimulationDivergedError("the simulation diverges near the estimate")
     whitened = _whitened(fit, values)

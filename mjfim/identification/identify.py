@@ -20,7 +20,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget, stop_on_interrupt
 from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.identification.accuracy import Accuracy, accuracy
 from mjfim.identification.cross_validation import predicted
 from mjfim.identification.fit_quality import Left, left
@@ -58,7 +58,7 @@ Found = TypeVar("Found")
 
 
 def identify(
-    experiment: Experiment | Setup,
+    experiment: Experiment,
     recordings: Sequence[Recording],
     method: Method = "least_squares",
     start: Array | None = None,
@@ -73,20 +73,32 @@ def identify(
     Ctrl-C ends the search with the best so far. Raises RecordingError for unusable recordings, SimulationDivergedError where the
     model diverges at the start.
     """
+    system = System.resolve(experiment)
+    return identify_system(system, recordings, method, start, held_out, callback)
+
+
+def identify_system(
+    system: System,
+    recordings: Sequence[Recording],
+    method: Method = "least_squares",
+    start: Array | None = None,
+    held_out: Sequence[Recording] = (),
+    callback: Callback | None = None,
+) -> Estimate:
+    """Estimate the parameters of a resolved system. See `identify`."""
     if method not in get_args(Method):
         raise ExperimentError(unknown("method", method, get_args(Method)))
-    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
-    theta0 = setup.parameters.guess if start is None else np.asarray(start, dtype=np.float64)
-    if theta0.shape != setup.parameters.guess.shape:
+    theta0 = system.parameters.guess if start is None else np.asarray(start, dtype=np.float64)
+    if theta0.shape != system.parameters.guess.shape:
         raise ExperimentError(
-            f"start: {theta0.shape} numbers, wanted one per parameter: {', '.join(setup.parameters.names)}"
+            f"start: {theta0.shape} numbers, wanted one per parameter: {', '.join(system.parameters.names)}"
         )
     if method == "least_squares":
-        theta0 = np.clip(theta0, setup.parameters.lower, setup.parameters.upper)
+        theta0 = np.clip(theta0, system.parameters.lower, system.parameters.upper)
     with threadpool_limits(
         1, user_api="blas"
     ):  # small matrices: threads of BLAS only wait for each other
-        return _Identification(setup, recordings, method, theta0, held_out, callback).run()
+        return _Identification(system, recordings, method, theta0, held_out, callback).run()
 
 
 def least_squares(
@@ -115,24 +127,24 @@ class _Identification:
 
     def __init__(
         self,
-        setup: Setup,
+        system: System,
         recordings: Sequence[Recording],
         method: Method,
         theta0: Array,
         held_out: Sequence[Recording],
         callback: Callback | None,
     ) -> None:
-        self.clock, self.steps = time.perf_counter(), setup.plant.engine_steps
-        self.setup, self.method, self.theta0, self.callback = setup, method, theta0, callback
+        self.clock, self.steps = time.perf_counter(), system.plant.engine_steps
+        self.system, self.method, self.theta0, self.callback = system, method, theta0, callback
         self.budget = Budget()
-        fit = Fit(setup, recordings)
+        fit = Fit(system, recordings)
         self.fit = fit.unbounded() if method == "newton" else fit
-        self.held_out = Fit(setup, held_out) if held_out else None
+        self.held_out = Fit(system, held_out) if held_out else None
         self.interrupted = False
-        self.stated = setup.experiment.fit.noise == "stated"
-        if not self.stated and setup.noise.correlated:
+        self.stated = system.experiment.fit.noise == "stated"
+        if not self.stated and system.noise.correlated:
             raise ExperimentError(
-                f'{setup.experiment.source}: fit.noise = "estimated" takes outputs as uncorrelated; take `correlated` out'
+                f'{system.experiment.source}: fit.noise = "estimated" takes outputs as uncorrelated; take `correlated` out'
             )
 
     def run(self) -> Estimate:
@@ -142,11 +154,11 @@ class _Identification:
             return self._run()
 
     def _run(self) -> Estimate:
-        fit, setup = self.fit, self.setup
+        fit, system = self.fit, self.system
         begin = fit.begin(self.theta0)
         if not np.isfinite(self._sample(fit).cost(self._sampled(begin))):
             raise SimulationDivergedError(
-                f"the simulation diverges at the start {dict(zip(setup.parameters.names, self.theta0, strict=True))}"
+                f"the simulation diverges at the start {dict(zip(system.parameters.names, self.theta0, strict=True))}"
             )
         null = self._null(fit)
         fit.pin(self.theta0, null)
@@ -155,7 +167,7 @@ class _Identification:
 
     def _null(self, fit: Fit) -> Null:
         """Directions of theta that neither the recordings nor the priors tell, at the start of the search."""
-        p, some = self.setup.parameters, self._sample(fit)
+        p, some = self.system.parameters, self._sample(fit)
         J, error = (
             np.concatenate(part) for part in zip(*some.sensed(some.begin(self.theta0)), strict=True)
         )
@@ -185,9 +197,9 @@ class _Identification:
         if self.method == "newton":
             return NEWTON
         search = SearchSettings(
-            max_iterations=self.setup.experiment.fit.max_iterations, tolerance=CLOSE
+            max_iterations=self.system.experiment.fit.max_iterations, tolerance=CLOSE
         )
-        if self.fit.samples * 2 * len(self.setup.parameters) >= LARGE * 10:
+        if self.fit.samples * 2 * len(self.system.parameters) >= LARGE * 10:
             return replace(search, tolerance=1e-2, relinearise_at_end=False)
         return search
 
@@ -231,7 +243,7 @@ class _Identification:
 
     def _best(self, begin: UnknownValues) -> UnknownValues:
         """Where the search over all data begins: the best end of short searches from several starts, on some of the data."""
-        some, count = self._sample(self.fit), self.setup.experiment.fit.starts
+        some, count = self._sample(self.fit), self.system.experiment.fit.starts
         whole = len(some.pieces) == len(self.fit.pieces)
         placed = self._placed(some, self._sampled(begin), BRIEF)
         if whole and count == 1:
@@ -266,9 +278,9 @@ class _Identification:
         """(count - 1, p) random starts."""
         if count == 1:
             return np.zeros((0, len(self.theta0)))
-        setup = self.setup
-        seed = setup.experiment.fit.seed
-        return sample_parameters(setup.parameters, self.theta0, count, seed, setup.impossible)[1:]
+        system = self.system
+        seed = system.experiment.fit.seed
+        return sample_parameters(system.parameters, self.theta0, count, seed, system.impossible)[1:]
 
     def _settled(self, begin: UnknownValues) -> Solution:
         """The minimum, with sigmas that agree with the residuals where they are to be estimated."""
@@ -291,7 +303,7 @@ class _Identification:
 
     def _sigma(self, at: UnknownValues) -> Array:
         """(ny,) of the residuals; with a robust loss from their median, which outliers hardly move."""
-        fit, robust = self.fit, self.setup.experiment.fit.loss != "linear"
+        fit, robust = self.fit, self.system.experiment.fit.loss != "linear"
         values = fit.predicted(at)
         if values is None:
             return np.array(fit.noise.sigma)
@@ -303,12 +315,12 @@ class _Identification:
                     if robust
                     else float(np.sqrt(np.mean(r**2) * free))
                 )
-                sigma[j] = max(spread, FLOOR * self.setup.noise.sigma[j])
+                sigma[j] = max(spread, FLOOR * self.system.noise.sigma[j])
         return sigma
 
     def _report(self, solution: Solution, null: Null) -> Estimate:
-        setup, fit, at = self.setup, self.fit, solution.unknowns
-        p, theta, rest = setup.parameters, fit.theta(at), left(fit, solution)
+        system, fit, at = self.system, self.fit, solution.unknowns
+        p, theta, rest = system.parameters, fit.theta(at), left(fit, solution)
         missing = self._afterwards(lambda: () if rest.unexplained else self._missing(at))
         predictions = self._afterwards(lambda: predicted(fit, at, self.held_out, self.budget))
         why = reasons(rest.chi2, rest.dof, self.stated, rest.white, missing)
@@ -319,7 +331,7 @@ class _Identification:
         at_bound = tuple(name for name, hit in zip(p.names, touch, strict=True) if hit)
         return Estimate(
             parameters=p.names,
-            units=setup.units,
+            units=system.units,
             prior=p.prior_information,
             theta=theta,
             std=known.std,
@@ -341,7 +353,7 @@ class _Identification:
             std_sandwich=known.sandwich,
             interval=known.interval,
             between_recordings=known.between,
-            sigma=dict(zip(setup.outputs.names, fit.noise.sigma.tolist(), strict=True)),
+            sigma=dict(zip(system.outputs.names, fit.noise.sigma.tolist(), strict=True)),
             reasons=why,
             whiteness=rest.white,
             sloppy=tuple(name for name, _ in known.sloppy),
@@ -356,7 +368,7 @@ class _Identification:
             motion=fit.motion(at, 0),
             interrupted=self.interrupted,
             seconds=time.perf_counter() - self.clock,
-            steps=setup.plant.engine_steps - self.steps,
+            steps=system.plant.engine_steps - self.steps,
         )
 
     def _afterwards(self, work: Callable[[], tuple[Found, ...]]) -> tuple[Found, ...]:
@@ -375,7 +387,7 @@ class _Identification:
         track = self.fit.tracks[i]
         held = self.fit.recordings[i].ctrl[: len(track.t) - 1]
         return Recording(
-            t=track.t, ctrl=held, y=track.y, outputs=self.setup.outputs.names, name=track.name
+            t=track.t, ctrl=held, y=track.y, outputs=self.system.outputs.names, name=track.name
         )
 
     def _sentences(
@@ -389,7 +401,7 @@ class _Identification:
         outside: bool,
     ) -> Iterator[str]:
         """What a user should know besides the numbers, the gravest first."""
-        p, fit = self.setup.parameters, self.fit
+        p, fit = self.system.parameters, self.fit
         if self.interrupted and not solution.interrupted:
             yield "interrupted after the search: what was not fitted is not predicted"
         if rest.unexplained:
@@ -425,7 +437,7 @@ class _Identification:
         yield from (
             f"poor data in {Path(r.name).name}: {said}"
             for r in fit.recordings
-            for said in plausibility_remarks(self.setup.channels, r)
+            for said in plausibility_remarks(self.system.channels, r)
         )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import norm
 
 from mjfim.errors import ExperimentError
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.identification.residuals import Fit
 from mjfim.model.coordinates import scalar_joints
 from mjfim.model.units import JOINT_FIELD_UNITS
@@ -49,18 +49,22 @@ def suspects(
 
     fit: of some of the pieces that the recordings are cut into
     """
-    setup = fit.setup
-    tested = list(_candidates(setup, fit.measured))[:MOST]
+    system = fit.system
+    tested = list(_candidates(system, fit.measured))[:MOST]
     if not tested:
         return ()
     stated = {
         f"?{i}": {"target": c.path, "guess": c.at, "scale": FAINT} for i, c in enumerate(tested)
     }
     try:
-        wider = Setup(setup.experiment.replace(parameters=stated), setup.plant.simulator.threads)
+        wider = System.resolve(
+            system.experiment.replace(parameters=stated),
+            threads=system.threads,
+            source=system.source,
+        )
     except ExperimentError:
         return ()
-    own = [wider.parameters.names.index(name) for name in setup.parameters.names]
+    own = [wider.parameters.names.index(name) for name in system.parameters.names]
     theta = np.array(wider.parameters.guess)
     theta[own] = at.theta
     other = Fit(wider, recordings).part(pieces).reweighted(fit.noise)
@@ -107,10 +111,10 @@ def suspects(
     return tuple(sorted(named, key=lambda s: -s.sigmas)[:LISTED])
 
 
-def _candidates(setup: Setup, measured: bool) -> Iterator[Candidate]:
+def _candidates(system: System, measured: bool) -> Iterator[Candidate]:
     """Everything that the experiment does not already seek."""
-    sought = {t.path.removesuffix("[0]") for p in setup.parameters.parameters for t in p.targets}
-    model: Any = setup.model
+    sought = {t.path.removesuffix("[0]") for p in system.parameters.parameters for t in p.targets}
+    model: Any = system.model
     for c in scalar_joints(model):
         dof = c.v
         for field, words, now in (
@@ -124,9 +128,9 @@ def _candidates(setup: Setup, measured: bool) -> Iterator[Candidate]:
                 yield Candidate(
                     f"{words} of {c.name}", path, unit, True, float(now), float(now) or FAINT
                 )
-    for output in setup.outputs.outputs:
+    for output in system.outputs.outputs:
         path = f"output/{output.name}:bias"
         if path not in sought:
             yield Candidate(f"bias of {output.name}", path, output.unit, False, 0.0, 0.0)
-    if not measured and not setup.parameters.delay_derivative.any():  # a lag would move the pieces
+    if not measured and not system.parameters.delay_derivative.any():  # a lag would move the pieces
         yield Candidate("a lag of everything that is measured", "output:delay", "s", True, 0.0, 0.0)

@@ -15,7 +15,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import track_of
 from mjfim.identification.segments import cut, groups, whole
 from mjfim.identification.unknowns import Layout
@@ -58,6 +58,10 @@ class Rows:
     private: Array | None
 
 
+# Samples of the longest recording along which difference steps are calibrated.
+CALIBRATION_SAMPLES = 1000
+
+
 class Fit:
     """Residuals of an experiment against recordings, as functions of the unknowns (`levenberg_marquardt.Problem`).
 
@@ -67,24 +71,28 @@ class Fit:
     """
 
     def __init__(
-        self, setup: Setup, recordings: Sequence[Recording], data_only: bool = False
+        self, system: System, recordings: Sequence[Recording], data_only: bool = False
     ) -> None:
         if not recordings:
             raise RecordingError("identify needs at least one recording")
-        self.setup, self.data_only = setup, data_only
-        p, fit = setup.parameters, setup.experiment.fit
+        self.system, self.data_only = system, data_only
+        p, fit = system.parameters, system.experiment.fit
         self.loss = RobustLoss(kind=fit.loss, scale=fit.loss_scale)
-        self.noise: Noise = setup.noise
+        self.noise: Noise = system.noise
         self.recordings = list(recordings)
-        self.tracks = [track_of(setup, r) for r in recordings]
+        self.tracks = [track_of(system, r) for r in recordings]
+
+        # Difference steps suit the motion that was recorded; a part of it shows how strongly each parameter acts.
+        longest = max(self.tracks, key=lambda track: len(track.ctrl))
+        self.system = system = system.calibrated(p.guess, longest.ctrl[:CALIBRATION_SAMPLES])
         self.measured = fit.start == "measured" or fit.segments is not None
         if self.measured:
             self._require_free()
-            self.free = np.eye(setup.space.nx)
-            self.pieces = cut(setup, self.tracks, fit.segments, self._lead())
+            self.free = np.eye(system.space.nx)
+            self.pieces = cut(system, self.tracks, fit.segments, self._lead())
         else:
-            self.free = p.initial_state_derivative(setup.space.nx)[:, p.initial_deviations]
-            self.pieces = whole(self.tracks, setup.plant.nominal_initial_state)
+            self.free = p.initial_state_derivative(system.space.nx)[:, p.initial_deviations]
+            self.pieces = whole(self.tracks, system.plant.nominal_initial_state)
         self.masks = [self._used(i) for i in range(len(self.tracks))]
         if not any(mask.any() for mask in self.masks):
             raise RecordingError("the recordings hold no measured value after t = 0")
@@ -94,17 +102,17 @@ class Fit:
 
     def _require_free(self) -> None:
         """Raises ExperimentError where deviations of the stated start are asked for though it is measured."""
-        starts = self.setup.parameters.initial_state_derivative(self.setup.space.nx).any(axis=0)
+        starts = self.system.parameters.initial_state_derivative(self.system.space.nx).any(axis=0)
         if starts.any():
-            name = self.setup.parameters.names[int(np.argmax(starts))]
+            name = self.system.parameters.names[int(np.argmax(starts))]
             raise ExperimentError(
-                f"{self.setup.experiment.source}: {name}: a start is free where fit.segments or fit.start = \"measured\" is "
+                f"{self.system.experiment.source}: {name}: a start is free where fit.segments or fit.start = \"measured\" is "
                 "stated; take nuisance.initial and parameters of the start out, or the other"
             )  # fmt: skip
 
     def _lead(self) -> float:
         """[s] that outputs may lag at most while the delay is sought."""
-        p = self.setup.parameters
+        p = self.system.parameters
         reach = np.array([DELAYED * (q.prior or q.scale) for q in p.parameters])
         latest = np.minimum(p.guess + reach, np.where(np.isfinite(p.upper), p.upper, np.inf))
         return max(float(p.delay_derivative @ latest), 0.0) if p.delay_derivative.any() else 0.0
@@ -221,7 +229,7 @@ class Fit:
 
     def pin(self, theta0: Array, null: Null) -> None:
         """Hold what no recording shows at its start, to one size of each parameter. null: of all p parameters"""
-        size = self.setup.parameters.magnitude
+        size = self.system.parameters.magnitude
         self.pins = np.linalg.qr(null.directions / size[:, None])[0].T / size
         self.pinned_at = np.array(theta0)
 
@@ -241,13 +249,13 @@ class Fit:
         parts = list(zip(values, self.tracks, self.masks, strict=True))
         return [
             np.concatenate([(y - track.y)[mask[:, j], j] for y, track, mask in parts])
-            for j in range(len(self.setup.outputs))
+            for j in range(len(self.system.outputs))
         ]
 
     def motion(self, at: UnknownValues, track: int) -> Trajectory | None:
         """The fitted motion of one track on its grid, jumps between pieces and all; None where it diverges."""
         plant, whole, theta = (
-            self.setup.plant,
+            self.system.plant,
             self.tracks[track],
             self.layout.of_recording(at, track),
         )
@@ -397,7 +405,7 @@ class Fit:
 
     def _inner(self, at: UnknownValues) -> Array:
         """(P, k, m) rows of priors on the private unknowns; pins that touch them belong to the first piece."""
-        n, c, p = self.free.shape[1], self.layout.columns, self.setup.parameters
+        n, c, p = self.free.shape[1], self.layout.columns, self.system.parameters
         private = self.layout.private
         if self.measured:
             rows = np.zeros((len(self.pieces), n, n + c + 1))
@@ -430,14 +438,14 @@ class Fit:
 
         every: differentiate by all of theta, what the layout does not seek too
         """
-        plant = self.setup.plant
-        sought = np.ones(len(self.setup.parameters), dtype=bool) if every else self.layout.sought
+        plant = self.system.plant
+        sought = np.ones(len(self.system.parameters), dtype=bool) if every else self.layout.sought
         q = int(sought.sum()) + self.free.shape[1]
         central = self.samples * 2 * q < LARGE if central is None else central
         sides = 1 + (q * (2 if central else 1) if derivatives else 0)
         most = max(
             MAX_NUMBERS_AT_ONCE
-            // (sides * self.setup.substeps * (1 + plant.nominal_initial_state.size)),
+            // (sides * self.system.grid.substeps * (1 + plant.nominal_initial_state.size)),
             1,
         )
         step = step if central else 0.1 * step
@@ -476,7 +484,7 @@ class Fit:
 
     def _start(self, at: UnknownValues, piece: int) -> Array:
         """(ns,) where a piece starts."""
-        space, p = self.setup.space, self.setup.parameters
+        space, p = self.system.space, self.system.parameters
         if self.measured:
             return space.plus(self.pieces[piece].start, self.free @ at.private[piece])
         theta = np.array(at.theta)
@@ -491,7 +499,7 @@ class Fit:
 
     def _read(self, theta: Array, piece: int, place: int, response: Response) -> Rows | None:
         """What a response says of the rows of one piece that fall into its stretch; None where none does."""
-        own, p = self.pieces[piece], self.setup.parameters
+        own, p = self.pieces[piece], self.system.parameters
         track = self.tracks[own.track]
         late = float(p.delay_derivative @ theta) / track.dt
         wanted = track.t[own.rows] / track.dt - own.begin - late

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import Track
 from mjfim.plant.outputs import outputs_by_state
 
@@ -42,7 +42,7 @@ def whole(tracks: Sequence[Track], start: Array) -> tuple[Piece, ...]:
 
 
 def cut(
-    setup: Setup, tracks: Sequence[Track], length: float | None, lead: float
+    system: System, tracks: Sequence[Track], length: float | None, lead: float
 ) -> tuple[Piece, ...]:
     """Pieces of a length [s], None: whole tracks, each with the start that the data show.
 
@@ -53,7 +53,7 @@ def cut(
         bounds = _bounds(track, length)
         ahead = int(np.ceil(lead / track.dt - 1e-9))
         begins = [max(int(b) - ahead, 0) for b in bounds[:-1]]
-        starts = measured_starts(setup, track, np.array(begins))
+        starts = measured_starts(system, track, np.array(begins))
         edges = np.searchsorted(track.t, bounds * track.dt - 1e-9 * track.dt)
         edges[-1] = len(track.t)
         for begin, end, first, last, start in zip(
@@ -77,14 +77,14 @@ def _bounds(track: Track, length: float | None) -> np.ndarray:
     return np.linspace(0, N, count + 1).astype(int)
 
 
-def measured_starts(setup: Setup, track: Track, begins: np.ndarray) -> Array:
+def measured_starts(system: System, track: Track, begins: np.ndarray) -> Array:
     """(n, ns) states at samples: what the log shows; what it does not show, as the model at the guess goes.
 
     A line through position and velocity of the rows around, a parabola where velocities were not measured.
     """
-    states = _nominal(setup, track, begins)
-    place = _shown(setup, track)
-    space = setup.space
+    states = _nominal(system, track, begins)
+    place = _shown(system, track)
+    space = system.space
     quaternion = {a for q, _ in space.quaternions for a in range(q, q + 4)}
     velocity = dict(zip(space.scalar_q.tolist(), (space.nq + space.scalar_v).tolist(), strict=True))
     for k, begin in enumerate(begins):
@@ -123,24 +123,24 @@ def _nearest(track: Track, columns: Sequence[int], t0: float) -> Array:
     return np.asarray(track.y[near][list(columns)])
 
 
-def _nominal(setup: Setup, track: Track, begins: np.ndarray) -> Array:
+def _nominal(system: System, track: Track, begins: np.ndarray) -> Array:
     """(n, ns) states of the model at the guess from the stated start; the start itself where that diverges."""
-    start = setup.plant.initial_state(setup.parameters.guess)
+    start = system.plant.initial_state(system.parameters.guess)
     out = np.tile(start, (len(begins), 1))
-    if set(_shown(setup, track)).issuperset(range(len(start))) or not begins.any():
+    if set(_shown(system, track)).issuperset(range(len(start))) or not begins.any():
         return out
-    model = setup.plant.model(setup.parameters.guess)
-    rolled = setup.plant.simulator.rollout(
+    model = system.plant.model(system.parameters.guess)
+    rolled = system.plant.simulator.rollout(
         [model], start[None], track.ctrl[None, : int(begins.max())]
     )
     return np.array(rolled.states[0][begins]) if rolled.finite[0] else out
 
 
-def _shown(setup: Setup, track: Track) -> dict[int, int]:
+def _shown(system: System, track: Track) -> dict[int, int]:
     """Output that shows a component of the state, by its address, where the track has values of it."""
     return {
         state: i
-        for state, i in outputs_by_state(setup.model, setup.outputs).items()
+        for state, i in outputs_by_state(system.model, system.outputs).items()
         if len(track.seen[i])
     }
 

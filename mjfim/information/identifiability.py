@@ -1,35 +1,53 @@
-"""What an experiment can see at all: along its own trajectory, and along random ones, which tell whether another would help."""
+"""Which parameters an experiment can identify: along its own trajectory, and along random ones.
+
+Random trajectories tell whether another control would help.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, UnidentifiableError
-from mjfim.excitation.initial_controls import probes
-from mjfim.experiment.system import Setup
 from mjfim.information.fisher import Information
 from mjfim.information.null_space import BLIND, COARSER, SURE, Null, grouped, invisible
+from mjfim.model.parameters import ParameterSet
 from mjfim.plant.derivatives import SENSITIVITY_STEP
+from mjfim.plant.noise import Noise
+from mjfim.plant.plant import Plant
 from mjfim.records.combinations import ParameterGroup, combination_matrix
 from mjfim.records.design import CombinationAccuracy
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
+# Number of random trajectories that are tried.
 PROBES = 3
-ROUND_OFF = 1e-7  # relative error of rows that are taken from an information matrix
-FAINTEST = 1e-6  # of the strongest effect in earlier experiments; less is their round-off
-LOCAL = 60  # samples of a trajectory that are looked at one by one, before all of them
-ONE_STEPS = (1e-4, 4e-4)  # relative to the parameters' sizes: a single step is smooth in them
+
+# Relative error of rows that are taken from an information matrix.
+ROUND_OFF = 1e-7
+
+# An effect below this share of the strongest one in earlier experiments is round-off.
+NEGLIGIBLE_EFFECT = 1e-6
+
+# Samples of a trajectory whose single steps are looked at first, before all of them.
+FEW_SAMPLES = 60
+
+# Difference steps of the parameters for single engine steps, relative to the size of each parameter.
+SINGLE_STEP_DIFFERENCES = (1e-4, 4e-4)
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
-    """Invisible directions here (along the given trajectory) and always (also along random multisines).
+class Identifiability:
+    """Directions of the wanted parameters that nothing measured can show.
 
-    names: of the wanted parameters;  groups_here, groups_always: the same in words
+    Attributes:
+        names: Names of the t wanted parameters.
+        here: Null space along the given trajectory.
+        always: Null space that random trajectories share with it.
+        groups_here: The null space along the given trajectory in the names of the parameters.
+        groups_always: The shared null space in the names of the parameters.
     """
 
     names: tuple[str, ...]
@@ -40,182 +58,269 @@ class Survey:
 
     @property
     def basis(self) -> Array | None:
-        """(t, s) combinations that some experiment can see; None where all parameters are such."""
+        """(t, s) combinations that some experiment can show; None where every parameter can be shown."""
         return self.always.basis if self.always.count else None
 
-    def combined(
+    def combinations(
         self, information: Information, values: Array, before: Array, after: Array
     ) -> tuple[CombinationAccuracy, ...]:
-        """The visible combinations of `groups_always`: words, value and standard deviations of two informations (p, p).
+        """Identifiable combinations with their standard deviations under two information matrices.
 
-        values: (t,) of the wanted parameters
+        Args:
+            information: Turns an information matrix into standard deviations of combinations.
+            values: (t,) values of the wanted parameters.
+            before: (p, p) information of the first experiment.
+            after: (p, p) information of the second one.
         """
         rows = combination_matrix(self.groups_always, self.names)
-        words = [str(c) for group in self.groups_always for c in group.combinations]
-        combined_values = (rows @ values).tolist()
-        std_before = information.spread(before, rows).tolist()
-        std_after = information.spread(after, rows).tolist()
+        words = [
+            str(combination) for group in self.groups_always for combination in group.combinations
+        ]
+        initial, final = (information.spread(matrix, rows).tolist() for matrix in (before, after))
 
-        columns = zip(words, combined_values, std_before, std_after, strict=True)
         return tuple(
-            CombinationAccuracy(expression=name, value=value, std_initial=initial, std_final=final)
-            for name, value, initial, final in columns
+            CombinationAccuracy(expression=text, value=value, std_initial=first, std_final=last)
+            for text, value, first, last in zip(
+                words, (rows @ values).tolist(), initial, final, strict=True
+            )
         )
 
 
-def rows(setup: Setup, sensitivity: Sensitivity) -> Array:
-    """(n, p) whitened rows of G at the measured samples."""
-    return setup.noise.whitened_rows(sensitivity.G)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Observer:
+    """Looks for parameters that the measurements of a plant cannot show.
 
-
-def survey(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivity) -> Survey:
-    """Look along a trajectory whose sensitivity is known; further only where that leaves a doubt."""
-    J = rows(setup, sensitivity)
-    local = _local(setup, [trajectory])
-    quick = _null(setup, [J], None, local)
-    if quick.smallest > SURE and not quick.count:
-        return _words(setup, quick, quick)
-    return _survey(setup, trajectory, *_pair(setup, trajectory, sensitivity), local)
-
-
-def survey_rows(setup: Setup, trajectory: Trajectory, J: Array, error: Array) -> Survey:
-    """Look at given rows of G: (n, p) and their error; along random trajectories only where that leaves a doubt.
-
-    trajectory: one of those that the rows belong to
+    Attributes:
+        plant: The plant.
+        parameters: The p unknown parameters.
+        noise: Noise of the measured outputs.
+        theta: (p,) parameter values.
+        earlier: (p, p) information of earlier experiments, without the priors of the parameters.
+        probes: Simulates a number of random controls; trajectories that diverge are left out.
     """
-    return _survey(setup, trajectory, J, error, _local(setup, [trajectory]))
+
+    plant: Plant
+    parameters: ParameterSet
+    noise: Noise
+    theta: Array
+    earlier: Array
+    probes: Callable[[int], Iterator[Trajectory]]
+
+    @property
+    def prior(self) -> Array:
+        """(p, p) information of earlier experiments and of the priors."""
+        return self.parameters.prior_information + self.earlier
+
+    def rows(self, sensitivity: Sensitivity) -> Array:
+        """(n, p) whitened rows of G at the measured samples."""
+        return self.noise.whitened_rows(sensitivity.G)
+
+    def identifiability(self, trajectory: Trajectory, sensitivity: Sensitivity) -> Identifiability:
+        """Look along a trajectory whose sensitivity is known; along random ones only where that leaves a doubt."""
+        J = self.rows(sensitivity)
+        single_steps = _single_step_null_space(self, [trajectory])
+
+        # One difference step is enough where every singular value stands far above its round-off.
+        quick = _null_space(self, [J], None, single_steps)
+        if quick.smallest > SURE and not quick.count:
+            return _in_words(self, quick, quick)
+
+        return _look(
+            self, trajectory, *_rows_and_error(self, trajectory, sensitivity), single_steps
+        )
+
+    def identifiability_of_rows(
+        self, trajectory: Trajectory, J: Array, error: Array
+    ) -> Identifiability:
+        """Look at given rows of G; along random trajectories only where that leaves a doubt.
+
+        Args:
+            trajectory: One of the trajectories to which the rows belong.
+            J: (n, p) whitened rows of G.
+            error: (n, p) their change with a longer difference step.
+        """
+        return _look(self, trajectory, J, error, _single_step_null_space(self, [trajectory]))
 
 
-def _survey(
-    setup: Setup, trajectory: Trajectory, J: Array, error: Array, local: Array | None
-) -> Survey:
-    here = _null(setup, [J], [error], local)
+def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
+    """Raise where a parameter cannot be told from data with these rows of G.
+
+    Args:
+        parameters: The p unknown parameters.
+        prior: (p, p) prior information.
+        J: (n, p) whitened rows of G.
+
+    Raises:
+        UnidentifiableError: A combination of parameters has no effect on the rows.
+    """
+    every = np.arange(len(parameters))
+    null = invisible(J, None, parameters.magnitude, parameters.scale, every, prior)
+    if not null.count:
+        return
+
+    units = [parameter.unit for parameter in parameters.parameters]
+    groups = grouped(null, parameters.names, parameters.magnitude, units)
+    listed = "; ".join(str(group) for group in groups)
+    raise UnidentifiableError(f"this trajectory does not show every parameter: {listed}")
+
+
+def _look(
+    observer: Observer, trajectory: Trajectory, J: Array, error: Array, single_steps: Array | None
+) -> Identifiability:
+    """Null space of given rows, and what random trajectories leave of it."""
+    here = _null_space(observer, [J], [error], single_steps)
     if not here.count:
-        return _words(setup, here, here)
-    tried = list(probes(setup, PROBES))
-    always = _local(setup, [trajectory, *tried])
+        return _in_words(observer, here, here)
+
+    tried = list(observer.probes(PROBES))
+    always = _single_step_null_space(observer, [trajectory, *tried])
     stack, errors = [J], [error]
+
+    # Whole motions are differentiated only where single steps do not explain the null space already.
     if always is None or here.count > always.shape[1]:
         for probe in tried:
-            fine = setup.plant.derivatives.sensitivity(setup.theta, probe)
-            if fine is not None:
-                more, doubt = _pair(setup, probe, fine)
-                stack.append(more)
-                errors.append(doubt)
-    return _words(setup, here, _null(setup, stack, errors, always))
+            fine = observer.plant.derivatives.sensitivity(observer.theta, probe)
+            if fine is None:
+                continue
+            rows, change = _rows_and_error(observer, probe, fine)
+            stack.append(rows)
+            errors.append(change)
+
+    return _in_words(observer, here, _null_space(observer, stack, errors, always))
 
 
-def _local(setup: Setup, trajectories: Sequence[Trajectory]) -> Array | None:
-    """(t, k) directions without effect on single steps and their outputs: exact, even where whole motions are chaotic.
+def _single_step_null_space(observer: Observer, trajectories: Sequence[Trajectory]) -> Array | None:
+    """Directions without effect on single steps and their outputs, (t, k); None without a parameter inside the model.
 
-    Such a direction moves nothing, whatever is measured. None: there is no parameter inside the model.
+    Such a direction moves nothing, whatever is measured. Single steps tell it exactly, even where motions are chaotic.
     """
-    p = setup.parameters
-    inside = p.interest[p.changes_model[p.interest]]
+    parameters = observer.parameters
+    inside = parameters.interest[parameters.changes_model[parameters.interest]]
     if not len(inside):
         return None
-    unseen = np.zeros_like(setup.prior)
-    every = max(t.samples for t in trajectories)
-    for most in (LOCAL, every):  # what a few samples do not show, a contact between them may
-        found = _stepped(setup, trajectories, most)
+
+    no_prior = np.zeros_like(observer.prior)
+    longest = max(trajectory.samples for trajectory in trajectories)
+
+    # A few samples first: where they leave a direction open, a contact between them may still show it.
+    for most in (FEW_SAMPLES, longest):
+        found = _step_effects(observer, trajectories, most)
         if found is None:
             return None
-        J, error = (each[:, inside] for each in found)
-        null = invisible(
-            J, error, p.magnitude[inside], p.scale[inside], np.arange(len(inside)), unseen
-        )
+        J, error = found[0][:, inside], found[1][:, inside]
+        step, scale = parameters.magnitude[inside], parameters.scale[inside]
+        null = invisible(J, error, step, scale, np.arange(len(inside)), no_prior)
         if not null.count:
             break
-    out = np.zeros((len(p.interest), null.count))
-    out[np.searchsorted(p.interest, inside)] = null.directions
-    return _unseen_before(setup, out)
+
+    directions = np.zeros((len(parameters.interest), null.count))
+    directions[np.searchsorted(parameters.interest, inside)] = null.directions
+    return _unseen_by_earlier(observer, directions)
 
 
-def _stepped(
-    setup: Setup, trajectories: Sequence[Trajectory], most: int
+def _step_effects(
+    observer: Observer, trajectories: Sequence[Trajectory], most: int
 ) -> tuple[Array, Array] | None:
-    """Effects on single steps at no more than so many samples of each trajectory, and their error; None where all diverge."""
+    """Effects of the parameters on single steps, and their error; None where all trajectories diverge.
+
+    Args:
+        observer: The plant and its parameters.
+        trajectories: Trajectories whose samples are looked at.
+        most: Largest number of samples of each.
+
+    Returns:
+        (n, p) effects and (n, p) their change with a longer difference step.
+    """
     stack, errors = [], []
     for trajectory in trajectories:
-        picked = np.unique(
-            np.linspace(0, trajectory.samples - 1, min(most, trajectory.samples)).astype(int)
-        )
+        count = min(most, trajectory.samples)
+        picked = np.unique(np.linspace(0, trajectory.samples - 1, count).astype(int))
         try:
             first, second = (
-                setup.plant.derivatives.one_step(setup.theta, trajectory, picked, step)
-                for step in ONE_STEPS
+                observer.plant.derivatives.one_step(observer.theta, trajectory, picked, step)
+                for step in SINGLE_STEP_DIFFERENCES
             )
         except SimulationDivergedError:
             continue
         stack.append(first)
         errors.append(second - first)
+
     return (np.concatenate(stack), np.concatenate(errors)) if stack else None
 
 
-def _words(setup: Setup, here: Null, always: Null) -> Survey:
-    p = setup.parameters
-    names = tuple(p.names[j] for j in p.interest)
-    size, units = p.magnitude[p.interest], [p.parameters[j].unit for j in p.interest]
-    return Survey(
-        names, here, always, grouped(here, names, size, units), grouped(always, names, size, units)
+def _in_words(observer: Observer, here: Null, always: Null) -> Identifiability:
+    """Two null spaces in the names of the wanted parameters."""
+    parameters = observer.parameters
+    interest = parameters.interest
+    names = tuple(parameters.names[j] for j in interest)
+    size = parameters.magnitude[interest]
+    units = [parameters.parameters[j].unit for j in interest]
+
+    return Identifiability(
+        names,
+        here,
+        always,
+        grouped(here, names, size, units),
+        grouped(always, names, size, units),
     )
 
 
-def _null(
-    setup: Setup, stack: Sequence[Array], errors: Sequence[Array] | None, known: Array | None
+def _null_space(
+    observer: Observer,
+    stack: Sequence[Array],
+    errors: Sequence[Array] | None,
+    known: Array | None,
 ) -> Null:
-    p = setup.parameters
-    before = _rows_of(setup.earlier)
-    error = None if errors is None else np.concatenate([*errors, ROUND_OFF * np.abs(before)])
+    """Null space of stacked rows together with those of earlier experiments. known: (t, k) directions found otherwise."""
+    parameters = observer.parameters
+    before = _rows_of_information(observer.earlier)
+    error = None
+    if errors is not None:
+        error = np.concatenate([*errors, ROUND_OFF * np.abs(before)])
+
     return invisible(
         np.concatenate([*stack, before]),
         error,
-        p.magnitude,
-        p.scale,
-        p.interest,
-        setup.prior,
+        parameters.magnitude,
+        parameters.scale,
+        parameters.interest,
+        observer.prior,
         known,
     )
 
 
-def _rows_of(information: Array) -> Array:
-    """(n, p) rows whose squares add up to what earlier experiments told."""
+def _rows_of_information(information: Array) -> Array:
+    """(n, p) rows whose squares add up to an information matrix (p, p)."""
     values, vectors = np.linalg.eigh(information)
     kept = values > 1e-14 * max(float(values[-1]), 0.0)
     return np.asarray(np.sqrt(values[kept])[:, None] * vectors.T[kept])
 
 
-def _unseen_before(setup: Setup, directions: Array) -> Array:
-    """Those (t, k) directions of the wanted parameters that earlier experiments do not see either."""
-    if not setup.earlier.any() or not directions.shape[1]:
+def _unseen_by_earlier(observer: Observer, directions: Array) -> Array:
+    """Combinations of (t, k) directions that earlier experiments do not show either."""
+    if not observer.earlier.any() or not directions.shape[1]:
         return directions
-    unit = directions / np.linalg.norm(
-        directions / setup.parameters.magnitude[setup.parameters.interest][:, None], axis=0
-    )
-    before = _rows_of(setup.earlier)
-    effect = before[:, setup.parameters.interest] @ unit
-    _, values, V = np.linalg.svd(
-        np.concatenate([effect, np.zeros((unit.shape[1], unit.shape[1]))]), full_matrices=False
-    )
-    strongest = np.linalg.norm(before * setup.parameters.magnitude, 2)
-    return np.asarray(unit @ V[values <= max(BLIND, FAINTEST * strongest)].T)
+
+    parameters = observer.parameters
+    interest = parameters.interest
+    sizes = parameters.magnitude[interest][:, None]
+    unit = directions / np.linalg.norm(directions / sizes, axis=0)
+
+    before = _rows_of_information(observer.earlier)
+    effect = before[:, interest] @ unit
+    square = np.zeros((unit.shape[1], unit.shape[1]))
+    _, values, V = np.linalg.svd(np.concatenate([effect, square]), full_matrices=False)
+
+    strongest = np.linalg.norm(before * parameters.magnitude, 2)
+    unseen = values <= max(BLIND, NEGLIGIBLE_EFFECT * strongest)
+    return np.asarray(unit @ V[unseen].T)
 
 
-def _pair(setup: Setup, trajectory: Trajectory, fine: Sensitivity) -> tuple[Array, Array]:
-    """Rows of G and their change with the longer step (all of them where that diverges)."""
-    J = rows(setup, fine)
-    coarse = setup.plant.derivatives.sensitivity(
-        setup.theta, trajectory, COARSER * SENSITIVITY_STEP
-    )
-    return J, np.zeros_like(J) if coarse is None else rows(setup, coarse) - J
-
-
-def require_visible(setup: Setup, J: Array) -> None:
-    """Raise UnidentifiableError where a wanted parameter cannot be told from data with these rows of G. J: (n, p)"""
-    p = setup.parameters
-    null = invisible(J, None, p.magnitude, p.scale, np.arange(len(p)), setup.prior)
-    if null.count:
-        said = "; ".join(
-            str(g) for g in grouped(null, p.names, p.magnitude, [q.unit for q in p.parameters])
-        )
-        raise UnidentifiableError(f"this trajectory does not show every parameter: {said}")
+def _rows_and_error(
+    observer: Observer, trajectory: Trajectory, fine: Sensitivity
+) -> tuple[Array, Array]:
+    """Rows of G and their change with a longer step, which is all of them where the longer step diverges."""
+    J = observer.rows(fine)
+    step = COARSER * SENSITIVITY_STEP
+    coarse = observer.plant.derivatives.sensitivity(observer.theta, trajectory, step)
+    return J, np.zeros_like(J) if coarse is None else observer.rows(coarse) - J

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.experiment.system import Setup
 from mjfim.information.null_space import BLIND, FAINT
+from mjfim.model.parameters import ParameterSet
 from mjfim.plant.active_constraints import active_constraints
 from mjfim.plant.derivatives import SENSITIVITY_STEP
+from mjfim.plant.noise import Noise
+from mjfim.plant.plant import Plant
 from mjfim.records.check import Roughness
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
@@ -27,51 +31,70 @@ def disagreement(fine: Array, coarse: Array) -> Array:
 
 
 def roughness(
-    setup: Setup, theta: Array, trajectory: Trajectory, fine: Sensitivity | None = None
+    plant: Plant,
+    noise: Noise,
+    model: Any,
+    theta: Array,
+    trajectory: Trajectory,
+    fine: Sensitivity | None = None,
 ) -> Roughness | None:
-    """The worst disagreement along a trajectory, or None where it is below `TOLERANCE`. fine: by the first step, if known"""
-    plant = setup.plant
+    """Find the worst disagreement of two difference steps along a trajectory.
+
+    Args:
+        plant: The plant.
+        noise: Noise of the measured outputs.
+        model: The user's model at theta, in which the causes are looked for.
+        theta: (p,) parameter values.
+        trajectory: The trajectory.
+        fine: Its sensitivity by the shorter step, if it is known.
+
+    Returns:
+        The worst disagreement and what causes it; None where it is below `TOLERANCE`.
+    """
+    parameters = plant.parameters
     fine = plant.derivatives.sensitivity(theta, trajectory) if fine is None else fine
-    longer = np.maximum(
-        LONGER * setup.parameters.magnitude / plant.derivatives.parameter_scale, LEAST
-    )
+    longer = np.maximum(LONGER * parameters.magnitude / plant.derivatives.parameter_scale, LEAST)
     coarse = plant.derivatives.sensitivity(theta, trajectory, longer * SENSITIVITY_STEP)
-    names = setup.parameters.names
+    names = parameters.names
+
     if fine is None or coarse is None:
-        causes = active_constraints(setup.model_at(theta), trajectory, range(trajectory.samples))
+        causes = active_constraints(model, trajectory, range(trajectory.samples))
         return Roughness(
             error=np.inf, parameter=", ".join(names), sample=0, time=0.0, causes=causes
         )
-    G = setup.noise.whiten(fine.G)
-    kept = np.flatnonzero(visible_columns(setup, G))
-    if not len(kept):
+
+    G = noise.whiten(fine.G)
+    visible = np.flatnonzero(visible_columns(parameters, G))
+    if not len(visible):
         return None
-    error = disagreement(G, setup.noise.whiten(coarse.G))[:, kept]
+
+    error = disagreement(G, noise.whiten(coarse.G))[:, visible]
     worst = int(np.argmax(error.max(axis=0)))
     if not error[:, worst].max() > TOLERANCE:
         return None
-    between = plant.derivatives.sensitivity(
-        theta, trajectory, np.maximum(longer / 3.0, 1.5) * SENSITIVITY_STEP
-    )
+
+    # Where a derivative exists, the error of central differences falls ninefold with a third of the step:
+    # the trajectory is strongly curved, but smooth.
+    medium = np.maximum(longer / 3.0, 1.5) * SENSITIVITY_STEP
+    between = plant.derivatives.sensitivity(theta, trajectory, medium)
     if between is not None:
-        less = disagreement(G, setup.noise.whiten(between.G))[:, kept]
-        if (less.max(axis=0) * CURVED <= error.max(axis=0)).all():
-            return (
-                None  # the error of central differences falls ninefold: strongly curved, but smooth
-            )
+        smaller = disagreement(G, noise.whiten(between.G))[:, visible]
+        if (smaller.max(axis=0) * CURVED <= error.max(axis=0)).all():
+            return None
+
     first = int(np.argmax(error[:, worst] > TOLERANCE))
     near = range(max(first - 2, 0), min(first + 1, trajectory.samples))
-    causes = active_constraints(setup.model_at(theta), trajectory, near)
+    causes = active_constraints(model, trajectory, near)
     return Roughness(
         error=float(error[:, worst].max()),
-        parameter=names[kept[worst]],
+        parameter=names[visible[worst]],
         sample=first,
         time=float(trajectory.t[first]),
         causes=causes,
     )
 
 
-def visible_columns(setup: Setup, G: Array) -> np.ndarray:
-    """(p,) True where a parameter has an effect that stands out of round-off. G: (N+1, ny, p), whitened"""
-    length = np.linalg.norm(G, axis=(0, 1)) * setup.parameters.magnitude
+def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:
+    """(p,) True where a parameter has an effect that stands out of round-off. G: (N+1, ny, p), whitened."""
+    length = np.linalg.norm(G, axis=(0, 1)) * parameters.magnitude
     return np.asarray((length > BLIND) & (length > FAINT * length.max(initial=0.0)))

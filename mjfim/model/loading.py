@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,145 @@ def compile_spec(spec: Any, path: Path) -> Any:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise ModelError(f"{path}: MuJoCo cannot compile the model: {str(error).strip()}") from None
+
+
+# Compiled models of edited specs that a source keeps. They are small; a search revisits few parameter values.
+MAX_EDITED_MODELS = 512
+
+
+class ModelSource:
+    """An MJCF file, parsed once and compiled once for each set of bodies whose inertia parameters may change.
+
+    All variants of a plant are copies of these compiled models with other settings.
+
+    Attributes:
+        path: The MJCF file.
+        spec: The parsed model (MjSpec), never changed.
+        model: The user's model (MjModel) as it compiles, never changed.
+    """
+
+    def __init__(self, path: Path, spec: Any = None) -> None:
+        """Parse and compile a file.
+
+        Args:
+            path: The MJCF file; relative paths inside are relative to its folder.
+            spec: The parsed model, where there is one already.
+
+        Raises:
+            ModelError: The file is absent, or MuJoCo cannot read or compile it.
+        """
+        self.path = path
+        self.spec = load_spec(path) if spec is None else spec
+        self.model = compile_spec(self.spec, path)
+        self._compiled: dict[frozenset[str] | None, Any] = {}
+        self._edited: dict[tuple[frozenset[str] | None, bytes], Any] = {}
+
+    def compiled(self, moved_bodies: frozenset[str] | None) -> Any:
+        """The compiled model in which the inertia of some bodies may be written.
+
+        Args:
+            moved_bodies: Bodies that MuJoCo must not treat as "simple", because parameters change their inertial frame;
+                None for all bodies.
+
+        Returns:
+            MjModel that callers copy and never change.
+        """
+        if moved_bodies not in self._compiled:
+            self._compiled[moved_bodies] = compile_spec(
+                self._editable_spec(moved_bodies), self.path
+            )
+        return self._compiled[moved_bodies]
+
+    def edited(
+        self, moved_bodies: frozenset[str] | None, key: bytes, edit: Callable[[Any], None]
+    ) -> Any:
+        """The compiled model of an edited copy of the spec, kept under a key.
+
+        Args:
+            moved_bodies: As for `compiled`.
+            key: Names the edit; the same key gives the same model again.
+            edit: Changes an MjSpec in place.
+
+        Returns:
+            MjModel that callers copy and never change.
+
+        Raises:
+            ModelError: The edited spec does not compile.
+        """
+        place = (moved_bodies, key)
+        if place not in self._edited:
+            if len(self._edited) >= MAX_EDITED_MODELS:
+                self._edited.clear()
+            spec = self._editable_spec(moved_bodies)
+            edit(spec)
+            self._edited[place] = compile_spec(spec, self.path)
+        return self._edited[place]
+
+    def _editable_spec(self, moved_bodies: frozenset[str] | None) -> Any:
+        """A copy of the spec whose moved bodies are not compiled as "simple"."""
+        spec = self.spec.copy()
+        for body in spec.bodies[1:]:
+            if moved_bodies is None or body.name in moved_bodies:
+                body.simple = 0
+        return spec
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A scalar joint: its name, unit and place. joint: id;  q: qpos address;  v: dof address."""
+
+    name: str
+    unit: str
+    joint: int
+    q: int
+    v: int
+
+
+def coordinates(model: Any) -> tuple[Coordinate, ...]:
+    """All slide and hinge joints, in order."""
+    found, names = [], joint_names(model)
+    for j in range(model.njnt):
+        if int(model.jnt_type[j]) in (
+            int(mujoco.mjtJoint.mjJNT_SLIDE),
+            int(mujoco.mjtJoint.mjJNT_HINGE),
+        ):
+            unit = "m" if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
+            found.append(
+                Coordinate(names[j], unit, j, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
+            )
+    return tuple(found)
+
+
+def joint_names(model: Any) -> tuple[str, ...]:
+    """njnt names; unnamed joints are called by their number."""
+    return _names(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt, "joint")
+
+
+def actuator_names(model: Any) -> tuple[str, ...]:
+    """nactuator names; unnamed actuators are called by their number."""
+    return _names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nactuator, "actuator")
+
+
+def _names(model: Any, kind: Any, count: int, fallback: str) -> tuple[str, ...]:
+    """Names of all objects of a kind, no two alike: a number that another one is called by gets underscores."""
+    given = [mujoco.mj_id2name(model, kind, i) for i in range(count)]
+    taken = {name for name in given if name}
+    for i in range(count):
+        if not given[i]:
+            name = f"{fallback}{i}"
+            while name in taken:
+                name += "_"
+            given[i] = name
+    return tuple(given)
+
+
+def control_names(model: Any) -> tuple[str, ...]:
+    """nu names; an actuator with several controls gets one name per control."""
+    names: list[str] = []
+    for i, name in enumerate(actuator_names(model)):
+        count = int(model.actuator_ctrlnum[i])
+        names += [name] if count == 1 else [f"{name}[{c}]" for c in range(count)]
+    return tuple(names)
 
 
 def decoration(spec: Any, model: Any) -> frozenset[str]:

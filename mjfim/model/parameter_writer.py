@@ -20,7 +20,7 @@ from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.spec_writer import write_element
 from mjfim.model.targets import InertiaField, ModelField, RotationField, SpecField
-from mjfim.model.variants import Source
+from mjfim.model.variants import PlantModel
 
 if TYPE_CHECKING:
     from mjfim.model.parameters import ParameterSet
@@ -38,11 +38,11 @@ class ParameterWriter:
         self._parameters = parameters
         self._scratch: Any = None
 
-    def model(self, base: Source | Any, theta: Array) -> Any:
+    def model(self, base: PlantModel | Any, theta: Array) -> Any:
         """A private copy of the base model with theta written into it.
 
         Args:
-            base: A `Source`, or an MjModel where nothing needs a compile.
+            base: A `PlantModel`, or an MjModel where nothing needs a compile.
             theta: (p,) values.
 
         Raises:
@@ -51,11 +51,11 @@ class ParameterWriter:
         """
         model = copy.copy(self.base(base, theta))
         self.write(model, theta)
-        return base.settle(model) if isinstance(base, Source) else model
+        return base.refresh(model) if isinstance(base, PlantModel) else model
 
-    def base(self, source: Source | Any, theta: Array) -> Any:
+    def base(self, source: PlantModel | Any, theta: Array) -> Any:
         """The model into which theta is written in place: compiled anew where theta needs it, then kept."""
-        if not isinstance(source, Source):
+        if not isinstance(source, PlantModel):
             return source
 
         needs_compile = self._parameters.needs_compile
@@ -91,12 +91,12 @@ class ParameterWriter:
             mocap.put(model, mocap.start)
 
     def unphysical_bodies(
-        self, base: Source | Any, theta: Array
+        self, base: PlantModel | Any, theta: Array
     ) -> list[tuple[tuple[int, ...], str]]:
         """Bodies whose inertia at theta no body can have.
 
         Args:
-            base: A `Source`, or an MjModel where nothing needs a compile.
+            base: A `PlantModel`, or an MjModel where nothing needs a compile.
             theta: (p,) values.
 
         Returns:
@@ -161,7 +161,7 @@ class ParameterWriter:
         if array == "site_quat":
             model.site_sameframe[row] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
-    def _edit(self, spec: Any, source: Source, theta: Array) -> None:
+    def _edit(self, spec: Any, source: PlantModel, theta: Array) -> None:
         """Write into an MjSpec, in place, what needs a compile."""
         p = self._parameters
         for j in np.flatnonzero(p.needs_compile):

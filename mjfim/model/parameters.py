@@ -26,7 +26,7 @@ from mjfim.model.targets import (
     TargetField,
     body_inertia,
 )
-from mjfim.model.variants import Mocap
+from mjfim.model.variants import MocapPlacement
 
 # Fields of a body that change its inertial frame, so that it must not be compiled as "simple".
 FRAME_FIELDS = {"pos", "ipos", "inertia", "mass", "rot", *INERTIAL_FIELDS}
@@ -123,7 +123,7 @@ class ParameterSet:
     parameters: tuple[Parameter, ...]
     fields: tuple[tuple[TargetField, ...], ...]
     nominal: dict[tuple[str, int], Array] = field(default_factory=dict)
-    mocap: Mocap | None = None
+    mocap: MocapPlacement | None = None
 
     @staticmethod
     def build(
@@ -131,7 +131,7 @@ class ParameterSet:
         model: Any,
         outputs: Sequence[str] = (),
         decoration: Collection[str] = frozenset(),
-        mocap: Mocap | None = None,
+        mocap: MocapPlacement | None = None,
     ) -> ParameterSet:
         """Resolve the targets of all parameters.
 
@@ -389,7 +389,7 @@ def _require_one_owner(
 
 
 def _require_movable(
-    model: Any, parameter: Parameter, target_field: TargetField, mocap: Mocap | None
+    model: Any, parameter: Parameter, target_field: TargetField, mocap: MocapPlacement | None
 ) -> None:
     """Raise where a parameter moves a mocap body whose place a keyframe states."""
     if isinstance(target_field, RotationField):

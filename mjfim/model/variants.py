@@ -1,10 +1,10 @@
-"""How the plant of a level of the descent differs from the user's: quicker to step, or smoother."""
+"""Variants of the user's model that a plant steps: quicker or smoother copies of one compiled model."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -12,34 +12,13 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError
-from mjfim.model.loading import compile_spec, unconstrained
+from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource, unconstrained
 from mjfim.model.smooth_friction import smooth_dry_friction
 
-
-@dataclass(frozen=True)
-class Level:
-    """A level.
-
-    coarsen: 1, or how many times longer than stated timestep and sample period are
-    stretch: 1, or how many times longer the timestep alone is, and the engine steps of a sample fewer
-    lifted: without the clamps and stops that hard limits keep a design away from
-    soft: speeds of every degree of freedom and tendon at which dry friction turns viscous where derivatives are taken, empty
-        where it is as it is;  softened: so it is in the motion as well
-    """
-
-    coarsen: int = 1
-    stretch: int = 1
-    lifted: bool = False
-    soft: tuple[float, ...] = ()
-    softened: bool = False
-
-
-STATED, FREE = Level(), Level(lifted=True)
-
-
-KEPT = 512  # compiled variants
+# Tolerance of the constraint solver in private copies: differences of steps see what a solver leaves undone.
 SOLVER_TOLERANCE = 1e-14
-# MjData of another layout would be written past its end
+
+# Sizes on which the layout of MjData rests. A model with other sizes would write past the end of it.
 LAYOUT = (
     "nq",
     "nv",
@@ -65,12 +44,41 @@ LAYOUT = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Mocap:
-    """Where a keyframe puts mocap bodies, written over the places at which they compile: MjData starts from there.
+@dataclass(frozen=True, kw_only=True)
+class ModelVariant:
+    """How the plant of a search differs from the user's model.
 
-    MuJoCo derives constants of equalities and tendons from the compiled places, so these must stand there meanwhile.
-    bodies: (n,) ids;  compiled, start: (n, 7) position [m] and quaternion (w, x, y, z)
+    Attributes:
+        sample_factor: Timestep and sample period are this many times longer than stated.
+        timestep_factor: The timestep alone is this many times longer; a sample has as many times fewer engine steps.
+        relaxed: Without the clamps, stops and contacts that hard limits keep a design away from.
+        smoothing_speeds: Speed of every degree of freedom, then of every tendon, below which dry friction is viscous
+            where derivatives are taken; empty for the engine's own friction. [rad/s or m/s]
+        smoothed: Dry friction is viscous below these speeds in the motion as well, not only in its derivatives.
+    """
+
+    sample_factor: int = 1
+    timestep_factor: int = 1
+    relaxed: bool = False
+    smoothing_speeds: tuple[float, ...] = ()
+    smoothed: bool = False
+
+
+STATED = ModelVariant()
+RELAXED = ModelVariant(relaxed=True)
+
+
+@dataclass(frozen=True, eq=False)
+class MocapPlacement:
+    """Where a keyframe puts mocap bodies.
+
+    MjData starts from the places that stand in the model, so the keyframe's are written over the compiled ones. MuJoCo
+    derives constants of equalities and tendons from the compiled places, which must stand in the model meanwhile.
+
+    Attributes:
+        bodies: (n,) ids of the bodies.
+        compiled: (n, 7) position [m] and quaternion (w, x, y, z) at which they compile.
+        start: (n, 7) position [m] and quaternion (w, x, y, z) of the keyframe.
     """
 
     bodies: np.ndarray
@@ -78,10 +86,11 @@ class Mocap:
     start: Array
 
     @staticmethod
-    def of(model: Any, key: Any) -> Mocap | None:
-        """Of the mocap bodies that a keyframe (`model.key(name)` or None) puts elsewhere; None where there are none."""
+    def of(model: Any, key: Any) -> MocapPlacement | None:
+        """Placement by a keyframe (`model.key(name)` or None); None where it moves no mocap body."""
         if key is None or model.nmocap == 0:
             return None
+
         bodies = np.flatnonzero(model.body_mocapid >= 0)
         order = model.body_mocapid[bodies]
         places = np.concatenate([model.body_pos[bodies], model.body_quat[bodies]], axis=1)
@@ -89,32 +98,39 @@ class Mocap:
             [key.mpos.reshape(-1, 3)[order], key.mquat.reshape(-1, 4)[order]], axis=1
         )
         moved = (places != start).any(axis=1)
-        return Mocap(bodies[moved], places[moved], start[moved]) if moved.any() else None
+
+        return MocapPlacement(bodies[moved], places[moved], start[moved]) if moved.any() else None
 
     def put(self, model: Any, places: Array) -> None:
         """Write places: (n, 7) into a model in place."""
-        model.body_pos[self.bodies], model.body_quat[self.bodies] = places[:, :3], places[:, 3:]
+        model.body_pos[self.bodies] = places[:, :3]
+        model.body_quat[self.bodies] = places[:, 3:]
 
 
-@dataclass(frozen=True)
-class Lifted:
-    """What hides derivatives and is changed in a private copy: clamps and stops that a design keeps away from, dry friction.
+@dataclass(frozen=True, kw_only=True)
+class Relaxation:
+    """Clamps, stops and dry friction that are changed in a private copy, because they hide derivatives.
 
-    joints: whose ranges;  forces: joints whose actuator force;  actuators: whose force;  controls: whether all control ranges
-    contacts: whether all contacts;  soft: speeds below which dry friction is viscous, empty: as it is (see `dry`)
+    Attributes:
+        joints: Ids of joints whose range is taken out.
+        joint_forces: Ids of joints whose limit of actuator force is taken out.
+        actuators: Ids of actuators whose force range is taken out.
+        controls: Whether all control ranges are taken out.
+        contacts: Whether all contacts are taken out.
+        smoothing_speeds: Speeds below which dry friction is viscous; empty for the engine's own friction.
     """
 
     joints: tuple[int, ...] = ()
-    forces: tuple[int, ...] = ()
+    joint_forces: tuple[int, ...] = ()
     actuators: tuple[int, ...] = ()
     controls: bool = False
     contacts: bool = False
-    soft: tuple[float, ...] = ()
+    smoothing_speeds: tuple[float, ...] = ()
 
-    def out_of(self, model: Any) -> None:
+    def apply(self, model: Any) -> None:
         """Change a model that the caller owns, in place."""
         model.jnt_limited[list(self.joints)] = 0
-        model.jnt_actfrclimited[list(self.forces)] = 0
+        model.jnt_actfrclimited[list(self.joint_forces)] = 0
         model.actuator_forcelimited[list(self.actuators)] = 0
         if self.controls:
             model.actuator_ctrllimited[:] = 0
@@ -122,84 +138,109 @@ class Lifted:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 
 
-class Source:
-    """Where the private copies of a model come from: work that cannot matter is off, bodies that move inside are not 'simple'.
+class PlantModel:
+    """The compiled model that a plant steps: a copy of the user's with its own settings.
 
-    moved: bodies whose inertial frame parameters change, None: any of them may;  sensors: whether sensor data is wanted
-    friction: whether a parameter is a frictionloss (the constraint solver must then stay on)
-    coarsen: how many times longer than stated the timestep is;  mocap: where mocap bodies start, None: as compiled
-    lifted: without the clamps and stops of limits that a design holds anyway
+    Args:
+        source: The user's model.
+        moved_bodies: Bodies whose inertial frame parameters change, None where any of them may.
+        sensors: Whether sensor data is wanted; MuJoCo skips the computation otherwise.
+        friction: Whether a parameter is a frictionloss, so that the constraint solver must stay on.
+        timestep_factor: The timestep is this many times longer than stated.
+        mocap: Where mocap bodies start; None for the places at which they compile.
+        relaxation: What is taken out of the copy; None for nothing.
+
+    Attributes:
+        model: The compiled copy (MjModel).
     """
 
     def __init__(
         self,
-        spec: Any,
-        path: Path,
-        moved: Collection[str] | None,
+        source: ModelSource,
+        *,
+        moved_bodies: Collection[str] | None,
         sensors: bool,
         friction: bool,
-        coarsen: int = 1,
-        mocap: Mocap | None = None,
-        lifted: Lifted | None = None,
+        timestep_factor: int = 1,
+        mocap: MocapPlacement | None = None,
+        relaxation: Relaxation | None = None,
     ) -> None:
-        self._spec, self._path, self._lifted = spec.copy(), path, lifted
-        for body in self._spec.bodies[1:]:
-            if moved is None or body.name in moved:
-                body.simple = 0
-        self._sensors, self._friction, self._coarsen = sensors, friction, coarsen
+        self._source = source
+        self._moved_bodies = None if moved_bodies is None else frozenset(moved_bodies)
+        self._sensors = sensors
+        self._friction = friction
+        self._timestep_factor = timestep_factor
         self._mocap = mocap
-        self.model = self._compile(self._spec)
+        self._relaxation = relaxation
         self._edited: dict[bytes, Any] = {}
-
-    def edited(self, key: bytes, edit: Callable[[Any], None]) -> Any:
-        """The model of an edited spec, kept under a key. Raises ModelError where it no longer compiles or fits.
-
-        Raises ExperimentError where the timestep changes: rate and samples rest on it.
-        """
-        if key not in self._edited:
-            if len(self._edited) > KEPT:
-                self._edited.clear()
-            own = self._spec.copy()
-            edit(own)
-            model = self._compile(own)
-            for size in LAYOUT:
-                if getattr(model, size) != getattr(self.model, size):
-                    raise ModelError(
-                        f"{self._path}: a parameter changes {size} of the model from {getattr(self.model, size)} to "
-                        f"{getattr(model, size)}; it may change numbers only"
-                    )
-            stated, found = float(self.model.opt.timestep), float(model.opt.timestep)
-            if found != stated:
-                raise ExperimentError(
-                    f"parameters: a function changes option.timestep of {self._path} from {stated / self._coarsen:g} s to "
-                    f"{found / self._coarsen:g} s; rate and samples rest on it: state the timestep in the MJCF"
-                )
-            self._edited[key] = model
-        return self._edited[key]
+        self.model = self._adapted(source.compiled(self._moved_bodies))
 
     @property
-    def soft(self) -> tuple[float, ...]:
-        """Speeds below which its dry friction is viscous; empty where it is as it is."""
-        return () if self._lifted is None else self._lifted.soft
+    def smoothing_speeds(self) -> tuple[float, ...]:
+        """Speeds below which its dry friction is viscous; empty for the engine's own friction."""
+        return () if self._relaxation is None else self._relaxation.smoothing_speeds
 
-    def settle(self, model: Any) -> Any:
-        """A model of this source after parameters were written into it: what rests on them is written anew, in place."""
-        if self.soft:
-            smooth_dry_friction(model, self.soft)
+    def edited(self, key: bytes, edit: Callable[[Any], None]) -> Any:
+        """The model of an edited spec, kept under a key.
+
+        Args:
+            key: Names the edit; the same key gives the same model again.
+            edit: Changes an MjSpec in place.
+
+        Raises:
+            ModelError: It no longer compiles, or its sizes change.
+            ExperimentError: The timestep changes, on which rate and samples rest.
+        """
+        if key not in self._edited:
+            if len(self._edited) >= MAX_EDITED_MODELS:
+                self._edited.clear()
+            compiled = self._source.edited(self._moved_bodies, key, edit)
+            self._require_layout(compiled)
+            self._edited[key] = self._adapted(compiled)
+        return self._edited[key]
+
+    def refresh(self, model: Any) -> Any:
+        """Write anew, in place, what rests on parameters that were written into a copy of this model."""
+        if self.smoothing_speeds:
+            smooth_dry_friction(model, self.smoothing_speeds)
         return model
 
-    def _compile(self, spec: Any) -> Any:
-        model = compile_spec(spec, self._path)
-        if self._lifted is not None:
-            self._lifted.out_of(model)
+    def _require_layout(self, compiled: Any) -> None:
+        """Raise where an edited model has other sizes or another timestep than the user's."""
+        path, stated = self._source.path, self._source.compiled(self._moved_bodies)
+
+        for size in LAYOUT:
+            if getattr(compiled, size) != getattr(stated, size):
+                raise ModelError(
+                    f"{path}: a parameter changes {size} of the model from {getattr(stated, size)} to "
+                    f"{getattr(compiled, size)}; it may change numbers only"
+                )
+
+        if compiled.opt.timestep != stated.opt.timestep:
+            raise ExperimentError(
+                f"parameters: a function changes option.timestep of {path} from {stated.opt.timestep:g} s to "
+                f"{compiled.opt.timestep:g} s; rate and samples rest on it: state the timestep in the MJCF"
+            )
+
+    def _adapted(self, compiled: Any) -> Any:
+        """A copy of a compiled model with the settings of this variant."""
+        model = copy.copy(compiled)
+
+        if self._relaxation is not None:
+            self._relaxation.apply(model)
+
+        # Work that cannot matter is switched off.
         if not self._sensors:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         if not self._friction and unconstrained(model):
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        model.opt.timestep *= self._coarsen
-        # differences of steps see what the constraint solver leaves undone, and where it starts from
+
+        model.opt.timestep *= self._timestep_factor
+
+        # Differences of steps must not see where the solver starts from, nor what it leaves undone.
         model.opt.tolerance = min(model.opt.tolerance, SOLVER_TOLERANCE)
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
+
         if self._mocap is not None:
             self._mocap.put(model, self._mocap.start)
-        return self.settle(model)
+        return self.refresh(model)

@@ -16,7 +16,7 @@ import pyarrow.csv
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import RecordingError
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.output.playback import design_columns, reference_columns, simulate_playback
 from mjfim.records.design import TRAJECTORY_ARRAYS, Design
 from mjfim.records.recording import Recording
@@ -30,7 +30,7 @@ MIN_ROWS = 3
 PERIOD_TOLERANCE = 1e-6
 
 
-def write_design(folder: Path, design: Design, setup: Setup) -> None:
+def write_design(folder: Path, design: Design, system: System) -> None:
     """Write design.npz, design.csv, reference.csv and design.json, each whole or not at all.
 
     `Design.load` reads the design back. design.json names the experiment file, relative to the folder.
@@ -38,15 +38,15 @@ def write_design(folder: Path, design: Design, setup: Setup) -> None:
     Args:
         folder: Folder for the files; made if it does not exist.
         design: The design.
-        setup: The experiment for which it was made.
+        system: The experiment for which it was made.
     """
-    playback = simulate_playback(setup, design.trajectory, design.final.gain)
+    playback = simulate_playback(system, design.trajectory, design.final.gain)
 
     design.save_archive(folder)
-    write_table(folder / "design.csv", design_columns(playback, setup))
-    write_table(folder / "reference.csv", reference_columns(playback, setup))
+    write_table(folder / "design.csv", design_columns(playback, system))
+    write_table(folder / "reference.csv", reference_columns(playback, system))
 
-    source = Path(setup.experiment.source)
+    source = Path(system.experiment.source)
     experiment = os.path.relpath(source.resolve(), folder.resolve()) if source.is_file() else None
     write_json(folder / "design.json", {"experiment": experiment, **design.summary()})
 
@@ -67,34 +67,34 @@ def write_table(path: Path, columns: Mapping[str, Array]) -> None:
         pyarrow.csv.write_csv(pyarrow.table(arrays), temporary, options)
 
 
-def write_control(path: Path, control: Array, setup: Setup) -> None:
+def write_control(path: Path, control: Array, system: System) -> None:
     """Write a control as a table that `initial.control` of an experiment reads.
 
     Args:
         path: CSV file to write.
         control: (N, nu) control [unit of the actuator].
-        setup: The experiment, which names the actuators.
+        system: The experiment, which names the actuators.
     """
-    columns = {"t": setup.t}
-    for i, name in enumerate(setup.controls):
+    columns = {"t": np.arange(len(control), dtype=np.float64) * system.dt}
+    for i, name in enumerate(system.controls):
         columns[name] = control[:, i]
     write_table(path, columns)
 
 
-def write_recording(path: Path, recording: Recording, setup: Setup) -> None:
+def write_recording(path: Path, recording: Recording, system: System) -> None:
     """Write a recording as CSV: `t`, `ctrl:<actuator>` and its outputs, empty where nothing was measured.
 
     Args:
         path: CSV file to write.
         recording: The recording.
-        setup: The experiment, which names the actuators.
+        system: The experiment, which names the actuators.
     """
     # The last row has no control.
     no_control = np.full((1, recording.ctrl.shape[1]), np.nan)
     ctrl = np.concatenate([recording.ctrl, no_control])
 
     columns = {"t": recording.t}
-    for i, name in enumerate(setup.controls):
+    for i, name in enumerate(system.controls):
         columns[f"ctrl:{name}"] = ctrl[:, i]
     for i, name in enumerate(recording.outputs):
         columns[name] = recording.y[:, i]
@@ -152,25 +152,25 @@ def _trajectory(path: Path, prefix: str, arrays: Mapping[str, np.ndarray]) -> Tr
     return Trajectory(**{key: arrays[prefix + key] for key in TRAJECTORY_ARRAYS})
 
 
-def check_fits(path: Path, trajectory: Trajectory, setup: Setup) -> None:
+def check_fits(path: Path, trajectory: Trajectory, system: System) -> None:
     """Check that a design belongs to an experiment.
 
     Args:
         path: File of the design, for the message.
         trajectory: Its trajectory.
-        setup: The experiment.
+        system: The experiment.
 
     Raises:
         RecordingError: The design was made for another model or another rate.
     """
-    wanted = (setup.model.nq, setup.model.nv, len(setup.controls))
+    wanted = (system.model.nq, system.model.nv, len(system.controls))
     found = (trajectory.qpos.shape[1], trajectory.qvel.shape[1], trajectory.ctrl.shape[1])
     if found != wanted:
         raise RecordingError(
             f"{path}: made for (nq, nv, nu) = {found}, the experiment's model has {wanted}"
         )
 
-    if abs(trajectory.dt - setup.dt) > PERIOD_TOLERANCE * setup.dt:
+    if abs(trajectory.dt - system.dt) > PERIOD_TOLERANCE * system.dt:
         raise RecordingError(
-            f"{path}: sampled at {1 / trajectory.dt:g} Hz, the experiment at {1 / setup.dt:g} Hz"
+            f"{path}: sampled at {1 / trajectory.dt:g} Hz, the experiment at {1 / system.dt:g} Hz"
         )

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from mjfim.errors import ModelError, RecordingError
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import measured_trajectory
 from mjfim.output import archive, plots
 from mjfim.output import rerun as rerun_log
@@ -101,17 +101,17 @@ def check_file(path: Path) -> None:
     check_folder(path.parent)
 
 
-def leave_design(folder: Path, design: Design, setup: Setup) -> None:
+def leave_design(folder: Path, design: Design, system: System) -> None:
     """Write a design's files, its Rerun file and its figures.
 
     Args:
         folder: Folder for the results.
         design: The design.
-        setup: The experiment for which it was made.
+        system: The experiment for which it was made.
     """
-    archive.write_design(folder, design, setup)
+    archive.write_design(folder, design, system)
 
-    labels = Labels.of_system(setup)
+    labels = Labels.of_system(system)
     figures = {
         "trajectories": plots.trajectories(design, labels),
         "sensitivity_phase": plots.sensitivity_phase(design, labels),
@@ -124,7 +124,7 @@ def leave_design(folder: Path, design: Design, setup: Setup) -> None:
     for name, figure in figures.items():
         plots.save(figure, folder / f"{name}.png")
 
-    rerun_log.log_design(folder / "design.rrd", setup.model_at(setup.theta), design, labels)
+    rerun_log.log_design(folder / "design.rrd", system.model_at(system.theta), design, labels)
 
 
 def leave_check(folder: Path, check: Check) -> None:
@@ -138,29 +138,29 @@ def leave_check(folder: Path, check: Check) -> None:
     plots.save(plots.check_figure(check), folder / "check.png")
 
 
-def leave_comparison(folder: Path, comparison: Comparison, setup: Setup) -> None:
+def leave_comparison(folder: Path, comparison: Comparison, system: System) -> None:
     """Write compare.json, compare.npz, a figure, and the control of each method for `initial.control` of an experiment.
 
     Args:
         folder: Folder for the results; controls of an earlier comparison are removed.
         comparison: The comparison.
-        setup: The experiment that was compared.
+        system: The experiment that was compared.
     """
     _clear(folder, r"control_[\w-]+\.csv")
     comparison.save(folder)
     for row in comparison.rows:
         if row.control is not None:
-            archive.write_control(folder / f"control_{row.method}.csv", row.control, setup)
+            archive.write_control(folder / f"control_{row.method}.csv", row.control, system)
     plots.save(plots.compare_figure(comparison), folder / "compare.png")
 
 
-def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
+def leave_estimate(folder: Path, estimate: Estimate, system: System) -> list[str]:
     """Write estimate.json, estimate.npz, identified.xml, estimate.rrd and figures.
 
     Args:
         folder: Folder for the results; those of an earlier estimate that are not overwritten are removed.
         estimate: The estimate.
-        setup: The experiment that was identified.
+        system: The experiment that was identified.
 
     Returns:
         Sentences about results that could not be written completely.
@@ -170,16 +170,16 @@ def leave_estimate(folder: Path, estimate: Estimate, setup: Setup) -> list[str]:
 
     remarks = []
     try:
-        remark = write_identified(folder / "identified.xml", setup, estimate.theta)
+        remark = write_identified(folder / "identified.xml", system, estimate.theta)
         remarks += [remark] if remark else []
     except ModelError as error:
         remarks.append(str(error))
 
-    labels = Labels.of_system(setup)
+    labels = Labels.of_system(system)
     _leave_fit_figures(folder, estimate, labels)
     if estimate.motion is not None:
-        measured = measured_trajectory(setup, estimate.recordings[0])
-        model = setup.model_at(estimate.theta)
+        measured = measured_trajectory(system, estimate.recordings[0])
+        model = system.model_at(estimate.theta)
         target = folder / "estimate.rrd"
         rerun_log.log_estimate(target, model, estimate, measured, estimate.motion, labels)
     return remarks
@@ -198,17 +198,17 @@ def _leave_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None
         plots.save(plots.predictions(estimate, labels), folder / "predictions.png")
 
 
-def leave_study(folder: Path, study: MonteCarloStudy, setup: Setup) -> None:
+def leave_study(folder: Path, study: MonteCarloStudy, system: System) -> None:
     """Write montecarlo.json, montecarlo.npz, a histogram per parameter, and the tables as a figure.
 
     Args:
         folder: Folder for the results.
         study: The Monte Carlo study.
-        setup: The experiment that was studied.
+        system: The experiment that was studied.
     """
     study.save(folder)
 
-    labels = Labels.of_system(setup)
+    labels = Labels.of_system(system)
     for i, name in enumerate(study.parameters):
         safe_name = re.sub(r"[^\w.-]", "_", name)
         plots.save(plots.histogram(study, i, labels), folder / f"histogram_{safe_name}.png")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import mujoco
 
 from mjfim.errors import MjfimError
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.model.coordinates import (
     control_labels,
     output_label,
@@ -60,17 +60,17 @@ class Labels:
         )
 
     @classmethod
-    def of_system(cls, setup: Setup) -> Labels:
+    def of_system(cls, system: System) -> Labels:
         """Names of an experiment: its model's, its parameters' and its outputs'."""
-        base = cls.of_model(setup.model)
-        outputs = {name: output_label(setup.model, name) for name in setup.outputs.names}
+        base = cls.of_model(system.model)
+        outputs = {name: output_label(system.model, name) for name in system.outputs.names}
         return cls(
             base.qpos,
             base.positions,
             base.velocities,
             base.controls,
-            setup.parameters.names,
-            setup.units,
+            system.parameters.names,
+            system.units,
             outputs,
         )
 

@@ -184,7 +184,7 @@ class Derivatives:
     @property
     def quickest_accuracy(self) -> DifferenceAccuracy:
         """The quickest differences for mixed second derivatives of this plant."""
-        return SHARED_ORIGIN_SHORT if self.plant.smooth.source.soft else SHARED_ORIGIN
+        return SHARED_ORIGIN_SHORT if self.plant.smooth.source.smoothing_speeds else SHARED_ORIGIN
 
     @property
     def parameter_scale(self) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ModelError, SimulationDivergedError
 from mjfim.model.parameters import ParameterSet
-from mjfim.model.variants import Source
+from mjfim.model.variants import PlantModel
 from mjfim.optimize.lq import TangentCurve
 from mjfim.plant.batch import BatchSimulator, SubstepObservations
 from mjfim.plant.delay import OutputDelay
@@ -28,7 +28,7 @@ class Plant:
     """A model, its parameters and its measured outputs as discrete-time dynamics.
 
     Attributes:
-        source: Source of the private model copies that are stepped.
+        source: PlantModel of the private model copies that are stepped.
         parameters: The p parameters theta.
         outputs: Output map h without bias and delay.
         simulator: Steps the model copies.
@@ -44,7 +44,7 @@ class Plant:
     def __init__(
         self,
         *,
-        source: Source,
+        source: PlantModel,
         parameters: ParameterSet,
         outputs: Outputs,
         nominal_initial_state: Array,
@@ -55,7 +55,7 @@ class Plant:
         """Build the plant.
 
         Args:
-            source: Source of the private model copies that are stepped.
+            source: PlantModel of the private model copies that are stepped.
             parameters: The parameters theta.
             outputs: The measured outputs.
             nominal_initial_state: (ns,) initial state where no parameter moves it.
@@ -187,7 +187,7 @@ class Plant:
         models = self._reusable_models[: len(theta)]
         for model, row in zip(models, theta, strict=True):
             self.parameters.writer.write(model, row)
-            self.source.settle(model)
+            self.source.refresh(model)
         return models, np.ones(len(theta), dtype=bool)
 
     def _compile(self, theta: Array) -> tuple[list[Any], np.ndarray]:

@@ -13,11 +13,11 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, SimulationDivergedError
-from mjfim.excitation.design import Monitor, design
+from mjfim.excitation.design import Monitor, design_task
 from mjfim.excitation.target_accuracy import furthest, require_reachable, wanted_of
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
-from mjfim.identification.identify import identify
+from mjfim.identification.identify import identify_system
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
@@ -59,7 +59,9 @@ def sequential(
             f"{experiment.source}: earlier: a campaign's estimate comes from recordings alone; give those of earlier "
             "experiments (`done` in Python) instead of the information they left"
         )
-    return _Loop(Setup(experiment, threads), monitor, report, executor).run(measure, rounds, done)
+    return _Loop(DesignTask.resolve(experiment, threads=threads), monitor, report, executor).run(
+        measure, rounds, done
+    )
 
 
 class _Loop:
@@ -67,7 +69,7 @@ class _Loop:
 
     def __init__(
         self,
-        base: Setup,
+        base: DesignTask,
         monitor: Monitor | None,
         report: Callable[[Round], None] | None,
         executor: Executor | None,
@@ -129,8 +131,8 @@ class _Loop:
         Where there is none at the estimate, at the last place where there was one, and a warning.
         """
         if not self.rounds:
-            stated = Setup(restated(self.base), self.base.plant.simulator.threads)
-            return design(stated, self.monitor, executor=self.executor), ()
+            stated = self.base.restated(restated(self.base))
+            return design_task(stated, self.monitor, executor=self.executor), ()
         first, last = self.rounds[0], self.rounds[-1]
         count = sum(len(r.recordings) for r in self.rounds)
         past = Past(last.estimate, count, first.theta, first.control, last.control)
@@ -208,7 +210,7 @@ class _Loop:
         )
 
 
-def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Estimate | None:
+def identified(base: DesignTask, recordings: Sequence[Recording], start: Array) -> Estimate | None:
     """Estimate from all recordings; where that is a misfit or fails, from the stated guess too, and the better one.
 
     None where it was interrupted: a round is complete or it is not kept.
@@ -219,7 +221,7 @@ def identified(base: Setup, recordings: Sequence[Recording], start: Array) -> Es
         if found and (not found[0].misfit or np.array_equal(begin, start)):
             break
         try:
-            found.append(identify(base, recordings, start=begin))
+            found.append(identify_system(base.system, recordings, start=begin))
         except SimulationDivergedError as error:
             fault = fault or error
         if found and found[-1].interrupted:

@@ -9,11 +9,13 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
+from mjfim.excitation.objective import DesignProblem, Point
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.identification.residuals import Fit
 from mjfim.information.fisher import Information
-from mjfim.information.identifiability import Survey, survey, survey_rows
+from mjfim.information.identifiability import Identifiability
 from mjfim.information.marginal import shared
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
@@ -32,9 +34,12 @@ DEFAULT_WANTED = 0.05  # of a parameter's own size, where none is stated
 MOST = 1_000_000_000
 LONGEST_LINE = 400
 
+# Samples of a recording along which the derivatives are tested.
+MOST_TESTED_SAMPLES = 2000
+
 
 def check(
-    experiment: Experiment | Setup,
+    experiment: Experiment,
     recordings: Sequence[Recording] = (),
     trajectory: Trajectory | None = None,
     threads: int | None = None,
@@ -43,68 +48,107 @@ def check(
 
     Raises SimulationDivergedError where that cannot be simulated, RecordingError for unusable recordings.
     """
-    setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
     if recordings and trajectory is not None:
         raise RecordingError("check either recordings or a designed trajectory, not both")
-    curve = (
-        setup.initial if trajectory is None else setup.plant.simulate(setup.theta, trajectory.ctrl)
-    )
+
     if recordings:
-        fit = Fit(setup, recordings, data_only=True)
-        longest = max(fit.tracks, key=lambda track: len(track.ctrl))
-        curve = setup.plant.simulate(setup.theta, longest.ctrl[: setup.samples])
-        recorded = fit.sensed(fit.begin(setup.theta))
-        seen = survey_rows(
-            setup, curve, *(np.concatenate(part) for part in zip(*recorded, strict=True))
-        )
-        tells, horizon = (
-            [J.T @ J for J, _ in recorded],
-            float(sum(track.t[-1] for track in fit.tracks)),
-        )
-        source = f"{len(recordings)} recording{'s' if len(recordings) > 1 else ''}"
-    problem = setup.problem
-    problem = replace(problem, running=replace(problem.running, desired=curve.state))
-    point = problem.point(curve, CENTRAL_DIFFERENCES)
+        return check_recordings(System.resolve(experiment, threads=threads), recordings)
+    return check_task(DesignTask.resolve(experiment, threads=threads), trajectory)
+
+
+def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
+    """Check along the initial control of a task, or along the control of a trajectory. See `check`."""
+    curve, source = task.initial, "the initial control"
+    if trajectory is not None:
+        curve, source = task.plant.simulate(task.theta, trajectory.ctrl), "the given trajectory"
+
+    problem, point = _evaluated(task, curve)
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError("the simulation diverges when the parameters move a little")
-    if not recordings:
-        seen = survey(setup, curve, point.sensitivity)
-        tells, horizon = [point.information - setup.information.prior], float(curve.t[-1])
-        source = "the initial control" if trajectory is None else "the given trajectory"
-    judged = replace(problem, information=replace(problem.information, basis=seen.basis))
-    tested = self_test(setup, judged, judged.judged(point))
-    p = setup.parameters
-    common = sum(
-        (shared(each, p.prior_information, p.recording_specific) for each in tells),
-        start=np.zeros_like(setup.prior),
-    )
-    return _concluded(setup, seen, common, horizon, source, tested)
+
+    seen = task.observer.identifiability(curve, point.sensitivity)
+    tested = _self_tested(task, problem, point, seen)
+
+    data = point.information - task.information.prior
+    return _concluded(task, seen, _shared(task, [data]), float(curve.t[-1]), source, tested)
+
+
+def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
+    """Check what recordings tell; derivatives are tested along the longest of them."""
+    fit = Fit(system, recordings, data_only=True)
+    longest = max(fit.tracks, key=lambda track: len(track.ctrl))
+    task = DesignTask.along(system, longest.ctrl[:MOST_TESTED_SAMPLES])
+
+    problem, point = _evaluated(task, task.initial)
+    if point.information is None or point.sensitivity is None:
+        raise SimulationDivergedError("the simulation diverges when the parameters move a little")
+
+    # Rows of G at the times at which the recordings were measured, and the error of their differences.
+    recorded = fit.sensed(fit.begin(task.theta))
+    J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
+    seen = task.observer.identifiability_of_rows(task.initial, J, error)
+    tested = _self_tested(task, problem, point, seen)
+
+    count = len(recordings)
+    source = f"{count} recording{'s' if count > 1 else ''}"
+    duration = float(sum(track.t[-1] for track in fit.tracks))
+    data = _shared(task, [rows.T @ rows for rows, _ in recorded])
+    return _concluded(task, seen, data, duration, source, tested)
+
+
+def _evaluated(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, Point]:
+    """The cost of a task with a trajectory as its own reference, and the trajectory's point."""
+    problem = task.problem
+    problem = replace(problem, running=replace(problem.running, desired=curve.state))
+    return problem, problem.point(curve, CENTRAL_DIFFERENCES)
+
+
+def _self_tested(
+    task: DesignTask, problem: DesignProblem, point: Point, seen: Identifiability
+) -> SelfTest:
+    """Test the derivatives along a point, for the combinations that can be identified."""
+    visible = replace(problem, information=replace(problem.information, basis=seen.basis))
+    return self_test(task, visible, visible.judged(point))
+
+
+def _shared(task: DesignTask, matrices: Sequence[Array]) -> Array:
+    """(p, p) sum of what several experiments tell about their common parameters; initial states are marginalised."""
+    p = task.parameters
+    parts = (shared(each, p.prior_information, p.recording_specific) for each in matrices)
+    return np.asarray(sum(parts, start=np.zeros_like(task.prior)))
 
 
 def _concluded(
-    setup: Setup, seen: Survey, data: Array, horizon: float, source: str, tested: SelfTest
+    task: DesignTask,
+    seen: Identifiability,
+    data: Array,
+    horizon: float,
+    source: str,
+    tested: SelfTest,
 ) -> Check:
     """data: (p, p) of all that was looked at, each start's own nuisance marginalised"""
-    p = setup.parameters
+    p = task.parameters
     information = replace(
-        setup.information, prior=setup.prior, basis=seen.here.basis if seen.here.count else None
+        task.information, prior=task.prior, basis=seen.here.basis if seen.here.count else None
     )
-    total = data + setup.prior
+    total = data + task.prior
     covariance = information.covariance(total)
     std = np.full(len(p), np.inf)
     std[p.interest] = np.nan_to_num(np.sqrt(np.diag(covariance)), nan=np.inf)
-    rows = tuple(_rows(setup, information, data, std, horizon))
+    rows = tuple(_rows(task, information, data, std, horizon))
     spread = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(spread, spread)
     confounded = tuple(_pairs(seen.names, correlation))
-    criterion = setup.information
+    criterion = task.information
     visible = replace(criterion, basis=seen.basis)
     never, more = seen.groups_always, seen.here.count > seen.always.count
     known = {str(g) for g in never}
     not_here = tuple(g for g in seen.groups_here if str(g) not in known) if more else ()
     eigenvalues = np.maximum(visible.evaluate(data + criterion.prior).eigenvalues, 0.0)
     verdict = tuple(_verdict(rows, never, not_here, confounded, tested, source))
-    combined = () if not_here else seen.combined(information, setup.theta[p.interest], total, total)
+    combined = (
+        () if not_here else seen.combinations(information, task.theta[p.interest], total, total)
+    )
     return Check(
         source=source,
         horizon=horizon,
@@ -123,18 +167,16 @@ def _concluded(
 
 
 def _rows(
-    setup: Setup, information: Information, data: Array, std: Array, horizon: float
+    task: DesignTask, information: Information, data: Array, std: Array, horizon: float
 ) -> Iterator[ParameterCheck]:
-    p = setup.parameters
+    p = task.parameters
     for j, parameter in enumerate(p.parameters):
-        value = float(setup.theta[j])
+        value = float(task.theta[j])
         plain = parameter.size == abs(parameter.guess) and value != 0.0
         size = abs(value) if plain else float(p.magnitude[j])
         stated = parameter.wanted is not None
         wanted = parameter.wanted or DEFAULT_WANTED * size
-        needed = (
-            0 if parameter.nuisance else _repetitions(information, data, setup.prior, j, wanted)
-        )
+        needed = 0 if parameter.nuisance else _repetitions(information, data, task.prior, j, wanted)
         yield ParameterCheck(
             name=parameter.name,
             unit=parameter.unit,

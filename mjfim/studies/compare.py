@@ -11,13 +11,13 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
-from mjfim.excitation.design import design, designable
+from mjfim.excitation.design import design_task, designable
 from mjfim.excitation.evaluation import fine_point
 from mjfim.excitation.interior_point import SHRUNK
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
 from mjfim.excitation.verification import SAME, audit, require_inside
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.parallel import salvaged, workers_of
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
@@ -49,7 +49,7 @@ Tell = Callable[[float, float], None]  # share of the budget, J
 
 
 def compare(
-    experiment: Experiment | Setup,
+    experiment: Experiment,
     seconds: float = 60.0,
     steps: float | None = None,
     seed: int = 0,
@@ -65,22 +65,35 @@ def compare(
     All look for a control under the same limits, by the same J, and are judged on the untouched model at every engine step.
     Ctrl-C returns the methods that are finished. Raises as `design` does.
     """
-    setup = experiment if isinstance(experiment, Setup) else Setup(experiment, threads)
+    task = DesignTask.resolve(experiment, threads=threads)
+    return compare_task(task, seconds, steps, seed, methods, executor, monitor)
+
+
+def compare_task(
+    task: DesignTask,
+    seconds: float = 60.0,
+    steps: float | None = None,
+    seed: int = 0,
+    methods: Sequence[str] | None = None,
+    executor: Executor | None = None,
+    monitor: Monitor | None = None,
+) -> Comparison:
+    """Compare the design of a resolved task with baselines. See `compare`."""
     if not (seconds > 0.0 and np.isfinite(seconds)) or not (steps is None or steps > 0.0):
         raise ExperimentError("compare: seconds and steps must be positive")
-    chosen = (*chosen_methods(setup, methods), DESIGN)
-    judge = Judge(setup, _combinations(setup))
+    chosen = (*chosen_methods(task, methods), DESIGN)
+    judge = Judge(task, _combinations(task))
     most = np.inf if steps is None else float(steps)
     job = Job(
-        setup.experiment,
+        task.experiment,
         DESIGN,
         seconds,
         most,
         seed,
         (0, 1),
         judge.stage.basis,
-        setup.added,
-        threads,
+        task.added_information,
+        task.system.threads,
     )
     rows: list[MethodResult] = []
     interrupted = False
@@ -95,45 +108,45 @@ def compare(
             rows.append(row)
     except KeyboardInterrupt:
         interrupted = True
-    p = setup.parameters
+    p = task.parameters
     return Comparison(
-        source=setup.experiment.source,
-        criterion=setup.experiment.cost.criterion,
+        source=task.experiment.source,
+        criterion=task.experiment.cost.criterion,
         nats=judge.nats,
         parameters=p.names,
-        units=setup.units,
+        units=task.system.units,
         scale=p.scale,
         nuisance=tuple(q.name for q in p.parameters if q.nuisance),
         rows=tuple(rows),
         seconds=seconds,
         steps=most,
         seed=seed,
-        weighted=bool(setup.control_weight.any() or setup.tracking.any()),
+        weighted=bool(task.control_weight.any() or task.tracking.any()),
         interrupted=interrupted,
     )
 
 
-def chosen_methods(setup: Setup, methods: Sequence[str] | None) -> tuple[str, ...]:
+def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str, ...]:
     """Keys of the baselines that are to run. Raises ExperimentError for others."""
     if methods is None:
         return tuple(
-            key for key, baseline in METHODS.items() if setup.enforced or not baseline.limited
+            key for key, baseline in METHODS.items() if task.is_limited or not baseline.limited
         )
     for key in methods:
         if key not in METHODS and key != DESIGN:
             raise ExperimentError(f"methods: {unknown('method', key, [*METHODS, DESIGN])}")
-        if key in METHODS and METHODS[key].limited and not setup.enforced:
+        if key in METHODS and METHODS[key].limited and not task.is_limited:
             raise ExperimentError(
-                f"methods: {key} needs hard limits; {setup.experiment.source} has none that hold"
+                f"methods: {key} needs hard limits; {task.experiment.source} has none that hold"
             )
     return tuple(key for key in dict.fromkeys(methods) if key != DESIGN)
 
 
-def _combinations(setup: Setup) -> Array | None:
+def _combinations(task: DesignTask) -> Array | None:
     """The identifiable combinations, as a design finds them. Raises where nothing can be designed."""
-    seen = designable(setup)
-    if setup.enforced:
-        require_inside(setup)
+    seen = designable(task)
+    if task.is_limited:
+        require_inside(task)
     return seen.basis
 
 
@@ -174,7 +187,11 @@ def _designed(
     )
     meter = Meter(job, tell)
     try:
-        found = design(Setup(stated, job.threads, added=job.added), meter, executor=executor)
+        found = design_task(
+            DesignTask.resolve(stated, threads=job.threads, added_information=job.added),
+            meter,
+            executor=executor,
+        )
     except SimulationDivergedError:
         return judge.row(DESIGN, OURS, Attempt(seconds=meter.seconds, steps=meter.steps)), False
     attempt = Attempt(
@@ -220,9 +237,9 @@ class Judge:
     nats: see `Comparison`
     """
 
-    def __init__(self, setup: Setup, combinations: Array | None) -> None:
-        self.setup, self.stage = setup, Stage(setup, combinations)
-        e, p = setup.experiment, setup.parameters
+    def __init__(self, task: DesignTask, combinations: Array | None) -> None:
+        self.task, self.stage = task, Stage(task, combinations)
+        e, p = task.experiment, task.parameters
         count = len(p.interest) if combinations is None else combinations.shape[1]
         self.nats = e.cost.information * count if e.cost.criterion == "D" else 0.0
 
@@ -234,7 +251,7 @@ class Judge:
         for share in (
             [1.0] if method == DESIGN or not np.isfinite(attempt.cost) else SHRUNK.tolist()
         ):
-            control = self.setup.centre + share * (attempt.control - self.setup.centre)
+            control = self.task.centre + share * (attempt.control - self.task.centre)
             told = note if share == 1.0 else f"shrunk to {100.0 * share:.3g} %"
             found = self._looked(method, title, replace(attempt, control=control), told)
             if found is not None and found.outcome is not MethodOutcome.OUTSIDE:
@@ -244,7 +261,7 @@ class Judge:
 
     def _looked(self, method: str, title: str, attempt: Attempt, note: str) -> MethodResult | None:
         """None where the simulation diverges."""
-        setup = self.setup
+        task = self.task
         point = None if attempt.control is None else fine_point(self.stage, attempt.control)
         if (
             point is None
@@ -253,11 +270,11 @@ class Judge:
             or point.information is None
         ):
             return None
-        found = audit(setup, point.trajectory)
+        found = audit(task, point.trajectory)
         outcome = MethodOutcome.INSIDE if found.kept else MethodOutcome.OUTSIDE
         if outcome is MethodOutcome.OUTSIDE and not np.isfinite(attempt.cost):
             outcome = MethodOutcome.NOTHING
-        clamped = saturated_actuators(setup.model_at(setup.theta), point.trajectory)
+        clamped = saturated_actuators(task.system.model_at(task.theta), point.trajectory)
         if outcome is MethodOutcome.INSIDE and clamped:
             outcome, note = MethodOutcome.CLAMPED, f"forcerange clamps {', '.join(clamped)}"
         elif found.deviation > SAME:
@@ -272,7 +289,7 @@ class Judge:
             criterion=point.criterion.value,
             std=self.stage.problem.information.std(point.information),
             min_eigenvalue=smallest,
-            worst_relative_std=(smallest * setup.measure_rate) ** -0.5
+            worst_relative_std=(smallest * task.system.measure_rate) ** -0.5
             if smallest > 0.0
             else np.inf,
             seconds=attempt.seconds,
@@ -285,7 +302,7 @@ class Judge:
 
     def _nothing(self, method: str, title: str, attempt: Attempt, note: str) -> MethodResult:
         outcome = MethodOutcome.NONE if attempt.control is None else MethodOutcome.NOTHING
-        blank = np.full(len(self.setup.parameters), np.nan)
+        blank = np.full(len(self.task.parameters), np.nan)
         return MethodResult(
             method=method,
             title=title,

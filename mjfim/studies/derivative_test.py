@@ -9,8 +9,8 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.objective import DesignProblem, Point
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
-from mjfim.experiment.system import Setup
 from mjfim.information.smoothness import roughness, visible_columns
 from mjfim.optimize.directions import LBFGS
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
@@ -20,19 +20,26 @@ from mjfim.records.check import SelfTest
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 
-def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
+def self_test(task: DesignTask, problem: DesignProblem, point: Point) -> SelfTest:
     """Test the derivatives about a point of a problem that was computed with central differences."""
     trajectory = point.trajectory
     if trajectory is None or point.sensitivity is None:
         raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
     found = SelfTest(
-        roughness=roughness(setup, setup.theta, trajectory, point.sensitivity),
-        recursion=recursion_error(setup, trajectory, point.sensitivity),
-        slope=slope_error(setup, problem, point),
+        roughness=roughness(
+            task.plant,
+            task.system.noise,
+            task.system.model_at(task.theta),
+            task.theta,
+            trajectory,
+            point.sensitivity,
+        ),
+        recursion=recursion_error(task, trajectory, point.sensitivity),
+        slope=slope_error(task, problem, point),
     )
     if found.passed or found.roughness is not None:
         return found
-    active = first_active_constraint(setup.model_at(setup.theta), trajectory)
+    active = first_active_constraint(task.system.model_at(task.theta), trajectory)
     if active is None:
         return replace(
             found,
@@ -45,10 +52,10 @@ def self_test(setup: Setup, problem: DesignProblem, point: Point) -> SelfTest:
     )
 
 
-def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivity) -> float:
+def recursion_error(task: DesignTask, trajectory: Trajectory, sensitivity: Sensitivity) -> float:
     """Largest difference between two ways to psi, relative to the largest entry of each parameter's psi."""
     try:
-        line = setup.plant.derivatives.linearize(setup.theta, trajectory)
+        line = task.plant.derivatives.linearize(task.theta, trajectory)
     except SimulationDivergedError:
         return np.inf
     psi = sensitivity.psi
@@ -57,20 +64,22 @@ def recursion_error(setup: Setup, trajectory: Trajectory, sensitivity: Sensitivi
         [recursion.forward(psi[0, :, j], line.E[..., j]) for j in range(psi.shape[2])], axis=2
     )
     size = np.abs(psi).max(axis=(0, 1))
-    moving = (size > 0.0) & visible_columns(setup, setup.noise.whiten(sensitivity.G))
+    moving = (size > 0.0) & visible_columns(
+        task.parameters, task.system.noise.whiten(sensitivity.G)
+    )
     if not moving.any():
         return 0.0
     return float((np.abs(own - psi).max(axis=(0, 1))[moving] / size[moving]).max())
 
 
-def slope_error(setup: Setup, problem: DesignProblem, point: Point) -> float:
+def slope_error(task: DesignTask, problem: DesignProblem, point: Point) -> float:
     """Relative error of DJ.zeta along the first descent direction, against central differences through the projection."""
     if not np.isfinite(point.cost) or point.trajectory is None:
         return float("nan")
     expansion = problem.expand(point)
-    K = regulator_for(setup).gain(expansion)
-    zeta = LBFGS(np.diag(setup.control_weight) * setup.dt)(expansion, K)
-    size = setup.plant.derivatives.difference_sizes(point.trajectory)
+    K = regulator_for(task).gain(expansion)
+    zeta = LBFGS(np.diag(task.control_weight) * task.dt)(expansion, K)
+    size = task.plant.derivatives.difference_sizes(point.trajectory)
     relative = max(
         np.abs(zeta.z / size[: zeta.z.shape[1]]).max(),
         np.abs(zeta.v / size[zeta.z.shape[1] :]).max(),

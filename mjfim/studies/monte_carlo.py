@@ -19,7 +19,7 @@ from scipy.stats import chi2 as chi2_distribution
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.identification.identify import least_squares, newton_raphson
 from mjfim.identification.residuals import Fit
 from mjfim.information.identifiability import require_visible
@@ -35,7 +35,7 @@ Progress = Callable[[str, float], None]
 
 
 def monte_carlo(
-    experiment: Experiment | Setup,
+    experiment: Experiment,
     trajectory: Trajectory | Mapping[str, Trajectory],
     trials: int = 1500,
     seed: int = 0,
@@ -48,29 +48,39 @@ def monte_carlo(
     sets that are finished. Raises ExperimentError for fewer than two trials, UnidentifiableError where a parameter does
     not show in the data.
     """
+    if measure_rate is not None:
+        experiment = experiment.replace(measure_rate=measure_rate)
+    return monte_carlo_system(System.resolve(experiment), trajectory, trials, seed, progress)
+
+
+def monte_carlo_system(
+    system: System,
+    trajectory: Trajectory | Mapping[str, Trajectory],
+    trials: int = 1500,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> MonteCarloStudy:
+    """Study the estimator on a resolved system. See `monte_carlo`."""
     if trials < 2:
         raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
-    if measure_rate is not None:
-        base = experiment.experiment if isinstance(experiment, Setup) else experiment
-        experiment = base.replace(measure_rate=measure_rate)
-    setup = experiment if isinstance(experiment, Setup) else Setup(experiment)
     named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
     for curve in named.values():
-        _exact(setup, curve)
+        _exact(system, curve)
+    system = system.calibrated(system.theta, next(iter(named.values())).ctrl)
     sets, information = {}, {}
     try:
         for rng, (name, curve) in zip(
             np.random.default_rng(seed).spawn(len(named)), named.items(), strict=True
         ):
             tell = None if progress is None else (lambda share, name=name: progress(name, share))
-            sets[name], information[name] = _trial_set(setup, curve, trials, rng, tell)
+            sets[name], information[name] = _trial_set(system, curve, trials, rng, tell)
     except KeyboardInterrupt:
         if not sets:
             raise
     return MonteCarloStudy(
-        parameters=setup.parameters.names,
-        theta=setup.parameters.true,
-        measure_rate=setup.measure_rate,
+        parameters=system.parameters.names,
+        theta=system.parameters.true,
+        measure_rate=system.measure_rate,
         sets=sets,
         information=information,
     )
@@ -96,32 +106,32 @@ class Shared:
 class Trials:
     """Many repetitions of one control with their own noise. measured: (m, n) whitened measurements of all trials."""
 
-    def __init__(self, setup: Setup, ctrl: Array, measured: Array) -> None:
-        self.setup, self.ctrl, self.measured = setup, ctrl, measured
+    def __init__(self, system: System, ctrl: Array, measured: Array) -> None:
+        self.system, self.ctrl, self.measured = system, ctrl, measured
 
     def outputs(self, theta: Array) -> tuple[Array, np.ndarray]:
         """Whitened predictions (m, n) at theta: (m, p), and which of them are finite."""
-        y, finite = self.setup.plant.measure(theta, self.ctrl)
-        return self.setup.noise.whitened_rows(np.moveaxis(y, 0, -1)).T, finite
+        y, finite = self.system.plant.measure(theta, self.ctrl)
+        return self.system.noise.whitened_rows(np.moveaxis(y, 0, -1)).T, finite
 
     def recording(self, measured: Array) -> Recording:
         """One trial, (n,) whitened, as a recording."""
-        noise = self.setup.noise
+        noise = self.system.noise
         mask = noise.measured(len(self.ctrl)) > 0
         y = np.zeros(mask.shape)
         y[mask] = measured
         y = np.where(mask, y @ noise.factor.T, np.nan)
         return Recording(
-            t=np.arange(len(y), dtype=np.float64) * self.setup.dt,
+            t=np.arange(len(y), dtype=np.float64) * self.system.dt,
             ctrl=self.ctrl,
             y=y,
-            outputs=self.setup.outputs.names,
+            outputs=self.system.outputs.names,
             name="trial",
         )
 
     def jacobian(self, theta: Array, predicted: Array, relative: float = 1e-6) -> Array:
         """(m, n, p) by one-sided differences about predictions already made."""
-        steps = relative * self.setup.parameters.magnitude
+        steps = relative * self.system.parameters.magnitude
         columns = []
         for j, h in enumerate(steps):
             moved = np.array(theta)
@@ -131,33 +141,33 @@ class Trials:
 
 
 def _trial_set(
-    setup: Setup,
+    system: System,
     curve: Trajectory,
     count: int,
     rng: np.random.Generator,
     tell: Callable[[float], None] | None,
 ) -> tuple[TrialStatistics, Array]:
     clock = time.perf_counter()
-    y, G = _exact(setup, curve)
-    J = setup.noise.whitened_rows(G)
+    y, G = _exact(system, curve)
+    J = system.noise.whitened_rows(G)
     information = np.asarray(J.T @ J)
-    require_visible(setup, J)
+    require_visible(system.parameters, system.parameters.prior_information, J)
     estimates = []
     chunk = max(64, int(CHUNK_BYTES / (8 * J.size)))
     for first in range(0, count, chunk):
         m = min(chunk, count - first)
-        whitened = setup.noise.whitened_rows(y) + rng.standard_normal((m, J.shape[0]))
-        trials = Trials(setup, curve.ctrl, whitened)
-        estimates.append(_solve(trials, _shared(setup, trials), tell))
+        whitened = system.noise.whitened_rows(y) + rng.standard_normal((m, J.shape[0]))
+        trials = Trials(system, curve.ctrl, whitened)
+        estimates.append(_solve(trials, _shared(system, trials), tell))
     every = np.concatenate(estimates)
     return _statistics(
         every, np.asarray(np.linalg.inv(information)), time.perf_counter() - clock
     ), information
 
 
-def _exact(setup: Setup, curve: Trajectory) -> tuple[Array, Array]:
+def _exact(system: System, curve: Trajectory) -> tuple[Array, Array]:
     """Noise-free outputs (N+1, ny) at the true values and their derivative (N+1, ny, p)."""
-    exact = setup.plant.derivatives.predict(setup.parameters.true, curve.ctrl)
+    exact = system.plant.derivatives.predict(system.parameters.true, curve.ctrl)
     if exact is None:
         raise SimulationDivergedError(
             "the simulation diverges at the true parameters under this control"
@@ -165,19 +175,19 @@ def _exact(setup: Setup, curve: Trajectory) -> tuple[Array, Array]:
     return exact
 
 
-def _shared(setup: Setup, trials: Trials) -> Shared:
+def _shared(system: System, trials: Trials) -> Shared:
     """Fit of the mean measurement from the guess, with its Jacobian and the Jacobian's derivative."""
-    fit = Fit(setup, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
-    theta = newton_raphson(fit, setup.parameters.guess).unknowns.theta
-    h = 1e-3 * setup.parameters.magnitude
+    fit = Fit(system, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
+    theta = newton_raphson(fit, system.parameters.guess).unknowns.theta
+    h = 1e-3 * system.parameters.magnitude
 
     def jacobian(at: Array) -> Array:
-        predicted = setup.plant.derivatives.predict(at, trials.ctrl)
+        predicted = system.plant.derivatives.predict(at, trials.ctrl)
         if predicted is None:
             raise SimulationDivergedError(
                 "the simulation diverges near the fit of the mean measurement"
             )
-        return setup.noise.whitened_rows(predicted[1])
+        return system.noise.whitened_rows(predicted[1])
 
     J = jacobian(theta)
     bend = np.stack(
@@ -201,7 +211,7 @@ def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None)
             tell((k + 1) / (SHARED_STEPS + 3))
     active = np.arange(m)
     for k in range(OWN_STEPS):
-        own = Trials(trials.setup, trials.ctrl, trials.measured[active])
+        own = Trials(trials.system, trials.ctrl, trials.measured[active])
         predicted, finite = own.outputs(theta[active])
         step = _gauss_newton(own.jacobian(theta[active], predicted), own.measured - predicted)
         step[~finite] = np.nan
@@ -213,7 +223,7 @@ def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None)
         if not len(active):
             break
     for i in active:
-        fit = Fit(trials.setup, [trials.recording(trials.measured[i])], data_only=True)
+        fit = Fit(trials.system, [trials.recording(trials.measured[i])], data_only=True)
         solution = least_squares(fit, shared.theta)
         theta[i] = solution.unknowns.theta if solution.success else np.nan
     return theta

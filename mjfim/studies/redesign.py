@@ -19,10 +19,10 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import MjfimError, SimulationDivergedError
-from mjfim.excitation.design import Monitor, design
-from mjfim.excitation.evaluation import evaluate_trajectory
+from mjfim.excitation.design import Monitor, design_task
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 
@@ -45,7 +45,7 @@ class Past:
 
 
 def redesigned(
-    base: Setup,
+    base: DesignTask,
     past: Past,
     theta: Array,
     monitor: Monitor | None = None,
@@ -56,47 +56,48 @@ def redesigned(
     base: of the experiment as stated. Raises as `design` does.
     """
     moved = restated(base, theta, past.estimate)
-    threads, told = base.plant.simulator.threads, past.estimate.data
+    told = past.estimate.data
     moved = moved.replace(cost={"information": _worth(base, moved, past)})
-    setup = Setup(moved, threads, added=told)
-    found = [design(setup, monitor, executor=executor)]
-    if past.last.shape == setup.control.shape and found[0].status is not Status.INTERRUPTED:
+    task = base.restated(moved, added_information=told)
+    found = [design_task(task, monitor, executor=executor)]
+    if past.last.shape == task.control.shape and found[0].status is not Status.INTERRUPTED:
         alone = moved.replace(descent={"starts": 1, "previous": (), "fourier": (), "repeats": ()})
         with suppress(
             SimulationDivergedError
         ):  # the old control may be too much for the new values
-            found.append(design(Setup(alone, threads, added=told), monitor, past.last))
+            found.append(
+                design_task(base.restated(alone, added_information=told), monitor, past.last)
+            )
     if found[-1].status is Status.INTERRUPTED:
         return found[-1]
     return min(found, key=lambda d: (d.status is Status.INFEASIBLE, d.final.cost))
 
 
-def _worth(base: Setup, moved: Experiment, past: Past) -> float:
+def _worth(base: DesignTask, moved: Experiment, past: Past) -> float:
     """Weight of the criterion at which a relative gain of information costs as much effort as in the first design."""
     stated, count = moved.cost.information, past.count + 1
     if moved.cost.criterion == "D":
         return stated * count
-    threads = base.plant.simulator.threads
     try:
-        begun = _phi(Setup(restated(base, past.begun), threads), past.first)
-        now = _phi(Setup(moved, threads, added=past.estimate.data), past.last)
+        begun = _phi(base.restated(restated(base, past.begun)), past.first)
+        now = _phi(base.restated(moved, added_information=past.estimate.data), past.last)
     except (MjfimError, ValueError):
         return stated * count**2  # as of equal experiments
     return float(stated * count * begun / now)
 
 
-def _phi(setup: Setup, control: Array) -> float:
+def _phi(task: DesignTask, control: Array) -> float:
     """Criterion along a control: (N, nu). Raises where there is none."""
-    if control.shape != setup.control.shape:
-        raise ValueError(f"a control of {control.shape} instead of {setup.control.shape}")
-    value = evaluate_trajectory(setup, setup.plant.simulate(setup.theta, control)).criterion
+    if control.shape != task.control.shape:
+        raise ValueError(f"a control of {control.shape} instead of {task.control.shape}")
+    value = evaluate_task(task, task.plant.simulate(task.theta, control)).criterion
     if not (np.isfinite(value) and value > 0.0):
         raise SimulationDivergedError(f"criterion {value}")
     return value
 
 
 def restated(
-    base: Setup, theta: Array | None = None, estimate: Estimate | None = None
+    base: DesignTask, theta: Array | None = None, estimate: Estimate | None = None
 ) -> Experiment:
     """The experiment as a redesign states it: guesses at theta, (p,), scales as they are, no true values.
 
@@ -129,7 +130,9 @@ def restated(
     )
 
 
-def _moved(base: Setup, j: int, theta: Array | None, estimate: Estimate | None) -> dict[str, Any]:
+def _moved(
+    base: DesignTask, j: int, theta: Array | None, estimate: Estimate | None
+) -> dict[str, Any]:
     """Keys of a parameter that a redesign states anew."""
     own, size = base.parameters.parameters[j], float(base.parameters.magnitude[j])
     low, high = own.bounds
@@ -147,7 +150,7 @@ def _moved(base: Setup, j: int, theta: Array | None, estimate: Estimate | None) 
     return keys
 
 
-def _shown(base: Setup, members: Sequence[int], estimate: Estimate) -> bool:
+def _shown(base: DesignTask, members: Sequence[int], estimate: Estimate) -> bool:
     """Whether the recordings show every one of some parameters: to move one by its size moves them by more than the noise."""
     at = np.asarray(members)
     return bool((np.diag(estimate.data)[at] * base.parameters.magnitude[at] ** 2 > 1.0).all())

@@ -18,7 +18,9 @@ from typer.testing import Result
 
 import mjfim
 from mjfim.cli import main as cli
-from mjfim.experiment.system import Setup
+from mjfim.excitation.design import design_task
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.task import DesignTask
 from mjfim.output import archive, plots
 from mjfim.output import folders as results
 from mjfim.output import rerun as rerun_log
@@ -100,8 +102,8 @@ def test_design_json_is_the_file(home: Path, designed: Result) -> None:
 
 def test_simulate_leaves_a_recording(study: Path, recorded: Path, archived: Path) -> None:
     """The design's control, noise of the stated size about the true model's outputs."""
-    setup = Setup(mjfim.Experiment.from_file(study))
-    recording = logs.read_recording(recorded, setup.channels)
+    task = DesignTask.resolve(mjfim.Experiment.from_file(study))
+    recording = logs.read_recording(recorded, task.system.channels)
     curve = archive.read_design(archived)["final"]
     assert np.array_equal(recording.ctrl, curve.ctrl)
     noise = recording.y - np.hstack([curve.qpos, curve.qvel])
@@ -554,16 +556,16 @@ def test_trials_that_diverge(
     for amplitude in np.geomspace(1.2e4, 4.8e4, 7):
         wave = {"kind": "sine", "frequency": 2.0, "amplitude": float(amplitude)}
         descent = {"max_iterations": 4, "coarse": 1}
-        setup = Setup(experiment.replace(initial={"control": wave}, descent=descent))
-        project = setup.plant.project
+        task = DesignTask.resolve(experiment.replace(initial={"control": wave}, descent=descent))
+        project = task.plant.project
 
         def spy(*words: Any, project: Any = project) -> Any:
             trial = project(*words)
             diverged.append(trial is None)
             return trial
 
-        monkeypatch.setattr(setup.plant, "project", spy)
-        result = mjfim.design(setup)
+        monkeypatch.setattr(task.plant, "project", spy)
+        result = design_task(task)
         assert result.final.cost < result.initial.cost
     assert any(diverged), "no trial diverged: this test has lost its object"
     assert capfd.readouterr() == ("", "")
@@ -601,7 +603,7 @@ def test_interrupted_before_a_result(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Exit code 1, one message, nothing on disk."""
-    monkeypatch.setattr(cli, "Setup", interrupt)
+    monkeypatch.setattr(cli, "DesignTask", interrupt)
     inputs = {"design": [], "identify": [recorded], "montecarlo": [archived]}[verb]
     result = run(verb, study, *inputs, "-o", tmp_path / "out")
     assert (result.exit_code, result.stdout) == (1, "")
@@ -684,9 +686,9 @@ def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
     data = read(out / "design.json")
     assert data["status"] == "interrupted"
     assert data["final"]["eigenvalues"][0] > 5 * data["initial"]["eigenvalues"][0]
-    setup = Setup(mjfim.Experiment.from_file(path))
+    task = DesignTask.resolve(mjfim.Experiment.from_file(path))
     curves = archive.read_design(out / "design.npz")
-    assert mjfim.evaluate_trajectory(setup, curves["final"]).cost == pytest.approx(
+    assert evaluate_task(task, curves["final"]).cost == pytest.approx(
         data["final"]["cost"], rel=1e-6
     )
     assert all(file.read_bytes()[:4] == b"\x89PNG" for file in out.glob("*.png"))

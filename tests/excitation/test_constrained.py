@@ -15,14 +15,15 @@ import pytest
 import mjfim
 from mjfim.excitation import interior_point as ladder_module
 from mjfim.excitation import multistart as contest
-from mjfim.excitation.constrained import Chase, Task, perform
+from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform
 from mjfim.excitation.constraints import basis_of, fence_of
+from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import Start
 from mjfim.excitation.interior_point import SHRUNK, Ladder, Rungs, held_back
 from mjfim.excitation.multistart import Contest
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, regulator_for
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.records.design import Design, HistoryRow, Status
 from mjfim.signals import spline_basis
 from tests.support.limits import ARM, HARD, cart_inside
@@ -30,7 +31,7 @@ from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,
     Array,
-    make_setup,
+    make_task,
     relative_error,
 )
 from tests.support.paths import MODELS
@@ -124,14 +125,14 @@ def test_and_no_engine_step_leaves_them(paper: Design) -> None:
 # ---- ways to the inside
 
 
-def assert_inside(setup: Setup, ctrl: Array) -> None:
+def assert_inside(task: DesignTask, ctrl: Array) -> None:
     """Every range of the experiment on a cart-pendulum holds at every engine step of a plain loop."""
-    start = setup.space.split(setup.plant.nominal_initial_state)[:2]
+    start = task.space.split(task.plant.nominal_initial_state)[:2]
     rows, places = (
-        played(setup.model, start, ctrl, setup.substeps),
+        played(task.system.model, start, ctrl, task.system.grid.substeps),
         {"position": "q", "velocity": "v", "acceleration": "a"},
     )
-    for limit in setup.limits:
+    for limit in task.limits:
         values = ctrl if limit.kind == "control" else rows[places.get(limit.kind, "f")]
         assert limit.lower <= values[:, limit.index].min(), limit
         assert values[:, limit.index].max() <= limit.upper, limit
@@ -139,9 +140,9 @@ def assert_inside(setup: Setup, ctrl: Array) -> None:
 
 def test_a_start_that_leaves_the_limits_is_driven_inside(tmp_path: Path) -> None:
     wild = {"kind": "sine", "amplitude": 40.0, "frequency": 1.0}
-    setup = cart_inside(tmp_path, control=wild)
-    outside = fence_of(setup)
-    watched = setup.plant.observe(setup.theta, setup.control, outside.observations)
+    task = cart_inside(tmp_path, control=wild)
+    outside = fence_of(task)
+    watched = task.plant.observe(task.theta, task.control, outside.observations)
     assert watched is not None
     assert set(outside.margins(outside.sight(*watched, slopes=False))) == {
         "control",
@@ -149,28 +150,26 @@ def test_a_start_that_leaves_the_limits_is_driven_inside(tmp_path: Path) -> None
         "velocity",
     }
     assert max(outside.margins(outside.sight(*watched, slopes=False)).values()) < 0.0
-    design = mjfim.design(setup)
+    design = design_task(task)
     assert design.limits == pytest.approx({k: max(v, 0.0) for k, v in design.limits.items()})
-    assert_inside(setup, design.trajectory.ctrl)
+    assert_inside(task, design.trajectory.ctrl)
     # it begins with as much of the start as keeps them
-    free = setup.free()
+    free = task.relaxed()
     ladder = Ladder(
         Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free)
     )
-    begun = ladder.inside(setup.control)
+    begun = ladder.inside(task.control)
     assert begun is not None
-    share = float(begun[10, 0] / setup.control[10, 0])
-    np.testing.assert_allclose(
-        begun, free.centre + share * (setup.control - free.centre), rtol=1e-9
-    )
-    assert_inside(setup, begun)
+    share = float(begun[10, 0] / task.control[10, 0])
+    np.testing.assert_allclose(begun, free.centre + share * (task.control - free.centre), rtol=1e-9)
+    assert_inside(task, begun)
     tried = sorted(SHRUNK.tolist())
     larger = free.centre + tried[tried.index(pytest.approx(share)) + 1] * (
-        setup.control - free.centre
+        task.control - free.centre
     )
     with pytest.raises(AssertionError):
-        assert_inside(setup, larger)
-    first = setup.problem.point(setup.plant.simulate(setup.theta, begun))
+        assert_inside(task, larger)
+    first = task.problem.point(task.plant.simulate(task.theta, begun))
     assert design.final.cost < 0.5 * first.cost
 
 
@@ -179,7 +178,7 @@ SWINGING = CART_PENDULUM.format(integrator="RK4").replace(
 )
 
 
-def swinging_setup(folder: Path, **tables: Any) -> Setup:
+def swinging_task(folder: Path, **tables: Any) -> DesignTask:
     """A pendulum that swings at first and has to hang still elsewhere after 1.5 s."""
     first = {
         "qpos": (0.0, 2.6),
@@ -197,36 +196,36 @@ def swinging_setup(folder: Path, **tables: Any) -> Setup:
         "boundary": {"end": "rest", "keyframe": "rest", "position": 0.02, "velocity": 0.05},
         "descent": {"max_iterations": 40, "coarse": 1},
     }
-    return make_setup(SWINGING, folder, **{**defaults, **tables})
+    return make_task(SWINGING, folder, **{**defaults, **tables})
 
 
-def assert_ends(setup: Setup, design: Design) -> None:
+def assert_ends(task: DesignTask, design: Design) -> None:
     """It hangs still where it has to, by a plain loop, within all limits."""
     assert design.status is not Status.INFEASIBLE
     rows = played(
-        setup.model,
+        task.system.model,
         (np.array([0.0, 2.6]), np.array([0.4, 1.0])),
         design.trajectory.ctrl,
-        setup.substeps,
+        task.system.grid.substeps,
     )
     np.testing.assert_allclose(rows["q"][-1], [0.3, np.pi], rtol=0, atol=0.02)
     np.testing.assert_allclose(rows["v"][-1], 0.0, rtol=0, atol=0.05)
-    assert_inside(setup, design.trajectory.ctrl)
+    assert_inside(task, design.trajectory.ctrl)
 
 
 @pytest.mark.slow
 def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> None:
     """The relaxed barrier brings it there, and the cost has its say from the first iterate on."""
-    setup = swinging_setup(tmp_path)
-    free = setup.free()
+    task = swinging_task(tmp_path)
+    free = task.relaxed()
     ladder = Ladder(
         Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free)
     )
-    first = next(ladder.climb(setup.control, 5))
+    first = next(ladder.climb(task.control, 5))
     assert first.mu == Rungs().first
     assert not first.feasible
-    np.testing.assert_array_equal(first.iterate.point.ctrl, setup.control)
-    assert_ends(setup, mjfim.design(setup))
+    np.testing.assert_array_equal(first.iterate.point.ctrl, task.control)
+    assert_ends(task, design_task(task))
 
 
 @pytest.mark.slow
@@ -235,28 +234,28 @@ def test_a_start_that_no_shrinking_brings_inside_is_steered(
 ) -> None:
     """Where it is too far outside to begin with: here by decree."""
     monkeypatch.setattr(ladder_module, "FARTHEST_START", -np.inf)
-    setup = swinging_setup(tmp_path)
-    free = setup.free()
+    task = swinging_task(tmp_path)
+    free = task.relaxed()
     ladder = Ladder(
         Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free)
     )
-    assert ladder.inside(setup.control) is None
-    first = next(ladder.climb(setup.control, 5))
+    assert ladder.inside(task.control) is None
+    first = next(ladder.climb(task.control, 5))
     assert first.mu == np.inf
     assert not first.feasible
-    design = mjfim.design(setup)
+    design = design_task(task)
     mus = [row.mu for row in design.history]
     steered = mus.count(np.inf)
     assert 1 < steered < 30
     assert mus[:steered] == [np.inf] * steered  # at first, then never again
-    assert_ends(setup, design)
+    assert_ends(task, design)
 
 
 def test_what_no_control_can_keep_ends_as_infeasible(tmp_path: Path) -> None:
     """The pendulum falls faster than it may, whatever the weak motor does: said, and no success."""
     weak = {**HARD, "control": {"force": (-0.05, 0.05)}, "velocity": {"hinge": 0.41}}
-    setup = cart_inside(tmp_path, horizon=0.3, limits=weak, descent={"max_iterations": 15})
-    design = mjfim.design(setup)
+    task = cart_inside(tmp_path, horizon=0.3, limits=weak, descent={"max_iterations": 15})
+    design = design_task(task)
     assert design.status is Status.INFEASIBLE
     assert not design.success
     assert design.limits["velocity"] < 0.0
@@ -265,20 +264,20 @@ def test_what_no_control_can_keep_ends_as_infeasible(tmp_path: Path) -> None:
 
 
 def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path: Path) -> None:
-    setup = cart_inside(tmp_path, descent={"max_iterations": 4})
-    task = Task(
-        setup.experiment,
-        Start("wild", 1e9 * np.ones((100, 1)) * np.sin(9.0 * setup.t)[:, None]),
+    task = cart_inside(tmp_path, descent={"max_iterations": 4})
+    search = ConstrainedSearch(
+        task.experiment,
+        Start("wild", 1e9 * np.ones((100, 1)) * np.sin(9.0 * task.t)[:, None]),
         Rungs(),
         4,
     )
-    chase = perform(task)
+    chase = perform(search)
     assert chase.status is Status.INFEASIBLE
     assert chase.cost == np.inf
     # beside it another start goes on
     chases: list[Chase] = []
-    starts = [task.start, Start("initial control", setup.control)]
-    rows = list(Contest(Stage(setup.free(), None), None).run(starts, chases))
+    starts = [search.start, Start("initial control", task.control)]
+    rows = list(Contest(Stage(task.relaxed(), None), None).run(starts, chases))
     assert rows
     assert np.isfinite(chases[1].cost)
 
@@ -287,12 +286,12 @@ def test_where_weights_keep_the_limits_there_is_no_barrier(tmp_path: Path) -> No
     """The design is that without limits; one that leaves them goes on from where it was still inside."""
     heavy = {"cost": {"control": 0.05}, "descent": {"max_iterations": 60}}
     wide = {"control": {"force": (-30.0, 30.0)}, "position": {"slide": (-3.0, 3.0)}}
-    kept = mjfim.design(cart_inside(tmp_path, limits=wide, **heavy))
-    free = mjfim.design(cart_inside(tmp_path, limits={}, **heavy))
+    kept = design_task(cart_inside(tmp_path, limits=wide, **heavy))
+    free = design_task(cart_inside(tmp_path, limits={}, **heavy))
     assert kept.final.cost == free.final.cost
     assert {row.mu for row in kept.history} == {0.0}
     assert np.isnan(kept.history[-1].margin)
-    left = mjfim.design(
+    left = design_task(
         cart_inside(
             tmp_path, **{**heavy, "cost": {"control": 1e-3}, "descent": {"max_iterations": 6}}
         )
@@ -308,7 +307,7 @@ def test_a_design_does_not_rest_on_a_clamp(tmp_path: Path) -> None:
         'joint="slide"/>', 'joint="slide" forcerange="-1.5 1.5"/>'
     )
     for cost in ({"control": 1e-3}, {"control": {"force": 1e-5}}):
-        setup = make_setup(
+        task = make_task(
             weak,
             tmp_path,
             horizon=1.0,
@@ -321,9 +320,12 @@ def test_a_design_does_not_rest_on_a_clamp(tmp_path: Path) -> None:
             cost=cost,
             descent={"max_iterations": 25},
         )
-        design = mjfim.design(setup)
+        design = design_task(task)
         rows = played(
-            setup.model, (np.array([0.0, 3.0]), np.zeros(2)), design.trajectory.ctrl, setup.substeps
+            task.system.model,
+            (np.array([0.0, 3.0]), np.zeros(2)),
+            design.trajectory.ctrl,
+            task.system.grid.substeps,
         )
         assert 1.2 < np.abs(rows["f"]).max() < 1.5
         assert 0.0 < design.limits["force"] < 0.3
@@ -338,10 +340,10 @@ def test_what_is_not_enforced_may_be_left_while_the_boundary_holds(tmp_path: Pat
             "enforce": False,
         }
     }
-    setup = swinging_setup(
+    task = swinging_task(
         tmp_path, **tables, cost={"control": 1e-4}, descent={"max_iterations": 12, "coarse": 1}
     )
-    design = mjfim.design(setup)
+    design = design_task(task)
     assert design.status is not Status.INFEASIBLE
     assert min(design.limits["end_position"], design.limits["end_velocity"]) >= 0.0
     assert design.limits["control"] < 0.0
@@ -352,14 +354,14 @@ def test_what_is_not_enforced_may_be_left_while_the_boundary_holds(tmp_path: Pat
 
 def test_the_stated_tolerance_ends_the_last_rung_once_the_limits_hold(tmp_path: Path) -> None:
     """One so wide that any slope will do: the first iterate there that is inside is the last."""
-    setup = cart_inside(tmp_path, descent={"max_iterations": 80, "tolerance": 100.0, "coarse": 1})
-    design = mjfim.design(setup)
+    task = cart_inside(tmp_path, descent={"max_iterations": 80, "tolerance": 100.0, "coarse": 1})
+    design = design_task(task)
     assert design.status is Status.CONVERGED
     sharpest = [row for row in design.history if row.mu == design.history[-1].mu]
     assert design.history[-1].mu == Rungs.last
     assert [row.margin >= 0.0 for row in sharpest].index(True) == len(sharpest) - 1
     assert design.slope > 1e-5
-    assert_inside(setup, design.trajectory.ctrl)
+    assert_inside(task, design.trajectory.ctrl)
 
 
 def test_more_is_held_back_where_a_rung_leaked_and_less_where_it_was_well_inside() -> None:
@@ -374,7 +376,7 @@ def test_more_is_held_back_where_a_rung_leaked_and_less_where_it_was_well_inside
 # ---- several starts
 
 
-def several(folder: Path, **tables: Any) -> Setup:
+def several(folder: Path, **tables: Any) -> DesignTask:
     """Four starts on a short cart-pendulum."""
     descent = {"max_iterations": 16, "starts": 4, "seed": 2}
     return cart_inside(folder, horizon=0.6, **{"descent": descent, **tables})
@@ -384,10 +386,10 @@ def several(folder: Path, **tables: Any) -> Setup:
 def test_starts_in_parallel_find_what_they_find_one_after_the_other(
     criterion: str, tmp_path: Path
 ) -> None:
-    setup = several(tmp_path, cost={"control": 0.0, "criterion": criterion})
-    alone = mjfim.design(setup)
+    task = several(tmp_path, cost={"control": 0.0, "criterion": criterion})
+    alone = design_task(task)
     with ThreadPoolExecutor(2) as executor:
-        together = mjfim.design(setup, executor=executor)
+        together = design_task(task, executor=executor)
     assert together.found_by == alone.found_by
     assert [(s.name, s.status, s.iterations) for s in together.starts] == [
         (s.name, s.status, s.iterations) for s in alone.starts
@@ -402,12 +404,12 @@ def test_starts_in_parallel_find_what_they_find_one_after_the_other(
     assert {s.name for s in alone.starts} == names
     assert sum(s.status is Status.LEFT for s in alone.starts) == 3
     assert alone.final.cost == min(s.cost for s in alone.starts)
-    assert_inside(setup, alone.trajectory.ctrl)
+    assert_inside(task, alone.trajectory.ctrl)
 
 
 def test_an_interrupted_contest_keeps_the_best_so_far(tmp_path: Path) -> None:
     """Also in its second round, also where the monitor interrupts: no worse than what was told before."""
-    setup = several(tmp_path)
+    task = several(tmp_path)
     told: list[HistoryRow] = []
 
     def stop(row: HistoryRow) -> None:
@@ -415,31 +417,31 @@ def test_an_interrupted_contest_keeps_the_best_so_far(tmp_path: Path) -> None:
         if row.mu < 0.01 and row.margin > 0.0:
             raise KeyboardInterrupt
 
-    design = mjfim.design(setup, stop)
+    design = design_task(task, stop)
     assert design.status is Status.INTERRUPTED
     feasible = [row.cost for row in told if row.margin >= 0.0]
     assert design.final.cost <= told[-1].cost * (1 + 1e-6)
     assert design.final.cost < 1.2 * min(feasible)
-    assert_inside(setup, design.trajectory.ctrl)
-    early = mjfim.design(setup, lambda row: stop(replace(row, mu=0.0, margin=1.0)))
+    assert_inside(task, design.trajectory.ctrl)
+    early = design_task(task, lambda row: stop(replace(row, mu=0.0, margin=1.0)))
     assert early.status is Status.INTERRUPTED
     assert len(early.starts) == 1
 
 
 def test_a_fourier_start_is_optimised_as_a_series_before_it_goes_on_freely(tmp_path: Path) -> None:
-    setup = several(tmp_path, descent={"max_iterations": 12, "fourier": (2.0,)})
+    task = several(tmp_path, descent={"max_iterations": 12, "fourier": (2.0,)})
     chases: list[Chase] = []
     first: dict[str, Array] = {}
     from mjfim.excitation.initial_controls import starts_of
 
-    for _ in Contest(Stage(setup.free(), None), None).run(list(starts_of(setup, None)), chases):
+    for _ in Contest(Stage(task.relaxed(), None), None).run(list(starts_of(task, None)), chases):
         for chase in chases:
             if chase.control is not None and chase.history[-1].mu >= 0.01:
                 first[chase.name] = chase.control
     assert list(first) == ["initial control", "Fourier series of 2 Hz"]
-    waves = [f(2 * np.pi * 2.0 * k * setup.t) for k in range(1, 16) for f in (np.sin, np.cos)]
+    waves = [f(2 * np.pi * 2.0 * k * task.t) for k in range(1, 16) for f in (np.sin, np.cos)]
     series = np.column_stack(waves)
-    control = first["Fourier series of 2 Hz"] - setup.centre
+    control = first["Fourier series of 2 Hz"] - task.centre
     assert relative_error(series @ np.linalg.lstsq(series, control)[0], control) < 1e-6
     assert np.isfinite(min(chase.cost for chase in chases))
 
@@ -447,7 +449,7 @@ def test_a_fourier_start_is_optimised_as_a_series_before_it_goes_on_freely(tmp_p
 # ---- how a design begins, ends and moves
 
 
-def arm_design(folder: Path, **tables: Any) -> tuple[Setup, Design]:
+def arm_design(folder: Path, **tables: Any) -> tuple[DesignTask, Design]:
     """The arm of two servos for half a second, from a standstill that its motors have to hold against gravity."""
     defaults: dict[str, Any] = {
         "horizon": 0.5,
@@ -462,38 +464,38 @@ def arm_design(folder: Path, **tables: Any) -> tuple[Setup, Design]:
         "control_rate": 6.0,
         **tables.pop("limits", {}),
     }
-    setup = make_setup(ARM, folder, **{**defaults, **tables, "limits": limits})
-    return setup, mjfim.design(setup)
+    task = make_task(ARM, folder, **{**defaults, **tables, "limits": limits})
+    return task, design_task(task)
 
 
 def assert_arm(
-    setup: Setup, design: Design, before: Array | None, after: Array | None
+    task: DesignTask, design: Design, before: Array | None, after: Array | None
 ) -> dict[str, Array]:
     """Ranges and rates of the control, by hand; returns what a plain loop shows."""
-    ctrl, dt = design.trajectory.ctrl, setup.dt
+    ctrl, dt = design.trajectory.ctrl, task.dt
     assert np.abs(ctrl).max() <= 1.0
     assert np.abs(np.diff(ctrl, axis=0)).max() / dt <= 6.0
     for end, other in ((ctrl[0], before), (ctrl[-1], after)):
         if other is not None:
             assert np.abs(end - other).max() / dt <= 6.0
     assert design.final.cost < design.initial.cost
-    return played(setup.model, (np.zeros(2), np.zeros(2)), ctrl, setup.substeps)
+    return played(task.system.model, (np.zeros(2), np.zeros(2)), ctrl, task.system.grid.substeps)
 
 
-def standstill(setup: Setup) -> Array:
+def standstill(task: DesignTask) -> Array:
     """Control that holds the arm at zero, by inverse dynamics: (2,)."""
-    data = mujoco.MjData(setup.model)
-    mujoco.mj_inverse(setup.model, data)
+    data = mujoco.MjData(task.system.model)
+    mujoco.mj_inverse(task.system.model, data)
     return np.array(data.qfrc_inverse) / np.array([40.0, 25.0])
 
 
 def test_a_design_from_rest_to_rest_begins_and_ends_at_what_holds(tmp_path: Path) -> None:
     tight = {"start": "rest", "end": "rest", "position": 0.005, "velocity": 0.03}
-    setup, design = arm_design(tmp_path, boundary=tight)
-    hold = standstill(setup)
-    np.testing.assert_allclose(setup.hold, hold, rtol=0, atol=1e-6)
+    task, design = arm_design(tmp_path, boundary=tight)
+    hold = standstill(task)
+    np.testing.assert_allclose(task.initial_hold, hold, rtol=0, atol=1e-6)
     assert np.abs(hold).min() > 0.01
-    rows = assert_arm(setup, design, hold, hold)
+    rows = assert_arm(task, design, hold, hold)
     assert np.abs(rows["q"][-1]).max() <= 0.005
     assert np.abs(rows["v"][-1]).max() <= 0.03
     assert np.abs(rows["q"]).max() > 0.1  # it moved
@@ -507,15 +509,18 @@ def test_a_design_from_rest_to_rest_begins_and_ends_at_what_holds(tmp_path: Path
 
 def test_a_periodic_design_can_be_repeated(tmp_path: Path) -> None:
     """Its control has no jump at the seam, its state comes back."""
-    setup, design = arm_design(
+    task, design = arm_design(
         tmp_path, boundary={"end": "periodic", "position": 0.005, "velocity": 0.05}
     )
     ctrl = design.trajectory.ctrl
-    rows = assert_arm(setup, design, None, ctrl[0])
+    rows = assert_arm(task, design, None, ctrl[0])
     assert np.abs(rows["q"][-1]).max() <= 0.005
     assert np.abs(rows["v"][-1]).max() <= 0.05
     twice = played(
-        setup.model, (np.zeros(2), np.zeros(2)), np.concatenate([ctrl, ctrl]), setup.substeps
+        task.system.model,
+        (np.zeros(2), np.zeros(2)),
+        np.concatenate([ctrl, ctrl]),
+        task.system.grid.substeps,
     )["q"]
     assert np.abs(twice[len(rows["q"]) :] - rows["q"]).max() < 0.05
 
@@ -524,24 +529,24 @@ def test_a_periodic_design_can_be_repeated(tmp_path: Path) -> None:
 def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_path: Path) -> None:
     """On the stated samples, from the coarse level as well; from rest its first control is what holds, without a slope."""
     boundary = {"start": "rest", "end": "rest", "position": 0.02, "velocity": 0.1}
-    setup, design = arm_design(
+    task, design = arm_design(
         tmp_path,
         boundary=boundary,
         limits={"bandwidth": 9.0},
         descent={"max_iterations": 24, "coarse": coarse},
     )
-    hold, ctrl = standstill(setup), design.trajectory.ctrl
-    basis = spline_basis(setup.t, 0.5, 9.0, True, True, False)
+    hold, ctrl = standstill(task), design.trajectory.ctrl
+    basis = spline_basis(task.t, 0.5, 9.0, True, True, False)
     assert basis.shape[1] == 8
-    swing = ctrl - setup.hold
+    swing = ctrl - task.initial_hold
     assert relative_error(basis @ np.linalg.lstsq(basis, swing)[0], swing) < 1e-9
     np.testing.assert_allclose(ctrl[0], hold, rtol=0, atol=1e-6)
     assert np.abs(ctrl[1] - ctrl[0]).max() < 0.05 * np.ptp(ctrl)
-    rows = assert_arm(setup, design, hold, hold)
+    rows = assert_arm(task, design, hold, hold)
     assert np.abs(rows["q"][-1]).max() <= 0.02
     assert np.abs(rows["v"][-1]).max() <= 0.1
     power = np.abs(np.fft.rfft(swing, axis=0)) ** 2
-    f = np.fft.rfftfreq(len(swing), setup.dt)
+    f = np.fft.rfftfreq(len(swing), task.dt)
     assert power[f > 18.0].sum() < 1e-2 * power.sum()
 
 
@@ -550,27 +555,27 @@ def test_a_bandwidth_near_that_of_the_samples_is_no_trouble(
     bandwidth: float, tmp_path: Path
 ) -> None:
     """There are then as many splines as samples or more, of a coarse level twice as many."""
-    setup = cart_inside(
+    task = cart_inside(
         tmp_path,
         limits={**HARD, "bandwidth": bandwidth},
         descent={"max_iterations": 6, "coarse": 2},
     )
-    fine = basis_of(setup, setup.t)
-    assert fine is not None and fine.shape[1] > 0.6 * setup.samples
-    design = mjfim.design(setup)
+    fine = basis_of(task, task.t)
+    assert fine is not None and fine.shape[1] > 0.6 * task.samples
+    design = design_task(task)
     assert design.final.cost < design.initial.cost
-    assert_inside(setup, design.trajectory.ctrl)
+    assert_inside(task, design.trajectory.ctrl)
 
 
-def nearest(setup: Setup, ctrl: Array) -> float:
+def nearest(task: DesignTask, ctrl: Array) -> float:
     """Smallest distance of the arm to post and floor at any engine step of a plain loop, by MuJoCo's own distances."""
-    model = setup.model
+    model = task.system.model
     data, geoms = (
         mujoco.MjData(model),
         [model.geom(name).id for name in ("fore", "post", "floor", "upper")],
     )
     near = []
-    for qpos in played(model, (np.zeros(2), np.zeros(2)), ctrl, setup.substeps)["q"]:
+    for qpos in played(model, (np.zeros(2), np.zeros(2)), ctrl, task.system.grid.substeps)["q"]:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         pairs = ((0, 1), (0, 2), (3, 1), (3, 2))
@@ -596,28 +601,28 @@ def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
     if not shrunk:
         monkeypatch.setattr(contest, "SHRUNK", np.ones(1))
     monkeypatch.setattr(contest, "PATIENCE", 12)
-    setup, design = arm_design(
+    task, design = arm_design(
         tmp_path,
         rate=20.0,
         horizon=1.0,
         limits={"clearance": 0.15, "control_rate": 20.0},
         descent={"max_iterations": 16, "coarse": 1},
     )
-    kept = nearest(setup, design.trajectory.ctrl) >= 0.15
+    kept = nearest(task, design.trajectory.ctrl) >= 0.15
     assert kept is (shrunk or bool(proofs))
     assert (design.status is Status.INFEASIBLE) is not kept
     assert design.limits["clearance"] == pytest.approx(
-        nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6
+        nearest(task, design.trajectory.ctrl) - 0.15, abs=1e-6
     )
 
 
 def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
     """Without the limit the fore-arm comes closer."""
-    setup, design = arm_design(tmp_path, limits={"clearance": 0.15})
+    task, design = arm_design(tmp_path, limits={"clearance": 0.15})
     free = arm_design(tmp_path)[1]
-    assert nearest(setup, design.trajectory.ctrl) >= 0.15 > nearest(setup, free.trajectory.ctrl)
+    assert nearest(task, design.trajectory.ctrl) >= 0.15 > nearest(task, free.trajectory.ctrl)
     assert design.limits["clearance"] == pytest.approx(
-        nearest(setup, design.trajectory.ctrl) - 0.15, abs=1e-6
+        nearest(task, design.trajectory.ctrl) - 0.15, abs=1e-6
     )
 
 
@@ -633,7 +638,7 @@ def test_a_shorter_design_played_twice_is_a_start(
     hanging = {"qpos": (0.0, np.pi), "qvel": (0.0, 0.0)}
     control = {"kind": "sine", "amplitude": 2.0, "frequency": 0.9}
     limits = {**HARD, "control_rate": 200.0}
-    setup = cart_inside(
+    task = cart_inside(
         tmp_path,
         horizon=2.0,
         boundary=rest,
@@ -642,10 +647,10 @@ def test_a_shorter_design_played_twice_is_a_start(
         initial={**hanging, "control": control},
     )
     with executor(2) if executor is not None else nullcontext() as pool:
-        design = mjfim.design(setup, executor=pool)
+        design = design_task(task, executor=pool)
     assert [start.name for start in design.starts] == ["initial control", "2 times a design of 1 s"]
     assert np.isfinite([start.cost for start in design.starts]).all()
-    assert len(design.trajectory.ctrl) == setup.samples
+    assert len(design.trajectory.ctrl) == task.samples
     assert min(design.limits.values()) >= 0.0
     assert design.final.cost == min(start.cost for start in design.starts)
 
@@ -658,7 +663,7 @@ def test_and_where_weights_bound_the_design_or_samples_are_odd(
 ) -> None:
     wide = {"control": {"force": (-50.0, 50.0)}, "position": {"slide": (-9.0, 9.0)}}
     descent = {"repeats": (count,), "max_iterations": 10}
-    design = mjfim.design(cart_inside(tmp_path, limits=wide, descent=descent, **tables))
+    design = design_task(cart_inside(tmp_path, limits=wide, descent=descent, **tables))
     assert design.final.cost < design.initial.cost
     assert len(design.starts) == 2
 
@@ -685,20 +690,20 @@ def test_every_criterion_gains_within_limits(tmp_path: Path, tables: dict[str, A
         name: {**stated, **tables.get("parameters", {}).get(name, {})}
         for name, stated in CART_PARAMETERS.items()
     }
-    setup = cart_inside(tmp_path, **{**tables, "parameters": known})
-    design = mjfim.design(setup)
-    first = setup.problem.point(
-        setup.plant.simulate(setup.theta, 0.2 * setup.control)
+    task = cart_inside(tmp_path, **{**tables, "parameters": known})
+    design = design_task(task)
+    first = task.problem.point(
+        task.plant.simulate(task.theta, 0.2 * task.control)
     ).cost  # inside as well
     assert design.final.cost < (
         first - 1.0 if tables["cost"].get("criterion") == "D" else 0.7 * first
     )
-    assert_inside(setup, design.trajectory.ctrl)
+    assert_inside(task, design.trajectory.ctrl)
     assert min(design.limits.values()) >= 0.0
 
 
 def test_what_leaks_a_little_goes_on_and_the_start_is_kept_beside_it(tmp_path: Path) -> None:
-    free = cart_inside(tmp_path).free()
+    free = cart_inside(tmp_path).relaxed()
     rivals = Contest(Stage(free, None), None)
     start, leaking, inside = (
         Start("x", s * free.control) for s in (0.2, 3.0, 0.1)

@@ -12,11 +12,11 @@ import pytest
 
 from mjfim.excitation.constraints import END_WEIGHT, Sight, fence_of
 from mjfim.excitation.interior_point import InteriorProblem, seen
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
 from mjfim.optimize.lq import TangentCurve
-from tests.support.limits import ARM, directions_of, floating_setup
-from tests.support.numerics import directional_check, make_setup
+from tests.support.limits import ARM, directions_of, floating_task
+from tests.support.numerics import directional_check, make_task
 
 WIDE = {
     "position": 0.5,
@@ -54,7 +54,7 @@ TOGETHER: dict[str, dict[str, Any]] = {
 KINDS = {"position", "velocity", "acceleration", "control", "control_rate", "force", "clearance"}
 
 
-def arm_setup(folder: Path, **tables: Any) -> Setup:
+def arm_task(folder: Path, **tables: Any) -> DesignTask:
     """The arm from a standstill, swung by sines of 1.5 Hz for 0.4 s, on its lifted plant."""
     swing = {"shoulder": 0.25, "elbow": 0.35}
     defaults: dict[str, Any] = {
@@ -68,18 +68,18 @@ def arm_setup(folder: Path, **tables: Any) -> Setup:
             "frequency": 1.5,
         },
     }
-    return make_setup(ARM, folder, **{**defaults, **tables}).free()
+    return make_task(ARM, folder, **{**defaults, **tables}).relaxed()
 
 
-def barrier_check(setup: Setup, delta: float, h: float = 2e-5) -> float:
+def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
     """Largest relative error of the slope of the barrier along random controls, against differences of simulations."""
-    problem = InteriorProblem(setup.problem, fence_of(setup), 1.0, delta, costs=False)
-    expansion = problem.expand(problem.point(setup.control))
-    open_loop = np.zeros((setup.samples, len(setup.controls), setup.space.nx))
+    problem = InteriorProblem(task.problem, fence_of(task), 1.0, delta, costs=False)
+    expansion = problem.expand(problem.point(task.control))
+    open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
     gradient = expansion.gradient(open_loop)
-    sizes = np.abs(setup.control - setup.centre).max(axis=0)
-    ways = directions_of(setup, 6) * sizes
-    curves = [lambda s, way=way: problem.point(setup.control + s * way).barrier for way in ways]
+    sizes = np.abs(task.control - task.centre).max(axis=0)
+    ways = directions_of(task, 6) * sizes
+    curves = [lambda s, way=way: problem.point(task.control + s * way).barrier for way in ways]
     return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
 
 
@@ -88,9 +88,9 @@ def barrier_check(setup: Setup, delta: float, h: float = 2e-5) -> float:
 def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
     name: str, delta: float, tmp_path: Path
 ) -> None:
-    setup = arm_setup(tmp_path, **{**ALONE, **TOGETHER}[name])
-    fence = fence_of(setup)
-    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
+    task = arm_task(tmp_path, **{**ALONE, **TOGETHER}[name])
+    fence = fence_of(task)
+    watched = task.plant.observe(task.theta, task.control, fence.observations)
     assert watched is not None
     margins = fence.margins(fence.sight(*watched, slopes=False))
     if name in KINDS:
@@ -98,7 +98,7 @@ def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
     elif name in TOGETHER:
         assert set(margins) >= KINDS
         assert min(margins.values()) < 0.0 < max(margins.values())
-    assert barrier_check(setup, delta) < 2e-3
+    assert barrier_check(task, delta) < 2e-3
 
 
 def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -> None:
@@ -109,25 +109,25 @@ def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -
             "control": {"kind": "sine", "amplitude": 0.3},
         }
     }
-    setup = floating_setup(
+    task = floating_task(
         tmp_path, boundary={"end": "periodic", "position": 0.5, "velocity": 50.0}, **wild
-    ).free()
-    rotation = setup.space.minus(setup.initial.state[-1], setup.target)[3:6]
+    ).relaxed()
+    rotation = task.space.minus(task.initial.state[-1], task.target)[3:6]
     assert np.linalg.norm(rotation) > 1.0
-    assert barrier_check(setup, 0.1) < 2e-3
+    assert barrier_check(task, 0.1) < 2e-3
 
 
 @pytest.mark.parametrize("name", TOGETHER)
 def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: Path) -> None:
     """Along any tangent curve it is the sum of squares of all that is looked at, weighted by the barriers' curvatures."""
-    setup = arm_setup(tmp_path, **TOGETHER[name])
-    fence, delta = fence_of(setup), 0.05
-    problem = InteriorProblem(setup.problem, fence, 1.0, delta, costs=False)
-    point = problem.point(setup.control)
+    task = arm_task(tmp_path, **TOGETHER[name])
+    fence, delta = fence_of(task), 0.05
+    problem = InteriorProblem(task.problem, fence, 1.0, delta, costs=False)
+    point = problem.point(task.control)
     expansion = problem.expand(point)
     assert expansion.barrier is not None
     w, rng = expansion.barrier.weights, np.random.default_rng(4)
-    for k in range(setup.samples):
+    for k in range(task.samples):
         form = np.block([[w.Q[k], w.S[k].T], [w.S[k], w.R[k]]])
         values = np.linalg.eigvalsh(0.5 * (form + form.T))
         assert values[0] > -1e-10 * values[-1]
@@ -138,11 +138,11 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     assert ((w.W[0] == 0.0).all(), (w.W[-1] == 0.0).all()) == free
     assert (w.W[1:-1] > 0.0).all()
     # its own: the squares of what every limited number moves by, times the curvature of its barrier
-    sight, N = fence.sight(seen(point).trajectory, seen(point).observed, slopes=True), setup.samples
-    _, _, rise = setup.plant.derivatives.observation_jacobians(
-        setup.theta, sight.trajectory, fence.observations
+    sight, N = fence.sight(seen(point).trajectory, seen(point).observed, slopes=True), task.samples
+    _, _, rise = task.plant.derivatives.observation_jacobians(
+        task.theta, sight.trajectory, fence.observations
     )
-    looked, ctrl = np.array(fence.observations.derivative_substeps) - 1, setup.control
+    looked, ctrl = np.array(fence.observations.derivative_substeps) - 1, task.control
     assert sight.distances is not None and sight.slopes is not None and fence.rate is not None
     assert fence.clearance is not None
     m, least = sight.distances.shape[1], np.full(sight.distances.shape[1], 0.03)
@@ -155,16 +155,16 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     ]
     for way in rng.normal(size=(3, *ctrl.shape)):
         way[0] = 0.0  # with a seam the metric leaves the move of the first control out
-        zeta = expansion.lift(np.zeros((N, 2, setup.space.nx)), way)
+        zeta = expansion.lift(np.zeros((N, 2, task.space.nx)), way)
         moves = [
             np.einsum("kswi,ki->ksw", rise, np.concatenate([zeta.z[:-1], zeta.v], axis=1)),
             zeta.v,
             fence.rates(ctrl + zeta.v) - fence.rates(ctrl),
-            np.einsum("kmi,ki->km", sight.slopes, zeta.z[1:, : setup.space.nv]),
+            np.einsum("kmi,ki->km", sight.slopes, zeta.z[1:, : task.space.nv]),
         ]
         wanted = [float(np.sum(bend * move**2)) for bend, move in zip(bends, moves, strict=True)]
         if fence.end is not None and fence.target is not None:
-            ended = setup.space.minus(sight.trajectory.state[-1], fence.target)
+            ended = task.space.minus(sight.trajectory.state[-1], fence.target)
             wanted.append(
                 float(
                     np.sum(fence.end.barrier(ended, delta, END_WEIGHT).curvature * zeta.z[-1] ** 2)
@@ -180,11 +180,11 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     narrow = replace(
         fence, shown=replace(fence.shown, lower=-endless, upper=endless), clearance=None, end=None
     )
-    problem = InteriorProblem(setup.problem, narrow, 1.0, delta, costs=False)
+    problem = InteriorProblem(task.problem, narrow, 1.0, delta, costs=False)
     barrier = problem.expand(problem.point(ctrl)).barrier
     assert barrier is not None
     _, b = barrier.weights.half_gradient(
-        TangentCurve(z=np.zeros((N + 1, setup.space.nx)), v=1e-5 * way)
+        TangentCurve(z=np.zeros((N + 1, task.space.nx)), v=1e-5 * way)
     )
     here, up, down = (problem.point(ctrl + s * way).barrier for s in (0.0, 1e-5, -1e-5))
     assert float(np.sum(b * 1e-5 * way)) == pytest.approx(up + down - 2 * here, rel=1e-3)
@@ -192,14 +192,14 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
 
 def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> None:
     """Over half of each range; the largest at any looked-at engine step."""
-    setup = arm_setup(tmp_path, limits=EVERY)
-    fence = fence_of(setup)
-    problem = InteriorProblem(setup.problem, fence, 1.0, 0.1, costs=False)
-    expansion = problem.expand(problem.point(setup.control))
+    task = arm_task(tmp_path, limits=EVERY)
+    fence = fence_of(task)
+    problem = InteriorProblem(task.problem, fence, 1.0, 0.1, costs=False)
+    expansion = problem.expand(problem.point(task.control))
     assert expansion.barrier is not None
-    for way in 1e-4 * directions_of(setup, 4, seed=2):
-        zeta = expansion.lift(np.zeros((setup.samples, 2, setup.space.nx)), way)
-        up, down = (seen(problem.point(setup.control + s * way)).observed for s in (1.0, -1.0))
+    for way in 1e-4 * directions_of(task, 4, seed=2):
+        zeta = expansion.lift(np.zeros((task.samples, 2, task.space.nx)), way)
+        up, down = (seen(problem.point(task.control + s * way)).observed for s in (1.0, -1.0))
         moved = (0.5 * np.abs(up - down) / fence.shown.scale)[
             :, np.array(fence.observations.derivative_substeps) - 1
         ].max()
@@ -209,20 +209,20 @@ def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> Non
 
 def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> None:
     """Every kind at once, in its own unit, at every engine step; shares are the same over half of the range."""
-    setup = arm_setup(
+    task = arm_task(
         tmp_path,
         limits=EVERY,
         boundary={"start": "rest", "end": "rest", "position": 0.2, "velocity": 3.0},
     )
-    fence, model, limits = fence_of(setup), mujoco.MjModel.from_xml_string(ARM), setup.limits
-    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
+    fence, model, limits = fence_of(task), mujoco.MjModel.from_xml_string(ARM), task.limits
+    watched = task.plant.observe(task.theta, task.control, fence.observations)
     assert watched is not None
     data, rows, near = mujoco.MjData(model), {kind: [] for kind in KINDS}, []
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     geoms = [model.geom(name).id for name in ("fore", "post", "floor", "upper")]
-    for held in setup.control:
+    for held in task.control:
         data.ctrl[:] = held
-        for _ in range(setup.substeps):
+        for _ in range(task.system.grid.substeps):
             before = data.qvel.copy()
             mujoco.mj_step(model, data)
             now = {
@@ -236,10 +236,10 @@ def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> Non
         mujoco.mj_kinematics(model, data)
         for a, b in ((0, 1), (0, 2), (3, 1)):
             near.append(mujoco.mj_geomDistance(model, data, geoms[a], geoms[b], 1.0, None))
-    held = setup.final_hold  # the start is the end
-    rows["control"] = list(setup.control)
+    held = task.final_hold  # the start is the end
+    rows["control"] = list(task.control)
     rows["control_rate"] = list(
-        np.diff(setup.control, axis=0, prepend=setup.hold[None], append=held[None]) / 0.01
+        np.diff(task.control, axis=0, prepend=task.initial_hold[None], append=held[None]) / 0.01
     )
     wanted, shares = {}, {}
     for kind in KINDS - {"clearance"}:
@@ -269,11 +269,11 @@ def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> Non
 
 
 def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> None:
-    setup = arm_setup(
+    task = arm_task(
         tmp_path, limits=EVERY, boundary={"end": "periodic", "position": 0.2, "velocity": 3.0}
     )
-    fence = fence_of(setup)
-    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
+    fence = fence_of(task)
+    watched = task.plant.observe(task.theta, task.control, fence.observations)
     assert watched is not None
     sight = fence.sight(*watched, slopes=False)
     shares = {kind: 0.01 * (i + 1) for i, kind in enumerate(sorted(fence.margins(sight)))}
@@ -294,8 +294,8 @@ def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> 
 
 
 def test_rates_begin_and_end_where_the_boundary_says(tmp_path: Path) -> None:
-    setup = arm_setup(tmp_path, limits={"control_rate": 9.0})
-    fence, ctrl = fence_of(setup), setup.control
+    task = arm_task(tmp_path, limits={"control_rate": 9.0})
+    fence, ctrl = fence_of(task), task.control
     inner = np.diff(ctrl, axis=0) / 0.01
     np.testing.assert_allclose(fence.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
     before, after = np.array([0.7, 0.1]), np.array([-0.2, 0.3])
@@ -310,10 +310,10 @@ def test_rates_begin_and_end_where_the_boundary_says(tmp_path: Path) -> None:
 
 def test_without_enforcement_only_the_boundary_is_left(tmp_path: Path) -> None:
     """What is checked and reported is all of them."""
-    setup = arm_setup(tmp_path, limits={**EVERY, "enforce": False}, boundary={"end": "periodic"})
+    task = arm_task(tmp_path, limits={**EVERY, "enforce": False}, boundary={"end": "periodic"})
     for every, kinds in ((False, set()), (True, KINDS)):
-        fence = fence_of(setup, every=every)
-        watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
+        fence = fence_of(task, every=every)
+        watched = task.plant.observe(task.theta, task.control, fence.observations)
         assert watched is not None
         sight = fence.sight(*watched, slopes=False)
         assert isinstance(sight, Sight)

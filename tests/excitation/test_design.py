@@ -10,10 +10,12 @@ import pytest
 
 import mjfim
 from mjfim.errors import ExperimentError, ModelError, UnidentifiableError
+from mjfim.excitation.design import design_task
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.records.design import Status
-from tests.support.numerics import CART_PARAMETERS, cart_setup
+from tests.support.numerics import CART_PARAMETERS, cart_task
 from tests.support.paths import ROOT
 
 
@@ -41,8 +43,8 @@ def test_scale_does_not_change_the_predicted_deviation(experiment: Experiment) -
     large = {name: {"scale": 1e4} for name in ("m", "l", "c")}
     stds = []
     for table in (relative, large):
-        setup = Setup(experiment.replace(parameters=table))
-        stds.append(mjfim.evaluate_trajectory(setup, setup.initial).std)
+        task = DesignTask.resolve(experiment.replace(parameters=table))
+        stds.append(evaluate_task(task, task.initial).std)
     np.testing.assert_allclose(stds[0], stds[1], rtol=1e-9)
 
 
@@ -54,7 +56,7 @@ def test_actuator_delays_are_refused(experiment: Experiment, tmp_path: Path) -> 
         '<motor name="force" joint="slide" delay="0.05" nsample="8"/>',
     )
     with pytest.raises(ModelError, match="delays"):
-        Setup(late)
+        DesignTask.resolve(late)
 
 
 def test_saturation_is_said(experiment: Experiment, tmp_path: Path) -> None:
@@ -118,13 +120,13 @@ def test_units_come_from_the_path_where_none_is_stated(experiment: Experiment) -
     values = experiment.model_dump(exclude_unset=True)
     for table in values["parameters"].values():
         table.pop("unit")
-    setup = Setup(Experiment(**values, directory=ROOT / "models"))
-    assert setup.units == ("kg", "m", "N m s/rad")
+    task = DesignTask.resolve(Experiment(**values, directory=ROOT / "models"))
+    assert task.system.units == ("kg", "m", "N m s/rad")
 
 
 def test_where_the_smallest_eigenvalues_meet_the_descent_goes_on_smoothly(tmp_path: Path) -> None:
-    setup = cart_setup(tmp_path, horizon=1.0, cost={"control": 1e-4})
-    made = mjfim.design(setup)
+    task = cart_task(tmp_path, horizon=1.0, cost={"control": 1e-4})
+    made = design_task(task)
     assert made.status is Status.SMOOTHED
     assert made.success
     first, second = made.final.eigenvalues[:2]
@@ -132,7 +134,7 @@ def test_where_the_smallest_eigenvalues_meet_the_descent_goes_on_smoothly(tmp_pa
     # what is reported is the exact criterion, and the best that any iterate had
     assert made.final.criterion == pytest.approx(1.0 / first, rel=1e-9)
     assert made.final.cost == pytest.approx(
-        1.0 / first + setup.problem.running.value(made.trajectory), rel=1e-9
+        1.0 / first + task.problem.running.value(made.trajectory), rel=1e-9
     )
     fine = [row.cost for row in made.history if row.rate == 100.0]
     assert made.final.cost == pytest.approx(min(fine), rel=1e-12)
@@ -140,38 +142,38 @@ def test_where_the_smallest_eigenvalues_meet_the_descent_goes_on_smoothly(tmp_pa
     # no small change of the control is much better
     rng, here = np.random.default_rng(0), made.trajectory.ctrl
     for _ in range(10):
-        wave = np.sin(2 * np.pi * rng.uniform(0.5, 4.0) * setup.t + rng.uniform(0.0, 6.3))[:, None]
+        wave = np.sin(2 * np.pi * rng.uniform(0.5, 4.0) * task.t + rng.uniform(0.0, 6.3))[:, None]
         for size in (-0.3, 0.3):
-            moved = setup.problem.point(setup.plant.simulate(setup.theta, here + size * wave))
+            moved = task.problem.point(task.plant.simulate(task.theta, here + size * wave))
             assert moved.cost > 0.99 * made.final.cost
 
 
 def test_a_design_that_knows_of_its_nuisances_beats_one_that_does_not(tmp_path: Path) -> None:
     shared = {"horizon": 1.0, "cost": {"control": 1e-3}}
-    unsure = cart_setup(tmp_path, **shared, nuisance={"initial": True, "bias": 0.2})
-    aware, naive = mjfim.design(unsure), mjfim.design(cart_setup(tmp_path, **shared))
+    unsure = cart_task(tmp_path, **shared, nuisance={"initial": True, "bias": 0.2})
+    aware, naive = design_task(unsure), design_task(cart_task(tmp_path, **shared))
     assert naive.nuisance == ()
     assert aware.nuisance[0] == "initial qpos:slide"
     assert len(aware.nuisance) == 8
     assert aware.final.eigenvalues.shape == (3,)
-    there = mjfim.evaluate_trajectory(unsure, naive.trajectory)
+    there = evaluate_task(unsure, naive.trajectory)
     assert aware.final.cost < 0.95 * there.cost
     # the trajectory is judged by the block of the full inverse that belongs to the wanted parameters
     block = np.linalg.inv(aware.final.information)[:3, :3] / np.outer(
         unsure.theta[:3], unsure.theta[:3]
     )
-    seen = np.sort(1.0 / np.linalg.eigvalsh(block)) / unsure.measure_rate
+    seen = np.sort(1.0 / np.linalg.eigvalsh(block)) / unsure.system.measure_rate
     np.testing.assert_allclose(aware.final.eigenvalues, seen, rtol=1e-6)
 
 
 def test_a_design_for_one_combination_tells_it_better_than_one_for_all(tmp_path: Path) -> None:
     wanted = {"criterion": "c", "combination": {"m": 1.0, "l": -1.0}, "control": 1e-3}
-    setup = cart_setup(tmp_path, horizon=1.0, cost=wanted)
-    made, general = mjfim.design(setup), mjfim.design(cart_setup(tmp_path, horizon=1.0))
-    assert made.final.cost < 0.9 * mjfim.evaluate_trajectory(setup, general.trajectory).cost
+    task = cart_task(tmp_path, horizon=1.0, cost=wanted)
+    made, general = design_task(task), design_task(cart_task(tmp_path, horizon=1.0))
+    assert made.final.cost < 0.9 * evaluate_task(task, general.trajectory).cost
     c = np.array([1.0, -1.0, 0.0])
     variance = c @ np.linalg.inv(made.final.information) @ c
-    assert made.final.criterion == pytest.approx(variance * setup.measure_rate, rel=1e-9)
+    assert made.final.criterion == pytest.approx(variance * task.system.measure_rate, rel=1e-9)
 
 
 RATED = {"state": 0.05, "qpos:hinge": {"sigma": 0.01, "rate": 20.0}}
@@ -188,15 +190,15 @@ LEVELS = {
 
 @pytest.mark.parametrize("case", LEVELS)
 def test_a_coarser_level_costs_about_the_same(case: str, tmp_path: Path) -> None:
-    setup = cart_setup(tmp_path, horizon=4.0, **LEVELS[case])
-    fine, coarse = (s.problem.point(s.initial) for s in (setup, setup.coarser(4)))
+    task = cart_task(tmp_path, horizon=4.0, **LEVELS[case])
+    fine, coarse = (s.problem.point(s.initial) for s in (task, task.coarser(4)))
     assert coarse.criterion.value == pytest.approx(fine.criterion.value, rel=0.03)
     assert coarse.cost == pytest.approx(fine.cost, rel=0.03)
 
 
 def test_the_choice_of_a_group_needs_no_error_where_members_are_invisible(tmp_path: Path) -> None:
     parameters = {"bob": {"inertial": "bob", "coordinates": "barycentric"}}
-    made = mjfim.design(cart_setup(tmp_path, parameters=parameters, descent={"max_iterations": 3}))
+    made = design_task(cart_task(tmp_path, parameters=parameters, descent={"max_iterations": 3}))
     # a point on a planar pendulum shows its mass, two first moments and the inertia about the hinge
     assert made.combinations[-1].endswith("no effect on anything that is measured")
     assert len(made.final.eigenvalues) < 10
@@ -211,7 +213,7 @@ def test_a_coarse_factor_that_does_not_divide_the_samples_is_refused(tmp_path: P
         ExperimentError,
         match=r"descent\.coarse: 4 does not divide the 406 samples; .*: 1, 2, 7, 14$",
     ):
-        mjfim.design(
-            cart_setup(tmp_path, **{**tables, "descent": {"max_iterations": 1, "coarse": 4}})
+        design_task(
+            cart_task(tmp_path, **{**tables, "descent": {"max_iterations": 1, "coarse": 4}})
         )
-    mjfim.design(cart_setup(tmp_path, **tables))
+    design_task(cart_task(tmp_path, **tables))

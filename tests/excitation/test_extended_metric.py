@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjfim.excitation.design import design
+from mjfim.excitation.design import design_task
 from mjfim.excitation.objective import extend
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, direction_for
-from mjfim.experiment.system import Setup
 from mjfim.information.fisher import Information
 from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
@@ -19,7 +19,7 @@ from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, Bilinear
 from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Sensitivity
-from tests.support.numerics import Array, Loop, body_setup, cart_setup, relative_error
+from tests.support.numerics import Array, Loop, body_task, cart_task, relative_error
 
 TRACKING = {"tracking": {"slide": 0.3, "hinge": 0.1}, "control": 1e-2}
 SENSED = {"angle": 0.01, "acc": 0.3, "drive": 0.1}
@@ -27,22 +27,22 @@ SENSED = {"angle": 0.01, "acc": 0.3, "drive": 0.1}
 CORRELATED = ({"outputs": ("angle", "drive"), "covariance": ((1e-4, 5e-4), (5e-4, 0.01))},)
 
 
-def expanded(setup: Setup) -> Expansion:
+def expanded(task: DesignTask) -> Expansion:
     """Expansion of J about the initial trajectory, psi among the states."""
-    problem = replace(setup.problem, extended=True)
-    return problem.expand(problem.point(setup.initial, CENTRAL_DIFFERENCES))
+    problem = replace(task.problem, extended=True)
+    return problem.expand(problem.point(task.initial, CENTRAL_DIFFERENCES))
 
 
 def both_directions(
-    setup: Setup, psi_weight: float
+    task: DesignTask, psi_weight: float
 ) -> tuple[Expansion, TangentCurve, TangentCurve]:
     """Expansion, metric descent, extended metric descent with a weight on psi."""
-    dt, p, nx = setup.dt, len(setup.theta), setup.space.nx
-    Q, R = np.diag(setup.tracking + 0.02) * dt, np.diag(setup.control_weight) * dt
+    dt, p, nx = task.dt, len(task.theta), task.space.nx
+    Q, R = np.diag(task.tracking + 0.02) * dt, np.diag(task.control_weight) * dt
     wide = np.zeros((nx * (1 + p), nx * (1 + p)))
     wide[:nx, :nx] = Q
     wide[nx:, nx:] = psi_weight * dt * np.eye(nx * p)
-    expansion, K = expanded(setup), np.zeros((setup.samples, setup.plant.nu, nx))
+    expansion, K = expanded(task), np.zeros((task.samples, task.plant.nu, nx))
     return (
         expansion,
         MetricDescent(Q, R, 3.0 * Q)(expansion, K),
@@ -56,18 +56,18 @@ def extended_direction(e: Expansion, K: Array, Q: Array, R: Array, terminal: Arr
 
 
 CASES = {
-    "cart E": lambda f: cart_setup(f, cost=TRACKING),
-    "cart A": lambda f: cart_setup(f, cost={**TRACKING, "criterion": "A"}),
-    "cart D sensors": lambda f: cart_setup(
+    "cart E": lambda f: cart_task(f, cost=TRACKING),
+    "cart A": lambda f: cart_task(f, cost={**TRACKING, "criterion": "A"}),
+    "cart D sensors": lambda f: cart_task(
         f, "Euler", noise=SENSED, cost={**TRACKING, "criterion": "D"}
     ),
-    "cart, correlated, nuisances": lambda f: cart_setup(
+    "cart, correlated, nuisances": lambda f: cart_task(
         f,
         noise=SENSED,
         correlated=CORRELATED,
         nuisance={"initial": 0.05, "bias": 0.1, "delay": 0.02},
     ),
-    "free body": body_setup,
+    "free body": body_task,
 }
 
 
@@ -129,11 +129,11 @@ def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None
 
 @pytest.mark.parametrize("case", CASES)
 def test_extended_slope_is_the_reduced_slope(case: str, tmp_path) -> None:
-    setup = CASES[case](tmp_path)
-    e, rng = expanded(setup), np.random.default_rng(1)
+    task = CASES[case](tmp_path)
+    e, rng = expanded(task), np.random.default_rng(1)
     wide = e.extended
     for _ in range(3):
-        v = rng.normal(size=setup.control.shape)
+        v = rng.normal(size=task.control.shape)
         z = LinearRecursion(e.A).forward(np.zeros(e.A.shape[1]), np.einsum("kij,kj->ki", e.B, v))
         full = LinearRecursion(wide.A).forward(
             np.zeros(wide.A.shape[1]), np.einsum("kij,kj->ki", wide.B, v)
@@ -153,22 +153,22 @@ def test_extended_slope_is_the_reduced_slope(case: str, tmp_path) -> None:
 def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_trajectories(
     case: str, tmp_path
 ) -> None:
-    setup = CASES[case](tmp_path)
-    wide, nx, p = expanded(setup).extended, setup.space.nx, len(setup.theta)
-    v, h = np.cos(9.0 * setup.t)[:, None] * np.ones(setup.plant.nu), 1e-2
+    task = CASES[case](tmp_path)
+    wide, nx, p = expanded(task).extended, task.space.nx, len(task.theta)
+    v, h = np.cos(9.0 * task.t)[:, None] * np.ones(task.plant.nu), 1e-2
     full = LinearRecursion(wide.A).forward(
         np.zeros(nx * (1 + p)), np.einsum("kij,kj->ki", wide.B, v)
     )
-    up, down = (setup.plant.simulate(setup.theta, setup.control + s * h * v) for s in (1, -1))
-    psi = [setup.plant.derivatives.sensitivity(setup.theta, curve).psi for curve in (up, down)]
-    change = np.swapaxes(psi[0] - psi[1], 1, 2).reshape(setup.samples + 1, p, nx) / (2 * h)
-    moved = full[:, nx:].reshape(setup.samples + 1, p, nx)
+    up, down = (task.plant.simulate(task.theta, task.control + s * h * v) for s in (1, -1))
+    psi = [task.plant.derivatives.sensitivity(task.theta, curve).psi for curve in (up, down)]
+    change = np.swapaxes(psi[0] - psi[1], 1, 2).reshape(task.samples + 1, p, nx) / (2 * h)
+    moved = full[:, nx:].reshape(task.samples + 1, p, nx)
     for j in range(p):
         assert relative_error(moved[:, j], change[:, j]) < 1e-3
 
 
 def psi_step(
-    setup: Setup, thetas: tuple[Loop, Loop], h: float, x: Array, u: Array, psi: Array, j: int
+    task: DesignTask, thetas: tuple[Loop, Loop], h: float, x: Array, u: Array, psi: Array, j: int
 ) -> Array:
     """psi_{k+1} of parameter j as a function of (x, u, psi): a plain difference of two steps at theta_j +- h."""
     up, down = thetas
@@ -178,17 +178,15 @@ def psi_step(
 
 @pytest.mark.parametrize("case", ["cart E", "free body"])
 def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tmp_path) -> None:
-    setup = CASES[case](tmp_path)
-    wide, nx, p, nu = expanded(setup).extended, setup.space.nx, len(setup.theta), setup.plant.nu
-    curve, S = setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = CASES[case](tmp_path)
+    wide, nx, p, nu = expanded(task).extended, task.space.nx, len(task.theta), task.plant.nu
+    curve, S = task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
     d = 1e-3
     for k, j in ((11, 0), (37, p - 1)):
-        h = 1e-3 * abs(setup.theta[j])
+        h = 1e-3 * abs(task.theta[j])
         shift = h * np.eye(p)[j]
         pair = tuple(
-            Loop(
-                setup.parameters.writer.model(setup.plant.source.model, setup.theta + s * shift), 1
-            )
+            Loop(task.parameters.writer.model(task.plant.source.model, task.theta + s * shift), 1)
             for s in (1, -1)
         )
         x, u, psi, loop = curve.state[k], curve.ctrl[k], S.psi[k][:, j], pair[0]
@@ -196,15 +194,12 @@ def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tm
         for i in range(nx + nu):
             e = d * np.eye(nx + nu)[i]
             moved = [
-                psi_step(setup, pair, h, loop.plus(x, s * e[:nx]), u + s * e[nx:], psi, j)
+                psi_step(task, pair, h, loop.plus(x, s * e[:nx]), u + s * e[nx:], psi, j)
                 for s in (1, -1)
             ]
             columns.append((moved[0] - moved[1]) / (2 * d))
         by_psi = [
-            (
-                psi_step(setup, pair, h, x, u, psi + s, j)
-                - psi_step(setup, pair, h, x, u, psi - s, j)
-            )
+            (psi_step(task, pair, h, x, u, psi + s, j) - psi_step(task, pair, h, x, u, psi - s, j))
             / 2
             for s in np.eye(nx)
         ]
@@ -220,32 +215,32 @@ def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tm
 
 
 def test_x_does_not_depend_on_psi_in_the_extended_system(tmp_path) -> None:
-    setup = CASES["cart E"](tmp_path)
-    wide = expanded(setup).extended
+    task = CASES["cart E"](tmp_path)
+    wide = expanded(task).extended
     np.testing.assert_array_equal(wide.A[:, :4, 4:], 0.0)
-    L = setup.plant.derivatives.linearize(setup.theta, setup.initial)
+    L = task.plant.derivatives.linearize(task.theta, task.initial)
     assert relative_error(wide.A[:, :4, :4], L.A) < 1e-5
     assert relative_error(wide.B[:, :4], L.B) < 1e-5
 
 
 def test_an_expansion_without_psi_is_refused(tmp_path) -> None:
-    setup = cart_setup(tmp_path)
-    plain = setup.problem.expand(setup.problem.point(setup.initial, CENTRAL_DIFFERENCES))
+    task = cart_task(tmp_path)
+    plain = task.problem.expand(task.problem.point(task.initial, CENTRAL_DIFFERENCES))
     assert plain.extended is None
     with pytest.raises(ValueError, match="extended"):
         extended_direction(plain, np.zeros((50, 1, 4)), np.eye(16), np.eye(1), np.eye(16))
 
 
 def test_the_experiment_chooses_the_extended_metric_and_it_lowers_the_cost(tmp_path: Path) -> None:
-    setup = cart_setup(
+    task = cart_task(
         tmp_path, descent={"method": "metric", "psi_weight": 1e-4, "max_iterations": 3}
     )
-    direction, problem = direction_for(Stage(setup, None))
+    direction, problem = direction_for(Stage(task, None))
     assert isinstance(direction, ExtendedMetricDescent)
     assert problem.extended
     assert direction.Q.shape == (16, 16)
-    assert np.count_nonzero(np.diag(direction.Q)[4:] == 1e-4 * setup.dt) == 12
-    result = design(setup)
+    assert np.count_nonzero(np.diag(direction.Q)[4:] == 1e-4 * task.dt) == 12
+    result = design_task(task)
     costs = [row.cost for row in result.history]
     assert len(costs) == 4
     assert (np.diff(costs) < 0).all()

@@ -10,10 +10,10 @@ import pytest
 
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.initial_controls import starts_of
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.signals import fourier_basis
 from tests.support.limits import ARM
-from tests.support.numerics import make_setup
+from tests.support.numerics import make_task
 
 SWING = {
     "kind": "sine",
@@ -24,7 +24,7 @@ SWING = {
 RANGE = {"shoulder": (-0.35, 0.3)}
 
 
-def arm(folder: Path, **tables: Any) -> Setup:
+def arm(folder: Path, **tables: Any) -> DesignTask:
     """The arm for a second."""
     defaults: dict[str, Any] = {
         "horizon": 1.0,
@@ -33,18 +33,18 @@ def arm(folder: Path, **tables: Any) -> Setup:
         "control": SWING,
         "limits": {"control": RANGE},
     }
-    return make_setup(ARM, folder, **{**defaults, **tables})
+    return make_task(ARM, folder, **{**defaults, **tables})
 
 
 def test_the_given_control_takes_the_place_of_the_initial_one(tmp_path: Path) -> None:
-    setup = arm(tmp_path, descent={"starts": 3, "fourier": (1.5,), "seed": 4})
-    starts = list(starts_of(setup, None))
+    task = arm(tmp_path, descent={"starts": 3, "fourier": (1.5,), "seed": 4})
+    starts = list(starts_of(task, None))
     random = ["Fourier series of 1.5 Hz", "multisine 1 of 2", "multisine 2 of 2"]
     assert [s.name for s in starts] == ["initial control", *random]
-    np.testing.assert_array_equal(starts[0].control, setup.control)
-    given = list(starts_of(setup, 0.5 * setup.control))
+    np.testing.assert_array_equal(starts[0].control, task.control)
+    given = list(starts_of(task, 0.5 * task.control))
     assert [s.name for s in given] == ["given control", *random]
-    np.testing.assert_array_equal(given[0].control, 0.5 * setup.control)
+    np.testing.assert_array_equal(given[0].control, 0.5 * task.control)
     for own, other in zip(starts[1:], given[1:], strict=True):  # the seed alone decides them
         np.testing.assert_array_equal(own.control, other.control)
     assert len({s.control.tobytes() for s in starts}) == 4
@@ -55,11 +55,11 @@ def test_the_given_control_takes_the_place_of_the_initial_one(tmp_path: Path) ->
 def test_random_starts_swing_about_the_middle_up_to_six_times_as_far_within_their_range(
     tmp_path: Path,
 ) -> None:
-    setup = arm(tmp_path, descent={"starts": 40})
-    shoulder, elbow = np.array([s.control for s in starts_of(setup, None)][1:]).transpose(2, 0, 1)
+    task = arm(tmp_path, descent={"starts": 40})
+    shoulder, elbow = np.array([s.control for s in starts_of(task, None)][1:]).transpose(2, 0, 1)
     assert shoulder.max() == 0.3 and shoulder.min() == -0.35
-    middle = setup.control[:, 1].mean()
-    peaks = np.abs(elbow - middle).max(axis=1) / np.abs(setup.control[:, 1] - middle).max()
+    middle = task.control[:, 1].mean()
+    peaks = np.abs(elbow - middle).max(axis=1) / np.abs(task.control[:, 1] - middle).max()
     assert peaks.min() >= 1.0 - 1e-9 and peaks.max() <= 6.0 + 1e-9
     assert peaks.min() < 2.0 and peaks.max() > 5.0
 
@@ -68,9 +68,9 @@ def test_random_starts_swing_about_the_middle_up_to_six_times_as_far_within_thei
 @pytest.mark.parametrize("ends", [False, True])
 def test_they_swell_from_what_holds_and_fade(begins: bool, ends: bool, tmp_path: Path) -> None:
     boundary = {"start": "rest" if begins else "given", "end": "rest" if ends else "free"}
-    setup = arm(tmp_path, boundary=boundary, descent={"starts": 6})
-    middle = setup.hold if begins else setup.control.mean(axis=0)
-    for start in list(starts_of(setup, None))[1:]:
+    task = arm(tmp_path, boundary=boundary, descent={"starts": 6})
+    middle = task.initial_hold if begins else task.control.mean(axis=0)
+    for start in list(starts_of(task, None))[1:]:
         away = np.abs(start.control - middle)
         assert bool((away[0] < 1e-12).all()) is begins
         assert bool((away[90:] < 1e-12).all()) is ends
@@ -85,11 +85,11 @@ def test_a_fourier_start_brings_its_series(begins: bool, ends: bool, tmp_path: P
     boundary = {"start": "rest" if begins else "given", "end": "rest" if ends else "free"}
     for bandwidth, harmonics in ((None, 15), (7.0, 4)):
         limits = {"control": RANGE, **({"bandwidth": bandwidth} if bandwidth else {})}
-        setup = arm(tmp_path, boundary=boundary, limits=limits, descent={"fourier": (1.5,)})
-        series = list(starts_of(setup, None))[1].basis
+        task = arm(tmp_path, boundary=boundary, limits=limits, descent={"fourier": (1.5,)})
+        series = list(starts_of(task, None))[1].basis
         assert series is not None
         np.testing.assert_array_equal(
-            series, fourier_basis(setup.t, 1.0, 1.5, harmonics, begins, ends)
+            series, fourier_basis(task.t, 1.0, 1.5, harmonics, begins, ends)
         )
 
 
@@ -97,11 +97,11 @@ def test_a_fourier_start_brings_its_series(begins: bool, ends: bool, tmp_path: P
 def test_a_series_without_a_single_harmonic_is_refused(
     limits: dict[str, float], most: int, tmp_path: Path
 ) -> None:
-    setup = arm(tmp_path, limits=limits, descent={"fourier": (60.0,)})
+    task = arm(tmp_path, limits=limits, descent={"fourier": (60.0,)})
     with pytest.raises(
         ExperimentError, match=rf"descent\.fourier: 60 Hz is above the bandwidth of {most} Hz"
     ):
-        list(starts_of(setup, None))
+        list(starts_of(task, None))
 
 
 def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) -> None:
@@ -111,10 +111,10 @@ def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) ->
     for name, count in (("old.csv", 21), ("short.csv", 5)):
         text = "\n".join(["t,ctrl:shoulder,ctrl:elbow,qpos:elbow", *lines[:count]])
         (tmp_path / name).write_text(text + "\n", encoding="utf-8")
-    setup = arm(
+    task = arm(
         tmp_path, descent={"previous": (str(tmp_path / "old.csv"), str(tmp_path / "short.csv"))}
     )
-    (_, old, short) = starts_of(setup, None)
+    (_, old, short) = starts_of(task, None)
     assert (old.name, short.name) == (
         f"previous design {tmp_path}/old.csv",
         f"previous design {tmp_path}/short.csv",
@@ -133,18 +133,18 @@ def test_a_repeated_start_is_the_first_part_of_the_initial_control_faded_to_rest
     tmp_path: Path,
 ) -> None:
     boundary, limits = {"start": "rest", "end": "rest"}, {"control": RANGE, "control_rate": 5.0}
-    setup = arm(tmp_path, boundary=boundary, limits=limits, descent={"repeats": (2, 4)})
-    half, quarter = list(starts_of(setup, None))[1:]
+    task = arm(tmp_path, boundary=boundary, limits=limits, descent={"repeats": (2, 4)})
+    half, quarter = list(starts_of(task, None))[1:]
     assert (half.name, half.repeats, len(half.control)) == (
         "2 times a design of 0.5 s",
         2,
-        setup.samples // 2,
+        task.samples // 2,
     )
-    assert (quarter.repeats, len(quarter.control)) == (4, setup.samples // 4)
-    np.testing.assert_allclose(half.control[0], setup.centre)
+    assert (quarter.repeats, len(quarter.control)) == (4, task.samples // 4)
+    np.testing.assert_allclose(half.control[0], task.centre)
     middle = slice(len(half.control) // 10 + 1, 3 * len(half.control) // 4)
-    np.testing.assert_allclose(half.control[middle], setup.control[: len(half.control)][middle])
-    assert np.abs(half.control[-1] - setup.centre).max() < 1e-9
+    np.testing.assert_allclose(half.control[middle], task.control[: len(half.control)][middle])
+    assert np.abs(half.control[-1] - task.centre).max() < 1e-9
 
 
 def test_repeats_that_do_not_divide_or_lack_limits_are_refused(tmp_path: Path) -> None:

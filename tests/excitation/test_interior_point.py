@@ -11,10 +11,10 @@ import pytest
 
 from mjfim.excitation.constraints import fence_of
 from mjfim.excitation.interior_point import DIVERGED_POINT, InteriorProblem, seen
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.optimize.projection_operator import Expansion
 from tests.support.limits import directions_of
-from tests.support.numerics import Array, cart_setup, directional_check
+from tests.support.numerics import Array, cart_task, directional_check
 
 LIMITS = {
     "control": {"force": (-5.0, 4.5)},
@@ -40,21 +40,23 @@ COSTS: dict[str, dict[str, Any]] = {
 }
 
 
-def problem_of(name: str, folder: Path, **tables: Any) -> tuple[Setup, InteriorProblem]:
+def problem_of(name: str, folder: Path, **tables: Any) -> tuple[DesignTask, InteriorProblem]:
     """The cart-pendulum within limits, some of which its initial control leaves."""
-    setup = cart_setup(folder, limits=LIMITS, **{**COSTS[name], **tables}).free()
-    base = setup.problem
+    task = cart_task(folder, limits=LIMITS, **{**COSTS[name], **tables}).relaxed()
+    base = task.problem
     if name == "smooth E":
         base = replace(base, information=replace(base.information, power=40.0))
-    return setup, InteriorProblem(base, fence_of(setup), 0.2, 0.05)
+    return task, InteriorProblem(base, fence_of(task), 0.2, 0.05)
 
 
-def check(setup: Setup, problem: InteriorProblem, expansion: Expansion, h: float = 2e-4) -> float:
+def check_task(
+    task: DesignTask, problem: InteriorProblem, expansion: Expansion, h: float = 2e-4
+) -> float:
     """Largest relative error of the slope of the problem's value along random controls."""
-    gradient = expansion.gradient(np.zeros((setup.samples, 1, setup.space.nx)))
-    ways = directions_of(setup, 4)
+    gradient = expansion.gradient(np.zeros((task.samples, 1, task.space.nx)))
+    ways = directions_of(task, 4)
     curves = [
-        lambda s, way=way: problem.value(problem.point(setup.control + s * way)) for way in ways
+        lambda s, way=way: problem.value(problem.point(task.control + s * way)) for way in ways
     ]
     return directional_check([float(np.sum(gradient * way)) for way in ways], curves, h)
 
@@ -62,16 +64,16 @@ def check(setup: Setup, problem: InteriorProblem, expansion: Expansion, h: float
 @pytest.mark.parametrize("name", COSTS)
 def test_its_slope_is_that_of_simulated_controls(name: str, tmp_path: Path) -> None:
     """With the barrier, whose share stands apart, and of the logarithm of the cost alone."""
-    setup, problem = problem_of(name, tmp_path)
-    point = problem.point(setup.control)
+    task, problem = problem_of(name, tmp_path)
+    point = problem.point(task.control)
     expansion = problem.expand(point)
-    assert check(setup, problem, expansion) < 5e-3
+    assert check_task(task, problem, expansion) < 5e-3
     bare, barrier = replace(problem, mu=0.0), expansion.barrier
     assert barrier is not None
     alone = Expansion(
         A=expansion.A, B=expansion.B, a=expansion.a - barrier.a, b=expansion.b - barrier.b
     )
-    assert check(setup, bare, alone) < 5e-3
+    assert check_task(task, bare, alone) < 5e-3
     twice = replace(problem, mu=0.4, delta=0.05).expand(point).barrier
     assert twice is not None
     np.testing.assert_allclose(twice.b, 2.0 * barrier.b, rtol=1e-12)
@@ -80,10 +82,10 @@ def test_its_slope_is_that_of_simulated_controls(name: str, tmp_path: Path) -> N
 @pytest.mark.parametrize("name", COSTS)
 def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> None:
     """The logarithm of J; of D-optimality, which is one, J per nat: one for each parameter and its weight."""
-    setup, problem = problem_of(name, tmp_path)
-    point = problem.point(setup.control)
+    task, problem = problem_of(name, tmp_path)
+    point = problem.point(task.control)
     assert point.point is not None
-    J = setup.problem.point(setup.initial).cost
+    J = task.problem.point(task.initial).cost
     if name == "smooth E":
         assert point.point.cost > J  # at most p^(1/q) above it
         J = point.point.cost
@@ -93,13 +95,13 @@ def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> No
     assert point.barrier == problem.fence.value(sight, 0.05)
     assert problem.value(point) == pytest.approx(point.merit + 0.2 * point.barrier, rel=1e-12)
     assert problem.size(point) == 1.0
-    np.testing.assert_array_equal(point.ctrl, setup.control)
+    np.testing.assert_array_equal(point.ctrl, task.control)
 
 
 def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
     """Without a step of the model: another mu, delta, fence or criterion."""
-    setup, problem = problem_of("E", tmp_path)
-    point = problem.point(setup.control)
+    task, problem = problem_of("E", tmp_path)
+    point = problem.point(task.control)
     tight = problem.fence.tightened({"control": 0.1, "position": 0.05, "velocity": 0.2})
     smooth = replace(problem.base, information=replace(problem.base.information, power=10.0))
     for other in (
@@ -108,11 +110,11 @@ def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
         replace(problem, base=smooth),
         replace(problem, base=smooth, fence=tight, mu=1e-3, delta=3e-4),
     ):
-        begun = setup.plant.simulator.steps
+        begun = task.plant.simulator.steps
         again = other.again(point)
-        assert setup.plant.simulator.steps == begun
-        fresh = other.point(setup.control)
-        assert setup.plant.simulator.steps > begun
+        assert task.plant.simulator.steps == begun
+        fresh = other.point(task.control)
+        assert task.plant.simulator.steps > begun
         assert (again.merit, again.barrier) == (fresh.merit, fresh.barrier)
         assert other.value(again) == other.value(fresh) != problem.value(point)
         e, f = other.expand(again), other.expand(fresh)
@@ -121,27 +123,27 @@ def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
 
 
 def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
-    setup, problem = problem_of("E", tmp_path)
+    task, problem = problem_of("E", tmp_path)
     inward = replace(problem, mu=1.0, costs=False)
-    begun = setup.plant.simulator.steps
-    point = inward.point(setup.control)
+    begun = task.plant.simulator.steps
+    point = inward.point(task.control)
     assert (
-        setup.plant.simulator.steps - begun == setup.samples * setup.substeps
+        task.plant.simulator.steps - begun == task.samples * task.system.grid.substeps
     )  # one rollout, no sensitivity
     assert (point.point, point.merit) == (None, 0.0)
-    assert inward.value(point) == point.barrier == problem.point(setup.control).barrier
+    assert inward.value(point) == point.barrier == problem.point(task.control).barrier
     assert inward.size(point) == max(1.0, abs(point.barrier))
     expansion = inward.expand(point)
     assert expansion.barrier is not None
     np.testing.assert_array_equal(expansion.a, expansion.barrier.a)
-    assert check(setup, inward, expansion) < 2e-3
+    assert check_task(task, inward, expansion) < 2e-3
     assert inward.again(point) is point
 
 
 def test_a_trial_that_diverges_is_outside_everything(tmp_path: Path) -> None:
-    setup, problem = problem_of("E", tmp_path)
+    task, problem = problem_of("E", tmp_path)
     for own in (problem, replace(problem, costs=False)):
-        point = own.point(1e12 * setup.control)
+        point = own.point(1e12 * task.control)
         assert point is DIVERGED_POINT
         assert own.value(point) == np.inf
         with pytest.raises(ValueError, match="diverged"):
@@ -152,21 +154,21 @@ def test_a_trial_that_diverges_is_outside_everything(tmp_path: Path) -> None:
 
 def test_a_projected_point_is_one_that_is_played_open_loop(tmp_path: Path) -> None:
     """Feedback makes another control out of a tangent curve; the point is that control's, with or without."""
-    setup, problem = problem_of("E", tmp_path)
-    point = problem.point(setup.control)
+    task, problem = problem_of("E", tmp_path)
+    point = problem.point(task.control)
     expansion = problem.expand(point)
-    way, N = np.sin(7.0 * setup.t)[:, None], setup.samples
+    way, N = np.sin(7.0 * task.t)[:, None], task.samples
     open_loop, gains = np.zeros((N, 1, 4)), np.tile([[1.0, 0.5, 0.3, 0.2]], (N, 1, 1))
     for K in (open_loop, gains):
         zeta = expansion.lift(K, way)
         moved = problem.project(point, zeta, 0.1, K)
         assert problem.value(moved) == problem.value(problem.point(moved.ctrl))
-        change: Array = moved.ctrl - setup.control - 0.1 * zeta.v
+        change: Array = moved.ctrl - task.control - 0.1 * zeta.v
         assert bool(np.abs(change).max() < 1e-12) is (K is open_loop)
         assert np.abs(change).max() < 0.05
         difference = problem.difference(moved, point)
-        np.testing.assert_allclose(difference.v, moved.ctrl - setup.control, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(difference.v, moved.ctrl - task.control, rtol=0, atol=1e-15)
         np.testing.assert_allclose(
-            difference.z, seen(moved).trajectory.state - setup.initial.state, rtol=0, atol=1e-12
+            difference.z, seen(moved).trajectory.state - task.initial.state, rtol=0, atol=1e-12
         )
     assert problem.refine(point) is None

@@ -7,8 +7,9 @@ import pytest
 
 import mjfim
 from mjfim.errors import ExperimentError, UnidentifiableError
-from mjfim.experiment.system import Setup
-from tests.support.numerics import CART_PARAMETERS, cart_setup, relative_error
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
+from tests.support.numerics import CART_PARAMETERS, cart_task, relative_error
 
 NEAR = {
     "qpos": (0.0, 3.0),
@@ -25,7 +26,7 @@ FAR = {
 def pair(folder, **tables) -> list[mjfim.Experiment]:
     """Two starts of the cart-pendulum, briefly descended."""
     common = {"descent": {"max_iterations": 8}, **tables}
-    return [cart_setup(folder, initial=start, **common).experiment for start in (NEAR, FAR)]
+    return [cart_task(folder, initial=start, **common).experiment for start in (NEAR, FAR)]
 
 
 def own(design: mjfim.Design) -> np.ndarray:
@@ -35,11 +36,11 @@ def own(design: mjfim.Design) -> np.ndarray:
 
 def test_the_sum_is_at_least_as_good_as_that_of_separate_designs(tmp_path) -> None:
     experiments = pair(tmp_path)
-    setup = Setup(experiments[0])
+    task = DesignTask.resolve(experiments[0])
     together = mjfim.design_together(experiments, rounds=2)
     apart = [mjfim.design(e) for e in experiments]
     phi = [
-        setup.information.evaluate(sum(own(d) for d in designs)).value
+        task.information.evaluate(sum(own(d) for d in designs)).value
         for designs in (together, apart)
     ]
     assert phi[0] <= 1.0001 * phi[1]
@@ -53,12 +54,12 @@ def test_each_design_holds_the_information_of_all(tmp_path) -> None:
 
 def test_what_one_experiment_cannot_see_another_may(tmp_path) -> None:
     still = {"qpos": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
-    blind, seeing = cart_setup(tmp_path, initial=still), cart_setup(tmp_path, initial=FAR)
+    blind, seeing = cart_task(tmp_path, initial=still), cart_task(tmp_path, initial=FAR)
     with pytest.raises(UnidentifiableError):
-        mjfim.design(blind)
+        design_task(blind)
     told = seeing.problem.point(seeing.initial).information
-    helped = mjfim.design(
-        Setup(blind.experiment.replace(descent={"max_iterations": 2}), added=told)
+    helped = design_task(
+        DesignTask.resolve(blind.experiment.replace(descent={"max_iterations": 2}), added=told)
     )
     assert np.isfinite(helped.final.std).all()
 
@@ -72,8 +73,8 @@ def test_nuisance_of_one_experiment_is_not_that_of_the_other(tmp_path) -> None:
 
 
 def test_other_parameters_are_refused(tmp_path) -> None:
-    one = cart_setup(tmp_path).experiment
-    other = cart_setup(tmp_path, parameters={"m": CART_PARAMETERS["m"]}).experiment
+    one = cart_task(tmp_path).experiment
+    other = cart_task(tmp_path, parameters={"m": CART_PARAMETERS["m"]}).experiment
     with pytest.raises(ExperimentError, match="same parameters"):
         mjfim.design_together([one, other])
     with pytest.raises(ExperimentError, match="two or more"):

@@ -16,7 +16,7 @@ from mjfim.model.coordinates import control_names, scalar_joints
 from mjfim.output.labels import Labels
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.trajectory import Trajectory
-from tests.support.numerics import make_setup
+from tests.support.numerics import make_task
 
 # A ball joint first, so that addresses of positions, velocities and joints all differ.
 XML = """
@@ -169,7 +169,7 @@ def test_misuse(model: mujoco.MjModel, tables: dict[str, object], message: str) 
 
 def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -> dict[str, float]:
     """Worst margins of a curve, looked at once per sample, by the fence of an experiment on a model."""
-    setup = make_setup(
+    task = make_task(
         text,
         folder,
         parameters={"damping": {"target": "joint/turn:damping", "scale": 1.0}},
@@ -177,7 +177,7 @@ def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -
         control={"kind": "constant", "amplitude": 0.0},
         limits=tables,
     )
-    fence = fence_of(setup)
+    fence = fence_of(task)
     assert not len(fence.observations.actuator_forces)
     shown = fence.observations.values(
         trajectory.qpos[1:], trajectory.qvel[1:], trajectory.qvel[:-1], dict[str, np.ndarray]().get

@@ -9,11 +9,12 @@ import pytest
 
 import mjfim
 from mjfim.errors import ExperimentError
+from mjfim.excitation.design import design_task
 from mjfim.excitation.limits import unwatched
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from tests.support.cli import loads, misused, names, run, write_experiment
-from tests.support.numerics import CART_PENDULUM, make_setup
+from tests.support.numerics import CART_PENDULUM, make_task
 
 MOTOR = (
     '<motor name="force" joint="slide"/>',
@@ -216,10 +217,10 @@ def test_a_control_with_neither_weight_nor_hard_range_is_refused(
 def test_a_hard_range_stands_for_the_weight(tmp_path: Path) -> None:
     """The file's, or the model's own."""
     path = with_control_weight(tmp_path, "[limits]\ncontrol = { force = [-5.0, 5.0] }")
-    assert Setup(Experiment.from_file(path)).control_weight.tolist() == [0.0]
+    assert DesignTask.resolve(Experiment.from_file(path)).control_weight.tolist() == [0.0]
     model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
     (tmp_path / "cart_pendulum.xml").write_text(model.replace(*MOTOR), encoding="utf-8")
-    assert Setup(
+    assert DesignTask.resolve(
         Experiment.from_file(with_control_weight(tmp_path, ""))
     ).control_weight.tolist() == [0.0]
 
@@ -227,7 +228,7 @@ def test_a_hard_range_stands_for_the_weight(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rate", [100.0, 2000.0])
 def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) -> None:
     """However little it falls within a sample."""
-    setup = make_setup(
+    task = make_task(
         CART_PENDULUM.format(integrator="RK4").replace('timestep="0.01"', 'timestep="0.0005"'),
         tmp_path,
         rate=rate,
@@ -240,7 +241,7 @@ def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) 
         ExperimentError,
         match=r"no control holds the start: joint 'hinge' still accelerates by \d\.\d+ per s²",
     ):
-        mjfim.design(setup)
+        design_task(task)
 
 
 def test_limits_that_no_control_can_keep_are_no_misuse(

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.objective import Point
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
-from mjfim.experiment.system import Setup
 from mjfim.optimize.lq import TangentCurve, regulator
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, DifferenceAccuracy
@@ -24,11 +24,11 @@ from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,
     Array,
-    body_setup,
-    cart_setup,
+    body_task,
+    cart_task,
     directional_check,
-    filtered_setup,
-    make_setup,
+    filtered_task,
+    make_task,
     shared_model,
 )
 
@@ -39,34 +39,34 @@ TRACKING = {
 }
 
 
-def cartpole(folder: Path) -> Setup:
+def cartpole(folder: Path) -> DesignTask:
     """dm_control's cart-pole, RK4. |u| <= 0.3 of 1 and the slide stays inside its +-1.8 m: no constraint acts."""
     parameters = {
         "m": {"target": "body/pole_1:mass"},
         "drag": {"target": "joint/slider:damping", "guess": 0.1},
     }
     control = {"kind": "sine", "amplitude": 0.3, "frequency": 1.0}
-    setup = make_setup(
+    task = make_task(
         shared_model("dmc_cartpole/cartpole.xml"),
         folder,
         initial={"qpos": (0.0, 2.5), "control": control},
         parameters=parameters,
         noise={"state": 0.01},
     )
-    assert np.abs(setup.initial.qpos[:, 0]).max() < 0.5
-    return setup
+    assert np.abs(task.initial.qpos[:, 0]).max() < 0.5
+    return task
 
 
-def acrobot(folder: Path) -> Setup:
+def acrobot(folder: Path) -> DesignTask:
     """dm_control's acrobot, RK4, its constraints switched off by its author. |u| <= 0.7 of 1."""
     parameters = {"m": {"target": "body/lower_arm:mass"}, "c": {"target": "joint/elbow:damping"}}
     control = {"kind": "sine", "amplitude": 0.7, "frequency": 1.0}
     initial = {"qpos": (2.5, 0.4), "control": control}
     model = shared_model("dmc_acrobot/acrobot.xml")
-    return make_setup(model, folder, initial=initial, parameters=parameters, noise={"state": 0.01})
+    return make_task(model, folder, initial=initial, parameters=parameters, noise={"state": 0.01})
 
 
-def furuta(folder: Path) -> Setup:
+def furuta(folder: Path) -> DesignTask:
     """The Qube, implicitfast, 20 steps per sample, neither limits nor contacts."""
     parameters = {
         "arm": {"target": "joint/theta:damping", "guess": 1e-3},
@@ -75,17 +75,17 @@ def furuta(folder: Path) -> Setup:
     control = {"kind": "sine", "amplitude": 5e-3, "frequency": 1.5}
     initial = {"qpos": (0.1, 0.3), "control": control}
     model = shared_model("qube_furuta/furuta_pendulum_implicitfast.xml")
-    return make_setup(
+    return make_task(
         model, folder, initial=initial, parameters=parameters, noise={"state": 0.01}, horizon=0.4
     )
 
 
-def cart(integrator: str = "RK4", **tables: Any) -> Callable[[Path], Setup]:
+def cart(integrator: str = "RK4", **tables: Any) -> Callable[[Path], DesignTask]:
     """Cart-pendulum with changes."""
-    return lambda folder: cart_setup(folder, integrator, **tables)
+    return lambda folder: cart_task(folder, integrator, **tables)
 
 
-def servo(folder: Path) -> Setup:
+def servo(folder: Path) -> DesignTask:
     """Cart under a position servo whose gain and damping are unknown but not wanted."""
     motor, position = (
         '<motor name="force" joint="slide"/>',
@@ -97,7 +97,7 @@ def servo(folder: Path) -> Setup:
         n: {"target": f"actuator/force:{n}", "nuisance": True, "prior": 2.0} for n in ("kp", "kv")
     }
     control = {"kind": "sine", "amplitude": 0.3, "frequency": 1.2}
-    return make_setup(
+    return make_task(
         xml.replace(motor, position),
         folder,
         parameters={**CART_PARAMETERS, **unwanted},
@@ -106,10 +106,10 @@ def servo(folder: Path) -> Setup:
     )
 
 
-def staged(setup: Setup, basis: Array | None = None, power: float = np.inf) -> Setup:
-    """The same setup, its cost as a stage of the descent sees it."""
-    setup.problem = Stage(setup, basis, power).problem
-    return setup
+def staged(task: DesignTask, basis: Array | None = None, power: float = np.inf) -> DesignTask:
+    """The same task, its cost as a stage of the descent sees it."""
+    task.problem = Stage(task, basis, power).problem
+    return task
 
 
 # Components of one quaternion measured alike would hold the same information at every orientation.
@@ -127,7 +127,7 @@ LATE = {"initial": {"qpos:hinge": 0.05, "qvel:slide": True}, "bias": 0.1, "delay
 KNOWN = {n: {**t, "bounds": (0.2, 3.0), "prior": 0.1} for n, t in CART_PARAMETERS.items()}
 BASIS = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 2)))[0]
 
-SETUPS: dict[str, Callable[[Path], Setup]] = {
+SETUPS: dict[str, Callable[[Path], DesignTask]] = {
     "cart E tracking": cart(cost={**TRACKING, "criterion": "E"}),
     "cart A tracking": cart(cost={**TRACKING, "criterion": "A"}),
     "cart D tracking": cart(cost={**TRACKING, "criterion": "D"}),
@@ -143,11 +143,11 @@ SETUPS: dict[str, Callable[[Path], Setup]] = {
         },
         cost={"criterion": "A"},
     ),
-    "free body with ball joint": body_setup,
-    "free body D": lambda folder: body_setup(folder, "Euler", cost={"criterion": "D"}),
-    "activation": filtered_setup,
+    "free body with ball joint": body_task,
+    "free body D": lambda folder: body_task(folder, "Euler", cost={"criterion": "D"}),
+    "activation": filtered_task,
     "start unknown": cart(nuisance={"initial": 0.05}, cost={"criterion": "A"}),
-    "ball joint, start unknown": lambda folder: body_setup(
+    "ball joint, start unknown": lambda folder: body_task(
         folder, nuisance={"initial": {"qvel:ball.ry": True}}
     ),
     "bias and delay unknown": cart(nuisance={"bias": True, "delay": True}, cost={"criterion": "D"}),
@@ -164,20 +164,20 @@ SETUPS: dict[str, Callable[[Path], Setup]] = {
         noise=SENSED, correlated=CORRELATED, nuisance=LATE, measure_rate=50.0
     ),
     "every sensor at its own rate": cart(noise={**SENSED, "acc": {"sigma": 0.3, "rate": 20.0}}),
-    "quaternions measured": lambda folder: body_setup(folder, noise=BALL),
-    "all states of a free body": lambda folder: body_setup(folder, noise={"state": 0.02}),
-    "quaternions measured late": lambda folder: body_setup(
+    "quaternions measured": lambda folder: body_task(folder, noise=BALL),
+    "all states of a free body": lambda folder: body_task(folder, noise={"state": 0.02}),
+    "quaternions measured late": lambda folder: body_task(
         folder, noise=BALL, nuisance={"delay": 0.01}
     ),
     "cart c combination": cart(
         cost={"criterion": "c", "combination": {"m": 1.0, "l": -0.5}}, nuisance=LATE
     ),
     "cart c subset": cart(cost={"criterion": "c", "subset": ("l", "c")}),
-    "cart E smooth": lambda folder: staged(cart_setup(folder, nuisance=LATE), power=40.0),
-    "cart E smooth, nearly a sum": lambda folder: staged(cart_setup(folder), power=1.5),
-    "cart E on combinations": lambda folder: staged(cart_setup(folder, nuisance=LATE), BASIS),
+    "cart E smooth": lambda folder: staged(cart_task(folder, nuisance=LATE), power=40.0),
+    "cart E smooth, nearly a sum": lambda folder: staged(cart_task(folder), power=1.5),
+    "cart E on combinations": lambda folder: staged(cart_task(folder, nuisance=LATE), BASIS),
     "cart c on combinations": lambda folder: staged(
-        cart_setup(folder, cost={"criterion": "c", "subset": ("m", "l", "c")}), BASIS, 40.0
+        cart_task(folder, cost={"criterion": "c", "subset": ("m", "l", "c")}), BASIS, 40.0
     ),
     "robust mean": cart(parameters=KNOWN, robust={"over": "mean", "samples": 4}, nuisance=LATE),
     "robust worst": cart(parameters=KNOWN, robust={"over": "worst", "samples": 4}, noise=SENSED),
@@ -193,41 +193,41 @@ SETUPS: dict[str, Callable[[Path], Setup]] = {
 STEPS = {"dmc_cartpole": 2e-2}
 
 
-def gain(setup: Setup) -> Array:
+def gain(task: DesignTask) -> Array:
     """Regulator with unit weights along the initial trajectory."""
-    A, B = (getattr(setup.plant.derivatives.linearize(setup.theta, setup.initial), n) for n in "AB")
-    Q, R = np.eye(setup.space.nx) * setup.dt, np.eye(setup.plant.nu) * setup.dt
-    return regulator(A, B, Q, R, Q / setup.dt)
+    A, B = (getattr(task.plant.derivatives.linearize(task.theta, task.initial), n) for n in "AB")
+    Q, R = np.eye(task.space.nx) * task.dt, np.eye(task.plant.nu) * task.dt
+    return regulator(A, B, Q, R, Q / task.dt)
 
 
-def directions(setup: Setup, gradient: Array) -> list[Array]:
+def directions(task: DesignTask, gradient: Array) -> list[Array]:
     """Curve directions (N, nu): random smooth, white noise, and the gradient itself; in the size of the control."""
-    rng, size = np.random.default_rng(7), np.abs(setup.control).max()
-    t, nu = setup.t / setup.t[-1], setup.plant.nu
+    rng, size = np.random.default_rng(7), np.abs(task.control).max()
+    t, nu = task.t / task.t[-1], task.plant.nu
     phase = rng.uniform(0, 2 * np.pi, nu)
     smooth = np.sin(2 * np.pi * rng.uniform(0.3, 3.0, nu) * t[:, None] + phase)
     white = rng.normal(size=(len(t), nu))
     return [size * v / np.abs(v).max() for v in (smooth, white, gradient)]
 
 
-def expansion_of(setup: Setup, accuracy: DifferenceAccuracy) -> tuple[Point, Expansion]:
+def expansion_of(task: DesignTask, accuracy: DifferenceAccuracy) -> tuple[Point, Expansion]:
     """The initial trajectory and J expanded about it."""
-    point = setup.problem.point(setup.initial, accuracy)
+    point = task.problem.point(task.initial, accuracy)
     assert np.isfinite(point.cost)
-    return point, setup.problem.expand(point)
+    return point, task.problem.expand(point)
 
 
 def gradient_error(
-    setup: Setup, K: Array, accuracy: DifferenceAccuracy, h: float, factor: float = 1.0
+    task: DesignTask, K: Array, accuracy: DifferenceAccuracy, h: float, factor: float = 1.0
 ) -> float:
     """Error of the slope (times a factor) along lifted tangent vectors, against J(P(xi + t zeta))."""
-    point, expansion = expansion_of(setup, accuracy)
+    point, expansion = expansion_of(task, accuracy)
     slopes, curves = [], []
-    for c in directions(setup, expansion.gradient(K)):
+    for c in directions(task, expansion.gradient(K)):
         zeta = expansion.lift(K, c)
 
         def J(t: float, zeta: TangentCurve = zeta) -> float:
-            return setup.problem.value(setup.problem.project(point, zeta, t, K))
+            return task.problem.value(task.problem.project(point, zeta, t, K))
 
         slopes.append(factor * expansion.slope(zeta))
         curves.append(J)
@@ -239,17 +239,17 @@ def gradient_error(
 def test_gradient_by_central_differences_is_that_of_J_through_the_projection(
     case: str, feedback: bool, tmp_path
 ) -> None:
-    setup = SETUPS[case](tmp_path)
-    K = gain(setup) * feedback
-    assert gradient_error(setup, K, CENTRAL_DIFFERENCES, STEPS.get(case, 5e-3)) < 1e-5
+    task = SETUPS[case](tmp_path)
+    K = gain(task) * feedback
+    assert gradient_error(task, K, CENTRAL_DIFFERENCES, STEPS.get(case, 5e-3)) < 1e-5
 
 
 @pytest.mark.parametrize("feedback", [False, True], ids=["open loop", "feedback"])
 @pytest.mark.parametrize("case", SETUPS)
 def test_gradient_by_fast_differences_is_close(case: str, feedback: bool, tmp_path) -> None:
-    setup = SETUPS[case](tmp_path)
-    K = gain(setup) * feedback
-    assert gradient_error(setup, K, FORWARD_DIFFERENCES, 5e-3) < 1e-3
+    task = SETUPS[case](tmp_path)
+    K = gain(task) * feedback
+    assert gradient_error(task, K, FORWARD_DIFFERENCES, 5e-3) < 1e-3
 
 
 OFF = [
@@ -263,23 +263,23 @@ OFF = [
 
 @pytest.mark.parametrize("case", OFF)
 def test_a_gradient_off_by_a_thousandth_would_be_rejected(case: str, tmp_path) -> None:
-    setup = SETUPS[case](tmp_path)
-    K = gain(setup)
+    task = SETUPS[case](tmp_path)
+    K = gain(task)
     for factor in (1.001, 0.999, -1.0):
-        assert gradient_error(setup, K, CENTRAL_DIFFERENCES, 5e-3, factor) > 5e-4
+        assert gradient_error(task, K, CENTRAL_DIFFERENCES, 5e-3, factor) > 5e-4
 
 
 def test_leaving_out_what_psi_does_to_the_information_would_be_rejected(tmp_path) -> None:
-    setup = cart_setup(tmp_path)
-    point, expansion = expansion_of(setup, CENTRAL_DIFFERENCES)
-    K = np.zeros((setup.samples, 1, 4))
-    a, b = setup.problem.running.gradient(setup.initial)
+    task = cart_task(tmp_path)
+    point, expansion = expansion_of(task, CENTRAL_DIFFERENCES)
+    K = np.zeros((task.samples, 1, 4))
+    a, b = task.problem.running.gradient(task.initial)
     wrong = Expansion(A=expansion.A, B=expansion.B, a=a, b=b)
-    c = directions(setup, expansion.gradient(K))[0]
+    c = directions(task, expansion.gradient(K))[0]
     zeta = expansion.lift(K, c)
 
     def J(t: float) -> float:
-        return setup.problem.value(setup.problem.project(point, zeta, t, K))
+        return task.problem.value(task.problem.project(point, zeta, t, K))
 
     assert directional_check([expansion.slope(zeta)], [J], 5e-3) < 1e-5
     assert directional_check([wrong.slope(zeta)], [J], 5e-3) > 0.1
@@ -296,29 +296,29 @@ def test_leaving_out_what_psi_does_to_the_information_would_be_rejected(tmp_path
 def test_leaving_out_a_term_of_the_measurement_would_be_rejected(
     case: str, term: str, tmp_path, monkeypatch
 ) -> None:
-    setup = SETUPS[case](tmp_path)
+    task = SETUPS[case](tmp_path)
     K, whole = (
-        np.zeros((setup.samples, setup.plant.nu, setup.space.nx)),
-        setup.plant.derivatives.bilinear,
+        np.zeros((task.samples, task.plant.nu, task.space.nx)),
+        task.plant.derivatives.bilinear,
     )
     monkeypatch.setattr(
-        setup.plant.derivatives, "bilinear", lambda *given: replace(whole(*given), **{term: None})
+        task.plant.derivatives, "bilinear", lambda *given: replace(whole(*given), **{term: None})
     )
-    assert gradient_error(setup, K, CENTRAL_DIFFERENCES, 5e-3) > 1e-3
+    assert gradient_error(task, K, CENTRAL_DIFFERENCES, 5e-3) > 1e-3
 
 
 @pytest.mark.parametrize("case", ["robust mean", "robust worst", "robust worst D"])
 def test_leaving_out_a_sample_of_a_robust_design_would_be_rejected(case: str, tmp_path) -> None:
-    setup = SETUPS[case](tmp_path)
+    task = SETUPS[case](tmp_path)
     point, K = (
-        setup.problem.point(setup.initial, CENTRAL_DIFFERENCES),
-        np.zeros((setup.samples, 1, 4)),
+        task.problem.point(task.initial, CENTRAL_DIFFERENCES),
+        np.zeros((task.samples, 1, 4)),
     )
-    whole, blind = setup.problem.expand(point), replace(setup.problem, pool=None).expand(point)
-    zeta = whole.lift(K, directions(setup, whole.gradient(K))[0])
+    whole, blind = task.problem.expand(point), replace(task.problem, pool=None).expand(point)
+    zeta = whole.lift(K, directions(task, whole.gradient(K))[0])
 
     def J(t: float) -> float:
-        return setup.problem.value(setup.problem.project(point, zeta, t, K))
+        return task.problem.value(task.problem.project(point, zeta, t, K))
 
     assert directional_check([whole.slope(zeta)], [J], 5e-3) < 1e-5
     assert directional_check([blind.slope(zeta)], [J], 5e-3) > 1e-2
@@ -326,11 +326,11 @@ def test_leaving_out_a_sample_of_a_robust_design_would_be_rejected(case: str, tm
 
 @pytest.mark.parametrize("case", ["cart A tracking", "free body with ball joint"])
 def test_gradient_and_lift_are_dual_to_the_slope_under_any_feedback(case: str, tmp_path) -> None:
-    setup = SETUPS[case](tmp_path)
-    _, expansion = expansion_of(setup, FORWARD_DIFFERENCES)
+    task = SETUPS[case](tmp_path)
+    _, expansion = expansion_of(task, FORWARD_DIFFERENCES)
     rng = np.random.default_rng(3)
-    for K in (gain(setup), 0.0 * gain(setup)):
-        c = rng.normal(size=setup.control.shape)
+    for K in (gain(task), 0.0 * gain(task)):
+        c = rng.normal(size=task.control.shape)
         zeta = expansion.lift(K, c)
         assert expansion.slope(zeta) == pytest.approx(
             float(np.sum(expansion.gradient(K) * c)), rel=1e-9
@@ -344,21 +344,19 @@ def test_gradient_and_lift_are_dual_to_the_slope_under_any_feedback(case: str, t
 
 
 def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
-    setup = cart_setup(tmp_path, cost=TRACKING)
-    running, rng = setup.problem.running, np.random.default_rng(4)
-    curve = setup.plant.simulate(setup.theta, setup.control + rng.normal(size=setup.control.shape))
+    task = cart_task(tmp_path, cost=TRACKING)
+    running, rng = task.problem.running, np.random.default_rng(4)
+    curve = task.plant.simulate(task.theta, task.control + rng.normal(size=task.control.shape))
     Q, total = np.array([0.3, 0.1, 0.2, 0.0]), 0.0
-    for k in range(setup.samples):
-        d = curve.state[k + 1] - setup.initial.state[k + 1]
+    for k in range(task.samples):
+        d = curve.state[k + 1] - task.initial.state[k + 1]
         total += 0.5 * 0.01 * (d @ np.diag(Q) @ d + 1e-2 * curve.ctrl[k, 0] ** 2)
     assert running.value(curve) == pytest.approx(total, rel=1e-12)
-    assert running.value(setup.initial) == pytest.approx(
-        0.5 * 0.01 * 1e-2 * np.sum(setup.control**2), rel=1e-12
+    assert running.value(task.initial) == pytest.approx(
+        0.5 * 0.01 * 1e-2 * np.sum(task.control**2), rel=1e-12
     )
     a, b = running.gradient(curve)
-    np.testing.assert_allclose(
-        a[1:], 0.01 * (curve.state - setup.initial.state)[1:] * Q, rtol=1e-12
-    )
+    np.testing.assert_allclose(a[1:], 0.01 * (curve.state - task.initial.state)[1:] * Q, rtol=1e-12)
     np.testing.assert_array_equal(a[0], 0.0)
     np.testing.assert_allclose(b, 0.01 * 1e-2 * curve.ctrl, rtol=1e-12)
 
@@ -367,32 +365,32 @@ def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
 def test_slopes_are_compared_with_J_or_where_J_may_vanish_with_what_cannot(
     criterion: str, tmp_path
 ) -> None:
-    setup = cart_setup(tmp_path, cost={**TRACKING, "criterion": criterion, "information": 0.3})
-    point = setup.problem.point(setup.initial)
+    task = cart_task(tmp_path, cost={**TRACKING, "criterion": criterion, "information": 0.3})
+    point = task.problem.point(task.initial)
     if criterion == "D":
-        assert setup.problem.size(point) == pytest.approx(
-            0.3 * 3 + setup.problem.running.value(setup.initial)
+        assert task.problem.size(point) == pytest.approx(
+            0.3 * 3 + task.problem.running.value(task.initial)
         )
         assert point.cost < 0.0
     else:
-        assert setup.problem.size(point) == point.cost > 0.0
+        assert task.problem.size(point) == point.cost > 0.0
 
 
 def test_a_diverged_trial_costs_infinity_and_cannot_be_expanded(tmp_path) -> None:
-    setup = cart_setup(tmp_path)
-    point, expansion = expansion_of(setup, FORWARD_DIFFERENCES)
-    K = np.zeros((setup.samples, 1, 4))
-    lost = setup.problem.project(point, expansion.lift(K, np.full((setup.samples, 1), 9e9)), 1.0, K)
-    assert setup.problem.value(lost) == np.inf
+    task = cart_task(tmp_path)
+    point, expansion = expansion_of(task, FORWARD_DIFFERENCES)
+    K = np.zeros((task.samples, 1, 4))
+    lost = task.problem.project(point, expansion.lift(K, np.full((task.samples, 1), 9e9)), 1.0, K)
+    assert task.problem.value(lost) == np.inf
     with pytest.raises(ValueError, match="diverged"):
-        setup.problem.expand(lost)
+        task.problem.expand(lost)
 
 
 def test_refining_keeps_the_trajectory_and_its_cost_and_happens_once(tmp_path) -> None:
-    setup = cart_setup(tmp_path)
-    point = setup.problem.point(setup.initial, FORWARD_DIFFERENCES)
-    better = setup.problem.refine(point)
+    task = cart_task(tmp_path)
+    point = task.problem.point(task.initial, FORWARD_DIFFERENCES)
+    better = task.problem.refine(point)
     assert better.accuracy is CENTRAL_DIFFERENCES
     assert better.trajectory is point.trajectory
     assert better.cost == point.cost
-    assert setup.problem.refine(better) is None
+    assert task.problem.refine(better) is None

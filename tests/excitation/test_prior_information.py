@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mjfim
 from mjfim.errors import ExperimentError
+from mjfim.excitation.design import design_task
 from mjfim.excitation.prior_information import information_of
 from mjfim.output import archive
-from tests.support.numerics import Array, cart_setup
+from tests.support.numerics import Array, cart_task
 
 
 def information(seed: int, size: int) -> Array:
@@ -165,21 +165,21 @@ def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
         "m": {"target": "body/bob:mass", "prior": 0.1},
         "c": {"target": "joint/hinge:damping"},
     }
-    first = cart_setup(tmp_path, parameters=priors, **tables)
-    design = mjfim.design(first)
-    archive.write_design(tmp_path / "one", design, first)
+    first = cart_task(tmp_path, parameters=priors, **tables)
+    design = design_task(first)
+    archive.write_design(tmp_path / "one", design, first.system)
     own = design.final.information - np.diag([100.0, 0.0])
     earlier = str(tmp_path / "one" / "design.json")
     turned = {
         "c": {"target": "joint/hinge:damping", "prior": 2.0},
         "m": {"target": "body/bob:mass"},
     }
-    second = cart_setup(tmp_path, parameters=turned, earlier=(earlier,), **tables)
+    second = cart_task(tmp_path, parameters=turned, earlier=(earlier,), **tables)
     np.testing.assert_allclose(second.prior, own[::-1, ::-1] + np.diag([0.25, 0.0]), rtol=1e-9)
-    again = mjfim.design(second)
-    archive.write_design(tmp_path / "two", again, second)
+    again = design_task(second)
+    archive.write_design(tmp_path / "two", again, second.system)
     late = str(tmp_path / "two" / "design.json")
     total = information_of([Path(earlier), Path(late)], ("c", "m"))
     np.testing.assert_allclose(total, again.final.information - np.diag([0.25, 0.0]), rtol=1e-8)
     with pytest.raises(ExperimentError, match=r"experiment: earlier: .*gone\.json"):
-        cart_setup(tmp_path, earlier=("gone.json",))
+        cart_task(tmp_path, earlier=("gone.json",))

@@ -10,13 +10,13 @@ import pytest
 from scipy.stats import norm
 
 from mjfim.errors import ExperimentError
-from mjfim.excitation.design import design
-from mjfim.excitation.evaluation import evaluate_trajectory
-from mjfim.excitation.robust import Pool
-from mjfim.experiment.system import Setup
+from mjfim.excitation.design import design_task
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.robust import ParameterSamples
+from mjfim.excitation.task import DesignTask
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import Parameter, ParameterSet
-from tests.support.numerics import CART_PARAMETERS, Array, body_setup, cart_setup
+from tests.support.numerics import CART_PARAMETERS, Array, body_task, cart_task
 
 KINDS = {
     "mean": ("mean", False),
@@ -26,9 +26,9 @@ KINDS = {
 }
 
 
-def pool(kind: str, count: int = 4) -> Pool:
+def pool(kind: str, count: int = 4) -> ParameterSamples:
     """Over any parameter values."""
-    return Pool(np.zeros((count, 1)), *KINDS[kind])
+    return ParameterSamples(np.zeros((count, 1)), *KINDS[kind])
 
 
 def unknowns(*parameters: dict) -> ParameterSet:
@@ -132,12 +132,12 @@ def test_parameters_without_prior_and_bounds_cannot_be_sampled(tmp_path) -> None
         with pytest.raises(ExperimentError, match="prior or bounds"):
             sample_parameters(unknowns(half), np.zeros(1), 3, 0)
     with pytest.raises(ExperimentError, match="robust: no parameter has"):
-        cart_setup(tmp_path, robust={"samples": 3})
+        cart_task(tmp_path, robust={"samples": 3})
     with pytest.raises(ExperimentError, match="samples"):
-        cart_setup(tmp_path, robust={"samples": 1})
+        cart_task(tmp_path, robust={"samples": 1})
     bounded = {"m": {**CART_PARAMETERS["m"], "bounds": (1.0, 2.0)}}
     with pytest.raises(ExperimentError, match="psi_weight"):
-        cart_setup(
+        cart_task(
             tmp_path, parameters=bounded, robust={}, descent={"method": "metric", "psi_weight": 1.0}
         )
 
@@ -150,40 +150,38 @@ VAGUE = {
 }
 
 
-def vague_setup(folder: Path, **tables: object) -> Setup:
+def vague_task(folder: Path, **tables: object) -> DesignTask:
     """Cart-pendulum for two seconds."""
     shared = {"parameters": VAGUE, "horizon": 2.0, "cost": {"control": 1e-4}}
-    return cart_setup(folder, **{**shared, **tables})
+    return cart_task(folder, **{**shared, **tables})
 
 
-def phis(setup: Setup, control: Array, thetas: Array) -> Array:
+def phis(task: DesignTask, control: Array, thetas: Array) -> Array:
     """The criterion of the guess's experiment at other parameter values, each with its own trajectory."""
     found = []
     for theta in thetas:
-        sensitivity = setup.plant.derivatives.sensitivity(
-            theta, setup.plant.simulate(theta, control)
-        )
-        found.append(setup.information.evaluate(setup.information.matrix(sensitivity)).value)
+        sensitivity = task.plant.derivatives.sensitivity(theta, task.plant.simulate(theta, control))
+        found.append(task.information.evaluate(task.information.matrix(sensitivity)).value)
     return np.array(found)
 
 
 def test_the_cost_is_the_pooled_criterion_of_separate_experiments_at_the_samples(tmp_path) -> None:
-    setup = vague_setup(tmp_path, robust={"over": "worst", "samples": 5, "seed": 2})
-    thetas = setup.pool.thetas
+    task = vague_task(tmp_path, robust={"over": "worst", "samples": 5, "seed": 2})
+    thetas = task.samples_of_parameters.thetas
     assert thetas.shape == (5, 3)
-    assert (thetas >= setup.parameters.lower).all() and (thetas <= setup.parameters.upper).all()
-    point = setup.problem.point(setup.initial)
+    assert (thetas >= task.parameters.lower).all() and (thetas <= task.parameters.upper).all()
+    point = task.problem.point(task.initial)
     alone = []
     for theta in thetas:
         there = {
             n: {**VAGUE[n], "guess": float(v), "scale": float(s)}
             for n, v, s in zip("mlc", theta, thetas[0], strict=True)
         }
-        single = vague_setup(tmp_path, parameters=there)
-        alone.append(evaluate_trajectory(single, single.initial).criterion)
+        single = vague_task(tmp_path, parameters=there)
+        alone.append(evaluate_task(single, single.initial).criterion)
     np.testing.assert_allclose(point.phi, alone, rtol=1e-6)
-    running = setup.problem.running.value(setup.initial)
-    assert point.cost == pytest.approx(setup.pool.value(alone) + running, rel=1e-6)
+    running = task.problem.running.value(task.initial)
+    assert point.cost == pytest.approx(task.samples_of_parameters.value(alone) + running, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -193,13 +191,15 @@ def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
     over: str, pooled: Callable[[Array], float], tmp_path
 ) -> None:
     robust, nominal = (
-        vague_setup(tmp_path, robust={"over": over, "samples": 5, "seed": 2}),
-        vague_setup(tmp_path),
+        vague_task(tmp_path, robust={"over": over, "samples": 5, "seed": 2}),
+        vague_task(tmp_path),
     )
-    plain = design(nominal)
-    made = design(robust, start=plain.trajectory.ctrl)
+    plain = design_task(nominal)
+    made = design_task(robust, start=plain.trajectory.ctrl)
     assert plain.status.success and made.status.success
-    ours, theirs = (phis(nominal, d.trajectory.ctrl, robust.pool.thetas) for d in (made, plain))
+    ours, theirs = (
+        phis(nominal, d.trajectory.ctrl, robust.samples_of_parameters.thetas) for d in (made, plain)
+    )
     assert pooled(ours) < 0.9 * pooled(theirs)
     # each is the better one by its own cost
     crossed = [
@@ -240,15 +240,16 @@ def test_samples_are_halved_until_their_bodies_can_exist() -> None:
 
 def test_samples_of_an_inertia_are_bodies(tmp_path) -> None:
     table = {"B": {"inertial": "hull", "coordinates": "barycentric", "prior": 0.5}}
-    setup = body_setup(tmp_path, parameters=table, robust={"samples": 8})
-    assert setup.pool is not None
+    task = body_task(tmp_path, parameters=table, robust={"samples": 8})
+    assert task.samples_of_parameters is not None
     moments = np.array(
-        [setup.plant.model(theta).body("hull").inertia for theta in setup.pool.thetas]
+        [
+            task.plant.model(theta).body("hull").inertia
+            for theta in task.samples_of_parameters.thetas
+        ]
     )
     assert (moments > 0.0).all()
     assert (2.0 * moments.max(axis=1) <= moments.sum(axis=1) * (1.0 + 1e-6)).all()
-    free = sample_parameters(setup.parameters, setup.theta, 8, 0)
-    assert any(
-        setup.parameters.writer.unphysical_bodies(setup.plant.source, theta) for theta in free
-    )
-    assert len(np.unique(setup.pool.thetas, axis=0)) == 8
+    free = sample_parameters(task.parameters, task.theta, 8, 0)
+    assert any(task.parameters.writer.unphysical_bodies(task.plant.source, theta) for theta in free)
+    assert len(np.unique(task.samples_of_parameters.thetas, axis=0)) == 8

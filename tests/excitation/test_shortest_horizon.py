@@ -13,9 +13,11 @@ from typer.testing import CliRunner
 import mjfim
 from mjfim.cli import main as cli
 from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.excitation.design import design_task
+from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, Tried, fitted
 from mjfim.excitation.target_accuracy import furthest, wanted_of
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.records.design import HistoryRow
 from tests.support.paths import MODELS
 
@@ -36,8 +38,8 @@ def wanting(sigma: dict[str, float], **tables: object) -> mjfim.Experiment:
 
 def worst(experiment: mjfim.Experiment) -> float:
     """Of a design's predicted σ over the wanted ones."""
-    setup = Setup(experiment)
-    return furthest(mjfim.design(setup).final.std, wanted_of(setup))[0]
+    task = DesignTask.resolve(experiment)
+    return furthest(design_task(task).final.std, wanted_of(task))[0]
 
 
 @pytest.fixture(scope="module")
@@ -48,13 +50,13 @@ def shorter() -> mjfim.Shortest:
 
 def test_it_reaches_what_is_wanted(shorter: mjfim.Shortest) -> None:
     assert 0.5 < shorter.horizon < 1.4 and shorter.closed
-    setup = Setup(shorter.experiment)
-    assert shorter.design.trajectory.samples == setup.samples
-    told = mjfim.evaluate_trajectory(setup, shorter.design.trajectory)
-    assert furthest(told.std, wanted_of(setup))[0] <= 1.0
+    task = DesignTask.resolve(shorter.experiment)
+    assert shorter.design.trajectory.samples == task.samples
+    told = evaluate_task(task, shorter.design.trajectory)
+    assert furthest(told.std, wanted_of(task))[0] <= 1.0
     best = next(t for t in shorter.tried if t.horizon == shorter.horizon)
     assert best.reached and best.ratio == pytest.approx(
-        furthest(told.std, wanted_of(setup))[0], rel=1e-6
+        furthest(told.std, wanted_of(task))[0], rel=1e-6
     )
     assert shorter.summary()["horizon"] == shorter.horizon
 
@@ -140,10 +142,10 @@ def test_a_duration_that_cannot_be_simulated_does_not_reach(
     """Except the stated one: there the fault is the user's to see."""
     real = mjfim.excitation.shortest_horizon.design  # type: ignore[attr-defined]
 
-    def faulty(setup: Setup, *rest: object, **more: object) -> mjfim.Design:
-        if setup.samples < 140:
+    def faulty(task: DesignTask, *rest: object, **more: object) -> mjfim.Design:
+        if task.samples < 140:
             raise SimulationDivergedError("too short")
-        return real(setup, *rest, **more)
+        return real(task, *rest, **more)
 
     monkeypatch.setattr(mjfim.excitation.shortest_horizon, "design", faulty)
     found = mjfim.shortest(wanting(SIGMA), tolerance=0.05)
@@ -162,7 +164,7 @@ def test_control_of_another_duration(tmp_path: Path) -> None:
 
     def made(samples: int, **tables: object) -> list[float]:
         return (
-            fitted(Setup(STUDY.replace(horizon=samples / 100.0, **tables)), control)
+            fitted(DesignTask.resolve(STUDY.replace(horizon=samples / 100.0, **tables)), control)
             .ravel()
             .tolist()
         )

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.constraints import fence_of
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import SAME, audit
-from mjfim.experiment.system import Setup
-from tests.support.numerics import CART_PENDULUM, make_setup
+from tests.support.numerics import CART_PENDULUM, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
 SPRING = """
@@ -31,7 +31,7 @@ SWING = 0.15  # [m]
 SPEED = SWING * 2 * np.pi * 10.0
 
 
-def spring_setup(folder: Path, joint: str = "", motor: str = "", **tables: Any) -> Setup:
+def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -> DesignTask:
     """A second of it, at 10 Hz, from the middle at full speed, hardly pushed."""
     defaults: dict[str, Any] = {
         "rate": 10.0,
@@ -44,7 +44,7 @@ def spring_setup(folder: Path, joint: str = "", motor: str = "", **tables: Any) 
         },
     }
     text = SPRING.format(joint=joint, motor=motor, integrator="RK4")
-    return make_setup(text, folder, **{**defaults, **tables})
+    return make_task(text, folder, **{**defaults, **tables})
 
 
 def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
@@ -54,12 +54,12 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
         "velocity": {"slide": (0.9 * SPEED, 2 * SPEED)},
         "acceleration": 300.0,
     }
-    setup = spring_setup(tmp_path, limits=limits)
-    samples = setup.initial
-    assert setup.substeps == 100
+    task = spring_task(tmp_path, limits=limits)
+    samples = task.initial
+    assert task.system.grid.substeps == 100
     assert np.abs(samples.qpos).max() < 0.01
     assert samples.qvel.min() > 0.98 * SPEED
-    found = audit(setup, samples)
+    found = audit(task, samples)
     assert not found.kept
     # by hand: a harmonic of 10 Hz
     assert found.margins["position"] == pytest.approx(0.1 - SWING, rel=1e-3)
@@ -69,8 +69,8 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
     )
     assert found.deviation < SAME
     # what a fence at the samples alone would have said
-    fence = fence_of(setup)
-    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
+    fence = fence_of(task)
+    watched = task.plant.observe(task.theta, task.control, fence.observations)
     assert watched is not None
     trajectory, observed = watched
     at_samples = fence.margins(fence.sight(trajectory, observed[:, -1:], slopes=False))
@@ -82,23 +82,23 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
 
 def test_clearance_between_the_samples_counts(tmp_path: Path) -> None:
     """The wall is 0.19 m from the ball in the middle, and 0.15 m nearer where it turns."""
-    setup = spring_setup(tmp_path, limits={"clearance": 0.1})
-    fence = fence_of(setup)
-    watched = setup.plant.observe(setup.theta, setup.control, fence.observations)
+    task = spring_task(tmp_path, limits={"clearance": 0.1})
+    fence = fence_of(task)
+    watched = task.plant.observe(task.theta, task.control, fence.observations)
     assert watched is not None
     assert fence.margins(fence.sight(*watched, slopes=False))["clearance"] > 0.05
-    found = audit(setup, setup.initial)
+    found = audit(task, task.initial)
     assert found.margins["clearance"] == pytest.approx(0.19 - SWING - 0.1, abs=1e-4)
     assert not found.kept
-    assert audit(spring_setup(tmp_path, limits={"clearance": 0.035}), setup.initial).kept
+    assert audit(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).kept
 
 
 def test_what_keeps_all_limits_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     """Just above the swing, just below it."""
     for edge, kept in ((1.001, True), (0.999, False)):
         limits = {"position": {"slide": (-edge * SWING, 1.0)}}
-        setup = spring_setup(tmp_path, limits=limits)
-        assert audit(setup, setup.initial).kept is kept
+        task = spring_task(tmp_path, limits=limits)
+        assert audit(task, task.initial).kept is kept
 
 
 @pytest.mark.parametrize("clamp", ["stop", "force", "joint force", "control"])
@@ -112,12 +112,12 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
     }[clamp]
     control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
     tables = {"rate": 50.0, "initial": {"qvel": (SPEED,), "control": control}}
-    setup = spring_setup(tmp_path, **words, **tables)
-    lifted = setup.free()
-    designed = lifted.plant.simulate(lifted.theta, setup.control)
-    found = audit(setup, designed)
+    task = spring_task(tmp_path, **words, **tables)
+    lifted = task.relaxed()
+    designed = lifted.plant.simulate(lifted.theta, task.control)
+    found = audit(task, designed)
     assert found.deviation > 10 * SAME
-    free = audit(spring_setup(tmp_path, **tables), designed)
+    free = audit(spring_task(tmp_path, **tables), designed)
     assert free.deviation < SAME
     if clamp in ("stop", "control"):
         assert not found.kept
@@ -137,13 +137,13 @@ def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
         "initial": {"qvel": (SPEED,), "control": control},
         "cost": {"control": 1.0},
     }
-    setup = spring_setup(
+    task = spring_task(
         tmp_path, motor=motor, boundary={"end": "periodic"}, limits={"enforce": enforce}, **tables
     )
-    assert setup.enforced
-    lifted = setup.free()
-    designed = lifted.plant.simulate(lifted.theta, setup.control)
-    assert (audit(setup, designed).deviation < SAME) is not enforce
+    assert task.is_limited
+    lifted = task.relaxed()
+    designed = lifted.plant.simulate(lifted.theta, task.control)
+    assert (audit(task, designed).deviation < SAME) is not enforce
 
 
 def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
@@ -154,8 +154,8 @@ def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
         ({"end": "periodic"}, True),
         ({"end": "periodic", "position": 1e-7}, False),
     ):
-        setup = spring_setup(tmp_path, limits=limits, boundary=boundary)
-        found = audit(setup, setup.initial)
+        task = spring_task(tmp_path, limits=limits, boundary=boundary)
+        found = audit(task, task.initial)
         assert found.margins["position"] < 0.0
         assert found.margins["clearance"] < 0.0
         assert found.kept is kept
@@ -163,15 +163,15 @@ def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
 
 def test_a_control_that_the_model_does_not_survive_keeps_nothing(tmp_path: Path) -> None:
     limits = {"position": {"slide": (-3.0, 3.0)}, "control": {"force": (-1e13, 1e13)}}
-    setup = make_setup(
+    task = make_task(
         CART_PENDULUM.format(integrator="RK4"),
         tmp_path,
         parameters={"m": {"target": "body/bob:mass"}},
         noise={"state": 0.01},
         limits=limits,
     )
-    wild = setup.plant.trajectory(setup.initial.state, np.full_like(setup.control, 1e12))
-    found = audit(setup, wild)
+    wild = task.plant.trajectory(task.initial.state, np.full_like(task.control, 1e12))
+    found = audit(task, wild)
     assert not found.kept
     assert found.deviation == np.inf
     assert set(found.margins.values()) == {-np.inf}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.control_signal import generate
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.experiment.system_tables import Signal
 from tests.support.paths import MODELS
 
@@ -112,11 +112,11 @@ def test_unknown_actuator(key: str) -> None:
 
 
 def test_setup_samples_the_signal_at_its_rate() -> None:
-    """At 20 Hz it has every fifth sample of 100 Hz; a coarser setup has the mean over its longer samples."""
+    """At 20 Hz it has every fifth sample of 100 Hz; a coarser task has the mean over its longer samples."""
     e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
         horizon=2.0, initial={"control": {"kind": "sine", "frequency": 0.7}}
     )
-    fine, slow = Setup(e), Setup(e.replace(rate=20.0, measure_rate=20.0))
+    fine, slow = DesignTask.resolve(e), DesignTask.resolve(e.replace(rate=20.0, measure_rate=20.0))
     assert np.allclose(slow.control, fine.control[::5], rtol=0, atol=1e-12)
     coarse = fine.coarser(4)
     assert coarse.dt == pytest.approx(4 * fine.dt)
@@ -136,9 +136,9 @@ def test_the_signal_oscillates_about_the_control_of_the_keyframe(tmp_path: Path)
         horizon=1.0,
         initial={"control": {"kind": "sine", "amplitude": 0.5}},
     )
-    control = Setup(e).control[:, 0]
+    control = DesignTask.resolve(e).control[:, 0]
     assert (control[0], control.max(), control.min()) == pytest.approx((1.5, 2.0, 1.5), abs=1e-2)
-    stated = Setup(
+    stated = DesignTask.resolve(
         e.replace(initial={"control": {"kind": "sine", "amplitude": 0.5, "offset": -1.0}})
     )
     assert stated.control[:, 0] == pytest.approx(control - 2.5, abs=1e-12)

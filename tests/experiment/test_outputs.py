@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.outputs import resolve_outputs
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.model.coordinates import (
     control_names,
     joint_names,
@@ -21,7 +21,7 @@ from mjfim.model.coordinates import (
     scalar_joints,
     state_components,
 )
-from tests.support.numerics import FREE_BODY, Array, Loop, body_setup, cart_setup, make_setup
+from tests.support.numerics import FREE_BODY, Array, Loop, body_task, cart_task, make_task
 from tests.support.paths import MODELS
 
 FREE = [f"qpos:float.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
@@ -31,25 +31,25 @@ RATES = [f"qvel:float.{part}" for part in ("x", "y", "z", "rx", "ry", "rz")] + [
 ]
 
 
-def sigmas(setup: Setup) -> dict[str, float]:
+def sigmas(task: DesignTask) -> dict[str, float]:
     """Standard deviation of every output."""
-    return dict(zip(setup.outputs.names, setup.noise.sigma.tolist(), strict=True))
+    return dict(zip(task.system.outputs.names, task.system.noise.sigma.tolist(), strict=True))
 
 
-def strides(setup: Setup) -> dict[str, int]:
+def strides(task: DesignTask) -> dict[str, int]:
     """Samples between two measurements of every output."""
-    return dict(zip(setup.outputs.names, setup.noise.strides.tolist(), strict=True))
+    return dict(zip(task.system.outputs.names, task.system.noise.strides.tolist(), strict=True))
 
 
 def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
     """In the order of qpos and qvel, with its unit; quaternions by half the stated angle."""
-    setup = body_setup(tmp_path, noise={"state": 0.02})
-    assert list(setup.outputs.names) == [*FREE, *BALL, *RATES]
-    assert [o.state for o in setup.outputs.outputs] == list(range(11 + 9))
-    assert [o.unit for o in setup.outputs.outputs] == [
+    task = body_task(tmp_path, noise={"state": 0.02})
+    assert list(task.system.outputs.names) == [*FREE, *BALL, *RATES]
+    assert [o.state for o in task.system.outputs.outputs] == list(range(11 + 9))
+    assert [o.unit for o in task.system.outputs.outputs] == [
         *["m"] * 3, *[""] * 8, *["m/s"] * 3, *["rad/s"] * 6
     ]  # fmt: skip
-    found = sigmas(setup)
+    found = sigmas(task)
     assert {found[n] for n in (*FREE[:3], *RATES)} == {0.02}
     assert {found[n] for n in (*FREE[3:], *BALL)} == {0.01}
     sensors = [
@@ -63,7 +63,7 @@ def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
         "tip[1]",
         "tip[2]",
     ]
-    assert list(measurable_columns(setup.model)) == [*FREE, *BALL, *RATES, *sensors]
+    assert list(measurable_columns(task.system.model)) == [*FREE, *BALL, *RATES, *sensors]
 
 
 def test_parts_of_a_joint_go_by_one_name(tmp_path: Path) -> None:
@@ -76,7 +76,7 @@ def test_parts_of_a_joint_go_by_one_name(tmp_path: Path) -> None:
         "acc": 0.4,
     }
     for noise in (table, dict(reversed(table.items()))):
-        found = sigmas(body_setup(tmp_path, noise=noise))
+        found = sigmas(body_task(tmp_path, noise=noise))
         wanted = dict.fromkeys(FREE, 0.1) | {"qpos:float.x": 0.7} | dict.fromkeys(FREE[3:], 0.1)
         wanted |= dict.fromkeys(RATES[:3], 0.3) | {f"acc[{i}]": 0.4 for i in range(3)}
         assert found == pytest.approx(wanted)
@@ -89,37 +89,37 @@ def test_four_components_hold_exactly_the_information_of_a_rotation_vector(
 ) -> None:
     """At every attitude of a tumbling body: derivatives of the quaternion by MuJoCo's own integration, over sigma / 2."""
     sigma = 0.05
-    setup = body_setup(
+    task = body_task(
         tmp_path, noise={f"qpos:{joint}.rot": sigma} if joint == "float" else {"qpos:ball": sigma}
     )
-    trajectory, loop = setup.initial, Loop(setup.model, 1)
+    trajectory, loop = task.initial, Loop(task.system.model, 1)
     q = {"ball": 7, "float": 3}[joint]
     v = {"ball": 6, "float": 3}[joint]
-    assert [o.state for o in setup.outputs.outputs] == list(range(q, q + 4))
-    _, _, C, D = setup.plant.derivatives.jacobians(setup.theta, trajectory)
+    assert [o.state for o in task.system.outputs.outputs] == list(range(q, q + 4))
+    _, _, C, D = task.plant.derivatives.jacobians(task.theta, trajectory)
     assert not D.any()
     for k in range(0, len(C), 10):
         by_hand = np.empty((4, 3))
         for i in range(3):
-            step = np.zeros(setup.space.nx)
+            step = np.zeros(task.space.nx)
             step[v + i] = 1e-6
             up, down = loop.plus(trajectory.state[k], step), loop.plus(trajectory.state[k], -step)
             by_hand[:, i] = (up[q : q + 4] - down[q : q + 4]) / 2e-6
         np.testing.assert_allclose(C[k, :, v : v + 3], by_hand, rtol=0, atol=1e-9)
-        white = setup.noise.whiten(C[k : k + 1])[0]
-        wanted = np.zeros((setup.space.nx, setup.space.nx))
+        white = task.system.noise.whiten(C[k : k + 1])[0]
+        wanted = np.zeros((task.space.nx, task.space.nx))
         wanted[v : v + 3, v : v + 3] = np.eye(3) / sigma**2
         np.testing.assert_allclose(white.T @ white, wanted, rtol=0, atol=1e-9 / sigma**2)
 
 
 def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: Path) -> None:
     """Through the whole chain: from measured quaternions, against psi in the tangent space over sigma."""
-    setup = body_setup(tmp_path, noise={"qpos:ball": 0.05})
-    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = body_task(tmp_path, noise={"qpos:ball": 0.05})
+    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
     psi = found.psi[1:, 6:9] / 0.05
     wanted = np.einsum("kip,kiq->pq", psi, psi)
     np.testing.assert_allclose(
-        setup.information.matrix(found), wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max()
+        task.information.matrix(found), wanted, rtol=1e-8, atol=1e-8 * np.abs(wanted).max()
     )
     assert np.linalg.eigvalsh(wanted)[-1] > 1.0
 
@@ -144,8 +144,13 @@ def test_an_unnamed_joint_does_not_take_the_name_of_another(tmp_path: Path) -> N
     assert [c.name for c in scalar_joints(model)] == ["joint0_", "joint0"]
     assert control_names(model) == ("actuator0_", "actuator0")
     parameters = {"d": {"target": "joint/joint0:damping", "guess": 0.1}}
-    setup = make_setup(xml, tmp_path, parameters=parameters, noise={"state": 0.1})
-    assert setup.outputs.names == ("qpos:joint0_", "qpos:joint0", "qvel:joint0_", "qvel:joint0")
+    task = make_task(xml, tmp_path, parameters=parameters, noise={"state": 0.1})
+    assert task.system.outputs.names == (
+        "qpos:joint0_",
+        "qpos:joint0",
+        "qvel:joint0_",
+        "qvel:joint0",
+    )
 
 
 def test_rates_are_each_outputs_own(tmp_path: Path) -> None:
@@ -155,32 +160,32 @@ def test_rates_are_each_outputs_own(tmp_path: Path) -> None:
         "qpos:hinge": {"sigma": 0.05, "rate": 100.0},
         "acc": {"sigma": 0.3, "rate": 10.0},
     }
-    setup = cart_setup(tmp_path, measure_rate=50.0, noise=noise)
+    task = cart_task(tmp_path, measure_rate=50.0, noise=noise)
     plain = {"qpos:slide": 2, "qvel:slide": 2, "qvel:hinge": 2}
-    assert strides(setup) == {**plain, "qpos:hinge": 1, **{f"acc[{i}]": 10 for i in range(3)}}
-    assert sigmas(setup)["qpos:hinge"] == 0.05
-    counts = setup.noise.measured(setup.samples).sum(axis=0)
-    assert dict(zip(setup.outputs.names, counts.tolist(), strict=True)) == {
+    assert strides(task) == {**plain, "qpos:hinge": 1, **{f"acc[{i}]": 10 for i in range(3)}}
+    assert sigmas(task)["qpos:hinge"] == 0.05
+    counts = task.system.noise.measured(task.samples).sum(axis=0)
+    assert dict(zip(task.system.outputs.names, counts.tolist(), strict=True)) == {
         **dict.fromkeys(plain, 25.0), "qpos:hinge": 50.0, **{f"acc[{i}]": 5.0 for i in range(3)}
     }  # fmt: skip
 
 
 def test_information_of_rates_is_the_sum_over_the_measured_samples(tmp_path: Path) -> None:
     """Output by output from G; twice the rate is not twice a weight."""
-    setup = cart_setup(tmp_path, noise={"qpos:hinge": {"sigma": 0.05, "rate": 20.0}, "rate": 0.2})
-    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = cart_task(tmp_path, noise={"qpos:hinge": {"sigma": 0.05, "rate": 20.0}, "rate": 0.2})
+    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
     G = found.G
-    assert setup.outputs.names == ("qpos:hinge", "rate")
+    assert task.system.outputs.names == ("qpos:hinge", "rate")
     wanted = sum(np.outer(G[k, 0], G[k, 0]) / 0.05**2 for k in range(5, 51, 5))
     wanted = wanted + sum(np.outer(G[k, 1], G[k, 1]) / 0.2**2 for k in range(1, 51))
-    np.testing.assert_allclose(setup.information.matrix(found), wanted, rtol=1e-10)
+    np.testing.assert_allclose(task.information.matrix(found), wanted, rtol=1e-10)
 
 
 def test_components_of_a_sensor_have_their_own_sigmas(tmp_path: Path) -> None:
-    setup = cart_setup(
+    task = cart_task(
         tmp_path, noise={"acc": {"sigma": [0.1, 0.2, 0.3]}, "qpos:slide": {"sigma": [0.4]}}
     )
-    assert sigmas(setup) == pytest.approx(
+    assert sigmas(task) == pytest.approx(
         {"qpos:slide": 0.4, "acc[0]": 0.1, "acc[1]": 0.2, "acc[2]": 0.3}
     )
 
@@ -190,34 +195,34 @@ BLOCK = np.array([[0.09, 0.03, 0.0], [0.03, 0.16, -0.02], [0.0, -0.02, 0.04]])
 
 def test_a_covariance_stands_where_its_outputs_stand(tmp_path: Path) -> None:
     """In a sensor's own rows; everything else stays independent."""
-    setup = cart_setup(tmp_path, noise={"state": 0.1, "acc": {"covariance": BLOCK.tolist()}})
-    at = [setup.outputs.names.index(f"acc[{i}]") for i in range(3)]
+    task = cart_task(tmp_path, noise={"state": 0.1, "acc": {"covariance": BLOCK.tolist()}})
+    at = [task.system.outputs.names.index(f"acc[{i}]") for i in range(3)]
     wanted = 0.01 * np.eye(7)
     wanted[np.ix_(at, at)] = BLOCK
-    np.testing.assert_allclose(setup.noise.covariance, wanted, rtol=1e-15)
-    assert setup.noise.correlated
+    np.testing.assert_allclose(task.system.noise.covariance, wanted, rtol=1e-15)
+    assert task.system.noise.correlated
 
 
 def test_what_names_less_takes_a_component_out_of_a_covariance(tmp_path: Path) -> None:
     """Its own sigma, and no correlation left with the others."""
     whole = 0.01 * (np.eye(4) + 0.3)
-    setup = cart_setup(tmp_path, noise={"qpos:hinge": 0.5, "state": {"covariance": whole.tolist()}})
-    hinge = setup.outputs.names.index("qpos:hinge")
+    task = cart_task(tmp_path, noise={"qpos:hinge": 0.5, "state": {"covariance": whole.tolist()}})
+    hinge = task.system.outputs.names.index("qpos:hinge")
     wanted = np.array(whole)
     wanted[hinge] = wanted[:, hinge] = 0.0
     wanted[hinge, hinge] = 0.25
-    np.testing.assert_allclose(setup.noise.covariance, wanted, rtol=1e-15)
+    np.testing.assert_allclose(task.system.noise.covariance, wanted, rtol=1e-15)
 
 
 def test_correlated_outputs_replace_their_sigmas(tmp_path: Path) -> None:
     """In the order in which the block names them, and measured even where the noise table does not name them."""
     names = ["acc[2]", "qpos:hinge", "drive"]
-    setup = cart_setup(
+    task = cart_task(
         tmp_path,
         noise={"state": 0.1},
         correlated=[{"outputs": names, "covariance": BLOCK.tolist()}],
     )
-    assert setup.outputs.names == (
+    assert task.system.outputs.names == (
         "qpos:slide",
         "qpos:hinge",
         "qvel:slide",
@@ -225,14 +230,14 @@ def test_correlated_outputs_replace_their_sigmas(tmp_path: Path) -> None:
         "acc[2]",
         "drive",
     )
-    at = [setup.outputs.names.index(n) for n in names]
-    np.testing.assert_allclose(setup.noise.covariance[np.ix_(at, at)], BLOCK, rtol=1e-15)
+    at = [task.system.outputs.names.index(n) for n in names]
+    np.testing.assert_allclose(task.system.noise.covariance[np.ix_(at, at)], BLOCK, rtol=1e-15)
     rest = np.setdiff1d(np.arange(6), at)
     np.testing.assert_allclose(
-        setup.noise.covariance[np.ix_(rest, rest)], 0.01 * np.eye(3), rtol=1e-15
+        task.system.noise.covariance[np.ix_(rest, rest)], 0.01 * np.eye(3), rtol=1e-15
     )
-    assert not setup.noise.covariance[np.ix_(rest, at)].any()
-    assert sigmas(setup)["acc[2]"] == pytest.approx(0.3)
+    assert not task.system.noise.covariance[np.ix_(rest, at)].any()
+    assert sigmas(task)["acc[2]"] == pytest.approx(0.3)
 
 
 def test_correlated_outputs_alone_are_a_measurement(tmp_path: Path) -> None:
@@ -248,23 +253,23 @@ def test_correlated_outputs_alone_are_a_measurement(tmp_path: Path) -> None:
         "initial": {"control": {"kind": "sine"}},
         "parameters": {"m": {"target": "body/bob:mass"}},
     }
-    setup = Setup(Experiment(**values, correlated=[plain]), threads=1)
-    assert setup.outputs.names == ("qpos:slide", "qvel:hinge")
-    np.testing.assert_allclose(setup.noise.covariance, [[0.04, 0.01], [0.01, 0.09]])
+    task = DesignTask.resolve(Experiment(**values, correlated=[plain]), threads=1)
+    assert task.system.outputs.names == ("qpos:slide", "qvel:hinge")
+    np.testing.assert_allclose(task.system.noise.covariance, [[0.04, 0.01], [0.01, 0.09]])
     with pytest.raises(
         ExperimentError, match=r"noise: nothing is measured: .*state, qpos:slide, .*hinge_velocity"
     ):
-        Setup(Experiment(**values), threads=1)
+        DesignTask.resolve(Experiment(**values), threads=1)
 
 
 def test_the_joint_information_needs_the_correlation(tmp_path: Path) -> None:
     """G' Sigma^-1 G with the full inverse, sample by sample."""
-    setup = cart_setup(tmp_path, measure_rate=50.0, noise={"acc": {"covariance": BLOCK.tolist()}})
-    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = cart_task(tmp_path, measure_rate=50.0, noise={"acc": {"covariance": BLOCK.tolist()}})
+    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
     inverse = np.linalg.inv(BLOCK)
     wanted = sum(found.G[k].T @ inverse @ found.G[k] for k in range(2, 51, 2))
     np.testing.assert_allclose(
-        setup.information.matrix(found), wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max()
+        task.information.matrix(found), wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max()
     )
     apart = sum(found.G[k].T @ np.diag(1 / np.diag(BLOCK)) @ found.G[k] for k in range(2, 51, 2))
     assert np.abs(apart - wanted).max() > 0.01 * np.abs(wanted).max(), "a weak test"
@@ -390,7 +395,7 @@ def test_wrong_tables_are_named(name: str, tmp_path: Path) -> None:
     """The key, the fault, what would have been valid."""
     tables, message = WRONG[name]
     with pytest.raises(ExperimentError, match=rf"experiment: {message}"):
-        cart_setup(tmp_path, **tables)
+        cart_task(tmp_path, **tables)
 
 
 @pytest.mark.parametrize(
@@ -405,7 +410,7 @@ def test_another_spelling_of_a_column_is_refused_with_its_name(
 ) -> None:
     """Columns of the state hold quaternions, by part and not by index."""
     with pytest.raises(ExperimentError, match=re.escape(message)):
-        body_setup(tmp_path, noise={written: 0.1})
+        body_task(tmp_path, noise={written: 0.1})
 
 
 def test_a_covariance_of_an_orientation_is_refused(tmp_path: Path) -> None:
@@ -415,8 +420,8 @@ def test_a_covariance_of_an_orientation_is_refused(tmp_path: Path) -> None:
             ExperimentError,
             match=rf"noise\.{key}: orientations take one sigma \[rad\], no covariance",
         ):
-            body_setup(tmp_path, noise={key: {"covariance": square(size)}})
-    found = body_setup(tmp_path, noise={"qvel:ball": {"covariance": square(3, 0.25)}})
+            body_task(tmp_path, noise={key: {"covariance": square(size)}})
+    found = body_task(tmp_path, noise={"qvel:ball": {"covariance": square(3, 0.25)}})
     assert set(sigmas(found).values()) == {0.5}
 
 
@@ -438,11 +443,11 @@ def test_a_model_without_joints_has_no_state_to_measure(tmp_path: Path) -> None:
 
 def test_sensors_read_by_the_plant_are_those_of_mujoco(tmp_path: Path) -> None:
     """Labels stand where MuJoCo writes their numbers."""
-    setup = body_setup(tmp_path, noise={"tip": 0.1, "gyro": 0.2, "qpos:float.pos": 0.3})
-    y, _ = setup.plant.measure(setup.theta[None], setup.control)
-    loop = Loop(setup.model, 1)
-    state = setup.initial.state[20]
-    sensed = loop.h(state, setup.control[20])
+    task = body_task(tmp_path, noise={"tip": 0.1, "gyro": 0.2, "qpos:float.pos": 0.3})
+    y, _ = task.plant.measure(task.theta[None], task.control)
+    loop = Loop(task.system.model, 1)
+    state = task.initial.state[20]
+    sensed = loop.h(state, task.control[20])
     wanted: Array = np.concatenate([state[:3], sensed[:3], sensed[6:9]])
-    assert setup.outputs.names[3:6] == ("gyro[0]", "gyro[1]", "gyro[2]")
+    assert task.system.outputs.names[3:6] == ("gyro[0]", "gyro[1]", "gyro[2]")
     np.testing.assert_allclose(y[0, 20], wanted, rtol=0, atol=1e-9)

@@ -11,31 +11,31 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
 from mjfim.model.parameters import Parameter
 from mjfim.model.targets import body_inertia
 from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,
-    body_setup,
-    cart_setup,
-    filtered_setup,
-    make_setup,
+    body_task,
+    cart_task,
+    filtered_task,
+    make_task,
 )
 
 ARM = {"inertial": "arm"}
 
 
-def named(setup: Setup) -> dict[str, Parameter]:
+def named(task: DesignTask) -> dict[str, Parameter]:
     """Parameters by name."""
-    return {p.name: p for p in setup.parameters.parameters}
+    return {p.name: p for p in task.parameters.parameters}
 
 
 @pytest.mark.parametrize("coordinates", [None, "logcholesky", "barycentric"])
 def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path: Path) -> None:
     """Guess, size, unit of each from the body itself; at the guess the model is the model."""
-    setup = body_setup(
+    task = body_task(
         tmp_path,
         parameters={
             "arm": {**ARM, "coordinates": coordinates},
@@ -43,31 +43,31 @@ def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path
         },
     )
     chart = INERTIA_PARAMETRISATIONS[coordinates or "logcholesky"]
-    body = setup.model.body("arm").id
-    assert setup.parameters.names == (*(f"arm.{n}" for n in chart.names), "d")
-    ten = setup.parameters.parameters[:10]
+    body = task.system.model.body("arm").id
+    assert task.parameters.names == (*(f"arm.{n}" for n in chart.names), "d")
+    ten = task.parameters.parameters[:10]
     np.testing.assert_allclose(
         [p.guess for p in ten],
-        chart.coordinates(body_inertia(setup.model, body)),
+        chart.coordinates(body_inertia(task.system.model, body)),
         rtol=1e-12,
         atol=1e-15,
     )
     np.testing.assert_array_equal(
-        [p.scale for p in ten], chart.magnitudes(body_inertia(setup.model, body))
+        [p.scale for p in ten], chart.magnitudes(body_inertia(task.system.model, body))
     )
     np.testing.assert_array_equal(
-        setup.parameters.magnitude[:10], chart.magnitudes(body_inertia(setup.model, body))
+        task.parameters.magnitude[:10], chart.magnitudes(body_inertia(task.system.model, body))
     )
     assert tuple(p.unit for p in ten) == chart.units
-    assert {p.group for p in ten} == {"arm"} and setup.parameters.parameters[10].group == ""
-    own = setup.model_at(setup.parameters.guess)
+    assert {p.group for p in ten} == {"arm"} and task.parameters.parameters[10].group == ""
+    own = task.system.model_at(task.parameters.guess)
     for field in ("body_mass", "body_ipos", "dof_M0"):
         np.testing.assert_allclose(
-            getattr(own, field), getattr(setup.model, field), rtol=1e-9, atol=1e-12
+            getattr(own, field), getattr(task.system.model, field), rtol=1e-9, atol=1e-12
         )
     np.testing.assert_allclose(
         body_inertia(own, body).inertia,
-        body_inertia(setup.model, body).inertia,
+        body_inertia(task.system.model, body).inertia,
         rtol=1e-9,
         atol=1e-12,
     )
@@ -76,11 +76,11 @@ def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path
 @pytest.mark.parametrize("coordinates", ["logcholesky", "barycentric"])
 def test_the_ten_are_written_together(coordinates: str, tmp_path: Path) -> None:
     """Another body's numbers: the model then holds that body."""
-    setup = body_setup(tmp_path, parameters={"arm": {**ARM, "coordinates": coordinates}})
-    chart, arm = INERTIA_PARAMETRISATIONS[coordinates], setup.model.body("arm").id
+    task = body_task(tmp_path, parameters={"arm": {**ARM, "coordinates": coordinates}})
+    chart, arm = INERTIA_PARAMETRISATIONS[coordinates], task.system.model.body("arm").id
     rng = np.random.default_rng(0)
-    theta = setup.parameters.guess + 0.05 * setup.parameters.scale * rng.standard_normal(10)
-    wanted, found = chart.inertia(theta), body_inertia(setup.model_at(theta), arm)
+    theta = task.parameters.guess + 0.05 * task.parameters.scale * rng.standard_normal(10)
+    wanted, found = chart.inertia(theta), body_inertia(task.system.model_at(theta), arm)
     assert found.mass == pytest.approx(wanted.mass, rel=1e-12)
     np.testing.assert_allclose(found.com, wanted.com, rtol=1e-12)
     np.testing.assert_allclose(found.inertia, wanted.inertia, rtol=1e-9, atol=1e-12)
@@ -92,7 +92,7 @@ def test_priors_of_an_inertial_are_relative_to_the_size_of_each(tmp_path: Path) 
         "arm": {**ARM, "prior": 0.1, "coordinates": "barycentric", "nuisance": True},
         "d": {"target": "joint/ball:damping"},
     }
-    parameters = named(body_setup(tmp_path, parameters=table))
+    parameters = named(body_task(tmp_path, parameters=table))
     for name in INERTIA_PARAMETRISATIONS["barycentric"].names:
         p = parameters[f"arm.{name}"]
         assert p.prior == pytest.approx(0.1 * p.scale)
@@ -103,12 +103,12 @@ def test_priors_of_an_inertial_are_relative_to_the_size_of_each(tmp_path: Path) 
 def test_scale_guess_of_an_inertial_is_each_coordinates_own_value(tmp_path: Path) -> None:
     """Where one is zero that cannot be."""
     hull = {"hull": {"inertial": "hull", "scale": "guess", "coordinates": "barycentric"}}
-    setup = body_setup(tmp_path, parameters=hull)
-    np.testing.assert_allclose(setup.parameters.scale, np.abs(setup.parameters.guess), rtol=1e-15)
+    task = body_task(tmp_path, parameters=hull)
+    np.testing.assert_allclose(task.parameters.scale, np.abs(task.parameters.guess), rtol=1e-15)
     with pytest.raises(
         ExperimentError, match=r"parameters\.arm\.scale: my is 0; leave scale = \"guess\" out"
     ):
-        body_setup(
+        body_task(
             tmp_path, parameters={"arm": {**ARM, "scale": "guess", "coordinates": "barycentric"}}
         )
 
@@ -126,23 +126,23 @@ def test_rods_and_plates_are_told_which_coordinates_fit(moments: str, tmp_path: 
         with pytest.raises(
             ExperimentError, match=r"bob\.inertial: body 'bob': .*a rod or a plate.*\"barycentric\""
         ):
-            make_setup(xml, tmp_path, parameters={"bob": {"inertial": "bob"}}, noise={"state": 0.1})
+            make_task(xml, tmp_path, parameters={"bob": {"inertial": "bob"}}, noise={"state": 0.1})
         table = {"s": {"target": "body/bob:logcholesky[4]"}}
         with pytest.raises(
             ExperimentError, match=r"parameters\.s: body 'bob' has no logcholesky coordinates"
         ):
-            make_setup(xml, tmp_path, parameters=table, noise={"state": 0.1})
+            make_task(xml, tmp_path, parameters=table, noise={"state": 0.1})
     else:  # thin, but a body
         assert (
             len(
-                make_setup(
+                make_task(
                     xml, tmp_path, parameters={"bob": {"inertial": "bob"}}, noise={"state": 0.1}
                 ).theta
             )
             == 10
         )
     table = {"bob": {"inertial": "bob", "coordinates": "barycentric"}}
-    assert len(make_setup(xml, tmp_path, parameters=table, noise={"state": 0.1}).theta) == 10
+    assert len(make_task(xml, tmp_path, parameters=table, noise={"state": 0.1}).theta) == 10
 
 
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
@@ -222,7 +222,7 @@ def test_wrong_parameters_are_named(name: str, tmp_path: Path) -> None:
     """The key, the fault, what would have been valid."""
     table, message = WRONG[name]
     with pytest.raises(ExperimentError, match=rf"experiment: .*{message}"):
-        body_setup(tmp_path, parameters=table)
+        body_task(tmp_path, parameters=table)
 
 
 @pytest.mark.parametrize(
@@ -243,29 +243,29 @@ def test_wrong_parameters_are_named(name: str, tmp_path: Path) -> None:
 def test_guess_unit_and_scale_come_from_what_is_named(
     path: str, guess: float, unit: str, scale: float, tmp_path: Path
 ) -> None:
-    parameters = named(body_setup(tmp_path, parameters={"p": {"target": path}}))
+    parameters = named(body_task(tmp_path, parameters={"p": {"target": path}}))
     p = parameters["p"]
     assert (p.guess, p.unit, p.scale) == pytest.approx((guess, unit, scale))
 
 
 def test_places_are_compared_with_the_size_of_the_body(tmp_path: Path) -> None:
     """A centre of mass at zero still has a scale: the radius of gyration; `scale = "guess"` asks for the value itself."""
-    setup = body_setup(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]"}})
-    radius = body_inertia(setup.model, setup.model.body("arm").id).gyration_radius
-    assert setup.parameters.guess.tolist() == [0.0]
-    assert setup.parameters.scale.tolist() == setup.parameters.magnitude.tolist() == [radius]
+    task = body_task(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]"}})
+    radius = body_inertia(task.system.model, task.system.model.body("arm").id).gyration_radius
+    assert task.parameters.guess.tolist() == [0.0]
+    assert task.parameters.scale.tolist() == task.parameters.magnitude.tolist() == [radius]
     with pytest.raises(ExperimentError, match=r"parameters\.y\.scale"):
-        body_setup(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]", "scale": "guess"}})
+        body_task(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]", "scale": "guess"}})
     turned = {"y": {"targets": [{"path": "body/arm:ipos[2]", "scale": -2.0, "offset": 1.0}]}}
-    setup = body_setup(tmp_path, parameters=turned)
-    assert setup.parameters.guess.tolist() == [(0.25 - 1.0) / -2.0]
-    assert setup.parameters.parameters[0].unit == ""
-    assert setup.model_at(setup.parameters.guess).body("arm").ipos[2] == 0.25
+    task = body_task(tmp_path, parameters=turned)
+    assert task.parameters.guess.tolist() == [(0.25 - 1.0) / -2.0]
+    assert task.parameters.parameters[0].unit == ""
+    assert task.system.model_at(task.parameters.guess).body("arm").ipos[2] == 0.25
 
 
 def test_whole_numbers_are_scales_too(tmp_path: Path) -> None:
     """TOML's 2 is as good as 2.0."""
-    assert body_setup(
+    assert body_task(
         tmp_path, parameters={"m": {"target": "body/arm:mass", "scale": 2}}
     ).parameters.scale.tolist() == [2.0]
 
@@ -275,21 +275,21 @@ def test_whole_numbers_are_scales_too(tmp_path: Path) -> None:
 
 def test_starts_of_all_components(tmp_path: Path) -> None:
     """One deviation for each degree of freedom in position and velocity, with the prior, unwanted."""
-    setup = body_setup(
+    task = body_task(
         tmp_path, parameters={"m": {"target": "body/arm:mass"}}, nuisance={"initial": 0.02}
     )
-    found = setup.parameters.parameters
+    found = task.parameters.parameters
     assert len(found) == 1 + 9 + 9
     names = [f"initial qpos:float.{part}" for part in ("x", "y", "z", "rx", "ry", "rz")] + [
         f"initial qpos:ball.{part}" for part in ("rx", "ry", "rz")
     ]
-    assert list(setup.parameters.names[1:10]) == names
-    assert list(setup.parameters.names[10:]) == [n.replace("qpos", "qvel") for n in names]
+    assert list(task.parameters.names[1:10]) == names
+    assert list(task.parameters.names[10:]) == [n.replace("qpos", "qvel") for n in names]
     assert all(p.nuisance and p.prior == 0.02 and p.guess == 0.0 for p in found[1:])
     assert [p.unit for p in found[1:8]] == ["m", "m", "m", "rad", "rad", "rad", "rad"]
-    assert setup.parameters.interest.tolist() == [0]
-    np.testing.assert_array_equal(setup.parameters.initial_state_derivative(18)[:, 1:], np.eye(18))
-    np.testing.assert_allclose(np.diag(setup.parameters.prior_information)[1:], 2500.0)
+    assert task.parameters.interest.tolist() == [0]
+    np.testing.assert_array_equal(task.parameters.initial_state_derivative(18)[:, 1:], np.eye(18))
+    np.testing.assert_allclose(np.diag(task.parameters.prior_information)[1:], 2500.0)
 
 
 @pytest.mark.parametrize(
@@ -306,7 +306,7 @@ def test_an_indexed_deviation_is_refused_with_its_present_name(
     """In the nuisance table."""
     message = f"nuisance.initial: '{written}' is now written '{right}'"
     with pytest.raises(ExperimentError, match=re.escape(message)):
-        body_setup(
+        body_task(
             tmp_path,
             parameters={"m": {"target": "body/arm:mass"}},
             nuisance={"initial": {written: 0.1}},
@@ -327,13 +327,13 @@ def test_an_indexed_path_is_refused_with_its_present_spelling(
     """In the paths of parameters."""
     message = f"parameters.p: in parameter path '{written}': '{written}' is now written '{right}'"
     with pytest.raises(ExperimentError, match=re.escape(message)):
-        body_setup(tmp_path, parameters={"p": {"target": written}})
+        body_task(tmp_path, parameters={"p": {"target": written}})
 
 
 def test_a_deviation_of_an_orientation_is_a_rotation_vector(tmp_path: Path) -> None:
     """A quaternion's component is refused with the names of the rotation vector."""
     with pytest.raises(ExperimentError, match=r"rotation vector here; valid: qpos:ball\.rx, .*rz"):
-        body_setup(
+        body_task(
             tmp_path,
             parameters={"m": {"target": "body/arm:mass"}},
             nuisance={"initial": {"qpos:ball.qw": 0.1}},
@@ -345,7 +345,7 @@ def test_a_deviation_of_a_free_joint_needs_a_part(tmp_path: Path) -> None:
     with pytest.raises(
         ExperimentError, match=r"initial/float:qpos'.*valid: .*initial/float:qpos\.rx"
     ):
-        body_setup(tmp_path, parameters={"p": {"target": "initial/float:qpos"}})
+        body_task(tmp_path, parameters={"p": {"target": "initial/float:qpos"}})
 
 
 def test_starts_and_biases_by_name(tmp_path: Path) -> None:
@@ -355,7 +355,7 @@ def test_starts_and_biases_by_name(tmp_path: Path) -> None:
         "bias": {"qpos:slide": 0.3},
         "delay": 0.005,
     }
-    parameters = named(cart_setup(tmp_path, nuisance=nuisance))
+    parameters = named(cart_task(tmp_path, nuisance=nuisance))
     assert list(parameters) == [
         "m",
         "l",
@@ -371,15 +371,15 @@ def test_starts_and_biases_by_name(tmp_path: Path) -> None:
 
 
 def test_biases_of_all_outputs(tmp_path: Path) -> None:
-    setup = cart_setup(tmp_path, noise={"qpos:hinge": 0.1, "acc": 0.2}, nuisance={"bias": True})
-    assert setup.parameters.names[3:] == (
+    task = cart_task(tmp_path, noise={"qpos:hinge": 0.1, "acc": 0.2}, nuisance={"bias": True})
+    assert task.parameters.names[3:] == (
         "bias qpos:hinge",
         "bias acc[0]",
         "bias acc[1]",
         "bias acc[2]",
     )
-    np.testing.assert_array_equal(setup.parameters.bias_derivative(4)[:, 3:], np.eye(4))
-    y, _ = setup.plant.measure(np.array([setup.theta, setup.theta + np.eye(7)[4]]), setup.control)
+    np.testing.assert_array_equal(task.parameters.bias_derivative(4)[:, 3:], np.eye(4))
+    y, _ = task.plant.measure(np.array([task.theta, task.theta + np.eye(7)[4]]), task.control)
     np.testing.assert_allclose(
         y[1] - y[0], np.broadcast_to([0.0, 1.0, 0.0, 0.0], (51, 4)), rtol=0, atol=1e-12
     )
@@ -406,7 +406,7 @@ def test_wrong_nuisance_is_named(name: str, tmp_path: Path) -> None:
     """The key, the fault, what would have been valid."""
     nuisance, message = NUISANCE[name]
     with pytest.raises(ExperimentError, match=rf"experiment: {message}"):
-        cart_setup(tmp_path, nuisance=nuisance)
+        cart_task(tmp_path, nuisance=nuisance)
 
 
 def test_what_the_nuisance_table_names_cannot_be_a_parameter_too(tmp_path: Path) -> None:
@@ -415,14 +415,14 @@ def test_what_the_nuisance_table_names_cannot_be_a_parameter_too(tmp_path: Path)
     with pytest.raises(
         ExperimentError, match=r"initial qpos:hinge: target .* already belongs to parameters\.q"
     ):
-        cart_setup(tmp_path, parameters=own, nuisance={"initial": True})
+        cart_task(tmp_path, parameters=own, nuisance={"initial": True})
     clash = {**CART_PARAMETERS, "delay": {"target": "joint/slide:damping"}}
     with pytest.raises(
         ExperimentError, match=r"parameters\.delay: duplicate parameter name; rename one"
     ):
-        cart_setup(tmp_path, parameters=clash, nuisance={"delay": True})
+        cart_task(tmp_path, parameters=clash, nuisance={"delay": True})
     with pytest.raises(ExperimentError, match=r"parameters: all are nuisance"):
-        cart_setup(
+        cart_task(
             tmp_path,
             parameters={"q": {"target": "body/bob:mass", "nuisance": True}},
             nuisance={"delay": True},
@@ -436,24 +436,22 @@ def test_joints_without_a_name_are_not_passed_over(tmp_path: Path) -> None:
     ).replace('<jointvel name="rate" joint="hinge" noise="0.05"/>', "")  # fmt: skip
     table = {"m": {"target": "body/bob:mass"}}
     with pytest.raises(ExperimentError, match=r"nuisance\.initial: 1 joints have no name"):
-        make_setup(xml, tmp_path, parameters=table, noise={"state": 0.1}, nuisance={"initial": 0.1})
-    setup = make_setup(
+        make_task(xml, tmp_path, parameters=table, noise={"state": 0.1}, nuisance={"initial": 0.1})
+    task = make_task(
         xml,
         tmp_path,
         parameters=table,
         noise={"state": 0.1},
         nuisance={"initial": {"qpos:slide": 0.1}},
     )
-    assert setup.parameters.names == ("m", "initial qpos:slide")
+    assert task.parameters.names == ("m", "initial qpos:slide")
 
 
 def test_activations_are_starts_by_path(tmp_path: Path) -> None:
     """The state of a filter, after positions and velocities."""
-    setup = filtered_setup(
-        tmp_path, parameters={"a": {"target": "initial/servo:act", "scale": 0.5}}
-    )
-    assert setup.parameters.initial_state_derivative(3).tolist() == [[0.0], [0.0], [1.0]]
-    assert setup.plant.initial_state(np.array([0.3]))[2] == pytest.approx(0.5)
+    task = filtered_task(tmp_path, parameters={"a": {"target": "initial/servo:act", "scale": 0.5}})
+    assert task.parameters.initial_state_derivative(3).tolist() == [[0.0], [0.0], [1.0]]
+    assert task.plant.initial_state(np.array([0.3]))[2] == pytest.approx(0.5)
 
 
 # ---- functions of an MjSpec
@@ -468,10 +466,8 @@ def lengthen(spec: Any, value: float) -> None:
 def test_a_function_edits_what_no_path_can(tmp_path: Path) -> None:
     """Against two targets that say the same; the derivative too."""
     targets = [{"path": "body/bob:pos[2]"}, {"path": "body/cart:mass", "scale": 2.0}]
-    first = cart_setup(
-        tmp_path, parameters={"l": {"function": lengthen, "guess": 0.7, "unit": "m"}}
-    )
-    second = cart_setup(tmp_path, parameters={"l": {"targets": targets, "guess": 0.7}})
+    first = cart_task(tmp_path, parameters={"l": {"function": lengthen, "guess": 0.7, "unit": "m"}})
+    second = cart_task(tmp_path, parameters={"l": {"targets": targets, "guess": 0.7}})
     assert first.parameters.needs_compile.tolist() == [
         True
     ] and second.parameters.needs_compile.tolist() == [False]
@@ -481,20 +477,22 @@ def test_a_function_edits_what_no_path_can(tmp_path: Path) -> None:
     assert np.abs(found[0]).max() > 0.1
     p = first.parameters.parameters[0]
     assert (p.unit, p.scale, p.targets) == ("m", 0.7, ())
-    assert first.spec.body("bob").pos[2] == 0.8, "the user's own spec must stay as it is"
+    assert first.system.source.spec.body("bob").pos[2] == 0.8, (
+        "the user's own spec must stay as it is"
+    )
 
 
 def test_a_function_goes_with_paths(tmp_path: Path) -> None:
     """What is written in place is written into the model that the function gave."""
     table = {"l": {"function": lengthen, "guess": 0.7}, "m": {"target": "body/bob:mass"}}
-    setup = cart_setup(tmp_path, parameters=table)
-    own = setup.model_at(np.array([0.6, 2.5]))
+    task = cart_task(tmp_path, parameters=table)
+    own = task.system.model_at(np.array([0.6, 2.5]))
     assert (
         own.body("bob").pos[2],
         own.body("cart").mass[0],
         own.body("bob").mass[0],
     ) == pytest.approx((0.6, 1.2, 2.5))
-    assert setup.model.body("bob").mass[0] == 1.5
+    assert task.system.model.body("bob").mass[0] == 1.5
 
 
 def failing(spec: Any, value: float) -> None:
@@ -550,10 +548,10 @@ def test_functions_that_do_not_do_are_named(
 ) -> None:
     """The parameter, and what its function did."""
     with pytest.raises(error, match=message):
-        cart_setup(tmp_path, parameters={"f": {"function": function, "guess": 1.0}})
+        cart_task(tmp_path, parameters={"f": {"function": function, "guess": 1.0}})
 
 
 def test_a_function_whose_guess_is_zero_needs_a_scale(tmp_path: Path) -> None:
     """There is no size to take from the model."""
     with pytest.raises(ExperimentError, match=r"parameters\.f\.scale"):
-        cart_setup(tmp_path, parameters={"f": {"function": lengthen, "guess": 0.0}})
+        cart_task(tmp_path, parameters={"f": {"function": lengthen, "guess": 0.0}})

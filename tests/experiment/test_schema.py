@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, MjfimError, ModelError, RecordingError
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment, json_schema
-from mjfim.experiment.system import Setup
 from mjfim.experiment.system_tables import Correlated, NoiseSpec, Nuisance, Signal
 from mjfim.experiment.task_tables import Cost, Descent, Limits, Robust
 from mjfim.recordings.spec import Section
@@ -127,12 +127,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def resolve(folder: Path) -> Callable[[str], Setup]:
+def resolve(folder: Path) -> Callable[[str], DesignTask]:
     """Read a text as the file bad.toml and resolve it."""
 
-    def run(text: str) -> Setup:
+    def run(text: str) -> DesignTask:
         (folder / "bad.toml").write_text(text, encoding="utf-8")
-        return Setup(Experiment.from_file(folder / "bad.toml"))
+        return DesignTask.resolve(Experiment.from_file(folder / "bad.toml"))
 
     return run
 
@@ -248,10 +248,10 @@ seed = 5
 """
 
 
-def test_extended_contract_parses_and_resolves(resolve: Callable[[str], Setup]) -> None:
+def test_extended_contract_parses_and_resolves(resolve: Callable[[str], DesignTask]) -> None:
     """Each table keeps the values of the file, and the system uses them."""
-    setup = resolve(EXTENDED)
-    e = setup.experiment
+    task = resolve(EXTENDED)
+    e = task.experiment
     assert e.noise["hinge_angle"] == NoiseSpec(sigma=(0.01,)) and e.noise["slide_position"] == 0.02
     assert e.correlated == (
         Correlated(
@@ -264,29 +264,37 @@ def test_extended_contract_parses_and_resolves(resolve: Callable[[str], Setup]) 
     assert e.robust == Robust(over="worst", samples=3, seed=4)
     assert (e.parameters["c"].wanted, e.parameters["bob"].coordinates) == (0.01, "barycentric")
     assert (e.descent.starts, e.descent.coarse, e.descent.seed) == (3, 2, 5)
-    assert setup.noise.strides.tolist() == [2] * 4 + [1] * 2
-    assert setup.noise.covariance[0, 1] == 1.0 and setup.noise.covariance[4, 5] == 1e-5
-    names = setup.parameters.names
+    assert task.system.noise.strides.tolist() == [2] * 4 + [1] * 2
+    assert task.system.noise.covariance[0, 1] == 1.0 and task.system.noise.covariance[4, 5] == 1e-5
+    names = task.parameters.names
     assert names[:2] == ("bob.mass", "bob.mx") and names[10] == "c"
     assert names[11:13] == ("initial qpos:slide", "initial qvel:hinge")
-    assert names[13:-1] == tuple(f"bias {n}" for n in setup.outputs.names) and names[-1] == "delay"
-    assert setup.parameters.interest.tolist() == [10]
-    assert setup.control[0] == pytest.approx(0.5)
+    assert (
+        names[13:-1] == tuple(f"bias {n}" for n in task.system.outputs.names)
+        and names[-1] == "delay"
+    )
+    assert task.parameters.interest.tolist() == [10]
+    assert task.control[0] == pytest.approx(0.5)
     assert Experiment(**e.model_dump(), directory=e.directory, source=e.source) == e
     assert e.replace(noise={"hinge_angle": 0.3}).noise == {**e.noise, "hinge_angle": 0.3}
 
 
-def test_contract_resolves(resolve: Callable[[str], Setup]) -> None:
+def test_contract_resolves(resolve: Callable[[str], DesignTask]) -> None:
     """The numbers arrive where they act."""
-    setup = resolve(CONTRACT)
-    assert setup.parameters.names == ("m", "l", "c")
-    assert setup.parameters.guess.tolist() == [2.5, -0.75, 1.0]  # c: the model's own damping
-    assert setup.parameters.true.tolist() == [2.0, -0.75, 1.0]
-    assert setup.parameters.scale.tolist() == [1.0, 0.75, 1.0]
-    assert setup.parameters.lower.tolist() == [0.1, -np.inf, -np.inf]
-    assert setup.parameters.prior_information.tolist() == np.diag([4.0, 0.0, 0.0]).tolist()
-    assert (setup.substeps, setup.stride, setup.samples, setup.measure_rate) == (1, 2, 100, 50.0)
-    sigma = dict(zip(setup.outputs.names, setup.noise.sigma, strict=True))
+    task = resolve(CONTRACT)
+    assert task.parameters.names == ("m", "l", "c")
+    assert task.parameters.guess.tolist() == [2.5, -0.75, 1.0]  # c: the model's own damping
+    assert task.parameters.true.tolist() == [2.0, -0.75, 1.0]
+    assert task.parameters.scale.tolist() == [1.0, 0.75, 1.0]
+    assert task.parameters.lower.tolist() == [0.1, -np.inf, -np.inf]
+    assert task.parameters.prior_information.tolist() == np.diag([4.0, 0.0, 0.0]).tolist()
+    assert (
+        task.system.grid.substeps,
+        task.system.grid.stride,
+        task.samples,
+        task.system.measure_rate,
+    ) == (1, 2, 100, 50.0)
+    sigma = dict(zip(task.system.outputs.names, task.system.noise.sigma, strict=True))
     assert sigma == {
         "qpos:slide": 0.05,
         "qpos:hinge": 0.05,
@@ -294,22 +302,22 @@ def test_contract_resolves(resolve: Callable[[str], Setup]) -> None:
         "qvel:hinge": 0.05,
         "hinge_angle": 0.01,
     }
-    assert setup.tracking.tolist() == [0.05, 0.0, 0.0, 0.1]
-    assert setup.control_weight.tolist() == [1e-2]
-    assert setup.theta.tolist() == setup.parameters.true.tolist()
-    assert setup.plant.nominal_initial_state.tolist() == [0.0, np.pi, 0.0, 0.0]
-    assert setup.control.shape == (100, 1)
-    assert {(x.kind, x.name, x.lower, x.upper) for x in setup.limits} == {
+    assert task.tracking.tolist() == [0.05, 0.0, 0.0, 0.1]
+    assert task.control_weight.tolist() == [1e-2]
+    assert task.theta.tolist() == task.parameters.true.tolist()
+    assert task.plant.nominal_initial_state.tolist() == [0.0, np.pi, 0.0, 0.0]
+    assert task.control.shape == (100, 1)
+    assert {(x.kind, x.name, x.lower, x.upper) for x in task.limits} == {
         ("position", "slide", -1.0, 1.0),
         ("velocity", "hinge", -8.0, 8.0),
         ("control", "force", -5.0, 5.0),
     }
 
 
-def test_defaults(resolve: Callable[[str], Setup]) -> None:
+def test_defaults(resolve: Callable[[str], DesignTask]) -> None:
     """Keys that a file leaves out have the defaults of DESIGN.md."""
-    setup = resolve(SHORT)
-    e = setup.experiment
+    task = resolve(SHORT)
+    e = task.experiment
     assert (e.cost.criterion, e.cost.information, e.cost.control, e.cost.linearize_at) == (
         "E",
         1.0,
@@ -317,33 +325,33 @@ def test_defaults(resolve: Callable[[str], Setup]) -> None:
         "guess",
     )
     assert (e.descent.method, e.descent.tolerance, e.descent.max_iterations) == ("lbfgs", 1e-7, 200)
-    assert setup.measure_rate == e.rate
+    assert task.system.measure_rate == e.rate
     assert (
-        setup.parameters.guess.tolist()
-        == setup.parameters.true.tolist()
-        == setup.parameters.scale.tolist()
+        task.parameters.guess.tolist()
+        == task.parameters.true.tolist()
+        == task.parameters.scale.tolist()
         == [2.0]
     )
-    assert not setup.tracking.any()
-    assert setup.limits == ()
+    assert not task.tracking.any()
+    assert task.limits == ()
 
 
-def test_mjcf_noise_is_the_default(resolve: Callable[[str], Setup]) -> None:
+def test_mjcf_noise_is_the_default(resolve: Callable[[str], DesignTask]) -> None:
     """Without a noise table the sensors that state their noise are measured."""
-    setup = resolve(edited("state = 0.05", ""))
-    assert setup.outputs.names == (
+    task = resolve(edited("state = 0.05", ""))
+    assert task.system.outputs.names == (
         "slide_position",
         "hinge_angle",
         "slide_velocity",
         "hinge_velocity",
     )
-    assert setup.noise.sigma.tolist() == [0.05] * 4
+    assert task.system.noise.sigma.tolist() == [0.05] * 4
 
 
-def test_start_from_qpos(resolve: Callable[[str], Setup]) -> None:
+def test_start_from_qpos(resolve: Callable[[str], DesignTask]) -> None:
     """Stated positions and velocities are used; the others are those of the model."""
-    setup = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
-    assert setup.plant.nominal_initial_state.tolist() == [0.5, 3.0, 0.0, -1.0]
+    task = resolve(edited('keyframe = "hanging"', "qpos = [0.5, 3.0]\nqvel = [0.0, -1.0]"))
+    assert task.plant.nominal_initial_state.tolist() == [0.5, 3.0, 0.0, -1.0]
     assert resolve(edited('keyframe = "hanging"', "")).plant.nominal_initial_state.tolist() == [
         0.0,
         0.0,
@@ -352,11 +360,11 @@ def test_start_from_qpos(resolve: Callable[[str], Setup]) -> None:
     ]
 
 
-def test_rate_below_the_timestep(resolve: Callable[[str], Setup]) -> None:
+def test_rate_below_the_timestep(resolve: Callable[[str], DesignTask]) -> None:
     """A sample has several engine steps."""
-    setup = resolve(edited("rate = 100.0", "rate = 20.0"))
-    assert (setup.substeps, setup.samples) == (5, 20)
-    assert setup.dt == pytest.approx(0.05)
+    task = resolve(edited("rate = 100.0", "rate = 20.0"))
+    assert (task.system.grid.substeps, task.samples) == (5, 20)
+    assert task.dt == pytest.approx(0.05)
 
 
 def test_python_says_what_toml_says(folder: Path) -> None:
@@ -393,12 +401,12 @@ def test_experiments_are_immutable(folder: Path) -> None:
 @pytest.mark.parametrize("name", ["cart_pendulum.toml", "cart_pendulum_guess.toml"])
 def test_shipped_experiments_resolve(name: str) -> None:
     """They are the study of the paper, designed at the true values and at a guess."""
-    setup = Setup(Experiment.from_file(MODELS / name))
-    assert setup.samples == 400
-    assert setup.parameters.true.tolist() == [2.0, 1.0, 1.0]
-    assert setup.theta.tolist() == ([2.5, 1.4, 1.4] if "guess" in name else [2.0, 1.0, 1.0])
+    task = DesignTask.resolve(Experiment.from_file(MODELS / name))
+    assert task.samples == 400
+    assert task.parameters.true.tolist() == [2.0, 1.0, 1.0]
+    assert task.theta.tolist() == ([2.5, 1.4, 1.4] if "guess" in name else [2.0, 1.0, 1.0])
     t = np.arange(400) * 0.01
-    assert np.allclose(setup.control[:, 0], (1 + t / 4) * np.sin(2 * t), rtol=0, atol=1e-12)
+    assert np.allclose(task.control[:, 0], (1 + t / 4) * np.sin(2 * t), rtol=0, atol=1e-12)
 
 
 E, M, R = ExperimentError, ModelError, RecordingError
@@ -866,7 +874,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_faults_are_named(name: str, resolve: Callable[[str], Setup]) -> None:
+def test_faults_are_named(name: str, resolve: Callable[[str], DesignTask]) -> None:
     """The message names the file, the key, the fault and the valid choices."""
     text, kind, fragments = FAULTS[name]
     with pytest.raises(kind) as caught:
@@ -876,13 +884,13 @@ def test_faults_are_named(name: str, resolve: Callable[[str], Setup]) -> None:
     assert [f for f in fragments if f not in message] == []
 
 
-def test_a_free_control_is_named_by_its_actuator(resolve: Callable[[str], Setup]) -> None:
+def test_a_free_control_is_named_by_its_actuator(resolve: Callable[[str], DesignTask]) -> None:
     """An unknown actuator in cost.control_about is refused when the cost is built."""
     with pytest.raises(ExperimentError, match=r"cost\.control_about: .*actuator 'motor'.*force"):
         _ = resolve(edited("[cost]", "[cost]\ncontrol_about = { motor = 1 }")).problem
 
 
-def test_the_short_experiment_has_no_fault(resolve: Callable[[str], Setup]) -> None:
+def test_the_short_experiment_has_no_fault(resolve: Callable[[str], DesignTask]) -> None:
     """Every fault above is the only one in its file."""
     assert resolve(SHORT).samples == 100
 
@@ -915,7 +923,7 @@ def test_no_file(tmp_path: Path) -> None:
         Experiment.from_file(tmp_path)
 
 
-def test_all_faults_at_once(resolve: Callable[[str], Setup]) -> None:
+def test_all_faults_at_once(resolve: Callable[[str], DesignTask]) -> None:
     """Every fault is reported on a line with the file and the key."""
     with pytest.raises(ExperimentError) as caught:
         resolve(
@@ -939,7 +947,7 @@ ONE_LINE: dict[str, str] = {
 
 
 @pytest.mark.parametrize("name", ONE_LINE)
-def test_one_fault_one_line(name: str, resolve: Callable[[str], Setup]) -> None:
+def test_one_fault_one_line(name: str, resolve: Callable[[str], DesignTask]) -> None:
     """A key that may have several types is reported once, not once per type."""
     with pytest.raises(ExperimentError) as caught:
         resolve(ONE_LINE[name])
@@ -966,7 +974,7 @@ MISUSE: dict[str, tuple[str, list[str]]] = {
 
 
 @pytest.mark.parametrize("name", MISUSE)
-def test_misuse_is_not_accepted(name: str, resolve: Callable[[str], Setup]) -> None:
+def test_misuse_is_not_accepted(name: str, resolve: Callable[[str], DesignTask]) -> None:
     """Mistakes that would otherwise pass silently or end in a traceback."""
     text, fragments = MISUSE[name]
     with pytest.raises(MjfimError) as caught:

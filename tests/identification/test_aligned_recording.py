@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 
 from mjfim.errors import RecordingError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.identification.aligned_recording import Track, held, measured_trajectory, track_of
 from mjfim.plant.delay import OutputDelay
 from mjfim.records.recording import Recording
-from tests.support.numerics import Array, body_setup, cart_setup
+from tests.support.numerics import Array, body_task, cart_task
 
 DT = 0.01
 
 
 @pytest.fixture(scope="module")
-def setup(tmp_path_factory: pytest.TempPathFactory) -> Setup:
-    return cart_setup(tmp_path_factory.mktemp("cart"))
+def task(tmp_path_factory: pytest.TempPathFactory) -> DesignTask:
+    return cart_task(tmp_path_factory.mktemp("cart"))
 
 
 @pytest.fixture(scope="module")
-def body(tmp_path_factory: pytest.TempPathFactory) -> Setup:
-    return body_setup(tmp_path_factory.mktemp("body"), noise={"state": 0.01})
+def body(tmp_path_factory: pytest.TempPathFactory) -> DesignTask:
+    return body_task(tmp_path_factory.mktemp("body"), noise={"state": 0.01})
 
 
 def stamps(rng: np.random.Generator, mean: float) -> Array:
@@ -78,52 +78,52 @@ def test_on_the_grid_the_control_is_itself() -> None:
     np.testing.assert_allclose(fine, rows.reshape(10, 4, 1).mean(axis=1), rtol=0, atol=1e-14)
 
 
-def log(setup: Setup, **changes: Any) -> Recording:
+def log(task: DesignTask, **changes: Any) -> Recording:
     """A plain recording with something replaced."""
-    N, ny = 30, len(setup.outputs)
+    N, ny = 30, len(task.system.outputs)
     rng = np.random.default_rng(0)
-    ctrl = rng.standard_normal((N, len(setup.controls)))
+    ctrl = rng.standard_normal((N, len(task.controls)))
     values = {
-        "t": np.arange(N + 1) * setup.dt,
+        "t": np.arange(N + 1) * task.dt,
         "ctrl": ctrl,
         "y": rng.standard_normal((N + 1, ny)),
-        "outputs": setup.outputs.names,
+        "outputs": task.system.outputs.names,
         "name": "x.csv",
     }
     return Recording(**{**values, **changes})
 
 
-def test_a_recording_on_the_grid_is_taken_as_it_is(setup: Setup) -> None:
+def test_a_recording_on_the_grid_is_taken_as_it_is(task: DesignTask) -> None:
     """Stamps from anywhere, within a hundredth of a sample; columns in any order, some absent; a last control too much."""
-    plain = log(setup)
+    plain = log(task)
     jitter = np.random.default_rng(1).uniform(-4e-5, 4e-5, len(plain.t))
     for t in (plain.t, plain.t + 1.7e9, plain.t + jitter):
-        track = track_of(setup, log(setup, t=t))
+        track = track_of(task.system, log(task, t=t))
         assert track.even
         np.testing.assert_allclose(track.t, plain.t, rtol=0, atol=1e-15)
         np.testing.assert_array_equal(track.ctrl, plain.ctrl)
         np.testing.assert_array_equal(track.y, plain.y)
-    swapped = log(setup, y=plain.y[:, [3, 0]], outputs=("qvel:hinge", "qpos:slide"))
-    track = track_of(setup, swapped)
+    swapped = log(task, y=plain.y[:, [3, 0]], outputs=("qvel:hinge", "qpos:slide"))
+    track = track_of(task.system, swapped)
     np.testing.assert_array_equal(track.y[:, [3, 0]], swapped.y)
     assert np.isnan(track.y[:, 1:3]).all()
     assert track.measured.sum() == 2 * len(plain.t)
-    more = log(setup, ctrl=np.concatenate([plain.ctrl, np.full((1, 1), np.nan)]))
-    np.testing.assert_array_equal(track_of(setup, more).ctrl, plain.ctrl)
+    more = log(task, ctrl=np.concatenate([plain.ctrl, np.full((1, 1), np.nan)]))
+    np.testing.assert_array_equal(track_of(task.system, more).ctrl, plain.ctrl)
 
 
-def test_a_recording_between_the_samples_keeps_its_times(setup: Setup) -> None:
+def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> None:
     """And its values; only the control is averaged. Missing rows of an even log leave it even."""
-    plain = log(setup)
+    plain = log(task)
     t = np.sort(np.random.default_rng(2).uniform(0.0, 0.3, len(plain.t)))
-    track = track_of(setup, log(setup, t=t + 5.0))
+    track = track_of(task.system, log(task, t=t + 5.0))
     assert not track.even
     np.testing.assert_allclose(track.t, t - t[0], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(track.y, plain.y)
-    np.testing.assert_allclose(track.ctrl, held(t - t[0], plain.ctrl, setup.dt), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(track.ctrl, held(t - t[0], plain.ctrl, task.dt), rtol=0, atol=1e-9)
     kept = np.delete(np.arange(31), [4, 5, 20])
     sparse = track_of(
-        setup, log(setup, t=plain.t[kept], ctrl=plain.ctrl[kept[:-1]], y=plain.y[kept])
+        task.system, log(task, t=plain.t[kept], ctrl=plain.ctrl[kept[:-1]], y=plain.y[kept])
     )
     assert sparse.even
     np.testing.assert_array_equal(sparse.ctrl[3:6], np.repeat(plain.ctrl[3:4], 3, axis=0))
@@ -131,12 +131,12 @@ def test_a_recording_between_the_samples_keeps_its_times(setup: Setup) -> None:
     assert len(sparse.ctrl) == 30
 
 
-def test_two_rows_of_one_sample_do_not_shift_the_control(setup: Setup) -> None:
+def test_two_rows_of_one_sample_do_not_shift_the_control(task: DesignTask) -> None:
     """A doubled stamp beside a missing row: as many rows as samples, and yet not one for each."""
-    plain = log(setup)
+    plain = log(task)
     t = np.array(plain.t)
-    t[8] = t[7] + 0.005 * setup.dt
-    track = track_of(setup, log(setup, t=t))
+    t[8] = t[7] + 0.005 * task.dt
+    track = track_of(task.system, log(task, t=t))
     np.testing.assert_allclose(track.ctrl[8], plain.ctrl[8], rtol=0, atol=0.05)
     np.testing.assert_allclose(track.ctrl[7], plain.ctrl[8], rtol=0, atol=0.05)
 
@@ -162,23 +162,23 @@ def test_two_rows_of_one_sample_do_not_shift_the_control(setup: Setup) -> None:
         ({"outputs": ("a", "b", "c", "d")}, "no measured column.*qpos:hinge"),
     ],
 )
-def test_faults_are_named(setup: Setup, changes: dict[str, Any], words: str) -> None:
+def test_faults_are_named(task: DesignTask, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(RecordingError, match=rf"x\.csv: .*{words}"):
-        track_of(setup, log(setup, **changes))
+        track_of(task.system, log(task, **changes))
 
 
-def test_quaternions_get_the_sign_of_the_model(body: Setup) -> None:
+def test_quaternions_get_the_sign_of_the_model(body: DesignTask) -> None:
     """A log that flips signs as it likes, with gaps, is the continuous curve that the model predicts."""
     ctrl = body.control
     y = body.plant.measure(body.parameters.guess[None], ctrl)[0][0]
-    names, flipped = body.outputs.names, np.array(y)
+    names, flipped = body.system.outputs.names, np.array(y)
     rng = np.random.default_rng(0)
     for joint in ("float", "ball"):
         columns = [names.index(f"qpos:{joint}.q{a}") for a in "wxyz"]
         flipped[:, columns] *= rng.choice([-1.0, 1.0], (len(y), 1))
         flipped[10:20, columns] = np.nan
     track = track_of(
-        body,
+        body.system,
         Recording(t=np.arange(len(y)) * body.dt, ctrl=ctrl, y=flipped, outputs=names, name="x.csv"),
     )
     seen = np.isfinite(flipped)
@@ -188,31 +188,31 @@ def test_quaternions_get_the_sign_of_the_model(body: Setup) -> None:
 
 def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
     """One component alone crosses zero as it likes: whether q or -q was logged cannot be told from it."""
-    some = body_setup(tmp_path, noise={"qpos:float.qx": 0.01, "qpos:ball.qy": 0.01}, horizon=3.0)
+    some = body_task(tmp_path, noise={"qpos:float.qx": 0.01, "qpos:ball.qy": 0.01}, horizon=3.0)
     y = some.plant.measure(some.parameters.guess[None], some.control)[0][0]
     assert (np.ptp(np.sign(y), axis=0) == 2.0).any(), "nothing crosses zero"
     track = track_of(
-        some,
+        some.system,
         Recording(
-            t=np.arange(len(y)) * some.dt, ctrl=some.control, y=y, outputs=some.outputs.names
+            t=np.arange(len(y)) * some.dt, ctrl=some.control, y=y, outputs=some.system.outputs.names
         ),
     )
     np.testing.assert_array_equal(track.y, y)
 
 
-def test_pictures_of_what_was_measured(setup: Setup, body: Setup) -> None:
+def test_pictures_of_what_was_measured(task: DesignTask, body: DesignTask) -> None:
     """All positions, gaps bridged; nothing where one was never measured."""
-    plain = log(setup)
+    plain = log(task)
     y = np.array(plain.y)
     y[10:13, 1] = np.nan
-    shown = measured_trajectory(setup, log(setup, y=y))
+    shown = measured_trajectory(task.system, log(task, y=y))
     assert shown is not None
     np.testing.assert_array_equal(shown.qpos[:, 0], y[:, 0])
     np.testing.assert_allclose(shown.qpos[11, 1], 0.5 * (y[9, 1] + y[13, 1]))
     y[:, 1] = np.nan
-    assert measured_trajectory(setup, log(setup, y=y)) is None
-    assert measured_trajectory(setup, log(setup, y=y[:, :1], outputs=("qpos:slide",))) is None
-    turned = measured_trajectory(body, log(body))
+    assert measured_trajectory(task.system, log(task, y=y)) is None
+    assert measured_trajectory(task.system, log(task, y=y[:, :1], outputs=("qpos:slide",))) is None
+    turned = measured_trajectory(body.system, log(body))
     assert turned is not None
     np.testing.assert_allclose(np.linalg.norm(turned.qpos[:, 3:7], axis=1), 1.0)
 
@@ -259,11 +259,11 @@ def test_reading_at_the_samples_is_the_lag_of_all_of_them(delay: float) -> None:
     )
 
 
-def test_a_track_does_not_change(setup: Setup) -> None:
+def test_a_track_does_not_change(task: DesignTask) -> None:
     """Its arrays are read-only, and the recording's are left as they were."""
-    plain = log(setup)
+    plain = log(task)
     before = np.array(plain.y)
-    track: Track = track_of(setup, plain)
+    track: Track = track_of(task.system, plain)
     with pytest.raises(ValueError, match="read-only"):
         track.y[0, 0] = 1.0
     np.testing.assert_array_equal(plain.y, before)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify_system
 from mjfim.identification.residuals import Fit
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.recording import Recording
@@ -20,21 +22,21 @@ def base() -> mjfim.Experiment:
     )
 
 
-def recorded(setup: Setup, seed: int, swing: float = 1.0) -> Recording:
+def recorded(task: DesignTask, seed: int, swing: float = 1.0) -> Recording:
     """One recording at the true values."""
-    trajectory = setup.plant.simulate(setup.theta, swing * setup.control)
-    return mjfim.simulate(setup, trajectory, seed)
+    trajectory = task.plant.simulate(task.theta, swing * task.control)
+    return simulate_system(task.system, trajectory, seed)
 
 
 def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.Experiment) -> None:
-    setup = Setup(base)
-    found = mjfim.identify(setup, [recorded(setup, 0)], held_out=[recorded(setup, 1, 1.5)])
+    task = DesignTask.resolve(base)
+    found = identify_system(task.system, [recorded(task, 0)], held_out=[recorded(task, 1, 1.5)])
     (prediction,) = found.predictions
     assert prediction.held_out
     np.testing.assert_allclose(prediction.identified.rms, 0.05, rtol=0.12)
     assert (prediction.nominal.rms > 1.5 * prediction.identified.rms).any()
     assert prediction.ratio < 0.8
-    alone = mjfim.predict(setup, found.theta, [recorded(setup, 1, 1.5)])
+    alone = mjfim.predict(task, found.theta, [recorded(task, 1, 1.5)])
     np.testing.assert_allclose(alone[0].rms, prediction.identified.rms, rtol=1e-9)
     assert (alone[0].mae < alone[0].rms).all()
 
@@ -42,8 +44,8 @@ def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.
 def test_without_held_out_recordings_each_is_predicted_by_the_others(
     base: mjfim.Experiment,
 ) -> None:
-    setup = Setup(base)
-    recordings = [recorded(setup, seed) for seed in range(3)]
+    task = DesignTask.resolve(base)
+    recordings = [recorded(task, seed) for seed in range(3)]
     spoilt = Recording(
         t=recordings[2].t,
         ctrl=recordings[2].ctrl,
@@ -51,7 +53,7 @@ def test_without_held_out_recordings_each_is_predicted_by_the_others(
         outputs=recordings[2].outputs,
         name="spoilt",
     )
-    found = mjfim.identify(setup, [*recordings[:2], spoilt])
+    found = identify_system(task.system, [*recordings[:2], spoilt])
     assert [p.name for p in found.predictions] == ["simulated", "simulated", "spoilt"]
     assert not any(p.held_out for p in found.predictions)
     assert (
@@ -60,12 +62,13 @@ def test_without_held_out_recordings_each_is_predicted_by_the_others(
 
 
 def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
-    setup = Setup(base)
-    recording = recorded(setup, 0)
+    task = DesignTask.resolve(base)
+    recording = recorded(task, 0)
     late = np.array(recording.y)
     late[320:] += 1.0
-    (prediction,) = mjfim.identify(
-        setup, [Recording(t=recording.t, ctrl=recording.ctrl, y=late, outputs=recording.outputs)]
+    (prediction,) = identify_system(
+        task.system,
+        [Recording(t=recording.t, ctrl=recording.ctrl, y=late, outputs=recording.outputs)],
     ).predictions
     assert prediction.name.startswith("last 25 %")
     np.testing.assert_allclose(
@@ -76,7 +79,7 @@ def test_a_single_recording_predicts_its_end(base: mjfim.Experiment) -> None:
 @pytest.mark.slow
 def test_every_recording_has_its_own_bias(base: mjfim.Experiment) -> None:
     own = base.replace(nuisance={"bias": {"qpos:hinge": True}, "per_recording": True})
-    setup, plain = Setup(own), Setup(base)
+    task, plain = DesignTask.resolve(own), DesignTask.resolve(base)
     biases = (0.1, -0.2, 0.0)
     recordings = []
     for seed, bias in enumerate(biases):
@@ -85,18 +88,18 @@ def test_every_recording_has_its_own_bias(base: mjfim.Experiment) -> None:
         recordings.append(
             Recording(t=clean.t, ctrl=clean.ctrl, y=clean.y + shift, outputs=clean.outputs)
         )
-    found = mjfim.identify(setup, recordings)
+    found = identify_system(task.system, recordings)
     np.testing.assert_allclose(found.per_recording["bias qpos:hinge"], biases, atol=0.02)
     j = found.parameters.index("bias qpos:hinge")
     assert found.theta[j] == found.per_recording["bias qpos:hinge"][0]
-    assert np.all(np.abs(found.theta[:3] - setup.parameters.true[:3]) < 4.0 * found.std[:3])
+    assert np.all(np.abs(found.theta[:3] - task.parameters.true[:3]) < 4.0 * found.std[:3])
     assert not found.misfit
-    assert mjfim.identify(
-        Setup(base.replace(nuisance={"bias": {"qpos:hinge": True}})), recordings
+    assert identify_system(
+        DesignTask.resolve(base.replace(nuisance={"bias": {"qpos:hinge": True}})).system, recordings
     ).misfit
-    alone = mjfim.identify(setup, recordings[:1])
+    alone = identify_system(task.system, recordings[:1])
     assert alone.theta[j] == pytest.approx(found.theta[j], abs=0.01)
-    fit = Fit(setup, recordings)
+    fit = Fit(task.system, recordings)
     H = fit.dense(fit.begin(found.theta)).J
     order = [*range(3), 3]  # m, l, c, the first recording's bias
     covariance = np.linalg.inv(H.T @ H)
@@ -109,9 +112,9 @@ def test_per_recording_belongs_to_nuisance(base: mjfim.Experiment) -> None:
 
 
 def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experiment) -> None:
-    setup = Setup(base)
-    good = recorded(setup, 0)
-    assert plausibility_remarks(setup.channels, good) == ()
+    task = DesignTask.resolve(base)
+    good = recorded(task, 0)
+    assert plausibility_remarks(task.system.channels, good) == ()
     rng = np.random.default_rng(0)
     y = np.array(good.y)
     y[:, 3] += rng.normal(0.0, 2.0, len(y))
@@ -122,16 +125,16 @@ def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experime
         outputs=good.outputs,
         name="x",
     )
-    said = " ".join(plausibility_remarks(setup.channels, noisy))
+    said = " ".join(plausibility_remarks(task.system.channels, noisy))
     assert "jumps from row to row" in said and "qvel:hinge is rough" in said
-    swung = recorded(setup, 0, 20.0)
-    assert plausibility_remarks(setup.channels, swung) == ()
+    swung = recorded(task, 0, 20.0)
+    assert plausibility_remarks(task.system.channels, swung) == ()
     y = np.array(swung.y)
     y[:, 3] *= 2.0
     assert any(
         "differ by" in s
         for s in plausibility_remarks(
-            setup.channels,
+            task.system.channels,
             Recording(t=swung.t, ctrl=swung.ctrl, y=y, outputs=swung.outputs, name="x"),
         )
     )

@@ -11,11 +11,11 @@ from scipy.stats import chi2
 
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.simulate import simulate
-from mjfim.experiment.system import Setup
+from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.aligned_recording import track_of
-from mjfim.identification.identify import identify, least_squares, newton_raphson
+from mjfim.identification.identify import identify, identify_system, least_squares, newton_raphson
 from mjfim.identification.residuals import Fit
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
@@ -24,57 +24,59 @@ from tests.support.paths import ROOT
 
 
 @pytest.fixture(scope="module")
-def setup() -> Setup:
-    return Setup(Experiment.from_file(ROOT / "models" / "cart_pendulum.toml"))
+def task() -> DesignTask:
+    return DesignTask.resolve(Experiment.from_file(ROOT / "models" / "cart_pendulum.toml"))
 
 
 @pytest.fixture(scope="module")
-def design(setup: Setup) -> mjfim.Design:
-    return mjfim.design(setup)
+def design_task(task: DesignTask) -> mjfim.Design:
+    return design_task(task)
 
 
 @pytest.fixture(scope="module")
-def recording(setup: Setup, design: mjfim.Design) -> Recording:
-    return simulate(setup, design.trajectory, seed=3)
+def recording(task: DesignTask, design: mjfim.Design) -> Recording:
+    return simulate_system(task.system, design.trajectory, seed=3)
 
 
-def noiseless(setup: Setup, recording: Recording) -> Recording:
-    y, _ = setup.plant.measure(setup.parameters.true[None], recording.ctrl)
+def noiseless(task: DesignTask, recording: Recording) -> Recording:
+    y, _ = task.plant.measure(task.parameters.true[None], recording.ctrl)
     return Recording(t=recording.t, ctrl=recording.ctrl, y=y[0], outputs=recording.outputs)
 
 
 @pytest.mark.parametrize("method", ["least_squares", "newton"])
 def test_noise_free_data_give_the_true_parameters(
-    setup: Setup, recording: Recording, method: str
+    task: DesignTask, recording: Recording, method: str
 ) -> None:
-    estimate = identify(setup, [noiseless(setup, recording)], method)
-    np.testing.assert_allclose(estimate.theta, setup.parameters.true, rtol=1e-7)
+    estimate = identify_system(task.system, [noiseless(task, recording)], method)
+    np.testing.assert_allclose(estimate.theta, task.parameters.true, rtol=1e-7)
     assert estimate.success
 
 
 def test_both_methods_find_the_minimum_of_the_weighted_squares(
-    setup: Setup, recording: Recording
+    task: DesignTask, recording: Recording
 ) -> None:
-    fit = Fit(setup, [recording])
+    fit = Fit(task.system, [recording])
 
     def cost(theta: np.ndarray) -> float:
-        y, _ = setup.plant.measure(theta[None], recording.ctrl)
+        y, _ = task.plant.measure(theta[None], recording.ctrl)
         return float(np.sum(((y[0, 1:] - recording.y[1:]) / 0.05) ** 2))
 
-    start = setup.parameters.true
+    start = task.parameters.true
     slow = minimize(
         cost, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-10, "maxiter": 400}
     )
     for solve in (least_squares, newton_raphson):
-        solution = solve(fit, setup.parameters.guess)
+        solution = solve(fit, task.parameters.guess)
         assert solution.success
         theta = solution.unknowns.theta
         assert cost(theta) <= slow.fun + 1e-5
         np.testing.assert_allclose(theta, slow.x, atol=1e-5)
 
 
-def test_jacobian_agrees_with_independent_differences(setup: Setup, recording: Recording) -> None:
-    fit, theta = Fit(setup, [recording]), np.array([2.2, 1.1, 1.2])
+def test_jacobian_agrees_with_independent_differences(
+    task: DesignTask, recording: Recording
+) -> None:
+    fit, theta = Fit(task.system, [recording]), np.array([2.2, 1.1, 1.2])
     value = fit.dense(fit.begin(theta))
     assert value is not None
     for j in range(3):
@@ -89,37 +91,41 @@ def test_jacobian_agrees_with_independent_differences(setup: Setup, recording: R
 
 
 def test_covariance_is_the_cramer_rao_bound_at_the_estimate(
-    setup: Setup, design: mjfim.Design, recording: Recording
+    task: DesignTask, design: mjfim.Design, recording: Recording
 ) -> None:
-    estimate = identify(setup, [recording])
+    estimate = identify_system(task.system, [recording])
     np.testing.assert_allclose(estimate.std, design.final.std, rtol=0.05)
     np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), estimate.std, rtol=1e-8)
 
 
-def test_chi_square_and_misfit(setup: Setup, recording: Recording) -> None:
-    right = identify(setup, [recording])
+def test_chi_square_and_misfit(task: DesignTask, recording: Recording) -> None:
+    right = identify_system(task.system, [recording])
     assert right.dof == 400 * 4 - 3
     assert 0.001 < chi2.sf(right.chi2, right.dof) < 0.999
     assert not right.misfit
     drag = np.array(recording.y)
     drag[:, 0] += 0.1 * np.sin(3 * recording.t)  # a structured error that no parameter explains
-    wrong = identify(
-        setup, [Recording(t=recording.t, ctrl=recording.ctrl, y=drag, outputs=recording.outputs)]
+    wrong = identify_system(
+        task.system,
+        [Recording(t=recording.t, ctrl=recording.ctrl, y=drag, outputs=recording.outputs)],
     )
     assert wrong.misfit
     assert any("not accuracy" in sentence for sentence in wrong.warnings)
 
 
-def test_overstated_noise_is_said(setup: Setup, recording: Recording) -> None:
-    estimate = identify(setup, [noiseless(setup, recording)])
+def test_overstated_noise_is_said(task: DesignTask, recording: Recording) -> None:
+    estimate = identify_system(task.system, [noiseless(task, recording)])
     assert any("overstated" in sentence for sentence in estimate.warnings)
 
 
 def test_two_recordings_carry_twice_the_information(
-    setup: Setup, design: mjfim.Design, recording: Recording
+    task: DesignTask, design: mjfim.Design, recording: Recording
 ) -> None:
-    again = simulate(setup, design.trajectory, seed=4)
-    one, two = identify(setup, [recording]), identify(setup, [recording, again])
+    again = simulate_system(task.system, design.trajectory, seed=4)
+    one, two = (
+        identify_system(task.system, [recording]),
+        identify_system(task.system, [recording, again]),
+    )
     np.testing.assert_allclose(two.std, one.std / np.sqrt(2), rtol=0.03)
     assert len(two.predicted) == 2
 
@@ -145,36 +151,41 @@ def test_prior_pulls_the_estimate_and_shrinks_its_deviation(
 
 
 def test_recording_with_fewer_outputs_and_gaps_still_fits(
-    setup: Setup, recording: Recording
+    task: DesignTask, recording: Recording
 ) -> None:
     y = np.array(recording.y[:, :2])
     y[50:80, 1] = np.nan
-    estimate = identify(
-        setup, [Recording(t=recording.t, ctrl=recording.ctrl, y=y, outputs=recording.outputs[:2])]
+    estimate = identify_system(
+        task.system,
+        [Recording(t=recording.t, ctrl=recording.ctrl, y=y, outputs=recording.outputs[:2])],
     )
     assert estimate.dof == 2 * 400 - 30 - 3
-    assert np.all(np.abs(estimate.theta - setup.parameters.true) < 5 * estimate.std)
+    assert np.all(np.abs(estimate.theta - task.parameters.true) < 5 * estimate.std)
 
 
-def test_unusable_recordings_are_named(setup: Setup, recording: Recording) -> None:
+def test_unusable_recordings_are_named(task: DesignTask, recording: Recording) -> None:
     t, ctrl, y, names = recording.t, recording.ctrl, recording.y, recording.outputs
     with pytest.raises(RecordingError, match="too few rows"):
-        track_of(setup, Recording(t=t[:2], ctrl=ctrl[:1], y=y[:2], outputs=names, name="x.csv"))
+        track_of(
+            task.system, Recording(t=t[:2], ctrl=ctrl[:1], y=y[:2], outputs=names, name="x.csv")
+        )
     with pytest.raises(RecordingError, match=r"x\.csv.*does not increase in data row 2"):
-        track_of(setup, Recording(t=-t, ctrl=ctrl, y=y, outputs=names, name="x.csv"))
+        track_of(task.system, Recording(t=-t, ctrl=ctrl, y=y, outputs=names, name="x.csv"))
     bad = np.array(ctrl)
     bad[7] = np.nan
     with pytest.raises(RecordingError, match="data row 8"):
-        track_of(setup, Recording(t=t, ctrl=bad, y=y, outputs=names, name="x.csv"))
+        track_of(task.system, Recording(t=t, ctrl=bad, y=y, outputs=names, name="x.csv"))
     with pytest.raises(RecordingError, match="qpos:slide"):
-        track_of(setup, Recording(t=t, ctrl=ctrl, y=y, outputs=("a", "b", "c", "d"), name="x.csv"))
+        track_of(
+            task.system, Recording(t=t, ctrl=ctrl, y=y, outputs=("a", "b", "c", "d"), name="x.csv")
+        )
     with pytest.raises(RecordingError, match="at least one"):
-        identify(setup, [])
+        identify_system(task.system, [])
 
 
-def test_divergence_at_the_start_is_an_error(setup: Setup, recording: Recording) -> None:
+def test_divergence_at_the_start_is_an_error(task: DesignTask, recording: Recording) -> None:
     with pytest.raises(SimulationDivergedError, match="diverges at the start"):
-        identify(setup, [recording], "newton", start=np.array([2.0, 1.0, -1e6]))
+        identify_system(task.system, [recording], "newton", start=np.array([2.0, 1.0, -1e6]))
 
 
 def test_newton_outside_the_bounds_is_no_success(recording: Recording) -> None:
@@ -185,15 +196,15 @@ def test_newton_outside_the_bounds_is_no_success(recording: Recording) -> None:
     assert any("outside its bounds" in sentence for sentence in estimate.warnings)
 
 
-def test_unknown_method_and_wrong_start_are_refused(setup: Setup, recording: Recording) -> None:
+def test_unknown_method_and_wrong_start_are_refused(task: DesignTask, recording: Recording) -> None:
     with pytest.raises(ExperimentError, match="least_squares"):
-        identify(setup, [recording], "lm")  # type: ignore[arg-type]
+        identify_system(task.system, [recording], "lm")  # type: ignore[arg-type]
     with pytest.raises(ExperimentError, match="m, l, c"):
-        identify(setup, [recording], start=np.ones(2))
+        identify_system(task.system, [recording], start=np.ones(2))
 
 
 def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
-    setup: Setup, recording: Recording
+    task: DesignTask, recording: Recording
 ) -> None:
     """Ctrl-C in the second iteration."""
     costs: list[float] = []
@@ -203,7 +214,7 @@ def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
         if len(costs) == 2:
             signal.raise_signal(signal.SIGINT)
 
-    found = identify(setup, [recording], callback=show)
+    found = identify_system(task.system, [recording], callback=show)
     assert found.interrupted and not found.success
     assert found.status.startswith("interrupted")
     assert found.chi2 == pytest.approx(2.0 * min(costs), rel=1e-9)
@@ -214,10 +225,10 @@ def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
     "place", ["identify.suspects", "cross_validation.minimise", "cross_validation._errors"]
 )
 def test_interrupted_after_the_search_the_estimate_stays(
-    setup: Setup, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
+    task: DesignTask, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ctrl-C while terms are looked for that the model lacks, or while the rest is predicted."""
-    whole = identify(setup, [recording])
+    whole = identify_system(task.system, [recording])
 
     pressed: list[bool] = []
 
@@ -227,7 +238,7 @@ def test_interrupted_after_the_search_the_estimate_stays(
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(f"mjfim.identification.{place}", interrupt)
-    found = identify(setup, [recording])
+    found = identify_system(task.system, [recording])
     assert whole.predictions and not whole.interrupted
     assert found.interrupted and found.predictions == ()
     np.testing.assert_array_equal(found.theta, whole.theta)
@@ -235,10 +246,10 @@ def test_interrupted_after_the_search_the_estimate_stays(
 
 
 def test_an_interrupted_search_gives_no_partial_result(
-    setup: Setup, recording: Recording, monkeypatch: pytest.MonkeyPatch
+    task: DesignTask, recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Functions without a budget are interrupted as usual; a round of a campaign is complete or not kept."""
-    fit, count = Fit(setup, [recording]), [0]
+    fit, count = Fit(task.system, [recording]), [0]
     condense = Fit.condense
 
     def interrupt(self: Fit, at: object) -> object:
@@ -249,37 +260,39 @@ def test_an_interrupted_search_gives_no_partial_result(
 
     monkeypatch.setattr(Fit, "condense", interrupt)
     for work in (
-        lambda: least_squares(fit, setup.parameters.guess),
-        lambda: newton_raphson(fit, setup.parameters.guess),
+        lambda: least_squares(fit, task.parameters.guess),
+        lambda: newton_raphson(fit, task.parameters.guess),
     ):
         count[0] = 0
         with pytest.raises(KeyboardInterrupt):
             work()
     count[0] = 0
-    assert identified(setup, [recording], setup.parameters.guess) is None
+    assert identified(task, [recording], task.parameters.guess) is None
     count[0] = 0
-    assert identify(setup, [recording]).interrupted
+    assert identify_system(task.system, [recording]).interrupted
 
 
-def test_interrupted_where_a_further_start_begins(setup: Setup, recording: Recording) -> None:
+def test_interrupted_where_a_further_start_begins(task: DesignTask, recording: Recording) -> None:
     """The starts before it stay; none comes after it."""
-    several, seen = Setup(setup.experiment.replace(fit={"starts": 6})), list[str]()
+    several, seen = DesignTask.resolve(task.experiment.replace(fit={"starts": 6})), list[str]()
 
     def show(event: FitEvent) -> None:
         seen.append(event.phase)
         if event.phase.startswith("start 3"):
             signal.raise_signal(signal.SIGINT)
 
-    found = identify(several, [recording], callback=show)
+    found = identify_system(several.system, [recording], callback=show)
     assert found.interrupted
     assert not any(what.startswith("start 4") or what == "all data" for what in seen)
-    np.testing.assert_allclose(found.theta, identify(setup, [recording]).theta, rtol=1e-3)
+    np.testing.assert_allclose(
+        found.theta, identify_system(task.system, [recording]).theta, rtol=1e-3
+    )
 
 
 def test_interrupted_before_the_last_search_nothing_more_is_searched(
-    setup: Setup, recording: Recording
+    task: DesignTask, recording: Recording
 ) -> None:
-    pieces = Setup(setup.experiment.replace(fit={"segments": 1.0}))
+    pieces = DesignTask.resolve(task.experiment.replace(fit={"segments": 1.0}))
     seen: list[str] = []
 
     def show(event: FitEvent) -> None:
@@ -287,37 +300,42 @@ def test_interrupted_before_the_last_search_nothing_more_is_searched(
         if event.phase == "where pieces start":
             signal.raise_signal(signal.SIGINT)
 
-    found = identify(pieces, [recording], callback=show)
+    found = identify_system(pieces.system, [recording], callback=show)
     assert found.interrupted and not found.success
     assert set(seen) == {"where pieces start"}
-    np.testing.assert_array_equal(found.theta, setup.parameters.guess)
+    np.testing.assert_array_equal(found.theta, task.parameters.guess)
 
 
 @pytest.mark.parametrize("scale", [1.0, 3.0])
 def test_a_robust_fit_judges_the_size_of_its_residuals(
-    setup: Setup, recording: Recording, scale: float
+    task: DesignTask, recording: Recording, scale: float
 ) -> None:
     """Right noise is neither too large nor too small, whatever counts as an outlier; noise of three times the size is said."""
-    robust = Setup(setup.experiment.replace(fit={"loss": "soft_l1", "loss_scale": scale}))
-    right = identify(robust, [recording])
+    robust = DesignTask.resolve(
+        task.experiment.replace(fit={"loss": "soft_l1", "loss_scale": scale})
+    )
+    right = identify_system(robust.system, [recording])
     assert right.chi2 / right.dof == pytest.approx(1.0, abs=0.15)
     assert not right.misfit
     assert not any("overstated" in sentence for sentence in right.warnings)
-    truth = noiseless(setup, recording).y
+    truth = noiseless(task, recording).y
     loud = Recording(
         t=recording.t,
         ctrl=recording.ctrl,
         y=truth + 3.0 * (recording.y - truth),
         outputs=recording.outputs,
     )
-    assert any("x the stated noise" in reason for reason in identify(robust, [loud]).reasons)
+    assert any(
+        "x the stated noise" in reason for reason in identify_system(robust.system, [loud]).reasons
+    )
 
 
 def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
     """Their covariance is infinite; what the others are traded for is told all the same (warnings are errors here)."""
-    setup = Setup(Experiment.from_file(ROOT / "models" / "ball_pendulum.toml"))
-    estimate = identify(
-        setup, [simulate(setup, setup.plant.simulate(setup.theta, setup.initial.ctrl), seed=1)]
+    task = DesignTask.resolve(Experiment.from_file(ROOT / "models" / "ball_pendulum.toml"))
+    estimate = identify_system(
+        task.system,
+        [simulate_system(task.system, task.plant.simulate(task.theta, task.initial.ctrl), seed=1)],
     )
     assert estimate.combinations
     assert estimate.sloppy

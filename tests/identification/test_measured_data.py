@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
+from mjfim.identification.identify import identify_system
 from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
 from tests.support.paths import ROOT, SHARED_DATA
@@ -66,11 +67,12 @@ def experiment(name: str, guess: dict[str, float] | None = None, **fit: object) 
 
 def identified(stated: mjfim.Experiment, files: list[Path], held_out: list[Path]) -> Estimate:
     """Read, fit, predict."""
-    setup = Setup(stated)
+    task = DesignTask.resolve(stated)
     fitted, kept = (
-        [read_recording(path, setup.channels) for path in paths] for paths in (files, held_out)
+        [read_recording(path, task.system.channels) for path in paths]
+        for paths in (files, held_out)
     )
-    return mjfim.identify(setup, fitted, held_out=kept)
+    return identify_system(task.system, fitted, held_out=kept)
 
 
 @pytest.mark.parametrize(
@@ -160,9 +162,9 @@ def test_servo_predicts_held_out_logs_as_well_as_published() -> None:
     found = identified(experiment("bam_xl330", bootstrap=300), fitted, others)
     mine = np.mean([p.identified.mae[0] for p in found.predictions])
     for published in (PUBLISHED_SERVO, HEAD_SERVO):
-        setup = Setup(experiment("bam_xl330", published))
+        task = DesignTask.resolve(experiment("bam_xl330", published))
         errors = mjfim.predict(
-            setup, setup.theta, [read_recording(path, setup.channels) for path in others]
+            task, task.theta, [read_recording(path, task.system.channels) for path in others]
         )
         assert mine < 1.05 * np.mean([e.mae[0] for e in errors])
     assert "coulomb" in found.sloppy

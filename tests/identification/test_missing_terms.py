@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify_system
 from mjfim.records.recording import Recording
 from tests.support.paths import ROOT
 
@@ -29,8 +31,8 @@ def robot(folder: Path, old: str, new: str, seed: int = 0, **tables: object) -> 
     other = mjfim.Experiment(
         **{**stated(**tables).model_dump(exclude_unset=True), "directory": folder}
     )
-    setup = Setup(other)
-    return mjfim.simulate(setup, setup.initial, seed)
+    task = DesignTask.resolve(other)
+    return simulate_system(task.system, task.initial, seed)
 
 
 @pytest.mark.parametrize(
@@ -57,27 +59,28 @@ def test_the_missing_term_comes_first_and_in_about_its_size(
 
 
 def test_a_bias_and_a_lag_are_told(tmp_path: Path) -> None:
-    setup = Setup(stated())
-    clean = mjfim.simulate(setup, setup.initial, seed=1)
+    task = DesignTask.resolve(stated())
+    clean = simulate_system(task.system, task.initial, seed=1)
     off = np.array(clean.y)
     off[:, 3] += 0.03
-    biased = mjfim.identify(
-        setup, [Recording(t=clean.t, ctrl=clean.ctrl, y=off, outputs=clean.outputs)]
+    biased = identify_system(
+        task.system, [Recording(t=clean.t, ctrl=clean.ctrl, y=off, outputs=clean.outputs)]
     )
     assert biased.missing_terms[0].path == "output/qvel:hinge:bias"
     assert biased.missing_terms[0].value == pytest.approx(0.03, rel=0.4)
     late = Recording(
         t=clean.t[2:] - clean.t[2], ctrl=clean.ctrl[2:], y=clean.y[:-2], outputs=clean.outputs
     )
-    lagging = mjfim.identify(setup, [late])
+    lagging = identify_system(task.system, [late])
     assert "output:delay" in [s.path for s in lagging.missing_terms]
 
 
 @pytest.mark.slow
 def test_a_right_model_lacks_nothing() -> None:
-    setup = Setup(stated())
+    task = DesignTask.resolve(stated())
     found = [
-        mjfim.identify(setup, [mjfim.simulate(setup, setup.initial, seed)]) for seed in range(12)
+        identify_system(task.system, [simulate_system(task.system, task.initial, seed)])
+        for seed in range(12)
     ]
     assert not any(e.missing_terms or e.misfit for e in found)
 

@@ -8,50 +8,51 @@ import numpy as np
 import pytest
 
 from mjfim.errors import RecordingError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.identification.aligned_recording import Track, track_of
-from mjfim.identification.identify import identify
+from mjfim.identification.identify import identify_system
 from mjfim.identification.segments import FEWEST, Piece, cut, groups, measured_starts, whole
 from mjfim.records.recording import Recording
-from tests.support.numerics import Array, body_setup, cart_setup
+from tests.support.numerics import Array, body_task, cart_task
 
 HORIZON = 2.0
 
 
 @pytest.fixture(scope="module")
-def setup(tmp_path_factory: pytest.TempPathFactory) -> Setup:
-    return cart_setup(tmp_path_factory.mktemp("cart"), horizon=HORIZON)
+def task(tmp_path_factory: pytest.TempPathFactory) -> DesignTask:
+    return cart_task(tmp_path_factory.mktemp("cart"), horizon=HORIZON)
 
 
 @pytest.fixture(scope="module")
-def body(tmp_path_factory: pytest.TempPathFactory) -> Setup:
-    return body_setup(tmp_path_factory.mktemp("body"), noise={"state": 0.01}, horizon=HORIZON)
+def body(tmp_path_factory: pytest.TempPathFactory) -> DesignTask:
+    return body_task(tmp_path_factory.mktemp("body"), noise={"state": 0.01}, horizon=HORIZON)
 
 
-def truth(setup: Setup, factor: float = 1.1) -> Array:
+def truth(task: DesignTask, factor: float = 1.1) -> Array:
     """(N+1, ny) of parameters that are not the guess."""
-    return np.asarray(
-        setup.plant.measure(factor * setup.parameters.guess[None], setup.control)[0][0]
-    )
+    return np.asarray(task.plant.measure(factor * task.parameters.guess[None], task.control)[0][0])
 
 
 def track(
-    setup: Setup, y: Array | None = None, rows: Array | None = None, hidden: tuple[str, ...] = ()
+    task: DesignTask,
+    y: Array | None = None,
+    rows: Array | None = None,
+    hidden: tuple[str, ...] = (),
 ) -> Track:
     """A noise-free log of some rows, some columns taken out."""
-    y = np.array(truth(setup) if y is None else y)
+    y = np.array(truth(task) if y is None else y)
     rows = np.arange(len(y)) if rows is None else rows
     kept = (
-        [i for i, name in enumerate(setup.outputs.names) if not name.startswith(hidden)]
+        [i for i, name in enumerate(task.system.outputs.names) if not name.startswith(hidden)]
         if hidden
         else slice(None)
     )
-    names = tuple(np.array(setup.outputs.names)[kept].tolist())
-    ctrl = setup.control[rows[:-1]]
+    names = tuple(np.array(task.system.outputs.names)[kept].tolist())
+    ctrl = task.control[rows[:-1]]
     return track_of(
-        setup,
+        task.system,
         Recording(
-            t=rows * setup.dt,
+            t=rows * task.dt,
             ctrl=ctrl,
             y=y[np.ix_(rows, np.arange(y.shape[1])[kept])],
             outputs=names,
@@ -73,24 +74,24 @@ def covered(pieces: tuple[Piece, ...], tracks: list[Track]) -> None:
 
 @pytest.mark.parametrize("length", [0.04, 0.05, 0.17, 0.33, 1.0, 1.5, 9.0, None])
 @pytest.mark.parametrize("lead", [0.0, 0.004, 0.03])
-def test_every_row_is_in_one_piece(setup: Setup, length: float | None, lead: float) -> None:
+def test_every_row_is_in_one_piece(task: DesignTask, length: float | None, lead: float) -> None:
     """Even logs, logs with missing rows, logs off the grid; pieces of nearly the length asked for."""
     rng = np.random.default_rng(0)
-    y = truth(setup)
+    y = truth(task)
     some = np.sort(rng.choice(len(y), 120, replace=False))
     some[0] = 0
     off = Recording(
         t=np.sort(rng.uniform(0, 1.7, 90)),
         ctrl=np.zeros((89, 1)),
         y=y[:90],
-        outputs=setup.outputs.names,
+        outputs=task.system.outputs.names,
         name="off.csv",
     )
-    tracks = [track(setup), track(setup, rows=some), track_of(setup, off)]
+    tracks = [track(task), track(task, rows=some), track_of(task.system, off)]
     assert [t.even for t in tracks] == [True, True, False]
-    pieces = cut(setup, tracks, length, lead)
+    pieces = cut(task.system, tracks, length, lead)
     covered(pieces, tracks)
-    ahead = int(np.ceil(lead / setup.dt))
+    ahead = int(np.ceil(lead / task.dt))
     for i, one in enumerate(tracks):
         mine = [p for p in pieces if p.track == i]
         sizes = np.array([p.samples - min(ahead, p.begin + ahead) * (p.begin > 0) for p in mine])
@@ -105,37 +106,37 @@ def test_every_row_is_in_one_piece(setup: Setup, length: float | None, lead: flo
         for p in mine[1:]:
             first = round(one.t[p.rows.start] / one.dt - 0.5)
             assert p.begin == 0 or first - p.begin >= ahead - 1
-            assert p.start.shape == (setup.space.nq + setup.space.nv,)
+            assert p.start.shape == (task.space.nq + task.space.nv,)
 
 
-def test_a_piece_begins_as_much_earlier_as_outputs_lag(setup: Setup) -> None:
+def test_a_piece_begins_as_much_earlier_as_outputs_lag(task: DesignTask) -> None:
     """So that what its first row shows is simulated; the first piece cannot."""
-    pieces = cut(setup, [track(setup)], 0.5, 0.025)
+    pieces = cut(task.system, [track(task)], 0.5, 0.025)
     assert [p.begin for p in pieces] == [0, 47, 97, 147]
     assert [p.rows.start for p in pieces] == [0, 50, 100, 150]
     assert [p.begin + p.samples for p in pieces] == [50, 100, 150, 200]
     assert pieces[-1].rows.stop == 201
 
 
-def test_stretches_without_rows_are_no_pieces(setup: Setup) -> None:
+def test_stretches_without_rows_are_no_pieces(task: DesignTask) -> None:
     """A hole longer than a piece."""
     rows = np.concatenate([np.arange(60), np.arange(140, 201)])
-    tracks = [track(setup, rows=rows)]
-    pieces = cut(setup, tracks, 0.2, 0.0)
+    tracks = [track(task, rows=rows)]
+    pieces = cut(task.system, tracks, 0.2, 0.0)
     covered(pieces, tracks)
     assert [p.begin for p in pieces] == [0, 20, 40, 140, 160, 180]
 
 
-def test_pieces_that_are_too_short_are_refused(setup: Setup) -> None:
+def test_pieces_that_are_too_short_are_refused(task: DesignTask) -> None:
     """In one sentence with the file, the key and what it takes."""
     with pytest.raises(
         RecordingError, match=r"x\.csv: fit\.segments = 0\.03 s is too short.*4 samples of 0\.01 s"
     ):
-        cut(setup, [track(setup)], 0.03, 0.0)
+        cut(task.system, [track(task)], 0.03, 0.0)
 
 
-def test_whole_tracks_start_as_stated(setup: Setup) -> None:
-    tracks = [track(setup), track(setup, rows=np.arange(80))]
+def test_whole_tracks_start_as_stated(task: DesignTask) -> None:
+    tracks = [track(task), track(task, rows=np.arange(80))]
     start = np.array([0.1, 3.0, 0.0, 0.4])
     pieces = whole(tracks, start)
     covered(pieces, tracks)
@@ -147,15 +148,15 @@ def test_whole_tracks_start_as_stated(setup: Setup) -> None:
 @pytest.mark.parametrize("hidden", [(), ("qvel",)])
 @pytest.mark.parametrize("gaps", [False, True])
 def test_measured_starts_are_where_the_motion_was(
-    setup: Setup, hidden: tuple[str, ...], gaps: bool
+    task: DesignTask, hidden: tuple[str, ...], gaps: bool
 ) -> None:
     """A slide and a hinge; velocities measured, or read off the positions. Against the motion itself."""
-    y = truth(setup)
+    y = truth(task)
     begins = np.array([0, 3, 60, 117, 199])
     shown = np.array(y)
     if gaps:
         shown[np.random.default_rng(0).random(shown.shape) < 0.3] = np.nan
-    states = measured_starts(setup, track(setup, shown, hidden=hidden), begins)
+    states = measured_starts(task.system, track(task, shown, hidden=hidden), begins)
     position, speed = np.ptp(y[:, :2], axis=0), np.ptp(y[:, 2:], axis=0)
     assert (np.abs(states[:, :2] - y[begins, :2]) < 0.02 * position).all()
     assert (np.abs(states[:, 2:] - y[begins, 2:]) < (0.15 if hidden else 0.1) * speed).all()
@@ -164,21 +165,21 @@ def test_measured_starts_are_where_the_motion_was(
     assert np.abs(states[2:, :2] - y[0, :2]).max() > 0.1, "a motion that goes nowhere shows nothing"
 
 
-def test_noise_is_averaged_over_the_rows_around(setup: Setup) -> None:
+def test_noise_is_averaged_over_the_rows_around(task: DesignTask) -> None:
     """Starts are several times better than the rows that they are read off."""
-    y, begins = truth(setup), np.arange(15, 185, 2)
+    y, begins = truth(task), np.arange(15, 185, 2)
     noisy = y + 0.02 * np.random.default_rng(0).standard_normal(y.shape)
-    states = measured_starts(setup, track(setup, noisy), begins)
+    states = measured_starts(task.system, track(task, noisy), begins)
     assert np.std((states - y[begins])[:, :2]) < 0.5 * 0.02
 
 
-def test_a_free_body_starts_with_its_orientation(body: Setup) -> None:
+def test_a_free_body_starts_with_its_orientation(body: DesignTask) -> None:
     """Position, measured quaternion (the nearest, of unit length), velocities; for a ball joint too."""
     y = truth(body)
     begins = np.array([0, 50, 133])
     noisy = np.array(y)
     noisy[:, 3:11] *= 1.01
-    states = measured_starts(body, track(body, noisy), begins)
+    states = measured_starts(body.system, track(body, noisy), begins)
     for first in (3, 7):
         np.testing.assert_allclose(
             np.linalg.norm(states[:, first : first + 4], axis=1), 1.0, rtol=1e-12
@@ -190,29 +191,29 @@ def test_a_free_body_starts_with_its_orientation(body: Setup) -> None:
     np.testing.assert_allclose(states[:, 11:], y[begins, 11:], rtol=0, atol=0.1 * np.ptp(y[:, 11:]))
 
 
-def test_what_is_not_measured_goes_as_the_model_at_the_guess(body: Setup) -> None:
+def test_what_is_not_measured_goes_as_the_model_at_the_guess(body: DesignTask) -> None:
     """Velocities of rotations that the log does not hold; all of it where orientations are missing too."""
     y, guess = truth(body), truth(body, 1.0)
     begins = np.array([0, 40, 120])
-    slow = measured_starts(body, track(body, y, hidden=("qvel",)), begins)
+    slow = measured_starts(body.system, track(body, y, hidden=("qvel",)), begins)
     np.testing.assert_allclose(slow[:, 14:], guess[begins, 14:], rtol=0, atol=1e-9)
     np.testing.assert_allclose(
         slow[:, 11:14], y[begins, 11:14], rtol=0, atol=0.1 * np.ptp(y[:, 11:14])
     )
-    ball = measured_starts(body, track(body, y, hidden=("qpos:ball", "qvel")), begins)
+    ball = measured_starts(body.system, track(body, y, hidden=("qpos:ball", "qvel")), begins)
     np.testing.assert_allclose(ball[:, 7:11], guess[begins, 7:11], rtol=0, atol=1e-9)
     np.testing.assert_allclose(ball[:, 3:7], y[begins, 3:7], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("hidden", [("qpos:slide",), ("qvel:hinge",), ("qpos:slide", "qvel")])
 def test_an_output_that_a_recording_lacks_does_not_spoil_its_starts(
-    setup: Setup, hidden: tuple[str, ...]
+    task: DesignTask, hidden: tuple[str, ...]
 ) -> None:
     """One of several recordings without that column: the model stands in."""
-    y, guess, begins = truth(setup), truth(setup, 1.0), np.array([0, 70, 150])
-    states = measured_starts(setup, track(setup, y, hidden=hidden), begins)
+    y, guess, begins = truth(task), truth(task, 1.0), np.array([0, 70, 150])
+    states = measured_starts(task.system, track(task, y, hidden=hidden), begins)
     assert np.isfinite(states).all()
-    names = setup.outputs.names
+    names = task.system.outputs.names
     if "qpos:slide" in hidden:
         np.testing.assert_allclose(states[:, 0], guess[begins, 0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(
@@ -227,11 +228,11 @@ def test_a_start_that_nothing_shows_does_no_harm(
 ) -> None:
     """Where the cart stands is in no output: only round-off of differences speaks of it, and must not steer the search."""
     noise = dict.fromkeys(names, 0.01)
-    blind = cart_setup(tmp_path, horizon=3.0, noise=noise, fit={**fit, "bootstrap": 0})
+    blind = cart_task(tmp_path, horizon=3.0, noise=noise, fit={**fit, "bootstrap": 0})
     theta, y = 1.1 * blind.parameters.guess, truth(blind)
     y = y + 0.01 * np.random.default_rng(0).standard_normal(y.shape)
-    found = identify(
-        blind,
+    found = identify_system(
+        blind.system,
         [
             Recording(
                 t=np.arange(len(y)) * blind.dt, ctrl=blind.control, y=y, outputs=names, name="x.csv"

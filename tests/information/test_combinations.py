@@ -9,9 +9,13 @@ import pytest
 
 import mjfim
 from mjfim.errors import UnidentifiableError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify_system
 from mjfim.output import archive
-from tests.support.numerics import make_setup, relative_error
+from mjfim.studies.check import check_recordings, check_task
+from tests.support.numerics import make_task, relative_error
 
 # A double pendulum whose first link holds a mass that no motion tells from the second one's.
 PENDULUM = """
@@ -42,7 +46,7 @@ PARAMETERS = {
 SINE = {"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}
 
 
-def pendulum(folder: Path, **tables) -> Setup:
+def pendulum(folder: Path, **tables) -> DesignTask:
     """One second of it, all states measured."""
     defaults = {
         "parameters": PARAMETERS,
@@ -52,7 +56,7 @@ def pendulum(folder: Path, **tables) -> Setup:
         "cost": {"control": 1e-3},
         "descent": {"max_iterations": 5},
     }
-    return make_setup(PENDULUM, folder, **{**defaults, **tables})
+    return make_task(PENDULUM, folder, **{**defaults, **tables})
 
 
 def lost(names: tuple[str, ...], std: np.ndarray) -> set[str]:
@@ -73,12 +77,12 @@ def test_experiments_together_do_not_take_round_off_for_information(tmp_path) ->
 
 
 def test_earlier_information_of_a_design_leaves_every_sigma_known(tmp_path) -> None:
-    setup = pendulum(tmp_path)
-    design = mjfim.design(setup)
-    archive.write_design(tmp_path, design, setup)
-    again = Setup(setup.experiment.replace(earlier=[str(tmp_path / "design.json")]))
-    told = mjfim.check(again, trajectory=design.trajectory)
-    alone = mjfim.check(setup, trajectory=design.trajectory)
+    task = pendulum(tmp_path)
+    design = design_task(task)
+    archive.write_design(tmp_path, design, task.system)
+    again = DesignTask.resolve(task.experiment.replace(earlier=[str(tmp_path / "design.json")]))
+    told = check_task(again, trajectory=design.trajectory)
+    alone = check_task(task, trajectory=design.trajectory)
     ratio = np.array(
         [b.std / a.std for a, b in zip(alone.rows, told.rows, strict=True) if np.isfinite(a.std)]
     )
@@ -91,38 +95,38 @@ def test_an_estimate_holds_what_no_recording_shows_and_knows_the_rest(tmp_path) 
         **PARAMETERS,
         "d": {"target": "joint/shoulder:damping", "guess": 0.15, "true": 0.1},
     }
-    setup = pendulum(tmp_path, parameters=parameters)
-    recording = mjfim.simulate(setup, setup.initial, seed=3)
-    estimate = mjfim.identify(setup, [recording])
+    task = pendulum(tmp_path, parameters=parameters)
+    recording = simulate_system(task.system, task.initial, seed=3)
+    estimate = identify_system(task.system, [recording])
     assert lost(estimate.parameters, estimate.std) == {"m1r1", "I1", "m2"}
     assert not estimate.success  # declared one by one, not all of them can be told
     assert "m1r1" in estimate.combinations[0]
     assert not estimate.misfit
     assert abs(estimate.theta[4] - 0.1) < 4.0 * estimate.std[4]
-    away = np.abs(estimate.theta[:3] - setup.parameters.guess[:3]) / np.abs(
-        setup.parameters.guess[:3]
+    away = np.abs(estimate.theta[:3] - task.parameters.guess[:3]) / np.abs(
+        task.parameters.guess[:3]
     )
     assert away.max() < 0.1  # not run away along what is invisible
-    told = mjfim.check(setup, [recording])
+    told = check_recordings(task.system, [recording])
     np.testing.assert_allclose(
         estimate.std[3:], [row.std for row in told.rows[3:]], rtol=0.3
     )  # there at the guess
 
 
 def test_an_estimate_of_combinations_serves_as_earlier_information(tmp_path) -> None:
-    setup = pendulum(tmp_path)
-    estimate = mjfim.identify(setup, [mjfim.simulate(setup, setup.initial, seed=3)])
+    task = pendulum(tmp_path)
+    estimate = identify_system(task.system, [simulate_system(task.system, task.initial, seed=3)])
     estimate.save(tmp_path)
-    again = Setup(setup.experiment.replace(earlier=[str(tmp_path / "estimate.json")]))
-    assert relative_error(again.earlier, estimate.data) < 1e-12
-    assert {row.name for row in mjfim.check(again).rows if np.isfinite(row.std)} == {"m2r2", "d"}
+    again = DesignTask.resolve(task.experiment.replace(earlier=[str(tmp_path / "estimate.json")]))
+    assert relative_error(again.prior_information, estimate.data) < 1e-12
+    assert {row.name for row in check_task(again).rows if np.isfinite(row.std)} == {"m2r2", "d"}
 
 
 def test_criterion_c_refuses_what_cannot_be_identified(tmp_path) -> None:
     with pytest.raises(UnidentifiableError, match=r"m1r1 .* m2"):
-        mjfim.design(pendulum(tmp_path, cost={"criterion": "c", "subset": ["m2"]}))
+        design_task(pendulum(tmp_path, cost={"criterion": "c", "subset": ["m2"]}))
     visible = {"criterion": "c", "combination": {"I1": 1.0, "m2": 0.09}}
-    design = mjfim.design(pendulum(tmp_path, cost=visible))
+    design = design_task(pendulum(tmp_path, cost=visible))
     known = {c.expression.split()[0]: c for c in design.combined}
     assert design.final.criterion == pytest.approx(
         known["I1"].std_final ** 2 * 100.0, rel=1e-6
@@ -130,7 +134,7 @@ def test_criterion_c_refuses_what_cannot_be_identified(tmp_path) -> None:
 
 
 def test_nothing_visible_is_a_verdict_not_a_crash(tmp_path) -> None:
-    found = mjfim.check(
+    found = check_task(
         pendulum(tmp_path, parameters={"wind": {"target": "option:wind[0]", "guess": 1.0}})
     )
     assert not found.ok
@@ -139,7 +143,7 @@ def test_nothing_visible_is_a_verdict_not_a_crash(tmp_path) -> None:
 
 def test_a_prior_on_one_member_tells_the_group_apart(tmp_path) -> None:
     parameters = {**PARAMETERS, "m2": {"target": "body/lower:mass", "prior": 0.01}}
-    found = mjfim.check(pendulum(tmp_path, parameters=parameters))
+    found = check_task(pendulum(tmp_path, parameters=parameters))
     assert all(np.isfinite(row.std) for row in found.rows)
     assert found.rows[2].std == pytest.approx(0.01, rel=1e-3)
     assert found.ok
@@ -147,20 +151,23 @@ def test_a_prior_on_one_member_tells_the_group_apart(tmp_path) -> None:
 
 
 def test_starts_are_each_recordings_own_for_check_as_for_identify(tmp_path) -> None:
-    setup = pendulum(tmp_path, parameters={"d": PARAMETERS["d"]}, nuisance={"initial": 0.05})
-    recordings = [mjfim.simulate(setup, setup.initial, seed=s) for s in range(3)]
-    told, estimate = mjfim.check(setup, recordings), mjfim.identify(setup, recordings)
+    task = pendulum(tmp_path, parameters={"d": PARAMETERS["d"]}, nuisance={"initial": 0.05})
+    recordings = [simulate_system(task.system, task.initial, seed=s) for s in range(3)]
+    told, estimate = (
+        check_recordings(task.system, recordings),
+        identify_system(task.system, recordings),
+    )
     assert told.rows[0].std == pytest.approx(estimate.std[0], rel=0.02)
-    single = mjfim.check(setup, recordings[:1]).rows[0].std
+    single = check_recordings(task.system, recordings[:1]).rows[0].std
     assert told.rows[0].std == pytest.approx(single / np.sqrt(3.0), rel=1e-6)
 
 
 def test_a_quaternion_sensor_may_come_with_either_sign(tmp_path) -> None:
-    setup = pendulum(tmp_path, noise={"tip": 0.005}, parameters={"d": PARAMETERS["d"]})
-    recording = mjfim.simulate(setup, setup.initial, seed=1)
+    task = pendulum(tmp_path, noise={"tip": 0.005}, parameters={"d": PARAMETERS["d"]})
+    recording = simulate_system(task.system, task.initial, seed=1)
     turned = mjfim.Recording(
         t=recording.t, ctrl=recording.ctrl, y=-recording.y, outputs=recording.outputs, name="turned"
     )
-    right, other = (mjfim.identify(setup, [r]) for r in (recording, turned))
+    right, other = (identify_system(task.system, [r]) for r in (recording, turned))
     np.testing.assert_allclose(other.theta, right.theta, rtol=1e-6)
     assert not other.misfit

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from mjfim.errors import UnidentifiableError
-from mjfim.excitation.design import design
-from mjfim.excitation.evaluation import evaluate_trajectory
-from mjfim.experiment.simulate import simulate
-from mjfim.identification.identify import identify
+from mjfim.excitation.design import design_task
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify_system
 from mjfim.information.criteria import CRITERIA
 from mjfim.information.fisher import Information
 from mjfim.information.marginal import standard_deviations
 from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Sensitivity
-from tests.support.numerics import CART_PARAMETERS, cart_setup, relative_error, richardson
+from tests.support.numerics import CART_PARAMETERS, cart_task, relative_error, richardson
 
 SIGMA = np.array([0.1, 0.5, 2.0])
 
@@ -245,15 +245,15 @@ VAGUE = {"initial": 0.1, "bias": 0.1, "delay": 0.01}
 
 def test_exactly_known_nuisances_change_neither_design_criterion_nor_estimate(tmp_path) -> None:
     plain, exact, vague = (
-        cart_setup(tmp_path, **t) for t in ({}, {"nuisance": EXACT}, {"nuisance": VAGUE})
+        cart_task(tmp_path, **t) for t in ({}, {"nuisance": EXACT}, {"nuisance": VAGUE})
     )
-    here = [evaluate_trajectory(s, s.initial) for s in (plain, exact, vague)]
+    here = [evaluate_task(s, s.initial) for s in (plain, exact, vague)]
     assert here[1].criterion == pytest.approx(here[0].criterion, rel=1e-6)
     np.testing.assert_allclose(here[1].std[:3], here[0].std, rtol=1e-6)
     np.testing.assert_allclose(here[1].std[3:], 1e-9, rtol=1e-6)
     assert here[2].criterion > 1.1 * here[0].criterion
-    recording = simulate(plain, plain.initial, seed=4)
-    found = [identify(s, [recording]) for s in (plain, exact, vague)]
+    recording = simulate_system(plain.system, plain.initial, seed=4)
+    found = [identify_system(s.system, [recording]) for s in (plain, exact, vague)]
     np.testing.assert_allclose(found[1].theta[:3], found[0].theta, atol=1e-4 * found[0].std.min())
     np.testing.assert_allclose(found[1].std[:3], found[0].std, rtol=1e-5)
     assert (found[2].std[:3] > 1.01 * found[0].std).all()
@@ -310,29 +310,29 @@ def test_the_stated_rate_divides_the_sum_so_that_weights_mean_the_same_at_every_
     tmp_path,
 ) -> None:
     (tmp_path / "b").mkdir()
-    dense, thin = cart_setup(tmp_path), cart_setup(tmp_path / "b", measure_rate=25.0)
+    dense, thin = cart_task(tmp_path), cart_task(tmp_path / "b", measure_rate=25.0)
     a, b = (s.problem.point(s.initial) for s in (dense, thin))
     assert relative_error(a.information, b.information) > 1.0  # four times the samples
     assert b.criterion.value == pytest.approx(a.criterion.value, rel=0.3)
 
 
 def test_information_of_a_real_experiment_is_the_sum_with_its_noise_and_scale(tmp_path) -> None:
-    setup = cart_setup(tmp_path, noise={"angle": 0.01, "acc": 0.3}, measure_rate=50.0)
-    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = cart_task(tmp_path, noise={"angle": 0.01, "acc": 0.3}, measure_rate=50.0)
+    S = task.plant.derivatives.sensitivity(task.theta, task.initial)
     sigma = np.array([0.01, 0.3, 0.3, 0.3])
     total = sum(S.G[k].T @ np.diag(sigma**-2) @ S.G[k] for k in range(2, 51, 2))
-    evaluation = evaluate_trajectory(setup, setup.initial)
+    evaluation = evaluate_task(task, task.initial)
     assert relative_error(evaluation.information, total) < 1e-12
-    scaled = total * np.outer(setup.theta, setup.theta) / 50.0  # relative to the guess by default
+    scaled = total * np.outer(task.theta, task.theta) / 50.0  # relative to the guess by default
     assert relative_error(evaluation.eigenvalues, np.linalg.eigvalsh(scaled)) < 1e-9
     assert evaluation.criterion == pytest.approx(1.0 / np.linalg.eigvalsh(scaled)[0], rel=1e-9)
     assert relative_error(evaluation.std, np.sqrt(np.diag(np.linalg.inv(total)))) < 1e-8
 
 
 def test_noise_of_sensors_defaults_to_the_mjcf(tmp_path) -> None:
-    setup = cart_setup(tmp_path, noise={})
-    assert setup.outputs.names == ("angle", "rate", "acc[0]", "acc[1]", "acc[2]", "drive")
-    np.testing.assert_array_equal(setup.noise.sigma, [0.01, 0.05, 0.3, 0.3, 0.3, 0.1])
+    task = cart_task(tmp_path, noise={})
+    assert task.system.outputs.names == ("angle", "rate", "acc[0]", "acc[1]", "acc[2]", "drive")
+    np.testing.assert_array_equal(task.system.noise.sigma, [0.01, 0.05, 0.3, 0.3, 0.3, 0.1])
 
 
 def test_standard_deviations_survive_parameters_of_very_different_size() -> None:
@@ -357,24 +357,24 @@ SHORT = {"max_iterations": 4}
 
 
 def test_a_product_is_designed_on_what_can_be_identified_of_it(tmp_path) -> None:
-    setup = cart_setup(tmp_path, parameters=PRODUCT, descent=SHORT)
-    result = design(setup)
+    task = cart_task(tmp_path, parameters=PRODUCT, descent=SHORT)
+    result = design_task(task)
     assert result.combinations == ("gear and gain only as gear + gain",)
     assert result.final.cost < 0.9 * result.initial.cost
     assert np.isinf(result.final.std[:2]).all()
     # one factor alone tells as much about the mass as both
     alone = {name: PRODUCT[name] for name in ("gain", "mass")}
-    single = evaluate_trajectory(cart_setup(tmp_path, parameters=alone), result.trajectory)
+    single = evaluate_task(cart_task(tmp_path, parameters=alone), result.trajectory)
     assert result.final.std[2] == pytest.approx(single.std[1], rel=1e-5)
     # the criterion sees (gear + gain) / sqrt(2) and the mass, in units of their guesses
     T = np.array([[np.sqrt(0.5), 0.0], [np.sqrt(0.5), 0.0], [0.0, 1.5]])
-    seen = np.linalg.eigvalsh(T.T @ result.final.information @ T / setup.measure_rate)
+    seen = np.linalg.eigvalsh(T.T @ result.final.information @ T / task.system.measure_rate)
     np.testing.assert_allclose(result.final.eigenvalues, seen, rtol=1e-6)
 
 
 def test_coefficients_of_a_combination_are_in_the_parameters_own_units(tmp_path) -> None:
     changed = {**PRODUCT, "gear": {"target": "actuator/force:gear[0]", "guess": 4.0}}
-    result = design(cart_setup(tmp_path, parameters=changed, descent={"max_iterations": 0}))
+    result = design_task(cart_task(tmp_path, parameters=changed, descent={"max_iterations": 0}))
     assert result.combinations == (
         "gear and gain only as gear + 4 gain",
     )  # d(gear gain) = d gear + 4 d gain
@@ -382,7 +382,7 @@ def test_coefficients_of_a_combination_are_in_the_parameters_own_units(tmp_path)
 
 def test_a_prior_on_one_factor_of_the_product_gives_both_a_deviation(tmp_path) -> None:
     known = {**PRODUCT, "gear": {"target": "actuator/force:gear[0]", "prior": 0.01}}
-    result = design(cart_setup(tmp_path, parameters=known, descent={"max_iterations": 0}))
+    result = design_task(cart_task(tmp_path, parameters=known, descent={"max_iterations": 0}))
     exact = np.sqrt(np.diag(np.linalg.inv(result.final.information)))
     np.testing.assert_allclose(result.final.std, exact, rtol=1e-4)
     assert result.final.std[0] == pytest.approx(
@@ -396,7 +396,7 @@ def test_a_prior_on_one_factor_of_the_product_gives_both_a_deviation(tmp_path) -
 def test_a_parameter_that_changes_nothing_is_an_error_that_names_it(others: dict, tmp_path) -> None:
     blind = {"depth": {"target": "body/bob:pos[1]", "guess": 0.1}, **others}
     with pytest.raises(UnidentifiableError, match=r"parameters\.depth changes nothing") as caught:
-        design(cart_setup(tmp_path, parameters=blind))
+        design_task(cart_task(tmp_path, parameters=blind))
     assert "parameters.m" not in str(caught.value)
 
 
@@ -407,6 +407,6 @@ def test_a_start_at_rest_without_control_is_unidentifiable(
 ) -> None:
     rest = {"qpos": (0.0, angle), "control": {"kind": "constant", "amplitude": 0.0}}
     parameters = dict(list(CART_PARAMETERS.items())[-count:])
-    setup = cart_setup(tmp_path, initial=rest, parameters=parameters, descent={"max_iterations": 5})
+    task = cart_task(tmp_path, initial=rest, parameters=parameters, descent={"max_iterations": 5})
     with pytest.raises(UnidentifiableError, match="the start excites nothing"):
-        design(setup)
+        design_task(task)

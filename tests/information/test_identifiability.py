@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from mjfim.errors import SimulationDivergedError, UnidentifiableError
-from mjfim.excitation.design import design, require_designable
-from mjfim.excitation.initial_controls import probes
-from mjfim.experiment.system import Setup
-from mjfim.information.identifiability import PROBES, Survey, require_visible, rows, survey
-from tests.support.numerics import CART_PARAMETERS, Array, cart_setup, make_setup
+from mjfim.excitation.design import design_task, require_designable
+from mjfim.excitation.task import DesignTask
+from mjfim.information.identifiability import PROBES, Identifiability, require_visible
+from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task
 
 PRODUCT = {
     "gear": {"target": "actuator/force:gear[0]"},
@@ -44,18 +43,18 @@ TWO = """
 """
 
 
-def two_setup(folder: Path, **tables: Any) -> Setup:
+def two_task(folder: Path, **tables: Any) -> DesignTask:
     """Two sliders, of which the initial control moves the left one only."""
     control = {"kind": "sine", "amplitude": {"left": 0.8, "right": 0.0}, "frequency": 1.0}
     masses = {name: {"target": f"body/{name}:mass"} for name in ("left", "right")}
     defaults = {"parameters": masses, "noise": {"state": 0.01}, "initial": {"control": control}}
-    return make_setup(TWO, folder, **{**defaults, **tables})
+    return make_task(TWO, folder, **{**defaults, **tables})
 
 
-def look(setup: Setup) -> Survey:
-    """Survey along the initial control."""
-    return survey(
-        setup, setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+def look(task: DesignTask) -> Identifiability:
+    """Identifiability along the initial control."""
+    return task.observer.identifiability(
+        task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
     )
 
 
@@ -65,47 +64,47 @@ def test_an_experiment_that_shows_everything_needs_no_random_controls(
     def refused(theta: Array, ctrl: Array) -> None:
         raise AssertionError("not needed")
 
-    def look_without_simulations(setup: Setup) -> Survey:
-        """Survey along the initial control on a plant that simulates no further control."""
-        curve = setup.initial
-        found = setup.plant.derivatives.sensitivity(setup.theta, curve)
-        monkeypatch.setattr(setup.plant, "simulate", refused)
-        return survey(setup, curve, found)
+    def look_without_simulations(task: DesignTask) -> Identifiability:
+        """Identifiability along the initial control on a plant that simulates no further control."""
+        curve = task.initial
+        found = task.plant.derivatives.sensitivity(task.theta, curve)
+        monkeypatch.setattr(task.plant, "simulate", refused)
+        return task.observer.identifiability(curve, found)
 
-    seen = look_without_simulations(cart_setup(tmp_path))
+    seen = look_without_simulations(cart_task(tmp_path))
     assert seen.basis is None
     assert (seen.here.count, seen.always.count) == (0, 0)
     assert (seen.groups_here, seen.groups_always) == ((), ())
     with pytest.raises(AssertionError, match="not needed"):
-        look_without_simulations(cart_setup(tmp_path, parameters=PRODUCT))
+        look_without_simulations(cart_task(tmp_path, parameters=PRODUCT))
 
 
 def test_a_start_that_moves_half_of_the_model_is_told_from_what_never_shows(tmp_path) -> None:
-    setup = two_setup(tmp_path)
-    seen = look(setup)
+    task = two_task(tmp_path)
+    seen = look(task)
     assert (seen.here.silent, seen.always.count) == ((1,), 0)
     assert seen.basis is None
     with pytest.raises(UnidentifiableError, match="start excites nothing") as caught:
-        require_designable(setup, seen)
+        require_designable(task, seen)
     assert "right" in str(caught.value)
     assert "left" not in str(caught.value)
 
 
 def test_at_rest_nothing_shows_here_and_everything_elsewhere(tmp_path) -> None:
-    seen = look(cart_setup(tmp_path, initial=REST))
+    seen = look(cart_task(tmp_path, initial=REST))
     assert seen.here.basis.shape == (3, 0)
     assert seen.always.count == 0
 
 
 def test_what_no_control_shows_is_the_same_here_and_always(tmp_path) -> None:
-    setup = cart_setup(tmp_path, parameters=PRODUCT)
-    seen = look(setup)
+    task = cart_task(tmp_path, parameters=PRODUCT)
+    seen = look(task)
     assert (seen.here.count, seen.always.count) == (1, 1)
     assert seen.basis.shape == (3, 2)
-    require_designable(setup, seen)  # a combination can be designed for
+    require_designable(task, seen)  # a combination can be designed for
     J = (
-        rows(setup, setup.plant.derivatives.sensitivity(setup.theta, setup.initial))
-        * setup.parameters.scale
+        task.observer.rows(task.plant.derivatives.sensitivity(task.theta, task.initial))
+        * task.parameters.scale
     )
     hidden = np.linalg.qr(seen.basis, mode="complete")[0][:, 2]
     assert np.linalg.norm(J @ hidden) < 1e-6 * np.linalg.norm(J)
@@ -115,8 +114,8 @@ def test_a_combination_hidden_at_the_start_alone_is_refused_with_a_way_out(tmp_p
     """A slider that coasts shows damping over mass alone; pushed, it shows both."""
     parameters = {"mass": {"target": "body/left:mass"}, "drag": {"target": "joint/left:damping"}}
     coasting = {"qvel": (1.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
-    setup = two_setup(tmp_path, parameters=parameters, initial=coasting)
-    seen = look(setup)
+    task = two_task(tmp_path, parameters=parameters, initial=coasting)
+    seen = look(task)
     assert (seen.here.count, seen.here.silent, seen.always.count) == (1, (), 0)
     (group,) = seen.groups_here
     assert group.members == ("mass", "drag")
@@ -128,7 +127,7 @@ def test_a_combination_hidden_at_the_start_alone_is_refused_with_a_way_out(tmp_p
     with pytest.raises(
         UnidentifiableError, match=r"start excites nothing .* mass and drag only as .* multisine"
     ):
-        require_designable(setup, seen)
+        require_designable(task, seen)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 1e-7], ids=["coarse", "fine sensor"])
@@ -136,24 +135,24 @@ def test_a_wanted_parameter_that_a_nuisance_imitates_is_named(sigma: float, tmp_
     """Where the cart starts and what its position sensor adds are the same to every measurement."""
     wanted = {"offset": {"target": "output/qpos:slide:bias"}}
     noise = {"qpos:slide": sigma, "qvel:slide": sigma}
-    setup = cart_setup(
+    task = cart_task(
         tmp_path, parameters=wanted, noise=noise, nuisance={"initial": {"qpos:slide": True}}
     )
     with pytest.raises(UnidentifiableError, match=r"parameters\.offset changes nothing"):
-        require_designable(setup, look(setup))
-    known = cart_setup(
+        require_designable(task, look(task))
+    known = cart_task(
         tmp_path, parameters=wanted, noise=noise, nuisance={"initial": {"qpos:slide": 0.1}}
     )
     require_designable(known, look(known))
 
 
 def test_members_of_an_inertia_may_be_invisible_but_not_all_of_them(tmp_path) -> None:
-    moving = two_setup(tmp_path, parameters={"left": {"inertial": "left"}})
+    moving = two_task(tmp_path, parameters={"left": {"inertial": "left"}})
     seen = look(moving)
     require_designable(moving, seen)
     assert seen.basis.shape == (10, 1)  # a slider shows its mass, nothing else
     assert seen.groups_always[-1].combinations == ()
-    welded = two_setup(tmp_path, parameters={"post": {"inertial": "post"}})
+    welded = two_task(tmp_path, parameters={"post": {"inertial": "post"}})
     with pytest.raises(UnidentifiableError, match="none of the parameters shows"):
         require_designable(welded, look(welded))
 
@@ -163,11 +162,11 @@ def test_several_dead_parameters_are_all_named(tmp_path) -> None:
         "y": {"target": "body/bob:pos[1]", "guess": 0.1},
         "i": {"target": "body/cart:inertia[0]"},
     }
-    setup = cart_setup(tmp_path, parameters={**CART_PARAMETERS, **dead})
+    task = cart_task(tmp_path, parameters={**CART_PARAMETERS, **dead})
     with pytest.raises(
         UnidentifiableError, match=r"parameters\.y, parameters\.i change nothing .* take them out"
     ):
-        require_designable(setup, look(setup))
+        require_designable(task, look(task))
 
 
 COLLISION = """
@@ -190,7 +189,7 @@ def test_a_contact_shorter_than_a_sample_period_shows_its_stiffness(tmp_path) ->
     control = {"kind": "sine", "amplitude": 0.1, "frequency": 3.0}
     initial = {"qpos": (0.9,), "qvel": (-1.0,), "control": control}
     for horizon in (3.3, 3.7, 5.0):  # wherever the looked-at samples fall
-        setup = make_setup(
+        task = make_task(
             COLLISION,
             tmp_path,
             horizon=horizon,
@@ -198,18 +197,18 @@ def test_a_contact_shorter_than_a_sample_period_shows_its_stiffness(tmp_path) ->
             noise={"state": 0.01},
             initial=initial,
         )
-        assert np.sum(setup.initial.qpos[:, 0] < 0.1) <= 2
+        assert np.sum(task.initial.qpos[:, 0] < 0.1) <= 2
         assert (
-            np.abs(setup.plant.derivatives.sensitivity(setup.theta, setup.initial).G[..., 0]).max()
+            np.abs(task.plant.derivatives.sensitivity(task.theta, task.initial).G[..., 0]).max()
             * 40000.0
             > 0.1
         )
-        assert look(setup).here.count == 0
+        assert look(task).here.count == 0
 
 
-def controls(setup: Setup) -> list[Array]:
+def controls(task: DesignTask) -> list[Array]:
     """Controls of the random trajectories."""
-    return [probe.ctrl for probe in probes(setup, PROBES)]
+    return [probe.ctrl for probe in task.probes(PROBES)]
 
 
 def test_random_controls_keep_to_the_actuators_and_about_the_initial_one(tmp_path) -> None:
@@ -218,8 +217,8 @@ def test_random_controls_keep_to_the_actuators_and_about_the_initial_one(tmp_pat
         "amplitude": {"left": 0.8, "right": 3.0},
         "offset": {"left": 0.1, "right": 5.0},
     }
-    setup = two_setup(tmp_path, initial={"control": {**control, "frequency": 2.0}})
-    made = controls(setup)
+    task = two_task(tmp_path, initial={"control": {**control, "frequency": 2.0}})
+    made = controls(task)
     assert len(made) == PROBES
     left, right = np.array(made).transpose(2, 0, 1)
     assert np.abs(left).max() == 1.0  # the range is reached, and kept
@@ -230,43 +229,45 @@ def test_random_controls_keep_to_the_actuators_and_about_the_initial_one(tmp_pat
 
 def test_the_seed_decides_the_random_controls(tmp_path) -> None:
     same, again, other = (
-        controls(two_setup(tmp_path, descent={"seed": seed})) for seed in (1, 1, 2)
+        controls(two_task(tmp_path, descent={"seed": seed})) for seed in (1, 1, 2)
     )
     np.testing.assert_array_equal(same, again)
     assert not np.array_equal(same, other)
 
 
 def test_random_controls_that_diverge_are_left_out(tmp_path, monkeypatch) -> None:
-    setup = cart_setup(tmp_path, parameters=PRODUCT)
-    curve, found = setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = cart_task(tmp_path, parameters=PRODUCT)
+    curve, found = task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
 
     def diverges(theta: Array, ctrl: Array) -> None:
         raise SimulationDivergedError("too fast")
 
-    monkeypatch.setattr(setup.plant, "simulate", diverges)
-    seen = survey(setup, curve, found)
+    monkeypatch.setattr(task.plant, "simulate", diverges)
+    seen = task.observer.identifiability(curve, found)
     assert (seen.here.count, seen.always.count) == (1, 1)
 
 
 def test_data_must_show_every_parameter_nuisance_and_prior_or_not(tmp_path) -> None:
-    plain = cart_setup(tmp_path)
+    plain = cart_task(tmp_path)
     require_visible(
-        plain, rows(plain, plain.plant.derivatives.sensitivity(plain.theta, plain.initial))
+        plain.parameters,
+        plain.prior,
+        plain.observer.rows(plain.plant.derivatives.sensitivity(plain.theta, plain.initial)),
     )
     sure = {**PRODUCT, "gear": {**PRODUCT["gear"], "nuisance": True, "prior": 1e-6}}
     for parameters in (PRODUCT, sure):
-        setup = cart_setup(tmp_path, parameters=parameters)
-        J = rows(setup, setup.plant.derivatives.sensitivity(setup.theta, setup.initial))
+        task = cart_task(tmp_path, parameters=parameters)
+        J = task.observer.rows(task.plant.derivatives.sensitivity(task.theta, task.initial))
         with pytest.raises(UnidentifiableError, match="gear and gain only as gear"):
-            require_visible(setup, J)
+            require_visible(task.parameters, task.prior, J)
 
 
 def test_the_design_refuses_before_it_spends_anything(tmp_path) -> None:
-    setup = two_setup(tmp_path)
+    task = two_task(tmp_path)
     told: list[object] = []
     with pytest.raises(UnidentifiableError, match="start excites nothing"):
-        design(setup, monitor=told.append)
+        design_task(task, monitor=told.append)
     assert told == []
-    start = np.stack([np.sin(5.0 * setup.t), np.cos(4.0 * setup.t)], axis=1)
-    result = design(two_setup(tmp_path, descent={"max_iterations": 1}), start=start)
+    start = np.stack([np.sin(5.0 * task.t), np.cos(4.0 * task.t)], axis=1)
+    result = design_task(two_task(tmp_path, descent={"max_iterations": 1}), start=start)
     assert np.isfinite(result.final.std).all()

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjfim.excitation.evaluation import evaluate_trajectory
-from mjfim.experiment.system import Setup
-from mjfim.information.identifiability import survey
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.task import DesignTask
 from mjfim.information.null_space import Null, grouped, invisible
-from tests.support.numerics import Array, make_setup
+from tests.support.numerics import Array, make_task
 
 SIZES = np.array([1e-6, 1e-3, 1.0, 1e3, 1e6])
 
@@ -213,20 +212,20 @@ DOUBLE = """
 """
 
 
-def double_pendulum(folder: Path, coordinates: str) -> Setup:
+def double_pendulum(folder: Path, coordinates: str) -> DesignTask:
     """Both inertias unknown, both joints driven and measured."""
     parameters = {name: {"inertial": name, "coordinates": coordinates} for name in "ab"}
     control = {"kind": "multisine", "amplitude": 2.0, "frequency": 1.0}
     initial = {"qpos": (0.4, 0.5), "control": control}
-    return make_setup(
+    return make_task(
         DOUBLE, folder, parameters=parameters, noise={"state": 1e-3}, initial=initial, horizon=1.0
     )
 
 
 def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
-    setup = double_pendulum(tmp_path, "barycentric")
-    seen = survey(
-        setup, setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = double_pendulum(tmp_path, "barycentric")
+    seen = task.observer.identifiability(
+        task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
     )
     assert (seen.here.count, seen.always.count) == (14, 14)
     assert seen.basis.shape == (20, 6)
@@ -247,15 +246,15 @@ def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
 def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_motion(
     tmp_path,
 ) -> None:
-    setup = double_pendulum(tmp_path, "logcholesky")
-    seen = survey(
-        setup, setup.initial, setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = double_pendulum(tmp_path, "logcholesky")
+    seen = task.observer.identifiability(
+        task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
     )
     assert seen.basis.shape == (20, 6)
     # a step along an invisible direction moves nothing measured, to second order
     for n in (seen.always.directions / np.linalg.norm(seen.always.directions, axis=0)).T:
-        y, _ = setup.plant.measure(setup.theta + np.outer([0.0, 1e-4, -1e-4], n), setup.control)
+        y, _ = task.plant.measure(task.theta + np.outer([0.0, 1e-4, -1e-4], n), task.control)
         assert np.abs(y[1] - y[2]).max() < 1e-8
-    evaluation = evaluate_trajectory(setup, setup.initial)
+    evaluation = evaluate_task(task, task.initial)
     assert len(evaluation.eigenvalues) == 6
     assert evaluation.eigenvalues[0] > 0.0

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjfim.excitation.design import design
-from mjfim.experiment.system import Setup
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
 from mjfim.information.smoothness import TOLERANCE, disagreement, roughness
 from mjfim.records.check import Roughness
-from tests.support.numerics import Array, Loop, body_setup, cart_setup, filtered_setup, make_setup
+from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
 
 SLIDER = """
 <mujoco model="slider">
@@ -41,53 +41,55 @@ BALL = """
 """
 
 
-def slider(folder: Path, joint: str = "", motor: str = "", amplitude: float = 3.0) -> Setup:
+def slider(folder: Path, joint: str = "", motor: str = "", amplitude: float = 3.0) -> DesignTask:
     """A block that is pushed to and fro."""
     parameters = {"mass": {"target": "body/block:mass"}, "drag": {"target": "joint/rail:damping"}}
     control = {"kind": "sine", "amplitude": amplitude, "frequency": 1.0}
     xml = SLIDER.format(joint=joint, motor=motor)
-    setup = {
+    task = {
         "parameters": parameters,
         "noise": {"state": 0.01},
         "initial": {"control": control},
         "horizon": 1.5,
     }
-    return make_setup(xml, folder, **setup)
+    return make_task(xml, folder, **task)
 
 
-def ball(folder: Path, horizon: float) -> Setup:
+def ball(folder: Path, horizon: float) -> DesignTask:
     """A ball that falls on the floor at about 0.2 s."""
     parameters = {"mass": {"target": "body/ball:mass"}}
     initial = {"control": {"kind": "constant", "amplitude": 1.0}}
-    return make_setup(
+    return make_task(
         BALL, folder, parameters=parameters, noise={"state": 0.01}, initial=initial, horizon=horizon
     )
 
 
-def along(setup: Setup) -> Roughness | None:
+def along(task: DesignTask) -> Roughness | None:
     """Roughness along the initial control."""
-    return roughness(setup, setup.theta, setup.initial)
+    return roughness(
+        task.plant, task.system.noise, task.system.model_at(task.theta), task.theta, task.initial
+    )
 
 
 @pytest.mark.parametrize(
     "make",
-    [cart_setup, body_setup, filtered_setup, slider, lambda f: ball(f, 0.15)],
+    [cart_task, body_task, filtered_task, slider, lambda f: ball(f, 0.15)],
     ids=["cart", "free body", "activation", "slider", "ball in the air"],
 )
 def test_a_smooth_motion_is_not_flagged(make, tmp_path) -> None:
     assert along(make(tmp_path)) is None
 
 
-def dry(folder: Path, loss: float) -> Setup:
+def dry(folder: Path, loss: float) -> DesignTask:
     """The block held by dry friction of this size, which is unknown."""
-    setup = slider(folder, f'frictionloss="{loss}"')
+    task = slider(folder, f'frictionloss="{loss}"')
     parameters = {"dry": {"target": "joint/rail:frictionloss"}}
-    return Setup(setup.experiment.replace(parameters=parameters), threads=1)
+    return DesignTask.resolve(task.experiment.replace(parameters=parameters), threads=1)
 
 
-def held(setup: Setup) -> Array:
+def held(task: DesignTask) -> Array:
     """(N,) force of the friction along the initial trajectory [N]."""
-    loop, curve = Loop(setup.plant.model(setup.theta), 1), setup.initial
+    loop, curve = Loop(task.plant.model(task.theta), 1), task.initial
     forces = []
     for k in range(curve.samples):
         loop.h(curve.state[k], curve.ctrl[k])
@@ -98,8 +100,8 @@ def held(setup: Setup) -> Array:
 def test_dry_friction_at_the_verge_of_sliding_is_flagged_where_it_breaks_away(tmp_path) -> None:
     force = held(dry(tmp_path, 100.0))
     assert 2.0 < force.max() < 3.0  # it holds what is pushed
-    setup = dry(tmp_path, force.max() * (1.0 - 1e-4))
-    found = along(setup)
+    task = dry(tmp_path, force.max() * (1.0 - 1e-4))
+    found = along(task)
     assert found.error > TOLERANCE
     assert found.parameter == "dry"
     assert found.causes == ("dry friction of rail",)
@@ -131,9 +133,9 @@ def test_a_joint_limit_is_named(tmp_path) -> None:
 def test_a_force_that_just_meets_its_range_is_named(
     amplitude: float, flagged: bool, tmp_path
 ) -> None:
-    setup = slider(tmp_path, motor='forcelimited="true" forcerange="-2 2"', amplitude=amplitude)
+    task = slider(tmp_path, motor='forcelimited="true" forcerange="-2 2"', amplitude=amplitude)
     gain = {"gain": {"target": "actuator/push:gainprm[0]"}}
-    found = along(Setup(setup.experiment.replace(parameters=gain), threads=1))
+    found = along(DesignTask.resolve(task.experiment.replace(parameters=gain), threads=1))
     assert (found is not None) == flagged
     if flagged:
         assert found.causes == ("force range of push",)
@@ -164,11 +166,15 @@ def test_the_sentence_says_parameter_sample_time_and_cause() -> None:
 
 
 def test_the_design_warns_of_roughness(tmp_path) -> None:
-    rough = Setup(ball(tmp_path, 1.0).experiment.replace(descent={"max_iterations": 0}), threads=1)
-    assert any("not smooth" in w and "contact floor - ball" in w for w in design(rough).warnings)
+    rough = DesignTask.resolve(
+        ball(tmp_path, 1.0).experiment.replace(descent={"max_iterations": 0}), threads=1
+    )
+    assert any(
+        "not smooth" in w and "contact floor - ball" in w for w in design_task(rough).warnings
+    )
     assert not any(
         "not smooth" in w
-        for w in design(cart_setup(tmp_path, descent={"max_iterations": 1})).warnings
+        for w in design_task(cart_task(tmp_path, descent={"max_iterations": 1})).warnings
     )
 
 
@@ -200,10 +206,10 @@ def test_round_off_of_outputs_that_a_parameter_does_not_move_is_no_disagreement(
 
 
 def test_a_parameter_without_effect_is_not_called_rough(tmp_path) -> None:
-    setup = slider(tmp_path, 'frictionloss="1.5"')
+    task = slider(tmp_path, 'frictionloss="1.5"')
     depth = {"depth": {"target": "body/block:ipos[1]", "guess": 0.1}}
-    assert along(Setup(setup.experiment.replace(parameters=depth), threads=1)) is None
-    alone = make_setup(
+    assert along(DesignTask.resolve(task.experiment.replace(parameters=depth), threads=1)) is None
+    alone = make_task(
         SLIDER.format(joint="", motor=""), tmp_path, parameters=depth, noise={"state": 0.01}
     )
     assert along(alone) is None
@@ -212,14 +218,14 @@ def test_a_parameter_without_effect_is_not_called_rough(tmp_path) -> None:
 def test_a_model_that_diverges_under_the_longer_step_is_rough_without_bound(
     tmp_path, monkeypatch
 ) -> None:
-    setup = slider(tmp_path, 'frictionloss="1.5"')
-    whole = setup.plant.derivatives.sensitivity
+    task = slider(tmp_path, 'frictionloss="1.5"')
+    whole = task.plant.derivatives.sensitivity
 
     def sensitivity(theta: Array, curve: object, step: object = None) -> object:
         return whole(theta, curve) if step is None else None
 
-    monkeypatch.setattr(setup.plant.derivatives, "sensitivity", sensitivity)
-    found = along(setup)
+    monkeypatch.setattr(task.plant.derivatives, "sensitivity", sensitivity)
+    found = along(task)
     assert found.error == np.inf
     assert found.parameter == "mass, drag"
     assert "dry friction of rail" in found.causes

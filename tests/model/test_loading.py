@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 import mjfim
-from mjfim.experiment.system import Setup
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
 from mjfim.output import folders as results
 from tests.support.cli import DESIGN, MODELS, names, read, run
 
@@ -52,12 +53,12 @@ def test_check_says_what_the_example_is_about(name: str, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("name", slow_except("four_bar"))
 def test_a_short_design_improves_and_leaves_everything(name: str, tmp_path: Path) -> None:
-    setup = Setup(
+    task = DesignTask.resolve(
         mjfim.Experiment.from_file(MODELS / f"{name}.toml").replace(descent={"max_iterations": 3})
     )
-    design = mjfim.design(setup)
+    design = design_task(task)
     assert design.final.cost < design.initial.cost
-    results.leave_design(tmp_path, design, setup)
+    results.leave_design(tmp_path, design, task.system)
     assert names(tmp_path) == DESIGN | ({"limits.png"} if design.usage else set())
     told = read(tmp_path / "design.json")
     assert len(told["final"]["std"]) == len(told["parameters"])

@@ -13,13 +13,13 @@ import pytest
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.model.elements import names_of
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS
-from mjfim.model.loading import decoration
+from mjfim.model.loading import ModelSource, decoration
 from mjfim.model.parameters import Parameter, ParameterSet, Target, moved_bodies
 from mjfim.model.paths import KINDS, ParameterPath, fields_of, resolve
 from mjfim.model.targets import ModelField, RotationField, SpecField, body_inertia
-from mjfim.model.variants import Source
+from mjfim.model.variants import PlantModel
 from mjfim.output.mjcf.write import write_identified, write_spec
-from tests.support.numerics import Loop, make_setup
+from tests.support.numerics import Loop, make_task
 
 # Two links with inertia from skewed geoms; a position servo; sensors that see sites and geoms.
 ARM = """
@@ -453,8 +453,11 @@ def test_geoms_that_matter_are_compiled_anew(
     resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
     assert isinstance(resolved.fields[0][0], SpecField)
     assert resolved.needs_compile.tolist() == resolved.changes_model.tolist() == [True]
-    source = Source(
-        spec, Path("model.xml"), [b.name for b in spec.bodies[1:]], sensors=True, friction=True
+    source = PlantModel(
+        ModelSource(Path("model.xml"), spec),
+        moved_bodies=[b.name for b in spec.bodies[1:]],
+        sensors=True,
+        friction=True,
     )
     before = arrays(source.model)
     own, theirs = resolved.writer.model(source, np.array([value])), spec.copy()
@@ -556,16 +559,19 @@ def test_elements_inside_frames_are_placed_in_the_coordinates_of_their_body(
 ) -> None:
     """`<frame>` is MJCF's way to write, not the compiled model's: at its own value the model stays the model."""
     table = {"theta": {"target": path}}
-    setup = make_setup(FRAMED, tmp_path, rate=500.0, parameters=table, noise={"acc": 0.1})
-    plain, same = mujoco.MjModel.from_xml_string(FRAMED), setup.model_at(setup.parameters.guess)
+    task = make_task(FRAMED, tmp_path, rate=500.0, parameters=table, noise={"acc": 0.1})
+    plain, same = (
+        mujoco.MjModel.from_xml_string(FRAMED),
+        task.system.model_at(task.parameters.guess),
+    )
     np.testing.assert_allclose(rollout(same, 50), rollout(plain, 50), rtol=1e-10, atol=1e-10)
-    moved = setup.parameters.guess + 0.1
-    own = setup.model_at(moved)
+    moved = task.parameters.guess + 0.1
+    own = task.system.model_at(moved)
     assert np.abs(rollout(own, 50) - rollout(plain, 50)).max() > 1e-3
     if ":pos" in path:  # the number that was named, in the compiled model
         found = getattr(own, path[: path.index("/")])(path[path.index("/") + 1 : path.index(":")])
         assert found.pos[int(path[-2])] == pytest.approx(moved[0], abs=1e-12)
-    write_identified(tmp_path / "identified.xml", setup, moved)
+    write_identified(tmp_path / "identified.xml", task.system, moved)
     again = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml"))
     np.testing.assert_allclose(rollout(again, 50), rollout(own, 50), rtol=0, atol=1e-4)
 
@@ -583,7 +589,9 @@ def test_a_mesh_moves_from_where_it_compiles_to() -> None:
     """MuJoCo shifts a mesh to its centre; that offset must not be added twice. Its size is no number of the geom."""
     parameters = [one("geom/h:pos[2]")]
     spec, base = compiled(MESHED, parameters)
-    source = Source(spec, Path("model.xml"), ["a", "b"], sensors=True, friction=True)
+    source = PlantModel(
+        ModelSource(Path("model.xml"), spec), moved_bodies=["a", "b"], sensors=True, friction=True
+    )
     resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
     now = resolved.fields[0][0].read(base)
     assert abs(now - 0.2) > 0.01, "no offset: a weak test"
@@ -806,7 +814,7 @@ def test_a_model_without_a_source_serves_only_what_is_written_in_place(tmp_path)
 
     table = {"theta": {"function": add_geoms, "guess": 0.1}}
     with pytest.raises(MjfimError, match=r"changes ngeom of the model.*numbers only"):
-        make_setup(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
+        make_task(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
 
 
 def test_outputs_and_starts_are_no_part_of_the_model() -> None:
@@ -855,14 +863,14 @@ def test_bodies_whose_inside_moves_are_found_so_that_they_are_not_compiled_as_si
 
 def test_setup_gives_a_model_at_theta_with_the_right_dynamics_for_simple_bodies(tmp_path) -> None:
     target = {"com": {"target": "body/flyer:ipos[0]", "guess": 0.1}}
-    setup = make_setup(SIMPLE, tmp_path, rate=500.0, parameters=target, noise={"state": 0.1})
+    task = make_task(SIMPLE, tmp_path, rate=500.0, parameters=target, noise={"state": 0.1})
     _, _, again = both_ways(SIMPLE, "body/flyer:ipos[0]", 0.1)
     plain = mujoco.MjModel.from_xml_string(SIMPLE)
     assert np.abs(rollout(plain) - rollout(again)).max() > 1e-3
     np.testing.assert_array_equal(
-        rollout(setup.plant.model(np.array([0.1])))[:, :17], rollout(again)[:, :17]
+        rollout(task.plant.model(np.array([0.1])))[:, :17], rollout(again)[:, :17]
     )
-    np.testing.assert_array_equal(rollout(setup.model_at(np.array([0.1]))), rollout(again))
+    np.testing.assert_array_equal(rollout(task.system.model_at(np.array([0.1]))), rollout(again))
 
 
 def test_several_targets_follow_one_parameter_by_scale_and_offset() -> None:
@@ -1106,12 +1114,12 @@ def test_the_identified_model_file_has_the_identified_dynamics_or_is_refused(
     xml, path, value = AWKWARD[case]
     table = {"theta": {"target": path, "guess": value}}
     try:
-        setup = make_setup(xml, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
-        write_identified(tmp_path / "identified.xml", setup, np.array([value]))
+        task = make_task(xml, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
+        write_identified(tmp_path / "identified.xml", task.system, np.array([value]))
     except MjfimError:
         return  # refused with a message: also right
     own, again = (
-        setup.plant.model(np.array([value])),
+        task.plant.model(np.array([value])),
         mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")),
     )
     states = own.nq + own.nv
@@ -1123,9 +1131,9 @@ def test_the_identified_model_file_has_the_identified_dynamics_or_is_refused(
 
 def test_an_inertia_that_no_body_can_have_is_refused_by_a_message_of_ours(tmp_path) -> None:
     table = {"theta": {"target": "body/a:inertia[0]", "guess": 0.01}}
-    setup = make_setup(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
+    task = make_task(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
     with pytest.raises(MjfimError, match="inertia"):
-        write_identified(tmp_path / "identified.xml", setup, np.array([5.0]))
+        write_identified(tmp_path / "identified.xml", task.system, np.array([5.0]))
 
 
 @pytest.mark.parametrize(
@@ -1135,23 +1143,23 @@ def test_geoms_that_make_a_simple_bodys_inertia_are_followed(
     path: str, guess: float, tmp_path
 ) -> None:
     """The body would be 'simple' but for the parameter; psi is that of models compiled one by one."""
-    setup = make_setup(
+    task = make_task(
         SIMPLE,
         tmp_path,
         parameters={"g": {"target": path, "guess": guess}},
         noise={"state": 0.01},
         horizon=0.2,
     )
-    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
     assert found is not None
     h, ends = 1e-4 * guess, []
     for sign in (1.0, -1.0):
         loop = Loop(
-            setup.parameters.writer.model(setup.plant.source, np.array([guess + sign * h])), 1
+            task.parameters.writer.model(task.plant.source, np.array([guess + sign * h])), 1
         )
-        state = setup.initial.state[0]
-        for u in setup.initial.ctrl:
-            for _ in range(setup.substeps):
+        state = task.initial.state[0]
+        for u in task.initial.ctrl:
+            for _ in range(task.system.grid.substeps):
                 state = loop.F(state, u)
         ends.append(state)
     reference = loop.minus(ends[0], ends[1]) / (2.0 * h)
@@ -1162,8 +1170,8 @@ def test_geoms_that_make_a_simple_bodys_inertia_are_followed(
 
 
 def in_arm(folder: Path, tables: dict) -> Any:
-    """Setup of an experiment on ARM."""
-    return make_setup(ARM, folder, rate=500.0, horizon=0.1, parameters=tables, noise={"state": 0.1})
+    """DesignTask of an experiment on ARM."""
+    return make_task(ARM, folder, rate=500.0, horizon=0.1, parameters=tables, noise={"state": 0.1})
 
 
 @pytest.mark.parametrize("key", ["guess", "true"])
@@ -1214,7 +1222,7 @@ def test_plates_and_loads_without_mass_are_bodies(field: str, tmp_path: Path) ->
     table = {
         "theta": {"target": path, "guess": 0.0 if field == "mass" else 0.00999999999, "scale": 1.0}
     }
-    make_setup(xml, tmp_path, rate=100.0, horizon=0.1, parameters=table, noise={"state": 0.1})
+    make_task(xml, tmp_path, rate=100.0, horizon=0.1, parameters=table, noise={"state": 0.1})
 
 
 def test_a_function_that_changes_the_timestep_is_refused(tmp_path: Path) -> None:

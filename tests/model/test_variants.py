@@ -10,14 +10,14 @@ import mujoco
 import numpy as np
 import pytest
 
-import mjfim
 from mjfim.arrays import Array
-from mjfim.experiment.system import Setup
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
 from mjfim.model.smooth_friction import SMOOTHING_SPEED_FRACTION
-from mjfim.model.variants import FREE, STATED
+from mjfim.model.variants import RELAXED, STATED
 from mjfim.plant.derivatives import SHARED_ORIGIN, SHARED_ORIGIN_SHORT
 from mjfim.records.design import Status
-from tests.support.numerics import make_setup
+from tests.support.numerics import make_task
 
 ARM = """
 <mujoco model="dry">
@@ -46,7 +46,7 @@ DRY: dict[str, Any] = {
 }
 
 
-def arm(folder: Path, friction: float = 0.1, **tables: Any) -> Setup:
+def arm(folder: Path, friction: float = 0.1, **tables: Any) -> DesignTask:
     """Two links with servos and dry joints, for a second."""
     stated: dict[str, Any] = {
         "horizon": 1.0,
@@ -57,56 +57,59 @@ def arm(folder: Path, friction: float = 0.1, **tables: Any) -> Setup:
         "cost": {"control": 0.0},
         "limits": {"control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)}},
     }
-    return make_setup(ARM.format(friction=friction), folder, **{**stated, **tables})
+    return make_task(ARM.format(friction=friction), folder, **{**stated, **tables})
 
 
 def test_only_dry_plants_have_speeds_at_which_friction_turns_viscous(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
-    smooth = arm(tmp_path, 0.0, parameters={name: DRY[name] for name in ("mass", "drag")}).free()
-    assert smooth.level == FREE
+    smooth = arm(tmp_path, 0.0, parameters={name: DRY[name] for name in ("mass", "drag")}).relaxed()
+    assert smooth.system.variant == RELAXED
     assert smooth.plant.smooth is smooth.plant
     assert smooth.plant.derivatives.quickest_accuracy is SHARED_ORIGIN
     limits = {
         "control": {"shoulder": (-1.0, 1.0), "elbow": (-1.0, 1.0)},
         "velocity": {"elbow": 20.0},
     }
-    setup = arm(tmp_path / "a", limits=limits).free()
-    fastest = np.abs(setup.initial.qvel[:, 0]).max()
-    assert setup.level.soft[1] == pytest.approx(SMOOTHING_SPEED_FRACTION * 20.0)
-    assert setup.level.soft[0] >= SMOOTHING_SPEED_FRACTION * fastest
-    assert setup.plant.derivatives.quickest_accuracy is SHARED_ORIGIN_SHORT
-    assert not setup.plant.source.soft
-    assert setup.plant.smooth.source.soft
-    assert setup.softened().plant.source.soft
+    task = arm(tmp_path / "a", limits=limits).relaxed()
+    fastest = np.abs(task.initial.qvel[:, 0]).max()
+    assert task.system.variant.smoothing_speeds[1] == pytest.approx(SMOOTHING_SPEED_FRACTION * 20.0)
+    assert task.system.variant.smoothing_speeds[0] >= SMOOTHING_SPEED_FRACTION * fastest
+    assert task.plant.derivatives.quickest_accuracy is SHARED_ORIGIN_SHORT
+    assert not task.plant.source.smoothing_speeds
+    assert task.plant.smooth.source.smoothing_speeds
+    assert task.smoothed().plant.source.smoothing_speeds
 
 
 def test_a_plant_with_dry_friction_moves_as_the_model_does_and_its_softened_level_nearly(
     tmp_path: Path,
 ) -> None:
-    setup = arm(tmp_path)
+    task = arm(tmp_path)
     model = mujoco.MjModel.from_xml_string(ARM.format(friction=0.1))
     model.opt.tolerance, data = 1e-14, mujoco.MjData(model)
-    for u in setup.control:
+    for u in task.control:
         data.ctrl[:] = u
-        mujoco.mj_step(model, data, setup.substeps)
-    free = setup.free()
-    own = free.plant.simulate(setup.theta, setup.control).qpos[-1]
+        mujoco.mj_step(model, data, task.system.grid.substeps)
+    free = task.relaxed()
+    own = free.plant.simulate(task.theta, task.control).qpos[-1]
     np.testing.assert_allclose(own, data.qpos, rtol=0, atol=1e-6)
-    level = free.softened()
-    softened = level.plant.simulate(setup.theta, setup.control).qpos[-1]
+    level = free.smoothed()
+    softened = level.plant.simulate(task.theta, task.control).qpos[-1]
     assert 1e-5 < np.abs(softened - own).max() < 0.02
 
 
 def test_a_longer_timestep_keeps_the_samples_and_stays_near(tmp_path: Path) -> None:
-    setup = arm(tmp_path, 0.0, parameters={"mass": DRY["mass"]})
-    long = setup.stretched(5)
-    assert (long.samples, long.dt, long.substeps) == (setup.samples, setup.dt, 1)
-    assert (setup.level, long.level) == (STATED, replace(STATED, stretch=5))
+    task = arm(tmp_path, 0.0, parameters={"mass": DRY["mass"]})
+    long = task.stretched(5)
+    assert (long.samples, long.dt, long.system.grid.substeps) == (task.samples, task.dt, 1)
+    assert (task.system.variant, long.system.variant) == (
+        STATED,
+        replace(STATED, timestep_factor=5),
+    )
     assert long.plant.source.model.opt.timestep == pytest.approx(0.01)
-    near, far = (s.plant.simulate(s.theta, s.control).qpos for s in (setup, long))
+    near, far = (s.plant.simulate(s.theta, s.control).qpos for s in (task, long))
     assert 1e-6 < np.abs(near - far).max() < 0.05
     with pytest.raises(ValueError, match="do not divide by 3"):
-        setup.stretched(3)
+        task.stretched(3)
 
 
 @pytest.mark.slow
@@ -116,8 +119,8 @@ def test_a_design_with_dry_joints_gains_and_keeps_its_limits(tmp_path: Path) -> 
         "control_rate": 20.0,
         "velocity": 6.0,
     }
-    setup = arm(tmp_path, limits=limits, descent={"max_iterations": 60})
-    design = mjfim.design(setup)
+    task = arm(tmp_path, limits=limits, descent={"max_iterations": 60})
+    design = design_task(task)
     assert design.status is not Status.INFEASIBLE
     assert min(design.limits.values()) >= 0.0
     assert design.final.cost < 0.5 * design.initial.cost
@@ -125,13 +128,15 @@ def test_a_design_with_dry_joints_gains_and_keeps_its_limits(tmp_path: Path) -> 
 
 
 def test_steps_on_the_softened_copy_are_counted(tmp_path: Path) -> None:
-    setup = arm(tmp_path).free()
-    plant, psi = setup.plant, np.zeros((setup.samples + 1, setup.space.nx, 3))
+    task = arm(tmp_path).relaxed()
+    plant, psi = task.plant, np.zeros((task.samples + 1, task.space.nx, 3))
     begun, own = plant.engine_steps, plant.simulator.steps
     plant.derivatives.bilinear(
-        setup.theta, setup.initial, psi, np.eye(3)[:2], plant.derivatives.quickest_accuracy
+        task.theta, task.initial, psi, np.eye(3)[:2], plant.derivatives.quickest_accuracy
     )
-    batch = (setup.samples + 1) * setup.substeps * (setup.space.nx + len(setup.controls) + 1)
+    batch = (
+        (task.samples + 1) * task.system.grid.substeps * (task.space.nx + len(task.controls) + 1)
+    )
     assert plant.simulator.steps - own == batch  # A and B
     assert plant.engine_steps - begun == 4 * batch  # and on the copy the origin and two directions
 
@@ -139,25 +144,25 @@ def test_steps_on_the_softened_copy_are_counted(tmp_path: Path) -> None:
 def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(
     tmp_path: Path,
 ) -> None:
-    setup = arm(tmp_path).free()
+    task = arm(tmp_path).relaxed()
     level, psi = (
-        setup.softened(),
-        np.random.default_rng(0).normal(size=(setup.samples + 1, setup.space.nx, 3)),
+        task.smoothed(),
+        np.random.default_rng(0).normal(size=(task.samples + 1, task.space.nx, 3)),
     )
     found, soft, own = (
         plant.derivatives._symmetric_pairs(
-            setup.theta,
-            setup.initial,
+            task.theta,
+            task.initial,
             psi,
             np.eye(3)[:1],
             plant.derivatives.quickest_accuracy,
             None,
         )
-        for plant in (setup.plant, level.plant, setup.plant.smooth)
+        for plant in (task.plant, level.plant, task.plant.smooth)
     )
     np.testing.assert_allclose(soft.F_mixed, own.F_mixed)
-    careful = replace(setup.plant.derivatives.quickest_accuracy, shared_origin=False)
-    both = setup.plant.derivatives.bilinear(setup.theta, setup.initial, psi, np.eye(3)[:1], careful)
+    careful = replace(task.plant.derivatives.quickest_accuracy, shared_origin=False)
+    both = task.plant.derivatives.bilinear(task.theta, task.initial, psi, np.eye(3)[:1], careful)
     np.testing.assert_array_equal(both.A, found.A)
     np.testing.assert_array_equal(both.F_mixed, own.F_mixed)
     assert np.abs(found.A - own.A).max() > 1e-3
@@ -168,11 +173,11 @@ def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(
 
 def test_the_gradient_of_the_softened_level_is_that_of_its_cost(tmp_path: Path) -> None:
     """Over moves that shift where joints turn round by several engine steps, and over short ones."""
-    setup = arm(tmp_path).free().softened()
-    wave = np.sin(np.pi * setup.t)[:, None] ** 2 * np.array([1.0, -0.5])
-    found = slope(setup, wave)
+    task = arm(tmp_path).relaxed().smoothed()
+    wave = np.sin(np.pi * task.t)[:, None] ** 2 * np.array([1.0, -0.5])
+    found = slope(task, wave)
     for h in (1e-5, 1e-3, 3e-3):
-        assert found == pytest.approx(difference(setup, wave, h), rel=0.15)
+        assert found == pytest.approx(difference(task, wave, h), rel=0.15)
 
 
 @pytest.mark.parametrize("amplitudes", [(1.0, -0.5), (0.5, 1.0), (1.0, 1.0)])
@@ -180,28 +185,28 @@ def test_and_of_the_stated_one_it_points_where_long_moves_lead(
     tmp_path: Path, amplitudes: tuple[float, float]
 ) -> None:
     """Its cost jumps with every engine step that a joint sticks for: no size is right, and short moves mislead."""
-    setup = arm(tmp_path).free()
-    wave = np.sin(np.pi * setup.t)[:, None] ** 2 * np.array(amplitudes)
-    found = slope(setup, wave)
-    wide = [difference(setup, wave, h) for h in (0.02, 0.03, 0.05, 0.1)]
+    task = arm(tmp_path).relaxed()
+    wave = np.sin(np.pi * task.t)[:, None] ** 2 * np.array(amplitudes)
+    found = slope(task, wave)
+    wide = [difference(task, wave, h) for h in (0.02, 0.03, 0.05, 0.1)]
     assert np.sign(found) == np.sign(np.mean(wide))
-    local = [difference(setup, wave, h) for h in (1e-6, 3e-4, 1e-3, 3e-3)]
+    local = [difference(task, wave, h) for h in (1e-6, 3e-4, 1e-3, 3e-3)]
     assert np.std(local) > 3.0 * np.std(wide)
 
 
-def slope(setup: Setup, wave: Array) -> float:
+def slope(task: DesignTask, wave: Array) -> float:
     """Change of log J per unit of a control's change."""
-    point = setup.problem.point(setup.initial, setup.plant.derivatives.quickest_accuracy)
-    open_loop = np.zeros((setup.samples, len(setup.controls), setup.space.nx))
-    return float(np.sum(setup.problem.expand(point).gradient(open_loop) * wave)) / point.cost
+    point = task.problem.point(task.initial, task.plant.derivatives.quickest_accuracy)
+    open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
+    return float(np.sum(task.problem.expand(point).gradient(open_loop) * wave)) / point.cost
 
 
-def difference(setup: Setup, wave: Array, h: float) -> float:
+def difference(task: DesignTask, wave: Array, h: float) -> float:
     """The same by two evaluations."""
     there, back = (
-        setup.problem.point(
-            setup.plant.simulate(setup.theta, setup.control + s * wave),
-            setup.plant.derivatives.quickest_accuracy,
+        task.problem.point(
+            task.plant.simulate(task.theta, task.control + s * wave),
+            task.plant.derivatives.quickest_accuracy,
         ).cost
         for s in (h, -h)
     )

@@ -11,7 +11,7 @@ from scipy.linalg import expm, logm
 from scipy.optimize import minimize
 
 from mjfim.excitation.constraints import fence_of
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.information.criteria import smooth_e_optimality
 from mjfim.optimize.eigenvalue_model import (
     EigenvalueModel,
@@ -19,7 +19,7 @@ from mjfim.optimize.eigenvalue_model import (
     symmetric_coordinates,
     symmetric_matrix,
 )
-from tests.support.numerics import Array, cart_setup, relative_error
+from tests.support.numerics import Array, cart_task, relative_error
 
 VALUES = {"apart": [0.5, 0.85, 2.0], "meeting": [0.5, 0.5 + 5e-10, 0.525]}
 
@@ -115,11 +115,11 @@ def test_slopes_agree_with_the_logarithm_of_simulated_information(
         },
     }[information]
     limits = {"control": {"force": (-9.0, 9.0)}}
-    setup: Setup = cart_setup(tmp_path, limits=limits, **tables).free()
-    problem = setup.problem
+    task: DesignTask = cart_task(tmp_path, limits=limits, **tables).relaxed()
+    problem = task.problem
     problem = replace(problem, information=replace(problem.information, power=3.0, faint=0.0))
-    point = problem.point(setup.initial)
-    expansion, _ = problem.expand_observed(point, fence_of(setup).observations)
+    point = problem.point(task.initial)
+    expansion, _ = problem.expand_observed(point, fence_of(task).observations)
     model = expansion.eigenvalue_model
     assert model is not None and point.information is not None
     assert len(model.eigenvalues) == 3
@@ -127,33 +127,30 @@ def test_slopes_agree_with_the_logarithm_of_simulated_information(
     vectors = np.linalg.eigh(reduced)[1]
 
     def logarithm(ctrl: Array) -> Array:
-        moved = problem.point(setup.plant.simulate(setup.theta, ctrl))
+        moved = problem.point(task.plant.simulate(task.theta, ctrl))
         assert moved.information is not None
         inside, _ = problem.information.reduced(moved.information)
         return symmetric_coordinates(np.real(vectors.T @ logm(inside) @ vectors))
 
-    rng, open_loop = np.random.default_rng(5), np.zeros((setup.samples, 1, 4))
+    rng, open_loop = np.random.default_rng(5), np.zeros((task.samples, 1, 4))
     for _ in range(3):
-        way = np.cos(2 * np.pi * rng.uniform(0.3, 3.0) * setup.t + rng.uniform(0, 6))[:, None]
+        way = np.cos(2 * np.pi * rng.uniform(0.3, 3.0) * task.t + rng.uniform(0, 6))[:, None]
         zeta = expansion.lift(open_loop, way)
         found = np.einsum("mki,ki->m", model.a, zeta.z) + np.einsum("mku,ku->m", model.b, zeta.v)
-        slope = (
-            logarithm(setup.control + 1e-3 * way) - logarithm(setup.control - 1e-3 * way)
-        ) / 2e-3
+        slope = (logarithm(task.control + 1e-3 * way) - logarithm(task.control - 1e-3 * way)) / 2e-3
         assert relative_error(found, slope) < 5e-3
         # what the gradient of the cost holds besides is the running cost's
-        running = problem.running.gradient(setup.initial)
+        running = problem.running.gradient(task.initial)
         rest = float(np.sum(running[0] * zeta.z) + np.sum(running[1] * zeta.v)) / point.cost
         whole = float(model.gradient(np.zeros(6)) @ found) + rest
         assert whole == pytest.approx(expansion.slope(zeta) / point.cost, rel=1e-6, abs=1e-9)
 
 
 def test_other_criteria_and_expansions_without_limits_have_no_model(tmp_path: Path) -> None:
-    setup = cart_setup(tmp_path, limits={"control": {"force": (-9.0, 9.0)}}).free()
-    point = setup.problem.point(setup.initial)
+    task = cart_task(tmp_path, limits={"control": {"force": (-9.0, 9.0)}}).relaxed()
+    point = task.problem.point(task.initial)
     assert (
-        setup.problem.expand_observed(point, fence_of(setup).observations)[0].eigenvalue_model
-        is None
+        task.problem.expand_observed(point, fence_of(task).observations)[0].eigenvalue_model is None
     )  # 1 / lambda_min itself
-    smooth = replace(setup.problem, information=replace(setup.problem.information, power=40.0))
+    smooth = replace(task.problem, information=replace(task.problem.information, power=40.0))
     assert smooth.expand(smooth.judged(point)).eigenvalue_model is None

@@ -16,7 +16,7 @@ from mjfim.optimize.projection_operator import Armijo, Expansion, Regulator, opt
 from mjfim.optimize.structured_bfgs import BasisMetric, CurveMetric, StructuredBFGS
 from mjfim.records.design import Status
 from tests.support.lq import random_system, random_weights
-from tests.support.numerics import Array, cart_setup, relative_error
+from tests.support.numerics import Array, cart_task, relative_error
 
 N, NX, NU = 12, 3, 2
 
@@ -354,17 +354,17 @@ def test_the_direction_descends_on_a_simulated_design(based: bool, tmp_path: Pat
     from mjfim.excitation.interior_point import InteriorProblem
     from mjfim.signals import spline_basis
 
-    setup = cart_setup(
+    task = cart_task(
         tmp_path, limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}}
-    ).free()
-    problem = InteriorProblem(setup.problem, fence_of(setup), 0.1, 0.03)
-    point = problem.point(setup.control)
+    ).relaxed()
+    problem = InteriorProblem(task.problem, fence_of(task), 0.1, 0.03)
+    point = problem.point(task.control)
     expansion = problem.expand(point)
-    basis = spline_basis(setup.t, 0.5, 8.0, False, False, False) if based else None
-    zeta = StructuredBFGS(np.full(1, 1e-4), basis)(expansion, np.zeros((setup.samples, 1, 4)))
+    basis = spline_basis(task.t, 0.5, 8.0, False, False, False) if based else None
+    zeta = StructuredBFGS(np.full(1, 1e-4), basis)(expansion, np.zeros((task.samples, 1, 4)))
     assert expansion.slope(zeta) < 0.0
     h = 1e-4
-    up, down = (problem.value(problem.point(setup.control + s * h * zeta.v)) for s in (1.0, -1.0))
+    up, down = (problem.value(problem.point(task.control + s * h * zeta.v)) for s in (1.0, -1.0))
     assert expansion.slope(zeta) == pytest.approx((up - down) / (2 * h), rel=1e-3)
     if basis is not None:
         left = zeta.v - basis @ np.linalg.lstsq(basis, zeta.v)[0]

@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 import mjfim
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, RecordingError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify_system
 from mjfim.output import archive
 from mjfim.output.mjcf.write import write_identified
 from mjfim.recordings import read as logs
@@ -26,6 +28,7 @@ from mjfim.records.design import Design
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import as_json
 from mjfim.records.trajectory import Trajectory
+from mjfim.studies.monte_carlo import monte_carlo_system
 from tests.support.paths import MODELS
 
 Array = NDArray[np.float64]
@@ -34,30 +37,32 @@ N, NQ, NV, NU, P = 40, 2, 2, 1, 3
 
 
 @pytest.fixture(scope="module")
-def setup() -> Setup:
+def task() -> DesignTask:
     """The cart-pendulum for 0.4 s, measured at every second sample."""
     e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    return Setup(e.replace(horizon=0.4, measure_rate=50.0, descent={"max_iterations": 2}))
+    return DesignTask.resolve(
+        e.replace(horizon=0.4, measure_rate=50.0, descent={"max_iterations": 2})
+    )
 
 
 @pytest.fixture(scope="module")
-def design(setup: Setup) -> Design:
+def design_task(task: DesignTask) -> Design:
     """Two iterations."""
-    return mjfim.design(setup)
+    return design_task(task)
 
 
 @pytest.fixture(scope="module")
-def folder(setup: Setup, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(task: DesignTask, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """design.json, design.npz and design.csv of it."""
     home = tmp_path_factory.mktemp("design") / "new" / "folder"
-    archive.write_design(home, design, setup)
+    archive.write_design(home, design, task.system)
     return home
 
 
 @pytest.fixture(scope="module")
-def recording(setup: Setup, design: Design) -> Recording:
+def recording(task: DesignTask, design: Design) -> Recording:
     """A noisy recording along the design."""
-    return mjfim.simulate(setup, design.trajectory, seed=4)
+    return simulate_system(task.system, design.trajectory, seed=4)
 
 
 def refuse_constant(name: str) -> float:
@@ -159,7 +164,7 @@ def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
     """Information holds the prior, which is written beside it so that a later experiment can take it out."""
     e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     table = {"m": {"prior": 0.5}, "c": {"nuisance": True}}
-    known = Setup(
+    known = DesignTask.resolve(
         e.replace(
             horizon=0.4,
             parameters=table,
@@ -167,7 +172,7 @@ def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
             descent={"max_iterations": 0},
         )
     )
-    archive.write_design(tmp_path, mjfim.design(known), known)
+    archive.write_design(tmp_path, design_task(known), known.system)
     data = strict_json((tmp_path / "design.json").read_text(encoding="utf-8"))
     starts = [
         "initial qpos:slide",
@@ -184,7 +189,7 @@ def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
     assert np.linalg.eigvalsh(left)[0] > -1e-8 * np.linalg.eigvalsh(left)[-1]
 
 
-def test_csv_plays_back(folder: Path, design: Design, setup: Setup) -> None:
+def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
     """Columns by name, all digits, no control in the last row; and it starts another design as it is. Gains stand behind."""
     with (folder / "design.csv").open(newline="", encoding="utf-8") as stream:
         header, *rows = csv.reader(stream)
@@ -195,8 +200,8 @@ def test_csv_plays_back(folder: Path, design: Design, setup: Setup) -> None:
     curve = design.trajectory
     assert [float(row[2]) for row in rows] == curve.qpos[:, 1].tolist()
     assert [float(row[5]) for row in rows[:-1]] == curve.ctrl[:, 0].tolist()
-    again = Setup(
-        setup.experiment.replace(initial={"control": str((folder / "design.csv").resolve())})
+    again = DesignTask.resolve(
+        task.experiment.replace(initial={"control": str((folder / "design.csv").resolve())})
     )
     assert np.array_equal(again.control, curve.ctrl)
 
@@ -325,12 +330,12 @@ def test_a_design_without_a_start(folder: Path, tmp_path: Path) -> None:
     ids=["flat", "text", "no-rows", "nan", "too-short"],
 )
 def test_wrong_arrays_are_refused(
-    folder: Path, tmp_path: Path, setup: Setup, arrays: dict[str, Array]
+    folder: Path, tmp_path: Path, task: DesignTask, arrays: dict[str, Array]
 ) -> None:
     """Before they are simulated or drawn."""
     path = altered(folder / "design.npz", tmp_path / "odd.npz", **arrays)
     with pytest.raises(RecordingError, match=r"odd\.npz: "):
-        archive.check_fits(path, archive.read_design(path)["final"], setup)
+        archive.check_fits(path, archive.read_design(path)["final"], task.system)
 
 
 @pytest.mark.parametrize("kind", ["empty", "bare"])
@@ -344,10 +349,10 @@ def test_not_an_archive(tmp_path: Path, kind: str) -> None:
         archive.read_design(path)
 
 
-def test_designs_of_other_experiments_are_refused(folder: Path, setup: Setup) -> None:
+def test_designs_of_other_experiments_are_refused(folder: Path, task: DesignTask) -> None:
     """Another model, another rate."""
     path, curve = folder / "design.npz", archive.read_design(folder / "design.npz")["final"]
-    archive.check_fits(path, curve, setup)
+    archive.check_fits(path, curve, task.system)
     wide = Trajectory(
         t=curve.t,
         qpos=np.zeros((N + 1, 3)),
@@ -359,14 +364,14 @@ def test_designs_of_other_experiments_are_refused(folder: Path, setup: Setup) ->
         RecordingError,
         match=r"design\.npz: made for \(nq, nv, nu\) = \(3, 3, 1\), .* has \(2, 2, 1\)",
     ):
-        archive.check_fits(path, wide, setup)
+        archive.check_fits(path, wide, task.system)
     slow = Trajectory(
         t=2 * curve.t, qpos=curve.qpos, qvel=curve.qvel, act=curve.act, ctrl=curve.ctrl
     )
     with pytest.raises(
         RecordingError, match=r"design\.npz: sampled at 50 Hz, the experiment at 100 Hz"
     ):
-        archive.check_fits(path, slow, setup)
+        archive.check_fits(path, slow, task.system)
 
 
 # ---- whole or not at all
@@ -425,7 +430,7 @@ def test_failing_disk_keeps_the_old_design(
     where: str,
     folder: Path,
     design: Design,
-    setup: Setup,
+    task: DesignTask,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -435,7 +440,9 @@ def test_failing_disk_keeps_the_old_design(
     with monkeypatch.context() as patch:
         patch.setattr(where, half_written)
         with pytest.raises(OSError, match="no space"):
-            archive.write_design(tmp_path / "copy", dataclasses.replace(design, seconds=1.0), setup)
+            archive.write_design(
+                tmp_path / "copy", dataclasses.replace(design, seconds=1.0), task.system
+            )
     after = {p.name for p in (tmp_path / "copy").iterdir()}
     assert after == set(before)
     assert archive.read_design(tmp_path / "copy" / "design.npz").keys() == {"initial", "final"}
@@ -446,11 +453,11 @@ def test_failing_disk_keeps_the_old_design(
 # ---- recordings
 
 
-def test_recording_round_trip(recording: Recording, setup: Setup, tmp_path: Path) -> None:
+def test_recording_round_trip(recording: Recording, task: DesignTask, tmp_path: Path) -> None:
     """Full precision; what was not measured stays empty."""
     path = tmp_path / "recording.csv"
-    archive.write_recording(path, recording, setup)
-    again = logs.read_recording(path, setup.channels)
+    archive.write_recording(path, recording, task.system)
+    again = logs.read_recording(path, task.system.channels)
     assert np.array_equal(again.t, recording.t)
     assert np.array_equal(again.ctrl, recording.ctrl)
     assert np.array_equal(again.y, recording.y, equal_nan=True)
@@ -459,32 +466,32 @@ def test_recording_round_trip(recording: Recording, setup: Setup, tmp_path: Path
     assert np.isfinite(recording.y[::2]).all()
 
 
-def test_recording_columns(recording: Recording, setup: Setup, tmp_path: Path) -> None:
+def test_recording_columns(recording: Recording, task: DesignTask, tmp_path: Path) -> None:
     """t, the controls, the outputs; no word for NaN in the file."""
     path = tmp_path / "recording.csv"
-    archive.write_recording(path, recording, setup)
+    archive.write_recording(path, recording, task.system)
     text = path.read_text(encoding="utf-8")
-    assert next(csv.reader(text.splitlines())) == ["t", "ctrl:force", *setup.outputs.names]
+    assert next(csv.reader(text.splitlines())) == ["t", "ctrl:force", *task.system.outputs.names]
     assert "nan" not in text.lower()
 
 
-def test_extreme_numbers_survive(setup: Setup, tmp_path: Path) -> None:
+def test_extreme_numbers_survive(task: DesignTask, tmp_path: Path) -> None:
     """From the smallest to the largest magnitudes."""
     values = np.array([5e-324, 1e-300, 0.1 + 0.2, -1.7976931348623157e308])
     r = Recording(
         t=np.arange(4) * 0.01, ctrl=values[:3, None], y=values[:, None], outputs=("qpos:slide",)
     )
-    archive.write_recording(tmp_path / "r.csv", r, setup)
-    assert np.array_equal(logs.read_recording(tmp_path / "r.csv", setup.channels).y, r.y)
+    archive.write_recording(tmp_path / "r.csv", r, task.system)
+    assert np.array_equal(logs.read_recording(tmp_path / "r.csv", task.system.channels).y, r.y)
 
 
-def test_foreign_recording(setup: Setup, tmp_path: Path) -> None:
+def test_foreign_recording(task: DesignTask, tmp_path: Path) -> None:
     """A subset of the outputs, in any order, with an empty last control."""
     path = tmp_path / "lab.csv"
     path.write_text(
         "qpos:hinge,t,ctrl:force\n3.1,0,1\n3.2,0.01,2\n,0.02,3\n3.4,0.03,\n", encoding="utf-8"
     )
-    r = logs.read_recording(path, setup.channels)
+    r = logs.read_recording(path, task.system.channels)
     assert (r.outputs, r.ctrl.tolist()) == (("qpos:hinge",), [[1.0], [2.0], [3.0]])
     assert np.array_equal(r.y[:, 0], [3.1, 3.2, np.nan, 3.4], equal_nan=True)
 
@@ -505,22 +512,22 @@ def test_foreign_recording(setup: Setup, tmp_path: Path) -> None:
         ("", r"the file is empty"),
     ],
 )
-def test_unusable_recordings(text: str, message: str, setup: Setup, tmp_path: Path) -> None:
+def test_unusable_recordings(text: str, message: str, task: DesignTask, tmp_path: Path) -> None:
     """File, column, fault."""
     path = tmp_path / "lab.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(RecordingError, match=rf"lab\.csv: .*{message}"):
-        logs.read_recording(path, setup.channels)
+        logs.read_recording(path, task.system.channels)
 
 
-def test_misspelled_output_is_not_ignored(setup: Setup, tmp_path: Path) -> None:
+def test_misspelled_output_is_not_ignored(task: DesignTask, tmp_path: Path) -> None:
     """Half of the data would be lost."""
     path = tmp_path / "lab.csv"
     path.write_text(
         "t,ctrl:force,qpos:slide,qpos:hing\n0,1,1,3\n0.01,1,1,3\n0.02,1,1,3\n", encoding="utf-8"
     )
     with pytest.raises(RecordingError, match=r"'qpos:hing'.*'qpos:hinge'"):
-        logs.read_recording(path, setup.channels)
+        logs.read_recording(path, task.system.channels)
 
 
 # ---- identified.xml
@@ -577,12 +584,12 @@ def load(path: Path) -> mujoco.MjModel:
 
 
 def test_identified_model_differs_in_the_identified_values_only(
-    setup: Setup, tmp_path: Path
+    task: DesignTask, tmp_path: Path
 ) -> None:
     """Entry by entry over the whole MjModel."""
     path = tmp_path / "deep" / "identified.xml"
-    write_identified(path, setup, VALUES)
-    found = changes(load(path), setup.model)
+    write_identified(path, task.system, VALUES)
+    found = changes(load(path), task.system.model)
     assert {name: rows for name, rows in found.items() if name not in DERIVED} == IDENTIFIED
     model = load(path)
     written = [
@@ -594,19 +601,19 @@ def test_identified_model_differs_in_the_identified_values_only(
     assert written == pytest.approx([VALUES[0], VALUES[1], VALUES[2], VALUES[1]], rel=1e-5)
 
 
-def test_identified_model_is_the_model_that_was_fitted(setup: Setup, tmp_path: Path) -> None:
+def test_identified_model_is_the_model_that_was_fitted(task: DesignTask, tmp_path: Path) -> None:
     """Derived constants too: the recompiled file agrees with what was simulated."""
     path = tmp_path / "identified.xml"
-    write_identified(path, setup, VALUES)
-    assert changes(load(path), setup.model_at(VALUES)) == {}
+    write_identified(path, task.system, VALUES)
+    assert changes(load(path), task.system.model_at(VALUES)) == {}
 
 
-def test_original_model_is_untouched(setup: Setup, tmp_path: Path) -> None:
+def test_original_model_is_untouched(task: DesignTask, tmp_path: Path) -> None:
     """Writing works on copies, in memory and on disk."""
     source = (MODELS / "cart_pendulum.xml").read_bytes()
-    write_identified(tmp_path / "identified.xml", setup, VALUES)
-    assert changes(setup.model, load(MODELS / "cart_pendulum.xml")) == {}
-    assert changes(setup.spec.copy().compile(), setup.model) == {}
+    write_identified(tmp_path / "identified.xml", task.system, VALUES)
+    assert changes(task.system.model, load(MODELS / "cart_pendulum.xml")) == {}
+    assert changes(task.system.source.spec.copy().compile(), task.system.model) == {}
     assert (MODELS / "cart_pendulum.xml").read_bytes() == source
 
 
@@ -662,25 +669,25 @@ def test_meshes_are_found_from_another_folder(
         noise={"state": 0.1},
         directory=Path("model"),
     )
-    setup = Setup(e)
-    value = 1.5 * setup.parameters.guess
-    write_identified(Path("results/run 1/identified.xml"), setup, value)
+    task = DesignTask.resolve(e)
+    value = 1.5 * task.parameters.guess
+    write_identified(Path("results/run 1/identified.xml"), task.system, value)
     model = load(tmp_path / "results" / "run 1" / "identified.xml")
     original = load(tmp_path / "model" / "arm.xml")
     assert model.nmeshvert == 4
     assert np.array_equal(model.mesh_vert, original.mesh_vert)
-    assert changes(model, setup.model_at(value)) == {}
+    assert changes(model, task.system.model_at(value)) == {}
     changed = {name for name in changes(model, original) if name not in DERIVED | {"stat"}}
     assert changed == ({"body_mass"} if target == "body/arm:mass" else {"dof_damping"})
 
 
-def test_failing_model_keeps_the_old_file(setup: Setup, tmp_path: Path) -> None:
+def test_failing_model_keeps_the_old_file(task: DesignTask, tmp_path: Path) -> None:
     """A negative mass is named, and no broken model is left behind."""
     path = tmp_path / "identified.xml"
-    write_identified(path, setup, VALUES)
+    write_identified(path, task.system, VALUES)
     before = path.read_bytes()
     with pytest.raises(ModelError, match="mass"):
-        write_identified(path, setup, np.array([-1.0, 1.0, 1.0]))
+        write_identified(path, task.system, np.array([-1.0, 1.0, 1.0]))
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["identified.xml"]
 
@@ -688,9 +695,9 @@ def test_failing_model_keeps_the_old_file(setup: Setup, tmp_path: Path) -> None:
 # ---- estimates and studies
 
 
-def test_estimate_summary(setup: Setup, recording: Recording) -> None:
+def test_estimate_summary(task: DesignTask, recording: Recording) -> None:
     """Keys of estimate.json, in standard JSON."""
-    estimate = mjfim.identify(setup, [recording])
+    estimate = identify_system(task.system, [recording])
     data = strict_json(as_json(estimate.summary()))
     assert {"theta", "std", "covariance", "chi2", "dof", "status", "residual_rms", "misfit"} <= set(
         data
@@ -698,16 +705,16 @@ def test_estimate_summary(setup: Setup, recording: Recording) -> None:
     assert np.array_equal(data["theta"], estimate.theta)
     assert np.array(data["covariance"]).shape == (P, P)
     assert np.sqrt(np.diag(data["covariance"])) == pytest.approx(data["std"], rel=1e-6)
-    assert set(data["residual_rms"]) == set(setup.outputs.names)
+    assert set(data["residual_rms"]) == set(task.system.outputs.names)
     assert data["misfit"] is False
-    assert (data["parameters"], data["units"]) == (["m", "l", "c"], list(setup.units))
+    assert (data["parameters"], data["units"]) == (["m", "l", "c"], list(task.system.units))
     assert data["prior"] == np.zeros((P, P)).tolist()
 
 
-def test_study_summary(setup: Setup, design: Design) -> None:
+def test_study_summary(task: DesignTask, design: Design) -> None:
     """Keys of montecarlo.json, for each trajectory."""
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    data = strict_json(as_json(mjfim.monte_carlo(setup, curves, trials=4).summary()))
+    data = strict_json(as_json(monte_carlo_system(task.system, curves, trials=4).summary()))
     for name in curves:
         assert {"mean", "covariance", "crlb", "efficiency", "trials", "failed"} <= set(data[name])
         assert (data[name]["trials"], np.array(data[name]["crlb"]).shape) == (4, (P, P))

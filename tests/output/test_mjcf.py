@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 
 import mjfim
 from mjfim.errors import ModelError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.model.paths import KINDS, fields_of
 from mjfim.output.mjcf.actuators import SHORTCUTS
 from mjfim.output.mjcf.document import MjcfDocument
 from mjfim.output.mjcf.write import COMPARED, NOT_DYNAMICS, write_identified
 from mjfim.output.mjcf.xml_edit import XmlText
-from tests.support.numerics import make_setup, shared_model
+from tests.support.numerics import make_task, shared_model
 from tests.support.paths import MODELS, SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
 
@@ -156,13 +156,13 @@ OUTSIDE = (
 )
 
 
-def setup_of(xml: str | Path, folder: Path, *targets: Any, **tables: Any) -> Setup:
+def task_of(xml: str | Path, folder: Path, *targets: Any, **tables: Any) -> DesignTask:
     """Experiment whose parameters p0, p1 ... have the given targets: paths or tables."""
     given = {
         f"p{i}": {"target": t, "scale": 1.0} if isinstance(t, str) else t
         for i, t in enumerate(targets)
     }
-    return make_setup(
+    return make_task(
         xml,
         folder,
         rate=500.0,
@@ -181,11 +181,11 @@ def lines(old: Path, new: Path) -> tuple[list[str], list[str]]:
     ]
 
 
-def assert_is_identified_model(path: Path, setup: Setup, theta: Any) -> None:
+def assert_is_identified_model(path: Path, task: DesignTask, theta: Any) -> None:
     """Assert that the file loads as the identified model, to 1e-12 of each array's largest number."""
     found, wanted = (
         mujoco.MjModel.from_xml_path(str(path)),
-        setup.model_at(np.asarray(theta, float), placed=False),
+        task.system.model_at(np.asarray(theta, float), at_keyframe=False),
     )
     for name in dir(found):
         if not name.startswith((*COMPARED, "opt", "eq_", "sensor_")) or name.startswith(
@@ -219,13 +219,13 @@ def test_one_value_changes_one_element(path: str, tmp_path: Path) -> None:
     target: Any = (
         {"target": path, "guess": 1.0, "scale": 1.0} if path.endswith(("mass", "density")) else path
     )
-    setup = setup_of(RICH, tmp_path, target)
+    task = task_of(RICH, tmp_path, target)
     new = tmp_path / "identified.xml"
-    assert write_identified(new, setup, np.array([value])) is None
+    assert write_identified(new, task.system, np.array([value])) is None
     gone, came = lines(tmp_path / "model.xml", new)
     assert any(line in text for text in came), came
     assert (len(gone), len(came)) == ((0, 1) if path.startswith("body/b ") else (1, 1))
-    assert_is_identified_model(new, setup, [value])
+    assert_is_identified_model(new, task, [value])
 
 
 def test_every_field_is_tested() -> None:
@@ -238,8 +238,11 @@ def test_every_field_is_tested() -> None:
 
 
 def test_parameters_outside_the_model_change_nothing(tmp_path: Path) -> None:
-    setup = setup_of(RICH, tmp_path, *OUTSIDE, noise={"seen": 0.1, "qpos:j": 0.1})
-    assert write_identified(tmp_path / "identified.xml", setup, np.full(len(OUTSIDE), 0.01)) is None
+    task = task_of(RICH, tmp_path, *OUTSIDE, noise={"seen": 0.1, "qpos:j": 0.1})
+    assert (
+        write_identified(tmp_path / "identified.xml", task.system, np.full(len(OUTSIDE), 0.01))
+        is None
+    )
     assert (tmp_path / "identified.xml").read_bytes() == (tmp_path / "model.xml").read_bytes()
 
 
@@ -265,8 +268,8 @@ UNCHANGED = [
     ids=["moments", "matrix", "barycentric", "logcholesky"],
 )
 def test_without_a_change_the_file_keeps_every_byte(more: tuple[str, ...], tmp_path: Path) -> None:
-    setup = setup_of(RICH, tmp_path, *(p for p in UNCHANGED if p != 'body/b "2":mass'), *more)
-    assert write_identified(tmp_path / "identified.xml", setup, setup.parameters.guess) is None
+    task = task_of(RICH, tmp_path, *(p for p in UNCHANGED if p != 'body/b "2":mass'), *more)
+    assert write_identified(tmp_path / "identified.xml", task.system, task.parameters.guess) is None
     assert (tmp_path / "identified.xml").read_bytes() == (tmp_path / "model.xml").read_bytes()
 
 
@@ -276,15 +279,15 @@ def test_an_identified_file_reproduces_itself(tmp_path: Path) -> None:
         "body/a:firstmoment[0]",
         "body/c:fullinertia[3]",
     ]
-    first = setup_of(RICH, tmp_path, *paths)
+    first = task_of(RICH, tmp_path, *paths)
     theta = first.parameters.guess * 1.013 + 1e-3 / 3
-    assert write_identified(tmp_path / "identified.xml", first, theta) is None
-    second = setup_of(tmp_path / "identified.xml", tmp_path, *paths)
+    assert write_identified(tmp_path / "identified.xml", first.system, theta) is None
+    second = task_of(tmp_path / "identified.xml", tmp_path, *paths)
     turned = np.array([":rot" in p for p in paths])
     np.testing.assert_allclose(
         second.parameters.guess[~turned], theta[~turned], rtol=1e-12, atol=1e-13
     )
-    assert write_identified(tmp_path / "again.xml", second, second.parameters.guess) is None
+    assert write_identified(tmp_path / "again.xml", second.system, second.parameters.guess) is None
     assert (tmp_path / "again.xml").read_bytes() == (tmp_path / "identified.xml").read_bytes()
 
 
@@ -296,8 +299,8 @@ def test_scale_and_offset_reach_every_target(tmp_path: Path) -> None:
         ],
         "guess": 0.3,
     }
-    setup = setup_of(RICH, tmp_path, both)
-    assert write_identified(tmp_path / "identified.xml", setup, np.array([0.125])) is None
+    task = task_of(RICH, tmp_path, both)
+    assert write_identified(tmp_path / "identified.xml", task.system, np.array([0.125])) is None
     gone, came = lines(tmp_path / "model.xml", tmp_path / "identified.xml")
     assert len(gone) == 2
     assert ['damping="0.125"' in came[0], 'damping="0.5 0.020"' in came[1]] == [True, True]
@@ -309,8 +312,8 @@ def test_line_ends_and_byte_order_marks_stay(ending: str, head: str, tmp_path: P
     source = tmp_path / "arm.xml"
     text = RICH.replace("\n", ending)
     source.write_bytes((head + text).encode())
-    setup = setup_of(source, tmp_path, "joint/k:frictionloss", 'body/b "2":mass')
-    assert write_identified(tmp_path / "identified.xml", setup, np.array([0.25, 2.0])) is None
+    task = task_of(source, tmp_path, "joint/k:frictionloss", 'body/b "2":mass')
+    assert write_identified(tmp_path / "identified.xml", task.system, np.array([0.25, 2.0])) is None
     found = (tmp_path / "identified.xml").read_bytes().decode()
     assert found.startswith(head) and found.count(ending) == text.count(ending) + 1
     at = re.search(r'<body name="b[^>]*>(\s+)<inertial [^>]*/>(\s+)<joint', found)
@@ -333,9 +336,9 @@ def test_empty_elements_without_spaces(tmp_path: Path) -> None:
         (("/>", ' gainprm="2.0"/>'), ("></motor >", ' gainprm="2.0"></general >'))
     ):
         (tmp_path / str(i)).mkdir()
-        setup = setup_of(xml.replace('"j"{}', f'"j"{end}'), tmp_path / str(i), "actuator/m:gainprm")
+        task = task_of(xml.replace('"j"{}', f'"j"{end}'), tmp_path / str(i), "actuator/m:gainprm")
         new = tmp_path / str(i) / "identified.xml"
-        assert write_identified(new, setup, np.array([2.0])) is None
+        assert write_identified(new, task.system, np.array([2.0])) is None
         assert f'<actuator><general name="m" joint="j"{wanted}</actuator>' in new.read_text(
             encoding="utf-8"
         )
@@ -353,8 +356,8 @@ def test_a_doctype_is_not_followed(tmp_path: Path) -> None:
         XmlText("<mujoco a='ü'/>".encode("latin-1"))
     with pytest.raises(ModelError, match="<robot>"):
         MjcfDocument(b"<robot/>")
-    setup = setup_of("<!DOCTYPE mujoco>\n" + RICH.split("?>\n", 1)[1], tmp_path, "joint/j:damping")
-    said = write_identified(tmp_path / "identified.xml", setup, np.array([0.7]))
+    task = task_of("<!DOCTYPE mujoco>\n" + RICH.split("?>\n", 1)[1], tmp_path, "joint/j:damping")
+    said = write_identified(tmp_path / "identified.xml", task.system, np.array([0.7]))
     assert said is not None and "printed by MuJoCo" in said and "DOCTYPE" in said
     assert (
         mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")).joint("j").damping[0] == 0.7
@@ -394,13 +397,13 @@ def test_mujoco_prints_values_that_the_text_cannot_express(case: str, tmp_path: 
     xml = RICH.replace(old, new)
     if case == "frame":
         xml = xml.replace("</body>\n  </worldbody>", "</body></frame>\n  </worldbody>")
-    setup = setup_of(xml, tmp_path, {"target": path, "guess": 0.5, "scale": 1.0})
-    said = write_identified(tmp_path / "identified.xml", setup, np.array([0.6]))
+    task = task_of(xml, tmp_path, {"target": path, "guess": 0.5, "scale": 1.0})
+    said = write_identified(tmp_path / "identified.xml", task.system, np.array([0.6]))
     assert said is not None and said.startswith("identified.xml: it is printed by MuJoCo")
     assert re.search(reason, said)
     found, wanted = (
         mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")),
-        setup.model_at(np.array([0.6])),
+        task.system.model_at(np.array([0.6])),
     )
     for name in ("dof_damping", "body_pos", "actuator_gainprm", "body_mass"):
         np.testing.assert_allclose(
@@ -414,8 +417,8 @@ def stiffen(spec: Any, value: float) -> None:
 
 
 def test_functions_of_the_spec_are_printed_by_mujoco(tmp_path: Path) -> None:
-    setup = setup_of(RICH, tmp_path, {"function": stiffen, "guess": 0.1, "scale": 1.0})
-    said = write_identified(tmp_path / "identified.xml", setup, np.array([0.25]))
+    task = task_of(RICH, tmp_path, {"function": stiffen, "guess": 0.1, "scale": 1.0})
+    said = write_identified(tmp_path / "identified.xml", task.system, np.array([0.25]))
     assert said is not None and "parameters.p0 is a Python function" in said
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")).dof_armature[0] == 0.25
 
@@ -430,15 +433,15 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
         RICH.replace("  </worldbody>", '<include file="parts/d.xml"/></worldbody>'),
         encoding="utf-8",
     )
-    setup = setup_of(source, tmp_path, "joint/j:damping")
+    task = task_of(source, tmp_path, "joint/j:damping")
     new = tmp_path / "out" / "deep" / "identified.xml"
-    assert write_identified(new, setup, np.array([0.7])) is None
+    assert write_identified(new, task.system, np.array([0.7])) is None
     gone, came = lines(source, new)
     assert len(gone) == len(came) == 2
     assert '<include file="../../parts/d.xml"/></worldbody>' in came
-    assert_is_identified_model(new, setup, [0.7])
-    inside = setup_of(source, tmp_path, "joint/dj:damping")
-    said = write_identified(new, inside, np.array([0.7]))
+    assert_is_identified_model(new, task, [0.7])
+    inside = task_of(source, tmp_path, "joint/dj:damping")
+    said = write_identified(new, inside.system, np.array([0.7]))
     assert said is not None and "joint 'dj' is not in the MJCF file itself" in said
     assert mujoco.MjModel.from_xml_path(str(new)).joint("dj").damping[0] == 0.7
 
@@ -455,8 +458,8 @@ def test_attached_models_are_printed_by_mujoco(tmp_path: Path) -> None:
         ("joint/x_dj:damping", "", "joint 'x_dj' is not in the MJCF file itself"),
         ("joint/j:damping", "out", "leg.xml"),
     ):
-        setup = setup_of(xml, tmp_path, path)
-        said = write_identified(tmp_path / folder / "identified.xml", setup, np.array([0.7]))
+        task = task_of(xml, tmp_path, path)
+        said = write_identified(tmp_path / folder / "identified.xml", task.system, np.array([0.7]))
         assert said is not None and "printed by MuJoCo" in said and reason in said
         found = mujoco.MjModel.from_xml_path(str(tmp_path / folder / "identified.xml"))
         assert found.joint(path[6:-8]).damping[0] == 0.7
@@ -489,21 +492,21 @@ def test_only_asset_folders_in_use_change(compiler: str, line: str, tmp_path: Pa
     xml = xml.replace(
         'type="sphere" size="0.10" density="300"', 'type="mesh" mesh="t" density="300"'
     )
-    setup = setup_of(xml, tmp_path / "model", "geom/i:pos[1]")
+    task = task_of(xml, tmp_path / "model", "geom/i:pos[1]")
     beside, away = tmp_path / "model" / "identified.xml", tmp_path / "out" / "identified.xml"
-    theta = setup.parameters.guess + 0.01
+    theta = task.parameters.guess + 0.01
     for path, changed in ((beside, 1), (away, 2 if compiler else 1)):
-        assert write_identified(path, setup, theta) is None
+        assert write_identified(path, task.system, theta) is None
         gone, came = lines(tmp_path / "model" / "model.xml", path)
         assert len(gone) == changed
         assert (line in came) == (path is away)
-        assert_is_identified_model(path, setup, theta)
-    plain = setup_of(
+        assert_is_identified_model(path, task, theta)
+    plain = task_of(
         RICH.replace("  <default>\n", f"  {compiler}\n  <default>\n", 1),
         tmp_path / "model",
         "joint/j:damping",
     )
-    assert write_identified(away, plain, np.array([0.7])) is None
+    assert write_identified(away, plain.system, np.array([0.7])) is None
     assert len(lines(tmp_path / "model" / "model.xml", away)[1]) == 1
 
 
@@ -535,24 +538,24 @@ DERIVED = {
 def test_numbers_that_the_compiler_would_derive_are_stated(case: str, tmp_path: Path) -> None:
     (old, new), path, value, stated = DERIVED[case]
     assert old in RICH
-    setup = setup_of(RICH.replace(old, new), tmp_path, path)
-    said = write_identified(tmp_path / "identified.xml", setup, np.array([value]))
+    task = task_of(RICH.replace(old, new), tmp_path, path)
+    said = write_identified(tmp_path / "identified.xml", task.system, np.array([value]))
     assert (
         said
         == f"identified.xml: it also states numbers that MuJoCo would otherwise derive from the identified values: {stated}"
     )
     assert "größer als ASCII" in (tmp_path / "identified.xml").read_text(encoding="utf-8")
-    assert_is_identified_model(tmp_path / "identified.xml", setup, [value])
+    assert_is_identified_model(tmp_path / "identified.xml", task, [value])
 
 
 def test_an_option_is_made_where_there_is_none(tmp_path: Path) -> None:
     xml = re.sub(r"\n +<option[^>]*/>[^\n]*", "", RICH)
     assert "<option" not in xml
-    setup = setup_of(xml, tmp_path, "option:gravity[0]", "option:density")
-    assert write_identified(tmp_path / "identified.xml", setup, np.array([0.1, 1.2])) is None
+    task = task_of(xml, tmp_path, "option:gravity[0]", "option:density")
+    assert write_identified(tmp_path / "identified.xml", task.system, np.array([0.1, 1.2])) is None
     gone, came = lines(tmp_path / "model.xml", tmp_path / "identified.xml")
     assert (gone, came) == ([], ['  <option gravity="0.1 0.0 -9.81" density="1.2"/>'])
-    assert_is_identified_model(tmp_path / "identified.xml", setup, [0.1, 1.2])
+    assert_is_identified_model(tmp_path / "identified.xml", task, [0.1, 1.2])
 
 
 @pytest.mark.parametrize("turned", ["", ' euler="10 20 30"', ' quat="0.6 0.8 0 0"'])
@@ -560,11 +563,11 @@ def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: 
     """`objtype="body"` is the frame of the principal axes: the matrix alone would leave their order open."""
     watch = '<framequat objtype="body" objname="a" name="axes" noise=".01"/></sensor>'
     xml = RICH.replace("</sensor>", watch).replace('mass="1.50"', f'mass="1.50"{turned}')
-    setup = setup_of(xml, tmp_path, "body/a:fullinertia[3]")
-    assert write_identified(tmp_path / "identified.xml", setup, np.array([0.004])) is None
+    task = task_of(xml, tmp_path, "body/a:fullinertia[3]")
+    assert write_identified(tmp_path / "identified.xml", task.system, np.array([0.004])) is None
     found, wanted = (
         mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")),
-        setup.model_at(np.array([0.004])),
+        task.system.model_at(np.array([0.004])),
     )
     np.testing.assert_allclose(found.body_iquat, wanted.body_iquat, rtol=0, atol=1e-15)
     np.testing.assert_allclose(found.body_inertia, wanted.body_inertia, rtol=1e-14)
@@ -597,16 +600,16 @@ def test_shortcuts_set_the_entries_that_mujoco_sets(element: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in MODELS.glob("*.toml")))
 def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
-    setup = Setup(mjfim.Experiment.from_file(MODELS / f"{name}.toml"))
-    theta = setup.parameters.guess * (
-        1.0 + 0.004 * np.random.default_rng(1).uniform(-1.0, 1.0, len(setup.parameters))
+    task = DesignTask.resolve(mjfim.Experiment.from_file(MODELS / f"{name}.toml"))
+    theta = task.parameters.guess * (
+        1.0 + 0.004 * np.random.default_rng(1).uniform(-1.0, 1.0, len(task.parameters))
     )
-    said = write_identified(tmp_path / "identified.xml", setup, theta)
+    said = write_identified(tmp_path / "identified.xml", task.system, theta)
     assert (said is None) == (name != "sliding_block"), said
     assert said is None or "body_invweight0" in said
-    assert_is_identified_model(tmp_path / "identified.xml", setup, theta)
-    gone, came = lines(setup.model_path, tmp_path / "identified.xml")
-    assert 0 < len(gone) == len(came) <= sum(len(p.targets) for p in setup.parameters.parameters)
+    assert_is_identified_model(tmp_path / "identified.xml", task, theta)
+    gone, came = lines(task.system.model_path, tmp_path / "identified.xml")
+    assert 0 < len(gone) == len(came) <= sum(len(p.targets) for p in task.parameters.parameters)
     numbers = re.compile(
         r'"[-+\d. e]*"| (damping|stiffness|armature|quat|euler|timeconst|fullinertia|diaginertia|gravcomp)='
     )
@@ -616,13 +619,15 @@ def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_models_of_other_projects(name: str, tmp_path: Path) -> None:
     shared_model(EXPERIMENTS[name]["model"])
-    setup = Setup(mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED_MODELS, source=name))
-    theta = setup.parameters.guess * (
-        1.0 + 0.03 * np.random.default_rng(1).uniform(-1.0, 1.0, len(setup.parameters))
+    task = DesignTask.resolve(
+        mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED_MODELS, source=name)
     )
-    said = write_identified(tmp_path / "identified.xml", setup, theta)
+    theta = task.parameters.guess * (
+        1.0 + 0.03 * np.random.default_rng(1).uniform(-1.0, 1.0, len(task.parameters))
+    )
+    said = write_identified(tmp_path / "identified.xml", task.system, theta)
     if name == "so_arm100":  # its servos have damping ratios
         assert said is not None and "it also states" in said and "printed" not in said
     else:
         assert said is None
-    assert_is_identified_model(tmp_path / "identified.xml", setup, theta)
+    assert_is_identified_model(tmp_path / "identified.xml", task, theta)

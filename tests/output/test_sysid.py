@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from mujoco import sysid
 
-import mjfim
 from mjfim.errors import ExperimentError
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
+from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.residuals import Fit
 from mjfim.output.archive import write_recording
 from mjfim.output.mjcf.write import same_dynamics
 from mjfim.records.recording import Recording
-from tests.support.numerics import Array, body_setup, filtered_setup
+from tests.support.numerics import Array, body_task, filtered_task
 from tests.support.paths import ROOT
 
 CART = ROOT / "models" / "cart_pendulum.toml"
@@ -41,17 +41,20 @@ def script() -> Iterator[ModuleType]:
     sys.path.remove(str(ROOT / "scripts"))
 
 
-def cart(**tables: Any) -> Setup:
+def cart(**tables: Any) -> DesignTask:
     """The cart-pendulum of the models. tables: replaced as a whole"""
-    return Setup(Experiment.from_file(CART).model_copy(update=tables))
+    return DesignTask.resolve(Experiment.from_file(CART).model_copy(update=tables))
 
 
-def noiseless(setup: Setup, theta: Array | None = None) -> Recording:
+def noiseless(task: DesignTask, theta: Array | None = None) -> Recording:
     """Of the initial control, at the true values."""
-    values = setup.parameters.true if theta is None else theta
-    y, _ = setup.plant.measure(values[None], setup.control)
+    values = task.parameters.true if theta is None else theta
+    y, _ = task.plant.measure(values[None], task.control)
     return Recording(
-        t=np.arange(len(y[0])) * setup.dt, ctrl=setup.control, y=y[0], outputs=setup.outputs.names
+        t=np.arange(len(y[0])) * task.dt,
+        ctrl=task.control,
+        y=y[0],
+        outputs=task.system.outputs.names,
     )
 
 
@@ -71,32 +74,32 @@ def residual(exported: Any, theta: Array, weighted: bool) -> Array:
 def test_sysid_recovers_the_truth_without_lag(
     script: ModuleType, noise: dict[str, float], weighted: bool
 ) -> None:
-    setup = cart(noise=noise)
-    exported = script.export(setup, [noiseless(setup)])
+    task = cart(noise=noise)
+    exported = script.export(task, [noiseless(task)])
     fit = script.fitted(exported, weighted)
-    np.testing.assert_allclose(fit.theta, setup.parameters.true, rtol=1e-6)
+    np.testing.assert_allclose(fit.theta, task.parameters.true, rtol=1e-6)
     assert fit.ended.startswith("Terminated after") and fit.seconds > 0.0
 
 
 @installed
 def test_states_are_compared_as_sysid_does_and_sensors_without_its_lag(script: ModuleType) -> None:
-    setup = cart()
-    exported = script.export(setup, [mjfim.simulate(setup, setup.initial, 0)])
+    task = cart()
+    exported = script.export(task, [simulate_system(task.system, task.initial, 0)])
     own = sysid.build_residual_fn(models_sequences=[exported.sequences])
-    theirs = np.concatenate(own(setup.parameters.guess, exported.parameters.copy())[0])
+    theirs = np.concatenate(own(task.parameters.guess, exported.parameters.copy())[0])
     np.testing.assert_allclose(
-        residual(exported, setup.parameters.guess, weighted=False), theirs, rtol=0, atol=1e-12
+        residual(exported, task.parameters.guess, weighted=False), theirs, rtol=0, atol=1e-12
     )
     names = ["slide_position", "hinge_angle", "slide_velocity", "hinge_velocity"]
-    setup = cart(noise=dict.fromkeys(names, 0.05))
-    exported = script.export(setup, [noiseless(setup)])
+    task = cart(noise=dict.fromkeys(names, 0.05))
+    exported = script.export(task, [noiseless(task)])
     own = sysid.build_residual_fn(models_sequences=[exported.sequences])
-    theirs = np.concatenate(own(setup.parameters.true, exported.parameters.copy())[0])
-    assert np.abs(residual(exported, setup.parameters.true, weighted=False)).max() < 1e-10
+    theirs = np.concatenate(own(task.parameters.true, exported.parameters.copy())[0])
+    assert np.abs(residual(exported, task.parameters.true, weighted=False)).max() < 1e-10
     assert np.abs(theirs).max() > 1e-3  # the lag: without noise, at the true values
 
 
-def coarse(folder: Path) -> tuple[Setup, Recording]:
+def coarse(folder: Path) -> tuple[DesignTask, Recording]:
     """Two engine steps a sample, velocities measured every other one."""
     noise = {**UNEQUAL, "qvel:slide": {"sigma": 0.005, "rate": 25.0}}
     values = Experiment.from_file(CART).model_dump(exclude_unset=True) | {
@@ -110,29 +113,29 @@ def coarse(folder: Path) -> tuple[Setup, Recording]:
         "frequency": 0.3,
         "frequency_end": 1.0,
     }
-    setup = Setup(Experiment(**values, directory=CART.parent))
-    return setup, mjfim.simulate(setup, setup.initial, 1)
+    task = DesignTask.resolve(Experiment(**values, directory=CART.parent))
+    return task, simulate_system(task.system, task.initial, 1)
 
 
-def whole(folder: Path) -> tuple[Setup, Recording]:
+def whole(folder: Path) -> tuple[DesignTask, Recording]:
     """Free and ball joints by their states, some components of them only, and sensors."""
     noise = {"qpos:float": 0.01, "qvel:ball.rx": 0.02, "gyro": 0.02, "tip": 0.01}
-    setup = body_setup(folder, noise=noise)
-    return setup, mjfim.simulate(setup, setup.initial, 1)
+    task = body_task(folder, noise=noise)
+    return task, simulate_system(task.system, task.initial, 1)
 
 
-def activated(folder: Path) -> tuple[Setup, Recording]:
+def activated(folder: Path) -> tuple[DesignTask, Recording]:
     """An actuator with a state."""
-    setup = filtered_setup(folder)
-    return setup, mjfim.simulate(setup, setup.initial, 1)
+    task = filtered_task(folder)
+    return task, simulate_system(task.system, task.initial, 1)
 
 
-def model(name: str) -> Callable[[Path], tuple[Setup, Recording]]:
+def model(name: str) -> Callable[[Path], tuple[DesignTask, Recording]]:
     """One of the models: inertias in charts, servo gains, a tendon, a loop."""
 
-    def build(folder: Path) -> tuple[Setup, Recording]:
-        setup = Setup(Experiment.from_file(ROOT / "models" / f"{name}.toml"))
-        return setup, mjfim.simulate(setup, setup.initial, 1)
+    def build(folder: Path) -> tuple[DesignTask, Recording]:
+        task = DesignTask.resolve(Experiment.from_file(ROOT / "models" / f"{name}.toml"))
+        return task, simulate_system(task.system, task.initial, 1)
 
     return build
 
@@ -152,16 +155,16 @@ def test_sysid_gets_the_same_model_data_and_weights(
     script: ModuleType, case: str, tmp_path: Path
 ) -> None:
     """Whitened residuals away from the guess, and what the MjSpec compiles to there."""
-    setup, recording = CASES[case](tmp_path)
-    exported, p = script.export(setup, [recording]), setup.parameters
+    task, recording = CASES[case](tmp_path)
+    exported, p = script.export(task, [recording]), task.parameters
     theta = np.clip(p.guess + 0.02 * p.magnitude * np.cos(np.arange(len(p))), p.lower, p.upper)
     moved = exported.parameters.copy()
     moved.update_from_vector(theta)
     before = exported.sequences.spec.to_xml()
     built = import_module("sysid_sequences").build(moved, exported.sequences.spec)
-    assert same_dynamics(built, setup.model_at(theta))
+    assert same_dynamics(built, task.system.model_at(theta))
     assert exported.sequences.spec.to_xml() == before
-    fit = Fit(setup, [recording])
+    fit = Fit(task.system, [recording])
     wanted = fit.dense(fit.begin(theta))
     assert wanted is not None
     mine = residual(exported, theta, weighted=True)
@@ -175,17 +178,17 @@ def test_sysid_gets_the_same_model_data_and_weights(
 
 @installed
 def test_times_off_the_grid_are_read_between_the_steps(script: ModuleType) -> None:
-    setup = cart()
-    fine, rng = noiseless(setup), np.random.default_rng(4)
+    task = cart()
+    fine, rng = noiseless(task), np.random.default_rng(4)
     rows = np.sort(rng.choice(np.arange(1, 400), 300, replace=False))
     t = fine.t[rows] + rng.uniform(-2e-3, 2e-3, 300)
     t[0] = 0.0
     y = np.column_stack([np.interp(t, fine.t, column) for column in fine.y.T])
     recording = Recording(t=t, ctrl=fine.ctrl[rows[:-1]], y=y, outputs=fine.outputs)
-    exported, fit = script.export(setup, [recording]), Fit(setup, [recording])
-    wanted = fit.dense(fit.begin(setup.parameters.true))
+    exported, fit = script.export(task, [recording]), Fit(task.system, [recording])
+    wanted = fit.dense(fit.begin(task.parameters.true))
     assert wanted is not None
-    mine = residual(exported, setup.parameters.true, weighted=True)
+    mine = residual(exported, task.parameters.true, weighted=True)
     np.testing.assert_allclose(mine, -wanted.r, atol=1e-3)
 
 
@@ -194,14 +197,14 @@ def test_the_report_draws_components_and_what_is_measured_now_and_then(
     script: ModuleType, tmp_path: Path
 ) -> None:
     """sysid's own report counts signals where it draws their components."""
-    setup, recording = whole(tmp_path)
-    exported = script.export(setup, [recording])
+    task, recording = whole(tmp_path)
+    exported = script.export(task, [recording])
     assert "tip[2]" in script.report(exported, script.fitted(exported, weighted=True))
     assert set(exported.layout.mapping) == {"hull_qpos", "ball_qvel", "gyro", "tip"}
-    setup, recording = coarse(tmp_path)
-    exported = script.export(setup, [recording])
+    task, recording = coarse(tmp_path)
+    exported = script.export(task, [recording])
     _, _, records = exported.residual(weighted=True)(
-        setup.parameters.guess, exported.parameters, return_pred_all=True
+        task.parameters.guess, exported.parameters, return_pred_all=True
     )
     assert list(records[0][0].signal_mapping) == [
         "slide_qpos",
@@ -219,7 +222,7 @@ def test_the_command_compares_both_and_leaves_the_report(
     script: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Unequal sensors: weighted, sysid finds what mjfim finds; as is, it is several sigmas off."""
-    setup = cart(noise=UNEQUAL)
+    task = cart(noise=UNEQUAL)
     text = CART.read_text(encoding="utf-8").replace(
         "state = 0.05", "\n".join(f'"{k}" = {v}' for k, v in UNEQUAL.items())
     )
@@ -230,7 +233,7 @@ def test_the_command_compares_both_and_leaves_the_report(
     experiment.write_text(text, encoding="utf-8")
     files = [tmp_path / f"recording_{seed}.csv" for seed in (0, 1)]
     for seed, path in enumerate(files):
-        write_recording(path, mjfim.simulate(setup, setup.initial, seed), setup)
+        write_recording(path, simulate_system(task.system, task.initial, seed), task.system)
     assert script.main([str(experiment), *map(str, files), "-o", str(tmp_path / "out")]) == 0
     shown = capfd.readouterr()
     assert not shown.err, "sysid is heard"
@@ -267,9 +270,9 @@ def test_the_command_compares_both_and_leaves_the_report(
 def test_what_sysid_cannot_fit_is_refused(
     script: ModuleType, tables: dict[str, Any], said: str
 ) -> None:
-    setup = Setup(Experiment.from_file(CART).replace(**tables))
+    task = DesignTask.resolve(Experiment.from_file(CART).replace(**tables))
     with pytest.raises(ExperimentError, match=said):
-        script.export(setup, [noiseless(setup)])
+        script.export(task, [noiseless(task)])
 
 
 @installed

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjfim.plant.delay import OutputDelay
-from tests.support.numerics import Array, cart_setup, richardson
+from tests.support.numerics import Array, cart_task, richardson
 
 DT = 0.01
 T = np.arange(120) * DT
@@ -129,15 +129,15 @@ def test_short_recordings_are_interpolated_by_what_there_is(samples: int) -> Non
 
 def test_the_sensitivity_to_a_delay_is_that_of_lagging_the_outputs(tmp_path: Path) -> None:
     """Through the plant: predictions at two delays, against G; a horizon of two samples works too."""
-    setup = cart_setup(tmp_path, nuisance={"delay": 0.01})
-    theta = np.array(setup.parameters.guess)
+    task = cart_task(tmp_path, nuisance={"delay": 0.01})
+    theta = np.array(task.parameters.guess)
     theta[-1] = 0.0137
-    assert setup.parameters.names[-1] == "delay"
-    y, G = setup.plant.derivatives.predict(theta, setup.control)
-    plain, _ = setup.plant.derivatives.predict(setup.parameters.guess, setup.control)
-    inside = setup.t[4:] - 0.0137
+    assert task.parameters.names[-1] == "delay"
+    y, G = task.plant.derivatives.predict(theta, task.control)
+    plain, _ = task.plant.derivatives.predict(task.parameters.guess, task.control)
+    inside = task.t[4:] - 0.0137
     shifted = np.stack(
-        [np.interp(inside, np.arange(len(plain)) * setup.dt, c) for c in plain.T], axis=1
+        [np.interp(inside, np.arange(len(plain)) * task.dt, c) for c in plain.T], axis=1
     )
     np.testing.assert_allclose(y[4:-1], shifted, rtol=0, atol=2e-3)
     for k, i in ((10, 1), (30, 3), (50, 2)):
@@ -145,8 +145,8 @@ def test_the_sensitivity_to_a_delay_is_that_of_lagging_the_outputs(tmp_path: Pat
         def at(h: float, k: int = k, i: int = i) -> float:
             moved = np.array(theta)
             moved[-1] += h
-            return float(setup.plant.measure(moved[None], setup.control)[0][0, k, i])
+            return float(task.plant.measure(moved[None], task.control)[0][0, k, i])
 
         assert G[k, i, -1] == pytest.approx(richardson(at, 1e-4), rel=1e-6)
-    short = cart_setup(tmp_path, horizon=0.02, nuisance={"delay": True})
+    short = cart_task(tmp_path, horizon=0.02, nuisance={"delay": True})
     assert np.isfinite(short.plant.derivatives.predict(theta, short.control)[0]).all()

@@ -11,10 +11,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.experiment.system import Setup
-from mjfim.model.loading import compile_spec, load_spec, unconstrained
+from mjfim.excitation.task import DesignTask
+from mjfim.model.loading import ModelSource, compile_spec, load_spec, unconstrained
 from mjfim.model.mujoco_log import silence_mujoco_log
-from mjfim.model.variants import Source
+from mjfim.model.variants import PlantModel
 from mjfim.optimize.lq import LinearRecursion, TangentCurve, regulator
 from mjfim.output.mjcf.write import write_spec
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
@@ -24,10 +24,10 @@ from tests.support.numerics import (
     CART_PENDULUM,
     Array,
     Loop,
-    body_setup,
-    cart_setup,
-    filtered_setup,
-    make_setup,
+    body_task,
+    cart_task,
+    filtered_task,
+    make_task,
     relative_error,
     shared_model,
 )
@@ -36,12 +36,12 @@ SENSED = {"angle": 0.01, "rate": 0.05, "acc": 0.3, "drive": 0.1}
 SAMPLES = (0, 7, 23, 49)
 
 
-def linear(setup: Setup) -> Linearization:
+def linear(task: DesignTask) -> Linearization:
     """Derivatives along the initial trajectory."""
-    return setup.plant.derivatives.linearize(setup.theta, setup.initial)
+    return task.plant.derivatives.linearize(task.theta, task.initial)
 
 
-def furuta(folder: Path) -> Setup:
+def furuta(folder: Path) -> DesignTask:
     """The Qube, RK4 with 20 steps per sample; a torque that swings the pole without limits or contacts (it has none)."""
     parameters = {
         "stiff": {"target": "joint/theta:damping"},
@@ -50,10 +50,10 @@ def furuta(folder: Path) -> Setup:
     control = {"kind": "sine", "amplitude": 2e-3, "frequency": 1.5}
     model = shared_model("qube_furuta/furuta_pendulum.xml")
     initial = {"qpos": (0.1, 0.3), "control": control}
-    return make_setup(model, folder, initial=initial, parameters=parameters, noise={"state": 0.01})
+    return make_task(model, folder, initial=initial, parameters=parameters, noise={"state": 0.01})
 
 
-def acrobot_without_rk4(folder: Path, integrator: str) -> Setup:
+def acrobot_without_rk4(folder: Path, integrator: str) -> DesignTask:
     """dm_control's acrobot under another integrator; its constraints are off and |u| stays below its range of 1."""
     source = shared_model("dmc_acrobot/acrobot.xml")
     spec = mujoco.MjSpec.from_file(str(source))
@@ -69,17 +69,17 @@ def acrobot_without_rk4(folder: Path, integrator: str) -> Setup:
     parameters = {"m": {"target": "body/lower_arm:mass"}, "c": {"target": "joint/elbow:damping"}}
     control = {"kind": "sine", "amplitude": 0.8, "frequency": 1.0}
     initial = {"qpos": (2.5, 0.4), "control": control}
-    return make_setup(
+    return make_task(
         spec.to_xml(), folder, initial=initial, parameters=parameters, noise={"state": 0.05}
     )
 
 
-def transition(setup: Setup, k: int) -> tuple[Array, Array, Array, Array]:
+def transition(task: DesignTask, k: int) -> tuple[Array, Array, Array, Array]:
     """A, B, C, D of sample k by `mjd_transitionFD`."""
-    model, curve = setup.plant.model(setup.theta), setup.initial
+    model, curve = task.plant.model(task.theta), task.initial
     loop = Loop(model, 1)
     loop.load(curve.state[k], curve.ctrl[k])
-    nx, nu = setup.space.nx, model.nu
+    nx, nu = task.space.nx, model.nu
     A, B = np.zeros((nx, nx)), np.zeros((nx, nu))
     C, D = np.zeros((model.nsensordata, nx)), np.zeros((model.nsensordata, nu))
     mujoco.mjd_transitionFD(model, loop.data, 1e-6, True, A, B, C, D)
@@ -88,26 +88,26 @@ def transition(setup: Setup, k: int) -> tuple[Array, Array, Array, Array]:
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
 @pytest.mark.parametrize(
-    "make", [cart_setup, body_setup, acrobot_without_rk4], ids=["cart", "body", "acrobot"]
+    "make", [cart_task, body_task, acrobot_without_rk4], ids=["cart", "body", "acrobot"]
 )
 def test_A_and_B_are_those_of_mjd_transitionFD(make, integrator: str, tmp_path) -> None:
-    setup = make(tmp_path, integrator)
-    assert setup.substeps == 1
-    found = linear(setup)
+    task = make(tmp_path, integrator)
+    assert task.system.grid.substeps == 1
+    found = linear(task)
     for k in SAMPLES:
-        A, B, _, _ = transition(setup, k)
+        A, B, _, _ = transition(task, k)
         assert relative_error(found.A[k], A) < 1e-8
         assert relative_error(found.B[k], B) < 1e-7
 
 
 @pytest.mark.parametrize(
-    "make", [body_setup, lambda f, i: cart_setup(f, i, noise=SENSED)], ids=["body", "cart"]
+    "make", [body_task, lambda f, i: cart_task(f, i, noise=SENSED)], ids=["body", "cart"]
 )
 def test_C_and_D_of_sensors_are_those_of_mjd_transitionFD(make, tmp_path) -> None:
-    setup = make(tmp_path, "implicitfast")
-    found = linear(setup)
+    task = make(tmp_path, "implicitfast")
+    found = linear(task)
     for k in SAMPLES:
-        _, _, C, D = transition(setup, k)
+        _, _, C, D = transition(task, k)
         assert relative_error(found.C[k], C) < 1e-7
         assert relative_error(found.D[k], D) < 1e-7
     assert np.abs(found.D).max() > 0.1  # accelerations and forces depend on the control at once
@@ -115,13 +115,13 @@ def test_C_and_D_of_sensors_are_those_of_mjd_transitionFD(make, tmp_path) -> Non
 
 @pytest.mark.parametrize(
     "make",
-    [cart_setup, body_setup, lambda f: filtered_setup(f, "RK4"), filtered_setup, furuta],
+    [cart_task, body_task, lambda f: filtered_task(f, "RK4"), filtered_task, furuta],
     ids=["cart", "body", "activation", "activation-implicitfast", "furuta"],
 )
 def test_A_and_B_are_those_of_a_plain_loop_for_any_integrator_and_substeps(make, tmp_path) -> None:
-    setup = make(tmp_path)
-    found, curve = linear(setup), setup.initial
-    loop = Loop(setup.plant.model(setup.theta), setup.substeps)
+    task = make(tmp_path)
+    found, curve = linear(task), task.initial
+    loop = Loop(task.plant.model(task.theta), task.system.grid.substeps)
     for k in SAMPLES:
         A, B, _, _ = loop.jacobians(curve.state[k], curve.ctrl[k])
         assert relative_error(found.A[k], A) < 1e-7
@@ -130,48 +130,52 @@ def test_A_and_B_are_those_of_a_plain_loop_for_any_integrator_and_substeps(make,
 
 def test_these_setups_hold_one_and_several_steps_per_sample(tmp_path) -> None:
     (tmp_path / "b").mkdir()
-    assert cart_setup(tmp_path).substeps == 1
-    assert filtered_setup(tmp_path / "b").substeps == 2
-    assert furuta(tmp_path).substeps == 20
+    assert cart_task(tmp_path).system.grid.substeps == 1
+    assert filtered_task(tmp_path / "b").system.grid.substeps == 2
+    assert furuta(tmp_path).system.grid.substeps == 20
 
 
 def test_a_wrong_jacobian_would_be_noticed(tmp_path) -> None:
-    setup = cart_setup(tmp_path)
-    A, _, _, _ = Loop(setup.plant.model(setup.theta), 2).jacobians(
-        setup.initial.state[7], setup.initial.ctrl[7]
+    task = cart_task(tmp_path)
+    A, _, _, _ = Loop(task.plant.model(task.theta), 2).jacobians(
+        task.initial.state[7], task.initial.ctrl[7]
     )
-    assert relative_error(linear(setup).A[7], A) > 1e-3  # two steps instead of one
-    assert relative_error(1.001 * linear(setup).A[7], linear(setup).A[7]) > 1e-7
+    assert relative_error(linear(task).A[7], A) > 1e-3  # two steps instead of one
+    assert relative_error(1.001 * linear(task).A[7], linear(task).A[7]) > 1e-7
 
 
-def rebuilt(setup: Setup, theta: Array) -> Any:
+def rebuilt(task: DesignTask, theta: Array) -> Any:
     """The model compiled anew at theta, sensors and solver as in the plant."""
-    spec = setup.spec.copy()
-    write_spec(spec, setup.model, setup.model_at(theta), setup.parameters, theta)
+    spec = task.system.source.spec.copy()
+    write_spec(spec, task.system.model, task.system.model_at(theta), task.parameters, theta)
     for body in spec.bodies:
         body.simple = 0
     return spec.compile()
 
 
-def sensed(setup: Setup) -> tuple[list[int], list[int]]:
+def sensed(task: DesignTask) -> tuple[list[int], list[int]]:
     """Rows of the outputs that are sensors, and where those stand in sensordata."""
-    found = [(i, o.sensor) for i, o in enumerate(setup.outputs.outputs) if o.sensor is not None]
+    found = [
+        (i, o.sensor) for i, o in enumerate(task.system.outputs.outputs) if o.sensor is not None
+    ]
     return [i for i, _ in found], [s for _, s in found]
 
 
 @pytest.mark.parametrize(
     ("make", "tolerance"),
-    [(cart_setup, 1e-6), (body_setup, 1e-6), (filtered_setup, 1e-6)],
+    [(cart_task, 1e-6), (body_task, 1e-6), (filtered_task, 1e-6)],
     ids=["cart", "body", "act"],
 )
 def test_E_and_H_are_differences_of_rebuilt_models(make, tolerance: float, tmp_path) -> None:
-    setup = make(tmp_path)
-    found, curve, theta = linear(setup), setup.initial, setup.theta
-    rows, address = sensed(setup)
+    task = make(tmp_path)
+    found, curve, theta = linear(task), task.initial, task.theta
+    rows, address = sensed(task)
     for j, h in enumerate(1e-5 * np.abs(theta)):
         step = h * np.eye(len(theta))[j]
-        up, down = (Loop(rebuilt(setup, theta + s), setup.substeps) for s in (step, -step))
-        F, H = np.zeros((len(SAMPLES), setup.space.nx)), np.zeros((len(SAMPLES), len(rows)))
+        up, down = (
+            Loop(rebuilt(task, theta + s), task.system.grid.substeps) for s in (step, -step)
+        )
+        F, H = np.zeros((len(SAMPLES), task.space.nx)), np.zeros((len(SAMPLES), len(rows)))
         for i, k in enumerate(SAMPLES):
             x, u = curve.state[k], curve.ctrl[k]
             F[i] = up.minus(up.F(x, u), down.F(x, u)) / (2 * h)
@@ -182,29 +186,29 @@ def test_E_and_H_are_differences_of_rebuilt_models(make, tolerance: float, tmp_p
 
 
 def test_H_of_sensors_is_not_zero_here(tmp_path) -> None:
-    assert np.abs(linear(body_setup(tmp_path)).H).max() > 0.1
-    assert np.abs(linear(cart_setup(tmp_path)).H).max() == 0.0  # states are measured as they are
+    assert np.abs(linear(body_task(tmp_path)).H).max() > 0.1
+    assert np.abs(linear(cart_task(tmp_path)).H).max() == 0.0  # states are measured as they are
 
 
 @pytest.mark.parametrize(
     "make",
     [
-        cart_setup,
-        body_setup,
-        filtered_setup,
-        lambda f: cart_setup(f, noise={**SENSED, "state": 0.1}),
+        cart_task,
+        body_task,
+        filtered_task,
+        lambda f: cart_task(f, noise={**SENSED, "state": 0.1}),
         furuta,
     ],
     ids=["cart", "body", "activation", "cart-sensors", "furuta"],
 )
 def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
-    setup = make(tmp_path)
+    task = make(tmp_path)
     tolerance = (
         1e-5 if make is furuta else 1e-6
     )  # its dampings are 1e-6, hardly above the round-off of a step
-    L, S = linear(setup), setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
-    psi = np.zeros((setup.space.nx, len(setup.theta)))
-    for k in range(setup.samples):
+    L, S = linear(task), task.plant.derivatives.sensitivity(task.theta, task.initial)
+    psi = np.zeros((task.space.nx, len(task.theta)))
+    for k in range(task.samples):
         psi = L.A[k] @ psi + L.E[k]
     np.testing.assert_array_equal(S.psi[0], 0.0)
     scale = np.abs(S.psi).max(axis=(0, 1))
@@ -212,7 +216,7 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
     assert np.abs((S.psi[-1] - psi) / scale).max() < tolerance
     every = np.stack(
         [
-            LinearRecursion(L.A).forward(np.zeros(setup.space.nx), L.E[:, :, j])
+            LinearRecursion(L.A).forward(np.zeros(task.space.nx), L.E[:, :, j])
             for j in range(len(scale))
         ],
         axis=2,
@@ -220,30 +224,30 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
     assert np.abs((S.psi - every) / scale).max() < tolerance
     G = np.einsum("kyx,kxp->kyp", L.C, S.psi) + L.H
     assert np.abs((S.G - G) / np.abs(G).max(axis=(0, 1))).max() < tolerance
-    assert S.G.shape == (setup.samples + 1, len(setup.outputs.outputs), len(setup.theta))
+    assert S.G.shape == (task.samples + 1, len(task.system.outputs.outputs), len(task.theta))
 
 
 def test_prediction_gives_the_same_outputs_and_derivative_as_the_sensitivity(tmp_path) -> None:
-    setup = body_setup(tmp_path)
-    y, G = setup.plant.derivatives.predict(setup.theta, setup.initial.ctrl)
-    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = body_task(tmp_path)
+    y, G = task.plant.derivatives.predict(task.theta, task.initial.ctrl)
+    S = task.plant.derivatives.sensitivity(task.theta, task.initial)
     assert relative_error(G, S.G) < 1e-6
-    measured, finite = setup.plant.measure(setup.theta[None], setup.initial.ctrl)
+    measured, finite = task.plant.measure(task.theta[None], task.initial.ctrl)
     assert finite.all()
     np.testing.assert_array_equal(measured[0], y)
 
 
 @pytest.mark.parametrize(
-    "make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"]
+    "make", [cart_task, body_task, filtered_task], ids=["cart", "body", "activation"]
 )
 @pytest.mark.parametrize(
     "accuracy", [CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES], ids=["central", "fast"]
 )
 def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> None:
-    setup = make(tmp_path)
-    L, psi = linear(setup), setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi
-    w = np.abs(setup.theta)[None] * np.linspace(0.5, 1.0, len(setup.theta))
-    found = setup.plant.derivatives.bilinear(setup.theta, setup.initial, psi, w, accuracy)
+    task = make(tmp_path)
+    L, psi = linear(task), task.plant.derivatives.sensitivity(task.theta, task.initial).psi
+    w = np.abs(task.theta)[None] * np.linspace(0.5, 1.0, len(task.theta))
+    found = task.plant.derivatives.bilinear(task.theta, task.initial, psi, w, accuracy)
     tolerance = 1e-5 if accuracy.central else 1e-3
     for name in ("A", "B", "C", "D"):
         if np.abs(getattr(L, name)).max() > 0:
@@ -251,17 +255,19 @@ def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> Non
 
 
 @pytest.mark.parametrize(
-    "make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"]
+    "make", [cart_task, body_task, filtered_task], ids=["cart", "body", "activation"]
 )
 def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, tmp_path) -> None:
-    setup = make(tmp_path)
-    theta, curve, nx = setup.theta, setup.initial, setup.space.nx
-    psi = setup.plant.derivatives.sensitivity(theta, curve).psi
+    task = make(tmp_path)
+    theta, curve, nx = task.theta, task.initial, task.space.nx
+    psi = task.plant.derivatives.sensitivity(theta, curve).psi
     w = np.abs(theta) * np.linspace(1.0, 0.5, len(theta))
-    found = setup.plant.derivatives.bilinear(theta, curve, psi, w[None], CENTRAL_DIFFERENCES)
+    found = task.plant.derivatives.bilinear(theta, curve, psi, w[None], CENTRAL_DIFFERENCES)
     e, d = 3e-4, 3e-4
-    rows, address = sensed(setup)
-    plus, minus = (Loop(rebuilt(setup, theta + s * e * w), setup.substeps) for s in (1, -1))
+    rows, address = sensed(task)
+    plus, minus = (
+        Loop(rebuilt(task, theta + s * e * w), task.system.grid.substeps) for s in (1, -1)
+    )
     for k in (7, 23):
         x, u, push = curve.state[k], curve.ctrl[k], psi[k] @ w
 
@@ -271,8 +277,8 @@ def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, t
             return plus.minus(plus.F(up, u), minus.F(down, u)) / (2 * e), dh
 
         F, H = [], []
-        for i in range(nx + setup.plant.nu):
-            step = d * np.eye(nx + setup.plant.nu)[i]
+        for i in range(nx + task.plant.nu):
+            step = d * np.eye(nx + task.plant.nu)[i]
             ahead, back = (
                 DF(plus.plus(x, step[:nx]), u + step[nx:]),
                 DF(plus.plus(x, -step[:nx]), u - step[nx:]),
@@ -280,31 +286,31 @@ def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, t
             F.append((ahead[0] - back[0]) / (2 * d))
             H.append((ahead[1] - back[1])[address] / (2 * d))
         assert relative_error(found.F_mixed[0, k], np.array(F)) < 1e-4
-        if setup.outputs.needs_sensors:
+        if task.system.outputs.needs_sensors:
             assert relative_error(found.h_mixed[0, k][:, rows], np.array(H)) < 1e-4
 
 
 def test_outputs_belong_to_the_state_and_control_of_their_own_sample(tmp_path) -> None:
     noise = {"state": 0.1, **SENSED}
-    setup = cart_setup(tmp_path, noise=noise)
-    y, _ = setup.plant.measure(setup.theta[None], setup.initial.ctrl)
-    columns = {name: y[0][:, i] for i, name in enumerate(setup.outputs.names)}
+    task = cart_task(tmp_path, noise=noise)
+    y, _ = task.plant.measure(task.theta[None], task.initial.ctrl)
+    columns = {name: y[0][:, i] for i, name in enumerate(task.system.outputs.names)}
     np.testing.assert_array_equal(
         columns["angle"], columns["qpos:hinge"]
     )  # no lag between sensor and state
     np.testing.assert_array_equal(columns["rate"], columns["qvel:hinge"])
     assert np.abs(np.diff(columns["angle"])).max() > 1e-3
-    np.testing.assert_array_equal(columns["drive"][:-1], setup.initial.ctrl[:, 0])
-    assert columns["drive"][-1] == setup.initial.ctrl[-1, 0]  # the last control is held
+    np.testing.assert_array_equal(columns["drive"][:-1], task.initial.ctrl[:, 0])
+    assert columns["drive"][-1] == task.initial.ctrl[-1, 0]  # the last control is held
 
 
-@pytest.mark.parametrize("make", [filtered_setup, body_setup], ids=["two steps a sample", "one"])
+@pytest.mark.parametrize("make", [filtered_task, body_task], ids=["two steps a sample", "one"])
 def test_rollout_and_sensors_are_those_of_a_plain_loop(make, tmp_path) -> None:
-    noise = {"noise": {"angle": 0.1, "torque": 0.1}} if make is filtered_setup else {}
-    setup = make(tmp_path, "RK4", **noise)
-    curve, loop = setup.initial, Loop(setup.plant.model(setup.theta), setup.substeps)
-    y, _ = setup.plant.measure(setup.theta[None], curve.ctrl)
-    for k in range(setup.samples):
+    noise = {"noise": {"angle": 0.1, "torque": 0.1}} if make is filtered_task else {}
+    task = make(tmp_path, "RK4", **noise)
+    curve, loop = task.initial, Loop(task.plant.model(task.theta), task.system.grid.substeps)
+    y, _ = task.plant.measure(task.theta[None], curve.ctrl)
+    for k in range(task.samples):
         expected = loop.F(curve.state[k], curve.ctrl[k])
         np.testing.assert_allclose(curve.state[k + 1], expected, rtol=0, atol=1e-13)
         np.testing.assert_allclose(
@@ -312,28 +318,30 @@ def test_rollout_and_sensors_are_those_of_a_plain_loop(make, tmp_path) -> None:
         )
     last = loop.h(curve.state[-1], curve.ctrl[-1])
     np.testing.assert_allclose(y[0, -1], last, rtol=0, atol=1e-11)
-    assert curve.t[-1] == pytest.approx(setup.samples * setup.substeps * setup.model.opt.timestep)
+    assert curve.t[-1] == pytest.approx(
+        task.samples * task.system.grid.substeps * task.system.model.opt.timestep
+    )
 
 
-def gain(setup: Setup) -> Array:
+def gain(task: DesignTask) -> Array:
     """Regulator with unit weights along the initial trajectory."""
-    L, dt = linear(setup), setup.dt
-    nx, nu = setup.space.nx, setup.plant.nu
+    L, dt = linear(task), task.dt
+    nx, nu = task.space.nx, task.plant.nu
     return regulator(L.A, L.B, np.eye(nx) * dt, np.eye(nu) * dt, np.eye(nx))
 
 
-def tangent(setup: Setup, K: Array, size: float = 1.0) -> TangentCurve:
+def tangent(task: DesignTask, K: Array, size: float = 1.0) -> TangentCurve:
     """A smooth tangent vector along the initial trajectory."""
-    L, t = linear(setup), setup.t[:, None]
-    c = size * np.sin(7.0 * t + 1.0 + np.arange(setup.plant.nu))
+    L, t = linear(task), task.t[:, None]
+    c = size * np.sin(7.0 * t + 1.0 + np.arange(task.plant.nu))
     z = LinearRecursion(L.A - L.B @ K).forward(
-        np.zeros(setup.space.nx), np.einsum("kiu,ku->ki", L.B, c)
+        np.zeros(task.space.nx), np.einsum("kiu,ku->ki", L.B, c)
     )
     return TangentCurve(z=z, v=c - np.einsum("kui,ki->ku", K, z[:-1]))
 
 
 STILL = pytest.mark.parametrize(
-    "make", [cart_setup, body_setup, filtered_setup], ids=["cart", "body", "activation"]
+    "make", [cart_task, body_task, filtered_task], ids=["cart", "body", "activation"]
 )
 
 
@@ -342,30 +350,30 @@ STILL = pytest.mark.parametrize(
 def test_projecting_a_trajectory_onto_itself_changes_nothing(
     make, open_loop: bool, tmp_path
 ) -> None:
-    setup = make(tmp_path)
-    K = gain(setup) * (not open_loop)
+    task = make(tmp_path)
+    K = gain(task) * (not open_loop)
     still = TangentCurve(
-        z=np.zeros((setup.samples + 1, setup.space.nx)), v=np.zeros((setup.samples, setup.plant.nu))
+        z=np.zeros((task.samples + 1, task.space.nx)), v=np.zeros((task.samples, task.plant.nu))
     )
-    same = setup.plant.project(setup.theta, setup.initial, still, 1.0, K)
-    np.testing.assert_allclose(same.state, setup.initial.state, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(same.ctrl, setup.initial.ctrl, rtol=0, atol=1e-12)
+    same = task.plant.project(task.theta, task.initial, still, 1.0, K)
+    np.testing.assert_allclose(same.state, task.initial.state, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(same.ctrl, task.initial.ctrl, rtol=0, atol=1e-12)
 
 
 @STILL
 def test_projection_is_idempotent_and_feasible(make, tmp_path) -> None:
-    setup = make(tmp_path)
-    K, plant, theta = gain(setup), setup.plant, setup.theta
-    zeta = tangent(setup, K)
-    once = plant.project(theta, setup.initial, zeta, 0.5, K)
-    moved = plant.difference(once, setup.initial)
+    task = make(tmp_path)
+    K, plant, theta = gain(task), task.plant, task.theta
+    zeta = tangent(task, K)
+    once = plant.project(theta, task.initial, zeta, 0.5, K)
+    moved = plant.difference(once, task.initial)
     assert np.abs(moved.z).max() > 1e-3
     # P(xi) is a trajectory: its own control in open loop gives it back
     np.testing.assert_allclose(
         plant.simulate(theta, once.ctrl).state, once.state, rtol=0, atol=1e-9
     )
     # P(P(xi)) = P(xi), by asking again for where it has arrived
-    twice = plant.project(theta, setup.initial, moved, 1.0, K)
+    twice = plant.project(theta, task.initial, moved, 1.0, K)
     np.testing.assert_allclose(twice.state, once.state, rtol=0, atol=1e-9)
     np.testing.assert_allclose(twice.ctrl, once.ctrl, rtol=0, atol=1e-9)
 
@@ -375,12 +383,12 @@ def test_projection_is_idempotent_and_feasible(make, tmp_path) -> None:
 def test_projection_moves_along_its_tangent_vector_to_first_order(
     make, open_loop: bool, tmp_path
 ) -> None:
-    setup = make(tmp_path)
-    K = gain(setup) * (not open_loop)
-    zeta, errors = tangent(setup, K), []
+    task = make(tmp_path)
+    K = gain(task) * (not open_loop)
+    zeta, errors = tangent(task, K), []
     for gamma in (1e-2, 5e-3):
-        moved = setup.plant.difference(
-            setup.plant.project(setup.theta, setup.initial, zeta, gamma, K), setup.initial
+        moved = task.plant.difference(
+            task.plant.project(task.theta, task.initial, zeta, gamma, K), task.initial
         )
         errors.append(
             np.abs(moved.z / gamma - zeta.z).max() + np.abs(moved.v / gamma - zeta.v).max()
@@ -390,9 +398,9 @@ def test_projection_moves_along_its_tangent_vector_to_first_order(
 
 
 def test_feedback_is_that_of_the_projection_operator(tmp_path) -> None:
-    setup = cart_setup(tmp_path)
-    K, curve, zeta = gain(setup), setup.initial, tangent(setup, gain(setup), 3.0)
-    new = setup.plant.project(setup.theta, curve, zeta, 1.0, K)
+    task = cart_task(tmp_path)
+    K, curve, zeta = gain(task), task.initial, tangent(task, gain(task), 3.0)
+    new = task.plant.project(task.theta, curve, zeta, 1.0, K)
     alpha, mu = curve.state + zeta.z, curve.ctrl + zeta.v
     expected = mu + np.einsum("kui,ki->ku", K, alpha[:-1] - new.state[:-1])
     np.testing.assert_allclose(new.ctrl, expected, rtol=0, atol=1e-12)
@@ -401,7 +409,7 @@ def test_feedback_is_that_of_the_projection_operator(tmp_path) -> None:
 def test_feedback_holds_an_upright_pendulum_that_open_loop_loses(tmp_path) -> None:
     start = {"qpos": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
     light = CART_PENDULUM.format(integrator="RK4").replace('damping="0.4"', 'damping="0.01"')
-    setup = make_setup(
+    task = make_task(
         light,
         tmp_path,
         initial=start,
@@ -409,11 +417,11 @@ def test_feedback_holds_an_upright_pendulum_that_open_loop_loses(tmp_path) -> No
         parameters=CART_PARAMETERS,
         noise={"state": 0.1},
     )
-    K, kick = gain(setup), np.zeros((setup.samples, 1))
+    K, kick = gain(task), np.zeros((task.samples, 1))
     kick[:20] = 0.5
-    zeta = TangentCurve(z=np.zeros((setup.samples + 1, 4)), v=kick)
-    lost = setup.plant.project(setup.theta, setup.initial, zeta, 1.0, 0.0 * K)
-    held = setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K)
+    zeta = TangentCurve(z=np.zeros((task.samples + 1, 4)), v=kick)
+    lost = task.plant.project(task.theta, task.initial, zeta, 1.0, 0.0 * K)
+    held = task.plant.project(task.theta, task.initial, zeta, 1.0, K)
     assert np.abs(lost.qpos[:, 1]).max() > 2.0
     assert np.abs(held.qpos[:, 1]).max() < 0.1
     assert np.abs(held.state[-1]).max() < 0.05
@@ -421,16 +429,16 @@ def test_feedback_holds_an_upright_pendulum_that_open_loop_loses(tmp_path) -> No
 
 def test_a_control_that_diverges_is_an_outcome_without_noise(tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.chdir(tmp_path)
-    setup = cart_setup(tmp_path)
-    before, K = sorted(p.name for p in tmp_path.iterdir()), gain(setup)
-    wild = TangentCurve(z=np.zeros((setup.samples + 1, 4)), v=np.full((setup.samples, 1), 9e9))
-    assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, 0.0 * K) is None
-    assert setup.plant.project(setup.theta, setup.initial, wild, 1.0, K) is None
+    task = cart_task(tmp_path)
+    before, K = sorted(p.name for p in tmp_path.iterdir()), gain(task)
+    wild = TangentCurve(z=np.zeros((task.samples + 1, 4)), v=np.full((task.samples, 1), 9e9))
+    assert task.plant.project(task.theta, task.initial, wild, 1.0, 0.0 * K) is None
+    assert task.plant.project(task.theta, task.initial, wild, 1.0, K) is None
     with pytest.raises(SimulationDivergedError, match="diverges"):
-        setup.plant.simulate(setup.theta, wild.v)
-    ctrl = setup.plant.trajectory(setup.initial.state, wild.v)
-    assert setup.plant.derivatives.sensitivity(setup.theta, ctrl) is None
-    assert setup.plant.derivatives.predict(setup.theta, wild.v) is None
+        task.plant.simulate(task.theta, wild.v)
+    ctrl = task.plant.trajectory(task.initial.state, wild.v)
+    assert task.plant.derivatives.sensitivity(task.theta, ctrl) is None
+    assert task.plant.derivatives.predict(task.theta, wild.v) is None
     assert capfd.readouterr() == ("", "")
     assert sorted(p.name for p in tmp_path.iterdir()) == before  # no MUJOCO_LOG.TXT
 
@@ -440,11 +448,11 @@ def test_a_control_that_diverges_is_an_outcome_without_noise(tmp_path, monkeypat
 def test_a_control_that_mujoco_would_silently_replace_by_zero_is_not_simulated(
     bad: float, open_loop: bool, tmp_path
 ) -> None:
-    setup = cart_setup(tmp_path)
-    K, wild = gain(setup) * (not open_loop), np.zeros((setup.samples, 1))
+    task = cart_task(tmp_path)
+    K, wild = gain(task) * (not open_loop), np.zeros((task.samples, 1))
     wild[20] = bad
-    zeta = TangentCurve(z=np.zeros((setup.samples + 1, 4)), v=wild)
-    assert setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K) is None
+    zeta = TangentCurve(z=np.zeros((task.samples + 1, 4)), v=wild)
+    assert task.plant.project(task.theta, task.initial, zeta, 1.0, K) is None
 
 
 @pytest.mark.parametrize("open_loop", [True, False])
@@ -457,21 +465,21 @@ def test_an_acceleration_that_makes_mujoco_reset_is_noticed_at_any_sample(
         .replace('mass="1"', 'mass="0.01"')
         .replace("1.5", "0.01")
     )
-    setup = make_setup(light, tmp_path, parameters=CART_PARAMETERS, noise={"state": 0.1})
-    K, wild = gain(setup) * (not open_loop), np.zeros((setup.samples, 1))
+    task = make_task(light, tmp_path, parameters=CART_PARAMETERS, noise={"state": 0.1})
+    K, wild = gain(task) * (not open_loop), np.zeros((task.samples, 1))
     wild[sample] = 9e9
-    zeta = TangentCurve(z=np.zeros((setup.samples + 1, 4)), v=wild)
-    assert setup.plant.project(setup.theta, setup.initial, zeta, 1.0, K) is None
+    zeta = TangentCurve(z=np.zeros((task.samples + 1, 4)), v=wild)
+    assert task.plant.project(task.theta, task.initial, zeta, 1.0, K) is None
 
 
 @pytest.mark.parametrize("bad", [np.nan, 1e12])
 def test_linearising_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_path) -> None:
-    setup = cart_setup(tmp_path)
-    states = np.array(setup.initial.state)
+    task = cart_task(tmp_path)
+    states = np.array(task.initial.state)
     states[20, 2] = bad
     with pytest.raises(SimulationDivergedError, match="linearization"):
-        setup.plant.derivatives.linearize(
-            setup.theta, setup.plant.trajectory(states, setup.initial.ctrl)
+        task.plant.derivatives.linearize(
+            task.theta, task.plant.trajectory(states, task.initial.ctrl)
         )
 
 
@@ -492,81 +500,81 @@ def test_quiet_blocks_may_overlap_in_threads() -> None:
 
 def test_mujoco_itself_would_have_made_that_noise(tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.chdir(tmp_path)
-    setup = cart_setup(tmp_path)
-    setup.initial  # noqa: B018  (quiet work first: afterwards MuJoCo's own settings must be back)
-    loop = Loop(setup.plant.model(setup.theta), 5)
-    loop.F(setup.plant.nominal_initial_state, np.array([9e9]))
+    task = cart_task(tmp_path)
+    task.initial  # noqa: B018  (quiet work first: afterwards MuJoCo's own settings must be back)
+    loop = Loop(task.plant.model(task.theta), 5)
+    loop.F(task.plant.nominal_initial_state, np.array([9e9]))
     out = "".join(capfd.readouterr())
     assert "WARNING" in out or (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
 def test_after_a_diverged_trial_the_plant_works_as_before(tmp_path) -> None:
-    setup = cart_setup(tmp_path, noise=SENSED)
-    first = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
-    L = linear(setup)
-    wild = setup.plant.trajectory(setup.initial.state, np.full((setup.samples, 1), 9e9))
-    assert setup.plant.derivatives.sensitivity(setup.theta, wild) is None
+    task = cart_task(tmp_path, noise=SENSED)
+    first = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    L = linear(task)
+    wild = task.plant.trajectory(task.initial.state, np.full((task.samples, 1), 9e9))
+    assert task.plant.derivatives.sensitivity(task.theta, wild) is None
     with pytest.raises(SimulationDivergedError):
-        setup.plant.simulate(setup.theta, wild.ctrl)
+        task.plant.simulate(task.theta, wild.ctrl)
     np.testing.assert_array_equal(
-        setup.plant.derivatives.sensitivity(setup.theta, setup.initial).G, first.G
+        task.plant.derivatives.sensitivity(task.theta, task.initial).G, first.G
     )
-    np.testing.assert_array_equal(linear(setup).A, L.A)
+    np.testing.assert_array_equal(linear(task).A, L.A)
 
 
 def test_results_do_not_depend_on_what_was_simulated_before_or_on_threads(tmp_path) -> None:
     (tmp_path / "b").mkdir()
-    setup, other = body_setup(tmp_path), body_setup(tmp_path / "b")
+    task, other = body_task(tmp_path), body_task(tmp_path / "b")
     other.plant.simulator.threads = 2
     other.plant.measure(1.3 * other.theta[None], -other.control)
     other.plant.derivatives.linearize(0.8 * other.theta, other.initial)
     np.testing.assert_array_equal(
-        setup.plant.derivatives.sensitivity(setup.theta, setup.initial).G,
+        task.plant.derivatives.sensitivity(task.theta, task.initial).G,
         other.plant.derivatives.sensitivity(other.theta, other.initial).G,
     )
 
 
 def test_batches_of_any_size_in_any_order_give_the_same_curves(tmp_path) -> None:
     (tmp_path / "b").mkdir()
-    setup, rng = filtered_setup(tmp_path), np.random.default_rng(5)
-    thetas = setup.theta * rng.uniform(0.8, 1.2, (70, 2))
+    task, rng = filtered_task(tmp_path), np.random.default_rng(5)
+    thetas = task.theta * rng.uniform(0.8, 1.2, (70, 2))
     alone = np.stack(
         [
-            filtered_setup(tmp_path / "b").plant.measure(t[None], setup.control)[0][0]
+            filtered_task(tmp_path / "b").plant.measure(t[None], task.control)[0][0]
             for t in thetas[:6]
         ]
     )
     for count in (2, 6, 1, 70, 3, 5):
-        y, finite = setup.plant.measure(thetas[:count], setup.control)
+        y, finite = task.plant.measure(thetas[:count], task.control)
         assert finite.shape == (count,)
         assert finite.all()
         np.testing.assert_array_equal(y[:6], alone[:count])
     wild = thetas.copy()
     wild[1] *= -1.0  # a negative mass: this one may do as it likes, its neighbours may not
-    y, _ = setup.plant.measure(wild[:4], setup.control)
+    y, _ = task.plant.measure(wild[:4], task.control)
     np.testing.assert_array_equal(y[[0, 2, 3]], alone[[0, 2, 3]])
-    states, ctrl = setup.initial.state, np.repeat(setup.control, 1, axis=0)
+    states, ctrl = task.initial.state, np.repeat(task.control, 1, axis=0)
     for count in (5, 50, 1, 12):
-        out = setup.plant.simulator.step(
-            [setup.plant.model(setup.theta)], states[:count], ctrl[:count]
+        out = task.plant.simulator.step(
+            [task.plant.model(task.theta)], states[:count], ctrl[:count]
         ).states
         np.testing.assert_array_equal(out, states[1 : count + 1])
 
 
 def test_every_mj_step_is_counted(tmp_path) -> None:
-    setup = filtered_setup(tmp_path)
-    engine, N, n = setup.plant.simulator, setup.samples, setup.substeps
-    curve, count = setup.initial, engine.steps
-    setup.plant.derivatives.linearize(setup.theta, curve)
+    task = filtered_task(tmp_path)
+    engine, N, n = task.plant.simulator, task.samples, task.system.grid.substeps
+    curve, count = task.initial, engine.steps
+    task.plant.derivatives.linearize(task.theta, curve)
     assert engine.steps - count == (N + 1) * n * (2 * (3 + 1) + 2 * 2)
     count = engine.steps
-    setup.plant.derivatives.sensitivity(setup.theta, curve)
+    task.plant.derivatives.sensitivity(task.theta, curve)
     assert engine.steps - count == 2 * 2 * (
         N * n + 1
     )  # one more for the sensors of the last sample
     count = engine.steps
     zero = TangentCurve(z=np.zeros((N + 1, 3)), v=np.zeros((N, 1)))
-    setup.plant.project(setup.theta, curve, zero, 1.0, np.ones((N, 1, 3)))
+    task.plant.project(task.theta, curve, zero, 1.0, np.ones((N, 1, 3)))
     assert engine.steps - count == N * n
 
 
@@ -593,7 +601,9 @@ def test_switching_off_solver_and_sensors_of_an_unconstrained_model_changes_no_b
     spec, path = written(tmp_path, CART_PENDULUM.format(integrator=integrator))
     plain, lean = (
         compile_spec(spec, path),
-        Source(spec, path, ["bob"], sensors=False, friction=False).model,
+        PlantModel(
+            ModelSource(path, spec), moved_bodies=["bob"], sensors=False, friction=False
+        ).model,
     )
     assert (bits(plain), bits(lean)) == ((False, False), (True, True))
     states = []
@@ -637,25 +647,29 @@ def test_the_solver_stays_on_where_a_constraint_can_act(case: str, tmp_path) -> 
     assert old in FREE_OF_CONSTRAINTS
     spec, path = written(tmp_path, FREE_OF_CONSTRAINTS.replace(old, new))
     assert not unconstrained(compile_spec(spec, path))
-    assert bits(Source(spec, path, [], sensors=True, friction=False).model) == (False, False)
+    assert bits(
+        PlantModel(ModelSource(path, spec), moved_bodies=[], sensors=True, friction=False).model
+    ) == (False, False)
 
 
 def test_the_solver_stays_on_where_friction_is_to_be_identified(tmp_path) -> None:
     spec, path = written(tmp_path, FREE_OF_CONSTRAINTS)
-    assert bits(Source(spec, path, [], sensors=True, friction=True).model) == (False, False)
+    assert bits(
+        PlantModel(ModelSource(path, spec), moved_bodies=[], sensors=True, friction=True).model
+    ) == (False, False)
     loss = {"loss": {"target": "joint/slide:frictionloss", "guess": 0.2}}
-    setup = cart_setup(tmp_path, parameters=loss)
-    assert bits(setup.plant.source.model)[0] is False
-    assert np.abs(setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi).max() > 1e-3
+    task = cart_task(tmp_path, parameters=loss)
+    assert bits(task.plant.source.model)[0] is False
+    assert np.abs(task.plant.derivatives.sensitivity(task.theta, task.initial).psi).max() > 1e-3
 
 
 def test_private_copies_leave_the_users_spec_and_model_alone(tmp_path) -> None:
-    setup = body_setup(tmp_path)
-    before = setup.spec.to_xml()
-    setup.plant.derivatives.linearize(1.5 * setup.theta, setup.initial)
-    assert setup.spec.to_xml() == before
-    assert setup.model.body("arm").mass[0] == pytest.approx(0.4)
-    assert bits(setup.model) == (False, False)
+    task = body_task(tmp_path)
+    before = task.system.source.spec.to_xml()
+    task.plant.derivatives.linearize(1.5 * task.theta, task.initial)
+    assert task.system.source.spec.to_xml() == before
+    assert task.system.model.body("arm").mass[0] == pytest.approx(0.4)
+    assert bits(task.system.model) == (False, False)
 
 
 OUTSIDE = {"noise": {"state": 0.05, **SENSED}}
@@ -663,43 +677,41 @@ START = {"initial": {"qpos:hinge": True, "qvel:slide": True}}
 
 
 def test_the_start_enters_the_sensitivity_as_its_own_initial_value(tmp_path) -> None:
-    setup = cart_setup(tmp_path, **OUTSIDE, nuisance=START)
-    L, S = linear(setup), setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = cart_task(tmp_path, **OUTSIDE, nuisance=START)
+    L, S = linear(task), task.plant.derivatives.sensitivity(task.theta, task.initial)
     start = np.eye(4)[:, [1, 2]]  # (dq, dv): the hinge's angle, the slide's speed
     np.testing.assert_allclose(S.psi[0][:, 3:], start, rtol=0, atol=1e-9)
     for j in (0, 1):
-        alone = LinearRecursion(L.A).forward(start[:, j], np.zeros((setup.samples, 4)))
+        alone = LinearRecursion(L.A).forward(start[:, j], np.zeros((task.samples, 4)))
         assert relative_error(S.psi[..., 3 + j], alone) < 1e-6
         assert relative_error(S.G[..., 3 + j], np.einsum("kyx,kx->ky", L.C, alone)) < 1e-6
 
 
 def test_the_start_of_a_quaternion_moves_in_its_tangent_space(tmp_path) -> None:
-    setup = body_setup(
-        tmp_path, nuisance={"initial": {"qpos:ball.rz": True, "qvel:float.ry": True}}
-    )
-    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = body_task(tmp_path, nuisance={"initial": {"qpos:ball.rz": True, "qvel:float.ry": True}})
+    S = task.plant.derivatives.sensitivity(task.theta, task.initial)
     np.testing.assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)
-    loop, h = Loop(setup.plant.model(setup.theta), 1), 1e-4
+    loop, h = Loop(task.plant.model(task.theta), 1), 1e-4
     ends = []
     for sign in (1, -1):
-        state = loop.plus(setup.initial.state[0], sign * h * np.eye(18)[8])
-        for u in setup.initial.ctrl[:20]:
+        state = loop.plus(task.initial.state[0], sign * h * np.eye(18)[8])
+        for u in task.initial.ctrl[:20]:
             state = loop.F(state, u)
         ends.append(state)
     assert relative_error(S.psi[20][:, 4], loop.minus(*ends) / (2 * h)) < 1e-6
 
 
 def test_biases_add_to_their_own_output_and_to_nothing_else(tmp_path) -> None:
-    setup = cart_setup(tmp_path, **OUTSIDE, nuisance={"bias": {"angle": True, "acc[2]": 0.1}})
-    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
-    names = list(setup.outputs.names)
+    task = cart_task(tmp_path, **OUTSIDE, nuisance={"bias": {"angle": True, "acc[2]": 0.1}})
+    S = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    names = list(task.system.outputs.names)
     for j, name in ((3, "angle"), (4, "acc[2]")):
         expected = np.zeros(len(names))
         expected[names.index(name)] = 1.0
         np.testing.assert_array_equal(S.G[..., j], np.broadcast_to(expected, S.G.shape[:2]))
         np.testing.assert_array_equal(S.psi[..., j], 0.0)
-    theta = setup.theta + np.array([0.0, 0.0, 0.0, 0.7, -0.2])
-    y, _ = setup.plant.measure(np.stack([setup.theta, theta]), setup.control)
+    theta = task.theta + np.array([0.0, 0.0, 0.0, 0.7, -0.2])
+    y, _ = task.plant.measure(np.stack([task.theta, theta]), task.control)
     shift = np.zeros(len(names))
     shift[[names.index("angle"), names.index("acc[2]")]] = 0.7, -0.2
     np.testing.assert_allclose(y[1] - y[0], np.broadcast_to(shift, y[0].shape), rtol=0, atol=1e-12)
@@ -712,8 +724,8 @@ def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
         "late": {"target": "output:delay", "guess": delay, "scale": 0.01},
     }
     late, plain = (
-        cart_setup(tmp_path, **OUTSIDE, parameters=parameters),
-        cart_setup(tmp_path, **OUTSIDE),
+        cart_task(tmp_path, **OUTSIDE, parameters=parameters),
+        cart_task(tmp_path, **OUTSIDE),
     )
     (y, G), (exact, exact_G) = (
         s.plant.derivatives.predict(s.theta, s.control) for s in (late, plain)
@@ -741,35 +753,35 @@ def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
 
 def test_faint_parameters_get_longer_differences_and_others_keep_theirs(tmp_path) -> None:
     faint = {"tiny": {"target": "body/bob:inertia[1]"}, **CART_PARAMETERS}
-    setup = cart_setup(tmp_path, parameters=faint)
-    relative = setup.plant.derivatives.parameter_scale / setup.parameters.magnitude
+    task = cart_task(tmp_path, parameters=faint)
+    relative = task.plant.derivatives.parameter_scale / task.parameters.magnitude
     assert relative[0] > 5.0
     assert (relative >= 1.0).all() and (relative <= 100.0).all()
     np.testing.assert_array_equal(relative[1:3], 1.0)
     # what the longer step is for: less round-off, without a change of the derivative
-    S = setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi[..., 0]
-    far = setup.plant.derivatives.sensitivity(setup.theta, setup.initial, 1e-4).psi[..., 0]
+    S = task.plant.derivatives.sensitivity(task.theta, task.initial).psi[..., 0]
+    far = task.plant.derivatives.sensitivity(task.theta, task.initial, 1e-4).psi[..., 0]
     assert relative_error(S, far) < 1e-6
 
 
 def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> None:
-    setup = body_setup(tmp_path)
-    picked, L = np.array([3, 20, 41]), linear(setup)
-    found = setup.plant.derivatives.one_step(setup.theta, setup.initial, picked, 1e-5)
-    nx, ny, p = setup.space.nx, len(setup.outputs), len(setup.theta)
+    task = body_task(tmp_path)
+    picked, L = np.array([3, 20, 41]), linear(task)
+    found = task.plant.derivatives.one_step(task.theta, task.initial, picked, 1e-5)
+    nx, ny, p = task.space.nx, len(task.system.outputs), len(task.theta)
     states = (
         found[: 3 * nx].reshape(3, nx, p)
-        * (setup.dt * setup.plant.derivatives.difference_sizes(setup.initial)[:nx])[:, None]
+        * (task.dt * task.plant.derivatives.difference_sizes(task.initial)[:nx])[:, None]
     )
     assert relative_error(states, L.E[picked]) < 1e-6
     sensors = found[3 * nx :].reshape(3, ny, p)
-    H = L.H[picked] * setup.parameters.magnitude
+    H = L.H[picked] * task.parameters.magnitude
     size = np.abs(H).max(axis=(0, 2))
     moving = size > 1e-6
     assert moving.sum() >= 3
     assert (
         relative_error(
-            sensors[:, moving] * setup.parameters.magnitude,
+            sensors[:, moving] * task.parameters.magnitude,
             (H / np.where(moving, size, 1.0)[:, None])[:, moving],
         )
         < 1e-5
@@ -808,41 +820,41 @@ def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> Non
             "guess": 1.0,
         }
     initial = {"keyframe": "moved", "control": {"kind": "sine", "amplitude": 2.0}}
-    setup = make_setup(CARRIED, tmp_path, initial=initial, parameters={"d": damped})
-    data = mujoco.MjData(setup.model)
-    mujoco.mj_resetDataKeyframe(setup.model, data, 0)
+    task = make_task(CARRIED, tmp_path, initial=initial, parameters={"d": damped})
+    data = mujoco.MjData(task.system.model)
+    mujoco.mj_resetDataKeyframe(task.system.model, data, 0)
     states, sensed = [], []
-    for u in [*setup.control, setup.control[-1]]:
+    for u in [*task.control, task.control[-1]]:
         states.append(np.concatenate([data.qpos, data.qvel]))
         data.ctrl[:] = u
-        mujoco.mj_step(setup.model, data)
+        mujoco.mj_step(task.system.model, data)
         sensed.append(np.array(data.sensordata))
     wanted = np.array(states)
     assert np.abs(wanted[-1] - wanted[0]).max() > 0.05
     tolerance = {"rtol": 0.0, "atol": 1e-6}  # the model is stepped to a tighter solver tolerance
-    for theta in (setup.theta, setup.theta + 0.5, setup.theta):  # models are written anew
-        y, _ = setup.plant.measure(theta[None], setup.control)
-    np.testing.assert_allclose(setup.initial.state, wanted, **tolerance)
+    for theta in (task.theta, task.theta + 0.5, task.theta):  # models are written anew
+        y, _ = task.plant.measure(theta[None], task.control)
+    np.testing.assert_allclose(task.initial.state, wanted, **tolerance)
     np.testing.assert_allclose(y[0], sensed, **tolerance)
-    model, K = setup.plant.model(setup.theta), np.zeros((setup.samples, 1, 4))
-    closed, _, _ = setup.plant.simulator.closed_loop(model, setup.initial.state, setup.control, K)
+    model, K = task.plant.model(task.theta), np.zeros((task.samples, 1, 4))
+    closed, _, _ = task.plant.simulator.closed_loop(model, task.initial.state, task.control, K)
     np.testing.assert_allclose(closed, wanted, **tolerance)
-    stepped = setup.plant.simulator.step([model], wanted[:-1], setup.control)
+    stepped = task.plant.simulator.step([model], wanted[:-1], task.control)
     np.testing.assert_allclose(stepped.states, wanted[1:], **tolerance)
-    whole = setup.model_at(setup.theta)
-    np.testing.assert_allclose(whole.eq_data, setup.model.eq_data, atol=1e-12)
+    whole = task.system.model_at(task.theta)
+    np.testing.assert_allclose(whole.eq_data, task.system.model.eq_data, atol=1e-12)
     np.testing.assert_array_equal(mujoco.MjData(whole).mocap_pos, [[0.6, 0, 0], [0.2, 1.1, 0]])
     np.testing.assert_array_equal(
-        setup.model_at(setup.theta, placed=False).body_pos, setup.model.body_pos
+        task.system.model_at(task.theta, at_keyframe=False).body_pos, task.system.model.body_pos
     )
 
 
 def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tmp_path) -> None:
     place = {"x": {"target": "body/near:pos[0]", "scale": 1.0}}
-    setup = make_setup(CARRIED, tmp_path, parameters=place)
-    found = setup.plant.derivatives.sensitivity(setup.theta, setup.initial)
+    task = make_task(CARRIED, tmp_path, parameters=place)
+    found = task.plant.derivatives.sensitivity(task.theta, task.initial)
     assert found is not None
-    ends = [setup.plant.simulate(setup.theta + h, setup.control).state[-1] for h in (1e-4, -1e-4)]
+    ends = [task.plant.simulate(task.theta + h, task.control).state[-1] for h in (1e-4, -1e-4)]
     slope = (ends[0] - ends[1]) / 2e-4
     assert np.abs(slope).max() > 0.1
     np.testing.assert_allclose(found.psi[-1, :, 0], slope, rtol=1e-4, atol=1e-6)
@@ -850,7 +862,7 @@ def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tm
     with pytest.raises(
         ExperimentError, match=r"parameters\.x: the keyframe states where mocap body 'near' is"
     ):
-        make_setup(CARRIED, tmp_path, parameters=place, initial=initial)
+        make_task(CARRIED, tmp_path, parameters=place, initial=initial)
 
 
 def test_clocks_begin_at_zero(tmp_path) -> None:
@@ -858,21 +870,21 @@ def test_clocks_begin_at_zero(tmp_path) -> None:
         "<sensor>", '<sensor><clock name="clock" noise="0.1"/>'
     )
     parameters = {"c": {"target": "joint/hinge:damping"}}
-    setup = make_setup(
+    task = make_task(
         xml, tmp_path, rate=50.0, parameters=parameters, noise={"clock": 0.1, "rate": 0.1}
     )
-    y, _ = setup.plant.measure(setup.theta[None], setup.control)
-    t = np.arange(setup.samples + 1) * setup.dt
-    np.testing.assert_allclose(y[0, :, setup.outputs.names.index("clock")], t, atol=1e-12)
-    model = setup.plant.model(setup.theta)
-    sensed = setup.plant.simulator.step([model], setup.initial.state[:1], setup.control[:1]).sensors
+    y, _ = task.plant.measure(task.theta[None], task.control)
+    t = np.arange(task.samples + 1) * task.dt
+    np.testing.assert_allclose(y[0, :, task.system.outputs.names.index("clock")], t, atol=1e-12)
+    model = task.plant.model(task.theta)
+    sensed = task.plant.simulator.step([model], task.initial.state[:1], task.control[:1]).sensors
     assert sensed is not None
-    assert sensed[0, setup.model.sensor("clock").adr[0]] == 0.0
+    assert sensed[0, task.system.model.sensor("clock").adr[0]] == 0.0
 
 
 def test_quaternions_of_the_start_have_unit_length_or_are_refused(tmp_path) -> None:
     def start(*qpos: float) -> Array:
-        return body_setup(
+        return body_task(
             tmp_path, initial={"qpos": qpos, "control": {"kind": "sine"}}
         ).plant.nominal_initial_state
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.constraints import fence_of, looked_at
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, SHARED_ORIGIN
-from tests.support.limits import FLOATING, floating_setup
+from tests.support.limits import FLOATING, floating_task
 from tests.support.numerics import Array, Loop, relative_error
 
 # kinds, names in the order of the observations
@@ -53,9 +53,9 @@ def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
     return rows
 
 
-def observations_of(setup: Setup) -> SubstepObservations:
+def observations_of(task: DesignTask) -> SubstepObservations:
     """What the limits of the experiment look at."""
-    fence = fence_of(setup)
+    fence = fence_of(task)
     assert fence.kinds == tuple(kind for kind, _ in SHOWN)
     return fence.observations
 
@@ -75,21 +75,21 @@ def test_derivatives_look_at_the_first_and_the_last_engine_step_and_some_between
 def test_what_is_watched_is_what_plain_steps_show_at_every_engine_step(
     lifted: bool, integrator: str, tmp_path: Path
 ) -> None:
-    setup = floating_setup(tmp_path, integrator)
-    model, plant = setup.model, setup.free().plant if lifted else setup.plant
+    task = floating_task(tmp_path, integrator)
+    model, plant = task.system.model, task.relaxed().plant if lifted else task.plant
     if lifted:
         model = mujoco.MjModel.from_xml_string(
             FLOATING.format(integrator=integrator)
             .replace('actuatorfrcrange="-0.9 0.9"', "")
             .replace('forcerange="-0.7 0.7"', "")
         )
-    watched = plant.observe(setup.theta, setup.control, observations_of(setup))
+    watched = plant.observe(task.theta, task.control, observations_of(task))
     assert watched is not None
     trajectory, observed = watched
-    np.testing.assert_array_equal(
-        trajectory.state, plant.simulate(setup.theta, setup.control).state
+    np.testing.assert_array_equal(trajectory.state, plant.simulate(task.theta, task.control).state)
+    wanted = played(
+        model, task.plant.initial_state(task.theta), task.control, task.system.grid.substeps
     )
-    wanted = played(model, setup.plant.initial_state(setup.theta), setup.control, setup.substeps)
     assert observed.shape == wanted.shape == (30, 5, len(SHOWN))
     for i, (kind, name) in enumerate(SHOWN):
         assert relative_error(observed[..., i], wanted[..., i]) < 1e-9, (kind, name)
@@ -100,16 +100,16 @@ def test_what_is_watched_is_what_plain_steps_show_at_every_engine_step(
 
 
 def test_a_batch_of_samples_shows_the_same_as_the_whole_curve(tmp_path: Path) -> None:
-    setup = floating_setup(tmp_path)
-    observations, plant = observations_of(setup), setup.plant
-    watched = plant.observe(setup.theta, setup.control, observations)
+    task = floating_task(tmp_path)
+    observations, plant = observations_of(task), task.plant
+    watched = plant.observe(task.theta, task.control, observations)
     assert watched is not None
     trajectory, observed = watched
     for order in (slice(None), slice(None, None, -1), slice(4, 9)):
         stepped = plant.simulator.step(
-            [plant.model(setup.theta)],
+            [plant.model(task.theta)],
             trajectory.state[:-1][order],
-            setup.control[order],
+            task.control[order],
             observations,
         )
         np.testing.assert_allclose(
@@ -121,38 +121,45 @@ def test_a_batch_of_samples_shows_the_same_as_the_whole_curve(tmp_path: Path) ->
         np.testing.assert_allclose(stepped.states, trajectory.state[1:][order], rtol=0, atol=1e-12)
     assert (
         plant.simulator.step(
-            [plant.model(setup.theta)], trajectory.state[:1], setup.control[:1]
+            [plant.model(task.theta)], trajectory.state[:1], task.control[:1]
         ).observed
         is None
     )
 
 
 def test_a_control_that_diverges_shows_nothing(tmp_path: Path) -> None:
-    setup = floating_setup(tmp_path)
-    assert setup.plant.observe(setup.theta, 1e12 * setup.control, observations_of(setup)) is None
+    task = floating_task(tmp_path)
+    assert task.plant.observe(task.theta, 1e12 * task.control, observations_of(task)) is None
 
 
 def test_taps_cost_no_further_steps(tmp_path: Path) -> None:
-    setup = floating_setup(tmp_path)
-    observations, plant = observations_of(setup), setup.plant
+    task = floating_task(tmp_path)
+    observations, plant = observations_of(task), task.plant
     counts = []
     for own in (None, observations):
         begun = plant.simulator.steps
         plant.simulator.step(
-            [plant.model(setup.theta)], setup.initial.state[:7], setup.control[:7], own
+            [plant.model(task.theta)], task.initial.state[:7], task.control[:7], own
         )
         counts.append(plant.simulator.steps - begun)
     assert counts == [35, 35]
 
 
-def differences(setup: Setup, sample: int, substeps: tuple[int, ...], step: float = 1e-6) -> Array:
+def differences(
+    task: DesignTask, sample: int, substeps: tuple[int, ...], step: float = 1e-6
+) -> Array:
     """(looked-at substeps, 9, nx+nu) central differences of plain loops over one sample of the lifted plant."""
-    plant, u = setup.plant, setup.control[sample]
-    model, x = plant.model(setup.theta), setup.initial.state[sample]
-    loop, nx, columns = Loop(model, setup.substeps), setup.space.nx, []
+    plant, u = task.plant, task.control[sample]
+    model, x = plant.model(task.theta), task.initial.state[sample]
+    loop, nx, columns = Loop(model, task.system.grid.substeps), task.space.nx, []
     for e in step * np.eye(nx + len(u)):
         up, down = (
-            played(model, loop.plus(x, sign * e[:nx]), (u + sign * e[nx:])[None], setup.substeps)[0]
+            played(
+                model,
+                loop.plus(x, sign * e[:nx]),
+                (u + sign * e[nx:])[None],
+                task.system.grid.substeps,
+            )[0]
             for sign in (1.0, -1.0)
         )
         columns.append((up - down)[np.array(substeps) - 1] / (2 * step))
@@ -160,11 +167,11 @@ def differences(setup: Setup, sample: int, substeps: tuple[int, ...], step: floa
 
 
 def assert_slopes(
-    found: Array, setup: Setup, observations: SubstepObservations, tolerance: float
+    found: Array, task: DesignTask, observations: SubstepObservations, tolerance: float
 ) -> None:
     """Derivatives (N, looked-at substeps, 9, nx+nu) of every kind at some samples."""
     for sample in (0, 11, 29):
-        wanted = differences(setup, sample, observations.derivative_substeps)
+        wanted = differences(task, sample, observations.derivative_substeps)
         for i, shown in enumerate(SHOWN):
             assert relative_error(found[sample, :, i], wanted[:, i]) < tolerance, (sample, shown)
 
@@ -173,14 +180,14 @@ def assert_slopes(
 def test_derivatives_of_taps_are_differences_of_independent_simulations(
     integrator: str, tmp_path: Path
 ) -> None:
-    setup = floating_setup(tmp_path, integrator).free()
-    observations = observations_of(setup)
-    A, B, slopes = setup.plant.derivatives.observation_jacobians(
-        setup.theta, setup.initial, observations
+    task = floating_task(tmp_path, integrator).relaxed()
+    observations = observations_of(task)
+    A, B, slopes = task.plant.derivatives.observation_jacobians(
+        task.theta, task.initial, observations
     )
     assert slopes.shape == (30, len(observations.derivative_substeps), len(SHOWN), 20)
-    assert_slopes(slopes, setup, observations, 1e-3)
-    exact = setup.plant.derivatives.jacobians(setup.theta, setup.initial)
+    assert_slopes(slopes, task, observations, 1e-3)
+    exact = task.plant.derivatives.jacobians(task.theta, task.initial)
     assert relative_error(A, exact[0]) < 1e-5
     assert relative_error(B, exact[1]) < 1e-3
 
@@ -200,21 +207,21 @@ def test_derivatives_beside_those_of_the_information_are_the_same(
         if sensors
         else {"qpos:elbow": 0.01, "qpos:shoulder": 0.01}
     )
-    setup = floating_setup(tmp_path, noise=noise).free()
-    assert setup.plant.simulator.sensors is sensors
+    task = floating_task(tmp_path, noise=noise).relaxed()
+    assert task.plant.simulator.sensors is sensors
     observations, psi = (
-        observations_of(setup),
-        setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi,
+        observations_of(task),
+        task.plant.derivatives.sensitivity(task.theta, task.initial).psi,
     )
     directions = np.array([[1.0, 0.3], [-0.2, 0.9]])
-    found = setup.plant.derivatives.bilinear(
-        setup.theta, setup.initial, psi, directions, accuracy, observations
+    found = task.plant.derivatives.bilinear(
+        task.theta, task.initial, psi, directions, accuracy, observations
     )
     assert found.observation_jacobian is not None
-    assert_slopes(found.observation_jacobian, setup, observations, 2e-3)
+    assert_slopes(found.observation_jacobian, task, observations, 2e-3)
     assert (
-        setup.plant.derivatives.bilinear(
-            setup.theta, setup.initial, psi, directions, accuracy
+        task.plant.derivatives.bilinear(
+            task.theta, task.initial, psi, directions, accuracy
         ).observation_jacobian
         is None
     )
@@ -222,21 +229,21 @@ def test_derivatives_beside_those_of_the_information_are_the_same(
 
 def test_drafted_derivatives_are_the_careful_ones_to_a_hundredth(tmp_path: Path) -> None:
     """One-sided from one origin against central differences of every direction."""
-    setup = floating_setup(tmp_path).free()
+    task = floating_task(tmp_path).relaxed()
     observations, psi = (
-        observations_of(setup),
-        setup.plant.derivatives.sensitivity(setup.theta, setup.initial).psi,
+        observations_of(task),
+        task.plant.derivatives.sensitivity(task.theta, task.initial).psi,
     )
     directions = np.array([[1.0, 0.3], [-0.2, 0.9], [0.0, -1.0]])
-    begun = setup.plant.simulator.steps
-    draft = setup.plant.derivatives.bilinear(
-        setup.theta, setup.initial, psi, directions, SHARED_ORIGIN, observations
+    begun = task.plant.simulator.steps
+    draft = task.plant.derivatives.bilinear(
+        task.theta, task.initial, psi, directions, SHARED_ORIGIN, observations
     )
-    spent, begun = setup.plant.simulator.steps - begun, setup.plant.simulator.steps
-    careful = setup.plant.derivatives.bilinear(
-        setup.theta, setup.initial, psi, directions, CENTRAL_DIFFERENCES, observations
+    spent, begun = task.plant.simulator.steps - begun, task.plant.simulator.steps
+    careful = task.plant.derivatives.bilinear(
+        task.theta, task.initial, psi, directions, CENTRAL_DIFFERENCES, observations
     )
-    assert spent < 0.4 * (setup.plant.simulator.steps - begun)
+    assert spent < 0.4 * (task.plant.simulator.steps - begun)
     for name in ("A", "B", "C", "D", "observation_jacobian"):
         if getattr(careful, name).any():
             assert relative_error(getattr(draft, name), getattr(careful, name)) < 1e-2, name

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mjfim.errors import ExperimentError, RecordingError
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.output.archive import write_table
 from mjfim.recordings.read import Log, read_log, read_recording
 from tests.support.paths import SHARED_DATA
@@ -54,7 +54,7 @@ T = np.arange(M) * 0.005
 CTRL = {"ctrl:push": np.cos(T), "ctrl:turn": np.sin(3.0 * T)}
 
 
-def setup_of(folder: Path, recording: Mapping[str, Any], model: str = ARM) -> Setup:
+def task_of(folder: Path, recording: Mapping[str, Any], model: str = ARM) -> DesignTask:
     """The arm on its cart, with this [recording] table."""
     (folder / "arm.xml").write_text(model, encoding="utf-8")
     mass = {"mass": {"target": "body/arm:mass"}}
@@ -64,7 +64,7 @@ def setup_of(folder: Path, recording: Mapping[str, Any], model: str = ARM) -> Se
         model="arm.xml", rate=100.0, horizon=1.0, initial=start, parameters=mass, noise=noise, recording=recording,
         directory=folder, source="study.toml",
     )  # fmt: skip
-    return Setup(e)
+    return DesignTask.resolve(e)
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def read(tmp_path: Path) -> Read:
     def run(columns: Mapping[str, Any], /, bare: bool = False, **recording: Any) -> Log:
         path = tmp_path / "lab.csv"
         write_table(path, dict(columns) if bare else {"t": T, **CTRL, **columns})
-        return read_log(path, setup_of(tmp_path, recording).channels)
+        return read_log(path, task_of(tmp_path, recording).system.channels)
 
     return run
 
@@ -524,11 +524,11 @@ def test_resolution_ignores_rounding(read: Read) -> None:
 
 def test_design_archives_are_recordings(tmp_path: Path) -> None:
     """Matrices are in the order of the model's joints and actuators, with one control less than states."""
-    setup = setup_of(tmp_path, {})
+    task = task_of(tmp_path, {})
     rng = np.random.default_rng(0)
     qpos, qvel, ctrl = (rng.standard_normal((n, k)) for n, k in ((M, 3), (M, 3), (M - 1, 2)))
     np.savez(tmp_path / "d.npz", t=T, qpos=qpos, qvel=qvel, ctrl=ctrl, gain=np.zeros((M - 1, 2, 6)))
-    r = read_recording(tmp_path / "d.npz", setup.channels)
+    r = read_recording(tmp_path / "d.npz", task.system.channels)
     assert np.array_equal(r.ctrl, ctrl)
     order = [f"{kind}:{joint}" for kind in ("qpos", "qvel") for joint in ("rail", "pin", "stop")]
     assert np.array_equal(
@@ -538,14 +538,16 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
     with pytest.raises(
         RecordingError, match=r"'qpos' has 2 columns, the model 3: qpos:rail, qpos:pin, qpos:stop"
     ):
-        read_recording(tmp_path / "d.npz", setup.channels)
-    stated = setup_of(tmp_path, {"columns": {"qpos:pin": "qpos[1]"}})
-    assert np.array_equal(read_recording(tmp_path / "d.npz", stated.channels).y[:, 0], qpos[:, 1])
+        read_recording(tmp_path / "d.npz", task.system.channels)
+    stated = task_of(tmp_path, {"columns": {"qpos:pin": "qpos[1]"}})
+    assert np.array_equal(
+        read_recording(tmp_path / "d.npz", stated.system.channels).y[:, 0], qpos[:, 1]
+    )
 
 
 def test_archives_with_one_array_per_column(tmp_path: Path) -> None:
     """An archive may have one array per column; the last row of a control of full length is dropped."""
-    setup = setup_of(tmp_path, {})
+    task = task_of(tmp_path, {})
     arrays = {
         "t": T,
         **CTRL,
@@ -553,7 +555,7 @@ def test_archives_with_one_array_per_column(tmp_path: Path) -> None:
         "gyro": np.column_stack([wave(), wave(2.0), wave(3.0)]),
     }
     np.savez(tmp_path / "r.npz", **arrays)
-    r = read_recording(tmp_path / "r.npz", setup.channels)
+    r = read_recording(tmp_path / "r.npz", task.system.channels)
     assert r.outputs == ("qpos:pin", "gyro[0]", "gyro[1]", "gyro[2]")
     assert np.array_equal(r.y[:, 3], wave(3.0))
     assert r.ctrl.shape == (M - 1, 2)
@@ -580,11 +582,11 @@ def test_bags_are_recordings(tmp_path: Path) -> None:
     with pytest.raises(
         RecordingError, match="column 'ctrl:push' is missing; found: t, position:pin"
     ):
-        read_recording(path, setup_of(tmp_path, {}).channels)
+        read_recording(path, task_of(tmp_path, {}).system.channels)
     spec = {
         "columns": {"ctrl:turn": "effort:pin", "ctrl:push": {"column": "effort:grip", "scale": 0.0}}
     }
-    r = read_recording(path, setup_of(tmp_path, spec).channels)
+    r = read_recording(path, task_of(tmp_path, spec).system.channels)
     assert r.outputs == ("qpos:pin", "qvel:pin")
     assert np.array_equal(r.y[:, 0], wave())
     assert np.allclose(r.t, T, rtol=0, atol=1e-12)
@@ -636,7 +638,7 @@ ROBOTS: dict[str, dict[str, Any]] = {
 }
 
 
-def robot(pattern: str, folder: Path, **changes: Any) -> tuple[list[Path], Setup]:
+def robot(pattern: str, folder: Path, **changes: Any) -> tuple[list[Path], DesignTask]:
     """Logs of one robot, and the experiment that reads them; skips where they are absent."""
     files = sorted(SHARED_DATA.glob(pattern))
     if not files:
@@ -645,15 +647,15 @@ def robot(pattern: str, folder: Path, **changes: Any) -> tuple[list[Path], Setup
     model = ONE.format(
         inner=INNER if double else "", motor='<motor name="two" joint="two"/>' if double else ""
     )
-    return files, setup_of(folder, {**ROBOTS[pattern], **changes}, model)
+    return files, task_of(folder, {**ROBOTS[pattern], **changes}, model)
 
 
 @pytest.mark.parametrize("pattern", ROBOTS)
 def test_logs_of_robots(pattern: str, tmp_path: Path) -> None:
     """All rows are read, and velocities are the slopes of positions."""
-    files, setup = robot(pattern, tmp_path)
+    files, task = robot(pattern, tmp_path)
     for file in files:
-        logged = read_log(file, setup.channels)
+        logged = read_log(file, task.system.channels)
         r, summary = logged.recording, logged.summary
         assert summary.rows == len(r.t) > 1000 and summary.dropped == 0
         assert 150.0 < summary.rate < 600.0 and 3.0 < summary.duration < 21.0
@@ -669,16 +671,18 @@ def test_logs_of_robots_in_degrees_are_refused(pattern: str, kind: str, tmp_path
     """Every log would have been refused if it had been in degrees."""
     sources = dict(ROBOTS[pattern]["columns"])
     sources[f"{kind}:one"] = {"column": sources[f"{kind}:one"], "scale": 180.0 / np.pi}
-    files, setup = robot(pattern, tmp_path, columns=sources)
+    files, task = robot(pattern, tmp_path, columns=sources)
     for file in files:
         with pytest.raises(RecordingError, match=f"'{kind}:one' is probably in deg"):
-            read_log(file, setup.channels)
+            read_log(file, task.system.channels)
 
 
 def test_loads_of_a_servo(tmp_path: Path) -> None:
     """A number near 65 thousand in the log is a small negative load."""
-    files, setup = robot("bam_xl330/raw/*.json", tmp_path)
-    loads = np.concatenate([read_recording(file, setup.channels).ctrl[:, 0] for file in files])
+    files, task = robot("bam_xl330/raw/*.json", tmp_path)
+    loads = np.concatenate(
+        [read_recording(file, task.system.channels).ctrl[:, 0] for file in files]
+    )
     assert loads.min() < -10.0 and loads.max() > 10.0
     assert np.abs(loads).max() < 500.0
     _, naive = robot(
@@ -686,4 +690,4 @@ def test_loads_of_a_servo(tmp_path: Path) -> None:
         tmp_path,
         columns={**ROBOTS["bam_xl330/raw/*.json"]["columns"], "ctrl:one": "load"},
     )
-    assert read_recording(files[0], naive.channels).ctrl.max() > 65_000
+    assert read_recording(files[0], naive.system.channels).ctrl.max() > 65_000

@@ -16,7 +16,9 @@ import pytest
 
 import mjfim
 from mjfim.errors import RecordingError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify_system
 from mjfim.output import archive
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
@@ -27,6 +29,8 @@ from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import RECORD, SavedRecord, as_json
 from mjfim.records.trajectory import Trajectory
+from mjfim.studies.check import check_task
+from mjfim.studies.monte_carlo import monte_carlo_system
 from tests.support.paths import MODELS
 
 SAVED: tuple[type[SavedRecord], ...] = (
@@ -140,10 +144,10 @@ def test_awkward_values_survive(
 
 
 @pytest.fixture(scope="module")
-def setup() -> Setup:
+def task() -> DesignTask:
     """The cart-pendulum for 0.4 s with limits."""
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    return Setup(
+    return DesignTask.resolve(
         experiment.replace(
             horizon=0.4,
             descent={"max_iterations": 2, "starts": 2},
@@ -154,16 +158,16 @@ def setup() -> Setup:
 
 
 @pytest.fixture(scope="module")
-def design(setup: Setup) -> Design:
+def design_task(task: DesignTask) -> Design:
     """Two iterations from two initial controls."""
-    return mjfim.design(setup)
+    return design_task(task)
 
 
 @pytest.fixture(scope="module")
-def estimate(setup: Setup, design: Design) -> Estimate:
+def estimate(task: DesignTask, design: Design) -> Estimate:
     """An estimate from two recordings and one that is held out."""
-    recordings = [mjfim.simulate(setup, design.trajectory, seed=seed) for seed in range(3)]
-    return mjfim.identify(setup, recordings[:2], held_out=recordings[2:])
+    recordings = [simulate_system(task.system, design.trajectory, seed=seed) for seed in range(3)]
+    return identify_system(task.system, recordings[:2], held_out=recordings[2:])
 
 
 def round_trip(record: SavedRecord, folder: Path) -> None:
@@ -185,21 +189,21 @@ def test_a_design_is_loaded_as_it_was(design: Design, tmp_path: Path) -> None:
 
 
 def test_the_files_of_the_design_verb_are_loaded(
-    design: Design, setup: Setup, tmp_path: Path
+    design: Design, task: DesignTask, tmp_path: Path
 ) -> None:
     """design.json has the experiment's name as well."""
-    archive.write_design(tmp_path, design, setup)
+    archive.write_design(tmp_path, design, task.system)
     loaded = Design.load(tmp_path)
     assert_same(loaded, design)
     assert loaded.success == design.success and loaded.wanted == design.wanted
     assert not loaded.theta.flags.writeable
 
 
-def test_a_design_goes_on_from_its_file(design: Design, setup: Setup, tmp_path: Path) -> None:
+def test_a_design_goes_on_from_its_file(design: Design, task: DesignTask, tmp_path: Path) -> None:
     """A loaded trajectory is simulated as the design's own."""
     design.save(tmp_path)
-    again = mjfim.simulate(setup, Design.load(tmp_path).trajectory, seed=3)
-    assert np.array_equal(again.y, mjfim.simulate(setup, design.trajectory, seed=3).y)
+    again = simulate_system(task.system, Design.load(tmp_path).trajectory, seed=3)
+    assert np.array_equal(again.y, simulate_system(task.system, design.trajectory, seed=3).y)
 
 
 def test_an_estimate_is_loaded_as_it_was(estimate: Estimate, tmp_path: Path) -> None:
@@ -208,25 +212,25 @@ def test_an_estimate_is_loaded_as_it_was(estimate: Estimate, tmp_path: Path) -> 
     round_trip(estimate, tmp_path)
 
 
-def test_a_check_is_loaded_as_it_was(setup: Setup, tmp_path: Path) -> None:
+def test_a_check_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
     """With its self-test."""
-    round_trip(mjfim.check(setup), tmp_path)
+    round_trip(check_task(task), tmp_path)
 
 
-def test_a_study_is_loaded_as_it_was(setup: Setup, design: Design, tmp_path: Path) -> None:
+def test_a_study_is_loaded_as_it_was(task: DesignTask, design: Design, tmp_path: Path) -> None:
     """With all estimates."""
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    round_trip(mjfim.monte_carlo(setup, curves, trials=3), tmp_path)
+    round_trip(monte_carlo_system(task.system, curves, trials=3), tmp_path)
 
 
-def test_a_comparison_is_loaded_as_it_was(setup: Setup, tmp_path: Path) -> None:
+def test_a_comparison_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
     """With the control of each method."""
-    round_trip(mjfim.compare(setup.experiment, seconds=0.5), tmp_path)
+    round_trip(mjfim.compare(task.experiment, seconds=0.5), tmp_path)
 
 
-def test_a_campaign_is_loaded_as_it_was(setup: Setup, tmp_path: Path) -> None:
+def test_a_campaign_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> None:
     """One round with its design, recording and estimate, and a design that waits for its recording."""
-    wanted = setup.experiment.replace(parameters={"m": {"wanted": 1e-6}})
+    wanted = task.experiment.replace(parameters={"m": {"wanted": 1e-6}})
 
     def measure(design: Design, number: int) -> Recording | None:
         return mjfim.simulate(wanted, design.trajectory, seed=0) if number == 1 else None

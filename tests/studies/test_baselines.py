@@ -12,8 +12,8 @@ import pytest
 
 from mjfim.arrays import Array
 from mjfim.excitation.interior_point import InteriorProblem
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.signals import (
     Chirp,
     ExcitationSettings,
@@ -150,11 +150,11 @@ def test_every_baseline_keeps_the_limits_and_its_budget(method: str) -> None:
     assert np.abs(qpos[:, 0]).max() <= 0.5
     assert np.abs(ctrl).max() <= 5.0
     assert 0.5 * STEPS < attempt.steps < 1.2 * STEPS
-    setup = Setup(pendulum())
-    point = setup.problem.point(setup.plant.simulate(setup.theta, attempt.control))
+    task = DesignTask.resolve(pendulum())
+    point = task.problem.point(task.plant.simulate(task.theta, attempt.control))
     assert point.cost == pytest.approx(attempt.cost, rel=1e-3)
     assert (
-        point.cost < 0.5 * setup.problem.point(setup.initial).cost
+        point.cost < 0.5 * task.problem.point(task.initial).cost
     )  # of a start that even leaves the limits
 
 
@@ -195,17 +195,17 @@ def test_workers_share_the_steps() -> None:
 )
 def test_from_rest_to_rest_without_jolts(method: str) -> None:
     experiment = arm(bandwidth=6.0)
-    setup = Setup(experiment)
+    task = DesignTask.resolve(experiment)
     attempt = perform(Job(experiment, method, 60.0, 400_000))
     assert attempt.control is not None
     assert np.isfinite(attempt.cost)
-    padded = np.concatenate([setup.hold[None], attempt.control, setup.hold[None]])
+    padded = np.concatenate([task.initial_hold[None], attempt.control, task.initial_hold[None]])
     assert np.abs(np.diff(padded, axis=0)).max() <= 4.0 / 100.0 + 1e-12
     qpos, qvel, _ = played(experiment, attempt.control)
     assert np.abs(qvel).max() <= 3.0
     assert np.abs(qpos[-1] - qpos[0]).max() <= 0.02
     assert np.abs(qvel[-1]).max() <= 0.05
-    spectrum = np.abs(np.fft.rfft(attempt.control - setup.hold, axis=0, n=1000)) ** 2
+    spectrum = np.abs(np.fft.rfft(attempt.control - task.initial_hold, axis=0, n=1000)) ** 2
     assert spectrum[np.fft.rfftfreq(1000, 0.01) > 15.0].sum() < 1e-2 * spectrum.sum()
 
 
@@ -225,15 +225,15 @@ def test_what_no_control_keeps_is_told_by_its_margin() -> None:
 def test_weights_are_part_of_the_cost() -> None:
     """Without limits the same J is lowered, effort included: as large as possible is not the best."""
     soft = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=2.0)
-    setup = Setup(soft)
-    assert not setup.enforced
+    task = DesignTask.resolve(soft)
+    assert not task.is_limited
     for method in ("multisine", "fourier5"):
         attempt = perform(Job(soft, method, 60.0, STEPS))
         assert attempt.control is not None
-        point = setup.problem.point(setup.plant.simulate(setup.theta, attempt.control))
+        point = task.problem.point(task.plant.simulate(task.theta, attempt.control))
         assert point.cost == pytest.approx(attempt.cost, rel=1e-3)
         assert point.criterion is not None
-        assert point.cost < setup.problem.point(setup.initial).cost
+        assert point.cost < task.problem.point(task.initial).cost
         assert 0.1 < point.criterion.value / point.cost < 0.99  # both terms count
     assert Shaper(Arena(Job(soft, "chirp", 1.0))).weighted
 
@@ -246,7 +246,7 @@ def test_the_usual_frequencies_come_first_and_stay_within_the_bandwidth() -> Non
     series = fourier(arena, 5)
     first = [next(series) for _ in range(7)]
     assert [s.name for s in first[:5]] == ["0.2 Hz", "0.1 Hz", "0.4 Hz", "0.8 Hz", "0.15 Hz"]
-    t = arena.setup.t
+    t = arena.task.t
     for s, frequency, harmonics in zip(
         first, (0.2, 0.1, 0.4, 0.8, 0.15), (5, 5, 2, 1, 5), strict=False
     ):

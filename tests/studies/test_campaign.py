@@ -19,13 +19,16 @@ from scipy.stats import chi2
 import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
-from mjfim.experiment.system import Setup
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify_system
 from mjfim.identification.residual_tests import larger
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import restated
-from tests.support.numerics import cart_setup
+from tests.support.numerics import cart_task
 from tests.support.paths import MODELS
 
 SCRIPTS = MODELS.parent / "scripts"
@@ -65,12 +68,12 @@ def campaign() -> Campaign:
 
 
 @pytest.fixture(scope="module")
-def truth() -> Setup:
+def truth() -> DesignTask:
     """The study at its true values."""
-    return Setup(STUDY.replace(cost={"linearize_at": "true"}))
+    return DesignTask.resolve(STUDY.replace(cost={"linearize_at": "true"}))
 
 
-def test_it_ends_at_what_is_wanted_and_at_the_truth(campaign: Campaign, truth: Setup) -> None:
+def test_it_ends_at_what_is_wanted_and_at_the_truth(campaign: Campaign, truth: DesignTask) -> None:
     assert campaign.reached and campaign.status is CampaignStatus.REACHED
     assert 2 <= len(campaign.rounds) <= 5, "one round would not test a redesign"
     last = campaign.estimate
@@ -83,13 +86,13 @@ def test_it_ends_at_what_is_wanted_and_at_the_truth(campaign: Campaign, truth: S
 
 def test_a_round_is_what_its_parts_say(campaign: Campaign) -> None:
     """All recordings so far count, once; the first design is at the guess, the next at the estimate; promises are kept."""
-    setup = Setup(STUDY)
+    task = DesignTask.resolve(STUDY)
     recordings = [r for each in campaign.rounds for r in each.recordings]
-    alone = mjfim.identify(setup, recordings)
+    alone = identify_system(task.system, recordings)
     last = campaign.rounds[-1]
     np.testing.assert_allclose(last.estimate.theta, alone.theta, atol=1e-4 * alone.std.min())
     np.testing.assert_allclose(last.attained, alone.std, rtol=1e-4)
-    np.testing.assert_array_equal(campaign.rounds[0].theta, setup.parameters.guess)
+    np.testing.assert_array_equal(campaign.rounds[0].theta, task.parameters.guess)
     np.testing.assert_array_equal(last.theta, campaign.rounds[-2].estimate.theta)
     np.testing.assert_allclose(last.predicted, last.attained, rtol=0.05)
     assert (np.abs(campaign.rounds[0].predicted / campaign.rounds[0].attained - 1.0) > 0.1).any(), (
@@ -98,11 +101,10 @@ def test_a_round_is_what_its_parts_say(campaign: Campaign) -> None:
     assert len(campaign.designs) == len(campaign.estimates) == len(recordings)
 
 
-def gained(controls: Sequence[Array], truth: Setup) -> float:
+def gained(controls: Sequence[Array], truth: DesignTask) -> float:
     """Smallest eigenvalue of what the controls tell at the truth, over that of as many repetitions of the first."""
     told = [
-        mjfim.evaluate_trajectory(truth, truth.plant.simulate(truth.theta, c)).information
-        for c in controls
+        evaluate_task(truth, truth.plant.simulate(truth.theta, c)).information for c in controls
     ]
     return float(
         np.linalg.eigvalsh(np.sum(told, axis=0))[0] / np.linalg.eigvalsh(len(told) * told[0])[0]
@@ -110,7 +112,7 @@ def gained(controls: Sequence[Array], truth: Setup) -> float:
 
 
 def test_a_redesign_tells_more_than_the_first_design_again(
-    campaign: Campaign, truth: Setup
+    campaign: Campaign, truth: DesignTask
 ) -> None:
     """For about the same effort: information that is there already makes later rounds neither gentler nor wilder."""
     assert gained([r.control for r in campaign.rounds], truth) > 1.03
@@ -124,12 +126,12 @@ def test_a_redesign_is_at_the_estimate_on_the_same_scales(tmp_path: Path) -> Non
         "m": {"target": "body/bob:mass", "true": 1.4, "bounds": (0.5, 2.0)},
         "c": {"target": "joint/hinge:damping"},
     }
-    base = cart_setup(tmp_path, parameters=tables, cost={"linearize_at": "true"})
-    moved = Setup(restated(base, np.array([2.0, 0.1])))
+    base = cart_task(tmp_path, parameters=tables, cost={"linearize_at": "true"})
+    moved = DesignTask.resolve(restated(base, np.array([2.0, 0.1])))
     np.testing.assert_array_equal(moved.parameters.scale, base.parameters.scale)
     assert moved.theta[0] == pytest.approx(2.0 - 1e-3 * 1.5) and moved.theta[1] == 0.1
     assert moved.experiment.parameters["m"].true is None
-    np.testing.assert_array_equal(Setup(restated(base)).theta, base.parameters.guess)
+    np.testing.assert_array_equal(DesignTask.resolve(restated(base)).theta, base.parameters.guess)
 
 
 def test_a_whole_inertia_moves_where_the_recordings_show_it(tmp_path: Path) -> None:
@@ -139,20 +141,21 @@ def test_a_whole_inertia_moves_where_the_recordings_show_it(tmp_path: Path) -> N
         "bob": {"inertial": "bob", "coordinates": "barycentric"},
         "d": {"target": "joint/slide:damping"},
     }
-    base = cart_setup(tmp_path, parameters=tables)
+    base = cart_task(tmp_path, parameters=tables)
     p = base.parameters
     theta = p.guess + 0.01 * p.magnitude
-    estimate = mjfim.identify(
-        cart_setup(tmp_path), [mjfim.simulate(cart_setup(tmp_path), cart_setup(tmp_path).initial)]
+    estimate = identify_system(
+        cart_task(tmp_path).system,
+        [simulate_system(cart_task(tmp_path).system, cart_task(tmp_path).initial)],
     )
     shown = replace(estimate, data=np.diag(1e4 / p.magnitude**2), std=0.01 * p.magnitude)
-    moved = Setup(restated(base, theta, shown))
+    moved = DesignTask.resolve(restated(base, theta, shown))
     assert moved.parameters.names == p.names
     np.testing.assert_allclose(moved.theta, theta)
     np.testing.assert_allclose(moved.parameters.scale, p.scale)
     hidden = np.array(shown.data)
     hidden[3, 3] = 0.0
-    kept = Setup(restated(base, theta, replace(shown, data=hidden)))
+    kept = DesignTask.resolve(restated(base, theta, replace(shown, data=hidden)))
     np.testing.assert_allclose(kept.theta[1:11], p.guess[1:11])
     np.testing.assert_allclose(kept.theta[[0, 11]], theta[[0, 11]])
 
@@ -160,8 +163,10 @@ def test_a_whole_inertia_moves_where_the_recordings_show_it(tmp_path: Path) -> N
 def test_robust_redesigns_sample_what_is_known_by_now(campaign: Campaign) -> None:
     wide = STUDY.replace(robust={"samples": 6})
     last = campaign.rounds[0].estimate
-    pool = Setup(restated(Setup(wide), last.theta, last)).pool
-    before = Setup(wide).pool
+    pool = DesignTask.resolve(
+        restated(DesignTask.resolve(wide), last.theta, last)
+    ).samples_of_parameters
+    before = DesignTask.resolve(wide).samples_of_parameters
     assert pool is not None and before is not None
     assert (np.abs(pool.thetas - last.theta) <= 2.51 * last.std).all()
     assert np.ptp(before.thetas, axis=0).min() > 10 * np.ptp(pool.thetas, axis=0).max()
@@ -283,7 +288,7 @@ def test_without_a_design_at_the_estimate_the_last_place_serves(
 ) -> None:
     first, asked = campaign.rounds[0], []
 
-    def fails_once(base: Setup, past: object, theta: Array, *rest: object) -> Design:
+    def fails_once(base: DesignTask, past: object, theta: Array, *rest: object) -> Design:
         asked.append(theta)
         if len(asked) == 1:
             raise SimulationDivergedError("too fast")
@@ -326,12 +331,12 @@ def test_each_recording_has_its_own_start() -> None:
     j = last.estimate.parameters.index("initial qpos:slide")
     assert not last.estimate.data[j].any()
     assert found.designs[1].prior[j, j] == pytest.approx(0.05**-2)
-    error = (last.estimate.theta - Setup(loose).parameters.true)[:3]
+    error = (last.estimate.theta - DesignTask.resolve(loose).parameters.true)[:3]
     assert (np.abs(error) < 3.5 * last.attained[:3]).all()
 
 
 @pytest.mark.slow
-def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: Setup) -> None:
+def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: DesignTask) -> None:
     limited = STUDY.replace(
         limits={"control": {"force": (-12.0, 12.0)}, "position": {"slide": (-1.0, 1.0)}},
         cost={"control": 0.0, "tracking": {}},

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.experiment.system import Setup
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.residuals import Fit
 from mjfim.information.fisher import Information
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import as_json
-from mjfim.studies.check import check
-from tests.support.numerics import CART_PARAMETERS, Array, cart_setup, make_setup, relative_error
+from mjfim.studies.check import check, check_recordings, check_task
+from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task, relative_error
 from tests.support.paths import MODELS, SHARED_DATA
 
 RECORDED = SHARED_DATA / "dfki_double_pendulum"
@@ -38,7 +40,7 @@ BLOCK = """
 
 
 def test_sigmas_are_the_square_roots_of_the_inverse_information(tmp_path) -> None:
-    found = check(cart_setup(tmp_path))
+    found = check_task(cart_task(tmp_path))
     expected = np.sqrt(np.diag(np.linalg.inv(found.information)))
     np.testing.assert_allclose([row.std for row in found.rows], expected, rtol=1e-8)
     np.testing.assert_allclose(
@@ -54,10 +56,10 @@ def test_sigmas_are_those_of_evaluate_trajectory_also_with_priors_and_nuisance(t
         **CART_PARAMETERS,
         "gain": {"target": "actuator/force:gainprm[0]", "nuisance": True, "prior": 0.1},
     }
-    setup = cart_setup(
+    task = cart_task(
         tmp_path, parameters=parameters, nuisance={"initial": 0.02, "bias": {"qpos:hinge": True}}
     )
-    found, told = check(setup), mjfim.evaluate_trajectory(setup, setup.initial)
+    found, told = check_task(task), evaluate_task(task, task.initial)
     wanted = [row.std for row in found.rows if not row.nuisance]
     np.testing.assert_allclose(wanted, told.std[:3], rtol=1e-6)
     assert found.wanted == ("m", "l", "c")
@@ -70,7 +72,7 @@ def test_a_product_is_told_with_its_combination(tmp_path) -> None:
         **PRODUCT,
         "gear": {"target": "actuator/force:gear[0]", "guess": 4.0},
     }
-    found = check(cart_setup(tmp_path, parameters=parameters))
+    found = check_task(cart_task(tmp_path, parameters=parameters))
     assert not found.ok
     assert len(found.not_separable) == 1
     group = found.not_separable[0]
@@ -95,7 +97,7 @@ def test_what_another_control_would_show_is_told_apart_from_what_none_would(tmp_
         "qvel": (0.0, 0.0),
         "control": {"kind": "constant", "amplitude": 0.0},
     }
-    found = check(cart_setup(tmp_path, initial=rest, parameters=CART_PARAMETERS))
+    found = check_task(cart_task(tmp_path, initial=rest, parameters=CART_PARAMETERS))
     assert not found.not_separable
     assert {name for group in found.not_excited for name in group.members} == {"m", "l", "c"}
     assert not found.ok
@@ -103,12 +105,12 @@ def test_what_another_control_would_show_is_told_apart_from_what_none_would(tmp_
 
 
 def test_repetitions_are_the_least_that_reach_the_wanted_sigma(tmp_path) -> None:
-    single = {row.name: row.std for row in check(cart_setup(tmp_path)).rows}
+    single = {row.name: row.std for row in check_task(cart_task(tmp_path)).rows}
     wanted = {"m": single["m"] / 3.001, "l": 10.0 * single["l"], "c": single["c"] / 1.5}
     parameters = {
         name: {**table, "wanted": wanted[name]} for name, table in CART_PARAMETERS.items()
     }
-    rows = {row.name: row for row in check(cart_setup(tmp_path, parameters=parameters)).rows}
+    rows = {row.name: row for row in check_task(cart_task(tmp_path, parameters=parameters)).rows}
     assert {name: row.repetitions for name, row in rows.items()} == {"m": 10, "l": 1, "c": 3}
     assert rows["m"].seconds == pytest.approx(10 * 0.5)
 
@@ -119,23 +121,23 @@ def test_a_wanted_sigma_below_what_nuisance_allows_is_never_reached(tmp_path) ->
         "gravity": {"target": "option:gravity[2]", "nuisance": True, "prior": 0.1},
         **PRODUCT,
     }
-    rows = {row.name: row for row in check(cart_setup(tmp_path, parameters=parameters)).rows}
+    rows = {row.name: row for row in check_task(cart_task(tmp_path, parameters=parameters)).rows}
     assert rows["gear"].repetitions == 0  # only the product shows, however often
     assert rows["m"].repetitions > 1
 
 
 def test_recordings_add_up_and_missing_values_do_not_count(tmp_path) -> None:
-    setup = cart_setup(tmp_path)
-    whole = mjfim.simulate(setup, setup.initial, seed=1)
+    task = cart_task(tmp_path)
+    whole = simulate_system(task.system, task.initial, seed=1)
     thinned = np.array(whole.y)
     thinned[::2] = np.nan
     part = Recording(t=whole.t, ctrl=whole.ctrl, y=thinned, outputs=whole.outputs, name="half")
-    two = check(setup, [whole, part])
-    fit = Fit(setup, [whole, part], data_only=True)
-    J = fit.dense(fit.begin(setup.theta)).J
+    two = check_recordings(task.system, [whole, part])
+    fit = Fit(task.system, [whole, part], data_only=True)
+    J = fit.dense(fit.begin(task.theta)).J
     assert relative_error(two.information, J.T @ J) < 1e-6
-    alone = check(setup, [whole])
-    assert relative_error(alone.information, check(setup).information) < 1e-6
+    alone = check_recordings(task.system, [whole])
+    assert relative_error(alone.information, check_task(task).information) < 1e-6
     ratio = np.diag(two.information) / np.diag(alone.information)
     assert (ratio > 1.3).all() and (ratio < 1.7).all()
     assert two.source == "2 recordings"
@@ -143,10 +145,10 @@ def test_recordings_add_up_and_missing_values_do_not_count(tmp_path) -> None:
 
 
 def test_a_given_trajectory_is_looked_at_instead(tmp_path) -> None:
-    setup = cart_setup(tmp_path)
-    other = setup.plant.simulate(setup.theta, 2.0 * setup.control)
-    found = check(setup, trajectory=other)
-    told = mjfim.evaluate_trajectory(setup, other)
+    task = cart_task(tmp_path)
+    other = task.plant.simulate(task.theta, 2.0 * task.control)
+    found = check_task(task, trajectory=other)
+    told = evaluate_task(task, other)
     np.testing.assert_allclose([row.std for row in found.rows], told.std, rtol=1e-6)
 
 
@@ -156,28 +158,28 @@ def test_dry_friction_is_flagged_with_its_sample_and_cause(tmp_path) -> None:
         "friction": {"target": "joint/x:frictionloss"},
     }
     sine = {"kind": "sine", "amplitude": 4.0, "frequency": 1.0}
-    setup = make_setup(
+    task = make_task(
         BLOCK, tmp_path, parameters=parameters, control=sine, noise={"state": 0.01}, horizon=2.0
     )
-    found = check(setup)
+    found = check_task(task)
     assert not found.self_test.passed
     rough = found.self_test.roughness
     assert rough is not None
-    assert 0 < rough.sample <= setup.samples
+    assert 0 < rough.sample <= task.samples
     assert "dry friction of x" in rough.causes
     assert "not smooth" in found.verdict[0]
 
 
 def test_a_wrong_sensitivity_is_caught_by_the_recursion(tmp_path, monkeypatch) -> None:
-    setup = cart_setup(tmp_path)
-    right = setup.plant.derivatives.sensitivity
+    task = cart_task(tmp_path)
+    right = task.plant.derivatives.sensitivity
 
     def wrong(*arguments, **options):
         found = right(*arguments, **options)
         return replace(found, psi=found.psi * 1.01)
 
-    monkeypatch.setattr(setup.plant.derivatives, "sensitivity", wrong)
-    tested = check(setup).self_test
+    monkeypatch.setattr(task.plant.derivatives, "sensitivity", wrong)
+    tested = check_task(task).self_test
     assert tested.recursion == pytest.approx(0.01, rel=0.05)
     assert not tested.passed
 
@@ -190,7 +192,7 @@ def test_a_wrong_gradient_is_caught_by_the_slope(tmp_path, monkeypatch) -> None:
         return 1.05 * a, 1.05 * b
 
     monkeypatch.setattr(Information, "gradient", wrong)
-    tested = check(cart_setup(tmp_path)).self_test
+    tested = check_task(cart_task(tmp_path)).self_test
     assert 0.02 < tested.slope < 0.1
     assert not tested.passed
 
@@ -227,7 +229,7 @@ def test_recordings_of_the_real_double_pendulum_tell_the_same() -> None:
             )
         )
     experiment = mjfim.Experiment.from_file(MODELS / "double_pendulum.toml")
-    setup = Setup(experiment)
+    task = DesignTask.resolve(experiment)
     every = round(500 / experiment.rate)
     count = 1 + round(2.0 * experiment.rate)  # two seconds; later the motion is chaotic
     picked = {name: column[::every][:count] for name, column in columns.items()}
@@ -237,14 +239,14 @@ def test_recordings_of_the_real_double_pendulum_tell_the_same() -> None:
     recording = Recording(
         t=np.arange(count) / experiment.rate, ctrl=ctrl, y=y, outputs=names, name=file.name
     )
-    combinations = double_pendulum_groups(check(setup, [recording]))
+    combinations = double_pendulum_groups(check_recordings(task.system, [recording]))
     assert combinations["m1r1"]["m2"] == pytest.approx(0.3, rel=1e-3)
     assert combinations["I1"]["m2"] == pytest.approx(0.09, rel=1e-3)
 
 
 def test_the_summary_is_strict_json(tmp_path) -> None:
     parameters = {**CART_PARAMETERS, **PRODUCT}
-    text = as_json(check(cart_setup(tmp_path, parameters=parameters)).summary())
+    text = as_json(check_task(cart_task(tmp_path, parameters=parameters)).summary())
     assert "NaN" not in text
     assert "Infinity" not in text
     assert '"identifiable"' in text

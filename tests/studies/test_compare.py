@@ -15,8 +15,10 @@ from matplotlib.image import imread
 
 import mjfim
 from mjfim.errors import ExperimentError
+from mjfim.excitation.design import design_task
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import audit
-from mjfim.experiment.system import Setup
 from mjfim.output.plots.compare import compare_figure
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design, HistoryRow
@@ -103,43 +105,43 @@ def test_each_method_has_its_budget_and_the_design_comes_last() -> None:
 
 
 def test_rows_say_what_their_controls_do() -> None:
-    setup = Setup(pendulum())
+    task = DesignTask.resolve(pendulum())
     for r in small().rows:
         assert r.control is not None
-        trajectory = setup.plant.simulate(setup.theta, r.control)
-        told = mjfim.evaluate_trajectory(setup, trajectory)
+        trajectory = task.plant.simulate(task.theta, r.control)
+        told = evaluate_task(task, trajectory)
         np.testing.assert_allclose(r.std, told.std, rtol=1e-5)
         assert r.cost == pytest.approx(told.cost, rel=1e-5)
         assert r.criterion == pytest.approx(told.criterion, rel=1e-5)
-        scale = setup.parameters.scale
+        scale = task.parameters.scale
         worst = np.linalg.eigvalsh(told.information * np.outer(scale, scale))[0] ** -0.5
         assert r.worst_relative_std == pytest.approx(worst, rel=1e-5)
-        assert r.margins == audit(setup, trajectory).margins
+        assert r.margins == audit(task, trajectory).margins
         qpos, _, ctrl = played(pendulum(), r.control)
         assert np.abs(qpos[:, 0]).max() <= 0.5
         assert np.abs(ctrl).max() <= 5.0
 
 
 def test_a_control_that_leaks_is_shrunk_until_it_does_not() -> None:
-    setup, found = Setup(pendulum()), small().rows[0]
+    task, found = DesignTask.resolve(pendulum()), small().rows[0]
     assert found.control is not None
-    leaking = setup.centre + 1.15 * (found.control - setup.centre)
-    r = Judge(setup, None).row("chirp", "chirp", Attempt(leaking, 1.0))
+    leaking = task.centre + 1.15 * (found.control - task.centre)
+    r = Judge(task, None).row("chirp", "chirp", Attempt(leaking, 1.0))
     assert r.outcome is MethodOutcome.INSIDE
     assert "shrunk to" in r.note
     assert min(r.margins.values()) >= 0.0
-    far = Judge(setup, None).row("chirp", "chirp", Attempt(leaking, np.inf))
+    far = Judge(task, None).row("chirp", "chirp", Attempt(leaking, np.inf))
     assert far.outcome is MethodOutcome.NOTHING
     assert min(far.margins.values()) < 0.0
     assert not far.sound
-    nothing = Judge(setup, None).row("chirp", "chirp", Attempt())
+    nothing = Judge(task, None).row("chirp", "chirp", Attempt())
     assert (nothing.outcome, nothing.control) == (MethodOutcome.NONE, None)
 
 
 def test_the_designs_control_is_never_shrunk() -> None:
-    setup, found = Setup(pendulum()), small().rows[2]
+    task, found = DesignTask.resolve(pendulum()), small().rows[2]
     assert found.control is not None
-    r = Judge(setup, None).row(DESIGN, "design", Attempt(1.05 * found.control, 1.0))
+    r = Judge(task, None).row(DESIGN, "design", Attempt(1.05 * found.control, 1.0))
     assert r.outcome is MethodOutcome.OUTSIDE
 
 
@@ -183,9 +185,12 @@ def test_logarithms_are_compared_by_their_difference() -> None:
 
 
 def test_only_methods_that_make_sense() -> None:
-    hard, soft = Setup(pendulum()), Setup(pendulum(limits={}, cost={"control": 1e-3}))
+    hard, soft = (
+        DesignTask.resolve(pendulum()),
+        DesignTask.resolve(pendulum(limits={}, cost={"control": 1e-3})),
+    )
     assert "fourier5-mjfim" in chosen_methods(hard, None)
-    assert soft.enforced or "fourier5-mjfim" not in chosen_methods(soft, None)
+    assert soft.is_limited or "fourier5-mjfim" not in chosen_methods(soft, None)
     assert chosen_methods(hard, ["steps", "design", "steps"]) == ("steps",)
     with pytest.raises(ExperimentError, match="did you mean 'chirp'"):
         chosen_methods(hard, ["chrip"])
@@ -331,18 +336,18 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
         '"cart_pendulum.csv"', f'"{out / "control_chirp.csv"}"'
     )
     (study.parent / "next.toml").write_text(text, encoding="utf-8")
-    setup = Setup(mjfim.Experiment.from_file(study.parent / "next.toml"))
+    task = DesignTask.resolve(mjfim.Experiment.from_file(study.parent / "next.toml"))
     reached = next(m for m in read(out / "compare.json")["methods"] if m["method"] == "chirp")
-    assert setup.problem.point(setup.initial).cost == pytest.approx(reached["cost"], rel=1e-6)
+    assert task.problem.point(task.initial).cost == pytest.approx(reached["cost"], rel=1e-6)
 
 
 def worse(design: Callable[..., Design]) -> Callable[..., Design]:
     """A design that keeps where it started."""
 
-    def rigged(setup: Setup, *args: Any, **kwargs: Any) -> Design:
-        found = design(setup, *args, **kwargs)
-        gentle = setup.plant.simulate(setup.theta, 0.05 * setup.control)
-        return replace(found, final=mjfim.evaluate_trajectory(setup, gentle))
+    def rigged(task: DesignTask, *args: Any, **kwargs: Any) -> Design:
+        found = design_task(task, *args, **kwargs)
+        gentle = task.plant.simulate(task.theta, 0.05 * task.control)
+        return replace(found, final=evaluate_task(task, gentle))
 
     return rigged
 

@@ -8,12 +8,12 @@ from scipy.stats import chi2, kstest, norm
 
 import mjfim
 from mjfim.errors import ExperimentError, UnidentifiableError
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.simulate import simulate
-from mjfim.experiment.system import Setup
-from mjfim.identification.identify import identify
+from mjfim.experiment.simulate import simulate_system
+from mjfim.identification.identify import identify, identify_system
 from mjfim.records.recording import Recording
-from mjfim.studies.monte_carlo import _statistics, monte_carlo
+from mjfim.studies.monte_carlo import _statistics, monte_carlo, monte_carlo_system
 from tests.support.paths import ROOT
 
 # Table III of the paper, diagonal, initial trajectory, 25 Hz
@@ -51,17 +51,18 @@ def test_each_trial_is_its_own_least_squares_estimate(
     study = monte_carlo(
         experiment, {"initial": design.initial.trajectory}, trials=20, seed=5, measure_rate=25.0
     )
-    setup = Setup(experiment.replace(measure_rate=25.0))
+    task = DesignTask.resolve(experiment.replace(measure_rate=25.0))
     rng = np.random.default_rng(5).spawn(1)[0]
     ctrl, rows = design.initial.trajectory.ctrl, np.arange(4, 401, 4)
-    exact, _ = setup.plant.measure(setup.parameters.true[None], ctrl)
+    exact, _ = task.plant.measure(task.parameters.true[None], ctrl)
     noise = rng.standard_normal((20, 400)).reshape(20, 100, 4)
     std = np.sqrt(np.diag(study.sets["initial"].crlb))
     for i in range(5):
         y = np.full((401, 4), np.nan)
         y[rows] = exact[0, rows] + 0.05 * noise[i]
-        alone = identify(
-            setup, [Recording(t=np.arange(401) * 0.01, ctrl=ctrl, y=y, outputs=setup.outputs.names)]
+        alone = identify_system(
+            task.system,
+            [Recording(t=np.arange(401) * 0.01, ctrl=ctrl, y=y, outputs=task.system.outputs.names)],
         )
         np.testing.assert_array_less(
             np.abs(study.sets["initial"].estimates[i] - alone.theta), 0.01 * std
@@ -107,9 +108,11 @@ def test_failed_trials_are_counted_not_averaged() -> None:
 def test_simulated_noise_is_white_gaussian_of_the_stated_size(
     experiment: Experiment, design: mjfim.Design
 ) -> None:
-    setup = Setup(experiment)
-    exact, _ = setup.plant.measure(setup.parameters.true[None], design.trajectory.ctrl)
-    residual = ((simulate(setup, design.trajectory, seed=9).y - exact[0]) / 0.05).ravel()
+    task = DesignTask.resolve(experiment)
+    exact, _ = task.plant.measure(task.parameters.true[None], design.trajectory.ctrl)
+    residual = (
+        (simulate_system(task.system, design.trajectory, seed=9).y - exact[0]) / 0.05
+    ).ravel()
     assert 0.001 < chi2.cdf(residual @ residual, residual.size) < 0.999
     assert kstest(residual, norm.cdf).pvalue > 1e-3
 
@@ -127,21 +130,21 @@ VARIED = {
 def test_simulated_noise_is_correlated_and_sampled_as_stated(
     experiment: Experiment, design: mjfim.Design
 ) -> None:
-    setup = Setup(experiment.replace(**VARIED))
-    exact, _ = setup.plant.measure(setup.parameters.true[None], design.trajectory.ctrl)
+    task = DesignTask.resolve(experiment.replace(**VARIED))
+    exact, _ = task.plant.measure(task.parameters.true[None], design.trajectory.ctrl)
     residuals = np.stack(
-        [simulate(setup, design.trajectory, seed=s).y - exact[0] for s in range(8)]
+        [simulate_system(task.system, design.trajectory, seed=s).y - exact[0] for s in range(8)]
     )
-    for i, stride in enumerate(setup.noise.strides):
+    for i, stride in enumerate(task.system.noise.strides):
         np.testing.assert_array_equal(
             np.flatnonzero(np.isfinite(residuals[0, :, i])), np.arange(0, 401, stride)
         )
-    names = list(setup.outputs.names)
-    assert dict(zip(names, setup.noise.strides, strict=True))["qpos:hinge"] == 4
-    assert dict(zip(names, setup.noise.strides, strict=True))["hinge_velocity"] == 2
+    names = list(task.system.outputs.names)
+    assert dict(zip(names, task.system.noise.strides, strict=True))["qpos:hinge"] == 4
+    assert dict(zip(names, task.system.noise.strides, strict=True))["hinge_velocity"] == 2
     every = residuals[:, ::4].reshape(-1, len(names))
-    error = (every.T @ every / len(every) - setup.noise.covariance) / np.outer(
-        setup.noise.sigma, setup.noise.sigma
+    error = (every.T @ every / len(every) - task.system.noise.covariance) / np.outer(
+        task.system.noise.sigma, task.system.noise.sigma
     )
     assert np.abs(error).max() < 4.5 * np.sqrt(2.0 / len(every))
 
@@ -149,13 +152,13 @@ def test_simulated_noise_is_correlated_and_sampled_as_stated(
 def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estimates(
     experiment: Experiment, design: mjfim.Design
 ) -> None:
-    setup = Setup(
+    task = DesignTask.resolve(
         experiment.replace(**VARIED, nuisance={"bias": {"qpos:slide": 0.05}, "delay": 0.01})
     )
     curve = design.trajectory
-    study = monte_carlo(setup, {"final": curve}, trials=6, seed=5)
-    exact, _ = setup.plant.measure(setup.parameters.true[None], curve.ctrl)
-    mask = setup.noise.measured(400) > 0
+    study = monte_carlo_system(task.system, {"final": curve}, trials=6, seed=5)
+    exact, _ = task.plant.measure(task.parameters.true[None], curve.ctrl)
+    mask = task.system.noise.measured(400) > 0
     white = np.random.default_rng(5).spawn(1)[0].standard_normal((6, mask.sum()))
     std = np.sqrt(np.diag(study.sets["final"].crlb))
     unprejudiced = experiment.replace(
@@ -164,10 +167,14 @@ def test_trials_with_correlated_noise_rates_and_nuisance_are_least_squares_estim
     for i in range(3):
         z = np.zeros(mask.shape)
         z[mask] = white[i]
-        y = np.where(mask, exact[0] + z @ setup.noise.factor.T, np.nan)
+        y = np.where(mask, exact[0] + z @ task.system.noise.factor.T, np.nan)
         alone = identify(
             unprejudiced,
-            [Recording(t=np.arange(401) * 0.01, ctrl=curve.ctrl, y=y, outputs=setup.outputs.names)],
+            [
+                Recording(
+                    t=np.arange(401) * 0.01, ctrl=curve.ctrl, y=y, outputs=task.system.outputs.names
+                )
+            ],
         )
         np.testing.assert_array_less(
             np.abs(study.sets["final"].estimates[i] - alone.theta), 0.01 * std

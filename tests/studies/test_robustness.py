@@ -18,8 +18,9 @@ from scipy.stats import binom
 
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError
+from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import previous
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.model.coordinates import tangent_names
 from mjfim.optimize.lq import regulator
 from mjfim.output import archive
@@ -27,23 +28,23 @@ from mjfim.output.playback import design_columns, reference_columns, simulate_pl
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.playback import Playback
 from tests.support.cli import run_script
-from tests.support.numerics import Array, body_setup, cart_setup, filtered_setup
+from tests.support.numerics import Array, body_task, cart_task, filtered_task
 from tests.support.paths import ROOT
 
 FILTERED_FINE = {"rate": 50.0, "playback_rate": 100.0}  # of an engine at 200 Hz
 COARSE = {"rate": 25.0, "horizon": 0.8}  # of engines at 100 Hz
 BUILD: dict[str, Any] = {
-    "cart": lambda folder, **tables: cart_setup(folder, **{**COARSE, **tables}),
-    "body": lambda folder, **tables: body_setup(folder, **{**COARSE, **tables}),
-    "filtered": lambda folder, **tables: filtered_setup(folder, **{"rate": 50.0, **tables}),
+    "cart": lambda folder, **tables: cart_task(folder, **{**COARSE, **tables}),
+    "body": lambda folder, **tables: body_task(folder, **{**COARSE, **tables}),
+    "filtered": lambda folder, **tables: filtered_task(folder, **{"rate": 50.0, **tables}),
 }
 FINE = {"cart": 100.0, "body": 50.0, "filtered": 100.0}
 
 
-def gains(setup: Setup) -> Array:
+def gains(task: DesignTask) -> Array:
     """(N, nu, nx) of a regulator about the initial trajectory."""
-    A, B, _, _ = setup.plant.derivatives.jacobians(setup.theta, setup.initial)
-    return regulator(A, B, np.eye(setup.space.nx), np.eye(B.shape[2]), np.eye(setup.space.nx))
+    A, B, _, _ = task.plant.derivatives.jacobians(task.theta, task.initial)
+    return regulator(A, B, np.eye(task.space.nx), np.eye(B.shape[2]), np.eye(task.space.nx))
 
 
 def table(path: Path) -> dict[str, Array]:
@@ -54,10 +55,10 @@ def table(path: Path) -> dict[str, Array]:
     return dict(zip(header, values.T, strict=True))
 
 
-def written(setup: Setup, folder: Path) -> tuple[Path, Playback]:
+def written(task: DesignTask, folder: Path) -> tuple[Path, Playback]:
     """design.csv of the initial trajectory, with gains."""
-    played = simulate_playback(setup, setup.initial, gains(setup))
-    archive.write_table(folder / "design.csv", design_columns(played, setup))
+    played = simulate_playback(task.system, task.initial, gains(task))
+    archive.write_table(folder / "design.csv", design_columns(played, task.system))
     return folder / "design.csv", played
 
 
@@ -69,8 +70,8 @@ def starting(rows: dict[str, Array], prefix: str) -> Array:
 @pytest.mark.parametrize("kind", BUILD)
 def test_the_table_alone_replays_exactly(kind: str, tmp_path: Path) -> None:
     """A bare mj_step loop on the model file, fed from the CSV, walks through its positions, velocities and activations."""
-    setup = BUILD[kind](tmp_path, playback_rate=FINE[kind])
-    path, _ = written(setup, tmp_path)
+    task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
+    path, _ = written(task, tmp_path)
     rows = table(path)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     data = mujoco.MjData(model)
@@ -79,7 +80,7 @@ def test_the_table_alone_replays_exactly(kind: str, tmp_path: Path) -> None:
     data.qpos[:], data.qvel[:] = qpos[0], qvel[0]
     if model.na:
         data.act[:] = starting(rows, "act:")[0]
-    assert len(qpos) == round(setup.experiment.horizon * FINE[kind]) + 1
+    assert len(qpos) == round(task.experiment.horizon * FINE[kind]) + 1
     for k in range(len(ctrl) - 1):
         np.testing.assert_allclose(data.qpos, qpos[k], rtol=0, atol=1e-9)
         np.testing.assert_allclose(data.qvel, qvel[k], rtol=0, atol=1e-9)
@@ -93,14 +94,14 @@ def test_the_table_alone_replays_exactly(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", BUILD)
 def test_rows_at_samples_are_the_design(kind: str, tmp_path: Path) -> None:
     """However fast the controller, every sample of the design stands there to the last bit."""
-    setup = BUILD[kind](tmp_path, playback_rate=FINE[kind])
-    stride = round(FINE[kind] / setup.experiment.rate)
-    played = simulate_playback(setup, setup.initial, gains(setup))
+    task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
+    stride = round(FINE[kind] / task.experiment.rate)
+    played = simulate_playback(task, task.initial, gains(task))
     assert stride > 1
-    np.testing.assert_array_equal(played.state[::stride], setup.initial.state)
+    np.testing.assert_array_equal(played.state[::stride], task.initial.state)
     for first in range(stride):
-        np.testing.assert_array_equal(played.ctrl[first::stride], setup.initial.ctrl)
-        np.testing.assert_array_equal(played.gain[first::stride], gains(setup))
+        np.testing.assert_array_equal(played.ctrl[first::stride], task.initial.ctrl)
+        np.testing.assert_array_equal(played.gain[first::stride], gains(task))
 
 
 def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Array]:
@@ -136,40 +137,38 @@ def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Ar
 @pytest.mark.parametrize("kind", BUILD)
 def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: Path) -> None:
     """On the plan it changes nothing; pushed off it, it is the engine's own loop with the arrays of design.npz."""
-    setup = BUILD[kind](tmp_path)
-    path, played = written(setup, tmp_path)
-    nx = setup.space.nx
+    task = BUILD[kind](tmp_path)
+    path, played = written(task, tmp_path)
+    nx = task.space.nx
     states, used, plan = closed_loop(path, tmp_path, np.zeros(nx))
     np.testing.assert_allclose(states, plan, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(used, setup.initial.ctrl, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(used, task.initial.ctrl, rtol=0, atol=1e-9)
     push = 0.02 * np.random.default_rng(1).standard_normal(nx)
     states, used, _ = closed_loop(path, tmp_path, push)
-    model = setup.plant.model(setup.theta)
-    reference = np.array(setup.initial.state)
-    expected = engine_loop(
-        setup, model, setup.space.plus(reference[0], push), reference, played.gain
-    )
+    model = task.plant.model(task.theta)
+    reference = np.array(task.initial.state)
+    expected = engine_loop(task, model, task.space.plus(reference[0], push), reference, played.gain)
     np.testing.assert_allclose(states, expected, rtol=0, atol=1e-9)
-    assert np.abs(used - setup.initial.ctrl).max() > 1e-3
+    assert np.abs(used - task.initial.ctrl).max() > 1e-3
 
 
-def engine_loop(setup: Setup, model: Any, start: Array, reference: Array, K: Array) -> Array:
+def engine_loop(task: DesignTask, model: Any, start: Array, reference: Array, K: Array) -> Array:
     """The same loop by single steps of the batch engine, deviations by `StateSpace.minus`."""
     states = [start]
     for k in range(len(K)):
-        u = setup.initial.ctrl[k] + K[k] @ setup.space.minus(reference[k], states[-1])
-        states.append(setup.plant.simulator.step([model], states[-1][None], u[None]).states[0])
+        u = task.initial.ctrl[k] + K[k] @ task.space.minus(reference[k], states[-1])
+        states.append(task.plant.simulator.step([model], states[-1][None], u[None]).states[0])
     return np.array(states)
 
 
 def test_gains_of_the_samples_serve_a_faster_controller(tmp_path: Path) -> None:
     """A cart that is put elsewhere comes back to the plan; open loop it stays away."""
-    setup = BUILD["cart"](tmp_path, playback_rate=100.0, horizon=4.0)
-    path, _ = written(setup, tmp_path)
+    task = BUILD["cart"](tmp_path, playback_rate=100.0, horizon=4.0)
+    path, _ = written(task, tmp_path)
     push = np.array([0.3, 0.0, 0.0, 0.0])
     states, _, plan = closed_loop(path, tmp_path, push)
-    model, start = setup.plant.model(setup.theta), setup.space.plus(setup.initial.state[:1], push)
-    alone = setup.plant.simulator.rollout([model], start, setup.initial.ctrl[None]).states[0]
+    model, start = task.plant.model(task.theta), task.space.plus(task.initial.state[:1], push)
+    alone = task.plant.simulator.rollout([model], start, task.initial.ctrl[None]).states[0]
     assert abs(alone[-1, 0] - plan[-1, 0]) == pytest.approx(0.3, rel=1e-6)
     assert abs(states[-1, 0] - plan[-1, 0]) < 0.1
 
@@ -195,9 +194,9 @@ def test_gain_columns_name_what_they_act_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", BUILD)
 def test_reference_is_what_mujoco_says(kind: str, tmp_path: Path) -> None:
     """Accelerations and joint forces are those of mj_forward at each row, not differences; no field is empty."""
-    setup = BUILD[kind](tmp_path, playback_rate=FINE[kind])
-    played = simulate_playback(setup, setup.initial, gains(setup))
-    archive.write_table(tmp_path / "reference.csv", reference_columns(played, setup))
+    task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
+    played = simulate_playback(task, task.initial, gains(task))
+    archive.write_table(tmp_path / "reference.csv", reference_columns(played, task.system))
     rows = table(tmp_path / "reference.csv")
     assert all(np.isfinite(values).all() for values in rows.values())
     kinds = [name.partition(":")[0] for name in rows]
@@ -206,34 +205,34 @@ def test_reference_is_what_mujoco_says(kind: str, tmp_path: Path) -> None:
     data = mujoco.MjData(model)
     qacc, force = starting(rows, "qacc:"), starting(rows, "force:")
     for k in (0, 3, len(qacc) - 1):
-        data.qpos[:], data.qvel[:], data.act[:] = setup.space.split(played.state[k])
+        data.qpos[:], data.qvel[:], data.act[:] = task.space.split(played.state[k])
         data.ctrl[:] = played.ctrl[min(k, len(played.ctrl) - 1)]
         mujoco.mj_forward(model, data)
         np.testing.assert_allclose(qacc[k], data.qacc, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(force[k], data.qfrc_actuator, rtol=1e-9, atol=1e-12)
-    np.testing.assert_array_equal(starting(rows, "qpos:"), played.state[:, : setup.space.nq])
+    np.testing.assert_array_equal(starting(rows, "qpos:"), played.state[:, : task.space.nq])
 
 
 def test_a_design_leaves_both_tables(tmp_path: Path) -> None:
     """At the controller's rate; design.csv is a control to start from and an earlier design, gains and all."""
-    setup = BUILD["filtered"](
+    task = BUILD["filtered"](
         tmp_path, **FILTERED_FINE, descent={"max_iterations": 1}, cost={"control": 0.1}
     )
-    design = mjfim.design(setup)
-    archive.write_design(tmp_path / "out", design, setup)
+    design = design_task(task)
+    archive.write_design(tmp_path / "out", design, task.system)
     rows, motion = table(tmp_path / "out" / "design.csv"), table(tmp_path / "out" / "reference.csv")
-    assert len(rows["t"]) == len(motion["t"]) == 2 * setup.samples + 1
+    assert len(rows["t"]) == len(motion["t"]) == 2 * task.samples + 1
     np.testing.assert_array_equal(rows["qpos:hinge"], motion["qpos:hinge"])
     np.testing.assert_array_equal(rows["qpos:hinge"][::2], design.trajectory.qpos[:, 0])
     np.testing.assert_array_equal(
-        starting(rows, "gain:")[:-1:2], design.final.gain.reshape(setup.samples, -1)
+        starting(rows, "gain:")[:-1:2], design.final.gain.reshape(task.samples, -1)
     )
-    again = Setup(
-        setup.experiment.replace(initial={"control": str(tmp_path / "out" / "design.csv")})
+    again = DesignTask.resolve(
+        task.experiment.replace(initial={"control": str(tmp_path / "out" / "design.csv")})
     )
     np.testing.assert_array_equal(again.control, design.trajectory.ctrl)
     np.testing.assert_array_equal(
-        previous(setup, str(tmp_path / "out" / "design.csv")), design.trajectory.ctrl
+        previous(task, str(tmp_path / "out" / "design.csv")), design.trajectory.ctrl
     )
 
 
@@ -244,19 +243,19 @@ def test_playback_rate_must_fit(rate: float, tmp_path: Path) -> None:
         ExperimentError,
         match=r"playback_rate: .* multiple of rate \(50 Hz\).*200 Hz.*valid: 50, 100, 200",
     ):
-        filtered_setup(tmp_path, rate=50.0, playback_rate=rate)
+        filtered_task(tmp_path, rate=50.0, playback_rate=rate)
 
 
 @pytest.mark.parametrize("rate", [0.0, -50.0, "fast", float("nan")])
 def test_playback_rate_is_a_rate(rate: Any, tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match="playback_rate"):
-        filtered_setup(tmp_path, rate=50.0, playback_rate=rate)
+        filtered_task(tmp_path, rate=50.0, playback_rate=rate)
 
 
 def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     """All digits of states, controls and gains, whatever the rate."""
-    setup = BUILD["body"](tmp_path, playback_rate=50.0)
-    path, played = written(setup, tmp_path)
+    task = BUILD["body"](tmp_path, playback_rate=50.0)
+    path, played = written(task, tmp_path)
     found = read_playback(path, BUILD["body"](tmp_path).channels)
     for name in ("t", "state", "ctrl", "gain"):
         np.testing.assert_array_equal(getattr(found, name), getattr(played, name))
@@ -297,11 +296,11 @@ def change(path: Path, **fields: Any) -> None:
     ],
 )
 def test_a_damaged_table_is_refused(column: str, wrong: Any, words: str, tmp_path: Path) -> None:
-    setup = BUILD["filtered"](tmp_path)
-    path, _ = written(setup, tmp_path)
+    task = BUILD["filtered"](tmp_path)
+    path, _ = written(task, tmp_path)
     change(path, **{column: None if wrong is None else wrong(table(path)[column])})
     with pytest.raises(RecordingError, match=words):
-        read_playback(path, setup.channels)
+        read_playback(path, task.system.channels)
 
 
 @pytest.fixture(scope="module")
@@ -360,8 +359,8 @@ limits.velocity = {{ slide = 4.0, hinge = 9.0 }}
 """
     (home / "cart.toml").write_text(text, encoding="utf-8")
     experiment = mjfim.Experiment.from_file(home / "cart.toml")
-    setup = Setup(experiment, threads=1)
-    return experiment, written(setup, home)[0]
+    task = DesignTask.resolve(experiment, threads=1)
+    return experiment, written(task, home)[0]
 
 
 def bench_of(robots: ModuleType, cart: tuple[mjfim.Experiment, Path], **conditions: Any) -> Any:
@@ -375,9 +374,9 @@ def test_a_robot_is_what_a_bare_loop_says(
     """Wrong parameters written by hand, commands three steps late, limits at every engine step, noisy feedback."""
     bench = bench_of(robots, cart, feedback=feedback)
     rng = np.random.default_rng(3)
-    noise = bench.setup.noise.sample(len(bench.plan.t), rng)
+    noise = bench.task.system.noise.sample(len(bench.plan.t), rng)
     stands = ("initial qpos:slide", "initial qpos:hinge") if feedback else ("initial qpos:hinge",)
-    assert bench.setup.parameters.names == ("mass", "damping", "spring", *stands, "delay")
+    assert bench.task.parameters.names == ("mass", "damping", "spring", *stands, "delay")
     theta = np.array([0.8 * 1.2, 0.1 * 0.8, 4.0 * 1.2, *np.zeros(len(stands)), 0.015])
     recording, margins, start = bench.play(theta, noise, feedback)
     model = mujoco.MjModel.from_xml_string(CART)
@@ -426,7 +425,7 @@ def test_without_noise_the_truth_is_found(
     bench = bench_of(robots, cart, feedback=feedback, latency=latency, loudness=0.0)
     for number in range(3):
         run = bench.run(number)
-        off = run.theta[:3] / bench.setup.parameters.guess[:3]
+        off = run.theta[:3] / bench.task.parameters.guess[:3]
         np.testing.assert_allclose(np.abs(off - 1.0), 0.2, rtol=0, atol=1e-12)
         np.testing.assert_allclose(
             run.estimate, run.theta, rtol=0, atol=float((1e-4 * run.std).max())
@@ -508,15 +507,15 @@ def test_limits_that_the_plan_uses_up_are_missed(
 
 def test_a_start_on_the_move_takes_no_latency(robots: ModuleType, tmp_path: Path) -> None:
     """What was before the start would matter; without a latency it can be played."""
-    setup = BUILD["cart"](tmp_path, playback_rate=50.0)
-    path, _ = written(setup, tmp_path)
+    task = BUILD["cart"](tmp_path, playback_rate=50.0)
+    path, _ = written(task, tmp_path)
     with pytest.raises(ExperimentError, match=r"no control holds the start.*--latency 0"):
-        robots.Bench(setup.experiment, path, robots.Conditions(latency=0.01))
-    bench = robots.Bench(setup.experiment, path, robots.Conditions(latency=0.0, loudness=0.0))
+        robots.Bench(task.experiment, path, robots.Conditions(latency=0.01))
+    bench = robots.Bench(task.experiment, path, robots.Conditions(latency=0.0, loudness=0.0))
     run = bench.run(0)
     np.testing.assert_allclose(run.estimate, run.theta, rtol=0, atol=float((1e-3 * run.std).max()))
     with pytest.raises(ExperimentError, match="whole number of timesteps"):
-        robots.Bench(setup.experiment, path, robots.Conditions(latency=0.005))
+        robots.Bench(task.experiment, path, robots.Conditions(latency=0.005))
 
 
 def test_the_script_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: Path) -> None:

@@ -1,1 +1,1 @@
-"""Models, setups, reference computations and folders that several test modules use."""
+"""Models, tasks, reference computations and folders that several test modules use."""

@@ -7,8 +7,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from tests.support.numerics import Array
 from tests.support.paths import MODELS
 
@@ -33,12 +33,12 @@ def played(experiment: Experiment, control: Array) -> tuple[Array, Array, Array]
     Returns:
         Positions (n+1, nq), velocities (n+1, nv) and controls (n, nu) at all n engine steps.
     """
-    setup = Setup(experiment)
-    model = setup.model_at(setup.theta)
+    task = DesignTask.resolve(experiment)
+    model = task.system.model_at(task.theta)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key(experiment.initial.keyframe).id)
     qpos, qvel, ctrl = [data.qpos.copy()], [data.qvel.copy()], []
-    for u in np.repeat(control, setup.substeps, axis=0):
+    for u in np.repeat(control, task.system.grid.substeps, axis=0):
         data.ctrl[:] = u
         mujoco.mj_step(model, data)
         qpos.append(data.qpos.copy())

@@ -1,4 +1,4 @@
-"""Models and setups that tests of hard limits share."""
+"""Models and tasks that tests of hard limits share."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mjfim.experiment.system import Setup
-from tests.support.numerics import Array, cart_setup, make_setup
+from mjfim.excitation.task import DesignTask
+from tests.support.numerics import Array, cart_task, make_task
 
 # An arm of two servos on a floating hull: the addresses of positions, velocities, joints and actuators all differ.
 # One servo has an activation state, the other a limited force; one joint limits the force of its actuators.
@@ -49,7 +49,7 @@ FLOATING_LIMITS = {
 }
 
 
-def floating_setup(folder: Path, integrator: str = "implicitfast", **tables: Any) -> Setup:
+def floating_task(folder: Path, integrator: str = "implicitfast", **tables: Any) -> DesignTask:
     """The floating arm, swinging: 0.3 s of five engine steps per sample; every state is measured."""
     tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
     control = {
@@ -73,7 +73,7 @@ def floating_setup(folder: Path, integrator: str = "implicitfast", **tables: Any
             "control": control,
         },
     }
-    return make_setup(FLOATING.format(integrator=integrator), folder, **{**defaults, **tables})
+    return make_task(FLOATING.format(integrator=integrator), folder, **{**defaults, **tables})
 
 
 # A planar arm of two torque-controlled servos over a floor, with a post in its way.
@@ -100,15 +100,15 @@ ARM = """
 """
 
 
-def directions_of(setup: Setup, count: int, seed: int = 0) -> Array:
+def directions_of(task: DesignTask, count: int, seed: int = 0) -> Array:
     """Random changes of the control, half of them smooth and half of them rough: (count, N, nu)."""
-    rng, t = np.random.default_rng(seed), setup.t[:, None] / setup.experiment.horizon
-    nu = setup.control.shape[1]
+    rng, t = np.random.default_rng(seed), task.t[:, None] / task.experiment.horizon
+    nu = task.control.shape[1]
     smooth = [
         np.sin(2 * np.pi * rng.uniform(0.5, 3.0, nu) * t + rng.uniform(0, 6, nu))
         for _ in range(count // 2)
     ]
-    return np.array([*smooth, *rng.normal(size=(count - count // 2, *setup.control.shape))])
+    return np.array([*smooth, *rng.normal(size=(count - count // 2, *task.control.shape))])
 
 
 # Limits that the cart-pendulum meets quickly.
@@ -119,7 +119,7 @@ HARD = {
 }
 
 
-def cart_inside(folder: Path, **tables: Any) -> Setup:
+def cart_inside(folder: Path, **tables: Any) -> DesignTask:
     """The cart-pendulum over one second under the limits `HARD`, without weights on control or state."""
     defaults: dict[str, Any] = {
         "horizon": 1.0,
@@ -127,4 +127,4 @@ def cart_inside(folder: Path, **tables: Any) -> Setup:
         "limits": HARD,
         "descent": {"max_iterations": 30},
     }
-    return cart_setup(folder, **{**defaults, **tables})
+    return cart_task(folder, **{**defaults, **tables})

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from tests.support.paths import SHARED_MODELS
 
 Array = NDArray[np.float64]
@@ -118,8 +118,8 @@ def shared_model(relative: str) -> Path:
     return path
 
 
-def make_setup(model: str | Path, folder: Path, **tables: Any) -> Setup:
-    """Setup of an experiment on an MJCF string (written into folder) or file. Default: 100 Hz, 0.5 s, a chirp."""
+def make_task(model: str | Path, folder: Path, **tables: Any) -> DesignTask:
+    """DesignTask of an experiment on an MJCF string (written into folder) or file. Default: 100 Hz, 0.5 s, a chirp."""
     path = model
     if isinstance(model, str):
         path = folder / "model.xml"
@@ -128,10 +128,10 @@ def make_setup(model: str | Path, folder: Path, **tables: Any) -> Setup:
     values = {"rate": 100.0, "horizon": 0.5, "initial": {"control": chirp}, **tables}
     if "control" in values:
         values["initial"] = {**values["initial"], "control": values.pop("control")}
-    return Setup(Experiment(model=str(path), **values), threads=1)
+    return DesignTask.resolve(Experiment(model=str(path), **values), threads=1)
 
 
-def cart_setup(folder: Path, integrator: str = "RK4", **tables: Any) -> Setup:
+def cart_task(folder: Path, integrator: str = "RK4", **tables: Any) -> DesignTask:
     """Cart-pendulum near hanging, all states measured."""
     control = {"kind": "sine", "amplitude": 4.0, "frequency": 0.9}
     defaults = {
@@ -139,10 +139,10 @@ def cart_setup(folder: Path, integrator: str = "RK4", **tables: Any) -> Setup:
         "noise": {"state": 0.05},
         "initial": {"qpos": (0.1, 3.0), "qvel": (0.0, 0.4), "control": control},
     }
-    return make_setup(CART_PENDULUM.format(integrator=integrator), folder, **{**defaults, **tables})
+    return make_task(CART_PENDULUM.format(integrator=integrator), folder, **{**defaults, **tables})
 
 
-def body_setup(folder: Path, integrator: str = "RK4", **tables: Any) -> Setup:
+def body_task(folder: Path, integrator: str = "RK4", **tables: Any) -> DesignTask:
     """Free body with a ball joint, seen by its sensors only, tumbling from the start."""
     spin = (0.2, -0.1, 0.3, 0.8, -0.5, 0.6, -0.4, 0.7, 0.3)
     tilt = np.array([0.9, 0.3, -0.2, 0.1]) / np.linalg.norm([0.9, 0.3, -0.2, 0.1])
@@ -152,14 +152,14 @@ def body_setup(folder: Path, integrator: str = "RK4", **tables: Any) -> Setup:
         "parameters": BODY_PARAMETERS,
         "initial": {"qpos": qpos, "qvel": spin, "control": control},
     }
-    return make_setup(FREE_BODY.format(integrator=integrator), folder, **{**defaults, **tables})
+    return make_task(FREE_BODY.format(integrator=integrator), folder, **{**defaults, **tables})
 
 
-def filtered_setup(folder: Path, integrator: str = "implicitfast", **tables: Any) -> Setup:
+def filtered_task(folder: Path, integrator: str = "implicitfast", **tables: Any) -> DesignTask:
     """A link behind a filtered motor: one activation state, two steps per sample."""
     control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.5, "offset": 0.5}
     defaults = {"parameters": FILTERED_PARAMETERS, "initial": {"act": (0.2,), "control": control}}
-    return make_setup(FILTERED.format(integrator=integrator), folder, **{**defaults, **tables})
+    return make_task(FILTERED.format(integrator=integrator), folder, **{**defaults, **tables})
 
 
 class Loop:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import mjfim
+from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Status
@@ -45,25 +45,25 @@ def experiment(case: str = "b", **descent: Any) -> Experiment:
 
 @pytest.mark.parametrize(("case", "place"), [("a", "true"), ("d", "guess")])
 def test_eigenvalues_of_the_initial_trajectory(case: str, place: str) -> None:
-    setup = Setup(experiment(case))
-    criterion = setup.problem.point(setup.initial).criterion
+    task = DesignTask.resolve(experiment(case))
+    criterion = task.problem.point(task.initial).criterion
     assert criterion is not None
     np.testing.assert_allclose(criterion.eigenvalues, EIGENVALUES[place], rtol=1e-5)
 
 
 def test_gradient_of_the_information_term() -> None:
-    setup = Setup(experiment("a"))
-    point = setup.problem.point(setup.initial, CENTRAL_DIFFERENCES)
+    task = DesignTask.resolve(experiment("a"))
+    point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     assert point.sensitivity is not None
     assert point.criterion is not None
-    bilinear = setup.plant.derivatives.bilinear(
-        setup.theta,
-        setup.initial,
+    bilinear = task.plant.derivatives.bilinear(
+        task.theta,
+        task.initial,
         point.sensitivity.psi,
         point.criterion.directions,
         CENTRAL_DIFFERENCES,
     )
-    a, b = setup.information.gradient(point.criterion, point.sensitivity, bilinear)
+    a, b = task.information.gradient(point.criterion, point.sensitivity, bilinear)
     gradient = Expansion(A=bilinear.A, B=bilinear.B, a=a, b=b).gradient(np.zeros((400, 1, 4)))[:, 0]
     assert np.linalg.norm(gradient) == pytest.approx(1.4318943623, rel=1e-4)
     np.testing.assert_allclose(

@@ -10,7 +10,7 @@ import pytest
 
 import mjfim
 from mjfim.arrays import Array
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from tests.support.numerics import Loop
 from tests.support.paths import MODELS
 
@@ -28,9 +28,9 @@ PARAMETERS = {
 }
 
 
-def tumbling() -> Setup:
+def tumbling() -> DesignTask:
     """One second of tumbling, driven by all four rotors."""
-    return Setup(
+    return DesignTask.resolve(
         mjfim.Experiment(
             model="quadrotor.xml",
             directory=MODELS,
@@ -64,17 +64,21 @@ def flown(
 
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_psi_of_a_tumbling_flight_is_that_of_re_simulation(name: str) -> None:
-    setup = tumbling()
-    curve, j = setup.initial, list(PARAMETERS).index(name)
+    task = tumbling()
+    curve, j = task.initial, list(PARAMETERS).index(name)
     turned = np.abs(curve.qvel[:, 3:]).max()
     assert turned > 3.0  # [rad/s] it does tumble
-    found = setup.plant.derivatives.sensitivity(setup.theta, curve)
+    found = task.plant.derivatives.sensitivity(task.theta, curve)
     assert found is not None
-    start, value = curve.state[0], setup.theta[j]
+    start, value = curve.state[0], task.theta[j]
 
     def difference(h: float) -> Array:
-        loop, up = flown(setup.model_path, {name: h}, curve.ctrl, start, setup.substeps)
-        _, down = flown(setup.model_path, {name: -h}, curve.ctrl, start, setup.substeps)
+        loop, up = flown(
+            task.system.model_path, {name: h}, curve.ctrl, start, task.system.grid.substeps
+        )
+        _, down = flown(
+            task.system.model_path, {name: -h}, curve.ctrl, start, task.system.grid.substeps
+        )
         return np.array([loop.minus(a, b) for a, b in zip(up, down, strict=True)]) / (
             2.0 * h * value
         )

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError
-from mjfim.experiment.system import Setup
+from mjfim.experiment.system import System
 from mjfim.model.loading import compile_spec, unconstrained
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.paths import MODEL_ARRAYS
@@ -58,14 +58,14 @@ ABSOLUTE_TOLERANCE = 1e-12
 INVERSE_WEIGHT = "body_invweight0"
 
 
-def write_identified(path: Path, setup: Setup, theta: Array) -> str | None:
+def write_identified(path: Path, system: System, theta: Array) -> str | None:
     """Write the user's MJCF with parameter values: the text with other numbers in it, with all their digits.
 
     Where the text cannot express the values, MuJoCo prints the model (six significant digits).
 
     Args:
         path: File that is written; its folder may differ from that of the model.
-        setup: The experiment with its model.
+        system: The experiment with its model.
         theta: (p,) parameter values.
 
     Returns:
@@ -74,13 +74,13 @@ def write_identified(path: Path, setup: Setup, theta: Array) -> str | None:
     Raises:
         ModelError: No MJCF expresses the values.
     """
-    wanted = setup.model_at(theta, placed=False)
+    wanted = system.model_at(theta, at_keyframe=False)
 
     remarks = []
     try:
-        stated = _write_edited(path, setup, theta, wanted)
+        stated = _write_edited(path, system, theta, wanted)
     except ModelError as error:
-        _write_printed(path, setup, theta, wanted)
+        _write_printed(path, system, theta, wanted)
         remarks.append(
             f"it is printed by MuJoCo, with six significant digits and without comments: {error}"
         )
@@ -101,17 +101,17 @@ def write_identified(path: Path, setup: Setup, theta: Array) -> str | None:
     return f"{path.name}: {'; '.join(remarks)}" if remarks else None
 
 
-def _write_edited(path: Path, setup: Setup, theta: Array, wanted: Any) -> list[str]:
+def _write_edited(path: Path, system: System, theta: Array, wanted: Any) -> list[str]:
     """Write the edited text; return the objects whose derived numbers had to be stated.
 
     Raises ModelError, with a clause that gives the reason, where the text cannot express the values.
     """
-    source = setup.model_path.resolve()
+    source = system.model_path.resolve()
     document = MjcfDocument(source.read_bytes())
-    relocate_assets(document, setup.spec, source.parent, path.resolve().parent)
+    relocate_assets(document, system.source.spec, source.parent, path.resolve().parent)
 
-    edits = ParameterEdits(document, setup.spec, setup.model, wanted)
-    edits.write_parameters(setup.parameters, theta)
+    edits = ParameterEdits(document, system.source.spec, system.model, wanted)
+    edits.write_parameters(system.parameters, theta)
 
     stated: list[str] = []
     with replacing(path) as temporary:
@@ -140,24 +140,24 @@ def _compiled(path: Path, document: MjcfDocument) -> Any:
         ) from None
 
 
-def _write_printed(path: Path, setup: Setup, theta: Array, wanted: Any) -> None:
+def _write_printed(path: Path, system: System, theta: Array, wanted: Any) -> None:
     """Write the model as MuJoCo prints it; refuse a print that compiles to another model."""
     # If the plain values are refused or give another model, derived numbers are stated as well.
     for states_derived in (False, True):
-        spec = setup.spec.copy()
+        spec = system.source.spec.copy()
         if states_derived:
-            state_derived_values(spec, setup.model)
+            state_derived_values(spec, system.model)
 
         try:
-            write_spec(spec, setup.model, wanted, setup.parameters, theta)
-            compiled = compile_spec(spec, setup.model_path)
+            write_spec(spec, system.model, wanted, system.parameters, theta)
+            compiled = compile_spec(spec, system.model_path)
         except (ValueError, ModelError) as error:
             if states_derived:
                 raise ModelError(f"{path}: MuJoCo refuses the identified values: {error}") from None
             continue
 
         if same_dynamics(compiled, wanted):
-            _save(path, spec, setup.model_path)
+            _save(path, spec, system.model_path)
             return
 
     raise ModelError(

@@ -12,9 +12,9 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.excitation.constraints import Fence, fence_of
 from mjfim.excitation.interior_point import WIDEST, InteriorPoint, InteriorProblem, seen
+from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
 from mjfim.experiment.schema import Experiment
-from mjfim.experiment.system import Setup
 from mjfim.parallel import stopped
 from mjfim.records.trajectory import Trajectory
 
@@ -76,18 +76,20 @@ class Arena:
 
     def __post_init__(self) -> None:
         self.clock, self.grace = time.perf_counter(), 0
-        plain = Setup(self.job.experiment, self.job.threads, added=self.job.added)
-        self.holds = plain.enforced
-        self.setup = plain.free() if self.holds else plain
-        self.begun = self.setup.plant.engine_steps
-        self.fence, self.centre = fence_of(self.setup), self.setup.centre
-        self.exact = Stage(self.setup, self.job.combinations).problem
+        plain = DesignTask.resolve(
+            self.job.experiment, threads=self.job.threads, added_information=self.job.added
+        )
+        self.holds = plain.is_limited
+        self.task = plain.relaxed() if self.holds else plain
+        self.begun = self.task.plant.engine_steps
+        self.fence, self.centre = fence_of(self.task), self.task.centre
+        self.exact = Stage(self.task, self.job.combinations).problem
         self.rng = np.random.default_rng((self.job.seed, *self.job.part))
 
     @property
     def used(self) -> float:
         """Share of the budget."""
-        taken = self.setup.plant.engine_steps - self.begun
+        taken = self.task.plant.engine_steps - self.begun
         return max((time.perf_counter() - self.clock) / self.job.seconds, taken / self.job.steps)
 
     def require(self, limit: float = 1.0) -> None:
@@ -101,7 +103,7 @@ class Arena:
     def finished(self) -> Attempt:
         """The attempt with what it took."""
         self.attempt.seconds = time.perf_counter() - self.clock
-        self.attempt.steps = self.setup.plant.engine_steps - self.begun
+        self.attempt.steps = self.task.plant.engine_steps - self.begun
         return self.attempt
 
     @cached_property
@@ -156,7 +158,7 @@ class Arena:
 
     def _first(self, swing: Array, scales: Array) -> int | None:
         """Index of the first of falling scales at which all limits hold."""
-        plant, theta = self.setup.plant, self.setup.theta
+        plant, theta = self.task.plant, self.task.theta
         ctrl = self.centre + scales[:, None, None] * swing
         start = np.repeat(plant.initial_state(theta)[None], len(scales), axis=0)
         out = plant.simulator.rollout([plant.model(theta)], start, ctrl, self.fence.observations)

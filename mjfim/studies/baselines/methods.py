@@ -16,7 +16,6 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.excitation.constraints import basis_of
-from mjfim.excitation.initial_controls import swell
 from mjfim.signals import Chirp, Excitation, ExcitationSettings, Multisine, RandomSteps
 from mjfim.studies.baselines.budget import Arena, Attempt, Job, Monitor, Spent
 from mjfim.studies.baselines.parametric import (
@@ -97,22 +96,22 @@ class Shaper:
 
     def __init__(self, arena: Arena) -> None:
         self.arena = arena
-        setup, fence = arena.setup, arena.fence
-        e = setup.experiment
-        fastest = min(e.limits.bandwidth or np.inf, 0.25 * e.rate, CYCLES / e.horizon)
+        task, fence = arena.task, arena.fence
+        e = task.experiment
+        fastest = min(e.limits.bandwidth or np.inf, 0.25 * e.rate, CYCLES / task.horizon)
         jumps = fence.rate is None and e.limits.bandwidth is None and e.boundary.start != "rest"
         self.frame = ExcitationSettings(
-            t=setup.t,
-            horizon=e.horizon,
-            nu=len(setup.controls),
-            min_frequency=min(0.5 / e.horizon, fastest),
+            t=task.t,
+            horizon=task.horizon,
+            nu=len(task.controls),
+            min_frequency=min(0.5 / task.horizon, fastest),
             max_frequency=fastest,
             may_jump=jumps,
         )
-        self.weighted = bool(setup.control_weight.any() or setup.tracking.any()) or not arena.holds
+        self.weighted = bool(task.control_weight.any() or task.tracking.any()) or not arena.holds
         self.most = BOUNDED if np.isfinite(fence.control.lower).all() else LARGEST
-        self.window = swell(setup)
-        self.basis = basis_of(setup, setup.t)
+        self.window = task.fade(task.samples)
+        self.basis = basis_of(task, task.t)
         self.fit = None if self.basis is None else np.linalg.pinv(self.basis)
 
     def swing(self, wave: Array) -> Array:

@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.constrained import Chase, Task, pursue, smoothed
+from mjfim.excitation.constrained import Chase, ConstrainedSearch, pursue, smoothed
 from mjfim.excitation.constraints import splines_of
 from mjfim.excitation.initial_controls import Start
 from mjfim.excitation.interior_point import (
@@ -79,25 +79,29 @@ Optimiser = Callable[
 
 def fourier(arena: Arena, harmonics: int) -> Iterator[Series]:
     """Finite Fourier series (Swevers et al. 1997) of the usual base frequencies, then of any."""
-    e = arena.setup.experiment
+    e = arena.task.experiment
     fastest = e.limits.bandwidth or 0.5 * e.rate
     rest = (e.boundary.start == "rest", e.boundary.end == "rest")
 
     def made(frequency: float) -> Array:
         count = max(min(harmonics, int(fastest / frequency + 1e-9)), 1)
-        return independent_curves(fourier_basis(arena.setup.t, e.horizon, frequency, count, *rest))
+        return independent_curves(
+            fourier_basis(arena.task.t, arena.task.horizon, frequency, count, *rest)
+        )
 
-    ends = tuple(min(periods / e.horizon, fastest / min(harmonics, BUSIEST)) for periods in PERIODS)
+    ends = tuple(
+        min(periods / arena.task.horizon, fastest / min(harmonics, BUSIEST)) for periods in PERIODS
+    )
     return _any(arena, [f for f in BASES if f <= fastest], ends, made)
 
 
 def splines(arena: Arena) -> Iterator[Series]:
     """Uniform cubic B-splines of the usual knots, then of any between."""
-    e = arena.setup.experiment
+    e = arena.task.experiment
     fastest = e.limits.bandwidth or 0.5 * e.rate
 
     def made(bandwidth: float) -> Array:
-        return independent_curves(splines_of(e, arena.setup.t, bandwidth))
+        return independent_curves(splines_of(arena.task, arena.task.t, bandwidth))
 
     ends = (min(0.5 * KNOTS[0], fastest), min(2.0 * KNOTS[-1], fastest))
     return _any(arena, [f for f in KNOTS if f <= fastest], ends, made)
@@ -110,7 +114,7 @@ def _any(
     i, n = arena.job.part
     for frequency in usual[i::n]:
         basis = made(frequency)
-        fitted = basis @ np.linalg.lstsq(basis, arena.setup.control - arena.centre)[0]
+        fitted = basis @ np.linalg.lstsq(basis, arena.task.control - arena.centre)[0]
         yield started(arena, f"{frequency:.3g} Hz", basis, fitted)
     size = arena.fence.control.scale
     while True:
@@ -182,7 +186,7 @@ def own(arena: Arena, series: Series, last: float, limit: float) -> None:
     )  # else sharper barriers would come too early
     start = Start(series.name, series.control, series.basis)
     rungs = Rungs(first=series.mu, last=last)
-    task = Task(
+    search = ConstrainedSearch(
         job.experiment,
         start,
         rungs,
@@ -192,7 +196,7 @@ def own(arena: Arena, series: Series, last: float, limit: float) -> None:
         job.added,
         threads=job.threads,
     )
-    for row in pursue(task, chase, arena.setup):
+    for row in pursue(search, chase, arena.task):
         series.mu = min(row.mu, series.mu)
         if chase.control is not None and chase.cost < series.cost:
             series.control, series.cost = chase.control, chase.cost
@@ -206,8 +210,8 @@ def own(arena: Arena, series: Series, last: float, limit: float) -> None:
 
 def scipy_own(arena: Arena, series: Series, last: float, limit: float) -> None:
     """Minimise the experiment's own cost."""
-    criterion = arena.setup.experiment.cost.criterion
-    base = smoothed(arena.setup, arena.job.combinations) if criterion == "E" else arena.exact
+    criterion = arena.task.experiment.cost.criterion
+    base = smoothed(arena.task, arena.job.combinations) if criterion == "E" else arena.exact
     Descent(arena, series, base, limit).run(Rungs(first=series.mu, last=last))
 
 
@@ -227,9 +231,9 @@ class Descent:
     def __init__(self, arena: Arena, series: Series, base: DesignProblem, limit: float) -> None:
         self.arena, self.series, self.base, self.limit = arena, series, base, limit
         self.ladder = Ladder(
-            base, arena.fence, arena.centre, series.basis, regulator_for(arena.setup)
+            base, arena.fence, arena.centre, series.basis, regulator_for(arena.task)
         )
-        self.K = np.zeros((len(series.basis), len(arena.centre), arena.setup.space.nx))
+        self.K = np.zeros((len(series.basis), len(arena.centre), arena.task.space.nx))
         self.s = np.zeros((series.basis.shape[1], len(arena.centre)))
 
     def run(self, rungs: Rungs) -> None:
@@ -333,13 +337,13 @@ class Descent:
 
     def _whitening(self, problem: InteriorProblem, point: InteriorPoint) -> Array:
         """Lower Cholesky factor of the barrier's Gauss-Newton Hessian and a ridge on the coefficients."""
-        setup, e = self.arena.setup, problem.expand(point)
+        task, e = self.arena.task, problem.expand(point)
         if e.barrier is None:
             raise ValueError("nothing to whiten with")
         N, w = len(self.series.basis), e.barrier.weights
         ridge = RIDGE / N / self.arena.fence.control.scale**2
         if problem.costs and point.point is not None and point.point.cost > 0.0:
-            ridge = ridge + setup.control_weight * setup.dt / point.point.cost
+            ridge = ridge + task.control_weight * task.dt / point.point.cost
         H = BasisMetric.from_weights(
             e, Weights(Q=w.Q, S=w.S, R=w.R + np.diag(ridge), W=w.W), self.series.basis
         ).H

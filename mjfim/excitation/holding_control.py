@@ -1,0 +1,78 @@
+"""The control that holds a state, found by Gauss-Newton steps on one sample of the plant."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError
+from mjfim.experiment.system import System
+from mjfim.model.coordinates import joint_names
+
+# Gauss-Newton steps; one is enough where forces are linear in the control.
+STEPS = 4
+
+# Difference step of the control, relative to its size.
+DIFFERENCE = 1e-4
+
+# Time for which the control has to keep the state below the velocity that `[boundary]` tolerates [s].
+HOLDING_TIME = 0.1
+
+
+def holding_control(system: System, state: Array, guess: Array, *, key: str, place: str) -> Array:
+    """Find the control that leaves a state unchanged, to the tolerance of the experiment's `[boundary]`.
+
+    Args:
+        system: The system; the plant is taken at its theta.
+        state: (ns,) state to hold.
+        guess: (nu,) control from which the search starts.
+        key: Key of the experiment file that asks for it, for the message.
+        place: Name of the state, for the message.
+
+    Returns:
+        (nu,) control.
+
+    Raises:
+        ExperimentError: No control holds the state.
+    """
+    plant, space = system.plant, system.space
+    control = np.array(guess)
+    size = np.maximum(np.abs(control), 1.0)
+
+    def drift(controls: Array) -> Array:
+        """(m, nx) change of the state over a sample under each of (m, nu) controls."""
+        held = np.broadcast_to(state, (len(controls), len(state)))
+        stepped = plant.simulator.step([plant.model(system.theta)], held, controls)
+        return space.minus(stepped.states, state)
+
+    for _ in range(STEPS):
+        moves = np.concatenate([np.zeros((1, len(control))), DIFFERENCE * np.diag(size)])
+        rows = drift(control + moves)
+        B = (rows[1:] - rows[0]).T / (DIFFERENCE * size)
+        control = control - np.linalg.lstsq(B, rows[0])[0]
+
+    _require_held(system, state, drift(control[None])[0], key, place)
+    return control
+
+
+def _require_held(system: System, state: Array, drift: Array, key: str, place: str) -> None:
+    """Raise ExperimentError where a state moves, or still accelerates. drift: (nx,) change over one sample."""
+    nv = system.space.nv
+    acceleration = np.abs(drift[nv : 2 * nv]) / system.dt
+    speed = np.abs(system.space.split(state)[1])
+
+    moves = bool(speed.any())
+    worst = int(np.argmax(speed if moves else acceleration))
+    tolerated = system.experiment.boundary.velocity
+    if acceleration[worst] * HOLDING_TIME <= tolerated and not moves:
+        return
+
+    model = system.model
+    name = joint_names(model)[int(model.dof_jntid[worst])]
+    fault = f"still accelerates by {acceleration[worst]:.3g} per s²"
+    if moves:
+        fault = f"moves at {speed[worst]:.3g} per s"
+    raise ExperimentError(
+        f"{key}: no control holds {place}: joint {name!r} {fault}; begin and end where the model can stand still "
+        '(qvel = 0, an equilibrium), or state start = "given", end = "free"'
+    )
