@@ -450,8 +450,10 @@ class BatchSimulator:
 
     def _on_time(self, time: Array, engine_steps: int, model: Any = None) -> np.ndarray:
         """True where a simulation ends at the expected time; MuJoCo resets the time of one that diverges."""
-        timestep = float((self.model if model is None else model).opt.timestep)
-        return np.asarray(np.abs(time - START_TIME - engine_steps * timestep) < 0.5 * timestep)
+        stepped = self.model if model is None else model
+        timestep = float(stepped.opt.timestep)
+        delay = np.abs(time - START_TIME - engine_steps * timestep)
+        return np.asarray(delay < 0.5 * timestep)
 
 
 def _is_accepted(ctrl: Array) -> np.ndarray:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.batch import Rollouts, SubstepObservations
 from mjfim.plant.delay import OutputDelay
 from mjfim.records.trajectory import Linearization, Sensitivity, Trajectory
 
@@ -110,13 +110,18 @@ class Bilinear:
     observation_jacobian: Array | None = None
 
 
-class _MovedSamples(NamedTuple):
-    """All samples of a trajectory, and copies of them that are moved along each coordinate of (x, u).
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _MovedSamples:
+    """All n samples of a trajectory, and copies of them that are moved along each coordinate of (x, u).
 
     There are c = nx+nu coordinates and m rows of moves: c forward ones, then c backward ones or a single zero row.
 
-    trajectory_states: (n, ns) states that are not moved;  states: (m*n, ns);  ctrl: (m*n, nu)
-    batch_shape: (m, n);  widths: (c, 1, 1) distance between forward and backward (or zero) move
+    Attributes:
+        trajectory_states: (n, ns) states that are not moved.
+        states: (m*n, ns) moved states.
+        ctrl: (m*n, nu) moved controls.
+        batch_shape: (m, n).
+        widths: (c, 1, 1) distance between the forward move and the backward or zero one [x-unit, u-unit].
     """
 
     trajectory_states: Array
@@ -126,7 +131,7 @@ class _MovedSamples(NamedTuple):
     widths: Array
 
     def unflatten(self, values: Array) -> Array:
-        """(..., m, n, k) from (... * m * n, k) values of the moved samples."""
+        """(b, m, n, ...) values of b batches of the moved samples from (b * m * n, ...)."""
         moves, samples = self.batch_shape
         batches = len(values) // (moves * samples)  # not -1: there may be no numbers per sample
         return values.reshape(batches, moves, samples, *values.shape[1:])
@@ -137,8 +142,17 @@ class _MovedSamples(NamedTuple):
         return np.asarray((values[:count] - values[count:]) / self.widths)
 
 
-class _Pair(NamedTuple):
-    """First and mixed differences (c, n, nx) of F, (c, n, nsensordata) of sensors and (N, substeps, w, c) of observations."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _PairDerivatives:
+    """Differences by the c coordinates of (x, u) of two steps at +-epsilon along (psi w, w).
+
+    Attributes:
+        first: (c, n, nx) first differences of F.
+        mixed: (c, n, nx) mixed differences of F.
+        sensor_first: (c, n, nsensordata) first differences of the sensors, or None without sensors.
+        sensor_mixed: (c, n, nsensordata) mixed differences of the sensors, or None without sensors.
+        observation_jacobian: (N, derivative substeps, w, c) first differences of the observations, or None.
+    """
 
     first: Array
     mixed: Array
@@ -147,12 +161,16 @@ class _Pair(NamedTuple):
     observation_jacobian: Array | None
 
 
-class _ResponseMoves(NamedTuple):
-    """Moves of theta and of the initial state whose rollouts give the derivatives of a response.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _ResponseMoves:
+    """Moves of theta and of the initial state whose rollouts give the derivatives of a response along q directions.
 
-    theta: (J, p) and initial_state: (J, nx): no move, q forward moves, and q backward ones if two-sided
-    moving: indices of the parameters among the q directions;  widths: (q,) distance between the moves of a quotient
-    central: True if two-sided
+    Attributes:
+        theta: (J, p) moves of theta: none, q forward ones, and q backward ones if two-sided [theta-unit].
+        initial_state: (J, nx) moves of the initial state, in the order of `theta` [x-unit].
+        moving: Indices of the parameters among the q directions, which come first.
+        widths: (q,) distance between the two moves of a quotient.
+        central: True for two-sided differences.
     """
 
     theta: Array
@@ -307,13 +325,9 @@ class Derivatives:
         sensors = None
         origin = np.zeros((N + 1, 0)) if states is None else states
         if len(moves):
-            starts = plant.space.plus(initial_state, moves @ plant.initial_state_derivative.T)
-            held = np.broadcast_to(ctrl, (len(moves), *ctrl.shape))
-            models, compiled = plant.try_models(theta + moves)
-            out = plant.simulator.rollout(models, starts, held)
-            if not (out.finite & compiled).all():
+            out = self._moved_rollouts(theta, initial_state, ctrl, moves)
+            if out is None:
                 return None
-
             if needs_origin:
                 origin = out.states[-1]
                 sensors = None if out.sensors is None else out.sensors[-1]
@@ -334,6 +348,20 @@ class Derivatives:
             G = delay.apply(G) + by_delay
             y = delay.apply(y)
         return y, Sensitivity(psi=psi, G=G)
+
+    def _moved_rollouts(
+        self, theta: Array, initial_state: Array, ctrl: Array, moves: Array
+    ) -> Rollouts | None:
+        """Rollouts under one control at theta plus each row of moves: (m, p), which also move the initial state.
+
+        None if one of them diverges or its model cannot be compiled.
+        """
+        plant = self.plant
+        starts = plant.space.plus(initial_state, moves @ plant.initial_state_derivative.T)
+        held = np.broadcast_to(ctrl, (len(moves), *ctrl.shape))
+        models, compiled = plant.try_models(theta + moves)
+        out = plant.simulator.rollout(models, starts, held)
+        return out if (out.finite & compiled).all() else None
 
     def responses(
         self,
@@ -413,13 +441,9 @@ class Derivatives:
         by_start = by_theta @ plant.initial_state_derivative.T
         by_start[len(moving) :] = step * start_directions.T
 
-        def sides(moves: Array) -> Array:
-            backward = -moves if central else moves[:0]
-            return np.concatenate([np.zeros((1, moves.shape[1])), moves, backward])
-
         return _ResponseMoves(
-            theta=sides(by_theta),
-            initial_state=sides(by_start),
+            theta=_with_origin(by_theta, central),
+            initial_state=_with_origin(by_start, central),
             moving=moving,
             widths=np.concatenate([h, np.full(k, step)]) * (2.0 if central else 1.0),
             central=central,
@@ -580,11 +604,13 @@ class Derivatives:
         self, theta: Array, states: Array, ctrl: Array, step: float
     ) -> tuple[Array, Array | None]:
         """Derivatives of single steps by theta: (p, n, nx) of the next state, (p, n, nsensordata) of sensors or None."""
-        p = len(theta)
         h = step * self.parameter_scale
-        models = self.plant.models(np.concatenate([theta + np.diag(h), theta - np.diag(h)]))
-        every_state = np.broadcast_to(states, (2 * p, *states.shape)).reshape(-1, states.shape[1])
-        every_ctrl = np.broadcast_to(ctrl, (2 * p, *ctrl.shape)).reshape(-1, self.plant.nu)
+        forward = theta + np.diag(h)
+        backward = theta - np.diag(h)
+        models = self.plant.models(np.concatenate([forward, backward]))
+
+        every_state = _tiled(states, len(models))
+        every_ctrl = _tiled(ctrl, len(models))
         return self._central_quotients(models, every_state, every_ctrl, 2.0 * h[:, None, None])
 
     def _central_quotients(
@@ -708,7 +734,7 @@ class Derivatives:
         w: Array,
         epsilon: float,
         observations: SubstepObservations | None,
-    ) -> _Pair:
+    ) -> _PairDerivatives:
         """Differences by (x, u) of the mean and of the quotient of two steps at +-epsilon along (psi w, w)."""
         plant, count = self.plant, len(moved.widths)
         shift = _tiled(epsilon * state_direction, moved.batch_shape[0])
@@ -736,8 +762,12 @@ class Derivatives:
             observed = moved.unflatten(stepped.observed)
             change = np.mean(observed[:, :count] - observed[:, count:], axis=0)
             jacobian = np.moveaxis((change / moved.widths[..., None])[:, :-1], 0, 3)
-        return _Pair(
-            rise / moved.widths, moved.quotient(slope), sensor_first, sensor_mixed, jacobian
+        return _PairDerivatives(
+            first=rise / moved.widths,
+            mixed=moved.quotient(slope),
+            sensor_first=sensor_first,
+            sensor_mixed=sensor_mixed,
+            observation_jacobian=jacobian,
         )
 
     def _shared_origin(
@@ -853,8 +883,15 @@ def _all_samples(trajectory: Trajectory) -> tuple[Array, Array]:
     return trajectory.state, np.concatenate([trajectory.ctrl, trajectory.ctrl[-1:]])
 
 
+def _with_origin(moves: Array, central: bool) -> Array:
+    """(J, k) moves of rollouts: none, the rows of moves: (q, k), and the opposite ones if differences are two-sided."""
+    origin = np.zeros((1, moves.shape[1]))
+    backward = -moves if central else moves[:0]
+    return np.concatenate([origin, moves, backward])
+
+
 def _tiled(curve: Array, count: int) -> Array:
-    """(count*n, nx) copies of a curve: (n, nx), one after the other."""
+    """(count*n, k) copies of a curve: (n, k), one after the other."""
     return np.broadcast_to(curve, (count, *curve.shape)).reshape(-1, curve.shape[1])
 
 
