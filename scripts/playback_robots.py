@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.constraints import SHOWN, fence_of
+from mjfim.excitation.constraints import SHOWN, constraint_set_of
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -113,7 +113,7 @@ class Bench:
             raise ExperimentError(
                 f"latency: {conditions.latency:g} s is no whole number of timesteps of {timestep:g} s"
             )
-        self.fence = fence_of(self.stated)
+        self.constraints = constraint_set_of(self.stated)
         self.limits = _looked_at(self.stated)
         self.rest = self._rest()
         self._simulator = BatchSimulator(
@@ -197,7 +197,9 @@ class Bench:
         u = self.plan.ctrl[row]
         if feedback:
             u = u + self.plan.gain[row] @ self._deviation(state, row)
-        return np.asarray(np.clip(u, self.fence.control.lower, self.fence.control.upper))
+        return np.asarray(
+            np.clip(u, self.constraints.control.lower, self.constraints.control.upper)
+        )
 
     def _deviation(self, state: Array, row: int) -> Array:
         """(nx,) planned minus measured; what is not measured counts as planned."""
@@ -351,7 +353,9 @@ class Bench:
         applied = np.concatenate(
             [np.tile(before, (self.late, 1)), np.repeat(sent, self.every, axis=0)]
         )
-        out = self._simulator.rollout([model], start[None], applied[None], self.fence.observations)
+        out = self._simulator.rollout(
+            [model], start[None], applied[None], self.constraints.observations
+        )
         if not out.finite[0] or out.observed is None:
             raise SimulationDivergedError("the robot's simulation diverges")
         last = M * self.every + 1
@@ -377,19 +381,23 @@ class Bench:
         self, shown: Array, sent: Array, before: Array, qpos: Array, feedback: bool
     ) -> Array:
         """(l,) in the order of the limits. shown, qpos: at every engine step;  sent: (M, nu)"""
-        fence, worst = self.fence, []
-        inside = fence.shown.margin(shown).min(axis=0, initial=np.inf) / fence.shown.scale
+        constraints, worst = self.constraints, []
+        inside = (
+            constraints.shown.margin(shown).min(axis=0, initial=np.inf) / constraints.shown.scale
+        )
         ahead = round(
-            fence.dt / self.plan.period
+            constraints.dt / self.plan.period
         )  # rates are over one sample, as they are in the design
-        after = sent[-1] if feedback or fence.after is None else fence.after
+        after = sent[-1] if feedback or constraints.after is None else constraints.after
         line = np.concatenate([np.tile(before, (ahead, 1)), sent, np.tile(after, (ahead, 1))])
-        rates = (line[ahead:] - line[:-ahead]) / fence.dt
+        rates = (line[ahead:] - line[:-ahead]) / constraints.dt
         for i, limit in enumerate(self.limits):
             if limit.kind in SHOWN:
                 worst.append(float(inside[i]))
-            elif limit.kind == "clearance" and fence.clearance is not None:
-                worst.append((fence.clearance.nearest(qpos)[0] - fence.least) / fence.least)
+            elif limit.kind == "clearance" and constraints.clearance is not None:
+                worst.append(
+                    (constraints.clearance.nearest(qpos)[0] - constraints.least) / constraints.least
+                )
             else:
                 u = (sent if limit.kind == "control" else rates)[:, limit.index]
                 worst.append(

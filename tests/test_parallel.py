@@ -20,7 +20,7 @@ import mjfim
 from mjfim import parallel as workers
 from mjfim.excitation import constrained as enclosed
 from mjfim.excitation.design import design_task
-from mjfim.excitation.interior_point import Ladder, Rung
+from mjfim.excitation.interior_point import BarrierIterate, InteriorPointMethod
 from mjfim.records.design import HistoryRow, Status
 from tests.support.cli import names, read, write_experiment
 from tests.support.limits import HARD, cart_inside
@@ -137,15 +137,17 @@ def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
 def test_a_start_that_breaks_does_not_end_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    climb = Ladder.climb
+    run = InteriorPointMethod.run
 
-    def broken(self: Ladder, control: np.ndarray, *rest: float) -> Iterator[Rung]:
+    def broken(
+        self: InteriorPointMethod, control: np.ndarray, *rest: float
+    ) -> Iterator[BarrierIterate]:
         if np.abs(control - task.control).max() > 1e-9:
             raise np.linalg.LinAlgError("singular")
-        yield from climb(self, control, *rest)
+        yield from run(self, control, *rest)
 
     task = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 20, "coarse": 1})
-    monkeypatch.setattr(enclosed.Ladder, "climb", broken)
+    monkeypatch.setattr(enclosed.InteriorPointMethod, "run", broken)
     design = design_task(task)
     assert [start.status is Status.INFEASIBLE for start in design.starts] == [False, True, True]
     assert design.final.cost < design.initial.cost

@@ -11,9 +11,14 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.constraints import Fence, basis_of, fence_of
+from mjfim.excitation.constraints import ConstraintSet, basis_of, constraint_set_of
 from mjfim.excitation.initial_controls import Start
-from mjfim.excitation.interior_point import Ladder, Rung, Rungs, seen
+from mjfim.excitation.interior_point import (
+    BarrierIterate,
+    BarrierSchedule,
+    InteriorPointMethod,
+    seen,
+)
 from mjfim.excitation.objective import DesignProblem, Point
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, regulator_for
@@ -42,7 +47,7 @@ class ConstrainedSearch:
 
     experiment: Experiment
     start: Start
-    rungs: Rungs
+    schedule: BarrierSchedule
     budget: int
     seconds: float = np.inf
     combinations: Array | None = None
@@ -88,33 +93,40 @@ def pursue(
     )
     basis = None if fine is None else independent_curves(task.averaged(fine))
     regulate = replace(regulator_for(task), feedback_threshold=CALM if basis is None else np.inf)
-    fence = fence_of(task).tightened(search.held)
-    ladder = Ladder(smooth, fence, task.centre, basis, regulate, search.rungs)
+    constraints = constraint_set_of(task).tightened(search.held)
+    barrier_weights = InteriorPointMethod(
+        smooth, constraints, task.centre, basis, regulate, search.schedule
+    )
     control = task.averaged(search.start.control)
-    for rung in _sound(ladder.climb(control, search.budget, clock + search.seconds), chase):
-        own = rung.iterate.point
+    for stage_iterate in _sound(
+        barrier_weights.run(control, search.budget, clock + search.seconds), chase
+    ):
+        own = stage_iterate.iterate.point
         point = None if own.point is None else exact.judged(_repeated(own.point, repeats))
-        chase.slope, chase.status = rung.iterate.slope, rung.status or Status.INTERRUPTED
+        chase.slope, chase.status = (
+            stage_iterate.iterate.slope,
+            stage_iterate.status or Status.INTERRUPTED,
+        )
         chase.steps = task.plant.engine_steps - begun
-        cost = np.inf if point is None or not rung.feasible else point.cost
+        cost = np.inf if point is None or not stage_iterate.feasible else point.cost
         if cost <= chase.cost:
             chase.control, chase.cost = np.tile(_stated(task, own.ctrl, fine), (repeats, 1)), cost
-        if rung.mended:
+        if stage_iterate.repaired:
             continue
-        row = _row(rung, point, 1.0 / task.dt, fence)
+        row = _row(stage_iterate, point, 1.0 / task.dt, constraints)
         row = replace(row, seconds=time.time() - search.begun, steps=chase.steps)
         chase.history += (row,)
         yield row
-    if chase.status is Status.INTERRUPTED and chase.history:  # the rungs asked for are done
+    if chase.status is Status.INTERRUPTED and chase.history:  # the schedule asked for are done
         chase.status = Status.MAX_ITERATIONS
     if not np.isfinite(chase.cost):
         chase.status = Status.INFEASIBLE
 
 
-def _sound(rungs: Iterator[Rung], chase: Chase) -> Iterator[Rung]:
+def _sound(schedule: Iterator[BarrierIterate], chase: Chase) -> Iterator[BarrierIterate]:
     """As far as numbers go: a start that leads beyond must not end the others."""
     try:
-        yield from rungs
+        yield from schedule
     except (SimulationDivergedError, np.linalg.LinAlgError):
         chase.status = Status.STALLED
 
@@ -143,13 +155,15 @@ def _stated(task: DesignTask, ctrl: Array, fine: Array | None) -> Array:
     )
 
 
-def _row(rung: Rung, point: Point | None, rate: float, fence: Fence) -> HistoryRow:
+def _row(
+    stage_iterate: BarrierIterate, point: Point | None, rate: float, constraints: ConstraintSet
+) -> HistoryRow:
     criterion = None if point is None else point.criterion
     value, smallest = (
         (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
     )
-    cost, i = (np.inf if point is None else point.cost), rung.iterate
-    margin = min(fence.shares(seen(i.point)).values(), default=np.nan)
+    cost, i = (np.inf if point is None else point.cost), stage_iterate.iterate
+    margin = min(constraints.shares(seen(i.point)).values(), default=np.nan)
     return HistoryRow(
         iteration=i.index,
         cost=cost,
@@ -160,7 +174,7 @@ def _row(rung: Rung, point: Point | None, rate: float, fence: Fence) -> HistoryR
         seconds=0.0,
         steps=0,
         rate=rate,
-        mu=rung.mu,
+        mu=stage_iterate.mu,
         margin=margin,
     )
 

@@ -52,7 +52,7 @@ def _dense(limits: list[Limit], count: int) -> Bounds | None:
     return Bounds.from_range(lower, upper)
 
 
-def fence_of(task: DesignTask, every: bool = False) -> Fence:
+def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
     """The limits that hold a design, or every stated one. Raises ExperimentError for what cannot be.
 
     Without limits.enforce only its boundary holds a design.
@@ -84,7 +84,7 @@ def fence_of(task: DesignTask, every: bool = False) -> Fence:
     if e.limits.clearance is not None and (every or e.limits.enforce):
         least = e.limits.clearance
         clearance = _kept_clear(task, least + REACH)
-    return Fence(
+    return ConstraintSet(
         space=task.space,
         dt=task.dt,
         observations=observations,
@@ -150,7 +150,7 @@ END_WEIGHT = 0.1  # of a condition at the end, over that of one that is held all
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class ConstraintValues:
     """What the limits look at along a trajectory.
 
     observed: (N, substeps, w);  distances: (N, m) [m] at the samples 1 ... N, or None
@@ -164,7 +164,7 @@ class Sight:
 
 
 @dataclass(frozen=True, eq=False)
-class Fence:
+class ConstraintSet:
     """The limits of an experiment.
 
     observations, shown: what is looked at within samples, its ranges (w,), and the kind of each
@@ -190,7 +190,7 @@ class Fence:
     clearance: GeomDistances | None = None
     least: float = 0.0
 
-    def tightened(self, shares: Mapping[str, float]) -> Fence:
+    def tightened(self, shares: Mapping[str, float]) -> ConstraintSet:
         """Some kinds held back from their bounds, by shares of half of their ranges."""
         inner = np.array([shares.get(kind, 0.0) for kind in self.kinds])
         end = [shares.get(kind, 0.0) for kind in ("end_position", "end_velocity")]
@@ -218,12 +218,12 @@ class Fence:
         """Positions, velocities and activations in the tangent space."""
         return self.space.nv, self.space.nv, self.space.na
 
-    def sight(self, trajectory: Trajectory, observed: Array, slopes: bool) -> Sight:
+    def evaluate(self, trajectory: Trajectory, observed: Array, slopes: bool) -> ConstraintValues:
         """Look at a trajectory. observed: (N, substeps, w) at every engine step"""
         if self.clearance is None:
-            return Sight(trajectory, observed)
+            return ConstraintValues(trajectory, observed)
         near = self.clearance(trajectory.qpos[1:], slopes)
-        return Sight(trajectory, observed, near.d, near.slope)
+        return ConstraintValues(trajectory, observed, near.d, near.slope)
 
     def rates(self, ctrl: Array) -> Array:
         """(N+1, nu) rates of the control into each sample and out of the last, zero where free."""
@@ -233,15 +233,15 @@ class Fence:
             last = ctrl[0]
         return np.diff(ctrl, axis=0, prepend=first[None], append=last[None]) / self.dt
 
-    def margins(self, sight: Sight) -> dict[str, float]:
+    def margins(self, values: ConstraintValues) -> dict[str, float]:
         """Worst margin of each kind, in its unit, negative outside."""
-        return self._worst(sight, relative=False)
+        return self._worst(values, relative=False)
 
-    def shares(self, sight: Sight) -> dict[str, float]:
+    def shares(self, values: ConstraintValues) -> dict[str, float]:
         """The same over half of the range of each."""
-        return self._worst(sight, relative=True)
+        return self._worst(values, relative=True)
 
-    def _worst(self, sight: Sight, relative: bool) -> dict[str, float]:
+    def _worst(self, values: ConstraintValues, relative: bool) -> dict[str, float]:
         worst: dict[str, float] = {}
 
         def tell(kind: str, margins: Array, scale: Array | float) -> None:
@@ -249,18 +249,18 @@ class Fence:
             if np.isfinite(margin):
                 worst[kind] = min(margin, worst.get(kind, margin))
 
-        shown, ctrl = self.shown.margin(sight.observed), sight.trajectory.ctrl
+        shown, ctrl = self.shown.margin(values.observed), values.trajectory.ctrl
         for i, kind in enumerate(self.kinds):
             tell(kind, shown[..., i], float(self.shown.scale[i]))
         tell("control", self.control.margin(ctrl), self.control.scale)
         if self.rate is not None:
             tell("control_rate", self.rate.margin(self.rates(ctrl)), self.rate.scale)
         if self.end is not None:
-            margin, nv = self.end.margin(self._ended(sight.trajectory)), self.space.nv
+            margin, nv = self.end.margin(self._ended(values.trajectory)), self.space.nv
             tell("end_position", margin[:nv], self.end.scale[:nv])
             tell("end_velocity", margin[nv : 2 * nv], self.end.scale[nv : 2 * nv])
-        if sight.distances is not None:
-            tell("clearance", sight.distances - self.least, self.least)
+        if values.distances is not None:
+            tell("clearance", values.distances - self.least, self.least)
         return worst
 
     def _ended(self, trajectory: Trajectory) -> Array:
@@ -272,18 +272,18 @@ class Fence:
         """Of a number that is held at every sample: the barrier is a mean over time."""
         return 1.0 / N
 
-    def value(self, sight: Sight, delta: float) -> float:
+    def value(self, values: ConstraintValues, delta: float) -> float:
         """The barrier."""
-        N, looked = len(sight.observed), np.array(self.observations.derivative_substeps) - 1
-        weight, ctrl = self._weight(N), sight.trajectory.ctrl
-        total = self.shown.barrier(sight.observed[:, looked], delta, weight / len(looked)).value
+        N, looked = len(values.observed), np.array(self.observations.derivative_substeps) - 1
+        weight, ctrl = self._weight(N), values.trajectory.ctrl
+        total = self.shown.barrier(values.observed[:, looked], delta, weight / len(looked)).value
         total += self.control.barrier(ctrl, delta, weight).value
         if self.rate is not None:
             total += self.rate.barrier(self.rates(ctrl), delta, weight).value
         if self.end is not None:
-            total += self.end.barrier(self._ended(sight.trajectory), delta, END_WEIGHT).value
-        if sight.distances is not None:
-            total += self._near(sight.distances).barrier(sight.distances, delta, weight).value
+            total += self.end.barrier(self._ended(values.trajectory), delta, END_WEIGHT).value
+        if values.distances is not None:
+            total += self._near(values.distances).barrier(values.distances, delta, weight).value
         return total
 
     def _near(self, distances: Array) -> Bounds:
@@ -297,12 +297,12 @@ class Fence:
             scale=np.full(m, self.clearance.reach - self.least),
         )
 
-    def expand(self, sight: Sight, rise: Array, delta: float) -> BarrierExpansion:
+    def expand(self, values: ConstraintValues, rise: Array, delta: float) -> BarrierExpansion:
         """Expansion about a trajectory. rise: (N, looked-at substeps, w, nx+nu) derivative of the observations"""
-        N, looked = len(sight.observed), np.array(self.observations.derivative_substeps) - 1
-        nx, ctrl = self.space.nx, sight.trajectory.ctrl
+        N, looked = len(values.observed), np.array(self.observations.derivative_substeps) - 1
+        nx, ctrl = self.space.nx, values.trajectory.ctrl
         nu, weight = ctrl.shape[1], self._weight(N)
-        barrier = self.shown.barrier(sight.observed[:, looked], delta, weight / len(looked))
+        barrier = self.shown.barrier(values.observed[:, looked], delta, weight / len(looked))
         both = np.einsum("kswi,ksw->ki", rise, barrier.slope)
         flat = rise.reshape(N, -1, nx + nu)
         H = np.swapaxes(flat * barrier.curvature.reshape(N, -1, 1), 1, 2) @ flat
@@ -325,21 +325,21 @@ class Fence:
                 b[-1] += barrier.slope[-1] / self.dt
                 W[-1] = 0.0
         if self.end is not None:
-            ended = self._ended(sight.trajectory)
+            ended = self._ended(values.trajectory)
             barrier, moved = (
                 self.end.barrier(ended, delta, END_WEIGHT),
                 self.space.minus_derivative(ended),
             )
             a[-1] += moved.T @ barrier.slope
             Q[-1] += moved.T @ (barrier.curvature[:, None] * moved)
-        if sight.distances is not None and sight.slopes is not None:
+        if values.distances is not None and values.slopes is not None:
             barrier, nv = (
-                self._near(sight.distances).barrier(sight.distances, delta, weight),
+                self._near(values.distances).barrier(values.distances, delta, weight),
                 self.space.nv,
             )
-            a[1:, :nv] += np.einsum("km,kmi->ki", barrier.slope, sight.slopes)
+            a[1:, :nv] += np.einsum("km,kmi->ki", barrier.slope, values.slopes)
             Q[1:, :nv, :nv] += (
-                np.swapaxes(sight.slopes * barrier.curvature[..., None], 1, 2) @ sight.slopes
+                np.swapaxes(values.slopes * barrier.curvature[..., None], 1, 2) @ values.slopes
             )
         step = np.full(nu, np.inf) if self.rate is None else self.rate.scale * self.dt
         return BarrierExpansion(

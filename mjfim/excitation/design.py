@@ -13,14 +13,14 @@ from threadpoolctl import threadpool_limits
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.constrained import Chase
-from mjfim.excitation.constraints import Fence, fence_of
+from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.evaluation import evaluate, fine_point, warnings_of
 from mjfim.excitation.initial_controls import Start, starts_of
-from mjfim.excitation.multistart import Contest
+from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.objective import Point
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import COARSEST, Run, Stage, borne, coarse_level, descend
-from mjfim.excitation.verification import audit, require_inside
+from mjfim.excitation.verification import require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
 from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.information.marginal import shared
@@ -66,7 +66,7 @@ def design_task(
     executor: Executor | None = None,
 ) -> Design:
     """Design the control of a resolved task. See `design`."""
-    require_inside(task)
+    require_feasible_start(task)
     clock, begun = time.perf_counter(), task.plant.engine_steps
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if start is not None:
@@ -117,9 +117,9 @@ def _free(
     starts: Iterable[Start],
     runs: list[Run],
     clock: float,
-    fence: Fence | None = None,
+    constraints: ConstraintSet | None = None,
 ) -> Generator[HistoryRow, None, None]:
-    """Descents without a barrier, from every start while there is time; with a fence, until one leaves it."""
+    """Descents without a barrier, from every start while there is time; with a constraints, until one leaves it."""
     task = stage.task
     until = clock + (task.experiment.descent.seconds or np.inf)
     coarse = coarse_level(task, first, stage.basis)
@@ -129,7 +129,7 @@ def _free(
         runs.append(Run(begin.name))
         elsewhere = sum(run.steps for run in runs)
         for row in descend(
-            [Stage(level, stage.basis) for level in levels], begin.whole, runs[-1], fence
+            [Stage(level, stage.basis) for level in levels], begin.whole, runs[-1], constraints
         ):
             spent = sum(level.plant.engine_steps for level in levels) - begun
             told = replace(row, seconds=time.perf_counter() - clock, steps=spent)
@@ -155,7 +155,7 @@ def _enclosed(
     """Descents inside the limits. Where soft weights alone keep them, there is no barrier to begin with."""
     task, starts, elsewhere = stage.task, list(starts), 0
     if _weighted(task):
-        yield from _free(stage, first, starts, runs, clock, fence_of(task))
+        yield from _free(stage, first, starts, runs, clock, constraint_set_of(task))
         if not runs[-1].outside:
             return
         left = runs.pop()
@@ -164,10 +164,12 @@ def _enclosed(
             starts[0] = Start(starts[0].name, left.control)
     free = task.relaxed()
     chases: list[Chase] = []
-    contest = Contest(Stage(free, stage.basis), _easier(Stage(free, stage.basis)), executor, clock)
+    multistart = Multistart(
+        Stage(free, stage.basis), _easier(Stage(free, stage.basis)), executor, clock
+    )
     try:
-        yield from contest.run(starts, chases)
-        yield from contest.prove(chases)
+        yield from multistart.run(starts, chases)
+        yield from multistart.prove(chases)
     finally:
         cut = any(chase.status is Status.INTERRUPTED for chase in chases)
         runs += [_settled(stage, chase, cut) for chase in chases]
@@ -229,7 +231,7 @@ def _coarser(stage: Stage, begin: Point, factor: int) -> Stage | None:
 
 
 def _settled(stage: Stage, chase: Chase, cut: bool) -> Run:
-    """What came of a start, on the plant as it is. cut: the contest was, before anybody looked at it there"""
+    """What came of a start, on the plant as it is. cut: the multistart was, before anybody looked at it there"""
     run = Run(
         chase.name, None, chase.control, chase.status, chase.slope, chase.history, steps=chase.steps
     )
@@ -238,7 +240,7 @@ def _settled(stage: Stage, chase: Chase, cut: bool) -> Run:
     run.inside = np.isfinite(chase.cost)
     if cut:
         found = None if run.point is None else run.point.trajectory
-        run.inside = found is not None and audit(stage.task, found).kept
+        run.inside = found is not None and verify(stage.task, found).kept
     return run
 
 
@@ -264,7 +266,7 @@ def _conclude(
         evaluate(stage, chosen),
         stage.problem.information,
     )
-    found = audit(task, final.trajectory)
+    found = verify(task, final.trajectory)
     clamped = saturated_actuators(task.system.model_at(task.theta), final.trajectory)
     rough = (
         None

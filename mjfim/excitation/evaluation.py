@@ -10,7 +10,7 @@ from mjfim.excitation.limits import unwatched
 from mjfim.excitation.objective import Point
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, regulator_for
-from mjfim.excitation.verification import SAME, Audit
+from mjfim.excitation.verification import SAME, Verification
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
@@ -58,7 +58,7 @@ UNSTABLE = 1e3
 
 def warnings_of(
     final: Evaluation,
-    found: Audit,
+    found: Verification,
     task: DesignTask,
     clamped: tuple[str, ...],
     rough: Roughness | None,

@@ -1,6 +1,6 @@
 """Designs under hard limits: `log J + mu * barrier`, mu falling in stages (Hauser & Saccon 2006).
 
-The logarithm makes the cost free of scale, so that one ladder of mu fits every experiment; its minima are those of J.
+The logarithm makes the cost free of scale, so that one barrier_weights of mu fits every experiment; its minima are those of J.
 The barrier is relaxed: it stays defined outside, and an infeasible start is first driven inside without any cost.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.constraints import Fence, Sight
+from mjfim.excitation.constraints import ConstraintSet, ConstraintValues
 from mjfim.excitation.objective import DIVERGED, DesignProblem, Point
 from mjfim.optimize.barrier import BarrierExpansion
 from mjfim.optimize.lq import TangentCurve
@@ -24,13 +24,13 @@ from mjfim.records.design import Status
 
 @dataclass(frozen=True, eq=False)
 class InteriorPoint:
-    """A trajectory with its cost and its limits. A diverged trial has no sight and infinite value.
+    """A trajectory with its cost and its limits. A diverged trial has no values and infinite value.
 
     point: with the cost J, or None where only the limits are looked at;  merit: log J, 0 without
     barrier: its value, mu left out
     """
 
-    sight: Sight | None
+    values: ConstraintValues | None
     point: Point | None
     merit: float
     barrier: float
@@ -44,11 +44,11 @@ class InteriorPoint:
 DIVERGED_POINT = InteriorPoint(None, None, np.inf, np.inf)
 
 
-def seen(point: InteriorPoint) -> Sight:
+def seen(point: InteriorPoint) -> ConstraintValues:
     """What its limits look at. Raises ValueError for a diverged trial."""
-    if point.sight is None:
+    if point.values is None:
         raise ValueError("a diverged trial has no trajectory")
-    return point.sight
+    return point.values
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,34 +59,37 @@ class InteriorProblem:
     """
 
     base: DesignProblem
-    fence: Fence
+    constraints: ConstraintSet
     mu: float
     delta: float
     costs: bool = True
 
     def point(self, ctrl: Array) -> InteriorPoint:
         """Evaluate along the open-loop trajectory of a control."""
-        watched = self.base.plant.observe(self.base.theta, ctrl, self.fence.observations)
+        watched = self.base.plant.observe(self.base.theta, ctrl, self.constraints.observations)
         if watched is None:
             return DIVERGED_POINT
-        sight = self.fence.sight(*watched, slopes=False)
-        barrier = self.fence.value(sight, self.delta)
+        values = self.constraints.evaluate(*watched, slopes=False)
+        barrier = self.constraints.value(values, self.delta)
         if not self.costs:
-            return InteriorPoint(sight, None, 0.0, barrier)
-        point = self.base.point(sight.trajectory, self.base.plant.derivatives.quickest_accuracy)
+            return InteriorPoint(values, None, 0.0, barrier)
+        point = self.base.point(values.trajectory, self.base.plant.derivatives.quickest_accuracy)
         return (
             DIVERGED_POINT
             if point is DIVERGED
-            else InteriorPoint(sight, point, self._merit(point), barrier)
+            else InteriorPoint(values, point, self._merit(point), barrier)
         )
 
     def again(self, point: InteriorPoint) -> InteriorPoint:
-        """A point of a problem that differs from this one in criterion, mu, delta or the fence's bounds."""
-        if point.sight is None or point.point is None:
+        """A point of a problem that differs from this one in criterion, mu, delta or the constraints's bounds."""
+        if point.values is None or point.point is None:
             return point
         judged = self.base.judged(point.point)
         return InteriorPoint(
-            point.sight, judged, self._merit(judged), self.fence.value(point.sight, self.delta)
+            point.values,
+            judged,
+            self._merit(judged),
+            self.constraints.value(point.values, self.delta),
         )
 
     def _merit(self, point: Point) -> float:
@@ -116,22 +119,24 @@ class InteriorProblem:
 
     def expand(self, point: InteriorPoint) -> Expansion:
         """Expansion of the sum; the barrier's share stands apart as well."""
-        sight = seen(point)
-        sight = self.fence.sight(sight.trajectory, sight.observed, slopes=True)
+        values = seen(point)
+        values = self.constraints.evaluate(values.trajectory, values.observed, slopes=True)
         if point.point is None:
             A, B, rise = self.base.plant.derivatives.observation_jacobians(
-                self.base.theta, sight.trajectory, self.fence.observations
+                self.base.theta, values.trajectory, self.constraints.observations
             )
             e = Expansion(
                 A=A, B=B, a=np.zeros((len(A) + 1, A.shape[1])), b=np.zeros((len(A), B.shape[2]))
             )
         else:
-            e, found = self.base.expand_observed(point.point, self.fence.observations)
+            e, found = self.base.expand_observed(point.point, self.constraints.observations)
             if found is None:
                 raise ValueError("an expansion along a criterion without directions")
             rise = found
         share = self._share(point)
-        barrier: BarrierExpansion = self.fence.expand(sight, rise, self.delta).scaled(self.mu)
+        barrier: BarrierExpansion = self.constraints.expand(values, rise, self.delta).scaled(
+            self.mu
+        )
         return Expansion(
             A=e.A,
             B=e.B,
@@ -157,20 +162,20 @@ class InteriorProblem:
         return self.base.plant.difference(seen(new).trajectory, seen(old).trajectory)
 
     def refine(self, point: InteriorPoint) -> InteriorPoint | None:
-        """Never: the ladder of mu ends before the differences matter."""
+        """Never: the barrier_weights of mu ends before the differences matter."""
         return None
 
 
-FACTOR = 3.0  # between rungs
+FACTOR = 3.0  # between schedule
 RELAXED = 0.3  # delta over mu
 WIDEST = 0.1  # delta at most
 SHRUNK = np.concatenate(
     [[1.0, 0.997, 0.99, 0.97, 0.94, 0.9], 0.8 ** np.arange(1, 24)]
 )  # of a start, tried in turn
 HOLDING = 4e-3  # mu from which on leaks are answered
-SPARE = 1.2  # what was outside at the end of a rung is held back on the next by that much of it
-SLACK = 1.5  # of the time that is left per rung, what one may take
-AGAIN = 3  # times that the last rung is repeated because of leaks, at most
+SPARE = 1.2  # what was outside at the end of a stage_iterate is held back on the next by that much of it
+SLACK = 1.5  # of the time that is left per stage_iterate, what one may take
+AGAIN = 3  # times that the last stage_iterate is repeated because of leaks, at most
 FARTHEST_START = (
     1.0  # of a start beyond its limits, over half of their ranges, that is begun with as it is
 )
@@ -180,10 +185,11 @@ ROUNDS, FEW = 60, 20  # iterations towards the inside, the latter where shrinkin
 
 
 @dataclass(frozen=True)
-class Rungs:
-    """first, last: mu;  patience: iterations per rung at most, twice as many on the last
+class BarrierSchedule:
+    """first, last: mu;  patience: iterations per stage at most, twice as many on the last
 
-    settled: progress over `window` iterations, over mu, below which a rung is done;  tolerance: slope at which the last is
+    settled: progress over `window` iterations, over mu, below which a stage is done
+    tolerance: slope at which the last stage is done
     """
 
     first: float = 0.1
@@ -193,24 +199,24 @@ class Rungs:
     window: int = 8
     tolerance: float = 1e-5
 
-    def ladder(self) -> list[float]:
+    def barrier_weights(self) -> list[float]:
         """Every mu, from the first to the last."""
         count = max(round(np.log(self.first / self.last) / np.log(FACTOR)), 1)
         return [float(mu) for mu in np.geomspace(self.first, self.last, count + 1)]
 
 
 @dataclass(frozen=True, eq=False)
-class Rung:
-    """An iterate on the ladder. margins: worst of each kind;  status: set on the very last one
+class BarrierIterate:
+    """An iterate on the barrier_weights. margins: worst of each kind;  status: set on the very last one
 
-    mended: no iterate, but the one before shrunk until it kept all limits
+    repaired: no iterate, but the one before shrunk until it kept all limits
     """
 
     iterate: Iterate[InteriorPoint]
     mu: float
     margins: dict[str, float]
     status: Status | None = None
-    mended: bool = False
+    repaired: bool = False
 
     @property
     def feasible(self) -> bool:
@@ -227,58 +233,64 @@ class Entry:
 
 
 @dataclass
-class Ladder:
+class InteriorPointMethod:
     """One descent. base: the cost on the lifted plant;  basis: (N, M) what the control minus centre is made of, or None
 
     centre: (nu,) control about which a start is shrunk until it is inside
     """
 
     base: DesignProblem
-    fence: Fence
+    constraints: ConstraintSet
     centre: Array
     basis: Array | None
     regulate: Regulator
-    rungs: Rungs = Rungs()
+    schedule: BarrierSchedule = BarrierSchedule()
 
-    def climb(self, control: Array, budget: int, until: float = np.inf) -> Iterator[Rung]:
+    def run(self, control: Array, budget: int, until: float = np.inf) -> Iterator[BarrierIterate]:
         """Every iterate from a control: (N, nu), at most `budget`, until a time of `time.perf_counter`."""
         entry = yield from self._entered(control, min(budget, ROUNDS), until)
         if entry.control is not None:
             yield from self._down(entry.control, self._direction(), budget, until, entry.iterations)
 
-    def _entered(self, control: Array, budget: int, until: float) -> Generator[Rung, None, Entry]:
+    def _entered(
+        self, control: Array, budget: int, until: float
+    ) -> Generator[BarrierIterate, None, Entry]:
         """A control inside all limits or near them; of those far outside, shrunk about the centre or steered, what costs less."""
         fitted = self._fitted(control)
         if self._near(fitted):
             return Entry(fitted, 0)
         shrunk = self.inside(fitted)
-        rung: Rung | None = None
-        for rung in self._steered(fitted, budget if shrunk is None else min(budget, FEW), until):
-            yield rung
-        if rung is None:
+        stage_iterate: BarrierIterate | None = None
+        for stage_iterate in self._steered(
+            fitted, budget if shrunk is None else min(budget, FEW), until
+        ):
+            yield stage_iterate
+        if stage_iterate is None:
             return Entry(shrunk, 0)
-        steered, taken = rung.iterate.point.ctrl, rung.iterate.index + 1
+        steered, taken = stage_iterate.iterate.point.ctrl, stage_iterate.iterate.index + 1
         if shrunk is None:
             return Entry(steered, taken)
-        problem = InteriorProblem(self.base, self.fence, self.rungs.first, WIDEST)
-        entries = [shrunk, steered] if rung.feasible else [shrunk]
+        problem = InteriorProblem(self.base, self.constraints, self.schedule.first, WIDEST)
+        entries = [shrunk, steered] if stage_iterate.feasible else [shrunk]
         values = [problem.value(problem.point(ctrl)) for ctrl in entries]
         return Entry(entries[int(np.argmin(values))], taken)
 
     def _near(self, control: Array) -> bool:
         """What a relaxed barrier brings back inside on its way down: an end that is missed can be any number of its bands off."""
-        point = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False).point(control)
-        if point.sight is None:
+        point = InteriorProblem(self.base, self.constraints, 1.0, WIDEST, costs=False).point(
+            control
+        )
+        if point.values is None:
             return False
         return all(
             s > -FARTHEST_START
-            for kind, s in self.fence.shares(point.sight).items()
+            for kind, s in self.constraints.shares(point.values).items()
             if not kind.startswith("end_")
         )
 
     def _direction(self) -> StructuredBFGS:
         N = len(self.base.running.desired) - 1
-        ridge = 0.03 / N / self.fence.control.scale**2
+        ridge = 0.03 / N / self.constraints.control.scale**2
         return StructuredBFGS(ridge, self.basis)
 
     def _fitted(self, control: Array) -> Array:
@@ -291,21 +303,21 @@ class Ladder:
 
     def inside(self, control: Array) -> Array | None:
         """A control shrunk about the centre until all limits hold; None where even the least one leaves them."""
-        problem = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False)
+        problem = InteriorProblem(self.base, self.constraints, 1.0, WIDEST, costs=False)
         for share in SHRUNK:
             candidate = control if share == 1.0 else self.centre + share * (control - self.centre)
             point = problem.point(candidate)
-            if point.sight is not None and all(
-                m > 0.0 for m in self.fence.margins(point.sight).values()
+            if point.values is not None and all(
+                m > 0.0 for m in self.constraints.margins(point.values).values()
             ):
                 return np.asarray(candidate)
         return None
 
-    def _steered(self, control: Array, budget: int, until: float) -> Iterator[Rung]:
+    def _steered(self, control: Array, budget: int, until: float) -> Iterator[BarrierIterate]:
         """Iterates towards the inside, without any cost."""
-        problem = InteriorProblem(self.base, self.fence, 1.0, WIDEST, costs=False)
+        problem = InteriorProblem(self.base, self.constraints, 1.0, WIDEST, costs=False)
         begin = problem.point(control)
-        if begin.sight is None:  # it diverges
+        if begin.values is None:  # it diverges
             return
         for iterate in optimize(
             problem,
@@ -316,34 +328,38 @@ class Ladder:
             tolerance=1e-6,
             max_iterations=budget,
         ):
-            margins = self.fence.margins(seen(iterate.point))
-            rung = Rung(iterate, np.inf, margins)
-            yield rung
+            margins = self.constraints.margins(seen(iterate.point))
+            stage_iterate = BarrierIterate(iterate, np.inf, margins)
+            yield stage_iterate
             if all(m > 0.0 for m in margins.values()) or time.perf_counter() > until:
                 return
 
     def _down(
         self, control: Array, direction: StructuredBFGS, budget: int, until: float, done: int
-    ) -> Iterator[Rung]:
-        r, held, budget = self.rungs, dict[str, float](), budget + done
-        ladder = r.ladder()
-        point = InteriorProblem(self.base, self.fence, r.first, WIDEST).point(control)
-        if point.sight is None:  # it diverges where the parameters move a little
+    ) -> Iterator[BarrierIterate]:
+        r, held, budget = self.schedule, dict[str, float](), budget + done
+        barrier_weights = r.barrier_weights()
+        point = InteriorProblem(self.base, self.constraints, r.first, WIDEST).point(control)
+        if point.values is None:  # it diverges where the parameters move a little
             return
-        for i, mu in enumerate([*ladder, *ladder[-1:] * AGAIN]):
-            left, last, now = max(len(ladder) - i, 1), i >= len(ladder) - 1, time.perf_counter()
+        for i, mu in enumerate([*barrier_weights, *barrier_weights[-1:] * AGAIN]):
+            left, last, now = (
+                max(len(barrier_weights) - i, 1),
+                i >= len(barrier_weights) - 1,
+                time.perf_counter(),
+            )
             deadline = until if last else min(until, now + SLACK * (until - now) / left)
             patience = min(
                 r.patience * (2 if last else 1),
                 -(-(budget - done) // left) if left > 1 else budget - done,
             )
-            fence = self.fence.tightened(held)
-            problem = InteriorProblem(self.base, fence, mu, min(WIDEST, RELAXED * mu))
+            constraints = self.constraints.tightened(held)
+            problem = InteriorProblem(self.base, constraints, mu, min(WIDEST, RELAXED * mu))
             point = problem.again(point)
             values: list[float] = []
             tight = min(
-                r.tolerance, Rungs.tolerance
-            )  # what leaks is mended by less slope than many a stated tolerance
+                r.tolerance, BarrierSchedule.tolerance
+            )  # what leaks is repaired by less slope than many a stated tolerance
             for iterate in optimize(
                 problem,
                 point,
@@ -353,11 +369,13 @@ class Ladder:
                 tolerance=tight,
                 max_iterations=patience,
             ):
-                point, margins = iterate.point, self.fence.margins(seen(iterate.point))
+                point, margins = iterate.point, self.constraints.margins(seen(iterate.point))
                 kept = all(m >= 0.0 for m in margins.values())
                 status = Status.CONVERGED if iterate.slope <= r.tolerance else iterate.status
                 status = status if last and kept else None
-                yield Rung(replace(iterate, index=done + iterate.index), mu, margins, status)
+                yield BarrierIterate(
+                    replace(iterate, index=done + iterate.index), mu, margins, status
+                )
                 if status is Status.CONVERGED:
                     return
                 values.append(iterate.value)
@@ -373,16 +391,16 @@ class Ladder:
             if over or (last and kept):
                 return
             if mu <= HOLDING:
-                held = held_back(held, self.fence.shares(seen(point)))
+                held = tightened_further(held, self.constraints.shares(seen(point)))
 
     def _mended(
         self, problem: InteriorProblem, iterate: Iterate[InteriorPoint], mu: float, done: int
-    ) -> Iterator[Rung]:
+    ) -> Iterator[BarrierIterate]:
         """An iterate that leaks, shrunk until it does not: the best so far in case that nothing follows."""
         control = self.inside(iterate.point.ctrl)
         if control is not None:
-            point = replace(problem, fence=self.fence).point(control)
-            if point.sight is not None:
+            point = replace(problem, constraints=self.constraints).point(control)
+            if point.values is not None:
                 own = replace(
                     iterate,
                     index=done,
@@ -391,10 +409,10 @@ class Ladder:
                     gamma=0.0,
                     status=None,
                 )
-                yield Rung(own, mu, self.fence.margins(point.sight), mended=True)
+                yield BarrierIterate(own, mu, self.constraints.margins(point.values), repaired=True)
 
 
-def held_back(held: Mapping[str, float], shares: Mapping[str, float]) -> dict[str, float]:
+def tightened_further(held: Mapping[str, float], shares: Mapping[str, float]) -> dict[str, float]:
     """How far each kind is held back from its bounds next: more where it was outside, less where it was well inside."""
     return {
         kind: max(0.0, held.get(kind, 0.0) - share * (SPARE if share < 0.0 else 0.5))

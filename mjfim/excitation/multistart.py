@@ -12,11 +12,11 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform, pursue
-from mjfim.excitation.constraints import Fence, fence_of
+from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.initial_controls import Start
-from mjfim.excitation.interior_point import SHRUNK, Rungs, held_back
+from mjfim.excitation.interior_point import SHRUNK, BarrierSchedule, tightened_further
 from mjfim.excitation.unconstrained import Stage
-from mjfim.excitation.verification import audit
+from mjfim.excitation.verification import verify
 from mjfim.parallel import salvaged, workers_of
 from mjfim.records.design import HistoryRow, Status
 
@@ -54,7 +54,7 @@ class Lead:
 
 
 @dataclass(frozen=True, eq=False)
-class Contest:
+class Multistart:
     """What all starts have in common.
 
     fine: the experiment on its lifted plant;  coarse: on a plant that is quicker to step, or smoother, or None
@@ -68,9 +68,9 @@ class Contest:
     begun: float = field(default_factory=time.perf_counter)
 
     @cached_property
-    def _fence(self) -> Fence:
+    def _constraints(self) -> ConstraintSet:
         """The limits on the plant without clamps."""
-        return fence_of(self.fine.task)
+        return constraint_set_of(self.fine.task)
 
     @property
     def _seconds(self) -> float:
@@ -98,13 +98,23 @@ class Contest:
             and starts[0].repeats == 1
         ):
             yield from self._round(
-                self.fine, starts, Rungs(), d.max_iterations, self._seconds - reserve, chases
+                self.fine,
+                starts,
+                BarrierSchedule(),
+                d.max_iterations,
+                self._seconds - reserve,
+                chases,
             )
             return
         share = EARLY * self._seconds / self._turns(len(starts))
         last = SHARP if len(starts) < KEPT and self._faithful else HALFWAY
         yield from self._round(
-            first, starts, Rungs(last=last), round(EARLY * d.max_iterations), share, chases
+            first,
+            starts,
+            BarrierSchedule(last=last),
+            round(EARLY * d.max_iterations),
+            share,
+            chases,
         )
         if any(chase.status is Status.INTERRUPTED for chase in chases):
             return
@@ -131,7 +141,7 @@ class Contest:
             for row in self._round(
                 self.fine,
                 again,
-                Rungs(first=min(SPAN * last, HALFWAY)),
+                BarrierSchedule(first=min(SPAN * last, HALFWAY)),
                 d.max_iterations - done,
                 left,
                 second,
@@ -159,12 +169,18 @@ class Contest:
             if self._seconds == 0.0:
                 break
             i, shares = leaking
-            held = held_back(held, shares)
+            held = tightened_further(held, shares)
             best, again = chases[i], list[Chase]()
             start = Start(best.name, np.asarray(best.control))
             try:
                 yield from self._round(
-                    self.fine, [start], Rungs(first=LATE), PATIENCE, self._seconds, again, held
+                    self.fine,
+                    [start],
+                    BarrierSchedule(first=LATE),
+                    PATIENCE,
+                    self._seconds,
+                    again,
+                    held,
                 )
             finally:  # also where the user interrupts
                 for chase in again:
@@ -184,7 +200,7 @@ class Contest:
         if chases[i].control is None or not np.isfinite(chases[i].cost):
             return None
         task = self.fine.task
-        found = audit(task, task.plant.simulate(task.theta, np.asarray(chases[i].control)))
+        found = verify(task, task.plant.simulate(task.theta, np.asarray(chases[i].control)))
         return None if found.kept or not np.isfinite(found.deviation) else (i, found.shares)
 
     def _judge(self, chase: Chase, start: Start) -> Lead:
@@ -204,17 +220,17 @@ class Contest:
 
     def _worth(self, control: Array) -> float:
         """J on the stated model, infinite outside the limits, also where a clamp alone keeps a force inside."""
-        task, fence = self.fine.task, self._fence
-        watched = task.plant.observe(task.theta, control, fence.observations)
+        task, constraints = self.fine.task, self._constraints
+        watched = task.plant.observe(task.theta, control, constraints.observations)
         if watched is None:
             return np.inf
-        sight = fence.sight(*watched, slopes=False)
+        values = constraints.evaluate(*watched, slopes=False)
         if (
-            min(fence.margins(sight).values(), default=0.0) < 0.0
-            or not audit(task, sight.trajectory).kept
+            min(constraints.margins(values).values(), default=0.0) < 0.0
+            or not verify(task, values.trajectory).kept
         ):
             return np.inf
-        return self.fine.problem.point(sight.trajectory).cost
+        return self.fine.problem.point(values.trajectory).cost
 
     def _shrink(self, chase: Chase) -> None:
         """Shrink a control about the centre until no limit is left, if it ever is."""
@@ -234,7 +250,7 @@ class Contest:
         self,
         stage: Stage,
         starts: Sequence[Start],
-        rungs: Rungs,
+        schedule: BarrierSchedule,
         budget: int,
         seconds: float,
         chases: list[Chase],
@@ -246,7 +262,7 @@ class Contest:
         common = ConstrainedSearch(
             level.experiment,
             starts[0],
-            replace(rungs, tolerance=max(rungs.tolerance, stated)),
+            replace(schedule, tolerance=max(schedule.tolerance, stated)),
             max(budget, 1),
             seconds,
             combinations,

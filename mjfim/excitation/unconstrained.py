@@ -10,7 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.constraints import Fence
+from mjfim.excitation.constraints import ConstraintSet
 from mjfim.excitation.objective import DIVERGED, DesignProblem, Point
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
@@ -133,11 +133,12 @@ CLAMPED = (
 
 
 def descend(
-    stages: Sequence[Stage], control: Array, run: Run, fence: Fence | None = None
+    stages: Sequence[Stage], control: Array, run: Run, constraints: ConstraintSet | None = None
 ) -> Iterator[HistoryRow]:
     """Follow Algorithm 1 from one control through the levels, coarse to fine, keeping `run` up to date.
 
-    With a fence it ends where an iterate leaves the limits, or several in a row rest on a clamp; its control is the last inside.
+    With a constraint set it ends where an iterate leaves the limits, or several in a row rest on a clamp; its control is
+    the last feasible one.
     Where the smallest eigenvalues meet, E-optimality goes on with the smooth criterion, on this level and all finer ones.
     """
     power, memory, given, clamped = np.inf, None, control, 0
@@ -146,7 +147,11 @@ def descend(
             stage = replace(level, power=power)
             pass_ = _Pass(stage, (control, given), run, memory)
             for row in pass_.rows():
-                margin = np.inf if fence is None else _margin(level.task, fence, pass_.control)
+                margin = (
+                    np.inf
+                    if constraints is None
+                    else _margin(level.task, constraints, pass_.control)
+                )
                 clamped = clamped + 1 if margin == 0.0 else 0
                 if margin < 0.0 or clamped > CLAMPED:
                     run.outside = True
@@ -164,12 +169,12 @@ def descend(
     run.outside = clamped > 0
 
 
-def _margin(task: DesignTask, fence: Fence, control: Array) -> float:
+def _margin(task: DesignTask, constraints: ConstraintSet, control: Array) -> float:
     """Sign of the worst margin at any engine step of the level, for a control at the stated rate; 0 where a force is clamped."""
-    watched = task.plant.observe(task.theta, task.averaged(control), fence.observations)
+    watched = task.plant.observe(task.theta, task.averaged(control), constraints.observations)
     if watched is None:
         return -1.0
-    margins = fence.margins(fence.sight(*watched, slopes=False))
+    margins = constraints.margins(constraints.evaluate(*watched, slopes=False))
     if min(margins.values(), default=1.0) < 0.0:
         return -1.0
     return float(all(margins.get(kind, 1.0) > 0.0 for kind in ("force", "joint_force")))

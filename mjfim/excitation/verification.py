@@ -10,7 +10,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.excitation.constraints import Fence, Sight, basis_of, fence_of
+from mjfim.excitation.constraints import (
+    ConstraintSet,
+    ConstraintValues,
+    basis_of,
+    constraint_set_of,
+)
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage
@@ -20,7 +25,7 @@ SAME = 1e-6  # deviation of a state, in its unit, up to which two simulations ar
 
 
 @dataclass(frozen=True)
-class Audit:
+class Verification:
     """margins: worst of each kind over all engine steps, in its unit, negative outside
 
     deviation: largest difference of a state at the samples from the trajectory that was designed
@@ -40,9 +45,9 @@ class Audit:
         return all(margin >= 0.0 for kind, margin in self.margins.items() if kind not in self.told)
 
 
-def audit(task: DesignTask, trajectory: Trajectory) -> Audit:
+def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
     """Play a trajectory's control open loop on the untouched model at the design's theta."""
-    fence = fence_of(task, every=True)
+    constraints = constraint_set_of(task, every=True)
     told = (
         frozenset()
         if task.experiment.limits.enforce
@@ -54,51 +59,58 @@ def audit(task: DesignTask, trajectory: Trajectory) -> Audit:
         [model],
         task.plant.initial_state(task.theta)[None],
         trajectory.ctrl[None],
-        fence.observations,
+        constraints.observations,
     )
     if not out.finite[0] or out.observed is None:
-        lost = dict.fromkeys((*fence.kinds, "simulation"), -np.inf)
-        return Audit(lost, lost, np.inf, frozenset(told))
+        lost = dict.fromkeys((*constraints.kinds, "simulation"), -np.inf)
+        return Verification(lost, lost, np.inf, frozenset(told))
     played = task.plant.trajectory(out.states[0], trajectory.ctrl)
-    sight = replace(fence, clearance=None).sight(played, out.observed[0], slopes=False)
-    margins, shares = fence.margins(sight), fence.shares(sight)
-    usage = [*_usage(task, fence, sight)]
-    if fence.clearance is not None:
+    values = replace(constraints, clearance=None).evaluate(played, out.observed[0], slopes=False)
+    margins, shares = constraints.margins(values), constraints.shares(values)
+    usage = [*_usage(task, constraints, values)]
+    if constraints.clearance is not None:
         positions = _positions(task, simulator, played)
-        distance, _, pair = fence.clearance.nearest(positions)
-        margins["clearance"] = distance - fence.least
-        over = np.maximum(fence.clearance(positions, slopes=False).d.min(axis=1), 1e-9)
+        distance, _, pair = constraints.clearance.nearest(positions)
+        margins["clearance"] = distance - constraints.least
+        over = np.maximum(constraints.clearance(positions, slopes=False).d.min(axis=1), 1e-9)
         t = np.arange(1, len(positions) + 1) * task.dt / task.system.grid.substeps
-        usage.append(LimitUsage(kind="clearance", name=pair.name, t=t, share=fence.least / over))
-        shares["clearance"] = margins["clearance"] / fence.least
+        usage.append(
+            LimitUsage(kind="clearance", name=pair.name, t=t, share=constraints.least / over)
+        )
+        shares["clearance"] = margins["clearance"] / constraints.least
     deviation = float(np.abs(task.space.minus(played.state, trajectory.state)).max())
-    return Audit(margins, shares, deviation, frozenset(told), tuple(usage))
+    return Verification(margins, shares, deviation, frozenset(told), tuple(usage))
 
 
-def _usage(task: DesignTask, fence: Fence, sight: Sight) -> Iterator[LimitUsage]:
+def _usage(
+    task: DesignTask, constraints: ConstraintSet, values: ConstraintValues
+) -> Iterator[LimitUsage]:
     """Of whatever has a range, within samples at every engine step."""
-    N, substeps, w = sight.observed.shape
-    observed, ctrl = sight.observed.reshape(N * substeps, w), sight.trajectory.ctrl
+    N, substeps, w = values.observed.shape
+    observed, ctrl = values.observed.reshape(N * substeps, w), values.trajectory.ctrl
     t = np.arange(1, len(observed) + 1) * task.dt / task.system.grid.substeps
     for kind, name, share in zip(
-        fence.kinds, fence.names, fence.shown.relative_position(observed).T, strict=True
+        constraints.kinds,
+        constraints.names,
+        constraints.shown.relative_position(observed).T,
+        strict=True,
     ):
         yield LimitUsage(kind=kind, name=name, t=t, share=share)
-    bands = [("control", fence.control, ctrl, task.t)]
-    if fence.rate is not None:
+    bands = [("control", constraints.control, ctrl, task.t)]
+    if constraints.rate is not None:
         bands.append(
             (
                 "control_rate",
-                fence.rate,
-                fence.rates(ctrl),
+                constraints.rate,
+                constraints.rates(ctrl),
                 np.append(task.t, task.t[-1] + task.dt),
             )
         )
-    for kind, band, values, times in bands:
+    for kind, band, used, times in bands:
         for i, name in enumerate(task.controls):
             if np.isfinite(band.lower[i]) or np.isfinite(band.upper[i]):
                 yield LimitUsage(
-                    kind=kind, name=name, t=times, share=band.relative_position(values)[:, i]
+                    kind=kind, name=name, t=times, share=band.relative_position(used)[:, i]
                 )
 
 
@@ -111,21 +123,21 @@ def _positions(task: DesignTask, simulator: BatchSimulator, played: Trajectory) 
     )
 
 
-def require_inside(task: DesignTask) -> None:
+def require_feasible_start(task: DesignTask) -> None:
     """Raise ExperimentError where limits cannot be, exclude the start or the end, or either cannot be held at rest."""
     try:
-        fence = fence_of(task, every=True)
+        constraints = constraint_set_of(task, every=True)
         basis_of(task, task.stated_times)
         places = {"the start": task.plant.initial_state(task.theta)}
         if task.experiment.boundary.end == "rest":
             places["the end"] = task.target
         if task.experiment.limits.enforce:
             for where, state in places.items():
-                _require_inside(task, fence, where, state)
+                _require_inside(task, constraints, where, state)
             start, end = task.plant.initial_state(task.theta), task.target
             for where, state, hold in (
-                ("boundary.start", start, fence.before),
-                ("boundary.end", end, fence.after),
+                ("boundary.start", start, constraints.before),
+                ("boundary.end", end, constraints.after),
             ):
                 if hold is not None:
                     _require_held(task, where, state, hold)
@@ -133,7 +145,7 @@ def require_inside(task: DesignTask) -> None:
         raise ExperimentError(f"{task.experiment.source}: {error}") from None
 
 
-def _require_inside(task: DesignTask, fence: Fence, where: str, state: Array) -> None:
+def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, state: Array) -> None:
     qpos, qvel, _ = task.space.split(state)
     units = {c.name: c.unit for c in task.system.coordinates}
     for limit in task.limits:
@@ -145,12 +157,12 @@ def _require_inside(task: DesignTask, fence: Fence, where: str, state: Array) ->
                     f"limits.{limit.kind}.{limit.name}: {where} is at {value:g} {unit}, outside "
                     f"[{limit.lower:g}, {limit.upper:g}]; widen the limit (where it is the MJCF's, there) or move {where}"
                 )
-    if fence.clearance is not None:
-        distance, _, pair = fence.clearance.nearest(state[None, : task.space.nq])
-        if distance < fence.least:
+    if constraints.clearance is not None:
+        distance, _, pair = constraints.clearance.nearest(state[None, : task.space.nq])
+        if distance < constraints.least:
             what = "in collision" if distance < 0.0 else "too close"
             raise ExperimentError(
-                f"limits.clearance: {where} is {what}: {pair.name} are {distance:.3g} m apart, wanted {fence.least:g} m; "
+                f"limits.clearance: {where} is {what}: {pair.name} are {distance:.3g} m apart, wanted {constraints.least:g} m; "
                 f"move {where}, lower the clearance, or list the pair's bodies in limits.ignored"
             )
 

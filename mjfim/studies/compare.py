@@ -16,7 +16,7 @@ from mjfim.excitation.evaluation import fine_point
 from mjfim.excitation.interior_point import SHRUNK
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
-from mjfim.excitation.verification import SAME, audit, require_inside
+from mjfim.excitation.verification import SAME, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import salvaged, workers_of
 from mjfim.plant.active_constraints import saturated_actuators
@@ -146,7 +146,7 @@ def _combinations(task: DesignTask) -> Array | None:
     """The identifiable combinations, as a design finds them. Raises where nothing can be designed."""
     seen = designable(task)
     if task.is_limited:
-        require_inside(task)
+        require_feasible_start(task)
     return seen.basis
 
 
@@ -270,7 +270,7 @@ class Judge:
             or point.information is None
         ):
             return None
-        found = audit(task, point.trajectory)
+        found = verify(task, point.trajectory)
         outcome = MethodOutcome.INSIDE if found.kept else MethodOutcome.OUTSIDE
         if outcome is MethodOutcome.OUTSIDE and not np.isfinite(attempt.cost):
             outcome = MethodOutcome.NOTHING

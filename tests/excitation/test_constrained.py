@@ -14,13 +14,18 @@ import pytest
 
 import mjfim
 from mjfim.excitation import interior_point as ladder_module
-from mjfim.excitation import multistart as contest
+from mjfim.excitation import multistart as multistart
 from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform
-from mjfim.excitation.constraints import basis_of, fence_of
+from mjfim.excitation.constraints import basis_of, constraint_set_of
 from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import Start
-from mjfim.excitation.interior_point import SHRUNK, Ladder, Rungs, held_back
-from mjfim.excitation.multistart import Contest
+from mjfim.excitation.interior_point import (
+    SHRUNK,
+    BarrierSchedule,
+    InteriorPointMethod,
+    tightened_further,
+)
+from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, regulator_for
 from mjfim.experiment.schema import Experiment
@@ -141,24 +146,24 @@ def assert_inside(task: DesignTask, ctrl: Array) -> None:
 def test_a_start_that_leaves_the_limits_is_driven_inside(tmp_path: Path) -> None:
     wild = {"kind": "sine", "amplitude": 40.0, "frequency": 1.0}
     task = cart_inside(tmp_path, control=wild)
-    outside = fence_of(task)
+    outside = constraint_set_of(task)
     watched = task.plant.observe(task.theta, task.control, outside.observations)
     assert watched is not None
-    assert set(outside.margins(outside.sight(*watched, slopes=False))) == {
+    assert set(outside.margins(outside.evaluate(*watched, slopes=False))) == {
         "control",
         "position",
         "velocity",
     }
-    assert max(outside.margins(outside.sight(*watched, slopes=False)).values()) < 0.0
+    assert max(outside.margins(outside.evaluate(*watched, slopes=False)).values()) < 0.0
     design = design_task(task)
     assert design.limits == pytest.approx({k: max(v, 0.0) for k, v in design.limits.items()})
     assert_inside(task, design.trajectory.ctrl)
     # it begins with as much of the start as keeps them
     free = task.relaxed()
-    ladder = Ladder(
-        Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free)
+    barrier_weights = InteriorPointMethod(
+        Stage(free, None).problem, constraint_set_of(free), free.centre, None, regulator_for(free)
     )
-    begun = ladder.inside(task.control)
+    begun = barrier_weights.inside(task.control)
     assert begun is not None
     share = float(begun[10, 0] / task.control[10, 0])
     np.testing.assert_allclose(begun, free.centre + share * (task.control - free.centre), rtol=1e-9)
@@ -218,11 +223,11 @@ def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> N
     """The relaxed barrier brings it there, and the cost has its say from the first iterate on."""
     task = swinging_task(tmp_path)
     free = task.relaxed()
-    ladder = Ladder(
-        Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free)
+    barrier_weights = InteriorPointMethod(
+        Stage(free, None).problem, constraint_set_of(free), free.centre, None, regulator_for(free)
     )
-    first = next(ladder.climb(task.control, 5))
-    assert first.mu == Rungs().first
+    first = next(barrier_weights.run(task.control, 5))
+    assert first.mu == BarrierSchedule().first
     assert not first.feasible
     np.testing.assert_array_equal(first.iterate.point.ctrl, task.control)
     assert_ends(task, design_task(task))
@@ -236,11 +241,11 @@ def test_a_start_that_no_shrinking_brings_inside_is_steered(
     monkeypatch.setattr(ladder_module, "FARTHEST_START", -np.inf)
     task = swinging_task(tmp_path)
     free = task.relaxed()
-    ladder = Ladder(
-        Stage(free, None).problem, fence_of(free), free.centre, None, regulator_for(free)
+    barrier_weights = InteriorPointMethod(
+        Stage(free, None).problem, constraint_set_of(free), free.centre, None, regulator_for(free)
     )
-    assert ladder.inside(task.control) is None
-    first = next(ladder.climb(task.control, 5))
+    assert barrier_weights.inside(task.control) is None
+    first = next(barrier_weights.run(task.control, 5))
     assert first.mu == np.inf
     assert not first.feasible
     design = design_task(task)
@@ -268,7 +273,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     search = ConstrainedSearch(
         task.experiment,
         Start("wild", 1e9 * np.ones((100, 1)) * np.sin(9.0 * task.t)[:, None]),
-        Rungs(),
+        BarrierSchedule(),
         4,
     )
     chase = perform(search)
@@ -277,7 +282,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     # beside it another start goes on
     chases: list[Chase] = []
     starts = [search.start, Start("initial control", task.control)]
-    rows = list(Contest(Stage(task.relaxed(), None), None).run(starts, chases))
+    rows = list(Multistart(Stage(task.relaxed(), None), None).run(starts, chases))
     assert rows
     assert np.isfinite(chases[1].cost)
 
@@ -358,19 +363,19 @@ def test_the_stated_tolerance_ends_the_last_rung_once_the_limits_hold(tmp_path: 
     design = design_task(task)
     assert design.status is Status.CONVERGED
     sharpest = [row for row in design.history if row.mu == design.history[-1].mu]
-    assert design.history[-1].mu == Rungs.last
+    assert design.history[-1].mu == BarrierSchedule.last
     assert [row.margin >= 0.0 for row in sharpest].index(True) == len(sharpest) - 1
     assert design.slope > 1e-5
     assert_inside(task, design.trajectory.ctrl)
 
 
 def test_more_is_held_back_where_a_rung_leaked_and_less_where_it_was_well_inside() -> None:
-    held = held_back(
+    held = tightened_further(
         {"position": 0.1, "control": 0.1, "force": 0.02},
         {"position": -0.05, "control": 0.06, "force": 0.5},
     )
     assert held == pytest.approx({"position": 0.16, "control": 0.07, "force": 0.0})
-    assert held_back({}, {"velocity": -0.1}) == pytest.approx({"velocity": 0.12})
+    assert tightened_further({}, {"velocity": -0.1}) == pytest.approx({"velocity": 0.12})
 
 
 # ---- several starts
@@ -434,7 +439,7 @@ def test_a_fourier_start_is_optimised_as_a_series_before_it_goes_on_freely(tmp_p
     first: dict[str, Array] = {}
     from mjfim.excitation.initial_controls import starts_of
 
-    for _ in Contest(Stage(task.relaxed(), None), None).run(list(starts_of(task, None)), chases):
+    for _ in Multistart(Stage(task.relaxed(), None), None).run(list(starts_of(task, None)), chases):
         for chase in chases:
             if chase.control is not None and chase.history[-1].mu >= 0.01:
                 first[chase.name] = chase.control
@@ -596,11 +601,11 @@ def nearest(task: DesignTask, ctrl: Array) -> float:
 def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
     proofs: int, shrunk: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The barrier looks at distances at the samples, of 50 ms; the audit at every engine step."""
-    monkeypatch.setattr(contest, "PROOFS", proofs)
+    """The barrier looks at distances at the samples, of 50 ms; the verify at every engine step."""
+    monkeypatch.setattr(multistart, "PROOFS", proofs)
     if not shrunk:
-        monkeypatch.setattr(contest, "SHRUNK", np.ones(1))
-    monkeypatch.setattr(contest, "PATIENCE", 12)
+        monkeypatch.setattr(multistart, "SHRUNK", np.ones(1))
+    monkeypatch.setattr(multistart, "PATIENCE", 12)
     task, design = arm_design(
         tmp_path,
         rate=20.0,
@@ -704,7 +709,7 @@ def test_every_criterion_gains_within_limits(tmp_path: Path, tables: dict[str, A
 
 def test_what_leaks_a_little_goes_on_and_the_start_is_kept_beside_it(tmp_path: Path) -> None:
     free = cart_inside(tmp_path).relaxed()
-    rivals = Contest(Stage(free, None), None)
+    rivals = Multistart(Stage(free, None), None)
     start, leaking, inside = (
         Start("x", s * free.control) for s in (0.2, 3.0, 0.1)
     )  # here the smaller one tells more

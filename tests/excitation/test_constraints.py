@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraints import END_WEIGHT, Sight, fence_of
+from mjfim.excitation.constraints import END_WEIGHT, ConstraintValues, constraint_set_of
 from mjfim.excitation.interior_point import InteriorProblem, seen
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
@@ -73,7 +73,7 @@ def arm_task(folder: Path, **tables: Any) -> DesignTask:
 
 def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
     """Largest relative error of the slope of the barrier along random controls, against differences of simulations."""
-    problem = InteriorProblem(task.problem, fence_of(task), 1.0, delta, costs=False)
+    problem = InteriorProblem(task.problem, constraint_set_of(task), 1.0, delta, costs=False)
     expansion = problem.expand(problem.point(task.control))
     open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
     gradient = expansion.gradient(open_loop)
@@ -89,10 +89,10 @@ def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
     name: str, delta: float, tmp_path: Path
 ) -> None:
     task = arm_task(tmp_path, **{**ALONE, **TOGETHER}[name])
-    fence = fence_of(task)
-    watched = task.plant.observe(task.theta, task.control, fence.observations)
+    constraints = constraint_set_of(task)
+    watched = task.plant.observe(task.theta, task.control, constraints.observations)
     assert watched is not None
-    margins = fence.margins(fence.sight(*watched, slopes=False))
+    margins = constraints.margins(constraints.evaluate(*watched, slopes=False))
     if name in KINDS:
         assert set(margins) == {name}
     elif name in TOGETHER:
@@ -121,8 +121,8 @@ def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -
 def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: Path) -> None:
     """Along any tangent curve it is the sum of squares of all that is looked at, weighted by the barriers' curvatures."""
     task = arm_task(tmp_path, **TOGETHER[name])
-    fence, delta = fence_of(task), 0.05
-    problem = InteriorProblem(task.problem, fence, 1.0, delta, costs=False)
+    constraints, delta = constraint_set_of(task), 0.05
+    problem = InteriorProblem(task.problem, constraints, 1.0, delta, costs=False)
     point = problem.point(task.control)
     expansion = problem.expand(point)
     assert expansion.barrier is not None
@@ -134,24 +134,31 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         np.testing.assert_allclose(form, form.T, rtol=0, atol=1e-9 * values[-1])
     assert (np.linalg.eigvalsh(w.Q[-1]) >= -1e-12 * np.abs(w.Q[-1]).max()).all()
     assert (w.W >= 0.0).all()
-    free = fence.before is None, fence.after is None and not fence.seam
+    free = constraints.before is None, constraints.after is None and not constraints.seam
     assert ((w.W[0] == 0.0).all(), (w.W[-1] == 0.0).all()) == free
     assert (w.W[1:-1] > 0.0).all()
     # its own: the squares of what every limited number moves by, times the curvature of its barrier
-    sight, N = fence.sight(seen(point).trajectory, seen(point).observed, slopes=True), task.samples
-    _, _, rise = task.plant.derivatives.observation_jacobians(
-        task.theta, sight.trajectory, fence.observations
+    values, N = (
+        constraints.evaluate(seen(point).trajectory, seen(point).observed, slopes=True),
+        task.samples,
     )
-    looked, ctrl = np.array(fence.observations.derivative_substeps) - 1, task.control
-    assert sight.distances is not None and sight.slopes is not None and fence.rate is not None
-    assert fence.clearance is not None
-    m, least = sight.distances.shape[1], np.full(sight.distances.shape[1], 0.03)
-    near = Bounds(lower=least, upper=np.full(m, np.inf), scale=fence.clearance.reach - least)
+    _, _, rise = task.plant.derivatives.observation_jacobians(
+        task.theta, values.trajectory, constraints.observations
+    )
+    looked, ctrl = np.array(constraints.observations.derivative_substeps) - 1, task.control
+    assert (
+        values.distances is not None and values.slopes is not None and constraints.rate is not None
+    )
+    assert constraints.clearance is not None
+    m, least = values.distances.shape[1], np.full(values.distances.shape[1], 0.03)
+    near = Bounds(lower=least, upper=np.full(m, np.inf), scale=constraints.clearance.reach - least)
     bends = [
-        fence.shown.barrier(sight.observed[:, looked], delta, 1.0 / N / len(looked)).curvature,
-        fence.control.barrier(ctrl, delta, 1.0 / N).curvature,
-        fence.rate.barrier(fence.rates(ctrl), delta, 1.0 / N).curvature,
-        near.barrier(sight.distances, delta, 1.0 / N).curvature,
+        constraints.shown.barrier(
+            values.observed[:, looked], delta, 1.0 / N / len(looked)
+        ).curvature,
+        constraints.control.barrier(ctrl, delta, 1.0 / N).curvature,
+        constraints.rate.barrier(constraints.rates(ctrl), delta, 1.0 / N).curvature,
+        near.barrier(values.distances, delta, 1.0 / N).curvature,
     ]
     for way in rng.normal(size=(3, *ctrl.shape)):
         way[0] = 0.0  # with a seam the metric leaves the move of the first control out
@@ -159,15 +166,18 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         moves = [
             np.einsum("kswi,ki->ksw", rise, np.concatenate([zeta.z[:-1], zeta.v], axis=1)),
             zeta.v,
-            fence.rates(ctrl + zeta.v) - fence.rates(ctrl),
-            np.einsum("kmi,ki->km", sight.slopes, zeta.z[1:, : task.space.nv]),
+            constraints.rates(ctrl + zeta.v) - constraints.rates(ctrl),
+            np.einsum("kmi,ki->km", values.slopes, zeta.z[1:, : task.space.nv]),
         ]
         wanted = [float(np.sum(bend * move**2)) for bend, move in zip(bends, moves, strict=True)]
-        if fence.end is not None and fence.target is not None:
-            ended = task.space.minus(sight.trajectory.state[-1], fence.target)
+        if constraints.end is not None and constraints.target is not None:
+            ended = task.space.minus(values.trajectory.state[-1], constraints.target)
             wanted.append(
                 float(
-                    np.sum(fence.end.barrier(ended, delta, END_WEIGHT).curvature * zeta.z[-1] ** 2)
+                    np.sum(
+                        constraints.end.barrier(ended, delta, END_WEIGHT).curvature
+                        * zeta.z[-1] ** 2
+                    )
                 )
             )
         assert min(wanted) > 1e-6 * sum(wanted)
@@ -176,9 +186,12 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
             sum(wanted), rel=1e-9
         )
     # and of what is linear in the control it is the curvature of the barrier itself
-    endless = np.full(len(fence.kinds), np.inf)
+    endless = np.full(len(constraints.kinds), np.inf)
     narrow = replace(
-        fence, shown=replace(fence.shown, lower=-endless, upper=endless), clearance=None, end=None
+        constraints,
+        shown=replace(constraints.shown, lower=-endless, upper=endless),
+        clearance=None,
+        end=None,
     )
     problem = InteriorProblem(task.problem, narrow, 1.0, delta, costs=False)
     barrier = problem.expand(problem.point(ctrl)).barrier
@@ -193,17 +206,17 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
 def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> None:
     """Over half of each range; the largest at any looked-at engine step."""
     task = arm_task(tmp_path, limits=EVERY)
-    fence = fence_of(task)
-    problem = InteriorProblem(task.problem, fence, 1.0, 0.1, costs=False)
+    constraints = constraint_set_of(task)
+    problem = InteriorProblem(task.problem, constraints, 1.0, 0.1, costs=False)
     expansion = problem.expand(problem.point(task.control))
     assert expansion.barrier is not None
     for way in 1e-4 * directions_of(task, 4, seed=2):
         zeta = expansion.lift(np.zeros((task.samples, 2, task.space.nx)), way)
         up, down = (seen(problem.point(task.control + s * way)).observed for s in (1.0, -1.0))
-        moved = (0.5 * np.abs(up - down) / fence.shown.scale)[
-            :, np.array(fence.observations.derivative_substeps) - 1
+        moved = (0.5 * np.abs(up - down) / constraints.shown.scale)[
+            :, np.array(constraints.observations.derivative_substeps) - 1
         ].max()
-        wanted = max(moved, np.abs(way / fence.control.scale).max())
+        wanted = max(moved, np.abs(way / constraints.control.scale).max())
         assert expansion.barrier.largest_relative_move(zeta) == pytest.approx(wanted, rel=1e-3)
 
 
@@ -214,8 +227,12 @@ def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> Non
         limits=EVERY,
         boundary={"start": "rest", "end": "rest", "position": 0.2, "velocity": 3.0},
     )
-    fence, model, limits = fence_of(task), mujoco.MjModel.from_xml_string(ARM), task.limits
-    watched = task.plant.observe(task.theta, task.control, fence.observations)
+    constraints, model, limits = (
+        constraint_set_of(task),
+        mujoco.MjModel.from_xml_string(ARM),
+        task.limits,
+    )
+    watched = task.plant.observe(task.theta, task.control, constraints.observations)
     assert watched is not None
     data, rows, near = mujoco.MjData(model), {kind: [] for kind in KINDS}, []
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -263,48 +280,48 @@ def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> Non
         wanted["end_position"] / 0.2,
         wanted["end_velocity"] / 3.0,
     )
-    sight = fence.sight(*watched, slopes=False)
-    assert fence.margins(sight) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
-    assert fence.shares(sight) == pytest.approx(shares, rel=1e-5, abs=1e-7)
+    values = constraints.evaluate(*watched, slopes=False)
+    assert constraints.margins(values) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
+    assert constraints.shares(values) == pytest.approx(shares, rel=1e-5, abs=1e-7)
 
 
 def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> None:
     task = arm_task(
         tmp_path, limits=EVERY, boundary={"end": "periodic", "position": 0.2, "velocity": 3.0}
     )
-    fence = fence_of(task)
-    watched = task.plant.observe(task.theta, task.control, fence.observations)
+    constraints = constraint_set_of(task)
+    watched = task.plant.observe(task.theta, task.control, constraints.observations)
     assert watched is not None
-    sight = fence.sight(*watched, slopes=False)
-    shares = {kind: 0.01 * (i + 1) for i, kind in enumerate(sorted(fence.margins(sight)))}
-    tighter = {kind: fence.shares(sight)[kind] - share for kind, share in shares.items()}
-    found = fence.tightened(shares).shares(sight)
+    values = constraints.evaluate(*watched, slopes=False)
+    shares = {kind: 0.01 * (i + 1) for i, kind in enumerate(sorted(constraints.margins(values)))}
+    tighter = {kind: constraints.shares(values)[kind] - share for kind, share in shares.items()}
+    found = constraints.tightened(shares).shares(values)
     least = 0.03 * (
         1.0 + shares["clearance"]
     )  # its share is of the least distance, which is raised
-    assert fence.tightened(shares).least == pytest.approx(least)
-    assert sight.distances is not None
-    tighter["clearance"] = float(sight.distances.min()) / least - 1.0
+    assert constraints.tightened(shares).least == pytest.approx(least)
+    assert values.distances is not None
+    tighter["clearance"] = float(values.distances.min()) / least - 1.0
     assert found == pytest.approx(tighter, abs=1e-12)
-    assert fence.tightened({}).shares(sight) == pytest.approx(fence.shares(sight))
+    assert constraints.tightened({}).shares(values) == pytest.approx(constraints.shares(values))
     # not so far that nothing is left between the least distance and where it no longer matters
-    far = fence.tightened({"clearance": 50.0})
+    far = constraints.tightened({"clearance": 50.0})
     assert far.clearance is not None and far.least < far.clearance.reach
-    assert far.value(sight, 0.1) > fence.value(sight, 0.1)
+    assert far.value(values, 0.1) > constraints.value(values, 0.1)
 
 
 def test_rates_begin_and_end_where_the_boundary_says(tmp_path: Path) -> None:
     task = arm_task(tmp_path, limits={"control_rate": 9.0})
-    fence, ctrl = fence_of(task), task.control
+    constraints, ctrl = constraint_set_of(task), task.control
     inner = np.diff(ctrl, axis=0) / 0.01
-    np.testing.assert_allclose(fence.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
+    np.testing.assert_allclose(constraints.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
     before, after = np.array([0.7, 0.1]), np.array([-0.2, 0.3])
-    rested = replace(fence, before=before, after=after).rates(ctrl)
+    rested = replace(constraints, before=before, after=after).rates(ctrl)
     np.testing.assert_allclose(
         rested[[0, -1]], [(ctrl[0] - before) / 0.01, (after - ctrl[-1]) / 0.01]
     )
     np.testing.assert_allclose(
-        replace(fence, seam=True).rates(ctrl)[[0, -1]], [[0, 0], (ctrl[0] - ctrl[-1]) / 0.01]
+        replace(constraints, seam=True).rates(ctrl)[[0, -1]], [[0, 0], (ctrl[0] - ctrl[-1]) / 0.01]
     )
 
 
@@ -312,9 +329,9 @@ def test_without_enforcement_only_the_boundary_is_left(tmp_path: Path) -> None:
     """What is checked and reported is all of them."""
     task = arm_task(tmp_path, limits={**EVERY, "enforce": False}, boundary={"end": "periodic"})
     for every, kinds in ((False, set()), (True, KINDS)):
-        fence = fence_of(task, every=every)
-        watched = task.plant.observe(task.theta, task.control, fence.observations)
+        constraints = constraint_set_of(task, every=every)
+        watched = task.plant.observe(task.theta, task.control, constraints.observations)
         assert watched is not None
-        sight = fence.sight(*watched, slopes=False)
-        assert isinstance(sight, Sight)
-        assert set(fence.margins(sight)) == kinds | {"end_position", "end_velocity"}
+        values = constraints.evaluate(*watched, slopes=False)
+        assert isinstance(values, ConstraintValues)
+        assert set(constraints.margins(values)) == kinds | {"end_position", "end_velocity"}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraints import fence_of
+from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.interior_point import DIVERGED_POINT, InteriorProblem, seen
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.projection_operator import Expansion
@@ -46,7 +46,7 @@ def problem_of(name: str, folder: Path, **tables: Any) -> tuple[DesignTask, Inte
     base = task.problem
     if name == "smooth E":
         base = replace(base, information=replace(base.information, power=40.0))
-    return task, InteriorProblem(base, fence_of(task), 0.2, 0.05)
+    return task, InteriorProblem(base, constraint_set_of(task), 0.2, 0.05)
 
 
 def check_task(
@@ -91,24 +91,26 @@ def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> No
         J = point.point.cost
     expected = np.log(J) if "D" not in name else J / (3 * (3.0 if "heavier" in name else 1.0))
     assert point.merit == pytest.approx(expected, rel=1e-4)
-    sight = problem.fence.sight(seen(point).trajectory, seen(point).observed, slopes=False)
-    assert point.barrier == problem.fence.value(sight, 0.05)
+    values = problem.constraints.evaluate(
+        seen(point).trajectory, seen(point).observed, slopes=False
+    )
+    assert point.barrier == problem.constraints.value(values, 0.05)
     assert problem.value(point) == pytest.approx(point.merit + 0.2 * point.barrier, rel=1e-12)
     assert problem.size(point) == 1.0
     np.testing.assert_array_equal(point.ctrl, task.control)
 
 
 def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
-    """Without a step of the model: another mu, delta, fence or criterion."""
+    """Without a step of the model: another mu, delta, constraints or criterion."""
     task, problem = problem_of("E", tmp_path)
     point = problem.point(task.control)
-    tight = problem.fence.tightened({"control": 0.1, "position": 0.05, "velocity": 0.2})
+    tight = problem.constraints.tightened({"control": 0.1, "position": 0.05, "velocity": 0.2})
     smooth = replace(problem.base, information=replace(problem.base.information, power=10.0))
     for other in (
         replace(problem, mu=0.02, delta=0.006),
-        replace(problem, fence=tight),
+        replace(problem, constraints=tight),
         replace(problem, base=smooth),
-        replace(problem, base=smooth, fence=tight, mu=1e-3, delta=3e-4),
+        replace(problem, base=smooth, constraints=tight, mu=1e-3, delta=3e-4),
     ):
         begun = task.plant.simulator.steps
         again = other.again(point)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError
-from mjfim.excitation.constraints import Sight, fence_of
+from mjfim.excitation.constraints import ConstraintValues, constraint_set_of
 from mjfim.excitation.limits import Limit, limits_of
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names, scalar_joints
@@ -168,7 +168,7 @@ def test_misuse(model: mujoco.MjModel, tables: dict[str, object], message: str) 
 
 
 def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -> dict[str, float]:
-    """Worst margins of a curve, looked at once per sample, by the fence of an experiment on a model."""
+    """Worst margins of a curve, looked at once per sample, by the constraints of an experiment on a model."""
     task = make_task(
         text,
         folder,
@@ -177,12 +177,12 @@ def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -
         control={"kind": "constant", "amplitude": 0.0},
         limits=tables,
     )
-    fence = fence_of(task)
-    assert not len(fence.observations.actuator_forces)
-    shown = fence.observations.values(
+    constraints = constraint_set_of(task)
+    assert not len(constraints.observations.actuator_forces)
+    shown = constraints.observations.values(
         trajectory.qpos[1:], trajectory.qvel[1:], trajectory.qvel[:-1], dict[str, np.ndarray]().get
     )
-    return fence.margins(Sight(trajectory, shown[:, None]))
+    return constraints.margins(ConstraintValues(trajectory, shown[:, None]))
 
 
 def test_no_limits_no_margins(model: mujoco.MjModel, tmp_path: Path) -> None:

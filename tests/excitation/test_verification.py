@@ -1,4 +1,4 @@
-"""The audit of a design on the model as the user wrote it: between the samples, with clamps and stops, or lost."""
+"""The verify of a design on the model as the user wrote it: between the samples, with clamps and stops, or lost."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraints import fence_of
+from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import SAME, audit
+from mjfim.excitation.verification import SAME, verify
 from tests.support.numerics import CART_PENDULUM, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
@@ -59,7 +59,7 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
     assert task.system.grid.substeps == 100
     assert np.abs(samples.qpos).max() < 0.01
     assert samples.qvel.min() > 0.98 * SPEED
-    found = audit(task, samples)
+    found = verify(task, samples)
     assert not found.kept
     # by hand: a harmonic of 10 Hz
     assert found.margins["position"] == pytest.approx(0.1 - SWING, rel=1e-3)
@@ -68,29 +68,31 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
         300.0 - SWING * (2 * np.pi * 10.0) ** 2, rel=3e-3
     )
     assert found.deviation < SAME
-    # what a fence at the samples alone would have said
-    fence = fence_of(task)
-    watched = task.plant.observe(task.theta, task.control, fence.observations)
+    # what a constraints at the samples alone would have said
+    constraints = constraint_set_of(task)
+    watched = task.plant.observe(task.theta, task.control, constraints.observations)
     assert watched is not None
     trajectory, observed = watched
-    at_samples = fence.margins(fence.sight(trajectory, observed[:, -1:], slopes=False))
-    assert min(at_samples.values()) > 0.0
-    assert fence.margins(fence.sight(trajectory, observed, slopes=False)) == pytest.approx(
-        found.margins
+    at_samples = constraints.margins(
+        constraints.evaluate(trajectory, observed[:, -1:], slopes=False)
     )
+    assert min(at_samples.values()) > 0.0
+    assert constraints.margins(
+        constraints.evaluate(trajectory, observed, slopes=False)
+    ) == pytest.approx(found.margins)
 
 
 def test_clearance_between_the_samples_counts(tmp_path: Path) -> None:
     """The wall is 0.19 m from the ball in the middle, and 0.15 m nearer where it turns."""
     task = spring_task(tmp_path, limits={"clearance": 0.1})
-    fence = fence_of(task)
-    watched = task.plant.observe(task.theta, task.control, fence.observations)
+    constraints = constraint_set_of(task)
+    watched = task.plant.observe(task.theta, task.control, constraints.observations)
     assert watched is not None
-    assert fence.margins(fence.sight(*watched, slopes=False))["clearance"] > 0.05
-    found = audit(task, task.initial)
+    assert constraints.margins(constraints.evaluate(*watched, slopes=False))["clearance"] > 0.05
+    found = verify(task, task.initial)
     assert found.margins["clearance"] == pytest.approx(0.19 - SWING - 0.1, abs=1e-4)
     assert not found.kept
-    assert audit(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).kept
+    assert verify(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).kept
 
 
 def test_what_keeps_all_limits_is_kept_to_the_last_digit(tmp_path: Path) -> None:
@@ -98,7 +100,7 @@ def test_what_keeps_all_limits_is_kept_to_the_last_digit(tmp_path: Path) -> None
     for edge, kept in ((1.001, True), (0.999, False)):
         limits = {"position": {"slide": (-edge * SWING, 1.0)}}
         task = spring_task(tmp_path, limits=limits)
-        assert audit(task, task.initial).kept is kept
+        assert verify(task, task.initial).kept is kept
 
 
 @pytest.mark.parametrize("clamp", ["stop", "force", "joint force", "control"])
@@ -115,9 +117,9 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
     task = spring_task(tmp_path, **words, **tables)
     lifted = task.relaxed()
     designed = lifted.plant.simulate(lifted.theta, task.control)
-    found = audit(task, designed)
+    found = verify(task, designed)
     assert found.deviation > 10 * SAME
-    free = audit(spring_task(tmp_path, **tables), designed)
+    free = verify(spring_task(tmp_path, **tables), designed)
     assert free.deviation < SAME
     if clamp in ("stop", "control"):
         assert not found.kept
@@ -143,7 +145,7 @@ def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
     assert task.is_limited
     lifted = task.relaxed()
     designed = lifted.plant.simulate(lifted.theta, task.control)
-    assert (audit(task, designed).deviation < SAME) is not enforce
+    assert (verify(task, designed).deviation < SAME) is not enforce
 
 
 def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
@@ -155,7 +157,7 @@ def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
         ({"end": "periodic", "position": 1e-7}, False),
     ):
         task = spring_task(tmp_path, limits=limits, boundary=boundary)
-        found = audit(task, task.initial)
+        found = verify(task, task.initial)
         assert found.margins["position"] < 0.0
         assert found.margins["clearance"] < 0.0
         assert found.kept is kept
@@ -171,7 +173,7 @@ def test_a_control_that_the_model_does_not_survive_keeps_nothing(tmp_path: Path)
         limits=limits,
     )
     wild = task.plant.trajectory(task.initial.state, np.full_like(task.control, 1e12))
-    found = audit(task, wild)
+    found = verify(task, wild)
     assert not found.kept
     assert found.deviation == np.inf
     assert set(found.margins.values()) == {-np.inf}

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm, logm
 from scipy.optimize import minimize
 
-from mjfim.excitation.constraints import fence_of
+from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
 from mjfim.information.criteria import smooth_e_optimality
 from mjfim.optimize.eigenvalue_model import (
@@ -119,7 +119,7 @@ def test_slopes_agree_with_the_logarithm_of_simulated_information(
     problem = task.problem
     problem = replace(problem, information=replace(problem.information, power=3.0, faint=0.0))
     point = problem.point(task.initial)
-    expansion, _ = problem.expand_observed(point, fence_of(task).observations)
+    expansion, _ = problem.expand_observed(point, constraint_set_of(task).observations)
     model = expansion.eigenvalue_model
     assert model is not None and point.information is not None
     assert len(model.eigenvalues) == 3
@@ -150,7 +150,10 @@ def test_other_criteria_and_expansions_without_limits_have_no_model(tmp_path: Pa
     task = cart_task(tmp_path, limits={"control": {"force": (-9.0, 9.0)}}).relaxed()
     point = task.problem.point(task.initial)
     assert (
-        task.problem.expand_observed(point, fence_of(task).observations)[0].eigenvalue_model is None
+        task.problem.expand_observed(point, constraint_set_of(task).observations)[
+            0
+        ].eigenvalue_model
+        is None
     )  # 1 / lambda_min itself
     smooth = replace(task.problem, information=replace(task.problem.information, power=40.0))
     assert smooth.expand(smooth.judged(point)).eigenvalue_model is None

@@ -131,7 +131,7 @@ class Toy:
 
     @property
     def delta(self) -> float:
-        """As on the ladder: sharper with mu."""
+        """As on the barrier_weights: sharper with mu."""
         return 0.3 * self.mu
 
     def point(self, u: Array) -> ToyPoint:
@@ -350,14 +350,14 @@ def test_an_expansion_without_limits_is_refused() -> None:
 @pytest.mark.parametrize("based", [False, True])
 def test_the_direction_descends_on_a_simulated_design(based: bool, tmp_path: Path) -> None:
     """Its slope agrees with differences of simulated trials."""
-    from mjfim.excitation.constraints import fence_of
+    from mjfim.excitation.constraints import constraint_set_of
     from mjfim.excitation.interior_point import InteriorProblem
     from mjfim.signals import spline_basis
 
     task = cart_task(
         tmp_path, limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}}
     ).relaxed()
-    problem = InteriorProblem(task.problem, fence_of(task), 0.1, 0.03)
+    problem = InteriorProblem(task.problem, constraint_set_of(task), 0.1, 0.03)
     point = problem.point(task.control)
     expansion = problem.expand(point)
     basis = spline_basis(task.t, 0.5, 8.0, False, False, False) if based else None

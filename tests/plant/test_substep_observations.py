@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraints import fence_of, looked_at
+from mjfim.excitation.constraints import constraint_set_of, looked_at
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, SHARED_ORIGIN
@@ -55,9 +55,9 @@ def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
 
 def observations_of(task: DesignTask) -> SubstepObservations:
     """What the limits of the experiment look at."""
-    fence = fence_of(task)
-    assert fence.kinds == tuple(kind for kind, _ in SHOWN)
-    return fence.observations
+    constraints = constraint_set_of(task)
+    assert constraints.kinds == tuple(kind for kind, _ in SHOWN)
+    return constraints.observations
 
 
 @pytest.mark.parametrize(

@@ -264,7 +264,7 @@ def test_slopes_for_scipy_are_the_derivatives() -> None:
     series = next(s for s in fourier(arena, 3) if s.name.startswith("0.8"))
     descent = Descent(arena, series, arena.exact, 1.0)
     s = descent._coefficients(series.control) * 0.7
-    problem = InteriorProblem(arena.exact, arena.fence, 0.1, 0.03)
+    problem = InteriorProblem(arena.exact, arena.constraints, 0.1, 0.03)
     _, slope = descent._valued(problem, s)
     for i in range(s.size):
         move = np.zeros(s.size)

@@ -18,7 +18,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import audit
+from mjfim.excitation.verification import verify
 from mjfim.output.plots.compare import compare_figure
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design, HistoryRow
@@ -116,7 +116,7 @@ def test_rows_say_what_their_controls_do() -> None:
         scale = task.parameters.scale
         worst = np.linalg.eigvalsh(told.information * np.outer(scale, scale))[0] ** -0.5
         assert r.worst_relative_std == pytest.approx(worst, rel=1e-5)
-        assert r.margins == audit(task, trajectory).margins
+        assert r.margins == verify(task, trajectory).margins
         qpos, _, ctrl = played(pendulum(), r.control)
         assert np.abs(qpos[:, 0]).max() <= 0.5
         assert np.abs(ctrl).max() <= 5.0

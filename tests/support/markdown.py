@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-# A fence that opens a block, with its language; the block ends at the next line with the same fence.
-FENCE = re.compile(r"^(?P<fence>```+|~~~+)(?P<language>\w*)\s*$")
+# A constraints that opens a block, with its language; the block ends at the next line with the same constraints.
+FENCE = re.compile(r"^(?P<constraints>```+|~~~+)(?P<language>\w*)\s*$")
 
 # A comment above a block that is not run, with the reason, e.g. `<!-- not run: needs a robot -->`.
 SKIP = re.compile(r"^<!--\s*not run:\s*(?P<reason>\S.*?)\s*-->\s*$")
@@ -22,9 +22,9 @@ class CodeBlock:
 
     Attributes:
         path: Markdown file that holds the block.
-        line: Line of the opening fence, counted from 1.
-        language: Word behind the opening fence; empty if there is none.
-        text: Lines between the fences.
+        line: Line of the opening constraints, counted from 1.
+        language: Word behind the opening constraints; empty if there is none.
+        text: Lines between the constraint_sets.
         skip_reason: Reason of the comment `<!-- not run: reason -->` above the block; empty if there is none.
     """
 
@@ -65,7 +65,7 @@ def code_blocks(path: Path) -> list[CodeBlock]:
 
         first = index + 1
         try:
-            last = lines.index(opening["fence"], first)
+            last = lines.index(opening["constraints"], first)
         except ValueError:
             raise ValueError(f"{path}: the block of line {first} is not closed") from None
 

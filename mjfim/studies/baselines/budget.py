@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.constraints import Fence, fence_of
+from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.interior_point import WIDEST, InteriorPoint, InteriorProblem, seen
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
@@ -82,7 +82,7 @@ class Arena:
         self.holds = plain.is_limited
         self.task = plain.relaxed() if self.holds else plain
         self.begun = self.task.plant.engine_steps
-        self.fence, self.centre = fence_of(self.task), self.task.centre
+        self.constraints, self.centre = constraint_set_of(self.task), self.task.centre
         self.exact = Stage(self.task, self.job.combinations).problem
         self.rng = np.random.default_rng((self.job.seed, *self.job.part))
 
@@ -109,19 +109,24 @@ class Arena:
     @cached_property
     def looking(self) -> InteriorProblem:
         """Evaluates points by the exact cost."""
-        return InteriorProblem(self.exact, self.fence, 1.0, WIDEST)
+        return InteriorProblem(self.exact, self.constraints, 1.0, WIDEST)
 
     def inside(self, point: InteriorPoint) -> bool:
         """Whether it keeps all limits at every engine step."""
-        return not self.holds or all(m >= 0.0 for m in self.fence.margins(seen(point)).values())
+        return not self.holds or all(
+            m >= 0.0 for m in self.constraints.margins(seen(point)).values()
+        )
 
     def offer(self, point: InteriorPoint, name: str = "") -> float:
         """Keep a point's control if it is the best so far; its cost J, infinite outside the limits."""
-        if point.sight is None or point.point is None:
+        if point.values is None or point.point is None:
             return np.inf
         cost = self.exact.judged(point.point).cost if self.inside(point) else np.inf
         self.keep(
-            point.ctrl, cost, min(self.fence.shares(point.sight).values(), default=np.inf), name
+            point.ctrl,
+            cost,
+            min(self.constraints.shares(point.values).values(), default=np.inf),
+            name,
         )
         return cost
 
@@ -161,24 +166,27 @@ class Arena:
         plant, theta = self.task.plant, self.task.theta
         ctrl = self.centre + scales[:, None, None] * swing
         start = np.repeat(plant.initial_state(theta)[None], len(scales), axis=0)
-        out = plant.simulator.rollout([plant.model(theta)], start, ctrl, self.fence.observations)
+        out = plant.simulator.rollout(
+            [plant.model(theta)], start, ctrl, self.constraints.observations
+        )
         for i in range(len(scales)):
             if not out.finite[i] or out.observed is None:
                 continue
             trajectory, observed = plant.trajectory(out.states[i], ctrl[i]), out.observed[i]
-            share = _share(replace(self.fence, clearance=None), trajectory, observed)
+            share = _share(replace(self.constraints, clearance=None), trajectory, observed)
             if (
-                share >= 0.0 and self.fence.clearance is not None
+                share >= 0.0 and self.constraints.clearance is not None
             ):  # distances take long, and are looked at last
-                share = _share(self.fence, trajectory, observed)
+                share = _share(self.constraints, trajectory, observed)
             if share >= 0.0:
                 return i
             self.keep(ctrl[i], np.inf, share)
         return None
 
 
-def _share(fence: Fence, trajectory: Trajectory, observed: Array) -> float:
+def _share(constraints: ConstraintSet, trajectory: Trajectory, observed: Array) -> float:
     """The worst margin over half of its range."""
     return min(
-        fence.shares(fence.sight(trajectory, observed, slopes=False)).values(), default=np.inf
+        constraints.shares(constraints.evaluate(trajectory, observed, slopes=False)).values(),
+        default=np.inf,
     )

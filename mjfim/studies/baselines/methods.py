@@ -96,10 +96,12 @@ class Shaper:
 
     def __init__(self, arena: Arena) -> None:
         self.arena = arena
-        task, fence = arena.task, arena.fence
+        task, constraints = arena.task, arena.constraints
         e = task.experiment
         fastest = min(e.limits.bandwidth or np.inf, 0.25 * e.rate, CYCLES / task.horizon)
-        jumps = fence.rate is None and e.limits.bandwidth is None and e.boundary.start != "rest"
+        jumps = (
+            constraints.rate is None and e.limits.bandwidth is None and e.boundary.start != "rest"
+        )
         self.frame = ExcitationSettings(
             t=task.t,
             horizon=task.horizon,
@@ -109,14 +111,14 @@ class Shaper:
             may_jump=jumps,
         )
         self.weighted = bool(task.control_weight.any() or task.tracking.any()) or not arena.holds
-        self.most = BOUNDED if np.isfinite(fence.control.lower).all() else LARGEST
+        self.most = BOUNDED if np.isfinite(constraints.control.lower).all() else LARGEST
         self.window = task.fade(task.samples)
         self.basis = basis_of(task, task.t)
         self.fit = None if self.basis is None else np.linalg.pinv(self.basis)
 
     def swing(self, wave: Array) -> Array:
         """(N, nu) what is added to the centre; at scale 1 as large as half of the controls' range."""
-        windowed = self.window * wave * self.arena.fence.control.scale
+        windowed = self.window * wave * self.arena.constraints.control.scale
         return (
             windowed
             if self.basis is None or self.fit is None

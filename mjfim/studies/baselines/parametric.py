@@ -1,6 +1,6 @@
 """Fourier series and B-splines, optimised with SciPy or with mjfim's own optimiser: many bluntly, the best ones sharply.
 
-SciPy gets what is best for it: the exact gradient of `log J + mu * barrier`, mu falling in the stages of `ladder`, and
+SciPy gets what is best for it: the exact gradient of `log J + mu * barrier`, mu falling in the stages of `barrier_weights`, and
 coefficients whitened by the Gauss-Newton metric of the barrier, anew at every stage.
 """
 
@@ -23,11 +23,11 @@ from mjfim.excitation.interior_point import (
     HOLDING,
     RELAXED,
     WIDEST,
+    BarrierSchedule,
     InteriorPoint,
+    InteriorPointMethod,
     InteriorProblem,
-    Ladder,
-    Rungs,
-    held_back,
+    tightened_further,
 )
 from mjfim.excitation.objective import DesignProblem
 from mjfim.excitation.unconstrained import regulator_for
@@ -64,7 +64,7 @@ class Series:
     basis: Array
     control: Array
     cost: float = np.inf
-    mu: float = Rungs().first
+    mu: float = BarrierSchedule().first
 
     @property
     def finished(self) -> bool:
@@ -116,7 +116,7 @@ def _any(
         basis = made(frequency)
         fitted = basis @ np.linalg.lstsq(basis, arena.task.control - arena.centre)[0]
         yield started(arena, f"{frequency:.3g} Hz", basis, fitted)
-    size = arena.fence.control.scale
+    size = arena.constraints.control.scale
     while True:
         frequency = float(np.exp(arena.rng.uniform(*np.log(ends))))
         basis = made(frequency)
@@ -172,7 +172,7 @@ def tournament(arena: Arena, entrants: Iterator[Series], count: int, optimise: O
         for i, series in enumerate(better):
             advance(series, BLUNT, arena.used + (second - arena.used) / (len(better) - i))
         for series in best(1):
-            advance(series, Rungs().last, 1.0)
+            advance(series, BarrierSchedule().last, 1.0)
 
 
 # with mjfim's own optimiser ---------------------------------------------------------------------------------------------
@@ -185,11 +185,11 @@ def own(arena: Arena, series: Series, last: float, limit: float) -> None:
         (1.0 - arena.used) * job.seconds if limit >= 1.0 else np.inf
     )  # else sharper barriers would come too early
     start = Start(series.name, series.control, series.basis)
-    rungs = Rungs(first=series.mu, last=last)
+    schedule = BarrierSchedule(first=series.mu, last=last)
     search = ConstrainedSearch(
         job.experiment,
         start,
-        rungs,
+        schedule,
         100_000,
         left,
         job.combinations,
@@ -202,7 +202,7 @@ def own(arena: Arena, series: Series, last: float, limit: float) -> None:
             series.control, series.cost = chase.control, chase.cost
             arena.keep(chase.control, chase.cost, 0.0, series.name)
         arena.require(limit)
-    series.mu = last if last > Rungs().last else 0.0
+    series.mu = last if last > BarrierSchedule().last else 0.0
 
 
 # with SciPy -------------------------------------------------------------------------------------------------------------
@@ -212,13 +212,13 @@ def scipy_own(arena: Arena, series: Series, last: float, limit: float) -> None:
     """Minimise the experiment's own cost."""
     criterion = arena.task.experiment.cost.criterion
     base = smoothed(arena.task, arena.job.combinations) if criterion == "E" else arena.exact
-    Descent(arena, series, base, limit).run(Rungs(first=series.mu, last=last))
+    Descent(arena, series, base, limit).run(BarrierSchedule(first=series.mu, last=last))
 
 
 def scipy_determinant(arena: Arena, series: Series, last: float, limit: float) -> None:
     """Minimise it with `-log det` for its criterion; what is kept is judged by the experiment's own."""
     base = replace(arena.exact, information=replace(arena.exact.information, criterion="D"))
-    Descent(arena, series, base, limit).run(Rungs(first=series.mu, last=last))
+    Descent(arena, series, base, limit).run(BarrierSchedule(first=series.mu, last=last))
 
 
 class Settled(Exception):
@@ -230,58 +230,62 @@ class Descent:
 
     def __init__(self, arena: Arena, series: Series, base: DesignProblem, limit: float) -> None:
         self.arena, self.series, self.base, self.limit = arena, series, base, limit
-        self.ladder = Ladder(
-            base, arena.fence, arena.centre, series.basis, regulator_for(arena.task)
+        self.barrier_weights = InteriorPointMethod(
+            base, arena.constraints, arena.centre, series.basis, regulator_for(arena.task)
         )
         self.K = np.zeros((len(series.basis), len(arena.centre), arena.task.space.nx))
         self.s = np.zeros((series.basis.shape[1], len(arena.centre)))
 
-    def run(self, rungs: Rungs) -> None:
+    def run(self, schedule: BarrierSchedule) -> None:
         """All stages. Raises Spent."""
         self.s = self._coefficients(self._begin())
         held = dict[str, float]()
         try:
-            for mu in rungs.ladder() if self.arena.holds else [rungs.last]:
+            for mu in schedule.barrier_weights() if self.arena.holds else [schedule.last]:
                 self.series.mu = mu
-                last = mu <= rungs.last or not self.arena.holds
-                fence = self.arena.fence.tightened(held)
+                last = mu <= schedule.last or not self.arena.holds
+                constraints = self.arena.constraints.tightened(held)
                 barrier = mu if self.arena.holds else 0.0
                 self._stage(
-                    InteriorProblem(self.base, fence, barrier, min(WIDEST, RELAXED * mu)),
-                    rungs,
+                    InteriorProblem(self.base, constraints, barrier, min(WIDEST, RELAXED * mu)),
+                    schedule,
                     mu,
                     last,
                 )
                 self._mend()
                 point = self._point(self.arena.looking)
-                if mu <= HOLDING and point.sight is not None:
-                    held = held_back(held, self.arena.fence.shares(point.sight))
+                if mu <= HOLDING and point.values is not None:
+                    held = tightened_further(held, self.arena.constraints.shares(point.values))
         except Spent:
             self._mend()
             raise
-        self.series.mu = rungs.last if rungs.last > Rungs().last and self.arena.holds else 0.0
+        self.series.mu = (
+            schedule.last if schedule.last > BarrierSchedule().last and self.arena.holds else 0.0
+        )
 
     def _begin(self) -> Array:
         """A control inside the limits; where none is near, one on its way there by the barrier alone."""
         arena, start = self.arena, self.series.control
         self.s = self._coefficients(start)
-        inner = self.ladder.inside(start) if arena.holds else start
+        inner = self.barrier_weights.inside(start) if arena.holds else start
         if inner is not None:
             return inner
-        problem = InteriorProblem(self.base, arena.fence, 1.0, WIDEST, costs=False)
-        self._stage(problem, Rungs(), 1.0, False)
-        inner = self.ladder.inside(self._control(self.s))
+        problem = InteriorProblem(self.base, arena.constraints, 1.0, WIDEST, costs=False)
+        self._stage(problem, BarrierSchedule(), 1.0, False)
+        inner = self.barrier_weights.inside(self._control(self.s))
         return self._control(self.s) if inner is None else inner
 
-    def _stage(self, problem: InteriorProblem, rungs: Rungs, mu: float, last: bool) -> None:
+    def _stage(
+        self, problem: InteriorProblem, schedule: BarrierSchedule, mu: float, last: bool
+    ) -> None:
         """Minimise one barrier from where the search is, until little is won."""
         point = self._point(problem)
-        if point.sight is None:
+        if point.values is None:
             return
         factor = self._whitening(problem, point)
         enough, patience = (
-            rungs.tolerance if last else rungs.settled * mu,
-            rungs.patience * (2 if last else 1),
+            schedule.tolerance if last else schedule.settled * mu,
+            schedule.patience * (2 if last else 1),
         )
         values, tried = [problem.value(point)], dict[bytes, float]()
 
@@ -295,7 +299,9 @@ class Descent:
         def accepted(y: Array) -> None:
             self.s = solve_triangular(factor.T, y).reshape(self.s.shape)
             values.append(tried.get(np.asarray(y).tobytes(), values[-1]))
-            slow = len(values) > rungs.window and values[-1 - rungs.window] - values[-1] < enough
+            slow = (
+                len(values) > schedule.window and values[-1 - schedule.window] - values[-1] < enough
+            )
             if slow or len(values) > patience:
                 raise Settled
 
@@ -315,7 +321,7 @@ class Descent:
         self.arena.require(self.limit)
         nothing = FAR, np.zeros(s.size)
         point = problem.point(self._control(s))
-        if point.sight is None or not np.isfinite(problem.value(point)):
+        if point.values is None or not np.isfinite(problem.value(point)):
             return nothing
         offered(self.arena, self.series, point)
         if not problem.costs and self.arena.inside(point):
@@ -330,8 +336,8 @@ class Descent:
     def _mend(self) -> None:
         """Shrink what leaks about the centre until it does not."""
         point = self._point(self.arena.looking)
-        if self.arena.holds and (point.sight is None or not self.arena.inside(point)):
-            control = self.ladder.inside(self._control(self.s))
+        if self.arena.holds and (point.values is None or not self.arena.inside(point)):
+            control = self.barrier_weights.inside(self._control(self.s))
             point = point if control is None else self.arena.looking.point(control)
         offered(self.arena, self.series, point)
 
@@ -341,7 +347,7 @@ class Descent:
         if e.barrier is None:
             raise ValueError("nothing to whiten with")
         N, w = len(self.series.basis), e.barrier.weights
-        ridge = RIDGE / N / self.arena.fence.control.scale**2
+        ridge = RIDGE / N / self.arena.constraints.control.scale**2
         if problem.costs and point.point is not None and point.point.cost > 0.0:
             ridge = ridge + task.control_weight * task.dt / point.point.cost
         H = BasisMetric.from_weights(
