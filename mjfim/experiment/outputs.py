@@ -105,7 +105,8 @@ class _NoiseTable:
 
     def places(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
         """Places of columns by name."""
-        return np.array([self.columns.index(name) for name in names], dtype=np.intp)
+        found = [self.columns.index(name) for name in names]
+        return np.array(found, dtype=np.intp)
 
     def set_key(
         self, key: str, value: float | NoiseSpec, names: list[str], experiment: Experiment

@@ -66,6 +66,16 @@ class ScalarJoint:
     q: int
     v: int
 
+    @property
+    def position_column(self) -> str:
+        """Column of its coordinate."""
+        return f"qpos:{self.name}"
+
+    @property
+    def velocity_column(self) -> str:
+        """Column of its velocity."""
+        return f"qvel:{self.name}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class StateComponent:
@@ -118,7 +128,8 @@ def control_names(model: Any) -> tuple[str, ...]:
     """Names of the nu controls; an actuator with several controls has one name for each, `<actuator>[<i>]`."""
     names: list[str] = []
     for i, name in enumerate(actuator_names(model)):
-        names += _indexed(name, int(model.actuator_ctrlnum[i]))
+        count = int(model.actuator_ctrlnum[i])
+        names += _indexed(name, count)
     return tuple(names)
 
 
@@ -127,8 +138,11 @@ def control_labels(model: Any) -> tuple[str, ...]:
     labels: list[str] = []
     for i, name in enumerate(actuator_names(model)):
         count = int(model.actuator_ctrlnum[i])
+
+        # The units of several controls of one actuator are not evident.
         unit = control_unit(model, i) if count == 1 else ""
         suffix = f"[{unit}]" if unit else "(control)"
+
         labels += [f"{control} {suffix}" for control in _indexed(name, count)]
     return tuple(labels)
 
@@ -154,11 +168,21 @@ def joint_dofs(model: Any, joint: int) -> int:
 
 
 def tangent_parts(model: Any, joint: int) -> tuple[str, ...]:
-    """Parts of a deviation of a joint, in the order of its degrees of freedom; none for slide and hinge joints."""
+    """Parts of a deviation of a joint, in the order of its degrees of freedom.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        joint: Number of the joint.
+
+    Returns:
+        The parts; none for slide and hinge joints.
+    """
     kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
     if kind == mujoco.mjtJoint.mjJNT_FREE:
         return (*TRANSLATION, *ROTATION_VECTOR)
-    return ROTATION_VECTOR if kind == mujoco.mjtJoint.mjJNT_BALL else ()
+    if kind == mujoco.mjtJoint.mjJNT_BALL:
+        return ROTATION_VECTOR
+    return ()
 
 
 def state_components(model: Any) -> tuple[StateComponent, ...]:
@@ -243,6 +267,12 @@ def _activation_components(model: Any) -> tuple[TangentComponent, ...]:
     return tuple(found[address] for address in sorted(found))
 
 
+def dof_names(model: Any) -> tuple[str, ...]:
+    """Names of the nv degrees of freedom: `<joint>`, or `<joint>.<part>` with the parts of a rotation vector."""
+    components = tangent_components(model)[: model.nv]
+    return tuple(component.name.removeprefix("qpos:") for component in components)
+
+
 def activation_names(model: Any) -> tuple[str, ...]:
     """Columns of the na activations: `act:<actuator>`, with `[i]` where an actuator has several."""
     return tuple(component.name for component in _activation_components(model))
@@ -250,7 +280,8 @@ def activation_names(model: Any) -> tuple[str, ...]:
 
 def state_names(model: Any) -> tuple[str, ...]:
     """Columns of the state (qpos, qvel, act): nq + nv + na names."""
-    return (*(component.name for component in state_components(model)), *activation_names(model))
+    joints = [component.name for component in state_components(model)]
+    return (*joints, *activation_names(model))
 
 
 def tangent_names(model: Any) -> tuple[str, ...]:
@@ -259,7 +290,12 @@ def tangent_names(model: Any) -> tuple[str, ...]:
 
 
 def gain_names(model: Any, controls: Sequence[str]) -> tuple[str, ...]:
-    """Columns of the gain K: (nu, nx), row by row: `gain:<control>:<component of the deviation>`."""
+    """Columns of the gain K: (nu, nx), row by row: `gain:<control>:<component of the deviation>`.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        controls: nu names of the controls.
+    """
     names: list[str] = []
     for control in controls:
         names += [f"gain:{control}:{component}" for component in tangent_names(model)]
@@ -267,20 +303,34 @@ def gain_names(model: Any, controls: Sequence[str]) -> tuple[str, ...]:
 
 
 def sensor_columns(model: Any, sensor: str) -> list[str]:
-    """Columns of a named sensor: its name, with `[i]` where it has several components."""
-    return _indexed(sensor, int(model.sensor(sensor).dim[0]))
+    """Columns of a named sensor: its name, with `[i]` where it has several components.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        sensor: Name of the sensor.
+    """
+    width = int(model.sensor(sensor).dim[0])
+    return _indexed(sensor, width)
 
 
 def measurable_columns(model: Any) -> tuple[str, ...]:
     """Columns of everything that a recording may hold: components of the state, then sensors."""
-    sensors = [
-        column for sensor in names_of(model, "sensor") for column in sensor_columns(model, sensor)
-    ]
-    return (*(component.name for component in state_components(model)), *sensors)
+    columns = [component.name for component in state_components(model)]
+    for sensor in names_of(model, "sensor"):
+        columns += sensor_columns(model, sensor)
+    return tuple(columns)
 
 
 def output_label(model: Any, output: str) -> str:
-    """Label `<column> [<unit>]` of a measured column; the column alone where no unit is known."""
+    """Label `<column> [<unit>]` of a measured column.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        output: The column.
+
+    Returns:
+        The label; the column alone where no unit is known.
+    """
     units = {component.name: component.unit for component in state_components(model)}
     unit = units.get(output, "")
 

@@ -22,19 +22,33 @@ COUNT_FIELDS = {"joint": "njnt", "actuator": "nactuator"}
 
 
 def element_count(model: Any, kind: str) -> int:
-    """Number of elements of a kind, with and without a name."""
+    """Number of elements of a kind, with and without a name.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        kind: A key of `OBJECT_TYPES`.
+    """
     return int(getattr(model, COUNT_FIELDS.get(kind, f"n{kind}")))
 
 
 def names_of(model: Any, kind: str) -> list[str]:
-    """Names of all elements of a kind that have one, in the order of the model."""
-    count = element_count(model, kind)
-    names = (mujoco.mj_id2name(model, OBJECT_TYPES[kind], i) for i in range(count))
+    """Names of all elements of a kind that have one, in the order of the model.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        kind: A key of `OBJECT_TYPES`.
+    """
+    names = [element_name(model, kind, i) for i in range(element_count(model, kind))]
     return [name for name in names if name]
 
 
 def unnamed_count(model: Any, kind: str) -> int:
-    """Number of elements of a kind that have no name."""
+    """Number of elements of a kind that have no name.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        kind: A key of `OBJECT_TYPES`.
+    """
     return element_count(model, kind) - len(names_of(model, kind))
 
 
@@ -42,13 +56,16 @@ def unique_names(model: Any, kind: str) -> tuple[str, ...]:
     """Names of all elements of a kind, no two alike.
 
     An element without a name is called `<kind><number>`; underscores are appended where another element has that name.
-    """
-    count = element_count(model, kind)
-    names = [mujoco.mj_id2name(model, OBJECT_TYPES[kind], i) for i in range(count)]
-    taken = {name for name in names if name}
 
-    for i in range(count):
-        if not names[i]:
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        kind: A key of `OBJECT_TYPES`.
+    """
+    names = [element_name(model, kind, i) for i in range(element_count(model, kind))]
+    taken = set(names)
+
+    for i, given in enumerate(names):
+        if not given:
             name = f"{kind}{i}"
             while name in taken:
                 name += "_"
@@ -58,10 +75,28 @@ def unique_names(model: Any, kind: str) -> tuple[str, ...]:
 
 
 def identifier(model: Any, kind: str, name: str) -> int:
-    """Number of the element of a kind that has a name; -1 where none has it."""
+    """Number of the element of a kind that has a name.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        kind: A key of `OBJECT_TYPES`.
+        name: Name of the element.
+
+    Returns:
+        The number; -1 where no element has the name.
+    """
     return int(mujoco.mj_name2id(model, OBJECT_TYPES[kind], name))
 
 
 def element_name(model: Any, kind: str, number: int) -> str:
-    """Name of an element in the MJCF; empty where it has none."""
+    """Name of an element in the MJCF.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        kind: A key of `OBJECT_TYPES`.
+        number: Number of the element.
+
+    Returns:
+        The name; empty where the element has none.
+    """
     return mujoco.mj_id2name(model, OBJECT_TYPES[kind], number) or ""

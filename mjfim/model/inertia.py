@@ -68,7 +68,8 @@ class BodyInertia:
     @property
     def second_moments(self) -> Array:
         """(3, 3) second moments about the centre of mass, `tr(I)/2 1 - I` [kg m²]."""
-        return np.asarray(0.5 * np.trace(self.inertia) * np.eye(3) - self.inertia)
+        half_trace = 0.5 * np.trace(self.inertia)
+        return np.asarray(half_trace * np.eye(3) - self.inertia)
 
     @property
     def gyration_radius(self) -> float:
@@ -79,7 +80,8 @@ class BodyInertia:
 
 def to_central(body: BodyInertia) -> Array:
     """(10,) mass, centre of mass, `fullinertia` about it."""
-    return np.concatenate([[body.mass], body.com, _entries(body.inertia)])
+    entries = _entries(body.inertia)
+    return np.concatenate([[body.mass], body.com, entries])
 
 
 def from_central(values: Array) -> BodyInertia:
@@ -154,8 +156,14 @@ def _symmetric(entries: Array) -> Array:
 
 
 def _steiner(mass: float, com: Array) -> Array:
-    """(3, 3) inertia [kg m²] about the origin of a point mass [kg] at com: (3,) [m], by the parallel axis theorem."""
-    return np.asarray(mass * (com @ com * np.eye(3) - np.outer(com, com)))
+    """(3, 3) inertia about the origin of a point mass, by the parallel axis theorem [kg m²].
+
+    Args:
+        mass: The mass [kg].
+        com: (3,) its place [m].
+    """
+    squared = com @ com
+    return np.asarray(mass * (squared * np.eye(3) - np.outer(com, com)))
 
 
 @dataclass(frozen=True, kw_only=True)

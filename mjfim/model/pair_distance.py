@@ -73,6 +73,8 @@ class PairDistances:
 
         self.first = np.array([pair.first for pair in pairs])
         self.second = np.array([pair.second for pair in pairs])
+
+        # (2, p) types of the geoms.
         types = self._model.geom_type
         kinds = np.stack([types[self.first], types[self.second]])
 

@@ -289,7 +289,10 @@ class ParameterSet:
 
     def _has_field(self, kinds: type | tuple[type, ...]) -> np.ndarray:
         """(p,) True where a parameter has a field of one of these kinds."""
-        return np.array([any(isinstance(f, kinds) for f in row) for row in self.fields], dtype=bool)
+        found = np.zeros(len(self), dtype=bool)
+        for j, _, target_field in self._targets():
+            found[j] |= isinstance(target_field, kinds)
+        return found
 
     def _targets(self) -> Iterator[tuple[int, Target, TargetField]]:
         """Every target with the index of its parameter and the field that it leads to."""

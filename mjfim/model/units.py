@@ -82,14 +82,27 @@ def per_second(unit: str) -> str:
 
 
 def joint_unit(model: Any, joint: int) -> str:
-    """Unit of the first coordinate of a joint: metres for slide and free joints, radians for hinge and ball joints."""
+    """Unit of the first coordinate of a joint: metres for slide and free joints, radians for hinge and ball joints.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        joint: Number of the joint.
+    """
     kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
     translates = kind in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)
     return LENGTH if translates else ANGLE
 
 
 def sensor_unit(model: Any, sensor: int) -> str:
-    """Unit of a sensor by its number; empty where it is dimensionless or depends on the model."""
+    """Unit of a sensor.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        sensor: Number of the sensor.
+
+    Returns:
+        The unit; empty where the sensor is dimensionless or its unit depends on the model.
+    """
     kind = mujoco.mjtSensor(int(model.sensor_type[sensor]))
 
     if kind in JOINT_POSITION_SENSORS:
@@ -101,17 +114,25 @@ def sensor_unit(model: Any, sensor: int) -> str:
 
 
 def control_unit(model: Any, actuator: int) -> str:
-    """Unit of the control of an actuator; empty where it is not evident from the model.
+    """Unit of the control of an actuator.
 
     It is evident for actuators that act on one joint with a gear of 1: a direct drive (gain 1, no bias) takes a force, a
     position servo (`biasprm[1] = -gain`) takes the joint's coordinate.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        actuator: Number of the actuator.
+
+    Returns:
+        The unit; empty where it is not evident from the model.
     """
     gear = model.actuator_gear[int(model.actuator_outadr[actuator]), 0]
     at_joint = int(model.actuator_trntype[actuator]) == int(mujoco.mjtTrn.mjTRN_JOINT)
     if not at_joint or gear != 1:
         return ""
 
-    unit = joint_unit(model, int(model.actuator_trnid[actuator, 0]))
+    joint = int(model.actuator_trnid[actuator, 0])
+    unit = joint_unit(model, joint)
     gain = float(model.actuator_gainprm[actuator, 0])
     bias = model.actuator_biasprm[actuator]
 

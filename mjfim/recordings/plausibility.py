@@ -126,7 +126,7 @@ def _contradiction_remarks(channels: Channels, recording: Recording) -> Iterator
     sigma = _sigma_by_name(channels)
 
     for joint in scalar_joints(channels.model):
-        position, velocity = f"qpos:{joint.name}", f"qvel:{joint.name}"
+        position, velocity = joint.position_column, joint.velocity_column
         if position not in columns or velocity not in columns:
             continue
 
