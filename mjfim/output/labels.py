@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import mujoco
 
@@ -11,6 +11,7 @@ from mjfim.errors import MjfimError
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import (
     control_labels,
+    dof_names,
     output_label,
     state_components,
     tangent_components,
@@ -18,13 +19,18 @@ from mjfim.model.coordinates import (
 from mjfim.model.units import per_second
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Labels:
-    """What each column is called, unit included.
+    """Labels of all columns that are shown, `<name> [<unit>]` unless stated otherwise.
 
-    qpos: nq, one per coordinate;  positions, velocities: nv, one per degree of freedom;  controls: nu
-    parameters: p names without unit;  parameter_units: p units, empty where dimensionless
-    outputs: `name [unit]` by output column (`qpos:<joint>`, sensor name);  missing ones show the column name
+    Attributes:
+        qpos: nq labels of the numbers of qpos.
+        positions: nv labels of the positions by degree of freedom; rotations of ball and free joints are rotation vectors.
+        velocities: nv labels of the velocities by degree of freedom.
+        controls: nu labels of the controls.
+        parameters: p names of the parameters, without unit.
+        parameter_units: p units of the parameters; empty where a parameter has none.
+        outputs: Labels of the measured columns, by column; others are shown by the name of their column.
     """
 
     qpos: tuple[str, ...]
@@ -36,6 +42,7 @@ class Labels:
     outputs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Check that every parameter has a unit."""
         names, units = len(self.parameters), len(self.parameter_units)
         if names != units:
             raise MjfimError(
@@ -44,10 +51,10 @@ class Labels:
 
     @classmethod
     def of_model(cls, model: mujoco.MjModel) -> Labels:
-        """Names of joints and actuators; rotations of ball and free joints are rotation vectors."""
+        """Labels of the joints and actuators of a model."""
         state = state_components(model)[: model.nq]
         tangent = tangent_components(model)[: model.nv]
-        names = [component.name.removeprefix("qpos:") for component in tangent]
+        names = dof_names(model)
 
         return cls(
             qpos=tuple(f"{c.name.removeprefix('qpos:')} [{c.unit or '1'}]" for c in state),
@@ -61,29 +68,33 @@ class Labels:
 
     @classmethod
     def of_system(cls, system: System) -> Labels:
-        """Names of an experiment: its model's, its parameters' and its outputs'."""
+        """Labels of a system: of its model, its parameters and its outputs."""
         base = cls.of_model(system.model)
         outputs = {name: output_label(system.model, name) for name in system.outputs.names}
-        return cls(
-            base.qpos,
-            base.positions,
-            base.velocities,
-            base.controls,
-            system.parameters.names,
-            system.units,
-            outputs,
+        return replace(
+            base,
+            parameters=system.parameters.names,
+            parameter_units=system.units,
+            outputs=outputs,
         )
 
     def parameter(self, j: int) -> str:
-        """`name [unit]` of parameter j."""
+        """Label of parameter j."""
         return f"{self.parameters[j]} [{self.parameter_units[j] or 'model unit'}]"
 
     def output(self, column: str) -> str:
-        """`name [unit]` of an output column."""
+        """Label of a measured column."""
         return self.outputs.get(column, f"{column} [model unit]")
 
     def check(self, **sizes: int) -> None:
-        """Raise unless each named field has the given length."""
+        """Check the lengths of fields.
+
+        Args:
+            sizes: Length of the data by the name of the field.
+
+        Raises:
+            MjfimError: A field has another length.
+        """
         for name, size in sizes.items():
             have = len(getattr(self, name))
             if have != size:

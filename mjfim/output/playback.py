@@ -1,8 +1,8 @@
-"""A design as a robot's controller plays it, at the controller's own rate: state, control, the gains about them (design.csv),
-and the joint motion that a position-controlled robot follows (reference.csv). No interpolation: rows are engine steps.
+"""Tables with which a robot plays a design: `design.csv` for its controller, `reference.csv` for a position-controlled robot.
 
-Feedback: `u = ctrl + gain (planned - measured)`, the difference in the tangent space: rotations of ball and free joints as
-rotation vectors in the measured body's frame.
+Rows are engine steps at the controller's rate; nothing is interpolated. With feedback the robot applies
+`u = ctrl + gain (planned - measured)`, the difference in the tangent space: rotations of ball and free joints are rotation
+vectors in the measured body's frame.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.model.coordinates import gain_names, state_components, state_names
+from mjfim.model.coordinates import dof_names, gain_names, state_components, state_names
 from mjfim.plant.active_constraints import forward_samples
 from mjfim.plant.batch import BatchSimulator
 from mjfim.records.playback import Playback
@@ -20,53 +20,82 @@ from mjfim.records.trajectory import Trajectory
 
 
 def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Playback:
-    """A designed trajectory at `playback_rate`, simulated again at the design's theta. gain: (N, nu, nx)
+    """Simulate a designed trajectory at `playback_rate`, at the parameters of the design.
 
-    Raises SimulationDivergedError where it cannot be simulated.
+    Args:
+        system: The system.
+        trajectory: The design, N samples.
+        gain: (N, nu, nx) feedback gains of the samples [control unit / state unit].
+
+    Returns:
+        The trajectory and the gains, one row for each period of the controller.
+
+    Raises:
+        SimulationDivergedError: The simulation diverges.
     """
-    rows = system.grid.substeps // system.stated_grid.playback_steps
-    simulator = BatchSimulator(
-        system.plant.simulator.model, substeps=system.stated_grid.playback_steps
-    )
+    steps = system.stated_grid.playback_steps
+    rows = system.grid.substeps // steps
     held = np.repeat(trajectory.ctrl, rows, axis=0)
-    out = simulator.rollout([system.plant.model(system.theta)], trajectory.state[:1], held[None])
+
+    simulator = BatchSimulator(system.plant.simulator.model, substeps=steps)
+    model = system.plant.model(system.theta)
+    out = simulator.rollout([model], trajectory.state[:1], held[None])
     if not out.finite[0]:
         raise SimulationDivergedError("the designed control diverges when it is simulated again")
+
     t = np.arange(len(held) + 1, dtype=np.float64) * (system.dt / rows)
     return Playback(t=t, state=out.states[0], ctrl=held, gain=np.repeat(gain, rows, axis=0))
 
 
 def design_columns(playback: Playback, system: System) -> dict[str, Array]:
-    """design.csv: t, state, ctrl, gains; the end has neither control nor gains."""
+    """Columns of `design.csv`: time, state, controls and gains by name, each (M+1,).
+
+    Controls and gains hold until the next row; the last row has none (NaN).
+
+    Args:
+        playback: The design by periods of the controller, M of them.
+        system: The system.
+    """
     M = len(playback.ctrl)
-    ctrl = np.concatenate([playback.ctrl, np.full((1, len(system.controls)), np.nan)])
-    flat = playback.gain.reshape(M, -1)
-    gain = np.concatenate([flat, np.full((1, flat.shape[1]), np.nan)])
-    return {
-        "t": playback.t,
-        **dict(zip(state_names(system.model), playback.state.T, strict=True)),
-        **{f"ctrl:{name}": ctrl[:, i] for i, name in enumerate(system.controls)},
-        **dict(zip(gain_names(system.model, system.controls), gain.T, strict=True)),
-    }
+    no_control = np.full((1, len(system.controls)), np.nan)
+    ctrl = np.concatenate([playback.ctrl, no_control])
+
+    gain = playback.gain.reshape(M, -1)
+    no_gain = np.full((1, gain.shape[1]), np.nan)
+    gain = np.concatenate([gain, no_gain])
+
+    columns = {"t": playback.t}
+    columns |= dict(zip(state_names(system.model), playback.state.T, strict=True))
+    columns |= {f"ctrl:{name}": ctrl[:, i] for i, name in enumerate(system.controls)}
+    columns |= dict(zip(gain_names(system.model, system.controls), gain.T, strict=True))
+    return columns
 
 
 def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
-    """reference.csv: what a position-controlled robot follows, and the feed-forward that goes with it. No empty field.
+    """Columns of `reference.csv` by name, each (M+1,): the planned motion and the feed-forward that belongs to it.
 
-    qpos, qvel: planned;  qacc:<joint>: MuJoCo's acceleration there under the row's control
-    force:<joint>: what the actuators apply at the joint. In the last row the last control is held on.
+    `qpos:<joint>` and `qvel:<joint>` are planned, `qacc:<joint>` is MuJoCo's acceleration under the control of the row, and
+    `force:<joint>` what the actuators apply at the joint. The last row continues the last control.
+
+    Args:
+        playback: The design by periods of the controller, M of them.
+        system: The system.
     """
     held = np.concatenate([playback.ctrl, playback.ctrl[-1:]])
     qpos, qvel, act = system.space.split(playback.state)
     rows = Trajectory(t=playback.t, qpos=qpos, qvel=qvel, act=act, ctrl=held)
-    qacc, force = np.empty_like(qvel), np.empty_like(qvel)
+
+    qacc = np.empty_like(qvel)
+    force = np.empty_like(qvel)
     for k, data in forward_samples(system.model_at(system.theta), rows, range(len(held))):
-        qacc[k], force[k] = data.qacc, data.qfrc_actuator
-    names = [c.name for c in state_components(system.model)]
-    dofs = [name.removeprefix("qvel:") for name in names[system.space.nq :]]
-    return {
-        "t": playback.t,
-        **dict(zip(names, np.concatenate([qpos, qvel], axis=1).T, strict=True)),
-        **{f"qacc:{name}": qacc[:, i] for i, name in enumerate(dofs)},
-        **{f"force:{name}": force[:, i] for i, name in enumerate(dofs)},
-    }
+        qacc[k] = data.qacc
+        force[k] = data.qfrc_actuator
+
+    names = [component.name for component in state_components(system.model)]
+    motion = np.concatenate([qpos, qvel], axis=1)
+    columns = {"t": playback.t}
+    columns |= dict(zip(names, motion.T, strict=True))
+    dofs = dof_names(system.model)
+    columns |= {f"qacc:{name}": qacc[:, i] for i, name in enumerate(dofs)}
+    columns |= {f"force:{name}": force[:, i] for i, name in enumerate(dofs)}
+    return columns

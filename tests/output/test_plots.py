@@ -433,7 +433,7 @@ def test_intervals_with_infinite_std(tmp_path: Path) -> None:
         lambda: plots.fit(make_estimate(), 1, make_labels(2, 3), [0.05, 0.05]),
         lambda: plots.fit(make_estimate(), 0, make_labels(2, 3), [0.05]),
         lambda: plots.save(Figure(), "figure.jpg"),
-        lambda: Labels((), (), (), (), ("m",), ()),
+        lambda: Labels(qpos=(), positions=(), velocities=(), controls=(), parameters=("m",)),
     ],
 )
 def test_misuse_is_refused(misuse: Callable[[], object]) -> None:

@@ -96,7 +96,7 @@ def test_rows_at_samples_are_the_design(kind: str, tmp_path: Path) -> None:
     """However fast the controller, every sample of the design stands there to the last bit."""
     task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
     stride = round(FINE[kind] / task.experiment.rate)
-    played = simulate_playback(task, task.initial, gains(task))
+    played = simulate_playback(task.system, task.initial, gains(task))
     assert stride > 1
     np.testing.assert_array_equal(played.state[::stride], task.initial.state)
     for first in range(stride):
@@ -195,7 +195,7 @@ def test_gain_columns_name_what_they_act_on(tmp_path: Path) -> None:
 def test_reference_is_what_mujoco_says(kind: str, tmp_path: Path) -> None:
     """Accelerations and joint forces are those of mj_forward at each row, not differences; no field is empty."""
     task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
-    played = simulate_playback(task, task.initial, gains(task))
+    played = simulate_playback(task.system, task.initial, gains(task))
     archive.write_table(tmp_path / "reference.csv", reference_columns(played, task.system))
     rows = table(tmp_path / "reference.csv")
     assert all(np.isfinite(values).all() for values in rows.values())
