@@ -28,7 +28,7 @@ START_TIME = 1.0
 MAX_CONTROL = float(mujoco.mjMAXVAL)
 # Type of the sensors that show the time.
 CLOCK_SENSOR = int(mujoco.mjtSensor.mjSENS_CLOCK)
-# Up to so many rollouts share a small batch; a Monte Carlo study has a large one besides.
+# Largest number of rollouts that use the small batch; the many of a Monte Carlo study have a second one.
 SMALL_BATCH = 64
 
 
@@ -395,20 +395,20 @@ class BatchSimulator:
 
         Returns sensor data (count, nsensordata) or None, and (count, w) observations at every derivative substep.
         """
-        looked = () if observations is None else observations.derivative_substeps
+        substeps = () if observations is None else observations.derivative_substeps
         accelerations = observations is not None and len(observations.accelerations) > 0
         sensors = None
         observed = []
 
         # Sensor data are those of the state before the sample: the first step computes them.
-        stops = {*looked, self.substeps}
+        stops = {*substeps, self.substeps}
         if self.sensors:
             stops.add(1)
 
         done = 0
         for stop in sorted(stops):
             # An acceleration is the change of velocity over one engine step.
-            if stop - done > 1 and stop in looked:
+            if stop - done > 1 and stop in substeps:
                 batch.step(ids, nstep=stop - done - 1)
                 done = stop - 1
             qvel_before = np.array(batch.bind("qvel")[:count]) if accelerations else None
@@ -417,7 +417,7 @@ class BatchSimulator:
             done = stop
             if self.sensors and stop == 1:
                 sensors = self._sensor_data(batch.bind("sensordata")[:count])
-            if observations is not None and stop in looked:
+            if observations is not None and stop in substeps:
                 qpos = batch.bind("qpos")[:count]
                 qvel = batch.bind("qvel")[:count]
                 before = qvel if qvel_before is None else qvel_before

@@ -191,7 +191,7 @@ class Plant:
         return models, np.ones(len(theta), dtype=bool)
 
     def _compile(self, theta: Array) -> tuple[list[Any], np.ndarray]:
-        """Compile one model per row of theta: (m, p), and tell which of them (m,) could be compiled."""
+        """Compile one model per row of theta: (m, p), and return which of them (m,) could be compiled."""
         models = []
         compiled = np.ones(len(theta), dtype=bool)
         for i, row in enumerate(theta):

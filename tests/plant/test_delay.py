@@ -1,4 +1,4 @@
-"""The lag of the outputs: a shifted curve, its derivative by the delay, its adjoint, and where it is clamped."""
+"""Output delay: a shifted curve, its derivative by the delay, its adjoint, and its values before the first sample."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ def curve(t: Array) -> Array:
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.003, 0.01, 0.0337, 0.25])
-def test_a_lagged_curve_is_the_curve_shifted(delay: float) -> None:
-    """To the fourth order of a cubic: at half the period the error falls sixteenfold."""
+def test_a_delayed_curve_is_the_shifted_curve(delay: float) -> None:
+    """Cubic interpolation is of fourth order: at half the period the error falls sixteenfold."""
     errors = []
     for dt in (DT, DT / 2):
         t = np.arange(round(1.2 / dt)) * dt
-        lagged = OutputDelay.on_grid(len(t), delay, dt).apply(curve(t))
+        delayed = OutputDelay.on_grid(len(t), delay, dt).apply(curve(t))
         inside = t - delay >= 2 * dt
-        errors.append(np.abs(lagged - curve(t - delay))[inside].max())
+        errors.append(np.abs(delayed - curve(t - delay))[inside].max())
     assert errors[0] < 1e-5
     assert errors[1] < max(errors[0] / 8, 1e-14)
 
 
 def test_a_cubic_is_shifted_exactly_and_a_quartic_is_not() -> None:
-    """Everywhere, the first samples after the start included."""
+    """At all samples, the first ones included."""
     output_delay = OutputDelay.on_grid(30, 0.3, 1.0)
     t = np.arange(30.0)
     for degree in range(5):
@@ -42,7 +42,7 @@ def test_a_cubic_is_shifted_exactly_and_a_quartic_is_not() -> None:
 
 
 def test_whole_samples_are_exact() -> None:
-    """No interpolation where there is none to do; no delay leaves every bit."""
+    """A delay of whole samples needs no interpolation; without a delay no bit changes."""
     y = curve(T)
     np.testing.assert_array_equal(OutputDelay.on_grid(len(T), 0.0, DT).apply(y), y)
     np.testing.assert_allclose(
@@ -50,8 +50,8 @@ def test_whole_samples_are_exact() -> None:
     )
 
 
-def test_what_was_before_the_start_is_the_start() -> None:
-    """And does not change with the delay; a lead is clamped at the end."""
+def test_before_the_first_sample_the_first_value_is_held() -> None:
+    """It does not change with the delay; a negative delay holds the last value after the last sample."""
     y = curve(T)
     output_delay = OutputDelay.on_grid(len(T), 0.055, DT)
     np.testing.assert_array_equal(output_delay.apply(y)[:6], np.broadcast_to(y[0], (6, 2)))
@@ -68,8 +68,8 @@ def test_what_was_before_the_start_is_the_start() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.0042, 0.0337, -0.0125])
-def test_the_rate_is_the_derivative_by_the_delay(delay: float) -> None:
-    """Against differences of the operator, and roughly minus the slope of the curve."""
+def test_the_derivative_by_the_delay(delay: float) -> None:
+    """It agrees with differences of the operator, and roughly with minus the slope of the curve."""
     y = curve(T)
     rate = OutputDelay.on_grid(len(T), delay, DT).derivative(y)
     for k in range(0, len(T), 7):
@@ -87,8 +87,8 @@ def test_the_rate_is_the_derivative_by_the_delay(delay: float) -> None:
     np.testing.assert_allclose(rate[inside], -slope[inside], rtol=0, atol=2e-2)
 
 
-def test_the_rate_without_a_delay_is_that_of_a_small_delay() -> None:
-    """The guess of a delay is zero: its derivative there is from the side that can be."""
+def test_the_derivative_at_zero_delay_is_one_sided() -> None:
+    """The guess of a delay may be zero: its derivative there is the one towards positive delays."""
     y = curve(T)
     h = 1e-7
     quotient = (OutputDelay.on_grid(len(T), h, DT).apply(y) - y) / h
@@ -98,7 +98,7 @@ def test_the_rate_without_a_delay_is_that_of_a_small_delay() -> None:
 
 
 def test_adjoints_by_dot_products() -> None:
-    """`<v, L y> = <L' v, y>` for arrays of any rank, in the shape that came in."""
+    """`<v, L y> = <L' v, y>` for arrays of any rank; shapes are kept."""
     rng = np.random.default_rng(0)
     output_delay = OutputDelay.on_grid(50, 0.0273, DT)
     for shape in ((50,), (50, 3), (50, 2, 4)):
@@ -116,19 +116,21 @@ def test_adjoints_by_dot_products() -> None:
 
 
 @pytest.mark.parametrize("samples", [2, 3])
-def test_short_recordings_are_interpolated_by_what_there_is(samples: int) -> None:
-    """A polynomial through all samples."""
+def test_short_recordings_are_interpolated_by_a_polynomial_through_all_samples(
+    samples: int,
+) -> None:
+    """Two samples give a line, three a parabola."""
     t = np.arange(float(samples))
     y = 2.0 + (t**2 if samples == 3 else t)
-    lagged = OutputDelay.on_grid(samples, 0.4, 1.0).apply(y)
+    delayed = OutputDelay.on_grid(samples, 0.4, 1.0).apply(y)
     wanted = np.maximum(t - 0.4, 0.0)
     np.testing.assert_allclose(
-        lagged, 2.0 + (wanted**2 if samples == 3 else wanted), rtol=0, atol=1e-12
+        delayed, 2.0 + (wanted**2 if samples == 3 else wanted), rtol=0, atol=1e-12
     )
 
 
-def test_the_sensitivity_to_a_delay_is_that_of_lagging_the_outputs(tmp_path: Path) -> None:
-    """Through the plant: predictions at two delays, against G; a horizon of two samples works too."""
+def test_the_sensitivity_to_a_delay_is_the_derivative_of_delayed_outputs(tmp_path: Path) -> None:
+    """Predictions of the plant at two delays agree with G; a horizon of two samples works too."""
     task = cart_task(tmp_path, nuisance={"delay": 0.01})
     theta = np.array(task.parameters.guess)
     theta[-1] = 0.0137

@@ -23,7 +23,7 @@ def correlated(strides: tuple[int, ...] = (1, 1, 1, 1)) -> Noise:
 
 
 def half_square(rows: Array) -> float:
-    """What whitened residuals contribute to minus the log-density."""
+    """Half the squares of whitened residuals: their part of minus the log-density."""
     return 0.5 * float(rows @ rows)
 
 
@@ -56,7 +56,7 @@ def test_independent_outputs_are_the_special_case() -> None:
 
 
 def test_jacobians_are_whitened_like_residuals() -> None:
-    """Any trailing axes; the product of whitened rows is the Fisher information by the precision."""
+    """With any trailing axes; products of whitened rows are the Fisher information by the precision matrix."""
     G = np.random.default_rng(2).standard_normal((5, 4, 3))
     noise = correlated()
     white = noise.whiten(G)
@@ -70,8 +70,8 @@ def test_jacobians_are_whitened_like_residuals() -> None:
     np.testing.assert_allclose(noise.sigma, np.sqrt(np.diag(FULL)), rtol=1e-15)
 
 
-def test_strides_say_which_samples_hold_which_output() -> None:
-    """The start is never measured; an output's slower rate is its own."""
+def test_strides_select_the_samples_of_each_output() -> None:
+    """The initial state is never measured; each output has its rate."""
     measured = correlated((2, 2, 2, 3)).measured(7)
     assert measured[:, 0].tolist() == [0, 0, 1, 0, 1, 0, 1, 0]
     assert measured[:, 3].tolist() == [0, 0, 0, 1, 0, 0, 1, 0]
@@ -86,7 +86,7 @@ def test_strides_say_which_samples_hold_which_output() -> None:
 
 
 def test_missing_values_are_marginalised() -> None:
-    """The density of what is there, by SciPy, whatever stands where nothing was measured."""
+    """The density of the present values agrees with SciPy, whatever stands in place of missing ones."""
     rng = np.random.default_rng(4)
     values = rng.standard_normal((12, 4))
     present = rng.random((12, 4)) < 0.6
@@ -112,7 +112,7 @@ def test_missing_values_are_marginalised() -> None:
 
 
 def test_missing_values_of_jacobians_go_with_those_of_residuals() -> None:
-    """In the same order, for correlated and for independent outputs."""
+    """Their order agrees, for correlated and for independent outputs."""
     rng = np.random.default_rng(5)
     y, G, present = (
         rng.standard_normal((9, 4)),
@@ -138,8 +138,8 @@ def test_samples_have_the_stated_covariance() -> None:
 
 
 @pytest.mark.parametrize("coarsen", [1, 3])
-def test_every_sample_keeps_the_information_per_second(coarsen: int) -> None:
-    """Of each output at its own rate, on a grid `coarsen` times longer, related to the measurement rate of that grid."""
+def test_measuring_every_sample_keeps_the_information_per_second(coarsen: int) -> None:
+    """On a grid with a period `coarsen` times longer, for outputs of different rates."""
     strides, stride, N, rate = np.array([4, 4, 4, 6]), 2, 72, 100.0
     G = np.array([[1.0, 0.2], [-0.5, 1.0], [0.3, 0.3], [2.0, -1.0]])  # the same at all samples
     fine = Noise(covariance=FULL, strides=strides)

@@ -128,7 +128,7 @@ def test_A_and_B_are_those_of_a_plain_loop_for_any_integrator_and_substeps(make,
         assert relative_error(found.B[k], B) < 1e-6
 
 
-def test_these_setups_hold_one_and_several_steps_per_sample(tmp_path) -> None:
+def test_the_tested_models_take_one_and_several_steps_per_sample(tmp_path) -> None:
     (tmp_path / "b").mkdir()
     assert cart_task(tmp_path).system.grid.substeps == 1
     assert filtered_task(tmp_path / "b").system.grid.substeps == 2
@@ -227,7 +227,7 @@ def test_sensitivity_by_rollouts_solves_its_recursion(make, tmp_path) -> None:
     assert S.G.shape == (task.samples + 1, len(task.system.outputs.outputs), len(task.theta))
 
 
-def test_prediction_gives_the_same_outputs_and_derivative_as_the_sensitivity(tmp_path) -> None:
+def test_prediction_and_sensitivity_agree(tmp_path) -> None:
     task = body_task(tmp_path)
     y, G = task.plant.derivatives.predict(task.theta, task.initial.ctrl)
     S = task.plant.derivatives.sensitivity(task.theta, task.initial)
@@ -243,7 +243,7 @@ def test_prediction_gives_the_same_outputs_and_derivative_as_the_sensitivity(tmp
 @pytest.mark.parametrize(
     "accuracy", [CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES], ids=["central", "fast"]
 )
-def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> None:
+def test_bilinear_derivatives_contain_A_B_C_D(make, accuracy, tmp_path) -> None:
     task = make(tmp_path)
     L, psi = linear(task), task.plant.derivatives.sensitivity(task.theta, task.initial).psi
     w = np.abs(task.theta)[None] * np.linspace(0.5, 1.0, len(task.theta))
@@ -257,7 +257,7 @@ def test_mixed_differences_give_A_B_C_D_as_well(make, accuracy, tmp_path) -> Non
 @pytest.mark.parametrize(
     "make", [cart_task, body_task, filtered_task], ids=["cart", "body", "activation"]
 )
-def test_mixed_differences_are_derivatives_of_the_directional_derivative(make, tmp_path) -> None:
+def test_mixed_derivatives_are_derivatives_of_the_directional_derivative(make, tmp_path) -> None:
     task = make(tmp_path)
     theta, curve, nx = task.theta, task.initial, task.space.nx
     psi = task.plant.derivatives.sensitivity(theta, curve).psi
@@ -305,7 +305,7 @@ def test_outputs_belong_to_the_state_and_control_of_their_own_sample(tmp_path) -
 
 
 @pytest.mark.parametrize("make", [filtered_task, body_task], ids=["two steps a sample", "one"])
-def test_rollout_and_sensors_are_those_of_a_plain_loop(make, tmp_path) -> None:
+def test_rollout_and_sensors_agree_with_a_plain_loop(make, tmp_path) -> None:
     noise = {"noise": {"angle": 0.1, "torque": 0.1}} if make is filtered_task else {}
     task = make(tmp_path, "RK4", **noise)
     curve, loop = task.initial, Loop(task.plant.model(task.theta), task.system.grid.substeps)
@@ -397,7 +397,7 @@ def test_projection_moves_along_its_tangent_vector_to_first_order(
     assert errors[1] < 0.6 * errors[0] or errors[1] < 1e-9  # the remainder is of second order
 
 
-def test_feedback_is_that_of_the_projection_operator(tmp_path) -> None:
+def test_closed_loop_control_follows_the_projection_operator(tmp_path) -> None:
     task = cart_task(tmp_path)
     K, curve, zeta = gain(task), task.initial, tangent(task, gain(task), 3.0)
     new = task.plant.project(task.theta, curve, zeta, 1.0, K)
@@ -406,7 +406,7 @@ def test_feedback_is_that_of_the_projection_operator(tmp_path) -> None:
     np.testing.assert_allclose(new.ctrl, expected, rtol=0, atol=1e-12)
 
 
-def test_feedback_holds_an_upright_pendulum_that_open_loop_loses(tmp_path) -> None:
+def test_feedback_stabilises_an_upright_pendulum_that_falls_in_open_loop(tmp_path) -> None:
     start = {"qpos": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
     light = CART_PENDULUM.format(integrator="RK4").replace('damping="0.4"', 'damping="0.01"')
     task = make_task(
@@ -427,7 +427,9 @@ def test_feedback_holds_an_upright_pendulum_that_open_loop_loses(tmp_path) -> No
     assert np.abs(held.state[-1]).max() < 0.05
 
 
-def test_a_control_that_diverges_is_an_outcome_without_noise(tmp_path, monkeypatch, capfd) -> None:
+def test_a_diverging_control_is_reported_without_messages_of_mujoco(
+    tmp_path, monkeypatch, capfd
+) -> None:
     monkeypatch.chdir(tmp_path)
     task = cart_task(tmp_path)
     before, K = sorted(p.name for p in tmp_path.iterdir()), gain(task)
@@ -473,7 +475,7 @@ def test_an_acceleration_that_makes_mujoco_reset_is_noticed_at_any_sample(
 
 
 @pytest.mark.parametrize("bad", [np.nan, 1e12])
-def test_linearising_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_path) -> None:
+def test_linearization_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_path) -> None:
     task = cart_task(tmp_path)
     states = np.array(task.initial.state)
     states[20, 2] = bad
@@ -483,8 +485,8 @@ def test_linearising_where_mujoco_resets_the_state_is_an_error(bad: float, tmp_p
         )
 
 
-def test_quiet_blocks_may_overlap_in_threads() -> None:
-    """Quiet until the last one is left, and as it was after that."""
+def test_blocks_that_silence_the_log_may_overlap_in_threads() -> None:
+    """The log is silent until the last block ends; then its former configuration is restored."""
     before = mujoco.MjLogConfig.get()
     first, second = silence_mujoco_log(), silence_mujoco_log()
     for block in (first, second):
@@ -498,7 +500,7 @@ def test_quiet_blocks_may_overlap_in_threads() -> None:
     assert after.logto_console or after.logto_file
 
 
-def test_mujoco_itself_would_have_made_that_noise(tmp_path, monkeypatch, capfd) -> None:
+def test_without_silencing_mujoco_would_print_messages(tmp_path, monkeypatch, capfd) -> None:
     monkeypatch.chdir(tmp_path)
     task = cart_task(tmp_path)
     task.initial  # noqa: B018  (quiet work first: afterwards MuJoCo's own settings must be back)
@@ -676,7 +678,7 @@ OUTSIDE = {"noise": {"state": 0.05, **SENSED}}
 START = {"initial": {"qpos:hinge": True, "qvel:slide": True}}
 
 
-def test_the_start_enters_the_sensitivity_as_its_own_initial_value(tmp_path) -> None:
+def test_an_unknown_initial_state_is_the_initial_value_of_its_sensitivity(tmp_path) -> None:
     task = cart_task(tmp_path, **OUTSIDE, nuisance=START)
     L, S = linear(task), task.plant.derivatives.sensitivity(task.theta, task.initial)
     start = np.eye(4)[:, [1, 2]]  # (dq, dv): the hinge's angle, the slide's speed
@@ -687,7 +689,7 @@ def test_the_start_enters_the_sensitivity_as_its_own_initial_value(tmp_path) -> 
         assert relative_error(S.G[..., 3 + j], np.einsum("kyx,kx->ky", L.C, alone)) < 1e-6
 
 
-def test_the_start_of_a_quaternion_moves_in_its_tangent_space(tmp_path) -> None:
+def test_an_unknown_initial_orientation_moves_in_its_tangent_space(tmp_path) -> None:
     task = body_task(tmp_path, nuisance={"initial": {"qpos:ball.rz": True, "qvel:float.ry": True}})
     S = task.plant.derivatives.sensitivity(task.theta, task.initial)
     np.testing.assert_allclose(S.psi[0][:, 4:], np.eye(18)[:, [8, 13]], rtol=0, atol=1e-9)
@@ -701,7 +703,7 @@ def test_the_start_of_a_quaternion_moves_in_its_tangent_space(tmp_path) -> None:
     assert relative_error(S.psi[20][:, 4], loop.minus(*ends) / (2 * h)) < 1e-6
 
 
-def test_biases_add_to_their_own_output_and_to_nothing_else(tmp_path) -> None:
+def test_each_bias_adds_to_its_output_only(tmp_path) -> None:
     task = cart_task(tmp_path, **OUTSIDE, nuisance={"bias": {"angle": True, "acc[2]": 0.1}})
     S = task.plant.derivatives.sensitivity(task.theta, task.initial)
     names = list(task.system.outputs.names)
@@ -718,7 +720,7 @@ def test_biases_add_to_their_own_output_and_to_nothing_else(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.004, 0.0237])
-def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
+def test_a_delay_shifts_all_outputs(delay: float, tmp_path) -> None:
     parameters = {
         **CART_PARAMETERS,
         "late": {"target": "output:delay", "guess": delay, "scale": 0.01},
@@ -751,20 +753,34 @@ def test_a_delay_moves_all_outputs_back_in_time(delay: float, tmp_path) -> None:
     assert relative_error(late.plant.derivatives.sensitivity(late.theta, late.initial).G, G) < 1e-6
 
 
-def test_faint_parameters_get_longer_differences_and_others_keep_theirs(tmp_path) -> None:
+def test_parameters_of_little_effect_get_longer_difference_steps_and_others_keep_theirs(
+    tmp_path,
+) -> None:
     faint = {"tiny": {"target": "body/bob:inertia[1]"}, **CART_PARAMETERS}
     task = cart_task(tmp_path, parameters=faint)
     relative = task.plant.derivatives.parameter_scale / task.parameters.magnitude
     assert relative[0] > 5.0
     assert (relative >= 1.0).all() and (relative <= 100.0).all()
     np.testing.assert_array_equal(relative[1:3], 1.0)
-    # what the longer step is for: less round-off, without a change of the derivative
+    # A longer step reduces round-off and leaves the derivative unchanged.
     S = task.plant.derivatives.sensitivity(task.theta, task.initial).psi[..., 0]
     far = task.plant.derivatives.sensitivity(task.theta, task.initial, 1e-4).psi[..., 0]
     assert relative_error(S, far) < 1e-6
 
 
-def test_one_step_effects_are_those_of_E_and_H_in_natural_units(tmp_path) -> None:
+def test_calibration_returns_another_plant_and_leaves_the_first_one_unchanged(tmp_path) -> None:
+    faint = {"tiny": {"target": "body/bob:inertia[1]"}, **CART_PARAMETERS}
+    task = cart_task(tmp_path, parameters=faint)
+    before = task.plant.derivatives.parameter_scale
+    other = task.plant.calibrated(2.0 * task.theta, task.initial)
+    assert other is not task.plant
+    assert other.simulator is task.plant.simulator
+    assert other.model(task.theta) is task.plant.model(task.theta)
+    assert other.derivatives.parameter_scale[0] != before[0]
+    np.testing.assert_array_equal(task.plant.derivatives.parameter_scale, before)
+
+
+def test_one_step_effects_are_E_and_H_in_natural_units(tmp_path) -> None:
     task = body_task(tmp_path)
     picked, L = np.array([3, 20, 41]), linear(task)
     found = task.plant.derivatives.one_step(task.theta, task.initial, picked, 1e-5)
@@ -811,8 +827,8 @@ CARRIED = """
 
 
 @pytest.mark.parametrize("function", [False, True])
-def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> None:
-    """Against plain MuJoCo from `mj_resetDataKeyframe`, by every way of stepping."""
+def test_mocap_bodies_stand_where_the_keyframe_puts_them(function: bool, tmp_path) -> None:
+    """Against plain MuJoCo from `mj_resetDataKeyframe`, by every kind of simulation."""
     damped: dict[str, Any] = {"target": "joint/x:damping"}
     if function:
         damped = {
@@ -849,7 +865,7 @@ def test_a_keyframe_says_where_mocap_bodies_are(function: bool, tmp_path) -> Non
     )
 
 
-def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tmp_path) -> None:
+def test_parameters_move_mocap_bodies_without_a_keyframe(tmp_path) -> None:
     place = {"x": {"target": "body/near:pos[0]", "scale": 1.0}}
     task = make_task(CARRIED, tmp_path, parameters=place)
     found = task.plant.derivatives.sensitivity(task.theta, task.initial)
@@ -865,7 +881,7 @@ def test_mocap_bodies_move_by_parameter_where_no_keyframe_says_where_they_are(tm
         make_task(CARRIED, tmp_path, parameters=place, initial=initial)
 
 
-def test_clocks_begin_at_zero(tmp_path) -> None:
+def test_clock_sensors_begin_at_zero(tmp_path) -> None:
     xml = CART_PENDULUM.format(integrator="RK4").replace(
         "<sensor>", '<sensor><clock name="clock" noise="0.1"/>'
     )
@@ -882,7 +898,7 @@ def test_clocks_begin_at_zero(tmp_path) -> None:
     assert sensed[0, task.system.model.sensor("clock").adr[0]] == 0.0
 
 
-def test_quaternions_of_the_start_have_unit_length_or_are_refused(tmp_path) -> None:
+def test_quaternions_of_the_initial_state_are_normalised_or_refused(tmp_path) -> None:
     def start(*qpos: float) -> Array:
         return body_task(
             tmp_path, initial={"qpos": qpos, "control": {"kind": "sine"}}

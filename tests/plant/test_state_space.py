@@ -1,4 +1,4 @@
-"""Steps and differences of states against MuJoCo's own, on a model with every type of joint."""
+"""Moves and differences of states against those of MuJoCo, on a model with every type of joint."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def random_rotations(count: int, longest: float, rng: np.random.Generator) -> np
 
 
 def random_steps(space, longest: float, rng: np.random.Generator, count: int = COUNT) -> np.ndarray:
-    """Tangent vectors whose rotations are at most so long [rad]."""
+    """Tangent vectors whose rotations are at most `longest` long [rad]."""
     dx = rng.normal(size=(count, space.nx))
     for _, v in space.quaternions:
         dx[:, v : v + 3] = random_rotations(count, longest, rng)
@@ -151,7 +151,7 @@ def test_inputs_are_left_alone(model) -> None:
     np.testing.assert_array_equal(dx, step)
 
 
-def test_the_slope_of_a_difference_is_that_of_nearby_differences(model) -> None:
+def test_the_derivative_of_minus_agrees_with_differences(model) -> None:
     """Also where rotations are small, and where they are nearly half a turn."""
     space, rng, h = state_space(model), np.random.default_rng(9), 1e-6
     origin = random_states(space, rng, 1)[0]

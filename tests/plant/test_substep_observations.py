@@ -1,4 +1,4 @@
-"""What the limits look at between the samples: against plain loops around mj_step, and their derivatives against differences."""
+"""Observations at engine steps within the samples, against plain loops around mj_step, and their derivatives."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SHOWN = [
 
 
 def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
-    """(N, substeps, 9) what SHOWN names at every engine step under ctrl: (N, nu), by a plain loop around mj_step."""
+    """(N, substeps, 9) values that SHOWN names at every engine step under ctrl: (N, nu), by a plain loop around mj_step."""
     data, rows = mujoco.MjData(model), np.empty((len(ctrl), substeps, len(SHOWN)))
     data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + model.nv])
     for k, held in enumerate(ctrl):
@@ -54,7 +54,7 @@ def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
 
 
 def observations_of(task: DesignTask) -> SubstepObservations:
-    """What the limits of the experiment look at."""
+    """Quantities that the limits of the experiment observe."""
     constraints = constraint_set_of(task)
     assert constraints.kinds == tuple(kind for kind, _ in SHOWN)
     return constraints.observations
@@ -64,7 +64,7 @@ def observations_of(task: DesignTask) -> SubstepObservations:
     ("substeps", "expected"),
     [(1, (1,)), (2, (1, 2)), (5, (1, 2, 3, 5)), (20, (1, 2, 4, 9, 20)), (100, (1, 3, 10, 32, 100))],
 )
-def test_derivatives_look_at_the_first_and_the_last_engine_step_and_some_between(
+def test_derivatives_are_taken_at_the_first_the_last_and_some_engine_steps_between(
     substeps: int, expected: tuple[int, ...]
 ) -> None:
     assert looked_at(substeps) == expected
@@ -72,7 +72,7 @@ def test_derivatives_look_at_the_first_and_the_last_engine_step_and_some_between
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "Euler", "RK4"])
 @pytest.mark.parametrize("lifted", [False, True], ids=["as it is", "without clamps"])
-def test_what_is_watched_is_what_plain_steps_show_at_every_engine_step(
+def test_observations_agree_with_plain_steps_at_every_engine_step(
     lifted: bool, integrator: str, tmp_path: Path
 ) -> None:
     task = floating_task(tmp_path, integrator)
@@ -99,7 +99,7 @@ def test_what_is_watched_is_what_plain_steps_show_at_every_engine_step(
     assert (np.abs(torques).max() == 0.9) is not lifted
 
 
-def test_a_batch_of_samples_shows_the_same_as_the_whole_curve(tmp_path: Path) -> None:
+def test_single_samples_and_the_whole_curve_give_equal_observations(tmp_path: Path) -> None:
     task = floating_task(tmp_path)
     observations, plant = observations_of(task), task.plant
     watched = plant.observe(task.theta, task.control, observations)
@@ -127,12 +127,12 @@ def test_a_batch_of_samples_shows_the_same_as_the_whole_curve(tmp_path: Path) ->
     )
 
 
-def test_a_control_that_diverges_shows_nothing(tmp_path: Path) -> None:
+def test_a_diverging_control_has_no_observations(tmp_path: Path) -> None:
     task = floating_task(tmp_path)
     assert task.plant.observe(task.theta, 1e12 * task.control, observations_of(task)) is None
 
 
-def test_taps_cost_no_further_steps(tmp_path: Path) -> None:
+def test_observations_cost_no_further_steps(tmp_path: Path) -> None:
     task = floating_task(tmp_path)
     observations, plant = observations_of(task), task.plant
     counts = []
@@ -148,7 +148,7 @@ def test_taps_cost_no_further_steps(tmp_path: Path) -> None:
 def differences(
     task: DesignTask, sample: int, substeps: tuple[int, ...], step: float = 1e-6
 ) -> Array:
-    """(looked-at substeps, 9, nx+nu) central differences of plain loops over one sample of the lifted plant."""
+    """(derivative substeps, 9, nx+nu) central differences of plain loops over one sample of the lifted plant."""
     plant, u = task.plant, task.control[sample]
     model, x = plant.model(task.theta), task.initial.state[sample]
     loop, nx, columns = Loop(model, task.system.grid.substeps), task.space.nx, []
@@ -169,7 +169,7 @@ def differences(
 def assert_slopes(
     found: Array, task: DesignTask, observations: SubstepObservations, tolerance: float
 ) -> None:
-    """Derivatives (N, looked-at substeps, 9, nx+nu) of every kind at some samples."""
+    """Derivatives (N, derivative substeps, 9, nx+nu) of every kind at some samples."""
     for sample in (0, 11, 29):
         wanted = differences(task, sample, observations.derivative_substeps)
         for i, shown in enumerate(SHOWN):
@@ -177,7 +177,7 @@ def assert_slopes(
 
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "RK4"])
-def test_derivatives_of_taps_are_differences_of_independent_simulations(
+def test_derivatives_of_observations_are_differences_of_independent_simulations(
     integrator: str, tmp_path: Path
 ) -> None:
     task = floating_task(tmp_path, integrator).relaxed()
@@ -198,10 +198,10 @@ def test_derivatives_of_taps_are_differences_of_independent_simulations(
     ids=["draft", "fast", "central"],
 )
 @pytest.mark.parametrize("sensors", [False, True], ids=["states", "sensors"])
-def test_derivatives_beside_those_of_the_information_are_the_same(
+def test_bilinear_derivatives_contain_those_of_the_observations(
     sensors: bool, accuracy, tmp_path: Path
 ) -> None:
-    """Whichever differences the information takes; with sensors all of them are made one direction at a time."""
+    """With every kind of differences, with and without sensors."""
     noise = (
         {"gyro": 0.1, "qpos:elbow": 0.01}
         if sensors
@@ -227,8 +227,10 @@ def test_derivatives_beside_those_of_the_information_are_the_same(
     )
 
 
-def test_drafted_derivatives_are_the_careful_ones_to_a_hundredth(tmp_path: Path) -> None:
-    """One-sided from one origin against central differences of every direction."""
+def test_differences_from_a_shared_origin_agree_with_central_ones_to_a_hundredth(
+    tmp_path: Path,
+) -> None:
+    """One-sided differences need less than 0.4 of the engine steps."""
     task = floating_task(tmp_path).relaxed()
     observations, psi = (
         observations_of(task),
