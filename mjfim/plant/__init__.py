@@ -1,1 +1,12 @@
-"""The model as discrete-time dynamics with outputs, noise, delay and derivatives."""
+"""The model as discrete-time dynamics with outputs, noise, delay and derivatives.
+
+Modules:
+    plant: The dynamics F and h at theta: rollouts, projection, models.
+    derivatives: First and mixed second derivatives of F and h, sensitivities of rollouts.
+    batch: Many MuJoCo simulations in one call, and observations at their engine steps.
+    state_space: Differences and moves of states on the configuration space.
+    outputs: Which components of the state and which sensors are measured.
+    noise: Covariance and sampling of the measurements, whitening.
+    delay: Time delay of the outputs.
+    active_constraints: Contacts, limits, friction and clamps that act along a trajectory.
+"""
