@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -111,64 +110,6 @@ class ModelSource:
             if moved_bodies is None or body.name in moved_bodies:
                 body.simple = 0
         return spec
-
-
-@dataclass(frozen=True)
-class Coordinate:
-    """A scalar joint: its name, unit and place. joint: id;  q: qpos address;  v: dof address."""
-
-    name: str
-    unit: str
-    joint: int
-    q: int
-    v: int
-
-
-def coordinates(model: Any) -> tuple[Coordinate, ...]:
-    """All slide and hinge joints, in order."""
-    found, names = [], joint_names(model)
-    for j in range(model.njnt):
-        if int(model.jnt_type[j]) in (
-            int(mujoco.mjtJoint.mjJNT_SLIDE),
-            int(mujoco.mjtJoint.mjJNT_HINGE),
-        ):
-            unit = "m" if int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_SLIDE) else "rad"
-            found.append(
-                Coordinate(names[j], unit, j, int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j]))
-            )
-    return tuple(found)
-
-
-def joint_names(model: Any) -> tuple[str, ...]:
-    """njnt names; unnamed joints are called by their number."""
-    return _names(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt, "joint")
-
-
-def actuator_names(model: Any) -> tuple[str, ...]:
-    """nactuator names; unnamed actuators are called by their number."""
-    return _names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nactuator, "actuator")
-
-
-def _names(model: Any, kind: Any, count: int, fallback: str) -> tuple[str, ...]:
-    """Names of all objects of a kind, no two alike: a number that another one is called by gets underscores."""
-    given = [mujoco.mj_id2name(model, kind, i) for i in range(count)]
-    taken = {name for name in given if name}
-    for i in range(count):
-        if not given[i]:
-            name = f"{fallback}{i}"
-            while name in taken:
-                name += "_"
-            given[i] = name
-    return tuple(given)
-
-
-def control_names(model: Any) -> tuple[str, ...]:
-    """nu names; an actuator with several controls gets one name per control."""
-    names: list[str] = []
-    for i, name in enumerate(actuator_names(model)):
-        count = int(model.actuator_ctrlnum[i])
-        names += [name] if count == 1 else [f"{name}[{c}]" for c in range(count)]
-    return tuple(names)
 
 
 def decoration(spec: Any, model: Any) -> frozenset[str]:

@@ -219,7 +219,6 @@ class ParameterSet:
 
     def initial_state_derivative(self, nx: int) -> Array:
         """(nx, p) derivative of the initial state, in the tangent space."""
-
         matrix = np.zeros((nx, len(self)))
         for j, target, target_field in self._targets():
             if isinstance(target_field, InitialStateField):
@@ -228,7 +227,6 @@ class ParameterSet:
 
     def bias_derivative(self, ny: int) -> Array:
         """(ny, p) derivative of every output by constant biases."""
-
         matrix = np.zeros((ny, len(self)))
         for j, target, target_field in self._targets():
             if isinstance(target_field, OutputBiasField):
@@ -238,7 +236,6 @@ class ParameterSet:
     @cached_property
     def delay_derivative(self) -> Array:
         """(p,) derivative of the time by which outputs lag [s / theta-unit]."""
-
         derivative = np.zeros(len(self))
         for j, target, target_field in self._targets():
             if isinstance(target_field, OutputDelayField):

@@ -66,8 +66,8 @@ def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
     assert list(measurable_columns(task.system.model)) == [*FREE, *BALL, *RATES, *sensors]
 
 
-def test_parts_of_a_joint_go_by_one_name(tmp_path: Path) -> None:
-    """`.pos` and `.rot`, the whole joint, one component; what names fewer wins, whatever the order in the file."""
+def test_groups_of_columns_can_be_named(tmp_path: Path) -> None:
+    """`.pos` and `.rot`, the whole joint, one component; the key that names fewer columns wins, in any order of the file."""
     table = {
         "qpos:float.rot": 0.2,
         "qpos:float": 0.1,
@@ -153,7 +153,7 @@ def test_an_unnamed_joint_does_not_take_the_name_of_another(tmp_path: Path) -> N
     )
 
 
-def test_rates_are_each_outputs_own(tmp_path: Path) -> None:
+def test_every_output_has_its_rate(tmp_path: Path) -> None:
     """Slower than, and faster than, the measurement rate of the others."""
     noise = {
         "state": 0.1,
@@ -193,8 +193,8 @@ def test_components_of_a_sensor_have_their_own_sigmas(tmp_path: Path) -> None:
 BLOCK = np.array([[0.09, 0.03, 0.0], [0.03, 0.16, -0.02], [0.0, -0.02, 0.04]])
 
 
-def test_a_covariance_stands_where_its_outputs_stand(tmp_path: Path) -> None:
-    """In a sensor's own rows; everything else stays independent."""
+def test_a_covariance_stands_in_the_rows_of_its_outputs(tmp_path: Path) -> None:
+    """The covariance of a sensor; all other outputs stay independent."""
     task = cart_task(tmp_path, noise={"state": 0.1, "acc": {"covariance": BLOCK.tolist()}})
     at = [task.system.outputs.names.index(f"acc[{i}]") for i in range(3)]
     wanted = 0.01 * np.eye(7)
@@ -203,8 +203,8 @@ def test_a_covariance_stands_where_its_outputs_stand(tmp_path: Path) -> None:
     assert task.system.noise.correlated
 
 
-def test_what_names_less_takes_a_component_out_of_a_covariance(tmp_path: Path) -> None:
-    """Its own sigma, and no correlation left with the others."""
+def test_a_key_of_one_column_overrules_a_covariance(tmp_path: Path) -> None:
+    """The column has the stated sigma and no correlation with the others."""
     whole = 0.01 * (np.eye(4) + 0.3)
     task = cart_task(tmp_path, noise={"qpos:hinge": 0.5, "state": {"covariance": whole.tolist()}})
     hinge = task.system.outputs.names.index("qpos:hinge")
@@ -241,7 +241,7 @@ def test_correlated_outputs_replace_their_sigmas(tmp_path: Path) -> None:
 
 
 def test_correlated_outputs_alone_are_a_measurement(tmp_path: Path) -> None:
-    """Where neither the experiment nor the MJCF states a sigma."""
+    """Neither the experiment nor the MJCF states a sigma."""
     plain = {"outputs": ["qpos:slide", "qvel:hinge"], "covariance": [[0.04, 0.01], [0.01, 0.09]]}
     model = tmp_path / "silent.xml"
     text = (MODELS / "cart_pendulum.xml").read_text(encoding="utf-8")
@@ -391,8 +391,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_wrong_tables_are_named(name: str, tmp_path: Path) -> None:
-    """The key, the fault, what would have been valid."""
+def test_messages_about_wrong_tables(name: str, tmp_path: Path) -> None:
+    """They name the key, the fault and the valid values."""
     tables, message = WRONG[name]
     with pytest.raises(ExperimentError, match=rf"experiment: {message}"):
         cart_task(tmp_path, **tables)
@@ -442,7 +442,7 @@ def test_a_model_without_joints_has_no_state_to_measure(tmp_path: Path) -> None:
 
 
 def test_sensors_read_by_the_plant_are_those_of_mujoco(tmp_path: Path) -> None:
-    """Labels stand where MuJoCo writes their numbers."""
+    """The columns have the order in which MuJoCo writes the numbers."""
     task = body_task(tmp_path, noise={"tip": 0.1, "gyro": 0.2, "qpos:float.pos": 0.3})
     y, _ = task.plant.measure(task.theta[None], task.control)
     loop = Loop(task.system.model, 1)

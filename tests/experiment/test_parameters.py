@@ -1,4 +1,4 @@
-"""What is unknown: guesses, scales and units of parameters, inertial groups, the nuisance table, functions of an MjSpec."""
+"""Unknown parameters: guesses, scales and units, inertias of bodies, the nuisance table, functions of an MjSpec."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def named(task: DesignTask) -> dict[str, Parameter]:
 
 
 @pytest.mark.parametrize("coordinates", [None, "logcholesky", "barycentric"])
-def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path: Path) -> None:
-    """Guess, size, unit of each from the body itself; at the guess the model is the model."""
+def test_the_inertia_of_a_body_is_ten_parameters(coordinates: str | None, tmp_path: Path) -> None:
+    """Guess, size, unit of each from the body itself; at the guess the model is unchanged."""
     task = body_task(
         tmp_path,
         parameters={
@@ -74,8 +74,10 @@ def test_an_inertial_stands_for_ten_parameters(coordinates: str | None, tmp_path
 
 
 @pytest.mark.parametrize("coordinates", ["logcholesky", "barycentric"])
-def test_the_ten_are_written_together(coordinates: str, tmp_path: Path) -> None:
-    """Another body's numbers: the model then holds that body."""
+def test_all_parameters_of_an_inertia_are_written_together(
+    coordinates: str, tmp_path: Path
+) -> None:
+    """With the numbers of another body the model holds that body."""
     task = body_task(tmp_path, parameters={"arm": {**ARM, "coordinates": coordinates}})
     chart, arm = INERTIA_PARAMETRISATIONS[coordinates], task.system.model.body("arm").id
     rng = np.random.default_rng(0)
@@ -86,8 +88,8 @@ def test_the_ten_are_written_together(coordinates: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(found.inertia, wanted.inertia, rtol=1e-9, atol=1e-12)
 
 
-def test_priors_of_an_inertial_are_relative_to_the_size_of_each(tmp_path: Path) -> None:
-    """One number for ten units."""
+def test_priors_of_an_inertia_are_relative_to_the_magnitude_of_each(tmp_path: Path) -> None:
+    """One number stands for ten units."""
     table = {
         "arm": {**ARM, "prior": 0.1, "coordinates": "barycentric", "nuisance": True},
         "d": {"target": "joint/ball:damping"},
@@ -100,8 +102,8 @@ def test_priors_of_an_inertial_are_relative_to_the_size_of_each(tmp_path: Path) 
     assert not parameters["d"].nuisance
 
 
-def test_scale_guess_of_an_inertial_is_each_coordinates_own_value(tmp_path: Path) -> None:
-    """Where one is zero that cannot be."""
+def test_scale_guess_of_an_inertia_is_the_value_of_each_coordinate(tmp_path: Path) -> None:
+    """A coordinate that is zero is refused."""
     hull = {"hull": {"inertial": "hull", "scale": "guess", "coordinates": "barycentric"}}
     task = body_task(tmp_path, parameters=hull)
     np.testing.assert_allclose(task.parameters.scale, np.abs(task.parameters.guess), rtol=1e-15)
@@ -119,8 +121,10 @@ PLATE = CART_PENDULUM.format(integrator="RK4").replace(
 
 
 @pytest.mark.parametrize("moments", ["2e-3 1e-3 1e-3", "1e-9 1e-3 1e-3"])
-def test_rods_and_plates_are_told_which_coordinates_fit(moments: str, tmp_path: Path) -> None:
-    """Log-Cholesky is the default and cannot hold them."""
+def test_the_message_about_rods_and_plates_names_the_right_coordinates(
+    moments: str, tmp_path: Path
+) -> None:
+    """Log-Cholesky is the default and cannot express them."""
     xml = PLATE.format(moments)
     if moments.startswith("2"):
         with pytest.raises(
@@ -218,8 +222,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_wrong_parameters_are_named(name: str, tmp_path: Path) -> None:
-    """The key, the fault, what would have been valid."""
+def test_messages_about_wrong_parameters(name: str, tmp_path: Path) -> None:
+    """They name the key, the fault and the valid values."""
     table, message = WRONG[name]
     with pytest.raises(ExperimentError, match=rf"experiment: .*{message}"):
         body_task(tmp_path, parameters=table)
@@ -240,7 +244,7 @@ def test_wrong_parameters_are_named(name: str, tmp_path: Path) -> None:
         ("option:gravity[2]", -0.5, "m/s²", 0.5),
     ],
 )
-def test_guess_unit_and_scale_come_from_what_is_named(
+def test_guess_unit_and_scale_come_from_the_first_target(
     path: str, guess: float, unit: str, scale: float, tmp_path: Path
 ) -> None:
     parameters = named(body_task(tmp_path, parameters={"p": {"target": path}}))
@@ -248,7 +252,7 @@ def test_guess_unit_and_scale_come_from_what_is_named(
     assert (p.guess, p.unit, p.scale) == pytest.approx((guess, unit, scale))
 
 
-def test_places_are_compared_with_the_size_of_the_body(tmp_path: Path) -> None:
+def test_positions_are_scaled_by_the_size_of_the_body(tmp_path: Path) -> None:
     """A centre of mass at zero still has a scale: the radius of gyration; `scale = "guess"` asks for the value itself."""
     task = body_task(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]"}})
     radius = body_inertia(task.system.model, task.system.model.body("arm").id).gyration_radius
@@ -263,8 +267,8 @@ def test_places_are_compared_with_the_size_of_the_body(tmp_path: Path) -> None:
     assert task.system.model_at(task.parameters.guess).body("arm").ipos[2] == 0.25
 
 
-def test_whole_numbers_are_scales_too(tmp_path: Path) -> None:
-    """TOML's 2 is as good as 2.0."""
+def test_integers_are_valid_scales(tmp_path: Path) -> None:
+    """TOML's 2 means 2.0."""
     assert body_task(
         tmp_path, parameters={"m": {"target": "body/arm:mass", "scale": 2}}
     ).parameters.scale.tolist() == [2.0]
@@ -273,8 +277,8 @@ def test_whole_numbers_are_scales_too(tmp_path: Path) -> None:
 # ---- nuisance table
 
 
-def test_starts_of_all_components(tmp_path: Path) -> None:
-    """One deviation for each degree of freedom in position and velocity, with the prior, unwanted."""
+def test_deviations_of_all_components_of_the_initial_state(tmp_path: Path) -> None:
+    """One deviation for each degree of freedom in position and velocity, with the prior, as nuisance."""
     task = body_task(
         tmp_path, parameters={"m": {"target": "body/arm:mass"}}, nuisance={"initial": 0.02}
     )
@@ -348,8 +352,8 @@ def test_a_deviation_of_a_free_joint_needs_a_part(tmp_path: Path) -> None:
         body_task(tmp_path, parameters={"p": {"target": "initial/float:qpos"}})
 
 
-def test_starts_and_biases_by_name(tmp_path: Path) -> None:
-    """Only what is named; `true` is unknown, a number is known that well."""
+def test_deviations_and_biases_by_name(tmp_path: Path) -> None:
+    """Only those that are named; `true` means no prior, a number is the standard deviation."""
     nuisance = {
         "initial": {"qpos:hinge": True, "qvel:slide": 0.1},
         "bias": {"qpos:slide": 0.3},
@@ -402,15 +406,15 @@ NUISANCE: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", NUISANCE)
-def test_wrong_nuisance_is_named(name: str, tmp_path: Path) -> None:
-    """The key, the fault, what would have been valid."""
+def test_messages_about_a_wrong_nuisance_table(name: str, tmp_path: Path) -> None:
+    """They name the key, the fault and the valid values."""
     nuisance, message = NUISANCE[name]
     with pytest.raises(ExperimentError, match=rf"experiment: {message}"):
         cart_task(tmp_path, nuisance=nuisance)
 
 
-def test_what_the_nuisance_table_names_cannot_be_a_parameter_too(tmp_path: Path) -> None:
-    """Neither its number nor its name."""
+def test_a_nuisance_cannot_be_a_parameter_as_well(tmp_path: Path) -> None:
+    """Neither its number nor its name may be used twice."""
     own = {**CART_PARAMETERS, "q": {"target": "initial/hinge:qpos"}}
     with pytest.raises(
         ExperimentError, match=r"initial qpos:hinge: target .* already belongs to parameters\.q"
@@ -429,8 +433,8 @@ def test_what_the_nuisance_table_names_cannot_be_a_parameter_too(tmp_path: Path)
         )
 
 
-def test_joints_without_a_name_are_not_passed_over(tmp_path: Path) -> None:
-    """A start that is said to be unknown must not be half known."""
+def test_joints_without_a_name_are_refused_where_all_deviate(tmp_path: Path) -> None:
+    """An initial state that is stated to be unknown must not be known in part."""
     xml = CART_PENDULUM.format(integrator="RK4").replace('joint name="hinge"', "joint").replace(
         '<jointpos name="angle" joint="hinge" noise="0.01"/>', ""
     ).replace('<jointvel name="rate" joint="hinge" noise="0.05"/>', "")  # fmt: skip
@@ -447,7 +451,7 @@ def test_joints_without_a_name_are_not_passed_over(tmp_path: Path) -> None:
     assert task.parameters.names == ("m", "initial qpos:slide")
 
 
-def test_activations_are_starts_by_path(tmp_path: Path) -> None:
+def test_activations_of_the_initial_state_have_paths(tmp_path: Path) -> None:
     """The state of a filter, after positions and velocities."""
     task = filtered_task(tmp_path, parameters={"a": {"target": "initial/servo:act", "scale": 0.5}})
     assert task.parameters.initial_state_derivative(3).tolist() == [[0.0], [0.0], [1.0]]
@@ -463,8 +467,8 @@ def lengthen(spec: Any, value: float) -> None:
     spec.body("cart").mass = 2.0 * value
 
 
-def test_a_function_edits_what_no_path_can(tmp_path: Path) -> None:
-    """Against two targets that say the same; the derivative too."""
+def test_a_function_edits_the_spec(tmp_path: Path) -> None:
+    """Against two equivalent targets, with the derivative."""
     targets = [{"path": "body/bob:pos[2]"}, {"path": "body/cart:mass", "scale": 2.0}]
     first = cart_task(tmp_path, parameters={"l": {"function": lengthen, "guess": 0.7, "unit": "m"}})
     second = cart_task(tmp_path, parameters={"l": {"targets": targets, "guess": 0.7}})
@@ -482,8 +486,8 @@ def test_a_function_edits_what_no_path_can(tmp_path: Path) -> None:
     )
 
 
-def test_a_function_goes_with_paths(tmp_path: Path) -> None:
-    """What is written in place is written into the model that the function gave."""
+def test_functions_and_paths_work_together(tmp_path: Path) -> None:
+    """Values that are written in place are written into the model that the function gave."""
     table = {"l": {"function": lengthen, "guess": 0.7}, "m": {"target": "body/bob:mass"}}
     task = cart_task(tmp_path, parameters=table)
     own = task.system.model_at(np.array([0.6, 2.5]))
@@ -496,22 +500,22 @@ def test_a_function_goes_with_paths(tmp_path: Path) -> None:
 
 
 def failing(spec: Any, value: float) -> None:
-    """A name that is not there."""
+    """Edit a body that does not exist."""
     spec.body("bobb").mass = value
 
 
 def negative(spec: Any, value: float) -> None:
-    """A body that cannot be."""
+    """Make a body unphysical."""
     spec.body("bob").mass = -value
 
 
 def another_joint(spec: Any, value: float) -> None:
-    """One more degree of freedom."""
+    """Add a degree of freedom."""
     spec.body("cart").add_joint()
 
 
 def another_sensor(spec: Any, value: float) -> None:
-    """One more number in sensordata."""
+    """Add a number to sensordata."""
     sensor = spec.add_sensor()
     sensor.type, sensor.objtype, sensor.objname = (
         mujoco.mjtSensor.mjSENS_JOINTPOS,
@@ -521,7 +525,7 @@ def another_sensor(spec: Any, value: float) -> None:
 
 
 def another_site(spec: Any, value: float) -> None:
-    """Nothing that moves, but MuJoCo's data has a place for it."""
+    """Add an element that does not move but takes a place in MuJoCo's data."""
     spec.body("bob").add_site()
 
 
@@ -543,15 +547,15 @@ def another_site(spec: Any, value: float) -> None:
         (another_site, ModelError, r"changes nsite of the model.*; it may change numbers only"),
     ],
 )
-def test_functions_that_do_not_do_are_named(
+def test_messages_about_functions_that_fail(
     function: Any, error: type[MjfimError], message: str, tmp_path: Path
 ) -> None:
-    """The parameter, and what its function did."""
+    """They name the parameter and the fault of its function."""
     with pytest.raises(error, match=message):
         cart_task(tmp_path, parameters={"f": {"function": function, "guess": 1.0}})
 
 
 def test_a_function_whose_guess_is_zero_needs_a_scale(tmp_path: Path) -> None:
-    """There is no size to take from the model."""
+    """The model gives no magnitude for it."""
     with pytest.raises(ExperimentError, match=r"parameters\.f\.scale"):
         cart_task(tmp_path, parameters={"f": {"function": lengthen, "guess": 0.0}})

@@ -1,4 +1,4 @@
-"""Geom distances: which geoms count, distances against MuJoCo and by hand, slopes against differences, nothing near is lost."""
+"""Geom distances: selection of pairs, distances against MuJoCo and by hand, slopes against differences."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ CROWD = """
 
 
 @pytest.mark.parametrize("flag", ['filterparent="enable"', 'filterparent="disable"'])
-def test_pairs_are_those_that_mujoco_lets_collide(flag: str) -> None:
+def test_pairs_agree_with_mujocos_collisions(flag: str) -> None:
     """Welded bodies, parents and children, excluded bodies, collision bits, explicit pairs, the world's exception."""
     model = mujoco.MjModel.from_xml_string(CROWD.format(flag=flag))
     data = mujoco.MjData(model)
@@ -175,7 +175,7 @@ def test_pairs_are_found_where_contacts_are_off() -> None:
     assert find_geom_pairs(off, ()) == find_geom_pairs(on, ())
 
 
-def test_what_no_joint_moves_has_no_pairs_with_itself() -> None:
+def test_fixed_geoms_have_no_pairs_with_each_other() -> None:
     """Mocap bodies and the world stay where they are."""
     model = mujoco.MjModel.from_xml_string(
         """
@@ -239,8 +239,8 @@ def test_height_fields_are_refused_unless_ignored() -> None:
     assert find_geom_pairs(model, {frozenset(("b", "world"))}) == ()
 
 
-def test_misuse_of_clearance() -> None:
-    """Nothing to keep apart is no clearance."""
+def test_no_pairs_are_refused() -> None:
+    """The message says that a moving geom is needed."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     with pytest.raises(ExperimentError, match="no two geoms can come near each other"):
         GeomDistances(model, (), 0.1)
@@ -268,8 +268,8 @@ def test_nothing_within_reach_is_lost(reach: float) -> None:
     )
 
 
-def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Many configurations are cut into pieces; none at all have empty arrays."""
+def test_blocks_of_configurations_give_equal_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many configurations are computed in blocks; no configurations give empty arrays."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, 0.3), scattered(model, 11, 0.4)
     whole = chosen(qpos, True)
@@ -304,7 +304,7 @@ def test_blocks_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_distances_by_hand(
     first: str, second: str, place: tuple[float, float, float], expected: float
 ) -> None:
-    """Upright geoms at a displacement, both ways round."""
+    """Upright geoms at a displacement, in either order."""
     for a, b, shift in ((first, second, np.array(place)), (second, first, -np.array(place))):
         model = mujoco.MjModel.from_xml_string(
             f"""
@@ -332,7 +332,7 @@ def test_planes_agree_with_contacts(kind: str) -> None:
 
 
 @pytest.mark.parametrize("eighths", range(8))
-def test_a_box_may_stand_on_its_edge(eighths: int) -> None:
+def test_a_box_on_its_edge_has_the_right_distance(eighths: int) -> None:
     """`mj_geomDistance` misses the lowest corners of a cube that is turned by 225 degrees."""
     model = mujoco.MjModel.from_xml_string(
         """
@@ -344,8 +344,8 @@ def test_a_box_may_stand_on_its_edge(eighths: int) -> None:
     assert found == pytest.approx(0.3 - 0.1 * (2**0.5 if eighths % 2 else 1.0), abs=1e-12)
 
 
-def test_a_capsule_deep_in_a_box_is_in_it() -> None:
-    """Against the same box as a mesh, through which MuJoCo sees capsules in another way."""
+def test_a_capsule_deep_in_a_box_has_a_negative_distance() -> None:
+    """Against that box as a mesh, for which MuJoCo uses another collider."""
     corners = " ".join(
         f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.05, 0.05) for z in (-0.2, 0.2)
     )
@@ -415,7 +415,7 @@ def test_slopes_to_the_floor_agree_with_differences(kind: str) -> None:
     + [("cylinder", "cylinder"), ("ellipsoid", "box")],
 )
 def test_slopes_in_penetration_agree_with_differences(first: str, second: str) -> None:
-    """Distances are negative, slopes point out all the same; curved surfaces are found to fewer digits inside."""
+    """Distances are negative, slopes still point outwards; curved surfaces are found to fewer digits inside."""
     model = two(KINDS[first], KINDS[second])
     chosen, qpos = between(model, 2.0), scattered(model, 60, 0.1, seed=3)
     d = chosen(qpos, False).d[:, 0]
@@ -426,7 +426,7 @@ def test_slopes_in_penetration_agree_with_differences(first: str, second: str) -
 
 @pytest.mark.parametrize("offset", [1e-6, 1e-10, 0.0, -1e-10, -1e-6])
 @pytest.mark.parametrize("second", ["sphere", "capsule", "ellipsoid", "cylinder"])
-def test_slopes_are_there_where_geoms_touch(second: str, offset: float) -> None:
+def test_touching_geoms_have_slopes(second: str, offset: float) -> None:
     """A sphere is brought to an offset along the slope of the distance; nearest points no longer tell the normal."""
     model = two(KINDS["sphere"], KINDS[second])
     chosen, qpos = between(model, 2.0), scattered(model, 1, 0.4)[0]
@@ -441,7 +441,7 @@ def test_slopes_are_there_where_geoms_touch(second: str, offset: float) -> None:
 
 
 def test_slopes_are_zero_beyond_reach() -> None:
-    """Where d is reach, and there only; without slopes there are none."""
+    """Exactly if the distance is the reach; slopes that were not asked for are None."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, 0.2, grouped=True), scattered(model, 100, 0.4)
     found = chosen(qpos, True)
@@ -501,8 +501,8 @@ def test_nearest_may_be_the_floor() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_diverged_configurations_are_not_called_clear(value: float) -> None:
-    """Their distances are NaN; the smallest of them is none."""
+def test_diverged_configurations_have_no_distance(value: float) -> None:
+    """Their distances are NaN, and their smallest distance is refused."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, 0.5, grouped=True), scattered(model, 5, 0.4)
     qpos[3, 1] = value
@@ -512,8 +512,8 @@ def test_diverged_configurations_are_not_called_clear(value: float) -> None:
         chosen.nearest(qpos)
 
 
-def test_models_are_left_alone() -> None:
-    """Options of the collider are set on a copy, and what becomes of the model later is not seen."""
+def test_the_model_is_not_changed() -> None:
+    """Options of the collider are set on a copy, and later changes of the model have no effect."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
     sizes, kinds, options = model.geom_size.copy(), model.geom_type.copy(), str(model.opt)

@@ -1,4 +1,4 @@
-"""Charts of a body's inertia: there and back, what they mean in the dynamics, what they refuse."""
+"""Parametrisations of a body's inertia: their inverses, their meaning in the dynamics, what they refuse."""
 
 from __future__ import annotations
 
@@ -91,8 +91,8 @@ def dynamics(body: BodyInertia) -> Array:
 
 
 @pytest.mark.parametrize("chart", INERTIA_PARAMETRISATIONS)
-def test_there_and_back(chart: str) -> None:
-    """Ten numbers are the body, and the body is ten numbers."""
+def test_every_parametrisation_has_an_inverse(chart: str) -> None:
+    """Inertia from coordinates and coordinates from inertia."""
     for body in solids(20, 0):
         v = INERTIA_PARAMETRISATIONS[chart].coordinates(body)
         again = INERTIA_PARAMETRISATIONS[chart].inertia(v)
@@ -105,7 +105,7 @@ def test_there_and_back(chart: str) -> None:
         )
 
 
-def test_principal_axes_are_mujocos() -> None:
+def test_principal_axes_agree_with_mujoco() -> None:
     """Descending moments in a right-handed frame, as the compiler writes them; and back."""
     for body in solids(20, 1):
         found = compiled(body).body("tip")
@@ -152,8 +152,8 @@ def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
     assert errors["logcholesky"] > 1e-3 and errors["central"] > 1e-3, "a weak test"
 
 
-def test_every_barycentric_coordinate_has_a_regressor_of_its_own() -> None:
-    """Eleven bodies tell the regressor; a twelfth is predicted to round-off."""
+def test_the_barycentric_regressor_predicts_the_dynamics() -> None:
+    """Eleven bodies determine the regressor; it predicts a twelfth to round-off."""
     bodies = solids(12, 4)
     V = np.array([np.append(to_barycentric(b), 1.0) for b in bodies])
     Y = np.array([dynamics(b) for b in bodies])
@@ -162,7 +162,7 @@ def test_every_barycentric_coordinate_has_a_regressor_of_its_own() -> None:
 
 
 def test_log_cholesky_is_physical_for_every_vector() -> None:
-    """MuJoCo compiles each of them, triangle inequality included; ten numbers at random in the central chart mostly fail."""
+    """MuJoCo compiles each of them, triangle inequality included; ten random central ones mostly fail."""
     rng = np.random.default_rng(6)
     failed = 0
     for v in rng.standard_normal((100, 10)):
@@ -225,7 +225,7 @@ def test_points_rods_and_plates_have_no_log_cholesky(moments: tuple[float, ...])
 
 
 def test_magnitudes_follow_the_units() -> None:
-    """In other units of mass and length they are the same magnitudes: a scale of comparison has no unit of its own."""
+    """Magnitudes in other units of mass and length are those converted."""
     body = solids(1, 9)[0]
     kilo, centi = 1000.0, 100.0
     other = BodyInertia(
@@ -243,7 +243,7 @@ def test_magnitudes_follow_the_units() -> None:
 
 
 def test_radius_of_gyration_is_about_the_bodys_origin() -> None:
-    """Of points: the root of the mean square distance."""
+    """The root of the mean square distance of points."""
     points = np.random.default_rng(10).standard_normal((7, 3))
     com, about = points.mean(axis=0), points - points.mean(axis=0)
     body = BodyInertia(
@@ -255,7 +255,7 @@ def test_radius_of_gyration_is_about_the_bodys_origin() -> None:
 
 
 def test_first_moments_at_the_origin_do_not_move_with_the_mass() -> None:
-    """What makes the chart barycentric: mass alone changes the centre and the inertia about it, not about the origin."""
+    """The mass alone changes the centre of mass and the inertia about it, not the inertia about the origin."""
     v = to_barycentric(solids(1, 11)[0])
     heavier = from_barycentric(np.append(2.0 * v[0], v[1:]))
     np.testing.assert_allclose(heavier.com, 0.5 * v[1:4] / v[0], rtol=1e-13)

@@ -263,7 +263,7 @@ def both_ways(xml: str, path: str, value: float) -> tuple[Any, Any, Any]:
     return base, resolved.writer.model(base, theta), other.compile()
 
 
-def test_the_edits_below_cover_every_field_that_can_be_named() -> None:
+def test_the_edits_cover_every_field_of_a_path() -> None:
     named = [
         ParameterPath.parse(path)
         for path in (*(e[1] for e in EDITS), *(e[1] for e in COMPILES), *CHARTED)
@@ -276,7 +276,7 @@ def test_the_edits_below_cover_every_field_that_can_be_named() -> None:
 
 
 @pytest.mark.parametrize(("xml", "path", "value", "derived"), EDITS, ids=[e[1] for e in EDITS])
-def test_writing_in_place_equals_a_recompile_bit_for_bit(
+def test_writing_in_place_equals_a_compile_bit_for_bit(
     xml: str, path: str, value: float, derived: tuple
 ) -> None:
     base, own, again = both_ways(xml, path, value)
@@ -306,7 +306,7 @@ def skew(v: np.ndarray) -> np.ndarray:
 
 
 def written_by_hand(spec: Any, base: Any, path: str, change: float) -> None:
-    """The edit of an MjSpec that a chart's coordinate means, from its definition."""
+    """The edit of an MjSpec that a coordinate of an inertia stands for, from its definition."""
     parsed = ParameterPath.parse(path)
     kind, name, field, i = parsed.kind, parsed.name, parsed.field, parsed.component
     element, found = getattr(spec, kind)(name), getattr(base, kind)(name)
@@ -358,9 +358,7 @@ SOLID = ARM.replace(
     "xml", [SOLID, SOLID.replace(' pos=".1 .05 .2"', "")], ids=["skew", "aligned"]
 )
 @pytest.mark.parametrize("path", CHARTED)
-def test_charts_and_rotations_written_in_place_equal_a_compile_of_what_they_mean(
-    xml: str, path: str
-) -> None:
+def test_inertias_and_rotations_written_in_place_equal_a_compile(xml: str, path: str) -> None:
     parameters = [one(path)]
     spec, base = compiled(xml, parameters)
     resolved = ParameterSet.build(parameters, base)
@@ -422,7 +420,7 @@ def test_inertia_of_a_tendon_couples_simple_bodies_as_a_compile_would() -> None:
     assert np.abs(rollout(own, 50) - rollout(base, 50)).max() > 1e-3
 
 
-def test_charts_of_simple_bodies_are_written_with_the_right_dynamics() -> None:
+def test_inertias_of_simple_bodies_are_written_with_the_right_dynamics() -> None:
     """Bodies that MuJoCo would compile with a diagonal mass matrix."""
     for path in (
         "body/flyer:fullinertia[3]",
@@ -444,7 +442,7 @@ def test_charts_of_simple_bodies_are_written_with_the_right_dynamics() -> None:
 @pytest.mark.parametrize(
     ("xml", "path", "value", "derived"), COMPILES, ids=[e[1] for e in COMPILES]
 )
-def test_geoms_that_matter_are_compiled_anew(
+def test_geoms_that_change_the_dynamics_are_compiled_anew(
     xml: str, path: str, value: float, derived: tuple
 ) -> None:
     """Against MuJoCo's own compile of the edited element."""
@@ -500,8 +498,8 @@ def test_geoms_that_matter_are_compiled_anew(
         np.testing.assert_array_equal(array, before[name], err_msg=name)
 
 
-def test_decoration_is_what_neither_collides_nor_weighs() -> None:
-    """A drawn geom is written in place; the moment that it collides, or its body takes inertia from geoms, it is not."""
+def test_decoration_neither_collides_nor_has_mass() -> None:
+    """A drawn geom is written in place; once it collides, or its body takes inertia from geoms, it is not."""
     for xml, drawn in (
         (DRAWN, True),
         (DRAWN.replace('contype="0" conaffinity="0"', 'contype="0" conaffinity="1"'), False),
@@ -585,7 +583,7 @@ MESHED = ARM.replace(
 )
 
 
-def test_a_mesh_moves_from_where_it_compiles_to() -> None:
+def test_a_mesh_moves_from_its_compiled_place() -> None:
     """MuJoCo shifts a mesh to its centre; that offset must not be added twice. Its size is no number of the geom."""
     parameters = [one("geom/h:pos[2]")]
     spec, base = compiled(MESHED, parameters)
@@ -617,7 +615,7 @@ def test_mass_and_density_of_geoms_are_not_in_the_compiled_model() -> None:
 
 
 def test_one_rest_length_stands_for_both_ends_of_the_range() -> None:
-    """Else the lower end would pass the upper one, which MuJoCo refuses."""
+    """Otherwise the lower end would exceed the upper one, which MuJoCo refuses."""
     _, base = compiled(TENDON, [])
     own = ParameterSet.build([one("tendon/t:springlength")], base).writer.model(
         base, np.array([0.5])
@@ -643,7 +641,7 @@ def test_one_rest_length_stands_for_both_ends_of_the_range() -> None:
         ),
     ],
 )
-def test_servo_gains_mean_what_mjcf_means_by_them(kind: str, written: str, path: str) -> None:
+def test_servo_gains_are_those_of_the_mjcf(kind: str, written: str, path: str) -> None:
     """Against a compile of the MJCF with the other number in it."""
     servo = '<position name="p" joint="k" kp="10" kv="0.5"/>'
     (_, base), (_, again) = (
@@ -763,7 +761,7 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
         ("firstmoment[0]", "logcholesky[3]"),
     ],
 )
-def test_coordinates_of_one_body_that_do_not_go_together_are_refused(
+def test_mixed_parametrisations_of_one_body_are_refused(
     fields: tuple[str, str],
 ) -> None:
     """In either order; on two bodies they are free."""
@@ -804,7 +802,7 @@ def test_mass_beside_first_moments_keeps_them() -> None:
     np.testing.assert_array_equal(alone.body("a").ipos, base.body("a").ipos)
 
 
-def test_a_model_without_a_source_serves_only_what_is_written_in_place(tmp_path) -> None:
+def test_a_change_of_the_layout_is_refused(tmp_path) -> None:
     """Functions and parameters that change the layout are caught before MuJoCo writes past the end of its data."""
 
     def add_geoms(spec: Any, value: float) -> None:
@@ -817,7 +815,7 @@ def test_a_model_without_a_source_serves_only_what_is_written_in_place(tmp_path)
         make_task(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
 
 
-def test_outputs_and_starts_are_no_part_of_the_model() -> None:
+def test_measurement_and_initial_state_are_outside_the_model() -> None:
     """Linear maps of theta outside the model, by the scale of their targets."""
     paths = ["initial/k:qvel", "initial/j:qpos", "output/b:bias", "output:delay", "body/a:mass"]
     parameters = [
@@ -848,7 +846,7 @@ def test_comparison_would_notice_a_write_without_mj_setConst() -> None:
     assert not np.array_equal(own.dof_M0, again.dof_M0)
 
 
-def test_bodies_whose_inside_moves_are_found_so_that_they_are_not_compiled_as_simple() -> None:
+def test_bodies_whose_inertial_frame_moves_are_found() -> None:
     paths = [
         "body/a:pos",
         "body/b:ipos[1]",
@@ -901,7 +899,7 @@ def test_one_number_takes_one_parameter() -> None:
         ParameterSet.build(parameters, base)
 
 
-def test_spelling_out_inertia_from_geoms_changes_nothing_but_the_target() -> None:
+def test_stating_the_inertia_of_geoms_changes_only_the_target() -> None:
     spec, base = compiled(ARM, [])
     assert not spec.body("b").explicitinertial
     resolved = ParameterSet.build([one("body/b:mass")], base)
@@ -910,7 +908,7 @@ def test_spelling_out_inertia_from_geoms_changes_nothing_but_the_target() -> Non
     np.testing.assert_array_equal(rollout(spec.compile()), rollout(base))
 
 
-def test_a_parameter_set_works_on_private_copies_and_leaves_the_base_model_alone() -> None:
+def test_values_are_written_into_private_copies() -> None:
     parameters = [one("body/b:ipos[1]"), one("body/b:mass")]
     _, base = compiled(ARM, parameters)
     before, resolved = arrays(base), ParameterSet.build(parameters, base)
@@ -1129,7 +1127,7 @@ def test_the_identified_model_file_has_the_identified_dynamics_or_is_refused(
     )
 
 
-def test_an_inertia_that_no_body_can_have_is_refused_by_a_message_of_ours(tmp_path) -> None:
+def test_an_unphysical_inertia_is_refused_with_a_clear_message(tmp_path) -> None:
     table = {"theta": {"target": "body/a:inertia[0]", "guess": 0.01}}
     task = make_task(ARM, tmp_path, rate=500.0, parameters=table, noise={"state": 0.1})
     with pytest.raises(MjfimError, match="inertia"):
@@ -1190,7 +1188,7 @@ def in_arm(folder: Path, tables: dict) -> Any:
         ("origininertia[1]", 1e-6, r"principal moments of inertia -.*; all must be > 0"),
     ],
 )
-def test_bodies_that_cannot_exist_are_refused_before_anything_is_simulated(
+def test_unphysical_bodies_are_refused_before_a_simulation(
     field: str, value: float, fault: str, key: str, tmp_path: Path
 ) -> None:
     table = {"theta": {"target": f"body/a:{field}", "scale": 1.0, key: value}}
@@ -1198,7 +1196,7 @@ def test_bodies_that_cannot_exist_are_refused_before_anything_is_simulated(
         in_arm(tmp_path, table)
 
 
-def test_both_makers_of_a_barycentric_inertia_are_named(tmp_path: Path) -> None:
+def test_both_parameters_of_a_barycentric_inertia_are_named(tmp_path: Path) -> None:
     table = {
         "m": {"target": "body/a:mass", "guess": -2.0},
         "h": {"target": "body/a:firstmoment[2]"},
@@ -1211,7 +1209,7 @@ def test_both_makers_of_a_barycentric_inertia_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("field", ["origininertia[0]", "fullinertia[0]", "mass"])
-def test_plates_and_loads_without_mass_are_bodies(field: str, tmp_path: Path) -> None:
+def test_plates_and_fixed_loads_without_mass_are_physical(field: str, tmp_path: Path) -> None:
     """A plate typed with few digits; a load of no mass that is fixed to a link."""
     plate = '<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.02 0.03"/>'
     load = (
@@ -1226,7 +1224,7 @@ def test_plates_and_loads_without_mass_are_bodies(field: str, tmp_path: Path) ->
 
 
 def test_a_function_that_changes_the_timestep_is_refused(tmp_path: Path) -> None:
-    """Also where it leaves it alone at the guess."""
+    """Also if it does not change the timestep at the guess."""
 
     def edit(spec: Any, value: float) -> None:
         spec.option.timestep = value

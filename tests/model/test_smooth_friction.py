@@ -37,7 +37,7 @@ def friction(model: Any, speed: float, push: float = 0.0) -> list[float]:
 
 
 @pytest.mark.parametrize("push", [0.0, 3.0])
-def test_softened_friction_is_viscous_up_to_its_speed_and_constant_beyond(push: float) -> None:
+def test_smoothed_friction_is_viscous_up_to_its_speed_and_constant_beyond(push: float) -> None:
     model = model_of(0.5, 0.8)
     smooth_dry_friction(model, (0.05, 0.0, 0.1))
     for speed in (-1.0, -0.2, -0.05, -0.03, 0.0, 0.01, 0.049, 0.07, 3.0):
@@ -46,7 +46,7 @@ def test_softened_friction_is_viscous_up_to_its_speed_and_constant_beyond(push: 
         np.testing.assert_allclose(found, wanted, atol=0.02 if push else 0.002)
 
 
-def test_it_scales_with_the_frictionloss_where_that_changes_the_law_is_written_again() -> None:
+def test_smoothed_friction_scales_with_the_friction_loss() -> None:
     """The derivative by the loss is clip(v / s), not zero below s."""
     forces = []
     for loss in (0.5, 0.6):
@@ -57,7 +57,7 @@ def test_it_scales_with_the_frictionloss_where_that_changes_the_law_is_written_a
     assert (forces[1] - forces[0]) / 0.1 == pytest.approx(-0.4, rel=0.02)
 
 
-def test_joints_without_friction_or_speed_stay_as_they_are() -> None:
+def test_joints_without_friction_or_speed_are_not_changed() -> None:
     model, plain = model_of(0.5), model_of(0.5)
     smooth_dry_friction(model, (0.0, 0.05, 0.05))
     np.testing.assert_array_equal(model.dof_solref, plain.dof_solref)
@@ -65,7 +65,7 @@ def test_joints_without_friction_or_speed_stay_as_they_are() -> None:
     assert friction(model, 0.3) == friction(plain, 0.3)
 
 
-def test_speeds_are_a_share_of_the_fastest_but_no_less_than_where_the_engine_sticks() -> None:
+def test_smoothing_speeds_are_a_fraction_of_the_fastest_and_above_sticking() -> None:
     model = model_of(0.5, 0.8)
     speeds = smoothing_speeds_of(model, np.array([10.0, 0.0]))
     assert speeds[0] == pytest.approx(0.2)
@@ -84,7 +84,7 @@ def test_speeds_are_a_share_of_the_fastest_but_no_less_than_where_the_engine_sti
     assert -0.5 < data.qfrc_constraint[0] < -0.2  # within: less than the loss
 
 
-def test_what_is_dry() -> None:
+def test_dry_friction_of_joints_and_tendons_is_found() -> None:
     assert has_dry_friction(model_of(0.1))
     assert has_dry_friction(model_of(0.0, 0.1))
     assert not has_dry_friction(model_of(0.0))
