@@ -528,8 +528,11 @@ def identifiable(e: Experiment) -> Iterator[tuple[str, str]]:
     )
     yield "best", ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[-2:])
     seen = task.observer.identifiability(task.initial, told)
-    yield "never identifiable", "; ".join(str(group) for group in seen.groups_always) or "none"
-    yield "not along this motion", "; ".join(str(group) for group in seen.groups_here) or "none"
+    yield "never identifiable", "; ".join(str(group) for group in seen.groups_along_all) or "none"
+    yield (
+        "not along this motion",
+        "; ".join(str(group) for group in seen.groups_along_trajectory) or "none",
+    )
 
 
 def timesteps(name: str, friction: bool, horizon: float, folder: Path) -> Table:

@@ -28,7 +28,7 @@ from sequential_folder import Folder, told
 import mjfim
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, RecordingError
-from mjfim.excitation.target_accuracy import wanted_of
+from mjfim.excitation.target_accuracy import target_accuracies
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
@@ -110,7 +110,7 @@ def real(folder: Folder, rounds: int, files: Sequence[Path]) -> Campaign:
     if waits and not done:
         return Campaign(
             parameters=folder.task.parameters.names,
-            wanted=wanted_of(folder.task),
+            wanted=target_accuracies(folder.task),
             rounds=(),
             status=CampaignStatus.WAITING,
         )
@@ -177,7 +177,7 @@ def main() -> int:
         stated = with_wanted(stated, args.wanted, first.parameters.names, first.parameters.guess)
         check_folder(args.output)
         folder = Folder(args.output, DesignTask.resolve(stated, threads=args.threads))
-        wanted_of(folder.task)
+        target_accuracies(folder.task)
         truth = not (args.real or args.recordings)
         campaign = (
             simulated(folder, args.rounds, args.seed)

@@ -13,7 +13,7 @@ from rich.console import Console
 from sequential_picture import figure
 
 from mjfim.errors import ModelError, RecordingError
-from mjfim.excitation.target_accuracy import wanted_of
+from mjfim.excitation.target_accuracy import target_accuracies
 from mjfim.excitation.task import DesignTask
 from mjfim.output.archive import check_fits, read_design, write_design
 from mjfim.output.mjcf.write import write_identified
@@ -134,7 +134,7 @@ class Folder:
 
 def described(now: Round, task: DesignTask) -> str:
     """The wanted parameters after a round."""
-    aims = wanted_of(task)
+    aims = target_accuracies(task)
     e, parts = now.estimate, []
     for j, name in enumerate(e.parameters):
         if np.isfinite(aims[j]):

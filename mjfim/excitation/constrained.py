@@ -11,15 +11,15 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.constraints import ConstraintSet, basis_of, constraint_set_of
-from mjfim.excitation.initial_controls import Start
+from mjfim.excitation.constraints import ConstraintSet, bandwidth_basis, constraint_set_of
+from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (
     BarrierIterate,
     BarrierSchedule,
     InteriorPointMethod,
     seen,
 )
-from mjfim.excitation.objective import DesignProblem, Point
+from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, regulator_for
 from mjfim.experiment.schema import Experiment
@@ -46,7 +46,7 @@ class ConstrainedSearch:
     """
 
     experiment: Experiment
-    start: Start
+    start: InitialControl
     schedule: BarrierSchedule
     budget: int
     seconds: float = np.inf
@@ -89,7 +89,9 @@ def pursue(
     begun = task.plant.engine_steps
     exact, smooth = Stage(task, search.combinations).problem, smoothed(task, search.combinations)
     fine = (
-        search.start.basis if search.start.basis is not None else basis_of(task, task.stated_times)
+        search.start.basis
+        if search.start.basis is not None
+        else bandwidth_basis(task, task.stated_times)
     )
     basis = None if fine is None else independent_curves(task.averaged(fine))
     regulate = replace(regulator_for(task), feedback_threshold=CALM if basis is None else np.inf)
@@ -102,7 +104,7 @@ def pursue(
         barrier_weights.run(control, search.budget, clock + search.seconds), chase
     ):
         own = stage_iterate.iterate.point
-        point = None if own.point is None else exact.judged(_repeated(own.point, repeats))
+        point = None if own.point is None else exact.reevaluated(_repeated(own.point, repeats))
         chase.slope, chase.status = (
             stage_iterate.iterate.slope,
             stage_iterate.status or Status.INTERRUPTED,
@@ -131,7 +133,7 @@ def _sound(schedule: Iterator[BarrierIterate], chase: Chase) -> Iterator[Barrier
         chase.status = Status.STALLED
 
 
-def _repeated(point: Point, count: int) -> Point:
+def _repeated(point: DesignPoint, count: int) -> DesignPoint:
     """A point as if its trajectory were measured so many times."""
     if count == 1 or point.information is None:
         return point
@@ -156,14 +158,17 @@ def _stated(task: DesignTask, ctrl: Array, fine: Array | None) -> Array:
 
 
 def _row(
-    stage_iterate: BarrierIterate, point: Point | None, rate: float, constraints: ConstraintSet
+    stage_iterate: BarrierIterate,
+    point: DesignPoint | None,
+    rate: float,
+    constraints: ConstraintSet,
 ) -> HistoryRow:
     criterion = None if point is None else point.criterion
     value, smallest = (
         (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
     )
     cost, i = (np.inf if point is None else point.cost), stage_iterate.iterate
-    margin = min(constraints.shares(seen(i.point)).values(), default=np.nan)
+    margin = min(constraints.relative_margins(seen(i.point)).values(), default=np.nan)
     return HistoryRow(
         iteration=i.index,
         cost=cost,

@@ -31,7 +31,7 @@ SHOWN = (
 )  # in the order of the observations
 
 
-def looked_at(substeps: int) -> tuple[int, ...]:
+def derivative_substeps_of(substeps: int) -> tuple[int, ...]:
     """Engine steps of a sample that derivatives look at: the first ones, where a held control jolts, to the last."""
     return tuple(
         sorted({round(s) for s in np.geomspace(1, substeps, min(LOOKS, substeps)).tolist()})
@@ -70,7 +70,7 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         accelerations=a,
         actuator_forces=f,
         joint_forces=j,
-        derivative_substeps=looked_at(task.system.grid.substeps),
+        derivative_substeps=derivative_substeps_of(task.system.grid.substeps),
         timestep=float(task.plant.simulator.model.opt.timestep),
     )
     shown = Bounds.from_range(
@@ -126,7 +126,7 @@ def _end(task: DesignTask) -> Bounds:
     return Bounds.from_range(-width, width)
 
 
-def basis_of(task: DesignTask, t: Array) -> Array | None:
+def bandwidth_basis(task: DesignTask, t: Array) -> Array | None:
     """(N, M) splines at times t: (N,) of which the control minus its centre is made, where its bandwidth is limited."""
     e = task.experiment
     if e.limits.bandwidth is None:
@@ -135,10 +135,10 @@ def basis_of(task: DesignTask, t: Array) -> Array | None:
         raise ExperimentError(
             f"limits.bandwidth: {e.limits.bandwidth:g} Hz; a control at {e.rate:g} Hz has {0.5 * e.rate:g} Hz at most"
         )
-    return splines_of(task, t, e.limits.bandwidth)
+    return boundary_splines(task, t, e.limits.bandwidth)
 
 
-def splines_of(task: DesignTask, t: Array, bandwidth: float) -> Array:
+def boundary_splines(task: DesignTask, t: Array, bandwidth: float) -> Array:
     """(N, M) splines of a bandwidth [Hz] at times t: (N,) that begin and end as the experiment does."""
     e = task.experiment
     begins, periodic = e.boundary.start == "rest", e.boundary.end == "periodic"
@@ -233,11 +233,21 @@ class ConstraintSet:
             last = ctrl[0]
         return np.diff(ctrl, axis=0, prepend=first[None], append=last[None]) / self.dt
 
+    def is_feasible(self, values: ConstraintValues, *, strictly: bool = False) -> bool:
+        """Tell whether all constraints hold.
+
+        Args:
+            values: Constrained quantities along a trajectory.
+            strictly: A margin of zero counts as a violation.
+        """
+        margins = self.margins(values).values()
+        return all(margin > 0.0 if strictly else margin >= 0.0 for margin in margins)
+
     def margins(self, values: ConstraintValues) -> dict[str, float]:
         """Worst margin of each kind, in its unit, negative outside."""
         return self._worst(values, relative=False)
 
-    def shares(self, values: ConstraintValues) -> dict[str, float]:
+    def relative_margins(self, values: ConstraintValues) -> dict[str, float]:
         """The same over half of the range of each."""
         return self._worst(values, relative=True)
 

@@ -14,10 +14,10 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.constrained import Chase
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.evaluation import evaluate, fine_point, warnings_of
-from mjfim.excitation.initial_controls import Start, starts_of
+from mjfim.excitation.evaluation import design_warnings, evaluate, point_at_stated_rate
+from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.multistart import Multistart
-from mjfim.excitation.objective import Point
+from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import COARSEST, Run, Stage, borne, coarse_level, descend
 from mjfim.excitation.verification import require_feasible_start, verify
@@ -75,7 +75,7 @@ def design_task(
             raise ExperimentError(
                 f"start: shape {start.shape}, wanted (samples, actuators) = {task.control.shape}"
             )
-    starts = starts_of(task, start)
+    starts = initial_controls_of(task, start)
     begin = (
         first
         if start is None
@@ -89,7 +89,7 @@ def design_task(
     seen = task.observer.identifiability(begin.trajectory, begin.sensitivity)
     require_designable(task, seen)
     stage = Stage(task, seen.basis)
-    first = stage.problem.judged(first)
+    first = stage.problem.reevaluated(first)
     runs: list[Run] = []
     with threadpool_limits(
         1, user_api="blas"
@@ -113,8 +113,8 @@ def design_task(
 
 def _free(
     stage: Stage,
-    first: Point,
-    starts: Iterable[Start],
+    first: DesignPoint,
+    starts: Iterable[InitialControl],
     runs: list[Run],
     clock: float,
     constraints: ConstraintSet | None = None,
@@ -146,8 +146,8 @@ def _free(
 
 def _enclosed(
     stage: Stage,
-    first: Point,
-    starts: Iterable[Start],
+    first: DesignPoint,
+    starts: Iterable[InitialControl],
     executor: Executor | None,
     runs: list[Run],
     clock: float,
@@ -161,7 +161,7 @@ def _enclosed(
         left = runs.pop()
         starts, elsewhere = starts[len(runs) :], left.steps
         if left.control is not None:  # as far as it came without a barrier
-            starts[0] = Start(starts[0].name, left.control)
+            starts[0] = InitialControl(starts[0].name, left.control)
     free = task.relaxed()
     chases: list[Chase] = []
     multistart = Multistart(
@@ -216,7 +216,7 @@ def _factors(task: DesignTask) -> tuple[int, ...]:
     return tuple(k for k in LONGER if task.system.grid.substeps % k == 0) or (HALF,)
 
 
-def _coarser(stage: Stage, begin: Point, factor: int) -> Stage | None:
+def _coarser(stage: Stage, begin: DesignPoint, factor: int) -> Stage | None:
     """A level so many times coarser, if the model bears it. begin: the stage's initial point"""
     task = stage.task
     stretch = task.system.grid.substeps % factor == 0
@@ -236,22 +236,27 @@ def _settled(stage: Stage, chase: Chase, cut: bool) -> Run:
         chase.name, None, chase.control, chase.status, chase.slope, chase.history, steps=chase.steps
     )
     if chase.control is not None:
-        run.point = fine_point(stage, chase.control)
+        run.point = point_at_stated_rate(stage, chase.control)
     run.inside = np.isfinite(chase.cost)
     if cut:
         found = None if run.point is None else run.point.trajectory
-        run.inside = found is not None and verify(stage.task, found).kept
+        run.inside = found is not None and verify(stage.task, found).is_feasible
     return run
 
 
 def _conclude(
-    stage: Stage, seen: Identifiability, first: Point, runs: list[Run], seconds: float, steps: int
+    stage: Stage,
+    seen: Identifiability,
+    first: DesignPoint,
+    runs: list[Run],
+    seconds: float,
+    steps: int,
 ) -> Design:
     task = stage.task
     if not runs:
         runs = [Run("initial control", status=Status.INTERRUPTED)]
     if runs[-1].point is None and runs[-1].control is not None:  # interrupted on the coarse level
-        runs[-1].point = fine_point(stage, runs[-1].control)
+        runs[-1].point = point_at_stated_rate(stage, runs[-1].control)
     best = min(runs, key=lambda run: (not run.inside, run.cost))
     interrupted = any(run.status is Status.INTERRUPTED for run in runs)
     if best.point is None and not interrupted:
@@ -283,7 +288,7 @@ def _conclude(
     status = Status.INTERRUPTED if interrupted else best.status
     if status.success and (rough is not None or clamped):
         status = Status.ROUGH
-    if task.is_limited and not found.kept and not interrupted:
+    if task.is_limited and not found.is_feasible and not interrupted:
         status = Status.INFEASIBLE
     return Design(
         status=status,
@@ -297,7 +302,7 @@ def _conclude(
         seconds=seconds,
         limits=found.margins,
         usage=found.usage,
-        warnings=tuple(warnings_of(final, found, task, clamped, rough)),
+        warnings=tuple(design_warnings(final, found, task, clamped, rough)),
         found_by=best.name,
         starts=tuple(
             StartResult(
@@ -309,7 +314,7 @@ def _conclude(
             for r in runs
         ),
         nuisance=tuple(p.name for p in task.parameters.parameters if p.nuisance),
-        combinations=tuple(str(group) for group in seen.groups_always),
+        combinations=tuple(str(group) for group in seen.groups_along_all),
         combined=seen.combinations(
             information,
             task.theta[task.parameters.interest],
@@ -344,7 +349,7 @@ def require_designable(task: DesignTask, seen: Identifiability) -> None:
     """
     p = task.parameters
     wanted = [p.parameters[j] for j in p.interest]
-    dead = [wanted[i].name for i in seen.always.silent if not wanted[i].group]
+    dead = [wanted[i].name for i in seen.along_all.silent if not wanted[i].group]
     if dead:
         raise UnidentifiableError(
             f"{_parameters(dead)} nothing in the measured outputs, neither along the initial control nor along "
@@ -355,13 +360,14 @@ def require_designable(task: DesignTask, seen: Identifiability) -> None:
         if not information.estimable(task.contrast).all():
             raise UnidentifiableError(
                 "cost.combination or cost.subset asks for what cannot be identified; what can is: "
-                + "; ".join(str(group) for group in seen.groups_always)
+                + "; ".join(str(group) for group in seen.groups_along_all)
             )
-    if not seen.always.basis.shape[1]:
+    if not seen.along_all.basis.shape[1]:
         raise UnidentifiableError("none of the parameters shows in the measured outputs")
-    if seen.here.count > seen.always.count:
+    if seen.along_trajectory.count > seen.along_all.count:
+        unexcited = "; ".join(_plainly(group) for group in seen.groups_along_trajectory)
         raise UnidentifiableError(
-            f"the start excites nothing along: {'; '.join(_plainly(g) for g in seen.groups_here)}. Another control would: "
+            f"the start excites nothing along: {unexcited}. Another control would: "
             "start from one that moves those parameters' joints, a multisine for example"
         )
 

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.limits import unwatched
-from mjfim.excitation.objective import Point
+from mjfim.excitation.limits import unsupported_ranges
+from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, regulator_for
-from mjfim.excitation.verification import SAME, Verification
+from mjfim.excitation.verification import SAME_STATE_TOLERANCE, Verification
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification, regulator
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
@@ -19,7 +19,7 @@ from mjfim.records.design import Evaluation
 from mjfim.records.trajectory import Trajectory
 
 
-def fine_point(stage: Stage, control: Array) -> Point | None:
+def point_at_stated_rate(stage: Stage, control: Array) -> DesignPoint | None:
     """A coarse level's control at the stated rate; None where it diverges."""
     try:
         return stage.problem.point(stage.task.plant.simulate(stage.task.theta, control))
@@ -27,7 +27,7 @@ def fine_point(stage: Stage, control: Array) -> Point | None:
         return None
 
 
-def evaluate(stage: Stage, point: Point) -> Evaluation:
+def evaluate(stage: Stage, point: DesignPoint) -> Evaluation:
     """Everything that a trajectory tells, with the regulator about it."""
     task, information = stage.task, stage.problem.information
     if (
@@ -56,7 +56,7 @@ def evaluate(stage: Stage, point: Point) -> Evaluation:
 UNSTABLE = 1e3
 
 
-def warnings_of(
+def design_warnings(
     final: Evaluation,
     found: Verification,
     task: DesignTask,
@@ -80,20 +80,20 @@ def warnings_of(
     for kind, margin in found.margins.items():
         if margin < 0.0:
             advice = "widen it, start more gently, or give the design more time"
-            if kind in found.told:
+            if kind in found.unenforced:
                 advice = (
                     "they are checked, not enforced; raise cost.control or cost.tracking until they hold before running "
                     "this on hardware"
                 )
             yield f"{kind} limits are exceeded by {-margin:.3g}: {advice}"
-    yield from left_open(task)
-    if found.deviation > SAME:
+    yield from open_boundary_warnings(task)
+    if found.deviation > SAME_STATE_TOLERANCE:
         yield (
             f"played on the untouched model, the design deviates by up to {found.deviation:.2g}: a clamp, stop or contact acts"
         )
 
 
-def left_open(task: DesignTask) -> Iterator[str]:
+def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
     """What the limits and boundaries that an experiment states leave open."""
     e, model = task.experiment, task.system.model
     rates = (
@@ -108,7 +108,7 @@ def left_open(task: DesignTask) -> Iterator[str]:
             "limits.bandwidth"
         )
     if e.limits.enforce:
-        unseen = unwatched(model)
+        unseen = unsupported_ranges(model)
         if unseen:
             yield f"the MJCF's ranges of {', '.join(unseen)} are no limits of the design: the simulation runs into them as it is"
 
@@ -126,4 +126,4 @@ def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
     if point.trajectory is None or point.sensitivity is None:
         raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
     stage = Stage(task, task.observer.identifiability(point.trajectory, point.sensitivity).basis)
-    return evaluate(stage, stage.problem.judged(point))
+    return evaluate(stage, stage.problem.reevaluated(point))

@@ -20,7 +20,7 @@ SWELL = 0.1  # share of the horizon over which a random start swells from rest a
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class InitialControl:
     """A control to begin with. control: (N, nu);  basis: (N, M) what it is optimised within at first, or None: anything
 
     repeats: times that the horizon is longer than the control, which is optimised alone at first, then played so many times
@@ -37,14 +37,17 @@ class Start:
         return np.tile(self.control, (self.repeats, 1))
 
 
-def starts_of(task: DesignTask, given: Array | None) -> Iterator[Start]:
+def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[InitialControl]:
     """The given or initial control, then what the experiment's [descent] asks for. Raises for what is not there at once."""
     e, d = task.experiment, task.experiment.descent
     found = [
-        Start("initial control", task.control) if given is None else Start("given control", given)
+        InitialControl("initial control", task.control)
+        if given is None
+        else InitialControl("given control", given)
     ]
     found += [
-        Start(f"previous design {path}", previous(task, path)) for path in dict.fromkeys(d.previous)
+        InitialControl(f"previous design {path}", previous(task, path))
+        for path in dict.fromkeys(d.previous)
     ]
     begins, ends = e.boundary.start == "rest", e.boundary.end == "rest"
     rng = np.random.default_rng(d.seed)
@@ -57,17 +60,20 @@ def starts_of(task: DesignTask, given: Array | None) -> Iterator[Start]:
             )
         series = fourier_basis(task.t, task.horizon, frequency, harmonics, begins, ends)
         fitted = series @ np.linalg.lstsq(series, _random(task, rng) - task.centre)[0]
-        found.append(Start(f"Fourier series of {frequency:g} Hz", task.centre + fitted, series))
+        found.append(
+            InitialControl(f"Fourier series of {frequency:g} Hz", task.centre + fitted, series)
+        )
     for count in dict.fromkeys(d.repeats):
         found.append(
-            Start(
+            InitialControl(
                 f"{count} times a design of {task.horizon / count:g} s",
                 _part(task, count),
                 repeats=count,
             )
         )
     multisines = (
-        Start(f"multisine {i} of {d.starts - 1}", _random(task, rng)) for i in range(1, d.starts)
+        InitialControl(f"multisine {i} of {d.starts - 1}", _random(task, rng))
+        for i in range(1, d.starts)
     )
     return chain(found, multisines)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.excitation.constraints import ConstraintSet, ConstraintValues
-from mjfim.excitation.objective import DIVERGED, DesignProblem, Point
+from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.optimize.barrier import BarrierExpansion
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Armijo, Expansion, Iterate, Regulator, optimize
@@ -31,7 +31,7 @@ class InteriorPoint:
     """
 
     values: ConstraintValues | None
-    point: Point | None
+    point: DesignPoint | None
     merit: float
     barrier: float
 
@@ -84,7 +84,7 @@ class InteriorProblem:
         """A point of a problem that differs from this one in criterion, mu, delta or the constraints's bounds."""
         if point.values is None or point.point is None:
             return point
-        judged = self.base.judged(point.point)
+        judged = self.base.reevaluated(point.point)
         return InteriorPoint(
             point.values,
             judged,
@@ -92,7 +92,7 @@ class InteriorProblem:
             self.constraints.value(point.values, self.delta),
         )
 
-    def _merit(self, point: Point) -> float:
+    def _merit(self, point: DesignPoint) -> float:
         if self.base.information.criterion == "D":
             return point.cost / self._nats(point)
         return float(np.log(point.cost)) if point.cost > 0.0 and np.isfinite(point.cost) else np.inf
@@ -105,7 +105,7 @@ class InteriorProblem:
             self._nats(point.point) if self.base.information.criterion == "D" else point.point.cost
         )
 
-    def _nats(self, point: Point) -> float:
+    def _nats(self, point: DesignPoint) -> float:
         count = 1 if point.criterion is None else len(point.criterion.eigenvalues)
         return self.base.information.weight * count
 
@@ -284,7 +284,7 @@ class InteriorPointMethod:
             return False
         return all(
             s > -FARTHEST_START
-            for kind, s in self.constraints.shares(point.values).items()
+            for kind, s in self.constraints.relative_margins(point.values).items()
             if not kind.startswith("end_")
         )
 
@@ -307,8 +307,8 @@ class InteriorPointMethod:
         for share in SHRUNK:
             candidate = control if share == 1.0 else self.centre + share * (control - self.centre)
             point = problem.point(candidate)
-            if point.values is not None and all(
-                m > 0.0 for m in self.constraints.margins(point.values).values()
+            if point.values is not None and self.constraints.is_feasible(
+                point.values, strictly=True
             ):
                 return np.asarray(candidate)
         return None
@@ -331,7 +331,10 @@ class InteriorPointMethod:
             margins = self.constraints.margins(seen(iterate.point))
             stage_iterate = BarrierIterate(iterate, np.inf, margins)
             yield stage_iterate
-            if all(m > 0.0 for m in margins.values()) or time.perf_counter() > until:
+            if (
+                self.constraints.is_feasible(seen(iterate.point), strictly=True)
+                or time.perf_counter() > until
+            ):
                 return
 
     def _down(
@@ -370,7 +373,7 @@ class InteriorPointMethod:
                 max_iterations=patience,
             ):
                 point, margins = iterate.point, self.constraints.margins(seen(iterate.point))
-                kept = all(m >= 0.0 for m in margins.values())
+                kept = self.constraints.is_feasible(seen(iterate.point))
                 status = Status.CONVERGED if iterate.slope <= r.tolerance else iterate.status
                 status = status if last and kept else None
                 yield BarrierIterate(
@@ -391,7 +394,7 @@ class InteriorPointMethod:
             if over or (last and kept):
                 return
             if mu <= HOLDING:
-                held = tightened_further(held, self.constraints.shares(seen(point)))
+                held = tightened_further(held, self.constraints.relative_margins(seen(point)))
 
     def _mended(
         self, problem: InteriorProblem, iterate: Iterate[InteriorPoint], mu: float, done: int

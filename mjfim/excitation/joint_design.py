@@ -69,7 +69,9 @@ def _data(task: DesignTask) -> Array:
             "the simulation diverges when the parameters move a little along the initial control"
         )
     seen = task.observer.identifiability(task.initial, point.sensitivity)
-    information = replace(task.information, basis=seen.here.basis if seen.here.count else None)
+    information = replace(
+        task.information, basis=seen.along_trajectory.basis if seen.along_trajectory.count else None
+    )
     p = task.parameters
     return shared(
         information.visible(point.information - task.information.prior),

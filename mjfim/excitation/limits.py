@@ -147,7 +147,7 @@ def _joint_force(model: Any, joints: Mapping[str, ScalarJoint]) -> dict[str, Ran
     return {name: tuple(model.jnt_actfrcrange[j]) for name, j in limited.items()}
 
 
-def unwatched(model: Any) -> tuple[str, ...]:
+def unsupported_ranges(model: Any) -> tuple[str, ...]:
     """What has a range in the MJCF that is not among the limits: ball joints, tendons, activations."""
 
     def named(kind: Any, rows: Any) -> list[str]:

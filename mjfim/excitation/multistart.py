@@ -13,7 +13,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform, pursue
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.initial_controls import Start
+from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import SHRUNK, BarrierSchedule, tightened_further
 from mjfim.excitation.unconstrained import Stage
 from mjfim.excitation.verification import verify
@@ -86,7 +86,7 @@ class Multistart:
         level = self.coarse.task.system.variant
         return replace(level, timestep_factor=1) == self.fine.task.system.variant
 
-    def run(self, starts: Sequence[Start], chases: list[Chase]) -> Iterator[HistoryRow]:
+    def run(self, starts: Sequence[InitialControl], chases: list[Chase]) -> Iterator[HistoryRow]:
         """Every iterate; `chases` gets one entry per start, the winners' ones after the second round."""
         d = self.fine.task.experiment.descent
         reserve = SPARE * (d.seconds or 0.0)
@@ -130,7 +130,7 @@ class Multistart:
         kept = order[: max(1, len(chases) // KEPT)]
         if not kept:
             return
-        again = [Start(chases[i].name, np.asarray(leads[i].control)) for i in kept]
+        again = [InitialControl(chases[i].name, np.asarray(leads[i].control)) for i in kept]
         for i in order[len(kept) :]:
             if np.isfinite(leads[i].cost):
                 chases[i].status = Status.LEFT
@@ -171,7 +171,7 @@ class Multistart:
             i, shares = leaking
             held = tightened_further(held, shares)
             best, again = chases[i], list[Chase]()
-            start = Start(best.name, np.asarray(best.control))
+            start = InitialControl(best.name, np.asarray(best.control))
             try:
                 yield from self._round(
                     self.fine,
@@ -201,9 +201,13 @@ class Multistart:
             return None
         task = self.fine.task
         found = verify(task, task.plant.simulate(task.theta, np.asarray(chases[i].control)))
-        return None if found.kept or not np.isfinite(found.deviation) else (i, found.shares)
+        return (
+            None
+            if found.is_feasible or not np.isfinite(found.deviation)
+            else (i, found.relative_margins)
+        )
 
-    def _judge(self, chase: Chase, start: Start) -> Lead:
+    def _judge(self, chase: Chase, start: InitialControl) -> Lead:
         """Replace a coarse level's cost by that on the stated model, of what was found or of the start if that is better.
 
         Returns what to go on with: that, or what leaks here as the coarse level saw it, since the second round brings it back.
@@ -225,10 +229,7 @@ class Multistart:
         if watched is None:
             return np.inf
         values = constraints.evaluate(*watched, slopes=False)
-        if (
-            min(constraints.margins(values).values(), default=0.0) < 0.0
-            or not verify(task, values.trajectory).kept
-        ):
+        if not constraints.is_feasible(values) or not verify(task, values.trajectory).is_feasible:
             return np.inf
         return self.fine.problem.point(values.trajectory).cost
 
@@ -249,7 +250,7 @@ class Multistart:
     def _round(
         self,
         stage: Stage,
-        starts: Sequence[Start],
+        starts: Sequence[InitialControl],
         schedule: BarrierSchedule,
         budget: int,
         seconds: float,

@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.robust import ParameterSamples
 from mjfim.information.criteria import Criterion
-from mjfim.information.fisher import Information
+from mjfim.information.fisher import FisherInformation
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.batch import SubstepObservations
@@ -81,7 +81,7 @@ class RunningCost:
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class DesignPoint:
     """A trajectory with everything computed along it. A diverged trial has no trajectory and infinite cost.
 
     others: the same control at the further parameter samples of a robust design
@@ -93,7 +93,7 @@ class Point:
     criterion: Criterion | None
     cost: float
     accuracy: DifferenceAccuracy
-    others: tuple[Point, ...] = ()
+    others: tuple[DesignPoint, ...] = ()
 
     @property
     def phi(self) -> tuple[float, ...]:
@@ -103,7 +103,7 @@ class Point:
         )
 
 
-DIVERGED = Point(None, None, None, None, np.inf, FORWARD_DIFFERENCES)
+DIVERGED = DesignPoint(None, None, None, None, np.inf, FORWARD_DIFFERENCES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,26 +111,26 @@ class DesignProblem:
     """J(theta fixed) as Algorithm 1 wants it: a `pronto.Problem` over `Point`s.
 
     extended: expansions also carry psi as a state;  draft: never refine the differences (coarse levels)
-    pool: of a robust design, its first sample theta itself; each sample is driven by the same control, open loop
+    parameter_samples: of a robust design, its first sample theta itself; each sample is driven by the same control, open loop
     """
 
     plant: Plant
     theta: Array
-    information: Information
+    information: FisherInformation
     running: RunningCost
     extended: bool = False
     draft: bool = False
-    pool: ParameterSamples | None = None
+    parameter_samples: ParameterSamples | None = None
 
     def point(
         self, trajectory: Trajectory, accuracy: DifferenceAccuracy = FORWARD_DIFFERENCES
-    ) -> Point:
+    ) -> DesignPoint:
         """Evaluate J along a trajectory."""
         point = self._sensed(self.theta, trajectory, accuracy)
         if point.criterion is None:
             return DIVERGED
         others = []
-        for theta in () if self.pool is None else self.pool.thetas[1:]:
+        for theta in () if self.parameter_samples is None else self.parameter_samples.thetas[1:]:
             try:
                 others.append(
                     self._sensed(theta, self.plant.simulate(theta, trajectory.ctrl), accuracy)
@@ -139,7 +139,7 @@ class DesignProblem:
                 return DIVERGED
         return self._priced(replace(point, others=tuple(others)))
 
-    def judged(self, point: Point) -> Point:
+    def reevaluated(self, point: DesignPoint) -> DesignPoint:
         """A point of a problem that differs from this one in the criterion alone."""
         here, *others = (
             p
@@ -151,12 +151,18 @@ class DesignProblem:
             point if here.criterion is None else self._priced(replace(here, others=tuple(others)))
         )
 
-    def _priced(self, point: Point) -> Point:
+    def _priced(self, point: DesignPoint) -> DesignPoint:
         trajectory, _, criterion = _computed(point)
-        phi = criterion.value if self.pool is None else self.pool.value(point.phi)
+        phi = (
+            criterion.value
+            if self.parameter_samples is None
+            else self.parameter_samples.value(point.phi)
+        )
         return replace(point, cost=phi + self.running.value(trajectory))
 
-    def _sensed(self, theta: Array, trajectory: Trajectory, accuracy: DifferenceAccuracy) -> Point:
+    def _sensed(
+        self, theta: Array, trajectory: Trajectory, accuracy: DifferenceAccuracy
+    ) -> DesignPoint:
         """A trajectory of the model at theta with its information; its cost is left open."""
         sensitivity = self.plant.derivatives.sensitivity(
             theta, trajectory, central=not accuracy.shared_origin
@@ -164,7 +170,7 @@ class DesignProblem:
         if sensitivity is None:
             return DIVERGED
         information = self.information.matrix(sensitivity)
-        return Point(
+        return DesignPoint(
             trajectory,
             sensitivity,
             information,
@@ -173,35 +179,39 @@ class DesignProblem:
             accuracy,
         )
 
-    def value(self, point: Point) -> float:
+    def value(self, point: DesignPoint) -> float:
         """J; infinite for a diverged trial."""
         return point.cost
 
-    def size(self, point: Point) -> float:
+    def size(self, point: DesignPoint) -> float:
         """J; for D-optimality, whose J has no natural zero, one nat per parameter and the running cost."""
         if self.information.criterion != "D":
             return point.cost
         trajectory, _, criterion = _computed(point)
         return self.information.weight * len(criterion.eigenvalues) + self.running.value(trajectory)
 
-    def expand(self, point: Point) -> Expansion:
+    def expand(self, point: DesignPoint) -> Expansion:
         """Expansion of J about a point: mixed differences for the information, closed form for the rest."""
         return self.expand_observed(point, None)[0]
 
     def expand_observed(
-        self, point: Point, observations: SubstepObservations | None
+        self, point: DesignPoint, observations: SubstepObservations | None
     ) -> tuple[Expansion, Array | None]:
         """The expansion, and the derivatives (N, looked-at substeps, w, nx+nu) of the observations, from the same steps."""
         trajectory, sensitivity, criterion = _computed(point)
         bilinear, a, b = self._slope(self.theta, point, observations)
         spectral = None
-        if self.pool is None and np.isfinite(criterion.power) and observations is not None:
+        if (
+            self.parameter_samples is None
+            and np.isfinite(criterion.power)
+            and observations is not None
+        ):
             spectral = self.information.spectral(criterion, sensitivity, bilinear, point.cost)
-        if self.pool is not None:
-            weights = self.pool.weights(point.phi)
+        if self.parameter_samples is not None:
+            weights = self.parameter_samples.weights(point.phi)
             a, b = weights[0] * a, weights[0] * b
             for weight, theta, other in zip(
-                weights[1:], self.pool.thetas[1:], point.others, strict=True
+                weights[1:], self.parameter_samples.thetas[1:], point.others, strict=True
             ):
                 own, a_own, b_own = self._slope(theta, other)
                 open_loop = np.zeros((len(b_own), b_own.shape[1], a_own.shape[1]))
@@ -225,7 +235,7 @@ class DesignProblem:
         ), bilinear.observation_jacobian
 
     def _slope(
-        self, theta: Array, point: Point, observations: SubstepObservations | None = None
+        self, theta: Array, point: DesignPoint, observations: SubstepObservations | None = None
     ) -> tuple[Bilinear, Array, Array]:
         """Derivatives at a point, and those of phi by x (N+1, nx) and u (N, nu)."""
         trajectory, sensitivity, criterion = _computed(point)
@@ -234,17 +244,19 @@ class DesignProblem:
         )
         return bilinear, *self.information.gradient(criterion, sensitivity, bilinear)
 
-    def project(self, point: Point, zeta: TangentCurve, gamma: float, K: Array) -> Point:
+    def project(
+        self, point: DesignPoint, zeta: TangentCurve, gamma: float, K: Array
+    ) -> DesignPoint:
         """P(xi + gamma zeta), evaluated."""
         trajectory, _, _ = _computed(point)
         moved = self.plant.project(self.theta, trajectory, zeta, gamma, K)
         return DIVERGED if moved is None else self.point(moved, point.accuracy)
 
-    def difference(self, new: Point, old: Point) -> TangentCurve:
+    def difference(self, new: DesignPoint, old: DesignPoint) -> TangentCurve:
         """(x_new - x_old, u_new - u_old)."""
         return self.plant.difference(_computed(new)[0], _computed(old)[0])
 
-    def refine(self, point: Point) -> Point | None:
+    def refine(self, point: DesignPoint) -> DesignPoint | None:
         """The same point, to be expanded with central differences."""
         if self.draft or point.accuracy is CENTRAL_DIFFERENCES:
             return None
@@ -255,7 +267,7 @@ class DesignProblem:
         )
 
 
-def _computed(point: Point) -> tuple[Trajectory, Sensitivity, Criterion]:
+def _computed(point: DesignPoint) -> tuple[Trajectory, Sensitivity, Criterion]:
     if point.trajectory is None or point.sensitivity is None or point.criterion is None:
         raise ValueError("a diverged trial has no expansion")
     return point.trajectory, point.sensitivity, point.criterion

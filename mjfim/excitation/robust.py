@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 
 from mjfim.arrays import Array
 
-SHARPNESS = 20.0
+POOLING_EXPONENT = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,11 @@ class ParameterSamples:
         if self.over == "mean":
             return float(values.mean())
         if self.logarithmic:
-            return float((logsumexp(SHARPNESS * values) - np.log(len(values))) / SHARPNESS)
+            return float(
+                (logsumexp(POOLING_EXPONENT * values) - np.log(len(values))) / POOLING_EXPONENT
+            )
         top = values.max()
-        return float(top * np.mean((values / top) ** SHARPNESS) ** (1.0 / SHARPNESS))
+        return float(top * np.mean((values / top) ** POOLING_EXPONENT) ** (1.0 / POOLING_EXPONENT))
 
     def weights(self, phi: Sequence[float]) -> Array:
         """(S,) derivative of the pooled criterion by each phi."""
@@ -47,6 +49,8 @@ class ParameterSamples:
         if self.over == "mean":
             return np.full(len(values), 1.0 / len(values))
         if self.logarithmic:
-            return np.asarray(np.exp(SHARPNESS * values - logsumexp(SHARPNESS * values)))
+            return np.asarray(
+                np.exp(POOLING_EXPONENT * values - logsumexp(POOLING_EXPONENT * values))
+            )
         pooled = self.value(phi)
-        return np.asarray((values / pooled) ** (SHARPNESS - 1.0) / len(values))
+        return np.asarray((values / pooled) ** (POOLING_EXPONENT - 1.0) / len(values))

@@ -17,7 +17,11 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError
 from mjfim.excitation.design import Monitor, design_task
-from mjfim.excitation.target_accuracy import furthest, require_reachable, wanted_of
+from mjfim.excitation.target_accuracy import (
+    largest_ratio_to_target,
+    require_reachable,
+    target_accuracies,
+)
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import AUTO, COARSEST
 from mjfim.experiment.schema import Experiment
@@ -145,7 +149,7 @@ class _Hunt:
         self.experiment, self.tolerance = experiment, tolerance
         self.monitor, self.threads, self.report, self.executor = monitor, threads, report, executor
         self.base = DesignTask.resolve(experiment, threads=threads)
-        self.wanted = wanted_of(self.base)
+        self.wanted = target_accuracies(self.base)
         self.grid = _grid(self.base)
         self.longest = _longest(self.base) if longest is None else longest
         if self.longest * experiment.rate < self.grid.minimum:
@@ -222,10 +226,10 @@ class _Hunt:
             return Tried(horizon, np.inf, why=str(error))
         if found.status is Status.INFEASIBLE:
             return Tried(horizon, np.inf, why=f"{found.status.value} ({_outside(found)})")
-        ratio, j = furthest(found.final.std, self.wanted)
+        ratio, j = largest_ratio_to_target(found.final.std, self.wanted)
         if (
             samples not in self.designs
-            or ratio < furthest(self.designs[samples].final.std, self.wanted)[0]
+            or ratio < largest_ratio_to_target(self.designs[samples].final.std, self.wanted)[0]
         ):
             self.designs[samples] = found
         return Tried(horizon, ratio, task.parameters.names[j])

@@ -10,7 +10,7 @@ from mjfim.excitation.task import DesignTask
 from mjfim.records.design import Design
 
 
-def wanted_of(task: DesignTask) -> Array:
+def target_accuracies(task: DesignTask) -> Array:
     """(p,) standard deviations aimed at, infinite where none is. Raises ExperimentError where no parameter states one."""
     stated = [None if q.nuisance else q.wanted for q in task.parameters.parameters]
     if not any(stated):
@@ -25,7 +25,7 @@ def wanted_of(task: DesignTask) -> Array:
     return np.array([np.inf if value is None else value for value in stated])
 
 
-def furthest(std: Array, wanted: Array) -> tuple[float, int]:
+def largest_ratio_to_target(std: Array, wanted: Array) -> tuple[float, int]:
     """Largest standard deviation over the wanted one, at most 1 where all are reached, and whose it is. Both (p,)."""
     share = np.where(np.isfinite(wanted), std / wanted, 0.0)
     return float(share.max()), int(np.argmax(share))

@@ -19,7 +19,7 @@ from mjfim.experiment.control_signal import generate
 from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System, keyframe
 from mjfim.experiment.system_tables import Signal
-from mjfim.information.fisher import Information
+from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Observer
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.parameter_samples import sample_parameters
@@ -230,7 +230,7 @@ class DesignTask:
         return self.parameters.prior_information + self.prior_information
 
     @property
-    def information(self) -> Information:
+    def information(self) -> FisherInformation:
         """Fisher information of the measured samples, and the criterion."""
         experiment, parameters = self.experiment, self.parameters
         measure_rate = self.system.measure_rate
@@ -239,7 +239,7 @@ class DesignTask:
         per_sample = measure_rate / (experiment.measure_rate or experiment.rate)
         all_wanted = len(parameters.interest) == len(parameters)
 
-        return Information(
+        return FisherInformation(
             self.system.noise,
             measure_rate,
             parameters.scale,
@@ -274,7 +274,11 @@ class DesignTask:
             self.control_about,
         )
         return DesignProblem(
-            self.plant, self.theta, self.information, running, pool=self.samples_of_parameters
+            self.plant,
+            self.theta,
+            self.information,
+            running,
+            parameter_samples=self.samples_of_parameters,
         )
 
     @property

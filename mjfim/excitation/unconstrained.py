@@ -11,7 +11,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.constraints import ConstraintSet
-from mjfim.excitation.objective import DIVERGED, DesignProblem, Point
+from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
@@ -48,7 +48,7 @@ class Run:
     """
 
     name: str
-    point: Point | None = None
+    point: DesignPoint | None = None
     control: Array | None = None
     status: Status = Status.STALLED
     slope: float = np.inf
@@ -92,7 +92,7 @@ COARSEST = 50  # samples of a coarse level, at least
 BORNE = 0.05  # relative change of the initial cost that it may make
 
 
-def coarse_level(task: DesignTask, first: Point, basis: Array | None) -> DesignTask | None:
+def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> DesignTask | None:
     """The coarse level, where the experiment wants it and the model bears it (the initial cost agrees within 5 %).
 
     Raises ExperimentError where a stated factor does not divide the samples.
@@ -113,7 +113,7 @@ def coarse_level(task: DesignTask, first: Point, basis: Array | None) -> DesignT
     return coarse if borne(Stage(coarse, basis), first, task.problem.size(first), BORNE) else None
 
 
-def borne(coarse: Stage, first: Point, size: float, share: float) -> bool:
+def borne(coarse: Stage, first: DesignPoint, size: float, share: float) -> bool:
     """Whether the initial cost of a coarse level is that of the first point, up to a share of its size."""
     try:
         there = coarse.problem.point(coarse.task.initial)
@@ -174,9 +174,10 @@ def _margin(task: DesignTask, constraints: ConstraintSet, control: Array) -> flo
     watched = task.plant.observe(task.theta, task.averaged(control), constraints.observations)
     if watched is None:
         return -1.0
-    margins = constraints.margins(constraints.evaluate(*watched, slopes=False))
-    if min(margins.values(), default=1.0) < 0.0:
+    values = constraints.evaluate(*watched, slopes=False)
+    if not constraints.is_feasible(values):
         return -1.0
+    margins = constraints.margins(values)
     return float(all(margins.get(kind, 1.0) > 0.0 for kind in ("force", "joint_force")))
 
 
@@ -244,7 +245,9 @@ class _Pass:
                 raise SimulationDivergedError("an iterate of Algorithm 1 diverged")
             self.control = np.repeat(trajectory.ctrl, level.system.variant.sample_factor, axis=0)
             self.eigenvalues = criterion.eigenvalues
-            point = iterate.point if np.isinf(self.stage.power) else exact.judged(iterate.point)
+            point = (
+                iterate.point if np.isinf(self.stage.power) else exact.reevaluated(iterate.point)
+            )
             run.slope, run.status = iterate.slope, iterate.status or Status.INTERRUPTED
             if run.status is Status.CONVERGED and np.isfinite(self.stage.power):
                 run.status = Status.SMOOTHED
@@ -257,7 +260,7 @@ class _Pass:
                 self.met = True
                 return
 
-    def _start(self) -> Point:
+    def _start(self) -> DesignPoint:
         """The cheapest point of the controls; infinite where all diverge."""
         level, points = self.stage.task, []
         for control in {id(c): c for c in self.controls}.values():
@@ -276,7 +279,7 @@ class _Pass:
         return bool(wanted and len(values) > 1 and values[1] < MEETING * values[0])
 
 
-def _row(iterate: Iterate[Point], done: int, rate: float) -> HistoryRow:
+def _row(iterate: Iterate[DesignPoint], done: int, rate: float) -> HistoryRow:
     criterion = iterate.point.criterion
     value, smallest = (
         (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))

@@ -13,7 +13,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.constraints import (
     ConstraintSet,
     ConstraintValues,
-    basis_of,
+    bandwidth_basis,
     constraint_set_of,
 )
 from mjfim.excitation.task import DesignTask
@@ -21,7 +21,9 @@ from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage
 from mjfim.records.trajectory import Trajectory
 
-SAME = 1e-6  # deviation of a state, in its unit, up to which two simulations are the same
+SAME_STATE_TOLERANCE = (
+    1e-6  # deviation of a state, in its unit, up to which two simulations are the same
+)
 
 
 @dataclass(frozen=True)
@@ -29,20 +31,22 @@ class Verification:
     """margins: worst of each kind over all engine steps, in its unit, negative outside
 
     deviation: largest difference of a state at the samples from the trajectory that was designed
-    shares: the margins over half of each range;  told: kinds that are checked, not enforced
+    relative_margins: the margins over half of each range;  unenforced: kinds that are checked, not enforced
     usage: of every limit over time
     """
 
     margins: dict[str, float]
-    shares: dict[str, float]
+    relative_margins: dict[str, float]
     deviation: float
-    told: frozenset[str] = frozenset()
+    unenforced: frozenset[str] = frozenset()
     usage: tuple[LimitUsage, ...] = ()
 
     @property
-    def kept(self) -> bool:
+    def is_feasible(self) -> bool:
         """Every limit that is enforced holds."""
-        return all(margin >= 0.0 for kind, margin in self.margins.items() if kind not in self.told)
+        return all(
+            margin >= 0.0 for kind, margin in self.margins.items() if kind not in self.unenforced
+        )
 
 
 def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
@@ -66,7 +70,7 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
         return Verification(lost, lost, np.inf, frozenset(told))
     played = task.plant.trajectory(out.states[0], trajectory.ctrl)
     values = replace(constraints, clearance=None).evaluate(played, out.observed[0], slopes=False)
-    margins, shares = constraints.margins(values), constraints.shares(values)
+    margins, shares = constraints.margins(values), constraints.relative_margins(values)
     usage = [*_usage(task, constraints, values)]
     if constraints.clearance is not None:
         positions = _positions(task, simulator, played)
@@ -127,7 +131,7 @@ def require_feasible_start(task: DesignTask) -> None:
     """Raise ExperimentError where limits cannot be, exclude the start or the end, or either cannot be held at rest."""
     try:
         constraints = constraint_set_of(task, every=True)
-        basis_of(task, task.stated_times)
+        bandwidth_basis(task, task.stated_times)
         places = {"the start": task.plant.initial_state(task.theta)}
         if task.experiment.boundary.end == "rest":
             places["the end"] = task.target

@@ -12,7 +12,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.residuals import Fit
 from mjfim.identification.robust_covariance import together, uncertainty
 from mjfim.information.marginal import marginal, standard_deviations
-from mjfim.information.null_space import Null, grouped
+from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.combinations import ParameterGroup
@@ -45,11 +45,11 @@ class Accuracy:
     detail: Uncertainty | None
 
 
-def accuracy(fit: Fit, solution: Solution, null: Null, times: Sequence[float]) -> Accuracy:
+def accuracy(fit: Fit, solution: Solution, null: NullSpace, times: Sequence[float]) -> Accuracy:
     """Of a solution. null: what no recording shows;  times: rows over which the residuals of each output hang together"""
     p, theta = fit.system.parameters, fit.theta(solution.unknowns)
     covariance, std = _formal(fit, solution)
-    groups = grouped(null, p.names, p.magnitude, [q.unit for q in p.parameters])
+    groups = parameter_groups(null, p.names, p.magnitude, [q.unit for q in p.parameters])
     lumped = np.isin(p.names, [name for group in groups for name in group.members])
     std = np.where(lumped, np.inf, std)
     covariance = np.where(np.logical_or.outer(lumped, lumped), np.inf, covariance)

@@ -27,7 +27,7 @@ from mjfim.identification.fit_quality import Left, left
 from mjfim.identification.missing_terms import suspects
 from mjfim.identification.residual_tests import reasons, smaller
 from mjfim.identification.residuals import LARGE, Fit
-from mjfim.information.null_space import Null, invisible
+from mjfim.information.null_space import NullSpace, find_null_space
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.levenberg_marquardt import (
@@ -165,7 +165,7 @@ class _Identification:
         solution = self._settled(self._best(begin))
         return self._report(solution, null)
 
-    def _null(self, fit: Fit) -> Null:
+    def _null(self, fit: Fit) -> NullSpace:
         """Directions of theta that neither the recordings nor the priors tell, at the start of the search."""
         p, some = self.system.parameters, self._sample(fit)
         J, error = (
@@ -173,7 +173,9 @@ class _Identification:
         )
         weight = np.sqrt(np.diag(np.diag(p.prior_information)))
         J, error = np.concatenate([J, weight]), np.concatenate([error, np.zeros_like(weight)])
-        return invisible(J, error, p.magnitude, p.scale, np.arange(len(p)), np.zeros_like(weight))
+        return find_null_space(
+            J, error, p.magnitude, p.scale, np.arange(len(p)), np.zeros_like(weight)
+        )
 
     def _sample(self, fit: Fit) -> Fit:
         """Of the pieces that are quick to look at."""
@@ -318,7 +320,7 @@ class _Identification:
                 sigma[j] = max(spread, FLOOR * self.system.noise.sigma[j])
         return sigma
 
-    def _report(self, solution: Solution, null: Null) -> Estimate:
+    def _report(self, solution: Solution, null: NullSpace) -> Estimate:
         system, fit, at = self.system, self.fit, solution.unknowns
         p, theta, rest = system.parameters, fit.theta(at), left(fit, solution)
         missing = self._afterwards(lambda: () if rest.unexplained else self._missing(at))

@@ -19,7 +19,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import track_of
 from mjfim.identification.segments import cut, groups, whole
 from mjfim.identification.unknowns import Layout
-from mjfim.information.null_space import COARSER, Null
+from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
@@ -227,7 +227,7 @@ class Fit:
         other.masks = [mask & own for mask, own in zip(masks, self.masks, strict=True)]
         return other
 
-    def pin(self, theta0: Array, null: Null) -> None:
+    def pin(self, theta0: Array, null: NullSpace) -> None:
         """Hold what no recording shows at its start, to one size of each parameter. null: of all p parameters"""
         size = self.system.parameters.magnitude
         self.pins = np.linalg.qr(null.directions / size[:, None])[0].T / size
@@ -339,7 +339,7 @@ class Fit:
         """
         fine, coarse = (
             self._rows(at, derivatives=True, central=True, step=step, every=True)
-            for step in (SENSITIVITY_STEP, COARSER * SENSITIVITY_STEP)
+            for step in (SENSITIVITY_STEP, COARSER_STEP_FACTOR * SENSITIVITY_STEP)
         )
         found: dict[int, Array] = {}
         n = self.free.shape[1] if self.measured else 0

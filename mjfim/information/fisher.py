@@ -37,7 +37,7 @@ ESTIMABLE = 1e-6  # squared share of a parameter outside the identifiable combin
 
 
 @dataclass(frozen=True, eq=False)
-class Information:
+class FisherInformation:
     """Turns sensitivities into Fisher information and the criterion into its gradient.
 
     noise: of the outputs;  measure_rate: [Hz];  scale: (p,);  prior: (p, p);  weight: Q_p

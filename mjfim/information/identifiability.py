@@ -12,8 +12,15 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError, UnidentifiableError
-from mjfim.information.fisher import Information
-from mjfim.information.null_space import BLIND, COARSER, SURE, Null, grouped, invisible
+from mjfim.information.fisher import FisherInformation
+from mjfim.information.null_space import (
+    CLEAR_SINGULAR_VALUE,
+    COARSER_STEP_FACTOR,
+    LEAST_EFFECT,
+    NullSpace,
+    find_null_space,
+    parameter_groups,
+)
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.derivatives import SENSITIVITY_STEP
 from mjfim.plant.noise import Noise
@@ -44,25 +51,25 @@ class Identifiability:
 
     Attributes:
         names: Names of the t wanted parameters.
-        here: Null space along the given trajectory.
-        always: Null space that random trajectories share with it.
-        groups_here: The null space along the given trajectory in the names of the parameters.
-        groups_always: The shared null space in the names of the parameters.
+        along_trajectory: Null space along the given trajectory.
+        along_all: Null space that random trajectories share with it.
+        groups_along_trajectory: The null space along the given trajectory in the names of the parameters.
+        groups_along_all: The shared null space in the names of the parameters.
     """
 
     names: tuple[str, ...]
-    here: Null
-    always: Null
-    groups_here: tuple[ParameterGroup, ...]
-    groups_always: tuple[ParameterGroup, ...]
+    along_trajectory: NullSpace
+    along_all: NullSpace
+    groups_along_trajectory: tuple[ParameterGroup, ...]
+    groups_along_all: tuple[ParameterGroup, ...]
 
     @property
     def basis(self) -> Array | None:
         """(t, s) combinations that some experiment can show; None where every parameter can be shown."""
-        return self.always.basis if self.always.count else None
+        return self.along_all.basis if self.along_all.count else None
 
     def combinations(
-        self, information: Information, values: Array, before: Array, after: Array
+        self, information: FisherInformation, values: Array, before: Array, after: Array
     ) -> tuple[CombinationAccuracy, ...]:
         """Identifiable combinations with their standard deviations under two information matrices.
 
@@ -72,9 +79,11 @@ class Identifiability:
             before: (p, p) information of the first experiment.
             after: (p, p) information of the second one.
         """
-        rows = combination_matrix(self.groups_always, self.names)
+        rows = combination_matrix(self.groups_along_all, self.names)
         words = [
-            str(combination) for group in self.groups_always for combination in group.combinations
+            str(combination)
+            for group in self.groups_along_all
+            for combination in group.combinations
         ]
         initial, final = (information.spread(matrix, rows).tolist() for matrix in (before, after))
 
@@ -122,7 +131,7 @@ class Observer:
 
         # One difference step is enough where every singular value stands far above its round-off.
         quick = _null_space(self, [J], None, single_steps)
-        if quick.smallest > SURE and not quick.count:
+        if quick.smallest > CLEAR_SINGULAR_VALUE and not quick.count:
             return _in_words(self, quick, quick)
 
         return _look(
@@ -154,12 +163,12 @@ def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
         UnidentifiableError: A combination of parameters has no effect on the rows.
     """
     every = np.arange(len(parameters))
-    null = invisible(J, None, parameters.magnitude, parameters.scale, every, prior)
+    null = find_null_space(J, None, parameters.magnitude, parameters.scale, every, prior)
     if not null.count:
         return
 
     units = [parameter.unit for parameter in parameters.parameters]
-    groups = grouped(null, parameters.names, parameters.magnitude, units)
+    groups = parameter_groups(null, parameters.names, parameters.magnitude, units)
     listed = "; ".join(str(group) for group in groups)
     raise UnidentifiableError(f"this trajectory does not show every parameter: {listed}")
 
@@ -209,7 +218,7 @@ def _single_step_null_space(observer: Observer, trajectories: Sequence[Trajector
             return None
         J, error = found[0][:, inside], found[1][:, inside]
         step, scale = parameters.magnitude[inside], parameters.scale[inside]
-        null = invisible(J, error, step, scale, np.arange(len(inside)), no_prior)
+        null = find_null_space(J, error, step, scale, np.arange(len(inside)), no_prior)
         if not null.count:
             break
 
@@ -248,7 +257,7 @@ def _step_effects(
     return (np.concatenate(stack), np.concatenate(errors)) if stack else None
 
 
-def _in_words(observer: Observer, here: Null, always: Null) -> Identifiability:
+def _in_words(observer: Observer, here: NullSpace, always: NullSpace) -> Identifiability:
     """Two null spaces in the names of the wanted parameters."""
     parameters = observer.parameters
     interest = parameters.interest
@@ -260,8 +269,8 @@ def _in_words(observer: Observer, here: Null, always: Null) -> Identifiability:
         names,
         here,
         always,
-        grouped(here, names, size, units),
-        grouped(always, names, size, units),
+        parameter_groups(here, names, size, units),
+        parameter_groups(always, names, size, units),
     )
 
 
@@ -270,7 +279,7 @@ def _null_space(
     stack: Sequence[Array],
     errors: Sequence[Array] | None,
     known: Array | None,
-) -> Null:
+) -> NullSpace:
     """Null space of stacked rows together with those of earlier experiments. known: (t, k) directions found otherwise."""
     parameters = observer.parameters
     before = _rows_of_information(observer.earlier)
@@ -278,7 +287,7 @@ def _null_space(
     if errors is not None:
         error = np.concatenate([*errors, ROUND_OFF * np.abs(before)])
 
-    return invisible(
+    return find_null_space(
         np.concatenate([*stack, before]),
         error,
         parameters.magnitude,
@@ -312,7 +321,7 @@ def _unseen_by_earlier(observer: Observer, directions: Array) -> Array:
     _, values, V = np.linalg.svd(np.concatenate([effect, square]), full_matrices=False)
 
     strongest = np.linalg.norm(before * parameters.magnitude, 2)
-    unseen = values <= max(BLIND, NEGLIGIBLE_EFFECT * strongest)
+    unseen = values <= max(LEAST_EFFECT, NEGLIGIBLE_EFFECT * strongest)
     return np.asarray(unit @ V[unseen].T)
 
 
@@ -321,6 +330,6 @@ def _rows_and_error(
 ) -> tuple[Array, Array]:
     """Rows of G and their change with a longer step, which is all of them where the longer step diverges."""
     J = observer.rows(fine)
-    step = COARSER * SENSITIVITY_STEP
+    step = COARSER_STEP_FACTOR * SENSITIVITY_STEP
     coarse = observer.plant.derivatives.sensitivity(observer.theta, trajectory, step)
     return J, np.zeros_like(J) if coarse is None else observer.rows(coarse) - J

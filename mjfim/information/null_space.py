@@ -15,18 +15,18 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.records.combinations import Combination, ParameterGroup
 
-COARSER = 4.0  # the second step, times the first
-SURE = 1e-4  # a normalised singular value above it needs no second look
+COARSER_STEP_FACTOR = 4.0  # the second step, times the first
+CLEAR_SINGULAR_VALUE = 1e-4  # a normalised singular value above it needs no second look
 TOLERANCE = (1e-9, 1e-5)
-BLIND = 1e-6  # standard deviations that the data move when a parameter changes by all its size: no effect
-FAINT = (
+LEAST_EFFECT = 1e-6  # standard deviations that the data move when a parameter changes by all its size: no effect
+LEAST_RELATIVE_EFFECT = (
     1e-7  # of the strongest column; an error of the difference may exceed a column only below it
 )
-CLEAN = 1e-4  # coefficients of a combination below it, in natural units, are round-off
+LEAST_COEFFICIENT = 1e-4  # coefficients of a combination below it, in natural units, are round-off
 
 
 @dataclass(frozen=True, eq=False)
-class Null:
+class NullSpace:
     """Invisible directions of the t wanted parameters.
 
     directions: (t, k) in raw units;  silent: indices of wanted parameters that change nothing by themselves
@@ -46,7 +46,7 @@ class Null:
         return int(self.directions.shape[1])
 
 
-def invisible(
+def find_null_space(
     J: Array,
     error: Array | None,
     size: Array,
@@ -54,7 +54,7 @@ def invisible(
     interest: np.ndarray,
     prior: Array,
     known: Array | None = None,
-) -> Null:
+) -> NullSpace:
     """Invisible directions of stacked, whitened rows of G.
 
     J: (n, p);  error: (n, p) its change with a longer difference step, None where that is not known
@@ -71,8 +71,8 @@ def invisible(
         J, error = J - Q @ (Q.T @ J), error - Q @ (Q.T @ error)
     J, error, t = J[:, interest], error[:, interest], len(interest)
     length, doubt = np.linalg.norm(J, axis=0), np.linalg.norm(error, axis=0)
-    dead = (length <= BLIND) | (length <= TOLERANCE[0] * whole)
-    dead |= (length <= 5.0 * doubt) & (length <= FAINT * whole.max(initial=0.0))
+    dead = (length <= LEAST_EFFECT) | (length <= TOLERANCE[0] * whole)
+    dead |= (length <= 5.0 * doubt) & (length <= LEAST_RELATIVE_EFFECT * whole.max(initial=0.0))
     share = float((length / np.maximum(whole, 1e-300))[~dead].min(initial=1.0))
     own = np.eye(t)[:, dead]
     if known is not None and known.shape[1]:
@@ -86,9 +86,13 @@ def invisible(
     k = raw.shape[1]
     full = np.linalg.qr(raw / scale[interest][:, None], mode="complete")[0] if k else np.eye(t)
     silent = (
-        np.sum(np.linalg.qr(own)[0] ** 2, axis=1) > 1.0 - CLEAN**2 if k else np.zeros(t, dtype=bool)
+        np.sum(np.linalg.qr(own)[0] ** 2, axis=1) > 1.0 - LEAST_COEFFICIENT**2
+        if k
+        else np.zeros(t, dtype=bool)
     )
-    return Null(raw, tuple(int(i) for i in np.flatnonzero(silent)), full[:, k:], smallest * share)
+    return NullSpace(
+        raw, tuple(int(i) for i in np.flatnonzero(silent)), full[:, k:], smallest * share
+    )
 
 
 def _hidden(J: Array, error: Array, live: np.ndarray) -> tuple[Array, float]:
@@ -121,8 +125,8 @@ def _range(A: Array) -> Array:
     return np.asarray(U[:, s > TOLERANCE[0]])
 
 
-def grouped(
-    null: Null, names: Sequence[str], size: Array, units: Sequence[str]
+def parameter_groups(
+    null: NullSpace, names: Sequence[str], size: Array, units: Sequence[str]
 ) -> tuple[ParameterGroup, ...]:
     """The invisible directions in the user's words: groups of parameters and the combinations that remain of them.
 
@@ -137,7 +141,9 @@ def grouped(
     coefficients = -N[base] @ np.linalg.inv(N[lumped])
     relative = coefficients * size[lumped] / size[base][:, None]
     coefficients = np.where(
-        np.abs(relative) > CLEAN * max(1.0, np.abs(relative).max(initial=0.0)), coefficients, 0.0
+        np.abs(relative) > LEAST_COEFFICIENT * max(1.0, np.abs(relative).max(initial=0.0)),
+        coefficients,
+        0.0,
     )
     links = [
         {int(f), *(int(b) for b, c in zip(base, coefficients[:, j], strict=True) if c)}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.information.null_space import BLIND, FAINT
+from mjfim.information.null_space import LEAST_EFFECT, LEAST_RELATIVE_EFFECT
 from mjfim.model.parameters import ParameterSet
 from mjfim.plant.active_constraints import active_constraints
 from mjfim.plant.derivatives import SENSITIVITY_STEP
@@ -18,7 +18,7 @@ from mjfim.records.trajectory import Sensitivity, Trajectory
 
 LONGER = 300.0  # the second step, times the first: a change of 0.3 %
 LEAST = 3.0  # the same for parameters so weak that the first step is long already
-TOLERANCE = 1e-2  # relative disagreement that is told
+DISAGREEMENT_TOLERANCE = 1e-2  # relative disagreement that is told
 CURVED = 6.0  # by how much the disagreement at least falls with a third of the step where a derivative exists
 MINOR = 1e-3  # of the largest effect of a parameter; an output that shows less of it tells nothing
 
@@ -49,7 +49,7 @@ def roughness(
         fine: Its sensitivity by the shorter step, if it is known.
 
     Returns:
-        The worst disagreement and what causes it; None where it is below `TOLERANCE`.
+        The worst disagreement and what causes it; None where it is below `DISAGREEMENT_TOLERANCE`.
     """
     parameters = plant.parameters
     fine = plant.derivatives.sensitivity(theta, trajectory) if fine is None else fine
@@ -70,7 +70,7 @@ def roughness(
 
     error = disagreement(G, noise.whiten(coarse.G))[:, visible]
     worst = int(np.argmax(error.max(axis=0)))
-    if not error[:, worst].max() > TOLERANCE:
+    if not error[:, worst].max() > DISAGREEMENT_TOLERANCE:
         return None
 
     # Where a derivative exists, the error of central differences falls ninefold with a third of the step:
@@ -82,7 +82,7 @@ def roughness(
         if (smaller.max(axis=0) * CURVED <= error.max(axis=0)).all():
             return None
 
-    first = int(np.argmax(error[:, worst] > TOLERANCE))
+    first = int(np.argmax(error[:, worst] > DISAGREEMENT_TOLERANCE))
     near = range(max(first - 2, 0), min(first + 1, trajectory.samples))
     causes = active_constraints(model, trajectory, near)
     return Roughness(
@@ -97,4 +97,6 @@ def roughness(
 def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:
     """(p,) True where a parameter has an effect that stands out of round-off. G: (N+1, ny, p), whitened."""
     length = np.linalg.norm(G, axis=(0, 1)) * parameters.magnitude
-    return np.asarray((length > BLIND) & (length > FAINT * length.max(initial=0.0)))
+    return np.asarray(
+        (length > LEAST_EFFECT) & (length > LEAST_RELATIVE_EFFECT * length.max(initial=0.0))
+    )

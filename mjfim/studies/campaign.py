@@ -14,7 +14,11 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, SimulationDivergedError
 from mjfim.excitation.design import Monitor, design_task
-from mjfim.excitation.target_accuracy import furthest, require_reachable, wanted_of
+from mjfim.excitation.target_accuracy import (
+    largest_ratio_to_target,
+    require_reachable,
+    target_accuracies,
+)
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.identification.identify import identify_system
@@ -74,7 +78,7 @@ class _Loop:
         report: Callable[[Round], None] | None,
         executor: Executor | None,
     ) -> None:
-        self.base, self.wanted = base, wanted_of(base)
+        self.base, self.wanted = base, target_accuracies(base)
         self.monitor, self.report, self.executor = monitor, report, executor
         self.rounds: list[Round] = []
         self.pending: Design | None = None
@@ -189,13 +193,19 @@ class _Loop:
                 f"{names[j]} moved from {before.theta[j]:.4g} to {now.theta[j]:.4g}, {moved[j]:.1f} σ of the last round's "
                 "estimate: formal σ is not accuracy; the model or the noise is wrong, or the last fit was a false minimum"
             )
-        (was, _), (is_, j) = furthest(before.std, self.wanted), furthest(now.std, self.wanted)
+        (was, _), (is_, j) = (
+            largest_ratio_to_target(before.std, self.wanted),
+            largest_ratio_to_target(now.std, self.wanted),
+        )
         if is_ > PROGRESS * was:
             yield f"no progress: the worst σ over the wanted one went from {was:.3g} to {is_:.3g} ({names[j]})"
 
     def _formally(self) -> bool:
         """Every wanted σ is reached."""
-        return bool(self.rounds) and furthest(self.rounds[-1].attained, self.wanted)[0] <= 1.0
+        return (
+            bool(self.rounds)
+            and largest_ratio_to_target(self.rounds[-1].attained, self.wanted)[0] <= 1.0
+        )
 
     def _concluded(self, status: CampaignStatus) -> Campaign:
         warnings = [f"round {r.number}: {sentence}" for r in self.rounds for sentence in r.warnings]

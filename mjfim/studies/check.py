@@ -9,12 +9,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
-from mjfim.excitation.objective import DesignProblem, Point
+from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.residuals import Fit
-from mjfim.information.fisher import Information
+from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability
 from mjfim.information.marginal import shared
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
@@ -96,7 +96,7 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
     return _concluded(task, seen, data, duration, source, tested)
 
 
-def _evaluated(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, Point]:
+def _evaluated(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:
     """The cost of a task with a trajectory as its own reference, and the trajectory's point."""
     problem = task.problem
     problem = replace(problem, running=replace(problem.running, desired=curve.state))
@@ -104,11 +104,11 @@ def _evaluated(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, Poin
 
 
 def _self_tested(
-    task: DesignTask, problem: DesignProblem, point: Point, seen: Identifiability
+    task: DesignTask, problem: DesignProblem, point: DesignPoint, seen: Identifiability
 ) -> SelfTest:
     """Test the derivatives along a point, for the combinations that can be identified."""
     visible = replace(problem, information=replace(problem.information, basis=seen.basis))
-    return self_test(task, visible, visible.judged(point))
+    return self_test(task, visible, visible.reevaluated(point))
 
 
 def _shared(task: DesignTask, matrices: Sequence[Array]) -> Array:
@@ -129,7 +129,9 @@ def _concluded(
     """data: (p, p) of all that was looked at, each start's own nuisance marginalised"""
     p = task.parameters
     information = replace(
-        task.information, prior=task.prior, basis=seen.here.basis if seen.here.count else None
+        task.information,
+        prior=task.prior,
+        basis=seen.along_trajectory.basis if seen.along_trajectory.count else None,
     )
     total = data + task.prior
     covariance = information.covariance(total)
@@ -141,9 +143,9 @@ def _concluded(
     confounded = tuple(_pairs(seen.names, correlation))
     criterion = task.information
     visible = replace(criterion, basis=seen.basis)
-    never, more = seen.groups_always, seen.here.count > seen.always.count
+    never, more = seen.groups_along_all, seen.along_trajectory.count > seen.along_all.count
     known = {str(g) for g in never}
-    not_here = tuple(g for g in seen.groups_here if str(g) not in known) if more else ()
+    not_here = tuple(g for g in seen.groups_along_trajectory if str(g) not in known) if more else ()
     eigenvalues = np.maximum(visible.evaluate(data + criterion.prior).eigenvalues, 0.0)
     verdict = tuple(_verdict(rows, never, not_here, confounded, tested, source))
     combined = (
@@ -167,7 +169,7 @@ def _concluded(
 
 
 def _rows(
-    task: DesignTask, information: Information, data: Array, std: Array, horizon: float
+    task: DesignTask, information: FisherInformation, data: Array, std: Array, horizon: float
 ) -> Iterator[ParameterCheck]:
     p = task.parameters
     for j, parameter in enumerate(p.parameters):
@@ -193,7 +195,7 @@ def _rows(
 
 
 def _repetitions(
-    information: Information, data: Array, prior: Array, parameter: int, wanted: float
+    information: FisherInformation, data: Array, prior: Array, parameter: int, wanted: float
 ) -> int:
     """Least number of repetitions whose information, with the prior, brings a parameter to the wanted sigma; 0: none do."""
     t = np.arange(len(data)) if information.interest is None else information.interest

@@ -12,11 +12,11 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 from mjfim.excitation.design import design_task, designable
-from mjfim.excitation.evaluation import fine_point
+from mjfim.excitation.evaluation import point_at_stated_rate
 from mjfim.excitation.interior_point import SHRUNK
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
-from mjfim.excitation.verification import SAME, require_feasible_start, verify
+from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import salvaged, workers_of
 from mjfim.plant.active_constraints import saturated_actuators
@@ -262,7 +262,9 @@ class Judge:
     def _looked(self, method: str, title: str, attempt: Attempt, note: str) -> MethodResult | None:
         """None where the simulation diverges."""
         task = self.task
-        point = None if attempt.control is None else fine_point(self.stage, attempt.control)
+        point = (
+            None if attempt.control is None else point_at_stated_rate(self.stage, attempt.control)
+        )
         if (
             point is None
             or point.trajectory is None
@@ -271,13 +273,13 @@ class Judge:
         ):
             return None
         found = verify(task, point.trajectory)
-        outcome = MethodOutcome.INSIDE if found.kept else MethodOutcome.OUTSIDE
+        outcome = MethodOutcome.INSIDE if found.is_feasible else MethodOutcome.OUTSIDE
         if outcome is MethodOutcome.OUTSIDE and not np.isfinite(attempt.cost):
             outcome = MethodOutcome.NOTHING
         clamped = saturated_actuators(task.system.model_at(task.theta), point.trajectory)
         if outcome is MethodOutcome.INSIDE and clamped:
             outcome, note = MethodOutcome.CLAMPED, f"forcerange clamps {', '.join(clamped)}"
-        elif found.deviation > SAME:
+        elif found.deviation > SAME_STATE_TOLERANCE:
             note = f"a clamp, stop or contact acts: deviates by {found.deviation:.2g}"
         smallest = float(point.criterion.eigenvalues[0])
         return MethodResult(
@@ -295,7 +297,7 @@ class Judge:
             seconds=attempt.seconds,
             steps=attempt.steps,
             margins=found.margins,
-            relative_margins=found.shares,
+            relative_margins=found.relative_margins,
             found_by=attempt.found_by,
             note=note,
         )

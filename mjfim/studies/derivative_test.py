@@ -8,7 +8,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.objective import DesignProblem, Point
+from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.information.smoothness import roughness, visible_columns
@@ -20,7 +20,7 @@ from mjfim.records.check import SelfTest
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 
-def self_test(task: DesignTask, problem: DesignProblem, point: Point) -> SelfTest:
+def self_test(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> SelfTest:
     """Test the derivatives about a point of a problem that was computed with central differences."""
     trajectory = point.trajectory
     if trajectory is None or point.sensitivity is None:
@@ -72,7 +72,7 @@ def recursion_error(task: DesignTask, trajectory: Trajectory, sensitivity: Sensi
     return float((np.abs(own - psi).max(axis=(0, 1))[moving] / size[moving]).max())
 
 
-def slope_error(task: DesignTask, problem: DesignProblem, point: Point) -> float:
+def slope_error(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> float:
     """Relative error of DJ.zeta along the first descent direction, against central differences through the projection."""
     if not np.isfinite(point.cost) or point.trajectory is None:
         return float("nan")
@@ -92,7 +92,7 @@ def slope_error(task: DesignTask, problem: DesignProblem, point: Point) -> float
 
 def _slope_error(
     problem: DesignProblem,
-    point: Point,
+    point: DesignPoint,
     expansion: Expansion,
     zeta: TangentCurve,
     K: Array,

@@ -16,9 +16,9 @@ import mjfim
 from mjfim.excitation import interior_point as ladder_module
 from mjfim.excitation import multistart as multistart
 from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform
-from mjfim.excitation.constraints import basis_of, constraint_set_of
+from mjfim.excitation.constraints import bandwidth_basis, constraint_set_of
 from mjfim.excitation.design import design_task
-from mjfim.excitation.initial_controls import Start
+from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (
     SHRUNK,
     BarrierSchedule,
@@ -272,7 +272,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     task = cart_inside(tmp_path, descent={"max_iterations": 4})
     search = ConstrainedSearch(
         task.experiment,
-        Start("wild", 1e9 * np.ones((100, 1)) * np.sin(9.0 * task.t)[:, None]),
+        InitialControl("wild", 1e9 * np.ones((100, 1)) * np.sin(9.0 * task.t)[:, None]),
         BarrierSchedule(),
         4,
     )
@@ -281,7 +281,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     assert chase.cost == np.inf
     # beside it another start goes on
     chases: list[Chase] = []
-    starts = [search.start, Start("initial control", task.control)]
+    starts = [search.start, InitialControl("initial control", task.control)]
     rows = list(Multistart(Stage(task.relaxed(), None), None).run(starts, chases))
     assert rows
     assert np.isfinite(chases[1].cost)
@@ -437,9 +437,11 @@ def test_a_fourier_start_is_optimised_as_a_series_before_it_goes_on_freely(tmp_p
     task = several(tmp_path, descent={"max_iterations": 12, "fourier": (2.0,)})
     chases: list[Chase] = []
     first: dict[str, Array] = {}
-    from mjfim.excitation.initial_controls import starts_of
+    from mjfim.excitation.initial_controls import initial_controls_of
 
-    for _ in Multistart(Stage(task.relaxed(), None), None).run(list(starts_of(task, None)), chases):
+    for _ in Multistart(Stage(task.relaxed(), None), None).run(
+        list(initial_controls_of(task, None)), chases
+    ):
         for chase in chases:
             if chase.control is not None and chase.history[-1].mu >= 0.01:
                 first[chase.name] = chase.control
@@ -565,7 +567,7 @@ def test_a_bandwidth_near_that_of_the_samples_is_no_trouble(
         limits={**HARD, "bandwidth": bandwidth},
         descent={"max_iterations": 6, "coarse": 2},
     )
-    fine = basis_of(task, task.t)
+    fine = bandwidth_basis(task, task.t)
     assert fine is not None and fine.shape[1] > 0.6 * task.samples
     design = design_task(task)
     assert design.final.cost < design.initial.cost
@@ -711,7 +713,7 @@ def test_what_leaks_a_little_goes_on_and_the_start_is_kept_beside_it(tmp_path: P
     free = cart_inside(tmp_path).relaxed()
     rivals = Multistart(Stage(free, None), None)
     start, leaking, inside = (
-        Start("x", s * free.control) for s in (0.2, 3.0, 0.1)
+        InitialControl("x", s * free.control) for s in (0.2, 3.0, 0.1)
     )  # here the smaller one tells more
     chase = Chase("x", leaking.control, 1e-3)
     lead = rivals._judge(chase, start)

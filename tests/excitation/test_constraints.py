@@ -282,7 +282,7 @@ def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> Non
     )
     values = constraints.evaluate(*watched, slopes=False)
     assert constraints.margins(values) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
-    assert constraints.shares(values) == pytest.approx(shares, rel=1e-5, abs=1e-7)
+    assert constraints.relative_margins(values) == pytest.approx(shares, rel=1e-5, abs=1e-7)
 
 
 def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> None:
@@ -294,8 +294,10 @@ def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> 
     assert watched is not None
     values = constraints.evaluate(*watched, slopes=False)
     shares = {kind: 0.01 * (i + 1) for i, kind in enumerate(sorted(constraints.margins(values)))}
-    tighter = {kind: constraints.shares(values)[kind] - share for kind, share in shares.items()}
-    found = constraints.tightened(shares).shares(values)
+    tighter = {
+        kind: constraints.relative_margins(values)[kind] - share for kind, share in shares.items()
+    }
+    found = constraints.tightened(shares).relative_margins(values)
     least = 0.03 * (
         1.0 + shares["clearance"]
     )  # its share is of the least distance, which is raised
@@ -303,7 +305,9 @@ def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> 
     assert values.distances is not None
     tighter["clearance"] = float(values.distances.min()) / least - 1.0
     assert found == pytest.approx(tighter, abs=1e-12)
-    assert constraints.tightened({}).shares(values) == pytest.approx(constraints.shares(values))
+    assert constraints.tightened({}).relative_margins(values) == pytest.approx(
+        constraints.relative_margins(values)
+    )
     # not so far that nothing is left between the least distance and where it no longer matters
     far = constraints.tightened({"clearance": 50.0})
     assert far.clearance is not None and far.least < far.clearance.reach

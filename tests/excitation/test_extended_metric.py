@@ -12,7 +12,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.objective import extend
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, direction_for
-from mjfim.information.fisher import Information
+from mjfim.information.fisher import FisherInformation
 from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve
 from mjfim.optimize.projection_operator import Expansion
@@ -101,7 +101,7 @@ def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None
     )
     S = Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, ny, p)))
     noise = Noise.independent([0.3, 2.0])
-    made = Information(noise, 20.0, np.array([1.0, 0.5, 3.0]), np.zeros((p, p)), criterion)
+    made = FisherInformation(noise, 20.0, np.array([1.0, 0.5, 3.0]), np.zeros((p, p)), criterion)
     found = made.evaluate(made.matrix(S))
     F, h = (np.einsum("rj,jkzx->rkzx", found.directions, m) for m in (unit.F_mixed, unit.h_mixed))
     a, b = made.gradient(found, S, Bilinear(A=A, B=B, C=C, D=D, F_mixed=F, h_mixed=h))

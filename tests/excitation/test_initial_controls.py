@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, RecordingError
-from mjfim.excitation.initial_controls import starts_of
+from mjfim.excitation.initial_controls import initial_controls_of
 from mjfim.excitation.task import DesignTask
 from mjfim.signals import fourier_basis
 from tests.support.limits import ARM
@@ -38,17 +38,17 @@ def arm(folder: Path, **tables: Any) -> DesignTask:
 
 def test_the_given_control_takes_the_place_of_the_initial_one(tmp_path: Path) -> None:
     task = arm(tmp_path, descent={"starts": 3, "fourier": (1.5,), "seed": 4})
-    starts = list(starts_of(task, None))
+    starts = list(initial_controls_of(task, None))
     random = ["Fourier series of 1.5 Hz", "multisine 1 of 2", "multisine 2 of 2"]
     assert [s.name for s in starts] == ["initial control", *random]
     np.testing.assert_array_equal(starts[0].control, task.control)
-    given = list(starts_of(task, 0.5 * task.control))
+    given = list(initial_controls_of(task, 0.5 * task.control))
     assert [s.name for s in given] == ["given control", *random]
     np.testing.assert_array_equal(given[0].control, 0.5 * task.control)
     for own, other in zip(starts[1:], given[1:], strict=True):  # the seed alone decides them
         np.testing.assert_array_equal(own.control, other.control)
     assert len({s.control.tobytes() for s in starts}) == 4
-    other = list(starts_of(arm(tmp_path, descent={"starts": 3, "seed": 5}), None))
+    other = list(initial_controls_of(arm(tmp_path, descent={"starts": 3, "seed": 5}), None))
     assert not np.array_equal(other[1].control, starts[2].control)
 
 
@@ -56,7 +56,9 @@ def test_random_starts_swing_about_the_middle_up_to_six_times_as_far_within_thei
     tmp_path: Path,
 ) -> None:
     task = arm(tmp_path, descent={"starts": 40})
-    shoulder, elbow = np.array([s.control for s in starts_of(task, None)][1:]).transpose(2, 0, 1)
+    shoulder, elbow = np.array([s.control for s in initial_controls_of(task, None)][1:]).transpose(
+        2, 0, 1
+    )
     assert shoulder.max() == 0.3 and shoulder.min() == -0.35
     middle = task.control[:, 1].mean()
     peaks = np.abs(elbow - middle).max(axis=1) / np.abs(task.control[:, 1] - middle).max()
@@ -70,7 +72,7 @@ def test_they_swell_from_what_holds_and_fade(begins: bool, ends: bool, tmp_path:
     boundary = {"start": "rest" if begins else "given", "end": "rest" if ends else "free"}
     task = arm(tmp_path, boundary=boundary, descent={"starts": 6})
     middle = task.initial_hold if begins else task.control.mean(axis=0)
-    for start in list(starts_of(task, None))[1:]:
+    for start in list(initial_controls_of(task, None))[1:]:
         away = np.abs(start.control - middle)
         assert bool((away[0] < 1e-12).all()) is begins
         assert bool((away[90:] < 1e-12).all()) is ends
@@ -86,7 +88,7 @@ def test_a_fourier_start_brings_its_series(begins: bool, ends: bool, tmp_path: P
     for bandwidth, harmonics in ((None, 15), (7.0, 4)):
         limits = {"control": RANGE, **({"bandwidth": bandwidth} if bandwidth else {})}
         task = arm(tmp_path, boundary=boundary, limits=limits, descent={"fourier": (1.5,)})
-        series = list(starts_of(task, None))[1].basis
+        series = list(initial_controls_of(task, None))[1].basis
         assert series is not None
         np.testing.assert_array_equal(
             series, fourier_basis(task.t, 1.0, 1.5, harmonics, begins, ends)
@@ -101,7 +103,7 @@ def test_a_series_without_a_single_harmonic_is_refused(
     with pytest.raises(
         ExperimentError, match=rf"descent\.fourier: 60 Hz is above the bandwidth of {most} Hz"
     ):
-        list(starts_of(task, None))
+        list(initial_controls_of(task, None))
 
 
 def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) -> None:
@@ -114,7 +116,7 @@ def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) ->
     task = arm(
         tmp_path, descent={"previous": (str(tmp_path / "old.csv"), str(tmp_path / "short.csv"))}
     )
-    (_, old, short) = starts_of(task, None)
+    (_, old, short) = initial_controls_of(task, None)
     assert (old.name, short.name) == (
         f"previous design {tmp_path}/old.csv",
         f"previous design {tmp_path}/short.csv",
@@ -126,7 +128,7 @@ def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) ->
         )
     missing = arm(tmp_path, descent={"previous": ("gone.csv",)})
     with pytest.raises(RecordingError, match=r"gone\.csv: no such file"):
-        list(starts_of(missing, None))
+        list(initial_controls_of(missing, None))
 
 
 def test_a_repeated_start_is_the_first_part_of_the_initial_control_faded_to_rest(
@@ -134,7 +136,7 @@ def test_a_repeated_start_is_the_first_part_of_the_initial_control_faded_to_rest
 ) -> None:
     boundary, limits = {"start": "rest", "end": "rest"}, {"control": RANGE, "control_rate": 5.0}
     task = arm(tmp_path, boundary=boundary, limits=limits, descent={"repeats": (2, 4)})
-    half, quarter = list(starts_of(task, None))[1:]
+    half, quarter = list(initial_controls_of(task, None))[1:]
     assert (half.name, half.repeats, len(half.control)) == (
         "2 times a design of 0.5 s",
         2,
@@ -151,11 +153,11 @@ def test_repeats_that_do_not_divide_or_lack_limits_are_refused(tmp_path: Path) -
     with pytest.raises(
         ExperimentError, match=r"descent\.repeats: 7 does not divide the 100 samples"
     ):
-        starts_of(arm(tmp_path, descent={"repeats": (7,)}), None)
+        initial_controls_of(arm(tmp_path, descent={"repeats": (7,)}), None)
     with pytest.raises(
         ExperimentError, match=r"descent\.repeats: 100 leaves 1 of 100 samples; needs 2"
     ):
-        starts_of(arm(tmp_path, descent={"repeats": (100,)}), None)
+        initial_controls_of(arm(tmp_path, descent={"repeats": (100,)}), None)
     weights = {"limits": {}, "cost": {"control": 1.0}, "descent": {"repeats": (2,)}}
     with pytest.raises(ExperimentError, match=r"descent\.repeats needs hard limits"):
-        starts_of(arm(tmp_path, **weights), None)
+        initial_controls_of(arm(tmp_path, **weights), None)

@@ -10,7 +10,7 @@ import pytest
 import mjfim
 from mjfim.errors import ExperimentError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.limits import unwatched
+from mjfim.excitation.limits import unsupported_ranges
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from tests.support.cli import loads, misused, names, run, write_experiment
@@ -297,7 +297,11 @@ LOOSE = """
 
 def test_ranges_that_are_no_limits_are_named() -> None:
     model = mujoco.MjModel.from_xml_string(LOOSE)
-    assert unwatched(model) == ("ball joint wrist", "tendon rope", "the activation of muscle")
+    assert unsupported_ranges(model) == (
+        "ball joint wrist",
+        "tendon rope",
+        "the activation of muscle",
+    )
 
 
 def test_a_jump_at_rest_is_warned_about(tmp_path: Path) -> None:

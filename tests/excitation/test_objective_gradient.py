@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.excitation.objective import Point
+from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
 from mjfim.optimize.lq import TangentCurve, regulator
@@ -210,7 +210,7 @@ def directions(task: DesignTask, gradient: Array) -> list[Array]:
     return [size * v / np.abs(v).max() for v in (smooth, white, gradient)]
 
 
-def expansion_of(task: DesignTask, accuracy: DifferenceAccuracy) -> tuple[Point, Expansion]:
+def expansion_of(task: DesignTask, accuracy: DifferenceAccuracy) -> tuple[DesignPoint, Expansion]:
     """The initial trajectory and J expanded about it."""
     point = task.problem.point(task.initial, accuracy)
     assert np.isfinite(point.cost)
@@ -314,7 +314,10 @@ def test_leaving_out_a_sample_of_a_robust_design_would_be_rejected(case: str, tm
         task.problem.point(task.initial, CENTRAL_DIFFERENCES),
         np.zeros((task.samples, 1, 4)),
     )
-    whole, blind = task.problem.expand(point), replace(task.problem, pool=None).expand(point)
+    whole, blind = (
+        task.problem.expand(point),
+        replace(task.problem, parameter_samples=None).expand(point),
+    )
     zeta = whole.lift(K, directions(task, whole.gradient(K))[0])
 
     def J(t: float) -> float:

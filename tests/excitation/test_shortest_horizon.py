@@ -16,7 +16,7 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, Tried, fitted
-from mjfim.excitation.target_accuracy import furthest, wanted_of
+from mjfim.excitation.target_accuracy import largest_ratio_to_target, target_accuracies
 from mjfim.excitation.task import DesignTask
 from mjfim.records.design import HistoryRow
 from tests.support.paths import MODELS
@@ -39,7 +39,7 @@ def wanting(sigma: dict[str, float], **tables: object) -> mjfim.Experiment:
 def worst(experiment: mjfim.Experiment) -> float:
     """Of a design's predicted σ over the wanted ones."""
     task = DesignTask.resolve(experiment)
-    return furthest(design_task(task).final.std, wanted_of(task))[0]
+    return largest_ratio_to_target(design_task(task).final.std, target_accuracies(task))[0]
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +53,10 @@ def test_it_reaches_what_is_wanted(shorter: mjfim.Shortest) -> None:
     task = DesignTask.resolve(shorter.experiment)
     assert shorter.design.trajectory.samples == task.samples
     told = evaluate_task(task, shorter.design.trajectory)
-    assert furthest(told.std, wanted_of(task))[0] <= 1.0
+    assert largest_ratio_to_target(told.std, target_accuracies(task))[0] <= 1.0
     best = next(t for t in shorter.tried if t.horizon == shorter.horizon)
     assert best.reached and best.ratio == pytest.approx(
-        furthest(told.std, wanted_of(task))[0], rel=1e-6
+        largest_ratio_to_target(told.std, target_accuracies(task))[0], rel=1e-6
     )
     assert shorter.summary()["horizon"] == shorter.horizon
 

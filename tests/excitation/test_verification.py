@@ -10,7 +10,7 @@ import pytest
 
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.verification import SAME, verify
+from mjfim.excitation.verification import SAME_STATE_TOLERANCE, verify
 from tests.support.numerics import CART_PENDULUM, make_task
 
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
@@ -60,14 +60,14 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
     assert np.abs(samples.qpos).max() < 0.01
     assert samples.qvel.min() > 0.98 * SPEED
     found = verify(task, samples)
-    assert not found.kept
+    assert not found.is_feasible
     # by hand: a harmonic of 10 Hz
     assert found.margins["position"] == pytest.approx(0.1 - SWING, rel=1e-3)
     assert found.margins["velocity"] == pytest.approx(-1.9 * SPEED, rel=1e-3)
     assert found.margins["acceleration"] == pytest.approx(
         300.0 - SWING * (2 * np.pi * 10.0) ** 2, rel=3e-3
     )
-    assert found.deviation < SAME
+    assert found.deviation < SAME_STATE_TOLERANCE
     # what a constraints at the samples alone would have said
     constraints = constraint_set_of(task)
     watched = task.plant.observe(task.theta, task.control, constraints.observations)
@@ -91,8 +91,8 @@ def test_clearance_between_the_samples_counts(tmp_path: Path) -> None:
     assert constraints.margins(constraints.evaluate(*watched, slopes=False))["clearance"] > 0.05
     found = verify(task, task.initial)
     assert found.margins["clearance"] == pytest.approx(0.19 - SWING - 0.1, abs=1e-4)
-    assert not found.kept
-    assert verify(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).kept
+    assert not found.is_feasible
+    assert verify(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).is_feasible
 
 
 def test_what_keeps_all_limits_is_kept_to_the_last_digit(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_what_keeps_all_limits_is_kept_to_the_last_digit(tmp_path: Path) -> None
     for edge, kept in ((1.001, True), (0.999, False)):
         limits = {"position": {"slide": (-edge * SWING, 1.0)}}
         task = spring_task(tmp_path, limits=limits)
-        assert verify(task, task.initial).kept is kept
+        assert verify(task, task.initial).is_feasible is kept
 
 
 @pytest.mark.parametrize("clamp", ["stop", "force", "joint force", "control"])
@@ -118,11 +118,11 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
     lifted = task.relaxed()
     designed = lifted.plant.simulate(lifted.theta, task.control)
     found = verify(task, designed)
-    assert found.deviation > 10 * SAME
+    assert found.deviation > 10 * SAME_STATE_TOLERANCE
     free = verify(spring_task(tmp_path, **tables), designed)
-    assert free.deviation < SAME
+    assert free.deviation < SAME_STATE_TOLERANCE
     if clamp in ("stop", "control"):
-        assert not found.kept
+        assert not found.is_feasible
     else:  # the clamp keeps the force at its range
         assert found.margins[clamp.replace(" ", "_")] == 0.0
 
@@ -145,7 +145,7 @@ def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
     assert task.is_limited
     lifted = task.relaxed()
     designed = lifted.plant.simulate(lifted.theta, task.control)
-    assert (verify(task, designed).deviation < SAME) is not enforce
+    assert (verify(task, designed).deviation < SAME_STATE_TOLERANCE) is not enforce
 
 
 def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
         found = verify(task, task.initial)
         assert found.margins["position"] < 0.0
         assert found.margins["clearance"] < 0.0
-        assert found.kept is kept
+        assert found.is_feasible is kept
 
 
 def test_a_control_that_the_model_does_not_survive_keeps_nothing(tmp_path: Path) -> None:
@@ -174,6 +174,6 @@ def test_a_control_that_the_model_does_not_survive_keeps_nothing(tmp_path: Path)
     )
     wild = task.plant.trajectory(task.initial.state, np.full_like(task.control, 1e12))
     found = verify(task, wild)
-    assert not found.kept
+    assert not found.is_feasible
     assert found.deviation == np.inf
     assert set(found.margins.values()) == {-np.inf}

@@ -13,7 +13,7 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify_system
 from mjfim.information.criteria import CRITERIA
-from mjfim.information.fisher import Information
+from mjfim.information.fisher import FisherInformation
 from mjfim.information.marginal import standard_deviations
 from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Sensitivity
@@ -28,10 +28,10 @@ def random_sensitivity(seed: int, N: int = 12, p: int = 4, nx: int = 5) -> Sensi
     return Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, 3, p)))
 
 
-def information(stride: int = 1, criterion: str = "E", **changes) -> Information:
+def information(stride: int = 1, criterion: str = "E", **changes) -> FisherInformation:
     """Three outputs, four parameters of different scale, no prior."""
     noise = Noise.independent(SIGMA, stride)
-    base = Information(
+    base = FisherInformation(
         noise, 50.0, np.array([1.0, 2.0, 0.1, 5.0]), np.zeros((4, 4)), criterion, 1.0
     )
     return replace(base, **changes)
@@ -120,7 +120,7 @@ PHI = {
 }
 
 
-def seeing(phi: str, seen: str) -> Information:
+def seeing(phi: str, seen: str) -> FisherInformation:
     """A criterion that sees less than all."""
     wanted = 4 if seen == "combinations" else 2
     contrast = {"contrast": np.arange(1.0, 2 * wanted + 1).reshape(wanted, 2)} if phi == "c" else {}

@@ -73,8 +73,8 @@ def test_an_experiment_that_shows_everything_needs_no_random_controls(
 
     seen = look_without_simulations(cart_task(tmp_path))
     assert seen.basis is None
-    assert (seen.here.count, seen.always.count) == (0, 0)
-    assert (seen.groups_here, seen.groups_always) == ((), ())
+    assert (seen.along_trajectory.count, seen.along_all.count) == (0, 0)
+    assert (seen.groups_along_trajectory, seen.groups_along_all) == ((), ())
     with pytest.raises(AssertionError, match="not needed"):
         look_without_simulations(cart_task(tmp_path, parameters=PRODUCT))
 
@@ -82,7 +82,7 @@ def test_an_experiment_that_shows_everything_needs_no_random_controls(
 def test_a_start_that_moves_half_of_the_model_is_told_from_what_never_shows(tmp_path) -> None:
     task = two_task(tmp_path)
     seen = look(task)
-    assert (seen.here.silent, seen.always.count) == ((1,), 0)
+    assert (seen.along_trajectory.silent, seen.along_all.count) == ((1,), 0)
     assert seen.basis is None
     with pytest.raises(UnidentifiableError, match="start excites nothing") as caught:
         require_designable(task, seen)
@@ -92,14 +92,14 @@ def test_a_start_that_moves_half_of_the_model_is_told_from_what_never_shows(tmp_
 
 def test_at_rest_nothing_shows_here_and_everything_elsewhere(tmp_path) -> None:
     seen = look(cart_task(tmp_path, initial=REST))
-    assert seen.here.basis.shape == (3, 0)
-    assert seen.always.count == 0
+    assert seen.along_trajectory.basis.shape == (3, 0)
+    assert seen.along_all.count == 0
 
 
 def test_what_no_control_shows_is_the_same_here_and_always(tmp_path) -> None:
     task = cart_task(tmp_path, parameters=PRODUCT)
     seen = look(task)
-    assert (seen.here.count, seen.always.count) == (1, 1)
+    assert (seen.along_trajectory.count, seen.along_all.count) == (1, 1)
     assert seen.basis.shape == (3, 2)
     require_designable(task, seen)  # a combination can be designed for
     J = (
@@ -116,8 +116,12 @@ def test_a_combination_hidden_at_the_start_alone_is_refused_with_a_way_out(tmp_p
     coasting = {"qvel": (1.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
     task = two_task(tmp_path, parameters=parameters, initial=coasting)
     seen = look(task)
-    assert (seen.here.count, seen.here.silent, seen.always.count) == (1, (), 0)
-    (group,) = seen.groups_here
+    assert (seen.along_trajectory.count, seen.along_trajectory.silent, seen.along_all.count) == (
+        1,
+        (),
+        0,
+    )
+    (group,) = seen.groups_along_trajectory
     assert group.members == ("mass", "drag")
     # d(drag / mass) = 0 along (mass, drag) = (1, 0.3): what remains is drag - 0.3 mass, or mass - drag / 0.3
     coefficients = dict(
@@ -151,7 +155,7 @@ def test_members_of_an_inertia_may_be_invisible_but_not_all_of_them(tmp_path) ->
     seen = look(moving)
     require_designable(moving, seen)
     assert seen.basis.shape == (10, 1)  # a slider shows its mass, nothing else
-    assert seen.groups_always[-1].combinations == ()
+    assert seen.groups_along_all[-1].combinations == ()
     welded = two_task(tmp_path, parameters={"post": {"inertial": "post"}})
     with pytest.raises(UnidentifiableError, match="none of the parameters shows"):
         require_designable(welded, look(welded))
@@ -203,7 +207,7 @@ def test_a_contact_shorter_than_a_sample_period_shows_its_stiffness(tmp_path) ->
             * 40000.0
             > 0.1
         )
-        assert look(task).here.count == 0
+        assert look(task).along_trajectory.count == 0
 
 
 def controls(task: DesignTask) -> list[Array]:
@@ -244,7 +248,7 @@ def test_random_controls_that_diverge_are_left_out(tmp_path, monkeypatch) -> Non
 
     monkeypatch.setattr(task.plant, "simulate", diverges)
     seen = task.observer.identifiability(curve, found)
-    assert (seen.here.count, seen.always.count) == (1, 1)
+    assert (seen.along_trajectory.count, seen.along_all.count) == (1, 1)
 
 
 def test_data_must_show_every_parameter_nuisance_and_prior_or_not(tmp_path) -> None:

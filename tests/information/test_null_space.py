@@ -9,7 +9,7 @@ import pytest
 
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
-from mjfim.information.null_space import Null, grouped, invisible
+from mjfim.information.null_space import NullSpace, find_null_space, parameter_groups
 from tests.support.numerics import Array, make_task
 
 SIZES = np.array([1e-6, 1e-3, 1.0, 1e3, 1e6])
@@ -22,11 +22,11 @@ def rows(null: Array, seed: int = 0, n: int = 60) -> Array:
     return np.random.default_rng(seed).normal(size=(n, p - k)) @ seen.T
 
 
-def look(J: Array, error: Array | None = None, size: Array = SIZES, **changes) -> Null:
+def look(J: Array, error: Array | None = None, size: Array = SIZES, **changes) -> NullSpace:
     """Invisible directions of rows whose parameters have these sizes and nothing known before."""
     p = len(size)
     given = {"scale": size, "interest": np.arange(p), "prior": np.zeros((p, p)), **changes}
-    return invisible(J, error, size, **given)
+    return find_null_space(J, error, size, **given)
 
 
 def same_span(found: Array, expected: Array) -> bool:
@@ -156,7 +156,9 @@ def test_a_direction_known_to_be_invisible_stays_so_however_large_the_round_off(
 
 def words(null: Array, units: tuple[str, ...] = ("",) * 5, size: Array = SIZES) -> list[str]:
     """Groups of parameters a to e in words."""
-    return [str(g) for g in grouped(look(rows(null) / size, size=size), "abcde", size, units)]
+    return [
+        str(g) for g in parameter_groups(look(rows(null) / size, size=size), "abcde", size, units)
+    ]
 
 
 def test_groups_name_their_members_and_what_remains_of_them() -> None:
@@ -169,7 +171,7 @@ def test_groups_name_their_members_and_what_remains_of_them() -> None:
 @pytest.mark.parametrize("case", NULLS)
 def test_what_remains_in_words_is_blind_to_every_invisible_direction(case: str) -> None:
     found = look(rows(NULLS[case]) / SIZES)
-    groups = grouped(found, "abcde", SIZES, [""] * 5)
+    groups = parameter_groups(found, "abcde", SIZES, [""] * 5)
     assert sum(len(g.members) - len(g.combinations) for g in groups) == found.count
     for group in groups:
         for combination in group.combinations:
@@ -182,14 +184,14 @@ def test_what_remains_in_words_is_blind_to_every_invisible_direction(case: str) 
 
 def test_nothing_invisible_gives_no_groups_and_silent_ones_are_said_once() -> None:
     assert (
-        grouped(
+        parameter_groups(
             look(np.random.default_rng(9).normal(size=(60, 5)) / SIZES), "abcde", SIZES, [""] * 5
         )
         == ()
     )
     J = np.random.default_rng(9).normal(size=(60, 5)) / SIZES
     J[:, [1, 3]] = 0.0
-    (group,) = grouped(look(J), "abcde", SIZES, [""] * 5)
+    (group,) = parameter_groups(look(J), "abcde", SIZES, [""] * 5)
     assert str(group) == "b and d: no effect on anything that is measured"
 
 
@@ -227,9 +229,9 @@ def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
     seen = task.observer.identifiability(
         task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
     )
-    assert (seen.here.count, seen.always.count) == (14, 14)
+    assert (seen.along_trajectory.count, seen.along_all.count) == (14, 14)
     assert seen.basis.shape == (20, 6)
-    lumped, silent = seen.groups_always
+    lumped, silent = seen.groups_along_all
     # first moment m1 r1 + l m2 and inertia J1 + l^2 m2 about the first hinge, each a textbook base parameter
     assert lumped.members == ("a.mz", "a.Jyy", "b.mass")
     (first, inertia) = lumped.combinations
@@ -252,7 +254,7 @@ def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_mot
     )
     assert seen.basis.shape == (20, 6)
     # a step along an invisible direction moves nothing measured, to second order
-    for n in (seen.always.directions / np.linalg.norm(seen.always.directions, axis=0)).T:
+    for n in (seen.along_all.directions / np.linalg.norm(seen.along_all.directions, axis=0)).T:
         y, _ = task.plant.measure(task.theta + np.outer([0.0, 1e-4, -1e-4], n), task.control)
         assert np.abs(y[1] - y[2]).max() < 1e-8
     evaluation = evaluate_task(task, task.initial)

@@ -9,7 +9,7 @@ import pytest
 
 from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
-from mjfim.information.smoothness import TOLERANCE, disagreement, roughness
+from mjfim.information.smoothness import DISAGREEMENT_TOLERANCE, disagreement, roughness
 from mjfim.records.check import Roughness
 from tests.support.numerics import Array, Loop, body_task, cart_task, filtered_task, make_task
 
@@ -102,7 +102,7 @@ def test_dry_friction_at_the_verge_of_sliding_is_flagged_where_it_breaks_away(tm
     assert 2.0 < force.max() < 3.0  # it holds what is pushed
     task = dry(tmp_path, force.max() * (1.0 - 1e-4))
     found = along(task)
-    assert found.error > TOLERANCE
+    assert found.error > DISAGREEMENT_TOLERANCE
     assert found.parameter == "dry"
     assert found.causes == ("dry friction of rail",)
     assert (

@@ -156,4 +156,4 @@ def test_other_criteria_and_expansions_without_limits_have_no_model(tmp_path: Pa
         is None
     )  # 1 / lambda_min itself
     smooth = replace(task.problem, information=replace(task.problem.information, power=40.0))
-    assert smooth.expand(smooth.judged(point)).eigenvalue_model is None
+    assert smooth.expand(smooth.reevaluated(point)).eigenvalue_model is None

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraints import constraint_set_of, looked_at
+from mjfim.excitation.constraints import constraint_set_of, derivative_substeps_of
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, SHARED_ORIGIN
@@ -67,7 +67,7 @@ def observations_of(task: DesignTask) -> SubstepObservations:
 def test_derivatives_are_taken_at_the_first_the_last_and_some_engine_steps_between(
     substeps: int, expected: tuple[int, ...]
 ) -> None:
-    assert looked_at(substeps) == expected
+    assert derivative_substeps_of(substeps) == expected
 
 
 @pytest.mark.parametrize("integrator", ["implicitfast", "Euler", "RK4"])

@@ -13,7 +13,7 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.residuals import Fit
-from mjfim.information.fisher import Information
+from mjfim.information.fisher import FisherInformation
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import as_json
 from mjfim.studies.check import check, check_recordings, check_task
@@ -185,13 +185,13 @@ def test_a_wrong_sensitivity_is_caught_by_the_recursion(tmp_path, monkeypatch) -
 
 
 def test_a_wrong_gradient_is_caught_by_the_slope(tmp_path, monkeypatch) -> None:
-    right = Information.gradient
+    right = FisherInformation.gradient
 
-    def wrong(information: Information, *arguments) -> tuple[Array, Array]:
+    def wrong(information: FisherInformation, *arguments) -> tuple[Array, Array]:
         a, b = right(information, *arguments)
         return 1.05 * a, 1.05 * b
 
-    monkeypatch.setattr(Information, "gradient", wrong)
+    monkeypatch.setattr(FisherInformation, "gradient", wrong)
     tested = check_task(cart_task(tmp_path)).self_test
     assert 0.02 < tested.slope < 0.1
     assert not tested.passed

@@ -113,19 +113,17 @@ class Arena:
 
     def inside(self, point: InteriorPoint) -> bool:
         """Whether it keeps all limits at every engine step."""
-        return not self.holds or all(
-            m >= 0.0 for m in self.constraints.margins(seen(point)).values()
-        )
+        return not self.holds or self.constraints.is_feasible(seen(point))
 
     def offer(self, point: InteriorPoint, name: str = "") -> float:
         """Keep a point's control if it is the best so far; its cost J, infinite outside the limits."""
         if point.values is None or point.point is None:
             return np.inf
-        cost = self.exact.judged(point.point).cost if self.inside(point) else np.inf
+        cost = self.exact.reevaluated(point.point).cost if self.inside(point) else np.inf
         self.keep(
             point.ctrl,
             cost,
-            min(self.constraints.shares(point.values).values(), default=np.inf),
+            min(self.constraints.relative_margins(point.values).values(), default=np.inf),
             name,
         )
         return cost
@@ -187,6 +185,8 @@ class Arena:
 def _share(constraints: ConstraintSet, trajectory: Trajectory, observed: Array) -> float:
     """The worst margin over half of its range."""
     return min(
-        constraints.shares(constraints.evaluate(trajectory, observed, slopes=False)).values(),
+        constraints.relative_margins(
+            constraints.evaluate(trajectory, observed, slopes=False)
+        ).values(),
         default=np.inf,
     )

@@ -15,7 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
-from mjfim.excitation.constraints import basis_of
+from mjfim.excitation.constraints import bandwidth_basis
 from mjfim.signals import Chirp, Excitation, ExcitationSettings, Multisine, RandomSteps
 from mjfim.studies.baselines.budget import Arena, Attempt, Job, Monitor, Spent
 from mjfim.studies.baselines.parametric import (
@@ -113,7 +113,7 @@ class Shaper:
         self.weighted = bool(task.control_weight.any() or task.tracking.any()) or not arena.holds
         self.most = BOUNDED if np.isfinite(constraints.control.lower).all() else LARGEST
         self.window = task.fade(task.samples)
-        self.basis = basis_of(task, task.t)
+        self.basis = bandwidth_basis(task, task.t)
         self.fit = None if self.basis is None else np.linalg.pinv(self.basis)
 
     def swing(self, wave: Array) -> Array:

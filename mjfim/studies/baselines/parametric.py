@@ -17,8 +17,8 @@ from scipy.optimize import minimize
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.constrained import Chase, ConstrainedSearch, pursue, smoothed
-from mjfim.excitation.constraints import splines_of
-from mjfim.excitation.initial_controls import Start
+from mjfim.excitation.constraints import boundary_splines
+from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (
     HOLDING,
     RELAXED,
@@ -101,7 +101,7 @@ def splines(arena: Arena) -> Iterator[Series]:
     fastest = e.limits.bandwidth or 0.5 * e.rate
 
     def made(bandwidth: float) -> Array:
-        return independent_curves(splines_of(arena.task, arena.task.t, bandwidth))
+        return independent_curves(boundary_splines(arena.task, arena.task.t, bandwidth))
 
     ends = (min(0.5 * KNOTS[0], fastest), min(2.0 * KNOTS[-1], fastest))
     return _any(arena, [f for f in KNOTS if f <= fastest], ends, made)
@@ -184,7 +184,7 @@ def own(arena: Arena, series: Series, last: float, limit: float) -> None:
     left = (
         (1.0 - arena.used) * job.seconds if limit >= 1.0 else np.inf
     )  # else sharper barriers would come too early
-    start = Start(series.name, series.control, series.basis)
+    start = InitialControl(series.name, series.control, series.basis)
     schedule = BarrierSchedule(first=series.mu, last=last)
     search = ConstrainedSearch(
         job.experiment,
@@ -255,7 +255,9 @@ class Descent:
                 self._mend()
                 point = self._point(self.arena.looking)
                 if mu <= HOLDING and point.values is not None:
-                    held = tightened_further(held, self.arena.constraints.shares(point.values))
+                    held = tightened_further(
+                        held, self.arena.constraints.relative_margins(point.values)
+                    )
         except Spent:
             self._mend()
             raise
