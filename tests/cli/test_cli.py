@@ -17,14 +17,15 @@ import pytest
 from typer.testing import Result
 
 import mjfim
-from mjfim.cli import main as cli
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
 from mjfim.output import archive, plots
 from mjfim.output import folders as results
 from mjfim.output import rerun as rerun_log
 from mjfim.recordings import read as logs
+from mjfim.records.design import HistoryRow, Status
 from tests.support.cli import (
     DESIGN,
     ESTIMATE,
@@ -473,7 +474,7 @@ def test_bad_recordings(study: Path, recorded: Path, tmp_path: Path) -> None:
             "'ctrl:force' is missing",
         ),
         "short.csv": ([header, *rows[:2]], "too few rows (2)"),
-        "gap.csv": ([header, *rows[:20], *rows[30:]], "a hole of 0.11 s after data row 20"),
+        "gap.csv": ([header, *rows[:20], *rows[30:]], "a gap of 0.11 s after data row 20"),
         "text.csv": (
             [header, *rows[:5], "0.05,0,0,high,0,0", *rows[6:]],
             "'qpos:hinge' is not numeric",
@@ -603,7 +604,7 @@ def test_interrupted_before_a_result(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Exit code 1, one message, nothing on disk."""
-    monkeypatch.setattr(cli, "DesignTask", interrupt)
+    monkeypatch.setattr(System, "resolve", interrupt)
     inputs = {"design": [], "identify": [recorded], "montecarlo": [archived]}[verb]
     result = run(verb, study, *inputs, "-o", tmp_path / "out")
     assert (result.exit_code, result.stdout) == (1, "")
@@ -625,7 +626,7 @@ def test_interrupted_on_the_coarse_level() -> None:
     """The best so far is better than the start, also before the stated sample rate is reached."""
     rates = []
 
-    def stop(row: mjfim.trajectory.HistoryRow) -> None:
+    def stop(row: HistoryRow) -> None:
         rates.append(row.rate)
         if row.iteration == 5:
             interrupt()
@@ -633,7 +634,7 @@ def test_interrupted_on_the_coarse_level() -> None:
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     result = mjfim.design(experiment, stop)
     assert set(rates) == {25.0}
-    assert result.status is mjfim.trajectory.Status.INTERRUPTED
+    assert result.status is Status.INTERRUPTED
     assert result.final.cost < 0.1 * result.initial.cost
 
 

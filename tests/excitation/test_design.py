@@ -14,7 +14,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
-from mjfim.records.design import Status
+from mjfim.records.design import HistoryRow, Status
 from tests.support.numerics import CART_PARAMETERS, cart_task
 from tests.support.paths import ROOT
 
@@ -108,7 +108,7 @@ def test_metric_weight_on_psi_needs_the_metric_descent(experiment: Experiment) -
 
 
 def test_monitor_sees_levels_and_growing_numbers(experiment: Experiment) -> None:
-    rows: list[mjfim.trajectory.HistoryRow] = []
+    rows: list[HistoryRow] = []
     design = mjfim.design(experiment, monitor=rows.append)
     assert [row.iteration for row in rows] == list(range(len(rows)))
     assert [row.rate for row in rows] == sorted(row.rate for row in rows)
