@@ -7,8 +7,8 @@ parameters from recordings, `monte_carlo` holds the estimator against the Cramer
 from mjfim.errors import MjfimError
 from mjfim.excitation.design import design
 from mjfim.excitation.evaluation import evaluate_trajectory
-from mjfim.excitation.joint_design import design_together
-from mjfim.excitation.shortest_horizon import Shortest, shortest
+from mjfim.excitation.joint_design import design_jointly
+from mjfim.excitation.shortest_horizon import ShortestExperiment, shortest_experiment
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate
 from mjfim.identification.cross_validation import predict
@@ -38,18 +38,18 @@ __all__ = [
     "MonteCarloStudy",
     "Pool",
     "Recording",
-    "Shortest",
+    "ShortestExperiment",
     "Trajectory",
     "check",
     "compare",
     "design",
-    "design_together",
+    "design_jointly",
     "evaluate_trajectory",
     "identify",
     "monte_carlo",
     "predict",
     "sequential",
-    "shortest",
+    "shortest_experiment",
     "simulate",
 ]
 __version__ = "0.1.0"

@@ -58,7 +58,7 @@ def stopped() -> bool:
     return bool(_STOP and _STOP[0].is_set())
 
 
-def salvaged(executor: Executor, futures: Iterable[Future[T]]) -> list[T]:
+def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T]:
     """Stop what an executor still runs, and return what its futures, in their order, have found within the grace."""
     waiting = list(futures)
     for future in waiting:

@@ -53,7 +53,7 @@ def test_a_pool_that_was_stopped_serves_again_once_nothing_runs() -> None:
     with mjfim.Pool(1) as pool:
         waiting = [pool.submit(until_told, 60.0) for _ in range(3)]
         time.sleep(0.5)
-        first = workers.salvaged(pool, waiting)[0]
+        first = workers.collect_finished(pool, waiting)[0]
         assert first[0]
         assert pool.submit(until_told, 0.1).result(timeout=30.0) == (False, first[1])
 
@@ -71,7 +71,7 @@ def test_what_has_ended_is_salvaged_in_order_and_the_rest_is_left(
     done[3].set_running_or_notify_cancel()  # and never ends
     monkeypatch.setattr(workers, "GRACE", 0.2)
     with ThreadPoolExecutor(1) as executor:
-        assert workers.salvaged(executor, [done[2], done[3], done[1], done[0]]) == [2, 0]
+        assert workers.collect_finished(executor, [done[2], done[3], done[1], done[0]]) == [2, 0]
     assert workers.workers_of(None) == 1
     assert workers.workers_of(ThreadPoolExecutor(3)) == 3
 

@@ -22,7 +22,7 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.excitation.design import design_task
-from mjfim.excitation.shortest_horizon import OutOfReachError, Shortest
+from mjfim.excitation.shortest_horizon import OutOfReachError, ShortestExperiment
 from mjfim.excitation.task import DesignTask
 from mjfim.output import text as report
 from mjfim.output.folders import check_folder
@@ -101,10 +101,10 @@ def design(
 
 def _shortest(
     task: DesignTask, monitor: Callable[[HistoryRow], None], executor: Executor | None
-) -> Shortest:
+) -> ShortestExperiment:
     """The shortest design, every duration told on the way; exit code 1 where none is long enough."""
     try:
-        return mjfim.shortest(
+        return mjfim.shortest_experiment(
             task.experiment,
             monitor=monitor,
             threads=task.plant.simulator.threads,

@@ -17,7 +17,7 @@ from mjfim.excitation.interior_point import (
     BarrierIterate,
     BarrierSchedule,
     InteriorPointMethod,
-    seen,
+    values_of,
 )
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
@@ -168,7 +168,7 @@ def _row(
         (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
     )
     cost, i = (np.inf if point is None else point.cost), stage_iterate.iterate
-    margin = min(constraints.relative_margins(seen(i.point)).values(), default=np.nan)
+    margin = min(constraints.relative_margins(values_of(i.point)).values(), default=np.nan)
     return HistoryRow(
         iteration=i.index,
         cost=cost,

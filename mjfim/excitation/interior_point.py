@@ -38,13 +38,13 @@ class InteriorPoint:
     @property
     def ctrl(self) -> Array:
         """(N, nu)"""
-        return seen(self).trajectory.ctrl
+        return values_of(self).trajectory.ctrl
 
 
 DIVERGED_POINT = InteriorPoint(None, None, np.inf, np.inf)
 
 
-def seen(point: InteriorPoint) -> ConstraintValues:
+def values_of(point: InteriorPoint) -> ConstraintValues:
     """What its limits look at. Raises ValueError for a diverged trial."""
     if point.values is None:
         raise ValueError("a diverged trial has no trajectory")
@@ -119,7 +119,7 @@ class InteriorProblem:
 
     def expand(self, point: InteriorPoint) -> Expansion:
         """Expansion of the sum; the barrier's share stands apart as well."""
-        values = seen(point)
+        values = values_of(point)
         values = self.constraints.evaluate(values.trajectory, values.observed, slopes=True)
         if point.point is None:
             A, B, rise = self.base.plant.derivatives.observation_jacobians(
@@ -151,7 +151,7 @@ class InteriorProblem:
         self, point: InteriorPoint, zeta: TangentCurve, gamma: float, K: Array
     ) -> InteriorPoint:
         """P(xi + gamma zeta), evaluated."""
-        trajectory = seen(point).trajectory
+        trajectory = values_of(point).trajectory
         if not K.any():
             return self.point(trajectory.ctrl + gamma * zeta.v)
         moved = self.base.plant.project(self.base.theta, trajectory, zeta, gamma, K)
@@ -159,7 +159,7 @@ class InteriorProblem:
 
     def difference(self, new: InteriorPoint, old: InteriorPoint) -> TangentCurve:
         """(x_new - x_old, u_new - u_old)."""
-        return self.base.plant.difference(seen(new).trajectory, seen(old).trajectory)
+        return self.base.plant.difference(values_of(new).trajectory, values_of(old).trajectory)
 
     def refine(self, point: InteriorPoint) -> InteriorPoint | None:
         """Never: the barrier_weights of mu ends before the differences matter."""
@@ -168,15 +168,15 @@ class InteriorProblem:
 
 FACTOR = 3.0  # between schedule
 RELAXED = 0.3  # delta over mu
-WIDEST = 0.1  # delta at most
-SHRUNK = np.concatenate(
+MAX_RELAXATION = 0.1  # delta at most
+SHRINK_FACTORS = np.concatenate(
     [[1.0, 0.997, 0.99, 0.97, 0.94, 0.9], 0.8 ** np.arange(1, 24)]
 )  # of a start, tried in turn
-HOLDING = 4e-3  # mu from which on leaks are answered
+TIGHTENING_MU = 4e-3  # mu from which on leaks are answered
 SPARE = 1.2  # what was outside at the end of a stage_iterate is held back on the next by that much of it
 SLACK = 1.5  # of the time that is left per stage_iterate, what one may take
 AGAIN = 3  # times that the last stage_iterate is repeated because of leaks, at most
-FARTHEST_START = (
+MAX_START_VIOLATION = (
     1.0  # of a start beyond its limits, over half of their ranges, that is begun with as it is
 )
 
@@ -270,20 +270,20 @@ class InteriorPointMethod:
         steered, taken = stage_iterate.iterate.point.ctrl, stage_iterate.iterate.index + 1
         if shrunk is None:
             return Entry(steered, taken)
-        problem = InteriorProblem(self.base, self.constraints, self.schedule.first, WIDEST)
+        problem = InteriorProblem(self.base, self.constraints, self.schedule.first, MAX_RELAXATION)
         entries = [shrunk, steered] if stage_iterate.feasible else [shrunk]
         values = [problem.value(problem.point(ctrl)) for ctrl in entries]
         return Entry(entries[int(np.argmin(values))], taken)
 
     def _near(self, control: Array) -> bool:
         """What a relaxed barrier brings back inside on its way down: an end that is missed can be any number of its bands off."""
-        point = InteriorProblem(self.base, self.constraints, 1.0, WIDEST, costs=False).point(
+        point = InteriorProblem(self.base, self.constraints, 1.0, MAX_RELAXATION, costs=False).point(
             control
         )
         if point.values is None:
             return False
         return all(
-            s > -FARTHEST_START
+            s > -MAX_START_VIOLATION
             for kind, s in self.constraints.relative_margins(point.values).items()
             if not kind.startswith("end_")
         )
@@ -303,8 +303,8 @@ class InteriorPointMethod:
 
     def inside(self, control: Array) -> Array | None:
         """A control shrunk about the centre until all limits hold; None where even the least one leaves them."""
-        problem = InteriorProblem(self.base, self.constraints, 1.0, WIDEST, costs=False)
-        for share in SHRUNK:
+        problem = InteriorProblem(self.base, self.constraints, 1.0, MAX_RELAXATION, costs=False)
+        for share in SHRINK_FACTORS:
             candidate = control if share == 1.0 else self.centre + share * (control - self.centre)
             point = problem.point(candidate)
             if point.values is not None and self.constraints.is_feasible(
@@ -315,7 +315,7 @@ class InteriorPointMethod:
 
     def _steered(self, control: Array, budget: int, until: float) -> Iterator[BarrierIterate]:
         """Iterates towards the inside, without any cost."""
-        problem = InteriorProblem(self.base, self.constraints, 1.0, WIDEST, costs=False)
+        problem = InteriorProblem(self.base, self.constraints, 1.0, MAX_RELAXATION, costs=False)
         begin = problem.point(control)
         if begin.values is None:  # it diverges
             return
@@ -328,11 +328,11 @@ class InteriorPointMethod:
             tolerance=1e-6,
             max_iterations=budget,
         ):
-            margins = self.constraints.margins(seen(iterate.point))
+            margins = self.constraints.margins(values_of(iterate.point))
             stage_iterate = BarrierIterate(iterate, np.inf, margins)
             yield stage_iterate
             if (
-                self.constraints.is_feasible(seen(iterate.point), strictly=True)
+                self.constraints.is_feasible(values_of(iterate.point), strictly=True)
                 or time.perf_counter() > until
             ):
                 return
@@ -342,7 +342,7 @@ class InteriorPointMethod:
     ) -> Iterator[BarrierIterate]:
         r, held, budget = self.schedule, dict[str, float](), budget + done
         barrier_weights = r.barrier_weights()
-        point = InteriorProblem(self.base, self.constraints, r.first, WIDEST).point(control)
+        point = InteriorProblem(self.base, self.constraints, r.first, MAX_RELAXATION).point(control)
         if point.values is None:  # it diverges where the parameters move a little
             return
         for i, mu in enumerate([*barrier_weights, *barrier_weights[-1:] * AGAIN]):
@@ -357,7 +357,7 @@ class InteriorPointMethod:
                 -(-(budget - done) // left) if left > 1 else budget - done,
             )
             constraints = self.constraints.tightened(held)
-            problem = InteriorProblem(self.base, constraints, mu, min(WIDEST, RELAXED * mu))
+            problem = InteriorProblem(self.base, constraints, mu, min(MAX_RELAXATION, RELAXED * mu))
             point = problem.again(point)
             values: list[float] = []
             tight = min(
@@ -372,8 +372,8 @@ class InteriorPointMethod:
                 tolerance=tight,
                 max_iterations=patience,
             ):
-                point, margins = iterate.point, self.constraints.margins(seen(iterate.point))
-                kept = self.constraints.is_feasible(seen(iterate.point))
+                point, margins = iterate.point, self.constraints.margins(values_of(iterate.point))
+                kept = self.constraints.is_feasible(values_of(iterate.point))
                 status = Status.CONVERGED if iterate.slope <= r.tolerance else iterate.status
                 status = status if last and kept else None
                 yield BarrierIterate(
@@ -393,8 +393,8 @@ class InteriorPointMethod:
                 yield from self._mended(problem, iterate, mu, done)
             if over or (last and kept):
                 return
-            if mu <= HOLDING:
-                held = tightened_further(held, self.constraints.relative_margins(seen(point)))
+            if mu <= TIGHTENING_MU:
+                held = updated_tightening(held, self.constraints.relative_margins(values_of(point)))
 
     def _mended(
         self, problem: InteriorProblem, iterate: Iterate[InteriorPoint], mu: float, done: int
@@ -415,7 +415,7 @@ class InteriorPointMethod:
                 yield BarrierIterate(own, mu, self.constraints.margins(point.values), repaired=True)
 
 
-def tightened_further(held: Mapping[str, float], shares: Mapping[str, float]) -> dict[str, float]:
+def updated_tightening(held: Mapping[str, float], shares: Mapping[str, float]) -> dict[str, float]:
     """How far each kind is held back from its bounds next: more where it was outside, less where it was well inside."""
     return {
         kind: max(0.0, held.get(kind, 0.0) - share * (SPARE if share < 0.0 else 0.5))

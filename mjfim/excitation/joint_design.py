@@ -17,7 +17,7 @@ from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 
 
-def design_together(
+def design_jointly(
     experiments: Sequence[Experiment],
     monitor: Monitor | None = None,
     rounds: int = 5,
@@ -36,7 +36,7 @@ def design_together(
     if len(tasks) < 2 or any(own != names[0] for own in names):
         told = "; ".join(", ".join(own) for own in names)
         raise ExperimentError(
-            f"design_together takes two or more experiments with the same parameters in one order: {told}"
+            f"design_jointly takes two or more experiments with the same parameters in one order: {told}"
         )
     tells = [_data(task) for task in tasks]
     controls: list[Array | None] = [None] * len(tasks)

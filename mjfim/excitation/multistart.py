@@ -14,10 +14,10 @@ from mjfim.arrays import Array
 from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform, pursue
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.initial_controls import InitialControl
-from mjfim.excitation.interior_point import SHRUNK, BarrierSchedule, tightened_further
+from mjfim.excitation.interior_point import SHRINK_FACTORS, BarrierSchedule, updated_tightening
 from mjfim.excitation.unconstrained import Stage
 from mjfim.excitation.verification import verify
-from mjfim.parallel import salvaged, workers_of
+from mjfim.parallel import collect_finished, workers_of
 from mjfim.records.design import HistoryRow, Status
 
 KEPT = 4  # one in so many goes on
@@ -169,7 +169,7 @@ class Multistart:
             if self._seconds == 0.0:
                 break
             i, shares = leaking
-            held = tightened_further(held, shares)
+            held = updated_tightening(held, shares)
             best, again = chases[i], list[Chase]()
             start = InitialControl(best.name, np.asarray(best.control))
             try:
@@ -236,7 +236,7 @@ class Multistart:
     def _shrink(self, chase: Chase) -> None:
         """Shrink a control about the centre until no limit is left, if it ever is."""
         task = self.fine.task
-        for share in SHRUNK:
+        for share in SHRINK_FACTORS:
             control = task.centre + share * (np.asarray(chase.control) - task.centre)
             cost = self._worth(control)
             if np.isfinite(cost):
@@ -294,7 +294,7 @@ class Multistart:
         except (
             BaseException
         ):  # the user's Ctrl-C, that of what watches the iterates, or a fault: nothing may run on
-            chases += salvaged(self.executor, futures[len(chases) :])
+            chases += collect_finished(self.executor, futures[len(chases) :])
             raise
 
 

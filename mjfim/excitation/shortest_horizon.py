@@ -1,4 +1,4 @@
-"""`mjfim.shortest`: the shortest experiment whose design tells every parameter as well as wanted.
+"""`mjfim.shortest_experiment`: the shortest experiment whose design tells every parameter as well as wanted.
 
 Standard deviations fall like T^-1/2 or faster with the duration T, so a secant on their logarithms finds the place where
 the worst of them, over the wanted one, is 1. Both ends of the bracket are designs: the one that is returned reaches what
@@ -63,7 +63,7 @@ class Tried:
 
 
 @dataclass(frozen=True, eq=False)
-class Shortest:
+class ShortestExperiment:
     """The shortest design. experiment: as stated, with its horizon and the repeats that divide it
 
     design: reaches every wanted σ
@@ -109,7 +109,7 @@ class Shortest:
         return max(shorter, key=lambda t: t.horizon, default=None)
 
 
-def shortest(
+def shortest_experiment(
     experiment: Experiment,
     longest: float | None = None,
     tolerance: float | None = None,
@@ -117,7 +117,7 @@ def shortest(
     threads: int | None = None,
     report: Callable[[Tried], None] | None = None,
     executor: Executor | None = None,
-) -> Shortest:
+) -> ShortestExperiment:
     """Find the shortest horizon whose design is predicted to reach every parameter's `wanted` σ, and that design.
 
     longest: [s], default four times the experiment's horizon, or as long as its table of the initial control lasts
@@ -160,7 +160,7 @@ class _Hunt:
         self.designs: dict[int, Design] = {}
         self.stopped = False
 
-    def run(self) -> Shortest:
+    def run(self) -> ShortestExperiment:
         """Bracket, then narrow."""
         most = self.grid.round_down(self.longest * self.experiment.rate)
         first = min(self.grid.round_up(self.base.samples), most)
@@ -172,7 +172,7 @@ class _Hunt:
         least = found <= self.grid.minimum
         closed = least or (below is not None and found - below <= self.slack(found))
         own, tolerance = self.at(found), self.slack(found) / self.experiment.rate
-        return Shortest(own, self.designs[found], tuple(self.tried.values()), tolerance, closed)
+        return ShortestExperiment(own, self.designs[found], tuple(self.tried.values()), tolerance, closed)
 
     def slack(self, samples: int) -> int:
         """Tolerance in samples: no less than the grid resolves."""

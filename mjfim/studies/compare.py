@@ -13,12 +13,12 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 from mjfim.excitation.design import design_task, designable
 from mjfim.excitation.evaluation import point_at_stated_rate
-from mjfim.excitation.interior_point import SHRUNK
+from mjfim.excitation.interior_point import SHRINK_FACTORS
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
-from mjfim.parallel import salvaged, workers_of
+from mjfim.parallel import collect_finished, workers_of
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import HistoryRow, Status
@@ -169,7 +169,7 @@ def _tried(job: Job, executor: Executor | None, tell: Tell) -> Attempt:
         futures += [executor.submit(perform, each) for each in jobs]
         attempts = [future.result() for future in futures]
     except BaseException:
-        salvaged(executor, futures)
+        collect_finished(executor, futures)
         raise
     best = min(attempts, key=lambda attempt: (attempt.cost, -attempt.share))
     return replace(
@@ -249,7 +249,7 @@ class Judge:
             return self._nothing(method, title, attempt, note)
         first: MethodResult | None = None
         for share in (
-            [1.0] if method == DESIGN or not np.isfinite(attempt.cost) else SHRUNK.tolist()
+            [1.0] if method == DESIGN or not np.isfinite(attempt.cost) else SHRINK_FACTORS.tolist()
         ):
             control = self.task.centre + share * (attempt.control - self.task.centre)
             told = note if share == 1.0 else f"shrunk to {100.0 * share:.3g} %"

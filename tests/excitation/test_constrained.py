@@ -20,10 +20,10 @@ from mjfim.excitation.constraints import bandwidth_basis, constraint_set_of
 from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (
-    SHRUNK,
+    SHRINK_FACTORS,
     BarrierSchedule,
     InteriorPointMethod,
-    tightened_further,
+    updated_tightening,
 )
 from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.task import DesignTask
@@ -168,7 +168,7 @@ def test_a_start_that_leaves_the_limits_is_driven_inside(tmp_path: Path) -> None
     share = float(begun[10, 0] / task.control[10, 0])
     np.testing.assert_allclose(begun, free.centre + share * (task.control - free.centre), rtol=1e-9)
     assert_inside(task, begun)
-    tried = sorted(SHRUNK.tolist())
+    tried = sorted(SHRINK_FACTORS.tolist())
     larger = free.centre + tried[tried.index(pytest.approx(share)) + 1] * (
         task.control - free.centre
     )
@@ -238,7 +238,7 @@ def test_a_start_that_no_shrinking_brings_inside_is_steered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where it is too far outside to begin with: here by decree."""
-    monkeypatch.setattr(ladder_module, "FARTHEST_START", -np.inf)
+    monkeypatch.setattr(ladder_module, "MAX_START_VIOLATION", -np.inf)
     task = swinging_task(tmp_path)
     free = task.relaxed()
     barrier_weights = InteriorPointMethod(
@@ -370,12 +370,12 @@ def test_the_stated_tolerance_ends_the_last_rung_once_the_limits_hold(tmp_path: 
 
 
 def test_more_is_held_back_where_a_rung_leaked_and_less_where_it_was_well_inside() -> None:
-    held = tightened_further(
+    held = updated_tightening(
         {"position": 0.1, "control": 0.1, "force": 0.02},
         {"position": -0.05, "control": 0.06, "force": 0.5},
     )
     assert held == pytest.approx({"position": 0.16, "control": 0.07, "force": 0.0})
-    assert tightened_further({}, {"velocity": -0.1}) == pytest.approx({"velocity": 0.12})
+    assert updated_tightening({}, {"velocity": -0.1}) == pytest.approx({"velocity": 0.12})
 
 
 # ---- several starts
@@ -606,7 +606,7 @@ def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
     """The barrier looks at distances at the samples, of 50 ms; the verify at every engine step."""
     monkeypatch.setattr(multistart, "PROOFS", proofs)
     if not shrunk:
-        monkeypatch.setattr(multistart, "SHRUNK", np.ones(1))
+        monkeypatch.setattr(multistart, "SHRINK_FACTORS", np.ones(1))
     monkeypatch.setattr(multistart, "PATIENCE", 12)
     task, design = arm_design(
         tmp_path,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.constraints import END_WEIGHT, ConstraintValues, constraint_set_of
-from mjfim.excitation.interior_point import InteriorProblem, seen
+from mjfim.excitation.interior_point import InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
 from mjfim.optimize.lq import TangentCurve
@@ -139,7 +139,7 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     assert (w.W[1:-1] > 0.0).all()
     # its own: the squares of what every limited number moves by, times the curvature of its barrier
     values, N = (
-        constraints.evaluate(seen(point).trajectory, seen(point).observed, slopes=True),
+        constraints.evaluate(values_of(point).trajectory, values_of(point).observed, slopes=True),
         task.samples,
     )
     _, _, rise = task.plant.derivatives.observation_jacobians(
@@ -212,7 +212,7 @@ def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> Non
     assert expansion.barrier is not None
     for way in 1e-4 * directions_of(task, 4, seed=2):
         zeta = expansion.lift(np.zeros((task.samples, 2, task.space.nx)), way)
-        up, down = (seen(problem.point(task.control + s * way)).observed for s in (1.0, -1.0))
+        up, down = (values_of(problem.point(task.control + s * way)).observed for s in (1.0, -1.0))
         moved = (0.5 * np.abs(up - down) / constraints.shown.scale)[
             :, np.array(constraints.observations.derivative_substeps) - 1
         ].max()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.constraints import constraint_set_of
-from mjfim.excitation.interior_point import DIVERGED_POINT, InteriorProblem, seen
+from mjfim.excitation.interior_point import DIVERGED_POINT, InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.projection_operator import Expansion
 from tests.support.limits import directions_of
@@ -92,7 +92,7 @@ def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> No
     expected = np.log(J) if "D" not in name else J / (3 * (3.0 if "heavier" in name else 1.0))
     assert point.merit == pytest.approx(expected, rel=1e-4)
     values = problem.constraints.evaluate(
-        seen(point).trajectory, seen(point).observed, slopes=False
+        values_of(point).trajectory, values_of(point).observed, slopes=False
     )
     assert point.barrier == problem.constraints.value(values, 0.05)
     assert problem.value(point) == pytest.approx(point.merit + 0.2 * point.barrier, rel=1e-12)
@@ -149,7 +149,7 @@ def test_a_trial_that_diverges_is_outside_everything(tmp_path: Path) -> None:
         assert point is DIVERGED_POINT
         assert own.value(point) == np.inf
         with pytest.raises(ValueError, match="diverged"):
-            seen(point)
+            values_of(point)
         with pytest.raises(ValueError, match="diverged"):
             own.expand(point)
 
@@ -171,6 +171,6 @@ def test_a_projected_point_is_one_that_is_played_open_loop(tmp_path: Path) -> No
         difference = problem.difference(moved, point)
         np.testing.assert_allclose(difference.v, moved.ctrl - task.control, rtol=0, atol=1e-15)
         np.testing.assert_allclose(
-            difference.z, seen(moved).trajectory.state - task.initial.state, rtol=0, atol=1e-12
+            difference.z, values_of(moved).trajectory.state - task.initial.state, rtol=0, atol=1e-12
         )
     assert problem.refine(point) is None

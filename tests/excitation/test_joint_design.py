@@ -37,7 +37,7 @@ def own(design: mjfim.Design) -> np.ndarray:
 def test_the_sum_is_at_least_as_good_as_that_of_separate_designs(tmp_path) -> None:
     experiments = pair(tmp_path)
     task = DesignTask.resolve(experiments[0])
-    together = mjfim.design_together(experiments, rounds=2)
+    together = mjfim.design_jointly(experiments, rounds=2)
     apart = [mjfim.design(e) for e in experiments]
     phi = [
         task.information.evaluate(sum(own(d) for d in designs)).value
@@ -47,7 +47,7 @@ def test_the_sum_is_at_least_as_good_as_that_of_separate_designs(tmp_path) -> No
 
 
 def test_each_design_holds_the_information_of_all(tmp_path) -> None:
-    together = mjfim.design_together(pair(tmp_path), rounds=1)
+    together = mjfim.design_jointly(pair(tmp_path), rounds=1)
     assert relative_error(together[1].final.information, own(together[0]) + own(together[1])) < 1e-6
     assert relative_error(together[1].prior, own(together[0])) < 1e-6
 
@@ -66,7 +66,7 @@ def test_what_one_experiment_cannot_see_another_may(tmp_path) -> None:
 
 def test_nuisance_of_one_experiment_is_not_that_of_the_other(tmp_path) -> None:
     experiments = pair(tmp_path, nuisance={"initial": 0.05})
-    together = mjfim.design_together(experiments, rounds=1)
+    together = mjfim.design_jointly(experiments, rounds=1)
     j = together[1].parameters.index("initial qpos:slide")
     assert not together[1].prior[j, :3].any()
     assert together[1].prior[j, j] == pytest.approx(0.05**-2)  # its own prior alone
@@ -76,6 +76,6 @@ def test_other_parameters_are_refused(tmp_path) -> None:
     one = cart_task(tmp_path).experiment
     other = cart_task(tmp_path, parameters={"m": CART_PARAMETERS["m"]}).experiment
     with pytest.raises(ExperimentError, match="same parameters"):
-        mjfim.design_together([one, other])
+        mjfim.design_jointly([one, other])
     with pytest.raises(ExperimentError, match="two or more"):
-        mjfim.design_together([one])
+        mjfim.design_jointly([one])

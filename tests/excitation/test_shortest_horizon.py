@@ -43,12 +43,12 @@ def worst(experiment: mjfim.Experiment) -> float:
 
 
 @pytest.fixture(scope="module")
-def shorter() -> mjfim.Shortest:
+def shorter() -> mjfim.ShortestExperiment:
     """Shorter than stated."""
-    return mjfim.shortest(wanting(SIGMA), tolerance=0.05)
+    return mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.05)
 
 
-def test_it_reaches_what_is_wanted(shorter: mjfim.Shortest) -> None:
+def test_it_reaches_what_is_wanted(shorter: mjfim.ShortestExperiment) -> None:
     assert 0.5 < shorter.horizon < 1.4 and shorter.closed
     task = DesignTask.resolve(shorter.experiment)
     assert shorter.design.trajectory.samples == task.samples
@@ -61,7 +61,7 @@ def test_it_reaches_what_is_wanted(shorter: mjfim.Shortest) -> None:
     assert shorter.summary()["horizon"] == shorter.horizon
 
 
-def test_a_tolerance_shorter_does_not(shorter: mjfim.Shortest) -> None:
+def test_a_tolerance_shorter_does_not(shorter: mjfim.ShortestExperiment) -> None:
     """By a design of its own, from the initial control."""
     below = shorter.missed
     assert below is not None and 0.0 < shorter.horizon - below.horizon <= shorter.tolerance + 1e-9
@@ -71,10 +71,10 @@ def test_a_tolerance_shorter_does_not(shorter: mjfim.Shortest) -> None:
 
 
 @pytest.mark.slow
-def test_longer_than_stated_where_it_takes_longer(shorter: mjfim.Shortest) -> None:
+def test_longer_than_stated_where_it_takes_longer(shorter: mjfim.ShortestExperiment) -> None:
     """Begun from too short it ends at about the same."""
     seen: list[Tried] = []
-    found = mjfim.shortest(wanting(SIGMA, horizon=0.8), tolerance=0.05, report=seen.append)
+    found = mjfim.shortest_experiment(wanting(SIGMA, horizon=0.8), tolerance=0.05, report=seen.append)
     assert found.horizon > 0.8 and abs(found.horizon - shorter.horizon) < 0.11
     assert tuple(seen) == found.tried and not seen[0].reached and seen[0].horizon == 0.8
 
@@ -85,7 +85,7 @@ def test_what_is_out_of_reach_is_said_with_numbers() -> None:
         OutOfReachError,
         match=r"0\.8 s is not enough: it does not tell m \(σ 0\.\d+, wanted 0\.001\)",
     ):
-        mjfim.shortest(hard, longest=0.8)
+        mjfim.shortest_experiment(hard, longest=0.8)
 
 
 def test_default_longest_is_what_a_table_covers(tmp_path: Path) -> None:
@@ -102,16 +102,16 @@ def test_default_longest_is_what_a_table_covers(tmp_path: Path) -> None:
         parameters={"m": {"wanted": 1e-4}}, descent={"starts": 1, "max_iterations": 2}
     )
     with pytest.raises(OutOfReachError, match=r"even 0\.6 s"):
-        mjfim.shortest(hard)
+        mjfim.shortest_experiment(hard)
 
 
 def test_faulty_requests_say_what_is_right() -> None:
     with pytest.raises(ExperimentError, match=r"parameters\.m\.wanted"):
-        mjfim.shortest(STUDY)
+        mjfim.shortest_experiment(STUDY)
     with pytest.raises(ExperimentError, match="tolerance"):
-        mjfim.shortest(wanting(SIGMA), tolerance=0.0)
+        mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.0)
     with pytest.raises(ExperimentError, match="longest"):
-        mjfim.shortest(wanting(SIGMA), longest=0.01)
+        mjfim.shortest_experiment(wanting(SIGMA), longest=0.01)
 
 
 def test_interrupted_it_returns_the_shortest_so_far() -> None:
@@ -121,7 +121,7 @@ def test_interrupted_it_returns_the_shortest_so_far() -> None:
         if len(horizons) == 1:
             raise KeyboardInterrupt
 
-    found = mjfim.shortest(
+    found = mjfim.shortest_experiment(
         wanting(SIGMA),
         tolerance=0.05,
         monitor=monitor,
@@ -129,7 +129,7 @@ def test_interrupted_it_returns_the_shortest_so_far() -> None:
     )
     assert found.horizon == 1.5 and not found.closed and "interrupted" in str(found)
     with pytest.raises(KeyboardInterrupt):
-        mjfim.shortest(wanting(SIGMA), report=_stop)
+        mjfim.shortest_experiment(wanting(SIGMA), report=_stop)
 
 
 def _stop(tried: Tried) -> None:
@@ -148,14 +148,14 @@ def test_a_duration_that_cannot_be_simulated_does_not_reach(
         return real(task, *rest, **more)
 
     monkeypatch.setattr(mjfim.excitation.shortest_horizon, "design", faulty)
-    found = mjfim.shortest(wanting(SIGMA), tolerance=0.05)
+    found = mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.05)
     assert (
         1.4 <= found.horizon <= 1.45
         and found.missed is not None
         and found.missed.why == "too short"
     )
     with pytest.raises(SimulationDivergedError):
-        mjfim.shortest(wanting(SIGMA, horizon=1.0))
+        mjfim.shortest_experiment(wanting(SIGMA, horizon=1.0))
 
 
 def test_control_of_another_duration(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def lost(names: tuple[str, ...], std: np.ndarray) -> set[str]:
 def test_experiments_together_do_not_take_round_off_for_information(tmp_path) -> None:
     first = pendulum(tmp_path).experiment
     second = pendulum(tmp_path, initial={"qpos": (0.5, -0.4), "control": SINE}).experiment
-    for design in mjfim.design_together([first, second], rounds=1):
+    for design in mjfim.design_jointly([first, second], rounds=1):
         assert lost(design.parameters, design.final.std) == {"m1r1", "I1", "m2"}
         assert len(design.combined) == 2
         assert len(design.final.eigenvalues) == 4

@@ -11,7 +11,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.interior_point import WIDEST, InteriorPoint, InteriorProblem, seen
+from mjfim.excitation.interior_point import MAX_RELAXATION, InteriorPoint, InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
 from mjfim.experiment.schema import Experiment
@@ -109,11 +109,11 @@ class Arena:
     @cached_property
     def looking(self) -> InteriorProblem:
         """Evaluates points by the exact cost."""
-        return InteriorProblem(self.exact, self.constraints, 1.0, WIDEST)
+        return InteriorProblem(self.exact, self.constraints, 1.0, MAX_RELAXATION)
 
     def inside(self, point: InteriorPoint) -> bool:
         """Whether it keeps all limits at every engine step."""
-        return not self.holds or self.constraints.is_feasible(seen(point))
+        return not self.holds or self.constraints.is_feasible(values_of(point))
 
     def offer(self, point: InteriorPoint, name: str = "") -> float:
         """Keep a point's control if it is the best so far; its cost J, infinite outside the limits."""

@@ -20,14 +20,14 @@ from mjfim.excitation.constrained import Chase, ConstrainedSearch, pursue, smoot
 from mjfim.excitation.constraints import boundary_splines
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (
-    HOLDING,
+    TIGHTENING_MU,
     RELAXED,
-    WIDEST,
+    MAX_RELAXATION,
     BarrierSchedule,
     InteriorPoint,
     InteriorPointMethod,
     InteriorProblem,
-    tightened_further,
+    updated_tightening,
 )
 from mjfim.excitation.objective import DesignProblem
 from mjfim.excitation.unconstrained import regulator_for
@@ -247,15 +247,15 @@ class Descent:
                 constraints = self.arena.constraints.tightened(held)
                 barrier = mu if self.arena.holds else 0.0
                 self._stage(
-                    InteriorProblem(self.base, constraints, barrier, min(WIDEST, RELAXED * mu)),
+                    InteriorProblem(self.base, constraints, barrier, min(MAX_RELAXATION, RELAXED * mu)),
                     schedule,
                     mu,
                     last,
                 )
                 self._mend()
                 point = self._point(self.arena.looking)
-                if mu <= HOLDING and point.values is not None:
-                    held = tightened_further(
+                if mu <= TIGHTENING_MU and point.values is not None:
+                    held = updated_tightening(
                         held, self.arena.constraints.relative_margins(point.values)
                     )
         except Spent:
@@ -272,7 +272,7 @@ class Descent:
         inner = self.barrier_weights.inside(start) if arena.holds else start
         if inner is not None:
             return inner
-        problem = InteriorProblem(self.base, arena.constraints, 1.0, WIDEST, costs=False)
+        problem = InteriorProblem(self.base, arena.constraints, 1.0, MAX_RELAXATION, costs=False)
         self._stage(problem, BarrierSchedule(), 1.0, False)
         inner = self.barrier_weights.inside(self._control(self.s))
         return self._control(self.s) if inner is None else inner
