@@ -277,9 +277,9 @@ class InteriorPointMethod:
 
     def _near(self, control: Array) -> bool:
         """What a relaxed barrier brings back inside on its way down: an end that is missed can be any number of its bands off."""
-        point = InteriorProblem(self.base, self.constraints, 1.0, MAX_RELAXATION, costs=False).point(
-            control
-        )
+        point = InteriorProblem(
+            self.base, self.constraints, 1.0, MAX_RELAXATION, costs=False
+        ).point(control)
         if point.values is None:
             return False
         return all(

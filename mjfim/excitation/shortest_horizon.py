@@ -172,7 +172,9 @@ class _Hunt:
         least = found <= self.grid.minimum
         closed = least or (below is not None and found - below <= self.slack(found))
         own, tolerance = self.at(found), self.slack(found) / self.experiment.rate
-        return ShortestExperiment(own, self.designs[found], tuple(self.tried.values()), tolerance, closed)
+        return ShortestExperiment(
+            own, self.designs[found], tuple(self.tried.values()), tolerance, closed
+        )
 
     def slack(self, samples: int) -> int:
         """Tolerance in samples: no less than the grid resolves."""

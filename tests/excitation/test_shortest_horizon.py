@@ -74,7 +74,9 @@ def test_a_tolerance_shorter_does_not(shorter: mjfim.ShortestExperiment) -> None
 def test_longer_than_stated_where_it_takes_longer(shorter: mjfim.ShortestExperiment) -> None:
     """Begun from too short it ends at about the same."""
     seen: list[Tried] = []
-    found = mjfim.shortest_experiment(wanting(SIGMA, horizon=0.8), tolerance=0.05, report=seen.append)
+    found = mjfim.shortest_experiment(
+        wanting(SIGMA, horizon=0.8), tolerance=0.05, report=seen.append
+    )
     assert found.horizon > 0.8 and abs(found.horizon - shorter.horizon) < 0.11
     assert tuple(seen) == found.tried and not seen[0].reached and seen[0].horizon == 0.8
 

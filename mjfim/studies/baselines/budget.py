@@ -11,7 +11,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.interior_point import MAX_RELAXATION, InteriorPoint, InteriorProblem, values_of
+from mjfim.excitation.interior_point import (
+    MAX_RELAXATION,
+    InteriorPoint,
+    InteriorProblem,
+    values_of,
+)
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage
 from mjfim.experiment.schema import Experiment

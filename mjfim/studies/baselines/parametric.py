@@ -20,9 +20,9 @@ from mjfim.excitation.constrained import Chase, ConstrainedSearch, pursue, smoot
 from mjfim.excitation.constraints import boundary_splines
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (
-    TIGHTENING_MU,
-    RELAXED,
     MAX_RELAXATION,
+    RELAXED,
+    TIGHTENING_MU,
     BarrierSchedule,
     InteriorPoint,
     InteriorPointMethod,
@@ -247,7 +247,9 @@ class Descent:
                 constraints = self.arena.constraints.tightened(held)
                 barrier = mu if self.arena.holds else 0.0
                 self._stage(
-                    InteriorProblem(self.base, constraints, barrier, min(MAX_RELAXATION, RELAXED * mu)),
+                    InteriorProblem(
+                        self.base, constraints, barrier, min(MAX_RELAXATION, RELAXED * mu)
+                    ),
                     schedule,
                     mu,
                     last,
