@@ -11,8 +11,9 @@ import mjfim
 from mjfim.cli.common import AsJson, ExperimentFile, Threads, _say, errors, progress, verb, writing
 from mjfim.experiment.system import System
 from mjfim.output import archive
-from mjfim.output import text as report
 from mjfim.output.folders import check_folder
+from mjfim.output.summaries import describe_check
+from mjfim.output.text import render
 from mjfim.recordings.read import read_recording
 
 
@@ -49,7 +50,7 @@ def check(
     if output is not None:
         with writing(output) as results:
             results.leave_check(output, result)
-    _say(as_json, result.summary(), report.check_report(result))
+    _say(as_json, result.summary(), render(describe_check(result)))
     if output is not None:
         errors.print(f"wrote {output}/")
     raise typer.Exit(0 if result.ok else 1)

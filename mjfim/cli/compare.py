@@ -19,8 +19,9 @@ from mjfim.cli.common import (
     writing,
 )
 from mjfim.excitation.task import DesignTask
-from mjfim.output import text as report
 from mjfim.output.folders import check_folder
+from mjfim.output.summaries import describe_comparison
+from mjfim.output.text import render
 from mjfim.studies.baselines.methods import METHODS
 from mjfim.studies.compare import Glance, compare_task
 
@@ -70,7 +71,7 @@ def compare(
         raise KeyboardInterrupt
     with writing(output) as results:
         results.leave_comparison(output, result, task.system)
-    _say(as_json, result.summary(), report.compare_report(result))
+    _say(as_json, result.summary(), render(describe_comparison(result)))
     errors.print(f"wrote {output}/")
     if not result.ok:
         errors.print(f"mjfim: {' '.join(result.verdict)}", markup=False)

@@ -24,8 +24,9 @@ from mjfim.cli.common import (
 from mjfim.excitation.design import design_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, ShortestExperiment
 from mjfim.excitation.task import DesignTask
-from mjfim.output import text as report
 from mjfim.output.folders import check_folder
+from mjfim.output.summaries import describe_design
+from mjfim.output.text import render
 from mjfim.parallel import Pool
 from mjfim.records.design import HistoryRow
 from mjfim.records.serialization import write_json
@@ -86,7 +87,7 @@ def design(
     _say(
         as_json,
         {**result.summary(), **told},
-        report.design_report(result, task.system.units),
+        render(describe_design(result, task.system.units)),
     )
     if found is not None:
         errors.print(

@@ -23,8 +23,9 @@ from mjfim.cli.common import (
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
-from mjfim.output import text as report
 from mjfim.output.folders import check_folder
+from mjfim.output.summaries import describe_estimate, describe_logs
+from mjfim.output.text import render
 from mjfim.recordings.read import read_log
 from mjfim.records.events import FitEvent
 
@@ -62,7 +63,7 @@ def identify(
             for paths in (recordings, held_out or [])
         )
         if not as_json:
-            out.print(report.log_report([log.summary for log in (*loaded, *kept)]))
+            out.print(render(describe_logs([log.summary for log in (*loaded, *kept)])))
 
         def show(event: FitEvent) -> None:
             text = (
@@ -86,7 +87,7 @@ def identify(
     _say(
         as_json,
         result.summary(),
-        report.estimate_report(result, system.units),
+        render(describe_estimate(result)),
     )
     errors.print(f"wrote {output}/")
     raise typer.Exit(0 if result.success and not result.misfit and not result.interrupted else 1)

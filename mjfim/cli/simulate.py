@@ -22,8 +22,9 @@ from mjfim.cli.common import (
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output import archive
-from mjfim.output import text as report
 from mjfim.output.folders import check_file, check_folder
+from mjfim.output.summaries import describe_study
+from mjfim.output.text import render
 from mjfim.studies.monte_carlo import monte_carlo_system
 
 
@@ -77,7 +78,7 @@ def montecarlo(
         study = monte_carlo_system(system, named, trials, seed, tell)
     with writing(output) as results:
         results.leave_study(output, study, system)
-    _say(as_json, study.summary(), report.study_report(study, system.units))
+    _say(as_json, study.summary(), render(describe_study(study, system.units)))
     errors.print(f"wrote {output}/")
     if len(study.sets) < len(named):
         errors.print(f"mjfim: interrupted; only {', '.join(study.sets)} is finished")

@@ -92,7 +92,7 @@ def make_design(dofs: int = 2, count: int = 3) -> Design:
     )
     return Design(
         status=Status.CONVERGED,
-        parameters=tuple(f"p{j}" for j in range(count)),
+        parameters=tuple(f"link_{j}.damping" for j in range(count)),
         theta=np.linspace(1.0, 2.0, count),
         initial=make_evaluation(dofs, count, 0.1),
         final=make_evaluation(dofs, count, 1.0),
@@ -133,7 +133,7 @@ def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
     }
     information = {name: np.diag(1.0 / np.diagonal(trials.crlb)) for name, trials in sets.items()}
     return MonteCarloStudy(
-        parameters=tuple(f"p{j}" for j in range(count)),
+        parameters=tuple(f"link_{j}.damping" for j in range(count)),
         theta=theta,
         measure_rate=25.0,
         sets=sets,
@@ -156,7 +156,7 @@ def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estima
     )
     theta = np.linspace(1.0, 2.0, count)
     return Estimate(
-        parameters=tuple(f"p{j}" for j in range(count)),
+        parameters=tuple(f"link_{j}.damping" for j in range(count)),
         theta=theta,
         std=0.02 * theta,
         covariance=np.diag((0.02 * theta) ** 2),
@@ -168,7 +168,7 @@ def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estima
         misfit=misfit,
         iterations=4,
         residual_rms={},
-        at_bound=("p0",),
+        at_bound=("link_0.damping",),
         predicted=(predicted,),
         recordings=(recording,),
     )

@@ -310,7 +310,7 @@ class TestDesign:
     def test_text_says_what_a_reader_needs(self, file: Path) -> None:
         text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
         assert "Stopped at max_iterations" in text
-        assert "| mass | 2 | 0.5 | 0.0312 | 16× |" in text
+        assert "| mass | 2 | 0.5 | 25 % | 0.0312 | 1.6 % | 16.0 × |" in text
         assert "Limits are violated: position" in text
         assert "nearly confounded" in text
         assert "Best of 2 starts: multisine 2" in text

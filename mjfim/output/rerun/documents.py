@@ -85,7 +85,8 @@ def log_design(
     with _document(
         path, model, "design", _layout(_robot_views(model, eye, titles), eye, panels)
     ) as rec:
-        _log_text(rec, design_text(design, summary))
+        units = names.parameter_units or ("",) * len(design.parameters)
+        _log_text(rec, design_text(design, units, summary))
         log_history(rec, design.history, (OPTIMIZED, INITIAL, *OTHERS))
         for phase in phases:
             phase.log_axes(rec, names)

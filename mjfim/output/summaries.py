@@ -1,0 +1,804 @@
+"""Results in words and tables, made once from each record, for the terminal, Rerun and figures alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.output.summary_parts import (
+    Cell,
+    Column,
+    ColumnGroup,
+    Emphasis,
+    Listing,
+    Name,
+    Paragraph,
+    Part,
+    Quantity,
+    Row,
+    Summary,
+    SummaryTable,
+    columns,
+)
+from mjfim.recordings.summary import ColumnSummary, LogSummary
+from mjfim.records.check import Check, ParameterCheck
+from mjfim.records.combinations import ParameterGroup
+from mjfim.records.comparison import DESIGN, Comparison, MethodResult
+from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate, Prediction
+from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+
+# Largest number of parameters or outputs that have a column each.
+MAX_COLUMNS = 7
+
+# Largest number of eigenvalues that a table shows one by one; of more, the largest three and the smallest two are shown.
+MAX_EIGENVALUES = 6
+
+# Largest number of eigenvalues that a sentence lists; of more, the smallest four and the largest two are listed.
+MAX_LISTED_EIGENVALUES = 8
+
+# Largest number of parameters for which covariance matrices are shown; of more, variances only.
+MAX_MATRIX = 5
+
+# Characters to which file names are shortened in tables of logs and of predictions.
+LOG_NAME_WIDTH = 34
+PREDICTION_NAME_WIDTH = 40
+
+# Smallest divisor of the improvement of an eigenvalue; avoids a division by zero.
+TINY = 1e-300
+
+NOT_ALONE = "not alone"
+
+BEST_CASE = (
+    "σ is the Cramér-Rao bound: a best case, true if the model and the stated noise are right."
+)
+
+SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+
+
+# ---- designs
+
+
+def describe_design(design: Design, units: Sequence[str]) -> Summary:
+    """Describe predicted standard deviations before and after a design, and how it ended.
+
+    Args:
+        design: The design.
+        units: Unit of each of the p parameters.
+    """
+    parts: list[Part] = [accuracy_table(design, units)]
+
+    before, after = float(design.initial.eigenvalues[0]), float(design.final.eigenvalues[0])
+    parts.append(
+        Paragraph(
+            text=f"λ_min {before:.4g} → {after:.4g} ({after / max(before, TINY):.1f} ×), "
+            f"cost J {design.initial.cost:.5g} → {design.final.cost:.5g}, found from the {design.found_by}"
+        )
+    )
+    parts.append(
+        Paragraph(
+            text=f"{design.iterations} iterations, {design.seconds:.2f} s, "
+            f"{design.steps / 1e6:.2f} million MuJoCo steps"
+        )
+    )
+    if design.nuisance:
+        names = ", ".join(design.nuisance)
+        parts.append(Paragraph(text=f"nuisance parameters, not designed for: {names}"))
+    if design.combinations:
+        parts.append(
+            Paragraph(
+                text="Some parameters are not identifiable alone: the design is made for their combinations; see design.json"
+            )
+        )
+    parts.append(Paragraph(text=BEST_CASE, emphasis=Emphasis.WEAK))
+
+    parts += _limit_parts(design)
+    parts += _start_parts(design)
+    parts.append(eigenvalue_table(design))
+    return Summary(
+        title="Designed experiment",
+        outcome=design.status.value,
+        parts=tuple(parts),
+        warnings=design.warnings,
+    )
+
+
+def accuracy_table(design: Design, units: Sequence[str]) -> SummaryTable:
+    """Tabulate the predicted standard deviation of every parameter before and after a design.
+
+    Args:
+        design: The design.
+        units: Unit of each of the p parameters.
+    """
+    rows = []
+    for j in design.wanted:
+        name = Name(name=design.parameters[j], unit=units[j])
+        std_initial, std_final = float(design.initial.std[j]), float(design.final.std[j])
+        rows.append(Row(cells=_accuracy_cells(name, design.theta[j], std_initial, std_final)))
+    for combination in design.combined:
+        cells = _accuracy_cells(
+            combination.expression,
+            combination.value,
+            combination.std_initial,
+            combination.std_final,
+        )
+        rows.append(Row(cells=cells, emphasis=Emphasis.DERIVED))
+
+    return SummaryTable(
+        key="accuracy",
+        title="Predicted standard deviation σ of each parameter after one experiment",
+        columns=columns(
+            "parameter", "value", "σ initial", "relative", "σ optimized", "relative", "smaller by"
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _accuracy_cells(
+    name: Cell, value: float, std_initial: float, std_final: float
+) -> tuple[Cell, ...]:
+    """Return the cells of one parameter or combination."""
+    return (
+        name,
+        Quantity(value=float(value), digits=4),
+        Quantity(value=std_initial, infinite=NOT_ALONE),
+        _relative(std_initial, value),
+        Quantity(value=std_final, infinite=NOT_ALONE),
+        _relative(std_final, value),
+        improvement(std_initial, std_final),
+    )
+
+
+def _relative(std: float, value: float) -> Quantity:
+    """Return a standard deviation in percent of a value; NaN where there is none."""
+    relative = 100.0 * std / abs(value) if value and np.isfinite(std) else float("nan")
+    return Quantity(value=float(relative), digits=2, suffix=" %")
+
+
+def improvement(before: float, after: float) -> str:
+    """Return in words by which factor a standard deviation became smaller.
+
+    Args:
+        before: Standard deviation before.
+        after: Standard deviation after, in the same unit.
+    """
+    if not (np.isfinite(before) and np.isfinite(after) and after > 0 and before > 0):
+        return "-"
+    if before >= after:
+        return f"{before / after:.1f} ×"
+    return f"{after / before:.1f} × larger"
+
+
+def eigenvalue_table(design: Design) -> SummaryTable:
+    """Tabulate eigenvalues (largest first), criterion and cost of both trajectories; of many, the middle ones are left out.
+
+    Args:
+        design: The design.
+    """
+    count = len(design.final.eigenvalues)
+    left_out = count > MAX_EIGENVALUES
+    shown = [0, 1, 2, count - 2, count - 1] if left_out else list(range(count))
+    headings = [f"λ{str(k + 1).translate(SUBSCRIPTS)}" for k in shown]
+    if left_out:
+        headings.insert(3, "…")
+
+    rows = []
+    for trajectory, title, evaluation in (
+        ("initial", "initial", design.initial),
+        ("final", "optimized", design.final),
+    ):
+        descending = evaluation.eigenvalues[::-1]
+        values: list[Cell] = [Quantity(value=float(descending[k]), digits=5) for k in shown]
+        if left_out:
+            values.insert(3, "…")
+        values += [
+            Quantity(value=evaluation.criterion, digits=5),
+            Quantity(value=evaluation.cost, digits=5),
+        ]
+        rows.append(Row(cells=(title, *values), trajectory=trajectory))
+
+    return SummaryTable(
+        key="eigenvalues",
+        title="Eigenvalues of the information, and cost",
+        columns=columns("trajectory", *headings, "criterion", "J"),
+        rows=tuple(rows),
+        detail=True,
+    )
+
+
+def _limit_parts(design: Design) -> list[Part]:
+    """Return a table of the worst margins, and which limits are violated."""
+    if not design.limits:
+        return []
+
+    parts: list[Part] = []
+    violated = [kind for kind, margin in design.limits.items() if margin < 0.0]
+    if violated:
+        parts.append(
+            Paragraph(
+                text=f"Limits are violated: {', '.join(violated)}.",
+                emphasis=Emphasis.STRONG_WARNING,
+                detail=True,
+            )
+        )
+    rows = tuple(
+        Row(cells=(kind, Quantity(value=margin))) for kind, margin in design.limits.items()
+    )
+    parts.append(
+        SummaryTable(
+            key="limits",
+            title="Limits",
+            columns=columns("limit", "worst margin (negative: violated)"),
+            rows=rows,
+            detail=True,
+        )
+    )
+    return parts
+
+
+def _start_parts(design: Design) -> list[Part]:
+    """Return a table of all initial controls of a multistart, and which was the best."""
+    count = len(design.starts)
+    if count < 2:
+        return []
+
+    rows = tuple(
+        Row(
+            cells=(
+                start.name,
+                Quantity(value=start.cost, digits=5),
+                str(start.iterations),
+                start.status.name.lower(),
+            )
+        )
+        for start in design.starts
+    )
+    table = SummaryTable(
+        key="starts",
+        title="Starts",
+        columns=columns("start", "cost", "iterations", "outcome", left=["outcome"]),
+        rows=rows,
+        detail=True,
+    )
+    return [
+        Paragraph(text=f"Best of {count} starts: {design.found_by}.", detail=True),
+        table,
+    ]
+
+
+# ---- estimates
+
+
+def describe_estimate(estimate: Estimate) -> Summary:
+    """Describe estimates with intervals, the fit of every output, and predictions of data that were not fitted.
+
+    Args:
+        estimate: The estimate.
+    """
+    parts: list[Part] = [_estimate_table(estimate)]
+
+    # Parameters that every recording has for itself: the table shows the first value only.
+    for name, values in estimate.per_recording.items():
+        if len(values) > 1:
+            listed = ", ".join(f"{value:.3g}" for value in values)
+            parts.append(Paragraph(text=f"{name} of each recording: {listed}"))
+
+    verdict = "no noise: σ is then not accuracy" if estimate.misfit else "as noise explains them"
+    rms = ", ".join(f"{name} {value:.3g}" for name, value in estimate.residual_rms.items())
+    parts.append(
+        Paragraph(
+            text=f"residuals: χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof:,} degrees of freedom, {verdict}; "
+            f"rms: {rms}"
+        )
+    )
+    parts.append(_residual_table(estimate))
+    parts.append(Paragraph(text=f"{estimate.iterations} iterations, {estimate.seconds:.1f} s"))
+    if estimate.predictions:
+        parts.append(_prediction_table(estimate.predictions))
+    parts.append(
+        Paragraph(
+            text="The formal σ is accuracy only if model and noise are right. The honest σ is a quarter of the interval, which "
+            "allows for residuals that are not noise and for recordings that disagree, but not for the bias of a wrong model.",
+            emphasis=Emphasis.WEAK,
+        )
+    )
+    return Summary(
+        title="Estimated parameters",
+        outcome=estimate.status,
+        parts=tuple(parts),
+        warnings=estimate.warnings,
+    )
+
+
+def _estimate_table(estimate: Estimate) -> SummaryTable:
+    """Tabulate estimates, standard deviations and intervals."""
+    rows = []
+    for j, name in enumerate(estimate.parameters):
+        low, high = estimate.interval[j]
+        uncertainty: tuple[Cell, ...] = (NOT_ALONE, "-", "-")
+        if np.isfinite(estimate.std[j]):
+            uncertainty = (
+                Quantity(value=float(estimate.std[j]), digits=2),
+                Quantity(value=float(0.25 * (high - low)), digits=2),
+                f"{low:.5g} … {high:.5g}",
+            )
+        cells = (
+            Name(name=name, unit=estimate.units[j]),
+            Quantity(value=float(estimate.initial_theta[j]), digits=5),
+            Quantity(value=float(estimate.theta[j]), digits=5),
+            *uncertainty,
+            "yes" if name in estimate.at_bound else "",
+        )
+        rows.append(Row(cells=cells))
+
+    headings = ["parameter", "guess", "estimate", "formal σ", "honest σ", "95 % interval"]
+    if estimate.at_bound:
+        headings.append("at bound")
+    else:
+        rows = [Row(cells=row.cells[:-1]) for row in rows]
+    return SummaryTable(
+        key="estimates",
+        title="Estimates",
+        columns=columns(*headings),
+        rows=tuple(rows),
+    )
+
+
+def _residual_table(estimate: Estimate) -> SummaryTable:
+    """Tabulate the residuals of every output."""
+    rows = tuple(
+        Row(cells=(name, Quantity(value=value))) for name, value in estimate.residual_rms.items()
+    )
+    return SummaryTable(
+        key="residuals",
+        title="Fit of every output",
+        columns=columns("output", "residual rms"),
+        rows=rows,
+        detail=True,
+    )
+
+
+def _prediction_table(predictions: Sequence[Prediction]) -> SummaryTable:
+    """Tabulate prediction errors of the identified and of the nominal model, for the first outputs."""
+    outputs = predictions[0].identified.outputs
+    measured = [
+        j
+        for j in range(len(outputs))
+        if any(np.isfinite(prediction.identified.rms[j]) for prediction in predictions)
+    ]
+    shown = measured[:MAX_COLUMNS]
+
+    rows = []
+    for prediction in predictions:
+        mark = "" if prediction.held_out else " *"
+        errors = [
+            f"{prediction.identified.rms[j]:.3g} / {prediction.nominal.rms[j]:.3g}" for j in shown
+        ]
+        better = prediction.ratio < 1.0
+        rows.append(
+            Row(
+                cells=(
+                    shortened(prediction.name, PREDICTION_NAME_WIDTH) + mark,
+                    *errors,
+                    f"{prediction.ratio:.2f}",
+                ),
+                emphasis=Emphasis.NORMAL if better else Emphasis.WARNING,
+            )
+        )
+
+    held_out = all(prediction.held_out for prediction in predictions)
+    return SummaryTable(
+        key="predictions",
+        title="Prediction of data that were not fitted: rms error of the identified / the nominal model",
+        columns=columns("data", *(outputs[j] for j in shown), "ratio"),
+        rows=tuple(rows),
+        note=""
+        if held_out
+        else "* predicted from a fit to the rest; --held-out keeps recordings out of the fit",
+    )
+
+
+# ---- logs
+
+
+def describe_logs(logs: Sequence[LogSummary]) -> Summary:
+    """Describe what was read: the clock of every log, then the range of its columns.
+
+    Args:
+        logs: Summaries of the logs.
+    """
+    rows = [
+        Row(
+            cells=(
+                shortened(log.file, LOG_NAME_WIDTH),
+                f"{log.rows:,}",
+                Quantity(value=log.duration, digits=4, suffix=" s"),
+                Quantity(value=log.rate, digits=5, suffix=" Hz"),
+                Quantity(value=1e3 * log.jitter_std, digits=2, suffix=" ms"),
+                Quantity(value=1e3 * log.longest_step, digits=3, suffix=" ms"),
+                f"{log.dropped:,} rows" if log.dropped else "-",
+            )
+        )
+        for log in logs
+    ]
+    clocks = SummaryTable(
+        key="clocks",
+        title="Logs as they were read",
+        columns=columns("log", "rows", "time", "rate", "jitter", "longest gap", "left out"),
+        rows=tuple(rows),
+    )
+
+    # Columns of the same name in several logs share a row.
+    by_name: dict[str, list[ColumnSummary]] = {}
+    for log in logs:
+        for column in log.columns:
+            by_name.setdefault(column.name, []).append(column)
+    ranges = SummaryTable(
+        key="ranges",
+        title="Range of their columns (all logs)",
+        columns=columns(
+            "column", "from", "smallest", "largest", "resolution", "empty", left=["from"]
+        ),
+        rows=tuple(Row(cells=_range_cells(found)) for found in by_name.values()),
+    )
+    return Summary(title="", outcome="", parts=(clocks, ranges))
+
+
+def _range_cells(found: Sequence[ColumnSummary]) -> tuple[Cell, ...]:
+    """Return the cells of one column over all logs."""
+    smallest = float(np.nanmin([column.minimum for column in found]))
+    largest = float(np.nanmax([column.maximum for column in found]))
+    resolutions = [column.resolution for column in found if column.resolution > 0.0]
+    empty = float(np.mean([column.empty_share for column in found]))
+    return (
+        found[0].name,
+        found[0].source,
+        Quantity(value=smallest, digits=4),
+        Quantity(value=largest, digits=4),
+        Quantity(value=min(resolutions, default=0.0), digits=2),
+        f"{100 * empty:.0f} %" if empty else "-",
+    )
+
+
+def shortened(path: str, width: int) -> str:
+    """Return the end of a path, which tells files apart.
+
+    Args:
+        path: The path.
+        width: Largest number of characters.
+    """
+    name = path.rsplit("/", 1)[-1]
+    return name if len(name) <= width else f"…{name[1 - width :]}"
+
+
+# ---- Monte Carlo studies
+
+
+def describe_study(study: MonteCarloStudy, units: Sequence[str]) -> Summary:
+    """Describe the observed scatter of estimates beside the Cramér-Rao bound.
+
+    Args:
+        study: The study.
+        units: Unit of each of the p parameters.
+    """
+    parts: list[Part] = [
+        _efficiency_table(study, name, trials, units) for name, trials in study.sets.items()
+    ]
+    parts.append(
+        Paragraph(
+            text="efficiency = Cramér-Rao bound / observed variance; 1 means that the bound is reached.",
+            emphasis=Emphasis.WEAK,
+        )
+    )
+    parts += _covariance_tables(study, units)
+    return Summary(
+        title="Monte Carlo study against the Cramér-Rao bound", outcome="", parts=tuple(parts)
+    )
+
+
+def _efficiency_table(
+    study: MonteCarloStudy, trajectory: str, trials: TrialStatistics, units: Sequence[str]
+) -> SummaryTable:
+    """Tabulate variance, bound and efficiency of every parameter along one trajectory."""
+    rows = []
+    for j, name in enumerate(study.parameters):
+        low, high = trials.efficiency_interval[j]
+        cells = (
+            Name(name=name, unit=units[j]),
+            Quantity(value=float(study.theta[j]), digits=4),
+            Quantity(value=float(trials.mean[j]), digits=5),
+            Quantity(value=float(trials.covariance[j, j]), digits=4),
+            Quantity(value=float(trials.crlb[j, j]), digits=4),
+            f"{trials.efficiency[j]:.3f}",
+            f"{low:.3f} … {high:.3f}",
+        )
+        rows.append(Row(cells=cells, trajectory=trajectory))
+
+    title = (
+        f"{trajectory}: {trials.trials} trials, {trials.failed} failed, {study.measure_rate:g} Hz"
+    )
+    return SummaryTable(
+        key=f"efficiency {trajectory}",
+        title=title,
+        columns=columns(
+            "parameter", "true", "mean", "variance", "bound", "efficiency", "95 % interval"
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _covariance_tables(study: MonteCarloStudy, units: Sequence[str]) -> list[SummaryTable]:
+    """Tabulate covariance, information and bound of all trajectories; of many parameters, the variances only."""
+    if len(study.parameters) > MAX_MATRIX:
+        return [_variance_table(study, units)]
+    return [
+        _matrix_table(
+            study, units, "Monte Carlo covariance", lambda name: study.sets[name].covariance
+        ),
+        _matrix_table(study, units, "Fisher information", lambda name: study.information[name]),
+        _matrix_table(study, units, "Cramér–Rao bound", lambda name: study.sets[name].crlb),
+    ]
+
+
+def _matrix_table(
+    study: MonteCarloStudy, units: Sequence[str], title: str, matrix_of: Callable[[str], Array]
+) -> SummaryTable:
+    """Tabulate the upper triangles of a symmetric matrix of each trajectory side by side."""
+    count = len(study.parameters)
+    cells: list[list[Cell]] = [
+        [Name(name=name, unit=unit)] for name, unit in zip(study.parameters, units, strict=True)
+    ]
+    groups = []
+    for k, trajectory in enumerate(study.sets):
+        groups.append(ColumnGroup(trajectory=trajectory, first=1 + k * count, last=(k + 1) * count))
+        matrix = matrix_of(trajectory)
+        for j in range(count):
+            cells[j] += [
+                "·" if i < j else Quantity(value=float(matrix[j, i])) for i in range(count)
+            ]
+
+    return SummaryTable(
+        key=title,
+        title=title,
+        columns=columns("", *(study.parameters * len(study.sets))),
+        rows=tuple(Row(cells=tuple(row)) for row in cells),
+        groups=tuple(groups),
+        detail=True,
+    )
+
+
+def _variance_table(study: MonteCarloStudy, units: Sequence[str]) -> SummaryTable:
+    """Tabulate observed variance, information and bound of every parameter, trajectories side by side."""
+    cells: list[list[Cell]] = [
+        [Name(name=name, unit=unit)] for name, unit in zip(study.parameters, units, strict=True)
+    ]
+    groups = []
+    for k, (trajectory, trials) in enumerate(study.sets.items()):
+        groups.append(ColumnGroup(trajectory=trajectory, first=1 + 3 * k, last=3 + 3 * k))
+        matrices = (trials.covariance, study.information[trajectory], trials.crlb)
+        for j, row in enumerate(cells):
+            row += [Quantity(value=float(matrix[j, j])) for matrix in matrices]
+
+    return SummaryTable(
+        key="variances",
+        title="Variances (diagonals)",
+        columns=columns("parameter", *(("observed", "information", "bound") * len(study.sets))),
+        rows=tuple(Row(cells=tuple(row)) for row in cells),
+        groups=tuple(groups),
+        detail=True,
+    )
+
+
+# ---- checks
+
+
+def describe_check(check: Check) -> Summary:
+    """Describe predicted standard deviations, what is identifiable in combination only, and the verdict.
+
+    Args:
+        check: The check.
+    """
+    parts: list[Part] = [_check_table(check)]
+
+    for title, groups in (
+        (
+            "Identifiable in combination only, with this control and with random ones from the initial state",
+            check.not_separable,
+        ),
+        ("Not excited here; another control would show", check.not_excited),
+    ):
+        if groups:
+            items = tuple(_group_lines(group, check) for group in groups)
+            parts.append(Listing(title=f"{title}:", items=items))
+
+    parts.append(Paragraph(text=_eigenvalue_sentence(check)))
+    parts.append(Paragraph(text=_self_test_sentence(check)))
+    emphasis = Emphasis.NORMAL if check.ok else Emphasis.WARNING
+    sentences = tuple(f"• {sentence}" for sentence in check.verdict)
+    parts.append(Listing(title="Verdict", items=sentences, emphasis=emphasis))
+    parts.append(Paragraph(text=BEST_CASE, emphasis=Emphasis.WEAK))
+    return Summary(title="", outcome="", parts=tuple(parts))
+
+
+def _check_table(check: Check) -> SummaryTable:
+    """Tabulate predicted and wanted standard deviations, and the repetitions that reach them."""
+    return SummaryTable(
+        key="accuracy",
+        title=f"Accuracy that {check.source} ({check.horizon:g} s) can give",
+        columns=columns("parameter", "value", "σ", "relative σ", "wanted σ", "repetitions", "time"),
+        rows=tuple(_check_row(row) for row in check.rows),
+    )
+
+
+def _check_row(row: ParameterCheck) -> Row:
+    """Return the row of one parameter."""
+    name = Name(name=row.name, unit=row.unit)
+    value = Quantity(value=row.value, digits=4)
+    if row.nuisance:
+        return Row(cells=(name, value, "nuisance", "", "", "", ""), emphasis=Emphasis.WEAK)
+
+    alone = bool(np.isfinite(row.std))
+    relative = 100.0 * row.relative if alone and np.isfinite(row.relative) else float("nan")
+    cells = (
+        name,
+        value,
+        Quantity(value=row.std, infinite=NOT_ALONE),
+        Quantity(value=relative, suffix=" %"),
+        f"{row.wanted:.3g}{'' if row.stated else ' (5 %)'}",
+        f"{row.repetitions:,}" if row.repetitions else "-",
+        f"{row.seconds:,.0f} s" if row.repetitions else "-",
+    )
+    return Row(cells=cells, emphasis=Emphasis.NORMAL if alone else Emphasis.WARNING)
+
+
+def _group_lines(group: ParameterGroup, check: Check) -> str:
+    """Return a group's members, then one combination a line with its value and standard deviation."""
+    if not group.combinations:
+        return str(group)
+
+    accuracy_of = {c.expression: f" = {c.value:.4g} ± {c.std_final:.2g}" for c in check.combined}
+    members = ", ".join(group.members)
+    lines = [
+        f"  {combination}{accuracy_of.get(str(combination), '')}"
+        for combination in group.combinations
+    ]
+    return "\n".join([f"{members} only as", *lines])
+
+
+def _eigenvalue_sentence(check: Check) -> str:
+    """Return the eigenvalues of the information, of many the smallest and the largest ones."""
+    values, selection = check.eigenvalues, ""
+    if len(values) > MAX_LISTED_EIGENVALUES:
+        values = np.concatenate([values[:4], values[-2:]])
+        selection = " (smallest four, largest two)"
+    listed = ", ".join(f"{value:.3g}" for value in values)
+    return f"eigenvalues{selection}: {listed}; condition {check.condition:.3g}"
+
+
+def _self_test_sentence(check: Check) -> str:
+    """Return the result of the derivative self-test."""
+    test = check.self_test
+    passed = "passed" if test.passed else "FAILED"
+    agreement = "agree" if test.roughness is None else "disagree"
+    return (
+        f"derivative self-test {passed}: psi recursion {test.recursion:.1e}, slope {test.slope:.1e}, "
+        f"two steps {agreement}"
+    )
+
+
+# ---- comparisons
+
+
+def describe_comparison(comparison: Comparison) -> Summary:
+    """Describe the result of each method with the same budget, in the order in which they ran; then which is the best.
+
+    Args:
+        comparison: The comparison.
+    """
+    parts: list[Part] = [_method_table(comparison)]
+    if len(comparison.wanted) <= MAX_COLUMNS:
+        parts.append(_method_accuracy_table(comparison))
+
+    for row in comparison.rows:
+        remarks = [] if row.sound else [row.outcome.value]
+        remarks += [row.note] if row.note else []
+        if remarks:
+            parts.append(Paragraph(text=f"{row.title}: {'; '.join(remarks)}"))
+
+    legend = (
+        "worst σ: of the worst combination of parameters, relative to their scales; "
+        "worst margin: over half of the range of its limit."
+    )
+    parts.append(Paragraph(text=f"{legend} {BEST_CASE}", emphasis=Emphasis.WEAK))
+    emphasis = Emphasis.STRONG if comparison.ok else Emphasis.STRONG_WARNING
+    parts += [Paragraph(text=sentence, emphasis=emphasis) for sentence in comparison.verdict]
+    return Summary(title="", outcome="", parts=tuple(parts))
+
+
+def _method_table(comparison: Comparison) -> SummaryTable:
+    """Tabulate cost, criterion, worst standard deviation, effort and margin of each method."""
+    budget = f"{comparison.seconds:g} s"
+    if np.isfinite(comparison.steps):
+        budget += f" or {comparison.steps / 1e6:.3g} million MuJoCo steps"
+
+    headings = ["method"]
+    if comparison.weighted:
+        headings.append("J")
+    headings += [f"φ ({comparison.criterion})", "J over design's", "worst σ"]
+    headings += ["time", "steps", "worst margin"]
+    return SummaryTable(
+        key="methods",
+        title=f"{comparison.source}: each method with {budget}",
+        columns=columns(*headings),
+        rows=tuple(
+            Row(cells=_method_cells(comparison, row), emphasis=_method_emphasis(comparison, row))
+            for row in comparison.rows
+        ),
+        unbroken=True,
+    )
+
+
+def _method_cells(comparison: Comparison, row: MethodResult) -> tuple[Cell, ...]:
+    """Return the cells of one method."""
+    design, (kind, relative_margin) = comparison.design, row.tightest
+
+    against_design = ""
+    if design is not None and row is not design and not np.isnan(row.cost):
+        against_design = f"{-100 * comparison.gain(row, design):+.3g} %"
+    margin = "-"
+    if kind and np.isfinite(relative_margin):
+        margin = f"{100.0 * relative_margin:.2g} % {kind.replace('_', ' ')}"
+
+    costs = [Quantity(value=row.criterion, digits=4)]
+    if comparison.weighted:
+        costs.insert(0, Quantity(value=row.cost, digits=4))
+    return (
+        _method_title(comparison, row),
+        *costs,
+        against_design,
+        Quantity(value=row.worst_relative_std),
+        f"{row.seconds:.1f} s",
+        f"{row.steps / 1e6:.2f} M",
+        margin,
+    )
+
+
+def _method_accuracy_table(comparison: Comparison) -> SummaryTable:
+    """Tabulate every method's standard deviations."""
+    rows = []
+    for row in comparison.rows:
+        cells = [Quantity(value=float(row.std[j])) for j in comparison.wanted]
+        rows.append(
+            Row(
+                cells=(_method_title(comparison, row), *cells),
+                emphasis=_method_emphasis(comparison, row),
+            )
+        )
+
+    names = [
+        Column(heading=Name(name=comparison.parameters[j], unit=comparison.units[j]))
+        for j in comparison.wanted
+    ]
+    return SummaryTable(
+        key="accuracy",
+        title="σ of each parameter",
+        columns=(*columns("method"), *names),
+        rows=tuple(rows),
+        unbroken=True,
+    )
+
+
+def _method_title(comparison: Comparison, row: MethodResult) -> str:
+    """Return a method's title; the best method has an arrow."""
+    return ("▶ " if row is comparison.best else "  ") + row.title
+
+
+def _method_emphasis(comparison: Comparison, row: MethodResult) -> Emphasis:
+    """The design stands out, and so do methods that beat it; results that must not be used recede."""
+    if not row.sound:
+        return Emphasis.WEAK
+    if row.method == DESIGN:
+        return Emphasis.STRONG
+    return Emphasis.WARNING if row in comparison.beating else Emphasis.NORMAL

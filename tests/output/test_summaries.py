@@ -1,0 +1,137 @@
+"""Summaries say the same in the terminal, in Markdown and in figures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import mjfim
+from mjfim.experiment.system import Setup
+from mjfim.output.rerun.text import design_text, estimate_text
+from mjfim.output.rerun.text import render as render_markdown
+from mjfim.output.summaries import (
+    describe_check,
+    describe_design,
+    describe_estimate,
+    describe_study,
+    improvement,
+    shortened,
+)
+from mjfim.output.summary_parts import Name, Quantity, Summary
+from mjfim.output.text import render
+from mjfim.records.design import CombinationAccuracy, Design
+from mjfim.records.estimate import Estimate
+from tests.support.paths import MODELS
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    """The cart-pendulum for 0.4 s."""
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    return Setup(experiment.replace(horizon=0.4, descent={"max_iterations": 1}))
+
+
+@pytest.fixture(scope="module")
+def design(setup: Setup) -> Design:
+    """One iteration."""
+    return mjfim.design(setup)
+
+
+@pytest.fixture(scope="module")
+def estimate(setup: Setup, design: Design) -> Estimate:
+    """From one recording."""
+    return mjfim.identify(setup, [mjfim.simulate(setup, design.trajectory, seed=0)])
+
+
+def printed(summary: Summary) -> str:
+    """Text in a wide terminal without colours."""
+    console = Console(width=200, no_color=True)
+    with console.capture() as capture:
+        console.print(render(summary))
+    return capture.get()
+
+
+def test_every_table_has_a_cell_for_every_column(
+    setup: Setup, design: Design, estimate: Estimate
+) -> None:
+    """A renderer may rely on it."""
+    study = mjfim.monte_carlo(setup, {"final": design.trajectory}, trials=3)
+    summaries = (
+        describe_design(design, setup.units),
+        describe_estimate(estimate),
+        describe_check(mjfim.check(setup)),
+        describe_study(study, setup.units),
+    )
+    for summary in summaries:
+        assert summary.tables
+        for table in summary.tables:
+            assert all(len(row.cells) == len(table.columns) for row in table.rows), table.title
+            assert all(group.last < len(table.columns) for group in table.groups), table.title
+
+
+def test_the_terminal_and_markdown_show_the_same_numbers(setup: Setup, design: Design) -> None:
+    """The Markdown has the details besides."""
+    summary = describe_design(design, setup.units)
+    terminal, markdown = printed(summary), design_text(design, setup.units)
+    for row in summary.table("accuracy").rows:
+        for cell in row.cells:
+            assert str(cell) in terminal and str(cell) in markdown
+    assert "Eigenvalues of the information" in markdown
+    assert "Eigenvalues of the information" not in terminal
+    assert design.status.value in terminal
+
+
+def test_an_estimate_names_units_bounds_and_warnings(estimate: Estimate) -> None:
+    """In the terminal and in Markdown."""
+    odd = replace(estimate, at_bound=("l",), misfit=True, warnings=("residuals are [odd]",))
+    for text in (printed(describe_estimate(odd)), estimate_text(odd, "see the report")):
+        assert "c (N m s/rad)" in text
+        assert "at bound" in text
+        assert "residuals are [odd]" in text
+        assert "no noise: σ is then not accuracy" in text
+    assert "at bound" not in printed(describe_estimate(estimate))
+
+
+def test_what_is_not_identifiable_alone_is_said_so(setup: Setup, design: Design) -> None:
+    """Its combination has a row of its own, and nothing is divided by zero."""
+    std = np.array([np.inf, 0.1, 0.1])
+    combined = CombinationAccuracy(expression="m + 2 l", value=0.0, std_initial=0.4, std_final=0.1)
+    blind = replace(
+        design,
+        initial=replace(design.initial, std=std),
+        final=replace(design.final, std=std),
+        combined=(combined,),
+        combinations=("m and l only as m + 2 l",),
+    )
+    text = printed(describe_design(blind, setup.units))
+    assert "not alone" in text and "m + 2 l" in text and "4.0 ×" in text
+
+
+def test_improvements_in_words() -> None:
+    """Smaller, larger, or neither."""
+    assert improvement(2.0, 0.5) == "4.0 ×"
+    assert improvement(0.5, 2.0) == "4.0 × larger"
+    assert improvement(np.inf, 2.0) == improvement(1.0, 0.0) == "-"
+
+
+def test_cells_in_words() -> None:
+    """Units in brackets; words for numbers that are none."""
+    assert str(Name(name="m", unit="kg")) == "m (kg)" and str(Name(name="ratio")) == "ratio"
+    assert str(Quantity(value=0.12345, digits=2, suffix=" %")) == "0.12 %"
+    assert str(Quantity(value=np.nan)) == "-"
+    assert str(Quantity(value=np.inf, infinite="not alone")) == "not alone"
+
+
+def test_bars_do_not_break_a_markdown_table(design: Design, setup: Setup) -> None:
+    """A name may hold one."""
+    odd = replace(design, parameters=("a|b", *design.parameters[1:]))
+    assert r"a\|b (kg)" in render_markdown(describe_design(odd, setup.units))
+
+
+def test_long_paths_keep_their_end() -> None:
+    """The end tells files apart."""
+    assert shortened("logs/monday/run_1.csv", 20) == "run_1.csv"
+    assert shortened("x" * 30 + "_7.csv", 10) == "…xxx_7.csv"
