@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
+from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
@@ -29,7 +30,7 @@ def task() -> DesignTask:
 
 
 @pytest.fixture(scope="module")
-def design_task(task: DesignTask) -> mjfim.Design:
+def design(task: DesignTask) -> mjfim.Design:
     return design_task(task)
 
 

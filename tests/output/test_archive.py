@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 import mjfim
 from mjfim.atomic_io import replacing
 from mjfim.errors import ModelError, RecordingError
+from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify_system
@@ -46,7 +47,7 @@ def task() -> DesignTask:
 
 
 @pytest.fixture(scope="module")
-def design_task(task: DesignTask) -> Design:
+def design(task: DesignTask) -> Design:
     """Two iterations."""
     return design_task(task)
 

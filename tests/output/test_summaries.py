@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 import mjfim
-from mjfim.experiment.system import Setup
+from mjfim.excitation.task import DesignTask
 from mjfim.output.rerun.text import design_text, estimate_text
 from mjfim.output.rerun.text import render as render_markdown
 from mjfim.output.summaries import (
@@ -28,22 +28,25 @@ from tests.support.paths import MODELS
 
 
 @pytest.fixture(scope="module")
-def setup() -> Setup:
+def task() -> DesignTask:
     """The cart-pendulum for 0.4 s."""
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    return Setup(experiment.replace(horizon=0.4, descent={"max_iterations": 1}))
+    shorter = experiment.replace(horizon=0.4, descent={"max_iterations": 1})
+    return DesignTask.resolve(shorter)
 
 
 @pytest.fixture(scope="module")
-def design(setup: Setup) -> Design:
+def design(task: DesignTask) -> Design:
     """One iteration."""
-    return mjfim.design(setup)
+    return mjfim.design(task.experiment)
 
 
 @pytest.fixture(scope="module")
-def estimate(setup: Setup, design: Design) -> Estimate:
+def estimate(task: DesignTask, design: Design) -> Estimate:
     """From one recording."""
-    return mjfim.identify(setup, [mjfim.simulate(setup, design.trajectory, seed=0)])
+    return mjfim.identify(
+        task.experiment, [mjfim.simulate(task.experiment, design.trajectory, seed=0)]
+    )
 
 
 def printed(summary: Summary) -> str:
@@ -55,15 +58,15 @@ def printed(summary: Summary) -> str:
 
 
 def test_every_table_has_a_cell_for_every_column(
-    setup: Setup, design: Design, estimate: Estimate
+    task: DesignTask, design: Design, estimate: Estimate
 ) -> None:
     """A renderer may rely on it."""
-    study = mjfim.monte_carlo(setup, {"final": design.trajectory}, trials=3)
+    study = mjfim.monte_carlo(task.experiment, {"final": design.trajectory}, trials=3)
     summaries = (
-        describe_design(design, setup.units),
+        describe_design(design, task.system.units),
         describe_estimate(estimate),
-        describe_check(mjfim.check(setup)),
-        describe_study(study, setup.units),
+        describe_check(mjfim.check(task.experiment)),
+        describe_study(study, task.system.units),
     )
     for summary in summaries:
         assert summary.tables
@@ -72,10 +75,10 @@ def test_every_table_has_a_cell_for_every_column(
             assert all(group.last < len(table.columns) for group in table.groups), table.title
 
 
-def test_the_terminal_and_markdown_show_the_same_numbers(setup: Setup, design: Design) -> None:
+def test_the_terminal_and_markdown_show_the_same_numbers(task: DesignTask, design: Design) -> None:
     """The Markdown has the details besides."""
-    summary = describe_design(design, setup.units)
-    terminal, markdown = printed(summary), design_text(design, setup.units)
+    summary = describe_design(design, task.system.units)
+    terminal, markdown = printed(summary), design_text(design, task.system.units)
     for row in summary.table("accuracy").rows:
         for cell in row.cells:
             assert str(cell) in terminal and str(cell) in markdown
@@ -95,7 +98,7 @@ def test_an_estimate_names_units_bounds_and_warnings(estimate: Estimate) -> None
     assert "at bound" not in printed(describe_estimate(estimate))
 
 
-def test_what_is_not_identifiable_alone_is_said_so(setup: Setup, design: Design) -> None:
+def test_what_is_not_identifiable_alone_is_said_so(task: DesignTask, design: Design) -> None:
     """Its combination has a row of its own, and nothing is divided by zero."""
     std = np.array([np.inf, 0.1, 0.1])
     combined = CombinationAccuracy(expression="m + 2 l", value=0.0, std_initial=0.4, std_final=0.1)
@@ -106,7 +109,7 @@ def test_what_is_not_identifiable_alone_is_said_so(setup: Setup, design: Design)
         combined=(combined,),
         combinations=("m and l only as m + 2 l",),
     )
-    text = printed(describe_design(blind, setup.units))
+    text = printed(describe_design(blind, task.system.units))
     assert "not alone" in text and "m + 2 l" in text and "4.0 ×" in text
 
 
@@ -125,10 +128,10 @@ def test_cells_in_words() -> None:
     assert str(Quantity(value=np.inf, infinite="not alone")) == "not alone"
 
 
-def test_bars_do_not_break_a_markdown_table(design: Design, setup: Setup) -> None:
+def test_bars_do_not_break_a_markdown_table(design: Design, task: DesignTask) -> None:
     """A name may hold one."""
     odd = replace(design, parameters=("a|b", *design.parameters[1:]))
-    assert r"a\|b (kg)" in render_markdown(describe_design(odd, setup.units))
+    assert r"a\|b (kg)" in render_markdown(describe_design(odd, task.system.units))
 
 
 def test_long_paths_keep_their_end() -> None:

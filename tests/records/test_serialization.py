@@ -16,6 +16,7 @@ import pytest
 
 import mjfim
 from mjfim.errors import RecordingError
+from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify_system
@@ -158,7 +159,7 @@ def task() -> DesignTask:
 
 
 @pytest.fixture(scope="module")
-def design_task(task: DesignTask) -> Design:
+def design(task: DesignTask) -> Design:
     """Two iterations from two initial controls."""
     return design_task(task)
 
