@@ -49,7 +49,7 @@ def problem_of(name: str, folder: Path, **tables: Any) -> tuple[DesignTask, Inte
     return task, InteriorProblem(base, constraint_set_of(task), 0.2, 0.05)
 
 
-def check_task(
+def check(
     task: DesignTask, problem: InteriorProblem, expansion: Expansion, h: float = 2e-4
 ) -> float:
     """Largest relative error of the slope of the problem's value along random controls."""
@@ -67,13 +67,13 @@ def test_its_slope_is_that_of_simulated_controls(name: str, tmp_path: Path) -> N
     task, problem = problem_of(name, tmp_path)
     point = problem.point(task.control)
     expansion = problem.expand(point)
-    assert check_task(task, problem, expansion) < 5e-3
+    assert check(task, problem, expansion) < 5e-3
     bare, barrier = replace(problem, mu=0.0), expansion.barrier
     assert barrier is not None
     alone = Expansion(
         A=expansion.A, B=expansion.B, a=expansion.a - barrier.a, b=expansion.b - barrier.b
     )
-    assert check_task(task, bare, alone) < 5e-3
+    assert check(task, bare, alone) < 5e-3
     twice = replace(problem, mu=0.4, delta=0.05).expand(point).barrier
     assert twice is not None
     np.testing.assert_allclose(twice.b, 2.0 * barrier.b, rtol=1e-12)
@@ -138,7 +138,7 @@ def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
     expansion = inward.expand(point)
     assert expansion.barrier is not None
     np.testing.assert_array_equal(expansion.a, expansion.barrier.a)
-    assert check_task(task, inward, expansion) < 2e-3
+    assert check(task, inward, expansion) < 2e-3
     assert inward.again(point) is point
 
 
