@@ -331,7 +331,7 @@ class Bench:
         ]
         for start in starts:
             try:
-                other = identify_system(self.task.system, [recording], "newton", start)
+                other = identify_system(self.task.system, [recording], method="newton", start=start)
             except SimulationDivergedError:
                 continue
             best = other if other.success and other.chi2 < best.chi2 else best

@@ -15,7 +15,7 @@ from sysid_signals import Compared, Layout
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, MjfimError, ModelError
 from mjfim.excitation.task import DesignTask
-from mjfim.identification.aligned_recording import Track, track_of
+from mjfim.identification.aligned_recording import AlignedRecording, align
 from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.paths import INERTIAL_FIELDS, SERVO_FIELDS, ParameterPath
 from mjfim.model.spec_writer import state_derived_values
@@ -102,7 +102,7 @@ def export(task: DesignTask, recordings: Sequence[Recording]) -> Exported:
     _require_alike(task)
     parameters, layout, spec = parameters_of(task), Layout.of(task), task.system.source.spec.copy()
     _require_followed(task, parameters, spec)
-    tracks = [track_of(task.system, recording) for recording in recordings]
+    tracks = [align(task.system, recording) for recording in recordings]
     nq, nv = task.system.model.nq, task.system.model.nv
     start = task.plant.initial_state(task.parameters.guess)
     state = sysid.create_initial_state(
@@ -121,7 +121,7 @@ def export(task: DesignTask, recordings: Sequence[Recording]) -> Exported:
     return Exported(task, sequences, parameters, layout, _notes(task))
 
 
-def control_of(task: DesignTask, track: Track) -> Any:
+def control_of(task: DesignTask, track: AlignedRecording) -> Any:
     """TimeSeries of the control at every engine step, held over each sample.
 
     sysid drops the last row; another one makes it step past the end, so that sensors there are seen.

@@ -77,7 +77,7 @@ def identify(
         result = identify_system(
             system,
             [log.recording for log in loaded],
-            "newton" if method == "newton" else "least_squares",
+            method="newton" if method == "newton" else "least_squares",
             held_out=[log.recording for log in kept],
             callback=show,
         )

@@ -9,7 +9,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.identification.robust_covariance import together, uncertainty
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
@@ -45,7 +45,9 @@ class Accuracy:
     detail: Uncertainty | None
 
 
-def accuracy(fit: Fit, solution: Solution, null: NullSpace, times: Sequence[float]) -> Accuracy:
+def accuracy(
+    fit: FitProblem, solution: Solution, null: NullSpace, times: Sequence[float]
+) -> Accuracy:
     """Of a solution. null: what no recording shows;  times: rows over which the residuals of each output hang together"""
     p, theta = fit.system.parameters, fit.theta(solution.unknowns)
     covariance, std = _formal(fit, solution)
@@ -71,7 +73,7 @@ def accuracy(fit: Fit, solution: Solution, null: NullSpace, times: Sequence[floa
     )
 
 
-def _formal(fit: Fit, solution: Solution) -> tuple[Array, Array]:
+def _formal(fit: FitProblem, solution: Solution) -> tuple[Array, Array]:
     """(p, p) covariance and (p,) standard deviations; of what recordings have of their own, the first one's."""
     layout, condensed = fit.layout, solution.condensed
     H = condensed.information()
@@ -97,23 +99,23 @@ def _formal(fit: Fit, solution: Solution) -> tuple[Array, Array]:
     return covariance, spread
 
 
-def _honest(fit: Fit, solution: Solution, times: Sequence[float]) -> Uncertainty | None:
+def _honest(fit: FitProblem, solution: Solution, times: Sequence[float]) -> Uncertainty | None:
     """What the blocks of the last linearisation say; None where a common unknown is not determined."""
     spec = fit.system.experiment.fit
     if not np.isfinite(standard_deviations(solution.condensed.information())).all():
         return None
     recording, rows = fit.blocks
-    total = sum(len(t.t) for t in fit.tracks)
+    total = sum(len(t.t) for t in fit.aligned)
     length = together(times, total)
     if spec.blocks is not None:
-        length = spec.blocks * total / sum(float(t.t[-1]) for t in fit.tracks)
+        length = spec.blocks * total / sum(float(t.t[-1]) for t in fit.aligned)
     rng = np.random.default_rng(spec.seed)
     place = fit.common_values(solution.unknowns)
     return uncertainty(solution.condensed, place, recording, rows, length, spec.bootstrap, rng)
 
 
 def _spread(
-    fit: Fit, theta: Array, std: Array, honest: Uncertainty | None
+    fit: FitProblem, theta: Array, std: Array, honest: Uncertainty | None
 ) -> tuple[Array, Array, Array]:
     """(p,) sandwich deviations, (p, 2) intervals, (p,) deviations between recordings; formal ones where there are none."""
     sandwich, between = np.array(std), np.zeros(len(std))
@@ -131,7 +133,7 @@ def _spread(
     return sandwich, np.column_stack([low, high]), between
 
 
-def _data(fit: Fit, condensed: Condensed) -> Array:
+def _data(fit: FitProblem, condensed: Condensed) -> Array:
     """(p, p) information of the recordings alone about what they share, everything else marginalised."""
     p, layout = fit.system.parameters, fit.layout
     H, places = condensed.information(with_common_rows=False), layout.places

@@ -22,7 +22,7 @@ ON_GRID = 0.01  # of a sample period: stamps that close to the grid are meant to
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class AlignedRecording:
     """A recording as the fit sees it.
 
     t: (M,) [s] from its first row;  y: (M, ny) in the order of the experiment's outputs, NaN where not measured
@@ -51,7 +51,7 @@ class Track:
         return tuple(np.flatnonzero(column) for column in self.measured.T)
 
 
-def track_of(system: System, recording: Recording) -> Track:
+def align(system: System, recording: Recording) -> AlignedRecording:
     """A recording on the experiment's grid. Raises RecordingError where time, control or columns do not fit."""
     names, where, dt = system.outputs.names, recording.name, system.dt
     if len(recording.t) < 3:
@@ -85,7 +85,7 @@ def track_of(system: System, recording: Recording) -> Track:
     t = place * dt if even else t
     if not even or not np.array_equal(place, np.arange(len(t))):
         ctrl = held(t, ctrl, dt)
-    return Track(where, t, _continuous(system, ctrl, y), ctrl, dt, even)
+    return AlignedRecording(where, t, _continuous(system, ctrl, y), ctrl, dt, even)
 
 
 def held(t: Array, ctrl: Array, dt: float) -> Array:

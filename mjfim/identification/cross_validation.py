@@ -15,7 +15,7 @@ from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, minimise
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.recording import Recording
@@ -27,22 +27,26 @@ STEPS = 8  # Levenberg-Marquardt steps of a fit without a part, and of a start
 
 
 def predict(
-    experiment: Experiment, theta: Array, recordings: Sequence[Recording]
+    experiment: Experiment,
+    theta: Array,
+    recordings: Sequence[Recording],
+    *,
+    threads: int | None = None,
 ) -> tuple[PredictionErrors, ...]:
     """Errors of a model at theta: (p,) on recordings; only what belongs to a recording alone is found from it.
 
     Raises RecordingError for unusable recordings.
     """
-    system = System.resolve(experiment)
-    fit = Fit(system, recordings)
+    system = System.resolve(experiment, threads=threads)
+    fit = FitProblem.of(system, recordings)
     return tuple(
-        _errors(fit, np.asarray(theta), _alone(fit.masks, i), fit.tracks[i].name)
-        for i in range(len(fit.tracks))
+        _errors(fit, np.asarray(theta), _alone(fit.masks, i), fit.aligned[i].name)
+        for i in range(len(fit.aligned))
     )
 
 
 def predicted(
-    fit: Fit, at: UnknownValues, held_out: Fit | None, budget: Budget | None = None
+    fit: FitProblem, at: UnknownValues, held_out: FitProblem | None, budget: Budget | None = None
 ) -> tuple[Prediction, ...]:
     """Of held-out recordings; without any, of recordings in turn, or of the last quarter of a single one.
 
@@ -60,7 +64,9 @@ def predicted(
     return tuple(_folds(fit, at, nominal, budget))
 
 
-def _folds(fit: Fit, at: UnknownValues, nominal: Array, budget: Budget) -> Iterator[Prediction]:
+def _folds(
+    fit: FitProblem, at: UnknownValues, nominal: Array, budget: Budget
+) -> Iterator[Prediction]:
     """What the rest says of each part; of much data, pieces all over it."""
     if fit.samples > MANY and len(fit.pieces) > 1:
         places = evenly_spread_indices(
@@ -81,11 +87,11 @@ def _folds(fit: Fit, at: UnknownValues, nominal: Array, budget: Budget) -> Itera
             yield _judged(fit, found.unknowns.theta, nominal, masks, names, False, budget)
 
 
-def _parts(fit: Fit) -> Iterator[tuple[tuple[int, ...], list[np.ndarray]]]:
+def _parts(fit: FitProblem) -> Iterator[tuple[tuple[int, ...], list[np.ndarray]]]:
     """Recordings in at most so many groups, and their masks; of a single one its end."""
-    count = len(fit.tracks)
+    count = len(fit.aligned)
     if count == 1:
-        track = fit.tracks[0]
+        track = fit.aligned[0]
         late = track.t >= (1.0 - REST) * track.t[-1]
         yield (0,), [np.broadcast_to(late[:, None], track.y.shape)]
         return
@@ -99,7 +105,7 @@ def _alone(masks: Sequence[np.ndarray], *kept: int) -> list[np.ndarray]:
 
 
 def _judged(
-    fit: Fit,
+    fit: FitProblem,
     theta: Array,
     nominal: Array,
     masks: Sequence[np.ndarray],
@@ -107,15 +113,19 @@ def _judged(
     held_out: bool,
     budget: Budget,
 ) -> Prediction:
-    name = ", ".join(fit.tracks[i].name for i in tracks)
-    if len(fit.tracks) == 1 and not held_out:
+    name = ", ".join(fit.aligned[i].name for i in tracks)
+    if len(fit.aligned) == 1 and not held_out:
         name = f"last {100 * REST:.0f} % of {name}"
     own, plain = (_errors(fit, value, masks, name, budget) for value in (theta, nominal))
     return Prediction(name=name, identified=own, nominal=plain, held_out=held_out)
 
 
 def _errors(
-    fit: Fit, theta: Array, masks: Sequence[np.ndarray], name: str, budget: Budget | None = None
+    fit: FitProblem,
+    theta: Array,
+    masks: Sequence[np.ndarray],
+    name: str,
+    budget: Budget | None = None,
 ) -> PredictionErrors:
     """Errors at theta: (p,) of the values that the masks: (M, ny) of each track hold.
 
@@ -141,7 +151,7 @@ def _errors(
     return PredictionErrors(name=name, outputs=outputs, rms=rms, mae=mae)
 
 
-def _learned(fit: Fit, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _learned(fit: FitProblem, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
     """What starts are found from."""
     found = [np.zeros_like(mask) for mask in fit.masks]
     for piece in fit.pieces:

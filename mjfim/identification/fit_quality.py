@@ -11,7 +11,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
 from mjfim.identification.residual_tests import whiteness, worst_place
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Whiteness, WorstResidual
 
@@ -20,7 +20,7 @@ HARDLY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Left:
+class FitQuality:
     """predicted: (M, ny) of every recording;  chi2: whitened squares;  dof: degrees of freedom;  rms: by output
 
     white: of every output;  worst: place;  unexplained: outputs whose motion the fit hardly explains
@@ -39,7 +39,7 @@ class Left:
         return [w.time * rows / max(w.count, 1) for w in self.white]
 
 
-def left(fit: Fit, solution: Solution) -> Left:
+def fit_quality(fit: FitProblem, solution: Solution) -> FitQuality:
     """Of a solution. Raises SimulationDivergedError."""
     values, names = fit.predicted(solution.unknowns), fit.system.outputs.names
     if values is None:
@@ -55,14 +55,14 @@ def left(fit: Fit, solution: Solution) -> Left:
         moved = float(
             np.std(
                 np.concatenate(
-                    [t.y[m[:, j], j] for t, m in zip(fit.tracks, fit.masks, strict=True)]
+                    [t.y[m[:, j], j] for t, m in zip(fit.aligned, fit.masks, strict=True)]
                 )
             )
         )
         if rms[name] > HARDLY * moved and float(np.nanmean(columns[j] ** 2)) > 1.0 / HARDLY**2:
             unexplained.append(name)
-    tracks = fit.tracks
-    return Left(
+    tracks = fit.aligned
+    return FitQuality(
         tuple(values),
         float(np.nansum(inside**2)) / fit.loss.inlier_mean_square,
         max(int(np.isfinite(inside).sum()) - solution.condensed.rank, 1),
@@ -73,17 +73,17 @@ def left(fit: Fit, solution: Solution) -> Left:
     )
 
 
-def _whitened(fit: Fit, values: Sequence[Array]) -> list[Array]:
+def _whitened(fit: FitProblem, values: Sequence[Array]) -> list[Array]:
     """(M, ny) whitened measured - predicted of every recording, NaN where nothing counts."""
     out = []
-    for y, track, mask in zip(values, fit.tracks, fit.masks, strict=True):
+    for y, track, mask in zip(values, fit.aligned, fit.masks, strict=True):
         z = np.full(y.shape, np.nan)
         z[mask] = fit.noise.whiten_present(np.where(mask, track.y - y, 0.0), mask)
         out.append(z)
     return out
 
 
-def _inside(fit: Fit, whitened: Sequence[Array]) -> Array:
+def _inside(fit: FitProblem, whitened: Sequence[Array]) -> Array:
     """All whitened residuals; with a robust loss without outliers."""
     every = np.concatenate([z.ravel() for z in whitened])
     return np.where(np.abs(every) <= fit.loss.outlier_threshold, every, np.nan)

@@ -17,16 +17,16 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array, evenly_spread_indices
-from mjfim.budget import Budget, stop_on_interrupt
+from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.accuracy import Accuracy, accuracy
 from mjfim.identification.cross_validation import predicted
-from mjfim.identification.fit_quality import Left, left
-from mjfim.identification.missing_terms import suspects
+from mjfim.identification.fit_quality import FitQuality, fit_quality
+from mjfim.identification.missing_terms import find_missing_terms
 from mjfim.identification.residual_tests import reasons, smaller
-from mjfim.identification.residuals import LARGE, Fit
+from mjfim.identification.residuals import LARGE, FitProblem
 from mjfim.information.null_space import NullSpace, find_null_space
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import ParameterSet
@@ -60,10 +60,13 @@ Found = TypeVar("Found")
 def identify(
     experiment: Experiment,
     recordings: Sequence[Recording],
+    *,
     method: Method = "least_squares",
     start: Array | None = None,
     held_out: Sequence[Recording] = (),
     callback: Callback | None = None,
+    threads: int | None = None,
+    stop: StopToken | None = None,
 ) -> Estimate:
     """Estimate the parameters from recordings, starting at the guess (or `start`: (p,)), as the table `fit` says.
 
@@ -73,17 +76,27 @@ def identify(
     Ctrl-C ends the search with the best so far. Raises RecordingError for unusable recordings, SimulationDivergedError where the
     model diverges at the start.
     """
-    system = System.resolve(experiment)
-    return identify_system(system, recordings, method, start, held_out, callback)
+    system = System.resolve(experiment, threads=threads)
+    return identify_system(
+        system,
+        recordings,
+        method=method,
+        start=start,
+        held_out=held_out,
+        callback=callback,
+        stop=stop,
+    )
 
 
 def identify_system(
     system: System,
     recordings: Sequence[Recording],
+    *,
     method: Method = "least_squares",
     start: Array | None = None,
     held_out: Sequence[Recording] = (),
     callback: Callback | None = None,
+    stop: StopToken | None = None,
 ) -> Estimate:
     """Estimate the parameters of a resolved system. See `identify`."""
     if method not in get_args(Method):
@@ -98,11 +111,14 @@ def identify_system(
     with threadpool_limits(
         1, user_api="blas"
     ):  # small matrices: threads of BLAS only wait for each other
-        return _Identification(system, recordings, method, theta0, held_out, callback).run()
+        return _Identification(system, recordings, method, theta0, held_out, callback).run(stop)
 
 
 def least_squares(
-    fit: Fit, start: Array, search: SearchSettings | None = None, budget: Budget | None = None
+    fit: FitProblem,
+    start: Array,
+    search: SearchSettings | None = None,
+    budget: Budget | None = None,
 ) -> Solution:
     """Levenberg-Marquardt inside the bounds from theta: (p,). Raises SimulationDivergedError where that diverges.
 
@@ -114,7 +130,7 @@ def least_squares(
     return found
 
 
-def newton_raphson(fit: Fit, start: Array, budget: Budget | None = None) -> Solution:
+def newton_raphson(fit: FitProblem, start: Array, budget: Budget | None = None) -> Solution:
     """The paper's iterator `theta - (J'J)^-1 J'r`, its step halved while the residual would grow. Bounds are not used.
 
     Stops when a step is below 1e-5 standard deviations. Raises SimulationDivergedError where the start diverges.
@@ -137,9 +153,9 @@ class _Identification:
         self.clock, self.steps = time.perf_counter(), system.plant.engine_steps
         self.system, self.method, self.theta0, self.callback = system, method, theta0, callback
         self.budget = Budget()
-        fit = Fit(system, recordings)
+        fit = FitProblem.of(system, recordings)
         self.fit = fit.unbounded() if method == "newton" else fit
-        self.held_out = Fit(system, held_out) if held_out else None
+        self.held_out = FitProblem.of(system, held_out) if held_out else None
         self.interrupted = False
         self.stated = system.experiment.fit.noise == "stated"
         if not self.stated and system.noise.correlated:
@@ -147,10 +163,10 @@ class _Identification:
                 f'{system.experiment.source}: fit.noise = "estimated" takes outputs as uncorrelated; take `correlated` out'
             )
 
-    def run(self) -> Estimate:
+    def run(self, stop: StopToken | None) -> Estimate:
         """From the start to the report; Ctrl-C ends the search with the best so far."""
-        with stop_on_interrupt() as stop:
-            self.budget = Budget(stop=stop)
+        with stop_on_interrupt(stop) as token:
+            self.budget = Budget(stop=token)
             return self._run()
 
     def _run(self) -> Estimate:
@@ -165,7 +181,7 @@ class _Identification:
         solution = self._settled(self._best(begin))
         return self._report(solution, null)
 
-    def _null(self, fit: Fit) -> NullSpace:
+    def _null(self, fit: FitProblem) -> NullSpace:
         """Directions of theta that neither the recordings nor the priors tell, at the start of the search."""
         p, some = self.system.parameters, self._sample(fit)
         J, error = (
@@ -177,7 +193,7 @@ class _Identification:
             J, error, p.magnitude, p.scale, np.arange(len(p)), np.zeros_like(weight)
         )
 
-    def _sample(self, fit: Fit) -> Fit:
+    def _sample(self, fit: FitProblem) -> FitProblem:
         """Of the pieces that are quick to look at."""
         return fit.part(self._places)
 
@@ -221,7 +237,7 @@ class _Identification:
         return report
 
     def _minimise(
-        self, fit: Fit, at: UnknownValues, search: SearchSettings, phase: str
+        self, fit: FitProblem, at: UnknownValues, search: SearchSettings, phase: str
     ) -> Solution:
         """Solution of a search. Raises SimulationDivergedError where its start diverges."""
         found = minimise(fit, at, search, self.budget, self._reported(phase))
@@ -232,7 +248,7 @@ class _Identification:
         self.interrupted = self.interrupted or found.interrupted
         return found
 
-    def _placed(self, fit: Fit, begin: UnknownValues, iterations: int) -> UnknownValues:
+    def _placed(self, fit: FitProblem, begin: UnknownValues, iterations: int) -> UnknownValues:
         """Starts that the data show roughly, at their best for theta as it is: far from it, theta would follow their errors."""
         if not fit.measured or self.interrupted:
             return begin
@@ -322,11 +338,11 @@ class _Identification:
 
     def _report(self, solution: Solution, null: NullSpace) -> Estimate:
         system, fit, at = self.system, self.fit, solution.unknowns
-        p, theta, rest = system.parameters, fit.theta(at), left(fit, solution)
+        p, theta, rest = system.parameters, fit.theta(at), fit_quality(fit, solution)
         missing = self._afterwards(lambda: () if rest.unexplained else self._missing(at))
         predictions = self._afterwards(lambda: predicted(fit, at, self.held_out, self.budget))
         why = reasons(rest.chi2, rest.dof, self.stated, rest.white, missing)
-        known = accuracy(fit, solution, null, rest.times(sum(len(t.t) for t in fit.tracks)))
+        known = accuracy(fit, solution, null, rest.times(sum(len(t.t) for t in fit.aligned)))
         near = 1e-6 * p.magnitude
         outside = bool(((theta < p.lower - near) | (theta > p.upper + near)).any())
         touch = np.minimum(theta - p.lower, p.upper - theta) < near
@@ -348,7 +364,7 @@ class _Identification:
             residual_rms=rest.rms,
             at_bound=at_bound,
             predicted=rest.predicted,
-            recordings=tuple(self._seen(i) for i in range(len(fit.tracks))),
+            recordings=tuple(self._seen(i) for i in range(len(fit.aligned))),
             warnings=tuple(self._sentences(solution, rest, known, why, missing, at_bound, outside)),
             combinations=tuple(str(group) for group in known.groups),
             data=known.data,
@@ -382,11 +398,11 @@ class _Identification:
     def _missing(self, at: UnknownValues) -> tuple[MissingTerm, ...]:
         """Terms that the model lacks, from recordings, or of much data from pieces of them."""
         some = self._sample(self.fit)
-        return suspects(some, self.fit.recordings, self._places, self._sampled(at))
+        return find_missing_terms(some, self.fit.recordings, self._places, self._sampled(at))
 
     def _seen(self, i: int) -> Recording:
         """A recording in the order of the outputs, as it was fitted."""
-        track = self.fit.tracks[i]
+        track = self.fit.aligned[i]
         held = self.fit.recordings[i].ctrl[: len(track.t) - 1]
         return Recording(
             t=track.t, ctrl=held, y=track.y, outputs=self.system.outputs.names, name=track.name
@@ -395,7 +411,7 @@ class _Identification:
     def _sentences(
         self,
         solution: Solution,
-        rest: Left,
+        rest: FitQuality,
         known: Accuracy,
         why: Sequence[str],
         missing: Sequence[MissingTerm],

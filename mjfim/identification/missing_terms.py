@@ -16,7 +16,7 @@ from scipy.stats import norm
 
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.model.coordinates import scalar_joints
 from mjfim.model.units import JOINT_FIELD_UNITS
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -42,8 +42,8 @@ class Candidate:
     at: float
 
 
-def suspects(
-    fit: Fit, recordings: Sequence[Recording], pieces: np.ndarray, at: UnknownValues
+def find_missing_terms(
+    fit: FitProblem, recordings: Sequence[Recording], pieces: np.ndarray, at: UnknownValues
 ) -> tuple[MissingTerm, ...]:
     """Terms that would explain significant residuals, the strongest first; none where nothing does.
 
@@ -67,7 +67,7 @@ def suspects(
     own = [wider.parameters.names.index(name) for name in system.parameters.names]
     theta = np.array(wider.parameters.guess)
     theta[own] = at.theta
-    other = Fit(wider, recordings).part(pieces).reweighted(fit.noise)
+    other = FitProblem.of(wider, recordings).part(pieces).reweighted(fit.noise)
     found = other.condense(replace(at, theta=theta))
     if found is None:
         return ()

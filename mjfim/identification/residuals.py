@@ -16,9 +16,9 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import track_of
+from mjfim.identification.aligned_recording import align
 from mjfim.identification.segments import cut, groups, whole
-from mjfim.identification.unknowns import Layout
+from mjfim.identification.unknowns import UnknownLayout
 from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
@@ -62,13 +62,20 @@ class Rows:
 CALIBRATION_SAMPLES = 1000
 
 
-class Fit:
+class FitProblem:
     """Residuals of an experiment against recordings, as functions of the unknowns (`levenberg_marquardt.Problem`).
 
     The common unknowns are theta without the private deviations of a start; every piece has its own of those. Pieces that
     start where the data say have all of the state as private unknowns.
     data_only: leave priors and bounds out
     """
+
+    @classmethod
+    def of(
+        cls, system: System, recordings: Sequence[Recording], *, data_only: bool = False
+    ) -> FitProblem:
+        """The problem of a system and recordings; data_only leaves priors and bounds out."""
+        return cls(system, recordings, data_only)
 
     def __init__(
         self, system: System, recordings: Sequence[Recording], data_only: bool = False
@@ -80,23 +87,23 @@ class Fit:
         self.loss = RobustLoss(kind=fit.loss, scale=fit.loss_scale)
         self.noise: Noise = system.noise
         self.recordings = list(recordings)
-        self.tracks = [track_of(system, r) for r in recordings]
+        self.aligned = [align(system, r) for r in recordings]
 
         # Difference steps suit the motion that was recorded; a part of it shows how strongly each parameter acts.
-        longest = max(self.tracks, key=lambda track: len(track.ctrl))
+        longest = max(self.aligned, key=lambda track: len(track.ctrl))
         self.system = system = system.calibrated(p.guess, longest.ctrl[:CALIBRATION_SAMPLES])
         self.measured = fit.start == "measured" or fit.segments is not None
         if self.measured:
             self._require_free()
             self.free = np.eye(system.space.nx)
-            self.pieces = cut(system, self.tracks, fit.segments, self._lead())
+            self.pieces = cut(system, self.aligned, fit.segments, self._lead())
         else:
             self.free = p.initial_state_derivative(system.space.nx)[:, p.initial_deviations]
-            self.pieces = whole(self.tracks, system.plant.nominal_initial_state)
-        self.masks = [self._used(i) for i in range(len(self.tracks))]
+            self.pieces = whole(self.aligned, system.plant.nominal_initial_state)
+        self.masks = [self._used(i) for i in range(len(self.aligned))]
         if not any(mask.any() for mask in self.masks):
             raise RecordingError("the recordings hold no measured value after t = 0")
-        self.layout = Layout.of(p, len(self.tracks), self.measured, not data_only)
+        self.layout = UnknownLayout.of(p, len(self.aligned), self.measured, not data_only)
         self.pins, self.pinned_at = np.zeros((0, len(p))), np.array(p.guess)
         self._offsets = self._partition()
 
@@ -119,14 +126,14 @@ class Fit:
 
     def _used(self, i: int) -> np.ndarray:
         """(M, ny) measured values of a track; what is measured at a stated start tells nothing."""
-        mask = np.array(self.tracks[i].measured)
+        mask = np.array(self.aligned[i].measured)
         if not self.measured:
             mask[0] = False
         return mask
 
     def _partition(self) -> np.ndarray:
         """First block of every piece, and the number of all blocks."""
-        total = sum(len(t.t) for t in self.tracks)
+        total = sum(len(t.t) for t in self.aligned)
         fine = max(FINE, -(-total // BLOCKS))
         counts = [max(round((p.rows.stop - p.rows.start) / fine), 1) for p in self.pieces]
         return np.concatenate([[0], np.cumsum(counts)])
@@ -193,25 +200,25 @@ class Fit:
         ]
         return tracks, np.repeat(rows, counts)
 
-    def unbounded(self) -> Fit:
+    def unbounded(self) -> FitProblem:
         """The same without bounds."""
         other = copy.copy(self)
         other.layout = self.layout.unbounded()
         return other
 
-    def frozen(self) -> Fit:
+    def frozen(self) -> FitProblem:
         """The same at any theta, whose shared part stays as it is."""
         other = copy.copy(self)
         other.layout, other.pins = self.layout.frozen(), self.pins[:0]
         return other
 
-    def reweighted(self, noise: Noise) -> Fit:
+    def reweighted(self, noise: Noise) -> FitProblem:
         """The same with other noise."""
         other = copy.copy(self)
         other.noise = noise
         return other
 
-    def part(self, pieces: np.ndarray) -> Fit:
+    def part(self, pieces: np.ndarray) -> FitProblem:
         """Of some pieces alone."""
         other = copy.copy(self)
         other.pieces = tuple(self.pieces[i] for i in pieces)
@@ -221,7 +228,7 @@ class Fit:
         other._offsets = other._partition()
         return other
 
-    def masked(self, masks: Sequence[np.ndarray]) -> Fit:
+    def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
         """Of some measured values alone. masks: (M, ny) for every track"""
         other = copy.copy(self)
         other.masks = [mask & own for mask, own in zip(masks, self.masks, strict=True)]
@@ -237,7 +244,7 @@ class Fit:
 
     def predicted(self, at: UnknownValues) -> list[Array] | None:
         """(M, ny) of every track at its measured times, NaN outside of all pieces; None where a simulation diverges."""
-        found = [np.full(track.y.shape, np.nan) for track in self.tracks]
+        found = [np.full(track.y.shape, np.nan) for track in self.aligned]
         for rows in self._rows(at, derivatives=False):
             if rows is None:
                 return None
@@ -246,7 +253,7 @@ class Fit:
 
     def errors(self, values: Sequence[Array]) -> list[Array]:
         """Predicted - measured of every output, those of all tracks in one row. values: (M, ny) of every track"""
-        parts = list(zip(values, self.tracks, self.masks, strict=True))
+        parts = list(zip(values, self.aligned, self.masks, strict=True))
         return [
             np.concatenate([(y - track.y)[mask[:, j], j] for y, track, mask in parts])
             for j in range(len(self.system.outputs))
@@ -256,7 +263,7 @@ class Fit:
         """The fitted motion of one track on its grid, jumps between pieces and all; None where it diverges."""
         plant, whole, theta = (
             self.system.plant,
-            self.tracks[track],
+            self.aligned[track],
             self.layout.of_recording(at, track),
         )
         states = np.full((len(whole.ctrl) + 1, plant.nominal_initial_state.size), np.nan)
@@ -346,7 +353,7 @@ class Fit:
         for rows, other in zip_longest(fine, coarse):
             if rows is None:
                 raise SimulationDivergedError(
-                    f"{self.tracks[0].name}: the simulation diverges under its control"
+                    f"{self.aligned[0].name}: the simulation diverges under its control"
                 )
             J = self._columns(rows)
             error = np.zeros_like(J) if other is None else self._columns(other) - J
@@ -372,7 +379,7 @@ class Fit:
         """Which values are there, (k, ny), and their whitened residuals, one after the other."""
         track = self.pieces[rows.piece].track
         mask = self.masks[track][rows.rows]
-        residual = np.where(mask, rows.y - self.tracks[track].y[rows.rows], 0.0)
+        residual = np.where(mask, rows.y - self.aligned[track].y[rows.rows], 0.0)
         return mask, self.noise.whiten_present(residual, mask)
 
     def _linear(self, rows: Rows) -> tuple[np.ndarray, Array, Array]:
@@ -477,7 +484,7 @@ class Fit:
         if not len(self.layout.own):
             yield from ((0, batch) for batch in groups(self.pieces, most))
             return
-        for track in range(len(self.tracks)):
+        for track in range(len(self.aligned)):
             mine = [i for i, piece in enumerate(self.pieces) if piece.track == track]
             for batch in groups([self.pieces[i] for i in mine], most):
                 yield track, [mine[k] for k in batch]
@@ -494,13 +501,13 @@ class Fit:
     def _control(self, piece: int, longest: int) -> Array:
         """(longest, nu) from the piece's begin; held where the track is over."""
         own = self.pieces[piece]
-        ctrl = self.tracks[own.track].ctrl[own.begin : own.begin + longest]
+        ctrl = self.aligned[own.track].ctrl[own.begin : own.begin + longest]
         return np.concatenate([ctrl, np.repeat(ctrl[-1:], longest - len(ctrl), axis=0)])
 
     def _read(self, theta: Array, piece: int, place: int, response: Response) -> Rows | None:
         """What a response says of the rows of one piece that fall into its stretch; None where none does."""
         own, p = self.pieces[piece], self.system.parameters
-        track = self.tracks[own.track]
+        track = self.aligned[own.track]
         late = float(p.delay_derivative @ theta) / track.dt
         wanted = track.t[own.rows] / track.dt - own.begin - late
         n = response.y.shape[1] - 1

@@ -14,7 +14,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import Track
+from mjfim.identification.aligned_recording import AlignedRecording
 from mjfim.plant.outputs import outputs_by_state
 
 NEAR = 12  # rows to either side from which a start is read off
@@ -23,7 +23,7 @@ ALIKE = 1.1  # ratio of lengths up to which pieces share a batch
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class Segment:
     """A run of samples of one track. track: its place;  begin: first sample;  samples: of the grid
 
     rows: of the track that belong to it;  start: (ns,) state at its begin, where the search starts
@@ -36,14 +36,16 @@ class Piece:
     start: Array
 
 
-def whole(tracks: Sequence[Track], start: Array) -> tuple[Piece, ...]:
+def whole(tracks: Sequence[AlignedRecording], start: Array) -> tuple[Segment, ...]:
     """Every track one piece from the stated start: (ns,)."""
-    return tuple(Piece(i, 0, len(t.ctrl), slice(0, len(t.t)), start) for i, t in enumerate(tracks))
+    return tuple(
+        Segment(i, 0, len(t.ctrl), slice(0, len(t.t)), start) for i, t in enumerate(tracks)
+    )
 
 
 def cut(
-    system: System, tracks: Sequence[Track], length: float | None, lead: float
-) -> tuple[Piece, ...]:
+    system: System, tracks: Sequence[AlignedRecording], length: float | None, lead: float
+) -> tuple[Segment, ...]:
     """Pieces of a length [s], None: whole tracks, each with the start that the data show.
 
     lead: [s] by which a piece is simulated before its first row, the longest delay of the outputs
@@ -60,11 +62,13 @@ def cut(
             begins, bounds[1:], edges[:-1], edges[1:], starts, strict=True
         ):
             if last > first:
-                found.append(Piece(i, begin, int(end) - begin, slice(int(first), int(last)), start))
+                found.append(
+                    Segment(i, begin, int(end) - begin, slice(int(first), int(last)), start)
+                )
     return tuple(found)
 
 
-def _bounds(track: Track, length: float | None) -> np.ndarray:
+def _bounds(track: AlignedRecording, length: float | None) -> np.ndarray:
     """Samples at which pieces begin, and the end; all of nearly the same length."""
     N = len(track.ctrl)
     if length is None:
@@ -77,7 +81,7 @@ def _bounds(track: Track, length: float | None) -> np.ndarray:
     return np.linspace(0, N, count + 1).astype(int)
 
 
-def measured_starts(system: System, track: Track, begins: np.ndarray) -> Array:
+def measured_starts(system: System, track: AlignedRecording, begins: np.ndarray) -> Array:
     """(n, ns) states at samples: what the log shows; what it does not show, as the model at the guess goes.
 
     A line through position and velocity of the rows around, a parabola where velocities were not measured.
@@ -102,7 +106,7 @@ def measured_starts(system: System, track: Track, begins: np.ndarray) -> Array:
     return states
 
 
-def _local(track: Track, column: int, t0: float, degree: int) -> tuple[float, float]:
+def _local(track: AlignedRecording, column: int, t0: float, degree: int) -> tuple[float, float]:
     """Value and slope at t0 of a polynomial through the rows around that hold a value of a column."""
     seen = track.seen[column]
     middle = int(np.searchsorted(seen, np.searchsorted(track.t, t0)))
@@ -115,7 +119,7 @@ def _local(track: Track, column: int, t0: float, degree: int) -> tuple[float, fl
     return float(fitted[0]), float(fitted[1] / unit)
 
 
-def _nearest(track: Track, columns: Sequence[int], t0: float) -> Array:
+def _nearest(track: AlignedRecording, columns: Sequence[int], t0: float) -> Array:
     """The measured values of some columns nearest to t0."""
     seen = track.seen[columns[0]]  # components of one quaternion are measured together
     after = int(np.clip(np.searchsorted(seen, np.searchsorted(track.t, t0)), 0, len(seen) - 1))
@@ -123,7 +127,7 @@ def _nearest(track: Track, columns: Sequence[int], t0: float) -> Array:
     return np.asarray(track.y[near][list(columns)])
 
 
-def _nominal(system: System, track: Track, begins: np.ndarray) -> Array:
+def _nominal(system: System, track: AlignedRecording, begins: np.ndarray) -> Array:
     """(n, ns) states of the model at the guess from the stated start; the start itself where that diverges."""
     start = system.plant.initial_state(system.parameters.guess)
     out = np.tile(start, (len(begins), 1))
@@ -136,7 +140,7 @@ def _nominal(system: System, track: Track, begins: np.ndarray) -> Array:
     return np.array(rolled.states[0][begins]) if rolled.finite[0] else out
 
 
-def _shown(system: System, track: Track) -> dict[int, int]:
+def _shown(system: System, track: AlignedRecording) -> dict[int, int]:
     """Output that shows a component of the state, by its address, where the track has values of it."""
     return {
         state: i
@@ -145,7 +149,7 @@ def _shown(system: System, track: Track) -> dict[int, int]:
     }
 
 
-def groups(pieces: Sequence[Piece], most: int) -> Iterator[list[int]]:
+def groups(pieces: Sequence[Segment], most: int) -> Iterator[list[int]]:
     """Places of pieces that are simulated in one batch: of like length, together at most so many samples."""
     order = sorted(range(len(pieces)), key=lambda i: pieces[i].samples)
     batch: list[int] = []

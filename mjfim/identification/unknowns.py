@@ -17,7 +17,7 @@ from mjfim.optimize.levenberg_marquardt import UnknownValues
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class UnknownLayout:
     """shared: (s,), own: (e,), private: (n,) places in theta;  recordings: K;  c = s + K e common columns
 
     lower, upper: (c,);  free: the start is private as a whole, and theta holds none of it
@@ -33,25 +33,25 @@ class Layout:
     free: bool
 
     @staticmethod
-    def of(parameters: ParameterSet, recordings: int, free: bool, bounded: bool) -> Layout:
+    def of(parameters: ParameterSet, recordings: int, free: bool, bounded: bool) -> UnknownLayout:
         """free: starts are measured;  bounded: False: without bounds"""
         p = parameters
         own = p.recording_specific & ~p.initial_deviations
         shared, each = np.flatnonzero(~p.recording_specific), np.flatnonzero(own)
         places = np.concatenate([shared, np.tile(each, recordings)])
         lower, upper = p.lower[places], p.upper[places]
-        found = Layout(
+        found = UnknownLayout(
             p, shared, each, np.flatnonzero(p.initial_deviations), recordings, lower, upper, free
         )
         return found if bounded else found.unbounded()
 
-    def unbounded(self) -> Layout:
+    def unbounded(self) -> UnknownLayout:
         """The same without bounds."""
         return replace(
             self, lower=np.full(self.columns, -np.inf), upper=np.full(self.columns, np.inf)
         )
 
-    def frozen(self) -> Layout:
+    def frozen(self) -> UnknownLayout:
         """The same with the shared parameters staying as they are."""
         s = len(self.shared)
         return replace(self, shared=self.shared[:0], lower=self.lower[s:], upper=self.upper[s:])

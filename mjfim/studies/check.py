@@ -13,7 +13,7 @@ from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability
 from mjfim.information.marginal import shared
@@ -75,8 +75,8 @@ def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
 
 def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
     """Check what recordings tell; derivatives are tested along the longest of them."""
-    fit = Fit(system, recordings, data_only=True)
-    longest = max(fit.tracks, key=lambda track: len(track.ctrl))
+    fit = FitProblem.of(system, recordings, data_only=True)
+    longest = max(fit.aligned, key=lambda track: len(track.ctrl))
     task = DesignTask.along(system, longest.ctrl[:MOST_TESTED_SAMPLES])
 
     problem, point = _evaluated(task, task.initial)
@@ -91,7 +91,7 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
 
     count = len(recordings)
     source = f"{count} recording{'s' if count > 1 else ''}"
-    duration = float(sum(track.t[-1] for track in fit.tracks))
+    duration = float(sum(track.t[-1] for track in fit.aligned))
     data = _shared(task, [rows.T @ rows for rows, _ in recorded])
     return _concluded(task, seen, data, duration, source, tested)
 

@@ -21,7 +21,7 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.identify import least_squares, newton_raphson
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.information.identifiability import require_visible
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
@@ -177,7 +177,7 @@ def _exact(system: System, curve: Trajectory) -> tuple[Array, Array]:
 
 def _shared(system: System, trials: Trials) -> Shared:
     """Fit of the mean measurement from the guess, with its Jacobian and the Jacobian's derivative."""
-    fit = Fit(system, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
+    fit = FitProblem.of(system, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
     theta = newton_raphson(fit, system.parameters.guess).unknowns.theta
     h = 1e-3 * system.parameters.magnitude
 
@@ -223,7 +223,7 @@ def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None)
         if not len(active):
             break
     for i in active:
-        fit = Fit(trials.system, [trials.recording(trials.measured[i])], data_only=True)
+        fit = FitProblem.of(trials.system, [trials.recording(trials.measured[i])], data_only=True)
         solution = least_squares(fit, shared.theta)
         theta[i] = solution.unknowns.theta if solution.success else np.nan
     return theta

@@ -10,7 +10,12 @@ import pytest
 
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
-from mjfim.identification.aligned_recording import Track, held, measured_trajectory, track_of
+from mjfim.identification.aligned_recording import (
+    AlignedRecording,
+    align,
+    held,
+    measured_trajectory,
+)
 from mjfim.plant.delay import OutputDelay
 from mjfim.records.recording import Recording
 from tests.support.numerics import Array, body_task, cart_task
@@ -98,31 +103,31 @@ def test_a_recording_on_the_grid_is_taken_as_it_is(task: DesignTask) -> None:
     plain = log(task)
     jitter = np.random.default_rng(1).uniform(-4e-5, 4e-5, len(plain.t))
     for t in (plain.t, plain.t + 1.7e9, plain.t + jitter):
-        track = track_of(task.system, log(task, t=t))
+        track = align(task.system, log(task, t=t))
         assert track.even
         np.testing.assert_allclose(track.t, plain.t, rtol=0, atol=1e-15)
         np.testing.assert_array_equal(track.ctrl, plain.ctrl)
         np.testing.assert_array_equal(track.y, plain.y)
     swapped = log(task, y=plain.y[:, [3, 0]], outputs=("qvel:hinge", "qpos:slide"))
-    track = track_of(task.system, swapped)
+    track = align(task.system, swapped)
     np.testing.assert_array_equal(track.y[:, [3, 0]], swapped.y)
     assert np.isnan(track.y[:, 1:3]).all()
     assert track.measured.sum() == 2 * len(plain.t)
     more = log(task, ctrl=np.concatenate([plain.ctrl, np.full((1, 1), np.nan)]))
-    np.testing.assert_array_equal(track_of(task.system, more).ctrl, plain.ctrl)
+    np.testing.assert_array_equal(align(task.system, more).ctrl, plain.ctrl)
 
 
 def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> None:
     """And its values; only the control is averaged. Missing rows of an even log leave it even."""
     plain = log(task)
     t = np.sort(np.random.default_rng(2).uniform(0.0, 0.3, len(plain.t)))
-    track = track_of(task.system, log(task, t=t + 5.0))
+    track = align(task.system, log(task, t=t + 5.0))
     assert not track.even
     np.testing.assert_allclose(track.t, t - t[0], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(track.y, plain.y)
     np.testing.assert_allclose(track.ctrl, held(t - t[0], plain.ctrl, task.dt), rtol=0, atol=1e-9)
     kept = np.delete(np.arange(31), [4, 5, 20])
-    sparse = track_of(
+    sparse = align(
         task.system, log(task, t=plain.t[kept], ctrl=plain.ctrl[kept[:-1]], y=plain.y[kept])
     )
     assert sparse.even
@@ -136,7 +141,7 @@ def test_two_rows_of_one_sample_do_not_shift_the_control(task: DesignTask) -> No
     plain = log(task)
     t = np.array(plain.t)
     t[8] = t[7] + 0.005 * task.dt
-    track = track_of(task.system, log(task, t=t))
+    track = align(task.system, log(task, t=t))
     np.testing.assert_allclose(track.ctrl[8], plain.ctrl[8], rtol=0, atol=0.05)
     np.testing.assert_allclose(track.ctrl[7], plain.ctrl[8], rtol=0, atol=0.05)
 
@@ -164,7 +169,7 @@ def test_two_rows_of_one_sample_do_not_shift_the_control(task: DesignTask) -> No
 )
 def test_faults_are_named(task: DesignTask, changes: dict[str, Any], words: str) -> None:
     with pytest.raises(RecordingError, match=rf"x\.csv: .*{words}"):
-        track_of(task.system, log(task, **changes))
+        align(task.system, log(task, **changes))
 
 
 def test_quaternions_get_the_sign_of_the_model(body: DesignTask) -> None:
@@ -177,7 +182,7 @@ def test_quaternions_get_the_sign_of_the_model(body: DesignTask) -> None:
         columns = [names.index(f"qpos:{joint}.q{a}") for a in "wxyz"]
         flipped[:, columns] *= rng.choice([-1.0, 1.0], (len(y), 1))
         flipped[10:20, columns] = np.nan
-    track = track_of(
+    track = align(
         body.system,
         Recording(t=np.arange(len(y)) * body.dt, ctrl=ctrl, y=flipped, outputs=names, name="x.csv"),
     )
@@ -191,7 +196,7 @@ def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
     some = body_task(tmp_path, noise={"qpos:float.qx": 0.01, "qpos:ball.qy": 0.01}, horizon=3.0)
     y = some.plant.measure(some.parameters.guess[None], some.control)[0][0]
     assert (np.ptp(np.sign(y), axis=0) == 2.0).any(), "nothing crosses zero"
-    track = track_of(
+    track = align(
         some.system,
         Recording(
             t=np.arange(len(y)) * some.dt, ctrl=some.control, y=y, outputs=some.system.outputs.names
@@ -263,7 +268,7 @@ def test_a_track_does_not_change(task: DesignTask) -> None:
     """Its arrays are read-only, and the recording's are left as they were."""
     plain = log(task)
     before = np.array(plain.y)
-    track: Track = track_of(task.system, plain)
+    track: AlignedRecording = align(task.system, plain)
     with pytest.raises(ValueError, match="read-only"):
         track.y[0, 0] = 1.0
     np.testing.assert_array_equal(plain.y, before)

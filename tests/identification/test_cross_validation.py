@@ -9,7 +9,7 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify_system
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.recordings.plausibility import plausibility_remarks
 from mjfim.records.recording import Recording
 from tests.support.paths import ROOT
@@ -36,7 +36,7 @@ def test_held_out_errors_are_the_noise_and_the_nominal_ones_are_not(base: mjfim.
     np.testing.assert_allclose(prediction.identified.rms, 0.05, rtol=0.12)
     assert (prediction.nominal.rms > 1.5 * prediction.identified.rms).any()
     assert prediction.ratio < 0.8
-    alone = mjfim.predict(task, found.theta, [recorded(task, 1, 1.5)])
+    alone = mjfim.predict(task.experiment, found.theta, [recorded(task, 1, 1.5)])
     np.testing.assert_allclose(alone[0].rms, prediction.identified.rms, rtol=1e-9)
     assert (alone[0].mae < alone[0].rms).all()
 
@@ -99,7 +99,7 @@ def test_every_recording_has_its_own_bias(base: mjfim.Experiment) -> None:
     ).misfit
     alone = identify_system(task.system, recordings[:1])
     assert alone.theta[j] == pytest.approx(found.theta[j], abs=0.01)
-    fit = Fit(task.system, recordings)
+    fit = FitProblem.of(task.system, recordings)
     H = fit.dense(fit.begin(found.theta)).J
     order = [*range(3), 3]  # m, l, c, the first recording's bias
     covariance = np.linalg.inv(H.T @ H)

@@ -15,9 +15,9 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification.aligned_recording import track_of
+from mjfim.identification.aligned_recording import align
 from mjfim.identification.identify import identify, identify_system, least_squares, newton_raphson
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
 from mjfim.studies.campaign import identified
@@ -48,7 +48,7 @@ def noiseless(task: DesignTask, recording: Recording) -> Recording:
 def test_noise_free_data_give_the_true_parameters(
     task: DesignTask, recording: Recording, method: str
 ) -> None:
-    estimate = identify_system(task.system, [noiseless(task, recording)], method)
+    estimate = identify_system(task.system, [noiseless(task, recording)], method=method)
     np.testing.assert_allclose(estimate.theta, task.parameters.true, rtol=1e-7)
     assert estimate.success
 
@@ -56,7 +56,7 @@ def test_noise_free_data_give_the_true_parameters(
 def test_both_methods_find_the_minimum_of_the_weighted_squares(
     task: DesignTask, recording: Recording
 ) -> None:
-    fit = Fit(task.system, [recording])
+    fit = FitProblem.of(task.system, [recording])
 
     def cost(theta: np.ndarray) -> float:
         y, _ = task.plant.measure(theta[None], recording.ctrl)
@@ -77,7 +77,7 @@ def test_both_methods_find_the_minimum_of_the_weighted_squares(
 def test_jacobian_agrees_with_independent_differences(
     task: DesignTask, recording: Recording
 ) -> None:
-    fit, theta = Fit(task.system, [recording]), np.array([2.2, 1.1, 1.2])
+    fit, theta = FitProblem.of(task.system, [recording]), np.array([2.2, 1.1, 1.2])
     value = fit.dense(fit.begin(theta))
     assert value is not None
     for j in range(3):
@@ -167,17 +167,15 @@ def test_recording_with_fewer_outputs_and_gaps_still_fits(
 def test_unusable_recordings_are_named(task: DesignTask, recording: Recording) -> None:
     t, ctrl, y, names = recording.t, recording.ctrl, recording.y, recording.outputs
     with pytest.raises(RecordingError, match="too few rows"):
-        track_of(
-            task.system, Recording(t=t[:2], ctrl=ctrl[:1], y=y[:2], outputs=names, name="x.csv")
-        )
+        align(task.system, Recording(t=t[:2], ctrl=ctrl[:1], y=y[:2], outputs=names, name="x.csv"))
     with pytest.raises(RecordingError, match=r"x\.csv.*does not increase in data row 2"):
-        track_of(task.system, Recording(t=-t, ctrl=ctrl, y=y, outputs=names, name="x.csv"))
+        align(task.system, Recording(t=-t, ctrl=ctrl, y=y, outputs=names, name="x.csv"))
     bad = np.array(ctrl)
     bad[7] = np.nan
     with pytest.raises(RecordingError, match="data row 8"):
-        track_of(task.system, Recording(t=t, ctrl=bad, y=y, outputs=names, name="x.csv"))
+        align(task.system, Recording(t=t, ctrl=bad, y=y, outputs=names, name="x.csv"))
     with pytest.raises(RecordingError, match="qpos:slide"):
-        track_of(
+        align(
             task.system, Recording(t=t, ctrl=ctrl, y=y, outputs=("a", "b", "c", "d"), name="x.csv")
         )
     with pytest.raises(RecordingError, match="at least one"):
@@ -186,20 +184,20 @@ def test_unusable_recordings_are_named(task: DesignTask, recording: Recording) -
 
 def test_divergence_at_the_start_is_an_error(task: DesignTask, recording: Recording) -> None:
     with pytest.raises(SimulationDivergedError, match="diverges at the start"):
-        identify_system(task.system, [recording], "newton", start=np.array([2.0, 1.0, -1e6]))
+        identify_system(task.system, [recording], method="newton", start=np.array([2.0, 1.0, -1e6]))
 
 
 def test_newton_outside_the_bounds_is_no_success(recording: Recording) -> None:
     base = Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     tight = base.replace(parameters={"c": {"bounds": [1.2, 10.0], "true": 1.3}})
-    estimate = identify(tight, [recording], "newton")
+    estimate = identify(tight, [recording], method="newton")
     assert not estimate.success
     assert any("outside its bounds" in sentence for sentence in estimate.warnings)
 
 
 def test_unknown_method_and_wrong_start_are_refused(task: DesignTask, recording: Recording) -> None:
     with pytest.raises(ExperimentError, match="least_squares"):
-        identify_system(task.system, [recording], "lm")  # type: ignore[arg-type]
+        identify_system(task.system, [recording], method="lm")  # type: ignore[arg-type]
     with pytest.raises(ExperimentError, match="m, l, c"):
         identify_system(task.system, [recording], start=np.ones(2))
 
@@ -223,7 +221,8 @@ def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
 
 
 @pytest.mark.parametrize(
-    "place", ["identify.suspects", "cross_validation.minimise", "cross_validation._errors"]
+    "place",
+    ["identify.find_missing_terms", "cross_validation.minimise", "cross_validation._errors"],
 )
 def test_interrupted_after_the_search_the_estimate_stays(
     task: DesignTask, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
@@ -250,16 +249,16 @@ def test_an_interrupted_search_gives_no_partial_result(
     task: DesignTask, recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Functions without a budget are interrupted as usual; a round of a campaign is complete or not kept."""
-    fit, count = Fit(task.system, [recording]), [0]
-    condense = Fit.condense
+    fit, count = FitProblem.of(task.system, [recording]), [0]
+    condense = FitProblem.condense
 
-    def interrupt(self: Fit, at: object) -> object:
+    def interrupt(self: FitProblem, at: object) -> object:
         count[0] += 1
         if count[0] == 3:
             signal.raise_signal(signal.SIGINT)
         return condense(self, at)
 
-    monkeypatch.setattr(Fit, "condense", interrupt)
+    monkeypatch.setattr(FitProblem, "condense", interrupt)
     for work in (
         lambda: least_squares(fit, task.parameters.guess),
         lambda: newton_raphson(fit, task.parameters.guess),

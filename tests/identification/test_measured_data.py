@@ -164,7 +164,9 @@ def test_servo_predicts_held_out_logs_as_well_as_published() -> None:
     for published in (PUBLISHED_SERVO, HEAD_SERVO):
         task = DesignTask.resolve(experiment("bam_xl330", published))
         errors = mjfim.predict(
-            task, task.theta, [read_recording(path, task.system.channels) for path in others]
+            task.experiment,
+            task.theta,
+            [read_recording(path, task.system.channels) for path in others],
         )
         assert mine < 1.05 * np.mean([e.mae[0] for e in errors])
     assert "coulomb" in found.sloppy

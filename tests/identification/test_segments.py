@@ -9,9 +9,9 @@ import pytest
 
 from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
-from mjfim.identification.aligned_recording import Track, track_of
+from mjfim.identification.aligned_recording import AlignedRecording, align
 from mjfim.identification.identify import identify_system
-from mjfim.identification.segments import FEWEST, Piece, cut, groups, measured_starts, whole
+from mjfim.identification.segments import FEWEST, Segment, cut, groups, measured_starts, whole
 from mjfim.records.recording import Recording
 from tests.support.numerics import Array, body_task, cart_task
 
@@ -38,7 +38,7 @@ def track(
     y: Array | None = None,
     rows: Array | None = None,
     hidden: tuple[str, ...] = (),
-) -> Track:
+) -> AlignedRecording:
     """A noise-free log of some rows, some columns taken out."""
     y = np.array(truth(task) if y is None else y)
     rows = np.arange(len(y)) if rows is None else rows
@@ -49,7 +49,7 @@ def track(
     )
     names = tuple(np.array(task.system.outputs.names)[kept].tolist())
     ctrl = task.control[rows[:-1]]
-    return track_of(
+    return align(
         task.system,
         Recording(
             t=rows * task.dt,
@@ -61,7 +61,7 @@ def track(
     )
 
 
-def covered(pieces: tuple[Piece, ...], tracks: list[Track]) -> None:
+def covered(pieces: tuple[Segment, ...], tracks: list[AlignedRecording]) -> None:
     """Every row of every track belongs to exactly one piece, which simulates it."""
     for i, one in enumerate(tracks):
         rows = np.concatenate([np.arange(len(one.t))[p.rows] for p in pieces if p.track == i])
@@ -87,7 +87,7 @@ def test_every_row_is_in_one_piece(task: DesignTask, length: float | None, lead:
         outputs=task.system.outputs.names,
         name="off.csv",
     )
-    tracks = [track(task), track(task, rows=some), track_of(task.system, off)]
+    tracks = [track(task), track(task, rows=some), align(task.system, off)]
     assert [t.even for t in tracks] == [True, True, False]
     pieces = cut(task.system, tracks, length, lead)
     covered(pieces, tracks)
@@ -244,8 +244,8 @@ def test_a_start_that_nothing_shows_does_no_harm(
     assert (np.abs(found.theta - theta) < 4.0 * found.std).all()
 
 
-def piece(samples: int) -> Piece:
-    return Piece(0, 0, samples, slice(0, 1), np.zeros(1))
+def piece(samples: int) -> Segment:
+    return Segment(0, 0, samples, slice(0, 1), np.zeros(1))
 
 
 def test_batches_hold_all_pieces_once_and_not_too_much() -> None:

@@ -19,7 +19,7 @@ from mjfim.errors import ExperimentError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.output.archive import write_recording
 from mjfim.output.mjcf.write import same_dynamics
 from mjfim.records.recording import Recording
@@ -164,7 +164,7 @@ def test_sysid_gets_the_same_model_data_and_weights(
     built = import_module("sysid_sequences").build(moved, exported.sequences.spec)
     assert same_dynamics(built, task.system.model_at(theta))
     assert exported.sequences.spec.to_xml() == before
-    fit = Fit(task.system, [recording])
+    fit = FitProblem.of(task.system, [recording])
     wanted = fit.dense(fit.begin(theta))
     assert wanted is not None
     mine = residual(exported, theta, weighted=True)
@@ -185,7 +185,7 @@ def test_times_off_the_grid_are_read_between_the_steps(script: ModuleType) -> No
     t[0] = 0.0
     y = np.column_stack([np.interp(t, fine.t, column) for column in fine.y.T])
     recording = Recording(t=t, ctrl=fine.ctrl[rows[:-1]], y=y, outputs=fine.outputs)
-    exported, fit = script.export(task, [recording]), Fit(task.system, [recording])
+    exported, fit = script.export(task, [recording]), FitProblem.of(task.system, [recording])
     wanted = fit.dense(fit.begin(task.parameters.true))
     assert wanted is not None
     mine = residual(exported, task.parameters.true, weighted=True)

@@ -12,7 +12,7 @@ import mjfim
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
-from mjfim.identification.residuals import Fit
+from mjfim.identification.residuals import FitProblem
 from mjfim.information.fisher import FisherInformation
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import as_json
@@ -133,7 +133,7 @@ def test_recordings_add_up_and_missing_values_do_not_count(tmp_path) -> None:
     thinned[::2] = np.nan
     part = Recording(t=whole.t, ctrl=whole.ctrl, y=thinned, outputs=whole.outputs, name="half")
     two = check_recordings(task.system, [whole, part])
-    fit = Fit(task.system, [whole, part], data_only=True)
+    fit = FitProblem.of(task.system, [whole, part], data_only=True)
     J = fit.dense(fit.begin(task.theta)).J
     assert relative_error(two.information, J.T @ J) < 1e-6
     alone = check_recordings(task.system, [whole])
