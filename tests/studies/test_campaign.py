@@ -276,7 +276,7 @@ def test_nothing_is_played_that_leaves_the_limits(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     outside = replace(campaign.designs[0], status=Status.INFEASIBLE)
-    monkeypatch.setattr(loop, "design", lambda *args, **kwargs: outside)
+    monkeypatch.setattr(loop, "design_task", lambda *args, **kwargs: outside)
     found = mjfim.sequential(STUDY, never)
     assert (
         found.status is CampaignStatus.INFEASIBLE and found.pending is outside and not found.rounds

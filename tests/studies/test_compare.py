@@ -231,7 +231,7 @@ def test_ctrl_c_keeps_the_methods_that_are_finished() -> None:
     assert [r.method for r in c.rows] == ["chirp"]
     assert c.interrupted
     assert not c.ok
-    assert "not reached" in c.verdict[0]
+    assert "not run" in c.verdict[0]
     assert "nterrupted" in c.verdict[1]
 
 
@@ -355,7 +355,7 @@ def worse(design: Callable[..., Design]) -> Callable[..., Design]:
 def test_a_design_that_is_worse_is_said_to_be_beaten(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compare, "design", worse(compare.design))
+    monkeypatch.setattr(compare, "design_task", worse(compare.design_task))
     result = run(
         "compare", study, "-o", tmp_path, "--seconds", 60, "--steps", 20_000, "--methods", "chirp"
     )
@@ -372,7 +372,7 @@ def test_an_interrupted_comparison_is_written(
     def interrupted(*args: Any, **kwargs: Any) -> Design:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(compare, "design", interrupted)
+    monkeypatch.setattr(compare, "design_task", interrupted)
     result = run("compare", study, "-o", tmp_path, "--steps", 10_000, "--methods", "chirp")
     assert result.exit_code == 1
     assert read(tmp_path / "compare.json")["interrupted"] is True
