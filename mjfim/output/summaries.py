@@ -153,8 +153,9 @@ def _accuracy_cells(
 
 def _relative(std: float, value: float) -> Quantity:
     """Return a standard deviation in percent of a value; NaN where there is none."""
-    relative = 100.0 * std / abs(value) if value and np.isfinite(std) else float("nan")
-    return Quantity(value=float(relative), digits=2, suffix=" %")
+    if not value or not np.isfinite(std):
+        return Quantity(value=float("nan"))
+    return Quantity(value=float(100.0 * std / abs(value)), digits=2, suffix=" %")
 
 
 def improvement(before: float, after: float) -> str:

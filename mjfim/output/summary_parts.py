@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Emphasis(Enum):
-    """How strongly a row or a sentence stands out."""
+    """Degree to which a row or a sentence stands out."""
 
     NORMAL = auto()
     STRONG = auto()

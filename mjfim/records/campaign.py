@@ -17,7 +17,7 @@ from mjfim.records.serialization import SavedRecord
 
 
 class CampaignStatus(Enum):
-    """How a campaign ended; the value is a sentence for the user."""
+    """Outcome of a campaign; the value is a sentence for the user."""
 
     REACHED = "reached: every parameter is known as accurately as wanted"
     DOUBTFUL = "every wanted σ is reached formally, but the fit is in doubt (see warnings): formal σ is not accuracy"

@@ -19,7 +19,7 @@ TIE_TOLERANCE = 1e-3
 
 
 class MethodOutcome(Enum):
-    """How a method ended; the value is a verb phrase for the user."""
+    """Outcome of a method; the value is a verb phrase for the user."""
 
     INSIDE = "keeps all limits"
     OUTSIDE = "violates a limit"

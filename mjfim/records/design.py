@@ -62,7 +62,7 @@ class Evaluation:
 
 
 class Status(Enum):
-    """How an optimisation ended; the value is a sentence for the user."""
+    """Outcome of an optimisation; the value is a sentence for the user."""
 
     CONVERGED = "converged: the slope fell below tolerance × cost (a local optimum)"
     SMOOTHED = (
@@ -166,7 +166,7 @@ class CombinationAccuracy:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LimitUsage:
-    """Where a trajectory lies between the two bounds of one limit.
+    """Position of a trajectory between the two bounds of one limit.
 
     Attributes:
         kind: Kind of the limit: "position", "velocity", "control", "clearance", ...

@@ -182,8 +182,9 @@ class WorstResidual:
     share: float
 
     def __str__(self) -> str:
-        when = f"{self.begin:.3g} to {self.end:.3g} s of {self.recording}"
-        return f"worst in {self.output}, {when}: {self.size:.2g} sigmas, {100 * self.share:.0f} % of all squares"
+        interval = f"{self.begin:.3g} to {self.end:.3g} s of {self.recording}"
+        size = f"{self.size:.2g} sigmas, {100 * self.share:.0f} % of all squares"
+        return f"worst in {self.output}, {interval}: {size}"
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of `worst` in estimate.json."""

@@ -155,7 +155,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 # ---- records to plain values, and back
 
 
-class MalformedRecord(ValueError):
+class MalformedRecordError(ValueError):
     """Plain values that do not fit the fields of a record; the message names the field."""
 
 
@@ -237,7 +237,7 @@ def _decode(hint: Any, value: Any, arrays: Mapping[str, np.ndarray], path: str) 
     """Build the value of one field from plain values and arrays; the inverse of `_Encoder.encode`.
 
     Raises:
-        MalformedRecord: The plain value does not fit the type of the field.
+        MalformedRecordError: The plain value does not fit the type of the field.
     """
     if _optional(hint) is not None:
         return None if value is None else _decode(_optional(hint), value, arrays, path)
@@ -272,10 +272,10 @@ def _decode_record(
 
     for name in values:
         if name not in known:
-            raise MalformedRecord(f"the field {_join(path, name)!r} is unknown")
+            raise MalformedRecordError(f"the field {_join(path, name)!r} is unknown")
     for name, field in known.items():
         if name not in values and not _has_default(field):
-            raise MalformedRecord(f"the field {_join(path, name)!r} is missing")
+            raise MalformedRecordError(f"the field {_join(path, name)!r} is missing")
 
     decoded = {
         name: _decode(hints[name], value, arrays, _join(path, name))
@@ -288,13 +288,13 @@ def _decode_scalar(hint: Any, value: Any, path: str) -> Any:
     """Build a member of an enumeration, a truth value, a number or a text."""
     if issubclass(hint, Enum):
         if value not in hint.__members__:
-            raise MalformedRecord(f"the field {path!r} holds {value!r}, no {hint.__name__}")
+            raise MalformedRecordError(f"the field {path!r} holds {value!r}, no {hint.__name__}")
         return hint[value]
     if hint is float:
         if isinstance(value, str) and value in NOT_FINITE:
             return NOT_FINITE[value]
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise MalformedRecord(f"the field {path!r} holds {value!r}, no number")
+            raise MalformedRecordError(f"the field {path!r} holds {value!r}, no number")
         return float(value)
     return _expect(hint, value, path)
 
@@ -302,17 +302,17 @@ def _decode_scalar(hint: Any, value: Any, path: str) -> Any:
 def _array(value: Any, arrays: Mapping[str, np.ndarray], path: str) -> Array:
     """Look up the array of numbers that a field names."""
     if not isinstance(value, str) or value not in arrays:
-        raise MalformedRecord(f"the array {value!r} of the field {path!r} is missing")
+        raise MalformedRecordError(f"the array {value!r} of the field {path!r} is missing")
     array = arrays[value]
     if array.dtype.kind not in "fiub":
-        raise MalformedRecord(f"the array {value!r} does not hold numbers")
+        raise MalformedRecordError(f"the array {value!r} does not hold numbers")
     return array
 
 
 def _expect(kind: type, value: Any, path: str) -> Any:
     """Return the value if it has the expected JSON type."""
     if type(value) is not kind:
-        raise MalformedRecord(f"the field {path!r} holds {value!r}, no {kind.__name__}")
+        raise MalformedRecordError(f"the field {path!r} holds {value!r}, no {kind.__name__}")
     return value
 
 
@@ -403,7 +403,7 @@ class SavedRecord:
 
         try:
             record: Self = _decode_record(cls, values, arrays, "")
-        except (MalformedRecord, TypeError, ValueError, IndexError) as error:
+        except (MalformedRecordError, TypeError, ValueError, IndexError) as error:
             raise RecordingError(
                 f"{archive}: not a {cls.__name__} of this version of mjfim: {error}; {cls._cure()}"
             ) from None
