@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.constraints import SHOWN, constraint_set_of
+from mjfim.excitation.constraints import SUBSTEP_KINDS, constraint_set_of
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -198,7 +198,7 @@ class Bench:
         if feedback:
             u = u + self.plan.gain[row] @ self._deviation(state, row)
         return np.asarray(
-            np.clip(u, self.constraints.control.lower, self.constraints.control.upper)
+            np.clip(u, self.constraints.control.bounds.lower, self.constraints.control.bounds.upper)
         )
 
     def _deviation(self, state: Array, row: int) -> Array:
@@ -382,21 +382,22 @@ class Bench:
     ) -> Array:
         """(l,) in the order of the limits. shown, qpos: at every engine step;  sent: (M, nu)"""
         constraints, worst = self.constraints, []
-        inside = (
-            constraints.shown.margin(shown).min(axis=0, initial=np.inf) / constraints.shown.scale
-        )
+        bounds = constraints.substeps.bounds
+        inside = bounds.margin(shown).min(axis=0, initial=np.inf) / bounds.scale
         ahead = round(
-            constraints.dt / self.plan.period
+            self.task.dt / self.plan.period
         )  # rates are over one sample, as they are in the design
-        after = sent[-1] if feedback or constraints.after is None else constraints.after
+        held = None if constraints.rate is None else constraints.rate.control_after
+        after = sent[-1] if feedback or held is None else held
         line = np.concatenate([np.tile(before, (ahead, 1)), sent, np.tile(after, (ahead, 1))])
-        rates = (line[ahead:] - line[:-ahead]) / constraints.dt
+        rates = (line[ahead:] - line[:-ahead]) / self.task.dt
         for i, limit in enumerate(self.limits):
-            if limit.kind in SHOWN:
+            if limit.kind in SUBSTEP_KINDS:
                 worst.append(float(inside[i]))
             elif limit.kind == "clearance" and constraints.clearance is not None:
                 worst.append(
-                    (constraints.clearance.nearest(qpos)[0] - constraints.least) / constraints.least
+                    constraints.clearance.distances.nearest(qpos)[0] / constraints.clearance.least
+                    - 1.0
                 )
             else:
                 u = (sent if limit.kind == "control" else rates)[:, limit.index]
@@ -424,10 +425,10 @@ class Bench:
 
 def _looked_at(task: DesignTask) -> tuple[Limit, ...]:
     """All limits, those that are held within samples first, in the order of the observations."""
-    within = [limit for kind in SHOWN for limit in task.limits if limit.kind == kind]
+    within = [limit for kind in SUBSTEP_KINDS for limit in task.limits if limit.kind == kind]
     least = task.experiment.limits.clearance
     near = [] if least is None else [Limit("clearance", "nearest pair", 0, least, np.inf)]
-    return (*within, *(limit for limit in task.limits if limit.kind not in SHOWN), *near)
+    return (*within, *(limit for limit in task.limits if limit.kind not in SUBSTEP_KINDS), *near)
 
 
 def _dof_labels(model: Any) -> Iterator[str]:

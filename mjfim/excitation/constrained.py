@@ -11,7 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.constraints import ConstraintSet, bandwidth_basis, constraint_set_of
+from mjfim.excitation.bandwidth import bandwidth_basis
+from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (
     BarrierIterate,

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.constraints import ConstraintSet, ConstraintValues
+from mjfim.excitation.constraint_kinds import ConstraintValues
+from mjfim.excitation.constraints import ConstraintSet
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.optimize.barrier import BarrierExpansion
 from mjfim.optimize.lq import TangentCurve
@@ -290,7 +291,7 @@ class InteriorPointMethod:
 
     def _direction(self) -> StructuredBFGS:
         N = len(self.base.running.desired) - 1
-        ridge = 0.03 / N / self.constraints.control.scale**2
+        ridge = 0.03 / N / self.constraints.control.bounds.scale**2
         return StructuredBFGS(ridge, self.basis)
 
     def _fitted(self, control: Array) -> Array:

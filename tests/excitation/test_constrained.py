@@ -15,8 +15,9 @@ import pytest
 import mjfim
 from mjfim.excitation import interior_point as ladder_module
 from mjfim.excitation import multistart as multistart
+from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform
-from mjfim.excitation.constraints import bandwidth_basis, constraint_set_of
+from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (

@@ -10,7 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjfim.excitation.constraints import END_WEIGHT, ConstraintValues, constraint_set_of
+from mjfim.excitation.constraint_kinds import END_WEIGHT, ConstraintValues
+from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.interior_point import InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
@@ -134,7 +135,9 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         np.testing.assert_allclose(form, form.T, rtol=0, atol=1e-9 * values[-1])
     assert (np.linalg.eigvalsh(w.Q[-1]) >= -1e-12 * np.abs(w.Q[-1]).max()).all()
     assert (w.W >= 0.0).all()
-    free = constraints.before is None, constraints.after is None and not constraints.seam
+    rate, clearance = constraints.rate, constraints.clearance
+    assert rate is not None
+    free = rate.control_before is None, rate.control_after is None and not rate.periodic
     assert ((w.W[0] == 0.0).all(), (w.W[-1] == 0.0).all()) == free
     assert (w.W[1:-1] > 0.0).all()
     # its own: the squares of what every limited number moves by, times the curvature of its barrier
@@ -146,18 +149,17 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         task.theta, values.trajectory, constraints.observations
     )
     looked, ctrl = np.array(constraints.observations.derivative_substeps) - 1, task.control
-    assert (
-        values.distances is not None and values.slopes is not None and constraints.rate is not None
-    )
-    assert constraints.clearance is not None
+    assert values.distances is not None
+    assert values.distance_slopes is not None
+    assert clearance is not None
     m, least = values.distances.shape[1], np.full(values.distances.shape[1], 0.03)
-    near = Bounds(lower=least, upper=np.full(m, np.inf), scale=constraints.clearance.reach - least)
+    near = Bounds(lower=least, upper=np.full(m, np.inf), scale=clearance.distances.reach - least)
     bends = [
-        constraints.shown.barrier(
+        constraints.substeps.bounds.barrier(
             values.observed[:, looked], delta, 1.0 / N / len(looked)
         ).curvature,
-        constraints.control.barrier(ctrl, delta, 1.0 / N).curvature,
-        constraints.rate.barrier(constraints.rates(ctrl), delta, 1.0 / N).curvature,
+        constraints.control.bounds.barrier(ctrl, delta, 1.0 / N).curvature,
+        rate.bounds.barrier(rate.rates(ctrl), delta, 1.0 / N).curvature,
         near.barrier(values.distances, delta, 1.0 / N).curvature,
     ]
     for way in rng.normal(size=(3, *ctrl.shape)):
@@ -166,16 +168,16 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         moves = [
             np.einsum("kswi,ki->ksw", rise, np.concatenate([zeta.z[:-1], zeta.v], axis=1)),
             zeta.v,
-            constraints.rates(ctrl + zeta.v) - constraints.rates(ctrl),
-            np.einsum("kmi,ki->km", values.slopes, zeta.z[1:, : task.space.nv]),
+            rate.rates(ctrl + zeta.v) - rate.rates(ctrl),
+            np.einsum("kmi,ki->km", values.distance_slopes, zeta.z[1:, : task.space.nv]),
         ]
         wanted = [float(np.sum(bend * move**2)) for bend, move in zip(bends, moves, strict=True)]
-        if constraints.end is not None and constraints.target is not None:
-            ended = task.space.minus(values.trajectory.state[-1], constraints.target)
+        if constraints.end is not None:
+            ended = task.space.minus(values.trajectory.state[-1], constraints.end.target)
             wanted.append(
                 float(
                     np.sum(
-                        constraints.end.barrier(ended, delta, END_WEIGHT).curvature
+                        constraints.end.bounds.barrier(ended, delta, END_WEIGHT).curvature
                         * zeta.z[-1] ** 2
                     )
                 )
@@ -186,10 +188,11 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
             sum(wanted), rel=1e-9
         )
     # and of what is linear in the control it is the curvature of the barrier itself
-    endless = np.full(len(constraints.kinds), np.inf)
+    substeps = constraints.substeps
+    endless = np.full(len(substeps.kinds), np.inf)
     narrow = replace(
         constraints,
-        shown=replace(constraints.shown, lower=-endless, upper=endless),
+        substeps=replace(substeps, bounds=replace(substeps.bounds, lower=-endless, upper=endless)),
         clearance=None,
         end=None,
     )
@@ -213,10 +216,10 @@ def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> Non
     for way in 1e-4 * directions_of(task, 4, seed=2):
         zeta = expansion.lift(np.zeros((task.samples, 2, task.space.nx)), way)
         up, down = (values_of(problem.point(task.control + s * way)).observed for s in (1.0, -1.0))
-        moved = (0.5 * np.abs(up - down) / constraints.shown.scale)[
+        moved = (0.5 * np.abs(up - down) / constraints.substeps.bounds.scale)[
             :, np.array(constraints.observations.derivative_substeps) - 1
         ].max()
-        wanted = max(moved, np.abs(way / constraints.control.scale).max())
+        wanted = max(moved, np.abs(way / constraints.control.bounds.scale).max())
         assert expansion.barrier.largest_relative_move(zeta) == pytest.approx(wanted, rel=1e-3)
 
 
@@ -301,7 +304,9 @@ def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> 
     least = 0.03 * (
         1.0 + shares["clearance"]
     )  # its share is of the least distance, which is raised
-    assert constraints.tightened(shares).least == pytest.approx(least)
+    raised = constraints.tightened(shares).clearance
+    assert raised is not None
+    assert raised.least == pytest.approx(least)
     assert values.distances is not None
     tighter["clearance"] = float(values.distances.min()) / least - 1.0
     assert found == pytest.approx(tighter, abs=1e-12)
@@ -310,22 +315,23 @@ def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> 
     )
     # not so far that nothing is left between the least distance and where it no longer matters
     far = constraints.tightened({"clearance": 50.0})
-    assert far.clearance is not None and far.least < far.clearance.reach
+    assert far.clearance is not None and far.clearance.least < far.clearance.distances.reach
     assert far.value(values, 0.1) > constraints.value(values, 0.1)
 
 
 def test_rates_begin_and_end_where_the_boundary_says(tmp_path: Path) -> None:
     task = arm_task(tmp_path, limits={"control_rate": 9.0})
-    constraints, ctrl = constraint_set_of(task), task.control
+    rate, ctrl = constraint_set_of(task).rate, task.control
+    assert rate is not None
     inner = np.diff(ctrl, axis=0) / 0.01
-    np.testing.assert_allclose(constraints.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
+    np.testing.assert_allclose(rate.rates(ctrl), np.concatenate([[[0, 0]], inner, [[0, 0]]]))
     before, after = np.array([0.7, 0.1]), np.array([-0.2, 0.3])
-    rested = replace(constraints, before=before, after=after).rates(ctrl)
+    rested = replace(rate, control_before=before, control_after=after).rates(ctrl)
     np.testing.assert_allclose(
         rested[[0, -1]], [(ctrl[0] - before) / 0.01, (after - ctrl[-1]) / 0.01]
     )
     np.testing.assert_allclose(
-        replace(constraints, seam=True).rates(ctrl)[[0, -1]], [[0, 0], (ctrl[0] - ctrl[-1]) / 0.01]
+        replace(rate, periodic=True).rates(ctrl)[[0, -1]], [[0, 0], (ctrl[0] - ctrl[-1]) / 0.01]
     )
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError
-from mjfim.excitation.constraints import ConstraintValues, constraint_set_of
+from mjfim.excitation.constraint_kinds import ConstraintValues
+from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.limits import Limit, limits_of
 from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import control_names, scalar_joints
@@ -182,7 +183,7 @@ def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -
     shown = constraints.observations.values(
         trajectory.qpos[1:], trajectory.qvel[1:], trajectory.qvel[:-1], dict[str, np.ndarray]().get
     )
-    return constraints.margins(ConstraintValues(trajectory, shown[:, None]))
+    return constraints.margins(ConstraintValues(trajectory=trajectory, observed=shown[:, None]))
 
 
 def test_no_limits_no_margins(model: mujoco.MjModel, tmp_path: Path) -> None:

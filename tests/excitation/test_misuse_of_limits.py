@@ -62,19 +62,19 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "start that falls": (
         '[boundary]\nstart = "rest"',
         [
-            "boundary.start: no control holds the start: joint 'hinge' still accelerates by 7.59 per s²",
+            "boundary.start: no control holds the initial state: joint 'hinge' still accelerates by 7.59 per s²",
             "an equilibrium",
         ],
         [("3.141592653589793", "2.0")],
     ),
     "start that moves": (
         '[boundary]\nstart = "rest"',
-        ["boundary.start: no control holds the start: joint 'slide' moves at 0.5 per s"],
+        ["boundary.start: no control holds the initial state: joint 'slide' moves at 0.5 per s"],
         [('qpos="0 3.141592653589793"', 'qpos="0 3.141592653589793" qvel="0.5 0"')],
     ),
     "end that falls": (
         '[boundary]\nend = "rest"\nkeyframe = "side"',
-        ["boundary.end: no control holds the end: joint 'hinge' still accelerates by 6.38 per s²"],
+        ["boundary.end: no control holds the final state: joint 'hinge' still accelerates by 6.38 per s²"],
         [SIDE],
     ),
     "end outside": (
@@ -239,7 +239,7 @@ def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) 
     )
     with pytest.raises(
         ExperimentError,
-        match=r"no control holds the start: joint 'hinge' still accelerates by \d\.\d+ per s²",
+        match=r"no control holds the initial state: joint 'hinge' still accelerates by \d\.\d+ per s²",
     ):
         design_task(task)
 

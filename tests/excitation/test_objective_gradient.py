@@ -108,7 +108,7 @@ def servo(folder: Path) -> DesignTask:
 
 def staged(task: DesignTask, basis: Array | None = None, power: float = np.inf) -> DesignTask:
     """The same task, its cost as a stage of the descent sees it."""
-    task.problem = Stage(task, basis, power).problem
+    vars(task)["problem"] = Stage(task, basis, power).problem
     return task
 
 

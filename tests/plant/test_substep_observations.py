@@ -56,7 +56,7 @@ def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
 def observations_of(task: DesignTask) -> SubstepObservations:
     """Quantities that the limits of the experiment observe."""
     constraints = constraint_set_of(task)
-    assert constraints.kinds == tuple(kind for kind, _ in SHOWN)
+    assert constraints.substeps.kinds == tuple(kind for kind, _ in SHOWN)
     return constraints.observations
 
 

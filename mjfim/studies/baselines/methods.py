@@ -15,7 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
-from mjfim.excitation.constraints import bandwidth_basis
+from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.signals import Chirp, Excitation, ExcitationSettings, Multisine, RandomSteps
 from mjfim.studies.baselines.budget import Arena, Attempt, Job, Monitor, Spent
 from mjfim.studies.baselines.parametric import (
@@ -111,14 +111,14 @@ class Shaper:
             may_jump=jumps,
         )
         self.weighted = bool(task.control_weight.any() or task.tracking.any()) or not arena.holds
-        self.most = BOUNDED if np.isfinite(constraints.control.lower).all() else LARGEST
+        self.most = BOUNDED if np.isfinite(constraints.control.bounds.lower).all() else LARGEST
         self.window = task.fade(task.samples)
         self.basis = bandwidth_basis(task, task.t)
         self.fit = None if self.basis is None else np.linalg.pinv(self.basis)
 
     def swing(self, wave: Array) -> Array:
         """(N, nu) what is added to the centre; at scale 1 as large as half of the controls' range."""
-        windowed = self.window * wave * self.arena.constraints.control.scale
+        windowed = self.window * wave * self.arena.constraints.control.bounds.scale
         return (
             windowed
             if self.basis is None or self.fit is None

@@ -16,8 +16,8 @@ from scipy.optimize import minimize
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
+from mjfim.excitation.bandwidth import boundary_splines
 from mjfim.excitation.constrained import Chase, ConstrainedSearch, pursue, smoothed
-from mjfim.excitation.constraints import boundary_splines
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (
     MAX_RELAXATION,
@@ -116,7 +116,7 @@ def _any(
         basis = made(frequency)
         fitted = basis @ np.linalg.lstsq(basis, arena.task.control - arena.centre)[0]
         yield started(arena, f"{frequency:.3g} Hz", basis, fitted)
-    size = arena.constraints.control.scale
+    size = arena.constraints.control.bounds.scale
     while True:
         frequency = float(np.exp(arena.rng.uniform(*np.log(ends))))
         basis = made(frequency)
@@ -351,7 +351,7 @@ class Descent:
         if e.barrier is None:
             raise ValueError("nothing to whiten with")
         N, w = len(self.series.basis), e.barrier.weights
-        ridge = RIDGE / N / self.arena.constraints.control.scale**2
+        ridge = RIDGE / N / self.arena.constraints.control.bounds.scale**2
         if problem.costs and point.point is not None and point.point.cost > 0.0:
             ridge = ridge + task.control_weight * task.dt / point.point.cost
         H = BasisMetric.from_weights(

@@ -1,0 +1,54 @@
+"""Controls of limited bandwidth, as sums of splines."""
+
+from __future__ import annotations
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError
+from mjfim.excitation.task import DesignTask
+from mjfim.signals import spline_basis
+
+
+def bandwidth_basis(task: DesignTask, t: Array) -> Array | None:
+    """Splines of the bandwidth that the experiment states.
+
+    Args:
+        task: The task.
+        t: (N,) times [s].
+
+    Returns:
+        (N, M) splines of which the control minus its centre is made; None where the bandwidth is not limited.
+
+    Raises:
+        ExperimentError: The bandwidth is above half of the sample rate.
+    """
+    e = task.experiment
+    if e.limits.bandwidth is None:
+        return None
+
+    if e.limits.bandwidth > 0.5 * e.rate:
+        raise ExperimentError(
+            f"limits.bandwidth: {e.limits.bandwidth:g} Hz; a control at {e.rate:g} Hz has {0.5 * e.rate:g} Hz at most"
+        )
+    return boundary_splines(task, t, e.limits.bandwidth)
+
+
+def boundary_splines(task: DesignTask, t: Array, bandwidth: float) -> Array:
+    """Splines that begin and end as the experiment's `[boundary]` asks for.
+
+    Args:
+        task: The task.
+        t: (N,) times [s].
+        bandwidth: Their bandwidth [Hz].
+
+    Returns:
+        (N, M) splines.
+    """
+    boundary = task.experiment.boundary
+    starts_at_rest = boundary.start == "rest"
+    periodic = boundary.end == "periodic"
+
+    # A periodic control that starts at rest ends at rest too.
+    ends_at_rest = boundary.end == "rest" or (periodic and starts_at_rest)
+    return spline_basis(
+        t, task.horizon, bandwidth, starts_at_rest, ends_at_rest, periodic and not starts_at_rest
+    )

@@ -1,0 +1,380 @@
+"""The kinds of inequality constraints along a trajectory: their margins, their barrier and its expansion.
+
+Every kind answers the same questions, so that a constraint set is a sum over its kinds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.model.geom_distance import GeomDistances
+from mjfim.optimize.barrier import Bounds
+from mjfim.optimize.lq import Weights
+from mjfim.plant.batch import SubstepObservations
+from mjfim.plant.state_space import StateSpace
+from mjfim.records.trajectory import Trajectory
+
+# Weight of a constraint on the final state in the barrier. A constraint that holds at every sample has the weight 1 / N.
+END_WEIGHT = 0.1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ConstraintValues:
+    """The constrained quantities along a trajectory.
+
+    Attributes:
+        trajectory: The trajectory.
+        observed: (N, substeps, w) quantities at every engine step [unit of each quantity].
+        distances: (N, m) distances at the samples 1 ... N [m], or None without a clearance.
+        distance_slopes: (N, m, nv) derivatives of the distances by the position [m / q-unit], or None where not asked for.
+        observation_jacobian: (N, S, w, nx+nu) derivatives of the quantities at S engine steps of each sample by the state and
+            the control at the beginning of the sample, or None where not asked for.
+    """
+
+    trajectory: Trajectory
+    observed: Array
+    distances: Array | None = None
+    distance_slopes: Array | None = None
+    observation_jacobian: Array | None = None
+
+    @property
+    def weight(self) -> float:
+        """Weight of one sample in the barrier, which is a mean over time."""
+        return 1.0 / len(self.observed)
+
+
+class KindMargins(NamedTuple):
+    """Margins of the quantities of one kind.
+
+    Attributes:
+        kind: Name of the kind, as in the experiment file.
+        margins: (...) distances to the nearer bound, negative outside [unit of the quantity].
+        scale: Number or array that makes the margins relative [unit of the quantity].
+    """
+
+    kind: str
+    margins: Array
+    scale: Array | float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ExpansionSums:
+    """Gradient and Gauss-Newton Hessian of the barrier, to which every kind of constraint adds its part in place.
+
+    Attributes:
+        a: (N+1, nx) derivative by the state [1 / x-unit].
+        b: (N, nu) derivative by the control [1 / u-unit].
+        weights: The Hessian as a quadratic form on tangent curves.
+    """
+
+    a: Array
+    b: Array
+    weights: Weights
+
+    @staticmethod
+    def zero(N: int, nx: int, nu: int) -> ExpansionSums:
+        """Sums without any part yet, for N samples, nx states and nu controls."""
+        weights = Weights(
+            Q=np.zeros((N + 1, nx, nx)),
+            S=np.zeros((N, nu, nx)),
+            R=np.zeros((N, nu, nu)),
+            W=np.zeros((N + 1, nu)),
+        )
+        return ExpansionSums(a=np.zeros((N + 1, nx)), b=np.zeros((N, nu)), weights=weights)
+
+
+class Constraint(Protocol):
+    """Inequality constraints of one or several kinds along a trajectory."""
+
+    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
+        """Margins of every constrained quantity, by kind."""
+        ...
+
+    def barrier(self, values: ConstraintValues, delta: float) -> float:
+        """Value of the barrier.
+
+        Args:
+            values: The constrained quantities.
+            delta: Relaxation of the barrier, a relative margin.
+        """
+        ...
+
+    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
+        """Add the derivatives of the barrier to the sums.
+
+        Args:
+            values: The constrained quantities with their derivatives.
+            delta: Relaxation of the barrier, a relative margin.
+            sums: Sums over all kinds, changed in place.
+        """
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SubstepConstraint:
+    """Ranges of positions, velocities, accelerations and forces, which are observed at the engine steps of every sample.
+
+    Attributes:
+        observations: The w observed quantities.
+        bounds: Their ranges, (w,).
+        kinds: Kind of each quantity.
+        names: Name of the joint or actuator of each quantity.
+    """
+
+    observations: SubstepObservations
+    bounds: Bounds
+    kinds: tuple[str, ...]
+    names: tuple[str, ...]
+
+    def tightened(self, fractions: Mapping[str, float]) -> SubstepConstraint:
+        """Ranges made narrower by fractions of their halves, by kind."""
+        each = np.array([fractions.get(kind, 0.0) for kind in self.kinds])
+        return replace(self, bounds=self.bounds.tightened(each))
+
+    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
+        """Margins at every engine step, one item per quantity. See `Constraint.margins`."""
+        margins = self.bounds.margin(values.observed)
+        for i, kind in enumerate(self.kinds):
+            yield KindMargins(kind, margins[..., i], float(self.bounds.scale[i]))
+
+    def barrier(self, values: ConstraintValues, delta: float) -> float:
+        """Mean over time and over the engine steps with derivatives. See `Constraint.barrier`."""
+        observed, weight = self._observed_with_weight(values)
+        return self.bounds.barrier(observed, delta, weight).value
+
+    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
+        """See `Constraint.add_expansion`."""
+        jacobian = values.observation_jacobian
+        if jacobian is None:
+            raise ValueError("the observations have no derivatives")
+
+        observed, weight = self._observed_with_weight(values)
+        barrier = self.bounds.barrier(observed, delta, weight)
+        N, nx = len(observed), sums.a.shape[1]
+
+        gradient = np.einsum("kswi,ksw->ki", jacobian, barrier.slope)
+        sums.a[:-1] += gradient[:, :nx]
+        sums.b[:] += gradient[:, nx:]
+
+        flat = jacobian.reshape(N, -1, jacobian.shape[-1])
+        hessian = np.swapaxes(flat * barrier.curvature.reshape(N, -1, 1), 1, 2) @ flat
+        sums.weights.Q[:-1] += hessian[:, :nx, :nx]
+        sums.weights.S[:] += hessian[:, nx:, :nx]
+        sums.weights.R[:] += hessian[:, nx:, nx:]
+
+    def _observed_with_weight(self, values: ConstraintValues) -> tuple[Array, float]:
+        """(N, S, w) quantities at the engine steps with derivatives, and the weight of each number."""
+        steps = np.array(self.observations.derivative_substeps) - 1
+        return values.observed[:, steps], values.weight / len(steps)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlConstraint:
+    """Ranges of the controls.
+
+    Attributes:
+        bounds: Range of each control, (nu,) [u-unit].
+    """
+
+    bounds: Bounds
+
+    def tightened(self, fractions: Mapping[str, float]) -> ControlConstraint:
+        """Ranges made narrower by the fraction of their halves for this kind."""
+        return replace(self, bounds=self.bounds.tightened(fractions.get("control", 0.0)))
+
+    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
+        """See `Constraint.margins`."""
+        margins = self.bounds.margin(values.trajectory.ctrl)
+        yield KindMargins("control", margins, self.bounds.scale)
+
+    def barrier(self, values: ConstraintValues, delta: float) -> float:
+        """See `Constraint.barrier`."""
+        return self.bounds.barrier(values.trajectory.ctrl, delta, values.weight).value
+
+    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
+        """See `Constraint.add_expansion`."""
+        barrier = self.bounds.barrier(values.trajectory.ctrl, delta, values.weight)
+        diagonal = np.arange(sums.b.shape[1])
+
+        sums.b[:] += barrier.slope
+        sums.weights.R[:, diagonal, diagonal] += barrier.curvature
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlRateConstraint:
+    """Ranges of the change of the controls from one sample to the next, divided by the sample period.
+
+    Attributes:
+        bounds: Range of the rate of each control, (nu,) [u-unit / s].
+        dt: Sample period [s].
+        control_before: (nu,) control before the first sample [u-unit]; None where it is free.
+        control_after: (nu,) control after the last sample [u-unit]; None where it is free.
+        periodic: The control after the last sample is that of the first one.
+    """
+
+    bounds: Bounds
+    dt: float
+    control_before: Array | None = None
+    control_after: Array | None = None
+    periodic: bool = False
+
+    def tightened(self, fractions: Mapping[str, float]) -> ControlRateConstraint:
+        """Ranges made narrower by the fraction of their halves for this kind."""
+        return replace(self, bounds=self.bounds.tightened(fractions.get("control_rate", 0.0)))
+
+    def rates(self, ctrl: Array) -> Array:
+        """Rates of the control into each sample and out of the last one.
+
+        Args:
+            ctrl: (N, nu) control [u-unit].
+
+        Returns:
+            (N+1, nu) rates [u-unit / s], zero at an end where the control is free.
+        """
+        first = ctrl[0] if self.control_before is None else self.control_before
+        last = ctrl[-1] if self.control_after is None else self.control_after
+        if self.periodic:
+            last = ctrl[0]
+        return np.diff(ctrl, axis=0, prepend=first[None], append=last[None]) / self.dt
+
+    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
+        """See `Constraint.margins`."""
+        margins = self.bounds.margin(self.rates(values.trajectory.ctrl))
+        yield KindMargins("control_rate", margins, self.bounds.scale)
+
+    def barrier(self, values: ConstraintValues, delta: float) -> float:
+        """See `Constraint.barrier`."""
+        rates = self.rates(values.trajectory.ctrl)
+        return self.bounds.barrier(rates, delta, values.weight).value
+
+    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
+        """See `Constraint.add_expansion`."""
+        rates = self.rates(values.trajectory.ctrl)
+        barrier = self.bounds.barrier(rates, delta, values.weight)
+        slope = barrier.slope / self.dt
+
+        # A control raises the rate into its sample and lowers the rate out of it.
+        b, W = sums.b, sums.weights.W
+        b += (barrier.slope[:-1] - barrier.slope[1:]) / self.dt
+        W += barrier.curvature / self.dt**2
+
+        # The rate out of a periodic control is that into the first sample.
+        if self.periodic:
+            b[0] += slope[-1]
+
+        # At a free end the rate is zero, whatever the control is.
+        if self.control_before is None:
+            b[0] -= slope[0]
+            W[0] = 0.0
+        if self.control_after is None and not self.periodic:
+            b[-1] += slope[-1]
+            W[-1] = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EndStateConstraint:
+    """The final state lies within tolerances about a target.
+
+    Attributes:
+        space: Layout of the state.
+        bounds: Ranges of the difference from the target, (nx,); activations are free [x-unit].
+        target: (ns,) state at which the trajectory has to end.
+    """
+
+    space: StateSpace
+    bounds: Bounds
+    target: Array
+
+    def tightened(self, fractions: Mapping[str, float]) -> EndStateConstraint:
+        """Ranges made narrower by fractions of their halves, by kind."""
+        kinds = [fractions.get(kind, 0.0) for kind in ("end_position", "end_velocity")]
+        space = self.space
+        each = np.repeat([*kinds, 0.0], (space.nv, space.nv, space.na))
+        return replace(self, bounds=self.bounds.tightened(each))
+
+    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
+        """See `Constraint.margins`."""
+        margins, nv = self.bounds.margin(self._difference(values)), self.space.nv
+        scale = self.bounds.scale
+        yield KindMargins("end_position", margins[:nv], scale[:nv])
+        yield KindMargins("end_velocity", margins[nv : 2 * nv], scale[nv : 2 * nv])
+
+    def barrier(self, values: ConstraintValues, delta: float) -> float:
+        """See `Constraint.barrier`."""
+        return self.bounds.barrier(self._difference(values), delta, END_WEIGHT).value
+
+    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
+        """See `Constraint.add_expansion`."""
+        difference = self._difference(values)
+        barrier = self.bounds.barrier(difference, delta, END_WEIGHT)
+
+        # A difference of large rotations does not move one to one with the state.
+        J = self.space.minus_derivative(difference)
+        sums.a[-1] += J.T @ barrier.slope
+        sums.weights.Q[-1] += J.T @ (barrier.curvature[:, None] * J)
+
+    def _difference(self, values: ConstraintValues) -> Array:
+        """(nx,) final state minus the target."""
+        return self.space.minus(values.trajectory.state[-1], self.target)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClearanceConstraint:
+    """Distances between geoms are at least a clearance.
+
+    Attributes:
+        distances: Measures the distances of all pairs up to its reach.
+        least: The clearance [m].
+    """
+
+    distances: GeomDistances
+    least: float
+
+    def tightened(self, fractions: Mapping[str, float]) -> ClearanceConstraint:
+        """The clearance raised by a fraction of it, at most half of the way to the reach of the distances."""
+        raised = self.least * (1.0 + fractions.get("clearance", 0.0))
+        return replace(self, least=min(raised, 0.5 * (self.least + self.distances.reach)))
+
+    def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
+        """See `Constraint.margins`."""
+        yield KindMargins("clearance", self._measured(values) - self.least, self.least)
+
+    def barrier(self, values: ConstraintValues, delta: float) -> float:
+        """See `Constraint.barrier`."""
+        measured = self._measured(values)
+        return self._bounds(measured).barrier(measured, delta, values.weight).value
+
+    def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
+        """See `Constraint.add_expansion`."""
+        measured, slopes = self._measured(values), values.distance_slopes
+        if slopes is None:
+            raise ValueError("the distances have no derivatives")
+
+        barrier = self._bounds(measured).barrier(measured, delta, values.weight)
+        nv = slopes.shape[2]
+        hessian = np.swapaxes(slopes * barrier.curvature[..., None], 1, 2) @ slopes
+
+        # Distances are measured at the samples 1 ... N.
+        sums.a[1:, :nv] += np.einsum("km,kmi->ki", barrier.slope, slopes)
+        sums.weights.Q[1:, :nv, :nv] += hessian
+
+    def _bounds(self, measured: Array) -> Bounds:
+        """Bounds of (N, m) distances: from the clearance on; the barrier is zero at the reach."""
+        m = measured.shape[1]
+        return Bounds(
+            lower=np.full(m, self.least),
+            upper=np.full(m, np.inf),
+            scale=np.full(m, self.distances.reach - self.least),
+        )
+
+    @staticmethod
+    def _measured(values: ConstraintValues) -> Array:
+        """(N, m) distances [m]."""
+        if values.distances is None:
+            raise ValueError("the distances were not measured")
+        return values.distances
