@@ -74,7 +74,9 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     ),
     "end that falls": (
         '[boundary]\nend = "rest"\nkeyframe = "side"',
-        ["boundary.end: no control holds the final state: joint 'hinge' still accelerates by 6.38 per s²"],
+        [
+            "boundary.end: no control holds the final state: joint 'hinge' still accelerates by 6.38 per s²"
+        ],
         [SIDE],
     ),
     "end outside": (

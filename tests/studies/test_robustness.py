@@ -509,7 +509,7 @@ def test_a_start_on_the_move_takes_no_latency(robots: ModuleType, tmp_path: Path
     """What was before the start would matter; without a latency it can be played."""
     task = BUILD["cart"](tmp_path, playback_rate=50.0)
     path, _ = written(task, tmp_path)
-    with pytest.raises(ExperimentError, match=r"no control holds the start.*--latency 0"):
+    with pytest.raises(ExperimentError, match=r"no control holds the initial state.*--latency 0"):
         robots.Bench(task.experiment, path, robots.Conditions(latency=0.01))
     bench = robots.Bench(task.experiment, path, robots.Conditions(latency=0.0, loudness=0.0))
     run = bench.run(0)
