@@ -231,7 +231,7 @@ def _verdict(comparison: Comparison) -> str:
 
     # Nothing to compare with, or nothing to compare.
     if design is None:
-        return "The design was not reached: there is nothing to compare the baselines with."
+        return "The design was not run: there is nothing to compare the baselines with."
     if rival is None:
         return (
             f"No baseline found a control that keeps all limits; the design {design.outcome.value}."
