@@ -46,7 +46,7 @@ def check(
         check_folder(output)
     with progress() as bar:
         bar.add_task("looking", total=None)
-        result = mjfim.check(stated, loaded, trajectory, threads)
+        result = mjfim.check(stated, loaded, trajectory, threads=threads)
     if output is not None:
         with writing(output) as results:
             results.leave_check(output, result)

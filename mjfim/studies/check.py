@@ -1,9 +1,9 @@
-"""`mjfim.check`: what an experiment, or recordings that are there already, can tell about the parameters, before any fit."""
+"""`mjfim.check`: which parameters an experiment or existing recordings can identify, and how well, before any fit."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,27 +26,47 @@ from mjfim.records.check import (
     SelfTest,
 )
 from mjfim.records.combinations import ParameterGroup, join_names
+from mjfim.records.design import CombinationAccuracy
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.derivative_test import self_test
 
-DEFAULT_WANTED = 0.05  # of a parameter's own size, where none is stated
-MOST = 1_000_000_000
-LONGEST_LINE = 400
+# Standard deviation aimed at where none is stated, relative to the size of the parameter.
+DEFAULT_RELATIVE_STD = 0.05
+
+# Repetitions beyond which a target accuracy counts as out of reach.
+MAX_REPETITIONS = 1_000_000_000
+
+# Characters beyond which a list of parameter groups is replaced by their number.
+MAX_LIST_LENGTH = 400
+
+# Confounded pairs that a sentence of the verdict lists.
+MAX_LISTED_PAIRS = 5
 
 # Samples of a recording along which the derivatives are tested.
-MOST_TESTED_SAMPLES = 2000
+MAX_TESTED_SAMPLES = 2000
 
 
 def check(
     experiment: Experiment,
     recordings: Sequence[Recording] = (),
     trajectory: Trajectory | None = None,
+    *,
     threads: int | None = None,
 ) -> Check:
-    """Look at an experiment's initial trajectory, at a given one (a design), or at recordings, at the design's theta.
+    """Check which parameters can be identified, at the parameter values that a design uses.
 
-    Raises SimulationDivergedError where that cannot be simulated, RecordingError for unusable recordings.
+    Without recordings and trajectory, the check is made along the experiment's initial control.
+
+    Args:
+        experiment: Experiment to check.
+        recordings: Recordings to check instead.
+        trajectory: Trajectory, of a design for example, whose control is checked instead.
+        threads: Threads of MuJoCo; None for all cores.
+
+    Raises:
+        RecordingError: Recordings are unusable, or given together with a trajectory.
+        SimulationDivergedError: The trajectory cannot be simulated.
     """
     if recordings and trajectory is not None:
         raise RecordingError("check either recordings or a designed trajectory, not both")
@@ -62,229 +82,340 @@ def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
     if trajectory is not None:
         curve, source = task.plant.simulate(task.theta, trajectory.ctrl), "the given trajectory"
 
-    problem, point = _evaluated(task, curve)
+    problem, point = _evaluate(task, curve)
     if point.information is None or point.sensitivity is None:
-        raise SimulationDivergedError("the simulation diverges when the parameters move a little")
+        raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
-    seen = task.observer.identifiability(curve, point.sensitivity)
-    tested = _self_tested(task, problem, point, seen)
-
-    data = point.information - task.information.prior
-    return _concluded(task, seen, _shared(task, [data]), float(curve.t[-1]), source, tested)
+    identifiability = task.observer.identifiability(curve, point.sensitivity)
+    return _Assessment(
+        task=task,
+        source=source,
+        duration=float(curve.t[-1]),
+        identifiability=identifiability,
+        data=_common_information(task, [point.information - task.information.prior]),
+        tested=_test_derivatives(task, problem, point, identifiability),
+    ).check()
 
 
 def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
-    """Check what recordings tell; derivatives are tested along the longest of them."""
+    """Check which parameters recordings identify; derivatives are tested along the longest one. See `check`."""
     fit = FitProblem.of(system, recordings, data_only=True)
-    longest = max(fit.aligned, key=lambda track: len(track.ctrl))
-    task = DesignTask.along(system, longest.ctrl[:MOST_TESTED_SAMPLES])
+    longest = max(fit.aligned, key=lambda recording: len(recording.ctrl))
+    task = DesignTask.along(system, longest.ctrl[:MAX_TESTED_SAMPLES])
 
-    problem, point = _evaluated(task, task.initial)
+    problem, point = _evaluate(task, task.initial)
     if point.information is None or point.sensitivity is None:
-        raise SimulationDivergedError("the simulation diverges when the parameters move a little")
+        raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
     # Rows of G at the times at which the recordings were measured, and the error of their differences.
     recorded = fit.sensed(fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
-    seen = task.observer.identifiability_of_rows(task.initial, J, error)
-    tested = _self_tested(task, problem, point, seen)
+    identifiability = task.observer.identifiability_of_rows(task.initial, J, error)
 
     count = len(recordings)
-    source = f"{count} recording{'s' if count > 1 else ''}"
-    duration = float(sum(track.t[-1] for track in fit.aligned))
-    data = _shared(task, [rows.T @ rows for rows, _ in recorded])
-    return _concluded(task, seen, data, duration, source, tested)
+    return _Assessment(
+        task=task,
+        source=f"{count} recording{'s' if count > 1 else ''}",
+        duration=float(sum(recording.t[-1] for recording in fit.aligned)),
+        identifiability=identifiability,
+        data=_common_information(task, [rows.T @ rows for rows, _ in recorded]),
+        tested=_test_derivatives(task, problem, point, identifiability),
+    ).check()
 
 
-def _evaluated(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:
-    """The cost of a task with a trajectory as its own reference, and the trajectory's point."""
+def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:
+    """The cost of a task whose tracking term refers to the given trajectory, and the cost's value there."""
     problem = task.problem
     problem = replace(problem, running=replace(problem.running, desired=curve.state))
     return problem, problem.point(curve, CENTRAL_DIFFERENCES)
 
 
-def _self_tested(
-    task: DesignTask, problem: DesignProblem, point: DesignPoint, seen: Identifiability
+def _test_derivatives(
+    task: DesignTask, problem: DesignProblem, point: DesignPoint, identifiability: Identifiability
 ) -> SelfTest:
-    """Test the derivatives along a point, for the combinations that can be identified."""
-    visible = replace(problem, information=replace(problem.information, basis=seen.basis))
+    """Test the derivatives at a point, with a criterion of the identifiable combinations."""
+    information = replace(problem.information, basis=identifiability.basis)
+    visible = replace(problem, information=information)
     return self_test(task, visible, visible.reevaluated(point))
 
 
-def _shared(task: DesignTask, matrices: Sequence[Array]) -> Array:
-    """(p, p) sum of what several experiments tell about their common parameters; initial states are marginalised."""
+def _common_information(task: DesignTask, matrices: Sequence[Array]) -> Array:
+    """(p, p) sum of information matrices about common parameters; parameters of single recordings are marginalised."""
     p = task.parameters
     parts = (shared(each, p.prior_information, p.recording_specific) for each in matrices)
     return np.asarray(sum(parts, start=np.zeros_like(task.prior)))
 
 
-def _concluded(
-    task: DesignTask,
-    seen: Identifiability,
-    data: Array,
-    horizon: float,
-    source: str,
-    tested: SelfTest,
-) -> Check:
-    """data: (p, p) of all that was looked at, each start's own nuisance marginalised"""
-    p = task.parameters
-    information = replace(
-        task.information,
-        prior=task.prior,
-        basis=seen.along_trajectory.basis if seen.along_trajectory.count else None,
-    )
-    total = data + task.prior
-    covariance = information.covariance(total)
-    std = np.full(len(p), np.inf)
-    std[p.interest] = np.nan_to_num(np.sqrt(np.diag(covariance)), nan=np.inf)
-    rows = tuple(_rows(task, information, data, std, horizon))
-    spread = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(spread, spread)
-    confounded = tuple(_pairs(seen.names, correlation))
-    criterion = task.information
-    visible = replace(criterion, basis=seen.basis)
-    never, more = seen.groups_along_all, seen.along_trajectory.count > seen.along_all.count
-    known = {str(g) for g in never}
-    not_here = tuple(g for g in seen.groups_along_trajectory if str(g) not in known) if more else ()
-    eigenvalues = np.maximum(visible.evaluate(data + criterion.prior).eigenvalues, 0.0)
-    verdict = tuple(_verdict(rows, never, not_here, confounded, tested, source))
-    combined = (
-        () if not_here else seen.combinations(information, task.theta[p.interest], total, total)
-    )
-    return Check(
-        source=source,
-        horizon=horizon,
-        rows=rows,
-        wanted=seen.names,
-        information=total,
-        eigenvalues=eigenvalues,
-        correlation=correlation,
-        confounded=confounded,
-        not_separable=never,
-        not_excited=not_here,
-        self_test=tested,
-        verdict=verdict,
-        combined=combined,
-    )
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Assessment:
+    """Everything that a check is computed from.
 
+    Attributes:
+        task: Task that holds the parameters and the criterion.
+        source: Name of the checked data for sentences.
+        duration: Duration of the checked data [s].
+        identifiability: Combinations that can be identified.
+        data: (p, p) information of the checked data [1 / theta-unit^2], without priors.
+        tested: Test of the derivatives.
+    """
 
-def _rows(
-    task: DesignTask, information: FisherInformation, data: Array, std: Array, horizon: float
-) -> Iterator[ParameterCheck]:
-    p = task.parameters
-    for j, parameter in enumerate(p.parameters):
-        value = float(task.theta[j])
-        plain = parameter.size == abs(parameter.guess) and value != 0.0
-        size = abs(value) if plain else float(p.magnitude[j])
-        stated = parameter.wanted is not None
-        wanted = parameter.wanted or DEFAULT_WANTED * size
-        needed = 0 if parameter.nuisance else _repetitions(information, data, task.prior, j, wanted)
-        yield ParameterCheck(
-            name=parameter.name,
-            unit=parameter.unit,
-            value=value,
-            nuisance=parameter.nuisance,
-            size=size,
-            std=float(std[j]),
-            relative=float(std[j] / size),
-            wanted=wanted,
-            stated=stated,
-            repetitions=needed,
-            seconds=needed * horizon,
+    task: DesignTask
+    source: str
+    duration: float
+    identifiability: Identifiability
+    data: Array
+    tested: SelfTest
+
+    def check(self) -> Check:
+        """The record for the user."""
+        task, found = self.task, self.identifiability
+        information = self._information()
+        total = self.data + task.prior
+
+        # Standard deviations of the wanted parameters; infinite where one cannot be identified alone.
+        covariance = information.covariance(total)
+        spread = np.sqrt(np.diag(covariance))
+        std = np.full(len(task.parameters), np.inf)
+        std[task.parameters.interest] = np.nan_to_num(spread, nan=np.inf)
+        correlation = covariance / np.outer(spread, spread)
+
+        # The criterion's eigenvalues, without combinations that no experiment can show.
+        criterion = replace(task.information, basis=found.basis)
+        eigenvalues = criterion.evaluate(self.data + criterion.prior).eigenvalues
+
+        rows = self._rows(information, std)
+        confounded = _confounded_pairs(found.names, correlation)
+        not_excited = self._not_excited()
+        combined: tuple[CombinationAccuracy, ...] = ()
+        if not not_excited:
+            values = task.theta[task.parameters.interest]
+            combined = found.combinations(information, values, total, total)
+
+        verdict = _Verdict(
+            rows=rows,
+            not_separable=found.groups_along_all,
+            not_excited=not_excited,
+            confounded=confounded,
+            tested=self.tested,
+            source=self.source,
+        )
+        return Check(
+            source=self.source,
+            horizon=self.duration,
+            rows=rows,
+            wanted=found.names,
+            information=total,
+            eigenvalues=np.maximum(eigenvalues, 0.0),
+            correlation=correlation,
+            confounded=confounded,
+            not_separable=found.groups_along_all,
+            not_excited=not_excited,
+            self_test=self.tested,
+            verdict=tuple(verdict.sentences()),
+            combined=combined,
         )
 
+    def _information(self) -> FisherInformation:
+        """Turns information matrices into covariances of the combinations that the checked data show."""
+        here = self.identifiability.along_trajectory
+        basis = here.basis if here.count else None
+        return replace(self.task.information, prior=self.task.prior, basis=basis)
 
-def _repetitions(
-    information: FisherInformation, data: Array, prior: Array, parameter: int, wanted: float
-) -> int:
-    """Least number of repetitions whose information, with the prior, brings a parameter to the wanted sigma; 0: none do."""
-    t = np.arange(len(data)) if information.interest is None else information.interest
-    place = int(np.flatnonzero(t == parameter)[0])
+    def _not_excited(self) -> tuple[ParameterGroup, ...]:
+        """Groups that the checked data do not show, though another control would."""
+        found = self.identifiability
+        if found.along_trajectory.count <= found.along_all.count:
+            return ()
 
-    def reached(n: int) -> bool:
-        """True where n repetitions are enough."""
-        variance = information.covariance(n * data + prior)[place, place]
-        return bool(variance <= wanted**2)
+        never_shown = {str(group) for group in found.groups_along_all}
+        return tuple(g for g in found.groups_along_trajectory if str(g) not in never_shown)
 
-    low, high = 0, 1
-    while not reached(high):
-        low, high = high, 2 * high
-        if high > MOST:
-            return 0
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if reached(middle) else (middle, high)
-    return high
+    def _rows(self, information: FisherInformation, std: Array) -> tuple[ParameterCheck, ...]:
+        """Predicted accuracy of every parameter; std: (p,) [theta-unit]."""
+        p = self.task.parameters
+        rows = []
+        for j, parameter in enumerate(p.parameters):
+            value = float(self.task.theta[j])
+
+            # Parameters of vectors and tensors are compared with the whole vector or tensor.
+            is_scalar = parameter.size == abs(parameter.guess) and value != 0.0
+            size = abs(value) if is_scalar else float(p.magnitude[j])
+            wanted = parameter.wanted or DEFAULT_RELATIVE_STD * size
+
+            repetitions = 0
+            if not parameter.nuisance:
+                repetitions = self._repetitions(information, j, wanted)
+
+            row = ParameterCheck(
+                name=parameter.name,
+                unit=parameter.unit,
+                value=value,
+                nuisance=parameter.nuisance,
+                size=size,
+                std=float(std[j]),
+                relative=float(std[j] / size),
+                wanted=wanted,
+                stated=parameter.wanted is not None,
+                repetitions=repetitions,
+                seconds=repetitions * self.duration,
+            )
+            rows.append(row)
+
+        return tuple(rows)
+
+    def _repetitions(self, information: FisherInformation, parameter: int, wanted: float) -> int:
+        """Smallest number of repetitions that reaches the wanted standard deviation [theta-unit]; 0 where none does."""
+        interest = information.interest
+        if interest is None:
+            interest = np.arange(len(self.data))
+        place = int(np.flatnonzero(interest == parameter)[0])
+
+        def suffices(repetitions: int) -> bool:
+            """True where that many repetitions reach the wanted standard deviation."""
+            total = repetitions * self.data + self.task.prior
+            variance = information.covariance(total)[place, place]
+            return bool(variance <= wanted**2)
+
+        # Double the number until it suffices, then bisect.
+        low, high = 0, 1
+        while not suffices(high):
+            low, high = high, 2 * high
+            if high > MAX_REPETITIONS:
+                return 0
+
+        while high - low > 1:
+            middle = (low + high) // 2
+            if suffices(middle):
+                high = middle
+            else:
+                low = middle
+        return high
 
 
-def _pairs(names: Sequence[str], correlation: Array) -> Iterator[ConfoundedPair]:
-    """Confounded pairs, the worst first."""
-    found = [
-        ConfoundedPair(first=names[i], second=names[j], correlation=float(correlation[i, j]))
-        for i in range(len(names))
-        for j in range(i + 1, len(names))
-        if abs(correlation[i, j]) > CONFOUNDED_CORRELATION
-    ]
-    yield from sorted(found, key=lambda pair: -abs(pair.correlation))
+def _confounded_pairs(names: Sequence[str], correlation: Array) -> tuple[ConfoundedPair, ...]:
+    """Confounded pairs of parameters, the strongest correlation first; correlation: (t, t)."""
+    strong = np.triu(np.abs(correlation) > CONFOUNDED_CORRELATION, k=1)
+    pairs = []
+    for i, j in np.argwhere(strong).tolist():
+        pair = ConfoundedPair(
+            first=names[i],
+            second=names[j],
+            correlation=float(correlation[i, j]),
+        )
+        pairs.append(pair)
+
+    return tuple(sorted(pairs, key=lambda pair: -abs(pair.correlation)))
 
 
-def _brief(groups: Sequence[ParameterGroup]) -> str:
-    """Groups in words, or only how many where that would fill a page."""
-    said = "; ".join(str(group) for group in groups)
-    if len(said) <= LONGEST_LINE:
-        return said
+def _groups_in_words(groups: Sequence[ParameterGroup]) -> str:
+    """List parameter groups, or only count them where the list would fill a page."""
+    words = "; ".join(str(group) for group in groups)
+    if len(words) <= MAX_LIST_LENGTH:
+        return words
+
     members = sum(len(group.members) for group in groups)
     return f"{members} parameters in {len(groups)} groups (listed under combinations)"
 
 
-def _verdict(
-    rows: Sequence[ParameterCheck],
-    never: Sequence[ParameterGroup],
-    not_here: Sequence[ParameterGroup],
-    confounded: Sequence[ConfoundedPair],
-    tested: SelfTest,
-    source: str,
-) -> Iterator[str]:
-    """Sentences that a person can act on, the gravest first."""
-    if tested.roughness is not None:
-        yield f"{tested.roughness}"
-    elif not tested.passed:
-        yield (
-            f"derivatives do not agree (psi recursion {tested.recursion:.1e}, slope {tested.slope:.1e}); {tested.likely_cause}. "
-            "Shorten horizon or timestep, or smooth the switch, before trusting numbers here"
-        )
-    known = {row.name for row in rows if np.isfinite(row.std)}
-    open_ = [group for group in never if not set(group.members) <= known]
-    settled = [group for group in never if set(group.members) <= known]
-    if open_:
-        yield (
-            f"no control from this start tells apart (nor did random ones): {_brief(open_)}. Take out or fix one of each group, "
-            "give it a prior, or measure something else; a design works on the combinations"
-        )
-    if settled:
-        yield f"told apart by priors only, not by data: {'; '.join(join_names(group.members) for group in settled)}"
-    if not_here:
-        yield f"not visible from {source}, but another control would show: {_brief(not_here)}. Move those joints more"
-    wanted = [row for row in rows if not row.nuisance]
-    alone = [row for row in wanted if np.isfinite(row.std)]
-    late = [row for row in alone if row.repetitions != 1]
-    if not alone:
-        yield "nothing can be identified from this"
-        return
-    worst = max(alone, key=lambda row: row.std / row.wanted)
-    if not late and tested.passed and not open_ and not not_here:
-        yield f"all that can be told alone reaches its wanted sigma from {source}: nothing more is needed"
-    elif late:
-        reach = (
-            f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s)"
-            if worst.repetitions
-            else "no repetition"
-        )
-        yield (
-            f"not known to the wanted sigma from {source} alone: {len(late)} of {len(alone)} parameters, above all "
-            f"{worst.name}: {reach} for {worst.wanted:.3g}. An excitation that is designed (`mjfim design`) tells more"
-        )
-    if confounded:
-        said = ", ".join(f"{p.first} / {p.second} ({p.correlation:+.3f})" for p in confounded[:5])
-        more = f" and {len(confounded) - 5} more pairs" if len(confounded) > 5 else ""
-        yield f"hardly told apart (correlation): {said}{more}; fixing one of a pair sharpens the other"
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Verdict:
+    """Findings of a check, from which sentences for the user are made.
+
+    Attributes:
+        rows: Accuracy of every parameter.
+        not_separable: Groups whose members no control can separate.
+        not_excited: Groups that the checked data do not show, though another control would.
+        confounded: Strongly correlated pairs.
+        tested: Test of the derivatives.
+        source: Name of the checked data.
+    """
+
+    rows: Sequence[ParameterCheck]
+    not_separable: Sequence[ParameterGroup]
+    not_excited: Sequence[ParameterGroup]
+    confounded: Sequence[ConfoundedPair]
+    tested: SelfTest
+    source: str
+
+    def sentences(self) -> Iterator[str]:
+        """Sentences that a person can act on, the gravest first."""
+        yield from self._about_derivatives()
+        yield from self._about_identifiability()
+
+        identifiable = [row for row in self.rows if not row.nuisance and np.isfinite(row.std)]
+        if not identifiable:
+            yield f"no parameter can be identified individually from {self.source}"
+            return
+
+        yield from self._about_accuracy(identifiable)
+        yield from self._about_correlation()
+
+    def _about_derivatives(self) -> Iterator[str]:
+        """Say why the numbers of the check cannot be trusted, where the self-test failed."""
+        tested = self.tested
+        if tested.roughness is not None:
+            yield f"{tested.roughness}"
+        elif not tested.passed:
+            yield (
+                f"the derivatives do not agree (psi recursion {tested.recursion:.1e}, slope {tested.slope:.1e}); "
+                f"{tested.likely_cause}. Shorten horizon or timestep, or smooth what switches, before you trust these numbers"
+            )
+
+    def _groups_left_to_priors(self) -> tuple[list[ParameterGroup], list[ParameterGroup]]:
+        """Inseparable groups that remain unknown, and those that priors alone resolve."""
+        known = {row.name for row in self.rows if np.isfinite(row.std)}
+        unknown, resolved = [], []
+        for group in self.not_separable:
+            if set(group.members) <= known:
+                resolved.append(group)
+            else:
+                unknown.append(group)
+
+        return unknown, resolved
+
+    def _about_identifiability(self) -> Iterator[str]:
+        """Name combinations that cannot be identified, and say what helps."""
+        unknown, resolved = self._groups_left_to_priors()
+        if unknown:
+            yield (
+                "not identifiable separately from this initial state, with any tested control: "
+                f"{_groups_in_words(unknown)}. Remove or fix one parameter of each group, give it a prior, or measure "
+                "another output; a design uses the identifiable combinations"
+            )
+        if resolved:
+            names = "; ".join(join_names(group.members) for group in resolved)
+            yield f"separated by priors only, not by data: {names}"
+        if self.not_excited:
+            yield (
+                f"not excited by {self.source}, but another control would show: {_groups_in_words(self.not_excited)}. "
+                "Move those joints more"
+            )
+
+    def _about_accuracy(self, identifiable: Sequence[ParameterCheck]) -> Iterator[str]:
+        """Compare the predicted standard deviations of identifiable parameters with the wanted ones."""
+        missed = [row for row in identifiable if row.repetitions != 1]
+        unknown, _ = self._groups_left_to_priors()
+
+        if missed:
+            worst = max(identifiable, key=lambda row: row.std / row.wanted)
+            needed = "no number of repetitions reaches"
+            if worst.repetitions:
+                needed = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s) reach"
+            yield (
+                f"{len(missed)} of {len(identifiable)} parameters miss the wanted sigma with {self.source} alone; "
+                f"the worst is {worst.name}: {needed} {worst.wanted:.3g}. "
+                "A designed excitation (`mjfim design`) needs fewer"
+            )
+        elif self.tested.passed and not unknown and not self.not_excited:
+            yield f"every identifiable parameter reaches its wanted sigma with {self.source}: nothing more is needed"
+
+    def _about_correlation(self) -> Iterator[str]:
+        """List confounded pairs."""
+        if not self.confounded:
+            return
+
+        listed = self.confounded[:MAX_LISTED_PAIRS]
+        words = ", ".join(f"{p.first} / {p.second} ({p.correlation:+.3f})" for p in listed)
+        rest = len(self.confounded) - len(listed)
+        more = f" and {rest} more pairs" if rest else ""
+        yield f"confounded (correlation of the estimates): {words}{more}; fixing one parameter of a pair makes the other more accurate"

@@ -1,4 +1,8 @@
-"""Derivatives checked on the user's own model: two difference steps, the recursion of psi, the slope along the manifold."""
+"""Tests of the derivatives on the user's model.
+
+Three numbers are compared along one trajectory: dy/dtheta by two difference steps, psi by rollouts against its linear
+recursion, and the slope of the cost against differences of the cost through the projection operator.
+"""
 
 from __future__ import annotations
 
@@ -19,78 +23,126 @@ from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.records.check import SelfTest
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
+# Steps along the tested curve, in units of the plant's own difference steps; the smaller error of the two counts.
+SLOPE_STEPS = (1e-3, 1e-4)
+
+# Smallest slope that an error is divided by; avoids a division by zero.
+LEAST_SLOPE = 1e-300
+
 
 def self_test(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> SelfTest:
-    """Test the derivatives about a point of a problem that was computed with central differences."""
+    """Test the derivatives about one trajectory.
+
+    Args:
+        task: Task whose model is tested.
+        problem: Cost whose slope is tested.
+        point: Trajectory with the cost there, computed with central differences.
+
+    Raises:
+        SimulationDivergedError: The trajectory diverges when the parameters change a little.
+    """
     trajectory = point.trajectory
     if trajectory is None or point.sensitivity is None:
-        raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
-    found = SelfTest(
-        roughness=roughness(
-            task.plant,
-            task.system.noise,
-            task.system.model_at(task.theta),
-            task.theta,
-            trajectory,
-            point.sensitivity,
-        ),
+        raise SimulationDivergedError("the trajectory diverges when the parameters change a little")
+
+    model = task.system.model_at(task.theta)
+    rough = roughness(
+        task.plant, task.system.noise, model, task.theta, trajectory, point.sensitivity
+    )
+    tested = SelfTest(
+        roughness=rough,
         recursion=recursion_error(task, trajectory, point.sensitivity),
         slope=slope_error(task, problem, point),
     )
-    if found.passed or found.roughness is not None:
-        return found
-    active = first_active_constraint(task.system.model_at(task.theta), trajectory)
+
+    # Roughness names its cause itself; any other failure gets the first constraint that acts as its likely cause.
+    if tested.passed or tested.roughness is not None:
+        return tested
+    active = first_active_constraint(model, trajectory)
     if active is None:
-        return replace(
-            found,
-            likely_cause="the motion may be too unstable, or something switches (muscle activation)",
-        )
+        cause = "the motion may be too unstable, or a component switches (muscle activation)"
+        return replace(tested, likely_cause=cause)
+
     sample, causes = active
-    where = f"sample {sample} (t = {trajectory.t[sample]:.4g} s)"
-    return replace(
-        found, likely_cause=f"something that switches acts from {where} on: {', '.join(causes)}"
+    cause = (
+        f"constraints are active from sample {sample} (t = {trajectory.t[sample]:.4g} s): "
+        f"{', '.join(causes)}"
     )
+    return replace(tested, likely_cause=cause)
 
 
 def recursion_error(task: DesignTask, trajectory: Trajectory, sensitivity: Sensitivity) -> float:
-    """Largest difference between two ways to psi, relative to the largest entry of each parameter's psi."""
+    """Compare psi by rollouts with psi by the recursion `psi_{k+1} = A_k psi_k + E_k`.
+
+    Args:
+        task: Task whose model is tested.
+        trajectory: Trajectory of N samples.
+        sensitivity: psi: (N+1, nx, p) [x-unit / theta-unit] and G: (N+1, ny, p) along it, by rollouts.
+
+    Returns:
+        Largest difference, relative to the largest entry of each parameter's psi; infinite where the motion diverges.
+    """
     try:
-        line = task.plant.derivatives.linearize(task.theta, trajectory)
+        linear = task.plant.derivatives.linearize(task.theta, trajectory)
     except SimulationDivergedError:
         return np.inf
+
     psi = sensitivity.psi
-    recursion = LinearRecursion(line.A)
-    own = np.stack(
-        [recursion.forward(psi[0, :, j], line.E[..., j]) for j in range(psi.shape[2])], axis=2
-    )
+    recursion = LinearRecursion(linear.A)
+    columns = [recursion.forward(psi[0, :, j], linear.E[..., j]) for j in range(psi.shape[2])]
+    expected = np.stack(columns, axis=2)
+
+    # Parameters that move nothing measurable have a psi of round-off, which says nothing about the recursion.
     size = np.abs(psi).max(axis=(0, 1))
-    moving = (size > 0.0) & visible_columns(
-        task.parameters, task.system.noise.whiten(sensitivity.G)
-    )
-    if not moving.any():
+    whitened = task.system.noise.whiten(sensitivity.G)
+    visible = (size > 0.0) & visible_columns(task.parameters, whitened)
+    if not visible.any():
         return 0.0
-    return float((np.abs(own - psi).max(axis=(0, 1))[moving] / size[moving]).max())
+
+    error = np.abs(expected - psi).max(axis=(0, 1))
+    return float((error[visible] / size[visible]).max())
 
 
 def slope_error(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> float:
-    """Relative error of DJ.zeta along the first descent direction, against central differences through the projection."""
+    """Compare the slope DJ . zeta along the first descent direction with central differences of J(P(xi + gamma zeta)).
+
+    Args:
+        task: Task whose model is tested.
+        problem: Cost whose slope is tested.
+        point: Trajectory with the cost there.
+
+    Returns:
+        Relative error; NaN where the cost is infinite, infinite where a moved trajectory diverges.
+    """
     if not np.isfinite(point.cost) or point.trajectory is None:
         return float("nan")
+
     expansion = problem.expand(point)
     K = regulator_for(task).gain(expansion)
-    zeta = LBFGS(np.diag(task.control_weight) * task.dt)(expansion, K)
-    size = task.plant.derivatives.difference_sizes(point.trajectory)
-    relative = max(
-        np.abs(zeta.z / size[: zeta.z.shape[1]]).max(),
-        np.abs(zeta.v / size[zeta.z.shape[1] :]).max(),
-    )
-    if relative == 0.0:
+    zeta = LBFGS(_control_metric(task))(expansion, K)
+
+    # Scale the curve so that its largest entry is one difference step of the plant.
+    sizes = task.plant.derivatives.difference_sizes(point.trajectory)
+    nx = zeta.z.shape[1]
+    largest = max(np.abs(zeta.z / sizes[:nx]).max(), np.abs(zeta.v / sizes[nx:]).max())
+    if largest == 0.0:
         return 0.0
-    unit = TangentCurve(z=zeta.z / relative, v=zeta.v / relative)
-    return min(_slope_error(problem, point, expansion, unit, K, step) for step in (1e-3, 1e-4))
+
+    unit = TangentCurve(z=zeta.z / largest, v=zeta.v / largest)
+    return min(_slope_error_at(problem, point, expansion, unit, K, step) for step in SLOPE_STEPS)
 
 
-def _slope_error(
+def _control_metric(task: DesignTask) -> Array:
+    """(nu, nu) metric of the tested direction: the weights of the control, or unit weights where one of them is zero."""
+    weights = task.control_weight
+    if (weights > 0.0).all():
+        return np.diag(weights) * task.dt
+
+    # A cost without control weights has no metric of its own: the direction would divide by zero.
+    return regulator_for(task).R
+
+
+def _slope_error_at(
     problem: DesignProblem,
     point: DesignPoint,
     expansion: Expansion,
@@ -98,8 +150,12 @@ def _slope_error(
     K: Array,
     step: float,
 ) -> float:
-    ends = [problem.value(problem.project(point, zeta, sign * step, K)) for sign in (1.0, -1.0)]
-    expected = expansion.slope(zeta)
-    if not np.isfinite(ends).all():
+    """Relative error of the slope along zeta against central differences of one step; infinite where these diverge."""
+    forward = problem.value(problem.project(point, zeta, step, K))
+    backward = problem.value(problem.project(point, zeta, -step, K))
+    if not np.isfinite([forward, backward]).all():
         return np.inf
-    return float(abs((ends[0] - ends[1]) / (2.0 * step) - expected) / max(abs(expected), 1e-300))
+
+    expected = expansion.slope(zeta)
+    measured = (forward - backward) / (2.0 * step)
+    return float(abs(measured - expected) / max(abs(expected), LEAST_SLOPE))

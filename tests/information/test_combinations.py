@@ -138,7 +138,7 @@ def test_nothing_visible_is_a_verdict_not_a_crash(tmp_path) -> None:
         pendulum(tmp_path, parameters={"wind": {"target": "option:wind[0]", "guess": 1.0}})
     )
     assert not found.ok
-    assert any("nothing can be identified" in sentence for sentence in found.verdict)
+    assert any("no parameter can be identified" in sentence for sentence in found.verdict)
 
 
 def test_a_prior_on_one_member_tells_the_group_apart(tmp_path) -> None:

@@ -1,9 +1,10 @@
-"""`mjfim.check` against independent numbers, null directions in the user's words, and what its self-test must catch."""
+"""`mjfim.check`: independent numbers, names of null directions, and wrong derivatives that the self-test must catch."""
 
 from __future__ import annotations
 
 import gzip
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -66,7 +67,7 @@ def test_sigmas_are_those_of_evaluate_trajectory_also_with_priors_and_nuisance(t
     assert [row.name for row in found.rows if row.nuisance][:2] == ["gain", "initial qpos:slide"]
 
 
-def test_a_product_is_told_with_its_combination(tmp_path) -> None:
+def test_factors_of_a_product_are_named_with_their_combination(tmp_path) -> None:
     parameters = {
         **CART_PARAMETERS,
         **PRODUCT,
@@ -91,7 +92,7 @@ def test_a_product_is_told_with_its_combination(tmp_path) -> None:
     assert any("gear" in sentence and "gain" in sentence for sentence in found.verdict)
 
 
-def test_what_another_control_would_show_is_told_apart_from_what_none_would(tmp_path) -> None:
+def test_parameters_that_only_this_control_does_not_excite_are_named_as_such(tmp_path) -> None:
     rest = {
         "qpos": (0.0, 0.0),
         "qvel": (0.0, 0.0),
@@ -126,7 +127,7 @@ def test_a_wanted_sigma_below_what_nuisance_allows_is_never_reached(tmp_path) ->
     assert rows["m"].repetitions > 1
 
 
-def test_recordings_add_up_and_missing_values_do_not_count(tmp_path) -> None:
+def test_information_of_recordings_adds_up_without_missing_values(tmp_path) -> None:
     task = cart_task(tmp_path)
     whole = simulate_system(task.system, task.initial, seed=1)
     thinned = np.array(whole.y)
@@ -144,7 +145,7 @@ def test_recordings_add_up_and_missing_values_do_not_count(tmp_path) -> None:
     assert two.horizon == pytest.approx(2 * alone.horizon)
 
 
-def test_a_given_trajectory_is_looked_at_instead(tmp_path) -> None:
+def test_a_given_trajectory_is_checked_instead_of_the_initial_one(tmp_path) -> None:
     task = cart_task(tmp_path)
     other = task.plant.simulate(task.theta, 2.0 * task.control)
     found = check_task(task, trajectory=other)
@@ -216,7 +217,7 @@ def test_the_double_pendulum_names_its_base_parameters() -> None:
 
 
 @pytest.mark.slow
-def test_recordings_of_the_real_double_pendulum_tell_the_same() -> None:
+def test_recordings_of_the_real_double_pendulum_give_the_same_combinations() -> None:
     file = RECORDED / "A0_00.csv.gz"
     if not file.is_file():
         pytest.skip("the recordings of the double pendulum are not here")
@@ -250,3 +251,23 @@ def test_the_summary_is_strict_json(tmp_path) -> None:
     assert "NaN" not in text
     assert "Infinity" not in text
     assert '"identifiable"' in text
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        pytest.param(
+            file,
+            id=file.stem,
+            marks=[] if file.stem == "cart_pendulum_limits" else pytest.mark.slow,
+        )
+        for file in sorted(MODELS.glob("*.toml"))
+    ],
+)
+def test_every_example_can_be_checked_whatever_its_weights(file: Path) -> None:
+    """A cost without control weights has no metric of its own; the slope is tested along a unit-weight direction."""
+    found = check(mjfim.Experiment.from_file(file))
+    assert found.verdict
+    assert np.isfinite(found.self_test.slope)
+    if found.self_test.roughness is None:
+        assert found.self_test.passed
