@@ -418,4 +418,7 @@ class _Verdict:
         words = ", ".join(f"{p.first} / {p.second} ({p.correlation:+.3f})" for p in listed)
         rest = len(self.confounded) - len(listed)
         more = f" and {rest} more pairs" if rest else ""
-        yield f"confounded (correlation of the estimates): {words}{more}; fixing one parameter of a pair makes the other more accurate"
+        yield (
+            f"confounded (correlation of the estimates): {words}{more}; "
+            "fixing one parameter of a pair makes the other more accurate"
+        )
