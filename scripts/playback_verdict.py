@@ -280,26 +280,29 @@ def picture(verdict: Verdict, path: Path, conditions: Conditions) -> None:
         f"{verdict.runs} robots, every parameter {100 * conditions.wrong:g} % off, commands "
         f"{1e3 * conditions.latency:g} ms late, {how}"
     )
-    figure.suptitle(title, x=0.01, ha="left", fontsize=style.LARGE, color=style.INK)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=style.LARGE_FONT, color=style.TEXT_COLOUR)
     style.save(figure, path)
 
 
 def draw_limits(axes: Axes, verdict: Verdict) -> None:
     """A row per limit: the plan and all robots."""
-    style.dress(axes, "margin over half of the range [%]")
+    style.format_axes(axes, "margin over half of the range [%]")
     rng, limits = np.random.default_rng(0), verdict.bench.limits
     place = np.arange(len(limits))[::-1]
     shown = 100.0 * np.maximum(verdict.margins, -1.0)
     low = min(-5.0, float(shown.min(initial=0.0)) - 5.0)
-    axes.axvspan(low, 0.0, color=style.OPTIMIZED, alpha=0.10, linewidth=0.0)
+    axes.axvspan(low, 0.0, color=style.OPTIMIZED_COLOUR, alpha=0.10, linewidth=0.0)
     for i, y in enumerate(place):
-        colour = style.INITIAL if verdict.kept[:, i].all() else style.OPTIMIZED
+        colour = style.INITIAL_COLOUR if verdict.kept[:, i].all() else style.OPTIMIZED_COLOUR
         spread = y + rng.uniform(-0.22, 0.22, verdict.runs)
         axes.plot(
             shown[:, i], spread, ".", color=colour, markersize=4.5, alpha=0.4, markeredgewidth=0.0
         )
         axes.plot(
-            [100.0 * verdict.planned[i]] * 2, [y - 0.32, y + 0.32], color=style.INK, linewidth=1.6
+            [100.0 * verdict.planned[i]] * 2,
+            [y - 0.32, y + 0.32],
+            color=style.TEXT_COLOUR,
+            linewidth=1.6,
         )
     axes.set_yticks(
         place,
@@ -308,14 +311,14 @@ def draw_limits(axes: Axes, verdict: Verdict) -> None:
     axes.set_xlim(low, max(100.0, 100.0 * float(verdict.planned.max(initial=0.0)) + 5.0))
     axes.set_ylim(-0.7, len(limits) - 0.3)
     title = f"Limits at every engine step: {verdict.all_kept} of {verdict.runs} robots keep all"
-    axes.set_title(title, fontsize=style.NORMAL, loc="left", color=style.INK)
+    axes.set_title(title, fontsize=style.NORMAL_FONT, loc="left", color=style.TEXT_COLOUR)
     handles = [
-        Line2D([], [], color=style.INK, linewidth=1.6, label="plan"),
-        Line2D([], [], color=style.INITIAL, marker=".", linestyle="", label="robots"),
+        Line2D([], [], color=style.TEXT_COLOUR, linewidth=1.6, label="plan"),
+        Line2D([], [], color=style.INITIAL_COLOUR, marker=".", linestyle="", label="robots"),
         Line2D(
             [],
             [],
-            color=style.OPTIMIZED,
+            color=style.OPTIMIZED_COLOUR,
             marker=".",
             linestyle="",
             label="robots, limit exceeded by some",
@@ -323,7 +326,7 @@ def draw_limits(axes: Axes, verdict: Verdict) -> None:
     ]
     axes.legend(
         handles=handles,
-        fontsize=style.SMALL,
+        fontsize=style.SMALL_FONT,
         frameon=False,
         loc="upper left",
         bbox_to_anchor=(0.0, -0.06),
@@ -333,21 +336,24 @@ def draw_limits(axes: Axes, verdict: Verdict) -> None:
 
 def draw_errors(axes: Axes, verdict: Verdict) -> None:
     """Estimates against the truth, in standard deviations."""
-    style.dress(axes, "", "(estimate − truth) / σ")
+    style.format_axes(axes, "", "(estimate − truth) / σ")
     rng = np.random.default_rng(0)
-    axes.axhspan(-HALF, HALF, color=style.MEASURED, alpha=0.12, linewidth=0.0)
-    axes.axhline(0.0, color=style.MUTED, linewidth=0.8)
+    axes.axhspan(-HALF, HALF, color=style.MEASURED_COLOUR, alpha=0.12, linewidth=0.0)
+    axes.axhline(0.0, color=style.MUTED_COLOUR, linewidth=0.8)
     for j in range(len(verdict.names)):
         z = np.clip(verdict.z[:, j], -5.0, 5.0)
         hit = np.abs(z) <= HALF
         x = j + rng.uniform(-0.28, 0.28, len(z))
-        for some, colour in ((hit, style.MEASURED), (~hit, style.OPTIMIZED)):
+        for some, colour in ((hit, style.MEASURED_COLOUR), (~hit, style.OPTIMIZED_COLOUR)):
             axes.plot(
                 x[some], z[some], ".", color=colour, markersize=4.0, alpha=0.7, markeredgewidth=0.0
             )
     axes.set_ylim(-5.2, 5.2)
     axes.set_title(
-        "Errors of the estimates; shaded: 95 %", fontsize=style.NORMAL, loc="left", color=style.INK
+        "Errors of the estimates; shaded: 95 %",
+        fontsize=style.NORMAL_FONT,
+        loc="left",
+        color=style.TEXT_COLOUR,
     )
 
 
@@ -355,37 +361,37 @@ def draw_coverage(axes: Axes, verdict: Verdict) -> None:
     """How often the interval holds the true value."""
     n, x = verdict.runs, np.arange(len(verdict.names))
     share = 100.0 * verdict.inside / n
-    style.dress(axes, "", "inside 95 % [%]")
+    style.format_axes(axes, "", "inside 95 % [%]")
     low, high = (100.0 * k / n for k in binom.interval(CONFIDENCE, n, CONFIDENCE))
-    axes.axhspan(low, high, color=style.MEASURED, alpha=0.12, linewidth=0.0)
-    axes.axhline(100.0 * WANTED, color=style.OPTIMIZED, linewidth=1.0, linestyle="--")
-    axes.plot(x, share, "o", color=style.INK, markersize=5.0)
+    axes.axhspan(low, high, color=style.MEASURED_COLOUR, alpha=0.12, linewidth=0.0)
+    axes.axhline(100.0 * WANTED, color=style.OPTIMIZED_COLOUR, linewidth=1.0, linestyle="--")
+    axes.plot(x, share, "o", color=style.TEXT_COLOUR, markersize=5.0)
     for i, value in enumerate(share):
         axes.annotate(
             f"{value:.0f}",
             (i, value),
             (6, 3),
             textcoords="offset points",
-            fontsize=style.SMALL,
-            color=style.INK,
+            fontsize=style.SMALL_FONT,
+            color=style.TEXT_COLOUR,
         )
     axes.set_ylim(min(85.0, float(share.min(initial=100.0)) - 3.0), 103.0)
     title = "Coverage; dashed: wanted, shaded: what chance makes of 95 %"
-    axes.set_title(title, fontsize=style.NORMAL, loc="left", color=style.INK)
+    axes.set_title(title, fontsize=style.NORMAL_FONT, loc="left", color=style.TEXT_COLOUR)
 
 
 def draw_arrival(axes: Axes, verdict: Verdict) -> None:
     """How wrong before, how wrong predicted, how wrong after."""
     x = np.arange(len(verdict.names))
-    style.dress(axes, "", "error, guess = 100 [%]")
+    style.format_axes(axes, "", "error, guess = 100 [%]")
     before = np.where(verdict.wrong > 0.0, verdict.wrong, np.nan)
     for y, marker, colour, label in (
-        (np.full(len(x), 100.0), "o", style.MUTED, "guess"),
-        (100.0 * verdict.predicted / before, "_", style.INK, "σ predicted before any run"),
+        (np.full(len(x), 100.0), "o", style.MUTED_COLOUR, "guess"),
+        (100.0 * verdict.predicted / before, "_", style.TEXT_COLOUR, "σ predicted before any run"),
         (
             100.0 * verdict.observed / before,
             ".",
-            style.OPTIMIZED,
+            style.OPTIMIZED_COLOUR,
             "root mean square error of all robots",
         ),
     ):
@@ -405,7 +411,7 @@ def draw_arrival(axes: Axes, verdict: Verdict) -> None:
     axes.set_ylim(60.0 * low, 400.0)
     axes.set_xticks(x, [style.shorten(name, 24) for name in verdict.names], rotation=30, ha="right")
     axes.legend(
-        fontsize=style.SMALL,
+        fontsize=style.SMALL_FONT,
         frameon=False,
         loc="lower left",
         bbox_to_anchor=(0.0, 0.98),

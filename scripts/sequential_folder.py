@@ -139,7 +139,7 @@ def described(now: Round, task: DesignTask) -> str:
     for j, name in enumerate(e.parameters):
         if np.isfinite(aims[j]):
             parts.append(
-                f"{name} {style.with_error(float(e.theta[j]), float(e.std[j]))} (wanted {aims[j]:.3g})"
+                f"{name} {style.format_with_uncertainty(float(e.theta[j]), float(e.std[j]))} (wanted {aims[j]:.3g})"
             )
     return ", ".join(parts)
 

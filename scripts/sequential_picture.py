@@ -27,8 +27,8 @@ def figure(campaign: Campaign, task: DesignTask, simulated: bool) -> Figure:
         _draw_std(panels[row, 0], campaign, j)
         _draw_estimate(panels[row, 1], campaign, j, float(p.true[j]) if simulated else None)
         name = style.shorten(p.names[j], 18)
-        style.dress(panels[row, 0], "round" if last else "", f"σ of {name}{unit}")
-        style.dress(panels[row, 1], "round" if last else "", f"{name}{unit}")
+        style.format_axes(panels[row, 0], "round" if last else "", f"σ of {name}{unit}")
+        style.format_axes(panels[row, 1], "round" if last else "", f"{name}{unit}")
         for axes in panels[row]:
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             axes.set_xlim(0.5, max(len(campaign.rounds), 2) + 0.5)
@@ -38,20 +38,22 @@ def figure(campaign: Campaign, task: DesignTask, simulated: bool) -> Figure:
         Line2D(
             [],
             [],
-            color=style.INITIAL,
+            color=style.INITIAL_COLOUR,
             marker="o",
             mfc="white",
             linestyle="",
             label="promised before the round",
         ),
-        Line2D([], [], color=style.OPTIMIZED, marker="o", label="after it, from all recordings"),
-        Line2D([], [], color=style.INK, linestyle="--", label="wanted"),
+        Line2D(
+            [], [], color=style.OPTIMIZED_COLOUR, marker="o", label="after it, from all recordings"
+        ),
+        Line2D([], [], color=style.TEXT_COLOUR, linestyle="--", label="wanted"),
     ]
     if simulated:
-        handles.append(Line2D([], [], color=style.MEASURED, label="true"))
+        handles.append(Line2D([], [], color=style.MEASURED_COLOUR, label="true"))
     note = "Bars and the last round's band: ± 1 and ± 2 formal σ, which are accuracy only if the model and the noise are right."
     title = f"{len(campaign.rounds)} rounds of design, recording and estimate: {campaign.status.value.split(':')[0]}"
-    style.headline(new, style.shorten(title, 100), handles, note)
+    style.add_title(new, style.shorten(title, 100), handles, note)
     return new
 
 
@@ -63,35 +65,35 @@ def _draw_std(axes: Axes, campaign: Campaign, j: int) -> None:
     axes.plot(
         number,
         promised,
-        color=style.INITIAL,
+        color=style.INITIAL_COLOUR,
         marker="o",
         mfc="white",
         linestyle="",
         markersize=8,
         zorder=2,
     )
-    axes.plot(number, after, color=style.OPTIMIZED, marker="o", markersize=4, zorder=3)
+    axes.plot(number, after, color=style.OPTIMIZED_COLOUR, marker="o", markersize=4, zorder=3)
     aim = float(campaign.wanted[j])
     values = np.concatenate([promised, after, [aim]])
     values = values[np.isfinite(values) & (values > 0.0)]
     if len(values):
         axes.set_ylim(values.min() / 1.5, values.max() * 1.5)
     if np.isfinite(aim):
-        axes.axhline(aim, color=style.INK, linestyle="--", linewidth=1.0)
-        axes.axhspan(axes.get_ylim()[0], aim, color=style.INK, alpha=0.06, linewidth=0.0)
+        axes.axhline(aim, color=style.TEXT_COLOUR, linestyle="--", linewidth=1.0)
+        axes.axhspan(axes.get_ylim()[0], aim, color=style.TEXT_COLOUR, alpha=0.06, linewidth=0.0)
         axes.text(
             0.99,
             aim,
-            style.number(aim, 2),
+            style.format_number(aim, 2),
             transform=axes.get_yaxis_transform(),
             ha="right",
             va="bottom",
-            fontsize=style.SMALL,
-            color=style.INK,
+            fontsize=style.SMALL_FONT,
+            color=style.TEXT_COLOUR,
         )
     low, high = axes.get_ylim()
     axes.set_yticks(_marks(low, high))
-    axes.yaxis.set_major_formatter(lambda value, _: style.number(float(value), 1))
+    axes.yaxis.set_major_formatter(lambda value, _: style.format_number(float(value), 1))
     axes.minorticks_off()
 
 
@@ -113,12 +115,12 @@ def _draw_estimate(axes: Axes, campaign: Campaign, j: int, true: float | None) -
     std = np.array([r.attained[j] for r in campaign.rounds])
     known = np.isfinite(std)
     bar = np.where(known, std, 0.0)
-    axes.errorbar(number, theta, 2 * bar, color=style.OPTIMIZED, linestyle="", linewidth=0.9)
+    axes.errorbar(number, theta, 2 * bar, color=style.OPTIMIZED_COLOUR, linestyle="", linewidth=0.9)
     axes.errorbar(
         number,
         theta,
         bar,
-        color=style.OPTIMIZED,
+        color=style.OPTIMIZED_COLOUR,
         linestyle="",
         linewidth=2.4,
         marker="o",
@@ -127,17 +129,17 @@ def _draw_estimate(axes: Axes, campaign: Campaign, j: int, true: float | None) -
     if known[-1]:
         for times in (1, 2):
             band = (theta[-1] - times * bar[-1], theta[-1] + times * bar[-1])
-            axes.axhspan(*band, color=style.OPTIMIZED, alpha=0.07, linewidth=0.0)
+            axes.axhspan(*band, color=style.OPTIMIZED_COLOUR, alpha=0.07, linewidth=0.0)
     if true is not None:
-        axes.axhline(true, color=style.MEASURED, linewidth=1.4)
+        axes.axhline(true, color=style.MEASURED_COLOUR, linewidth=1.4)
     guess = float(campaign.rounds[0].theta[j])
     axes.text(
         0.99,
         0.97,
-        f"first design at {style.number(guess, 4)}",
+        f"first design at {style.format_number(guess, 4)}",
         transform=axes.transAxes,
         ha="right",
         va="top",
-        fontsize=style.SMALL,
-        color=style.MUTED,
+        fontsize=style.SMALL_FONT,
+        color=style.MUTED_COLOUR,
     )

@@ -21,7 +21,14 @@ from mjfim.arrays import Array
 from mjfim.errors import MjfimError
 from mjfim.output import plots
 from mjfim.output.labels import Labels
-from mjfim.output.plots.style import INITIAL, OPTIMIZED, number, per, squared, with_error
+from mjfim.output.plots.style import (
+    INITIAL_COLOUR,
+    OPTIMIZED_COLOUR,
+    format_number,
+    format_with_uncertainty,
+    quotient_unit,
+    squared_unit,
+)
 from mjfim.records.design import Design, Evaluation, HistoryRow, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
@@ -249,7 +256,7 @@ def test_table_names_every_parameter_and_unit(
     "name", [n for n in (*FIGURES, *TABLES) if n not in ("fit", "parameter_intervals")]
 )
 def test_both_trajectories_are_drawn_in_their_colours(name: str) -> None:
-    assert {INITIAL, OPTIMIZED} <= all_colours((FIGURES | TABLES)[name](2, 3))
+    assert {INITIAL_COLOUR, OPTIMIZED_COLOUR} <= all_colours((FIGURES | TABLES)[name](2, 3))
 
 
 @pytest.mark.parametrize("name", [*FIGURES, *TABLES])
@@ -263,7 +270,7 @@ def test_artists_stay_inside_the_figure(name: str) -> None:
 
 def test_trajectories_prints_the_final_information() -> None:
     text = all_text(plots.trajectories(make_design(), make_labels(2, 3)))
-    assert number(1.0) in text and number(0.1) in text
+    assert format_number(1.0) in text and format_number(0.1) in text
 
 
 def test_trajectories_accepts_more_positions_than_velocities() -> None:
@@ -494,16 +501,18 @@ def test_only_the_plot_modules_import_matplotlib() -> None:
     ],
 )
 def test_number(value: float, text: str) -> None:
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 def test_units_of_quotients_and_variances() -> None:
-    assert per("m", "kg") == "m/kg"
-    assert per("rad/s", "N m s/rad") == "(rad/s)/(N m s/rad)"
-    assert per("m", "") == "m"
-    assert squared("kg") == "kg²" and squared("N m") == "(N m)²" and squared("") == ""
+    assert quotient_unit("m", "kg") == "m/kg"
+    assert quotient_unit("rad/s", "N m s/rad") == "(rad/s)/(N m s/rad)"
+    assert quotient_unit("m", "") == "m"
+    assert (
+        squared_unit("kg") == "kg²" and squared_unit("N m") == "(N m)²" and squared_unit("") == ""
+    )
 
 
 def test_value_is_rounded_to_its_uncertainty() -> None:
-    assert with_error(0.99412, 0.0121) == "0.994 ± 0.012"
-    assert with_error(1.0, np.inf) == "1.000 ± ∞"
+    assert format_with_uncertainty(0.99412, 0.0121) == "0.994 ± 0.012"
+    assert format_with_uncertainty(1.0, np.inf) == "1.000 ± ∞"

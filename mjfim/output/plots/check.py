@@ -10,19 +10,19 @@ from matplotlib.patches import Patch
 
 from mjfim.output.plots.style import (
     BEST_CASE,
-    FAINT,
-    INITIAL,
-    INK,
-    MUTED,
-    NORMAL,
-    OPTIMIZED,
-    SMALL,
-    dress,
-    headline,
+    GRID_COLOUR,
+    INITIAL_COLOUR,
+    MUTED_COLOUR,
+    NORMAL_FONT,
+    OPTIMIZED_COLOUR,
+    SMALL_FONT,
+    TEXT_COLOUR,
+    add_title,
+    format_axes,
+    format_percent,
     new_figure,
-    percent,
-    say,
     shorten,
+    write_message,
 )
 from mjfim.records.check import CONFOUNDED_CORRELATION, Check, ParameterCheck
 
@@ -39,12 +39,17 @@ def check_figure(check: Check) -> Figure:
     _bars(left, rows)
     _heat(right, check)
     handles = [
-        Patch(color=INITIAL, label="predicted σ"),
-        Line2D([], [], color=INK, marker="|", linestyle="", markersize=10, label="wanted"),
-        Patch(facecolor="white", edgecolor=OPTIMIZED, hatch="////", label="not identifiable alone"),
+        Patch(color=INITIAL_COLOUR, label="predicted σ"),
+        Line2D([], [], color=TEXT_COLOUR, marker="|", linestyle="", markersize=10, label="wanted"),
+        Patch(
+            facecolor="white",
+            edgecolor=OPTIMIZED_COLOUR,
+            hatch="////",
+            label="not identifiable alone",
+        ),
     ]
     verdict = "identifiable" if check.ok else "read the verdict in check.json"
-    headline(
+    add_title(
         figure, f"What {check.source} ({check.horizon:g} s) can tell: {verdict}", handles, BEST_CASE
     )
     return figure
@@ -56,28 +61,40 @@ def _bars(axes: Axes, rows: list[ParameterCheck]) -> None:
     known = np.isfinite(std) & (std > 0.0)
     values = np.concatenate([std[known], wanted])
     low, high = float(values.min()) / 3.0, max(float(values.max()) * 4.0, 0.2)
-    places, font = np.arange(len(rows)), SMALL if len(rows) <= 30 else 6.0
-    dress(axes, "predicted standard deviation, relative to the parameter's size")
+    places, font = np.arange(len(rows)), SMALL_FONT if len(rows) <= 30 else 6.0
+    format_axes(axes, "predicted standard deviation, relative to the parameter's size")
     axes.set_xscale("log")
     axes.set_xlim(low, high)
     axes.set_ylim(len(rows) - 0.4, -0.6)
-    axes.barh(places[known], std[known], height=0.6, color=INITIAL)
+    axes.barh(places[known], std[known], height=0.6, color=INITIAL_COLOUR)
     axes.barh(
         places[~known],
         high,
         height=0.6,
         facecolor="white",
-        edgecolor=OPTIMIZED,
+        edgecolor=OPTIMIZED_COLOUR,
         hatch="////",
         linewidth=0.8,
     )
     axes.plot(
-        wanted, places, linestyle="", marker="|", color=INK, markersize=10, markeredgewidth=1.6
+        wanted,
+        places,
+        linestyle="",
+        marker="|",
+        color=TEXT_COLOUR,
+        markersize=10,
+        markeredgewidth=1.6,
     )
     if len(rows) <= 30:
         for x, y in zip(std[known], places[known], strict=True):
             axes.text(
-                high, y, percent(float(x)), ha="right", va="center", fontsize=SMALL, color=INITIAL
+                high,
+                y,
+                format_percent(float(x)),
+                ha="right",
+                va="center",
+                fontsize=SMALL_FONT,
+                color=INITIAL_COLOUR,
             )
     axes.grid(False, axis="y")
     axes.set_yticks(places, [shorten(row.name) for row in rows], fontsize=font)
@@ -94,11 +111,11 @@ def _heat(axes: Axes, check: Check) -> None:
     count = len(names)
     if not np.isfinite(matrix).any():
         axes.set_axis_off()
-        say(axes, "no parameter can be told alone:\nthere are no correlations")
+        write_message(axes, "no parameter can be told alone:\nthere are no correlations")
         return
     image = axes.imshow(np.ma.masked_invalid(matrix), cmap="RdBu_r", vmin=-1.0, vmax=1.0)
-    axes.set_facecolor(FAINT)
-    font = SMALL if count <= 30 else 5.5
+    axes.set_facecolor(GRID_COLOUR)
+    font = SMALL_FONT if count <= 30 else 5.5
     long = sum(len(name) for name in names) > 24
     axes.set_xticks(range(count), names, fontsize=font, rotation=90 if long else 0)
     axes.set_yticks(range(count), names, fontsize=font)
@@ -112,22 +129,22 @@ def _heat(axes: Axes, check: Check) -> None:
             if count <= READABLE:
                 strong = abs(value) > 0.6
                 weight = "bold" if abs(value) > CONFOUNDED_CORRELATION else "normal"
-                colour = "white" if strong else INK
+                colour = "white" if strong else TEXT_COLOUR
                 axes.text(
                     j,
                     i,
                     f"{value:+.2f}",
                     ha="center",
                     va="center",
-                    fontsize=SMALL,
+                    fontsize=SMALL_FONT,
                     color=colour,
                     weight=weight,
                 )
             elif abs(value) > CONFOUNDED_CORRELATION:
-                axes.plot(j, i, marker="o", color=INK, markersize=2.0)
+                axes.plot(j, i, marker="o", color=TEXT_COLOUR, markersize=2.0)
     bar = axes.figure.colorbar(image, ax=axes, shrink=0.7, pad=0.02)
-    bar.set_label("correlation of the estimates", fontsize=NORMAL, color=INK)
-    bar.ax.tick_params(labelsize=SMALL, color=MUTED)
+    bar.set_label("correlation of the estimates", fontsize=NORMAL_FONT, color=TEXT_COLOUR)
+    bar.ax.tick_params(labelsize=SMALL_FONT, color=MUTED_COLOUR)
     grey = "; grey: not alone" if np.isnan(matrix).any() else ""
     marked = f"{'bold' if count <= READABLE else 'dots'}: |correlation| > {CONFOUNDED_CORRELATION:g}, hardly told apart{grey}"
-    axes.set_title(marked, fontsize=SMALL, color=MUTED)
+    axes.set_title(marked, fontsize=SMALL_FONT, color=MUTED_COLOUR)

@@ -9,21 +9,21 @@ from matplotlib.patches import Patch
 
 from mjfim.arrays import Array
 from mjfim.output.plots.style import (
-    FAINT,
-    INITIAL,
-    INK,
-    MUTED,
-    NORMAL,
-    OPTIMIZED,
-    OTHER,
-    SMALL,
-    dress,
-    headline,
+    GRID_COLOUR,
+    INITIAL_COLOUR,
+    MUTED_COLOUR,
+    NORMAL_FONT,
+    OPTIMIZED_COLOUR,
+    OTHER_COLOUR,
+    SMALL_FONT,
+    TEXT_COLOUR,
+    add_title,
+    format_axes,
+    format_number,
+    format_percent,
     new_figure,
-    number,
-    percent,
-    say,
     shorten,
+    write_message,
 )
 from mjfim.records.comparison import DESIGN, Comparison, MethodResult
 
@@ -44,13 +44,17 @@ def compare_figure(comparison: Comparison) -> Figure:
     _cells(left, comparison)
     _bars(right, comparison)
     handles = [
-        Patch(color=OPTIMIZED, label="design"),
-        Patch(color=INITIAL, label="baseline"),
-        Patch(color=OTHER, label="baseline that beats the design"),
-        Patch(facecolor="white", edgecolor=MUTED, hatch="////", label="may not be played"),
+        Patch(color=OPTIMIZED_COLOUR, label="design"),
+        Patch(color=INITIAL_COLOUR, label="baseline"),
+        Patch(color=OTHER_COLOUR, label="baseline that beats the design"),
+        Patch(facecolor="white", edgecolor=MUTED_COLOUR, hatch="////", label="may not be played"),
     ]
     used = {_colour(comparison, row) for row in rows if row.sound}
-    kept = [h for h, c in zip(handles, (OPTIMIZED, INITIAL, OTHER), strict=False) if c in used]
+    kept = [
+        h
+        for h, c in zip(handles, (OPTIMIZED_COLOUR, INITIAL_COLOUR, OTHER_COLOUR), strict=False)
+        if c in used
+    ]
     kept += (
         handles[3:]
         if any(not row.sound and np.isfinite(row.worst_relative_std) for row in rows)
@@ -58,16 +62,16 @@ def compare_figure(comparison: Comparison) -> Figure:
     )
     budget = f"{comparison.seconds:g} s"
     if np.isfinite(comparison.steps):
-        budget += f" or {number(comparison.steps / 1e6)} million MuJoCo steps"
+        budget += f" or {format_number(comparison.steps / 1e6)} million MuJoCo steps"
     note = f"{' '.join(comparison.verdict)} Each method had {budget}. Predicted standard deviations are a best case."
-    headline(figure, "The design against what else could be played", kept, note)
+    add_title(figure, "The design against what else could be played", kept, note)
     return figure
 
 
 def _colour(comparison: Comparison, row: MethodResult) -> str:
     if row.method == DESIGN:
-        return OPTIMIZED
-    return OTHER if row in comparison.beating else INITIAL
+        return OPTIMIZED_COLOUR
+    return OTHER_COLOUR if row in comparison.beating else INITIAL_COLOUR
 
 
 def _reference(comparison: Comparison) -> tuple[Array, str]:
@@ -85,7 +89,7 @@ def _cells(axes: Axes, comparison: Comparison) -> None:
     ratios = np.array([row.std[wanted] for row in rows]).reshape(len(rows), len(wanted)) / reference
     if not np.isfinite(ratios).any():
         axes.set_axis_off()
-        say(axes, "no parameter is known alone")
+        write_message(axes, "no parameter is known alone")
         return
     relative = comparison.design is not None and np.isfinite(comparison.design.std[wanted]).any()
     logs = np.log(np.where(np.isfinite(ratios), ratios, np.nan))
@@ -94,7 +98,7 @@ def _cells(axes: Axes, comparison: Comparison) -> None:
         if relative
         else (float(np.nanmean(logs)), max(float(np.nanstd(logs)) * 2.0, 0.1))
     )
-    axes.set_facecolor(FAINT)
+    axes.set_facecolor(GRID_COLOUR)
     image = axes.imshow(
         np.ma.masked_invalid(logs),
         cmap="RdBu_r",
@@ -107,29 +111,38 @@ def _cells(axes: Axes, comparison: Comparison) -> None:
     axes.set_xticks(
         range(len(names)),
         names,
-        fontsize=SMALL if len(names) <= 30 else 5.0,
+        fontsize=SMALL_FONT if len(names) <= 30 else 5.0,
         rotation=90 if upright else 0,
     )
     axes.set_yticks(
-        range(len(rows)), [shorten(row.title, WIDTH) for row in rows], fontsize=NORMAL, color=INK
+        range(len(rows)),
+        [shorten(row.title, WIDTH) for row in rows],
+        fontsize=NORMAL_FONT,
+        color=TEXT_COLOUR,
     )
     for label, row in zip(axes.get_yticklabels(), rows, strict=True):
-        label.set_color(_colour(comparison, row) if row.sound else MUTED)
+        label.set_color(_colour(comparison, row) if row.sound else MUTED_COLOUR)
         label.set_fontweight("bold" if row.method == DESIGN else "normal")
     axes.tick_params(length=0.0)
     axes.spines[:].set_visible(False)
-    axes.set_title(title, fontsize=NORMAL, color=INK)
+    axes.set_title(title, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
     if len(names) > READABLE:
         bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.015, aspect=30)
         ticks = [t for t in (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8) if abs(np.log(t) - middle) <= span]
         bar.set_ticks(np.log(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
-        bar.ax.tick_params(labelsize=SMALL, color=MUTED)
+        bar.ax.tick_params(labelsize=SMALL_FONT, color=MUTED_COLOUR)
         return
     for (i, j), ratio in np.ndenumerate(ratios):
         strong = np.isfinite(ratio) and abs(logs[i, j] - middle) > 0.6 * span
-        text = number(float(ratio), 3) if np.isfinite(ratio) else "–"
+        text = format_number(float(ratio), 3) if np.isfinite(ratio) else "–"
         axes.text(
-            j, i, text, ha="center", va="center", fontsize=SMALL, color="white" if strong else INK
+            j,
+            i,
+            text,
+            ha="center",
+            va="center",
+            fontsize=SMALL_FONT,
+            color="white" if strong else TEXT_COLOUR,
         )
 
 
@@ -138,15 +151,17 @@ def _bars(axes: Axes, comparison: Comparison) -> None:
     rows = comparison.rows
     worst = np.array([row.worst_relative_std for row in rows])
     known = worst[np.isfinite(worst)]
-    dress(axes, "standard deviation, relative to the parameters' scales [–]")
+    format_axes(axes, "standard deviation, relative to the parameters' scales [–]")
     axes.grid(False, axis="y")
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_yticks([])
     axes.set_title(
-        "σ of the worst combination, and the worst margin of all limits", fontsize=NORMAL, color=INK
+        "σ of the worst combination, and the worst margin of all limits",
+        fontsize=NORMAL_FONT,
+        color=TEXT_COLOUR,
     )
     if not len(known):
-        say(axes, "nothing found")
+        write_message(axes, "nothing found")
         return
     low, high = 0.0, float(known.max())
     if high > WIDE * known.min():
@@ -154,7 +169,7 @@ def _bars(axes: Axes, comparison: Comparison) -> None:
         axes.set_xscale("log")
     room = high * (high / low) ** 0.75 if low else 1.7 * high
     axes.set_xlim(low, room)
-    axes.tick_params(which="both", labelsize=SMALL, color=MUTED, labelcolor=INK)
+    axes.tick_params(which="both", labelsize=SMALL_FONT, color=MUTED_COLOUR, labelcolor=TEXT_COLOUR)
     for i, row in enumerate(rows):
         if not np.isfinite(row.worst_relative_std):
             axes.text(
@@ -162,8 +177,8 @@ def _bars(axes: Axes, comparison: Comparison) -> None:
                 i,
                 row.outcome.value,
                 va="center",
-                fontsize=SMALL,
-                color=MUTED,
+                fontsize=SMALL_FONT,
+                color=MUTED_COLOUR,
             )
             continue
         colour = _colour(comparison, row)
@@ -171,17 +186,26 @@ def _bars(axes: Axes, comparison: Comparison) -> None:
             i, row.worst_relative_std - low, left=low, height=0.62, color=colour, linewidth=0.8
         )
         if not row.sound:
-            bar[0].set(facecolor="white", edgecolor=MUTED, hatch="////")
+            bar[0].set(facecolor="white", edgecolor=MUTED_COLOUR, hatch="////")
         text = axes.text(
             row.worst_relative_std,
             i,
-            f"  {number(row.worst_relative_std)}",
+            f"  {format_number(row.worst_relative_std)}",
             va="center",
-            fontsize=SMALL,
-            color=INK,
+            fontsize=SMALL_FONT,
+            color=TEXT_COLOUR,
         )
         kind, share = row.tightest
-        said = f"  {percent(share)} {kind.replace('_', ' ')}" if kind and np.isfinite(share) else ""
+        said = (
+            f"  {format_percent(share)} {kind.replace('_', ' ')}"
+            if kind and np.isfinite(share)
+            else ""
+        )
         axes.annotate(
-            said, (1.0, 0.5), xycoords=text, va="center", fontsize=SMALL - 1.0, color=MUTED
+            said,
+            (1.0, 0.5),
+            xycoords=text,
+            va="center",
+            fontsize=SMALL_FONT - 1.0,
+            color=MUTED_COLOUR,
         )

@@ -12,21 +12,21 @@ from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
 from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
-    FAINT,
-    INITIAL,
-    INK,
-    MUTED,
-    OPTIMIZED,
-    SMALL,
-    dress,
-    headline,
+    GRID_COLOUR,
+    INITIAL_COLOUR,
+    MUTED_COLOUR,
+    OPTIMIZED_COLOUR,
+    SMALL_FONT,
+    TEXT_COLOUR,
+    add_title,
+    break_before_unit,
+    format_axes,
+    format_number,
     new_figure,
-    number,
-    pair_handles,
-    per,
-    say,
+    quotient_unit,
     shorten,
-    two_lines,
+    trajectory_handles,
+    write_message,
 )
 from mjfim.records.design import Design, Evaluation
 
@@ -37,7 +37,7 @@ ZOOM = 4.0
 
 def pair(design: Design) -> tuple[tuple[Evaluation, str, float], ...]:
     """Both evaluations with colour and line width."""
-    return (design.initial, INITIAL, 1.5), (design.final, OPTIMIZED, 1.7)
+    return (design.initial, INITIAL_COLOUR, 1.5), (design.final, OPTIMIZED_COLOUR, 1.7)
 
 
 def state_panels(design: Design, labels: Labels) -> list[tuple[str, str, int]]:
@@ -69,12 +69,12 @@ def draw_information(axes: Axes, design: Design) -> None:
         root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
         axes.plot(evaluation.trajectory.t, root, color=colour, linewidth=width)
         axes.annotate(
-            number(float(root[-1])),
+            format_number(float(root[-1])),
             (float(evaluation.trajectory.t[-1]), float(root[-1])),
             xytext=(4, 0),
             textcoords="offset points",
             va="center",
-            fontsize=SMALL,
+            fontsize=SMALL_FONT,
             color=colour,
             annotation_clip=False,
         )
@@ -96,16 +96,18 @@ def trajectories(design: Design, labels: Labels) -> Figure:
         axes = figure.add_subplot(grid[divmod(k, columns)], sharex=first)
         first = first or axes
         draw_state(axes, design, name, column)
-        dress(axes, ylabel=two_lines(label))
+        format_axes(axes, ylabel=break_before_unit(label))
         last = k // columns == rows - 1
         axes.tick_params(labelbottom=last)
         axes.set_xlabel("time [s]" if last else "")
     # The information takes whatever the last row has left.
     axes = figure.add_subplot(grid[rows - 1, len(panels) % columns :], sharex=first)
     draw_information(axes, design)
-    dress(axes, "time [s]", r"$\sqrt{\lambda_{\min}}$  [$\sqrt{\mathrm{s}}$ / unit of $\theta$]")
+    format_axes(
+        axes, "time [s]", r"$\sqrt{\lambda_{\min}}$  [$\sqrt{\mathrm{s}}$ / unit of $\theta$]"
+    )
     note = "λ_min: smallest eigenvalue of the Fisher information per measurement rate, accumulated up to time t."
-    headline(figure, "Trajectories and the information they gather", pair_handles(), note)
+    add_title(figure, "Trajectories and the information they gather", trajectory_handles(), note)
     return figure
 
 
@@ -127,7 +129,7 @@ def draw_phase(axes: Axes, design: Design, dof: int, dofs: int, j: int) -> None:
         axes.plot(
             psi[:, dof, j], psi[:, dofs + dof, j], color=colour, linewidth=width, zorder=order
         )
-    axes.plot(0.0, 0.0, "o", color=INK, markersize=3.5, zorder=4)
+    axes.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=3.5, zorder=4)
 
 
 def enlarge_initial(axes: Axes, design: Design, dof: int, dofs: int, j: int) -> None:
@@ -142,11 +144,13 @@ def enlarge_initial(axes: Axes, design: Design, dof: int, dofs: int, j: int) -> 
     axes.set_yticks([tick for tick in axes.get_yticks() if low <= tick <= high])
     axes.set_ylim(low, high + 0.62 * (high - low))
     box = axes.inset_axes((0.2, 0.72, 0.6, 0.27))
-    box.plot(*design.initial.sensitivity[:, columns, j].T, color=INITIAL, linewidth=1.2)
-    box.plot(0.0, 0.0, "o", color=INK, markersize=2.5)
-    box.tick_params(labelsize=SMALL - 2.5, color=MUTED, labelcolor=MUTED, length=2, pad=1.5)
+    box.plot(*design.initial.sensitivity[:, columns, j].T, color=INITIAL_COLOUR, linewidth=1.2)
+    box.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=2.5)
+    box.tick_params(
+        labelsize=SMALL_FONT - 2.5, color=MUTED_COLOUR, labelcolor=MUTED_COLOUR, length=2, pad=1.5
+    )
     box.locator_params(nbins=3)
-    box.spines[:].set_color(INITIAL)
+    box.spines[:].set_color(INITIAL_COLOUR)
     box.spines[:].set_linewidth(0.7)
 
 
@@ -168,18 +172,22 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
             draw_phase(axes, design, int(dof), dofs, int(j))
             enlarge_initial(axes, design, int(dof), dofs, int(j))
             theta, divisor = shorten(labels.parameters[j], 18), labels.parameter_units[j]
-            dress(
+            format_axes(
                 axes,
-                f"∂{name}/∂{theta}\n[{per(unit, divisor)}]",
-                f"∂{name}′/∂{theta}\n[{per(rate, divisor)}]",
+                f"∂{name}/∂{theta}\n[{quotient_unit(unit, divisor)}]",
+                f"∂{name}′/∂{theta}\n[{quotient_unit(rate, divisor)}]",
             )
     note = "Each loop starts at the dot (time 0, no sensitivity); ′ is the time derivative."
     note += " Blue boxes enlarge the initial loop."
     if len(rows) < dofs or len(columns) < count:
         note += f" Shown: {len(rows)} of {dofs} degrees of freedom (most sensitive), {len(columns)} of {count}"
         note += " parameters (largest predicted relative standard deviation)."
-    start = Line2D([], [], color=INK, marker="o", markersize=3.5, linestyle="", label="start")
-    headline(figure, "Sensitivity of the motion to each parameter", [*pair_handles(), start], note)
+    start = Line2D(
+        [], [], color=TEXT_COLOUR, marker="o", markersize=3.5, linestyle="", label="start"
+    )
+    add_title(
+        figure, "Sensitivity of the motion to each parameter", [*trajectory_handles(), start], note
+    )
     return figure
 
 
@@ -191,28 +199,28 @@ def draw_history(
     usable = np.isfinite(positive)
     if not usable.any():
         if not np.isfinite(values).any():
-            say(axes, "no iterations recorded")
+            write_message(axes, "no iterations recorded")
             return
         positive, usable = values, np.isfinite(values)
     else:
         axes.set_yscale("log")
-    axes.plot(iterations, positive, color=MUTED, linewidth=1.3, marker=".", markersize=3)
+    axes.plot(iterations, positive, color=MUTED_COLOUR, linewidth=1.3, marker=".", markersize=3)
     if relative is not None:
         axes.plot(
             iterations,
             np.where(relative > 0.0, relative, np.nan),
-            color=MUTED,
+            color=MUTED_COLOUR,
             linewidth=1.0,
             linestyle=":",
         )
     for k, colour in (
-        (np.flatnonzero(usable)[0], INITIAL),
-        (np.flatnonzero(usable)[-1], OPTIMIZED),
+        (np.flatnonzero(usable)[0], INITIAL_COLOUR),
+        (np.flatnonzero(usable)[-1], OPTIMIZED_COLOUR),
     ):
         axes.plot(iterations[k], positive[k], "o", color=colour, markersize=6)
     ends = positive[usable]
-    text = f"{number(float(ends[0]))} → {number(float(ends[-1]))}"
-    axes.set_title(text, loc="right", fontsize=SMALL, color=MUTED, pad=4)
+    text = f"{format_number(float(ends[0]))} → {format_number(float(ends[-1]))}"
+    axes.set_title(text, loc="right", fontsize=SMALL_FONT, color=MUTED_COLOUR, pad=4)
 
 
 def convergence(design: Design) -> Figure:
@@ -234,34 +242,38 @@ def convergence(design: Design) -> Figure:
     rates = np.array([row.rate for row in history])
     for k in np.flatnonzero(np.diff(rates)):
         for axes in top:
-            axes.axvline(iterations[k + 1], color=FAINT, linewidth=2.0, zorder=0)
+            axes.axvline(iterations[k + 1], color=GRID_COLOUR, linewidth=2.0, zorder=0)
         top[0].annotate(
             f" {rates[k]:g} Hz | {rates[k + 1]:g} Hz",
             (iterations[k + 1], 0.97),
             xycoords=("data", "axes fraction"),
             ha="center",
             va="top",
-            fontsize=SMALL,
-            color=MUTED,
+            fontsize=SMALL_FONT,
+            color=MUTED_COLOUR,
         )
     for k in np.flatnonzero(mus[1:] != mus[:-1]):
         for axes in top:
-            axes.axvline(iterations[k + 1], color=FAINT, linewidth=1.0, linestyle="--", zorder=0)
+            axes.axvline(
+                iterations[k + 1], color=GRID_COLOUR, linewidth=1.0, linestyle="--", zorder=0
+            )
     names = ("cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]")
     for axes, name in zip(top, names, strict=True):
-        dress(axes, "iteration [–]", name)
+        format_axes(axes, "iteration [–]", name)
         axes.xaxis.get_major_locator().set_params(integer=True)
     dots = [
         Line2D([], [], color=colour, marker="o", linestyle="", label=name)
-        for name, colour in (("initial", INITIAL), ("optimized", OPTIMIZED))
+        for name, colour in (("initial", INITIAL_COLOUR), ("optimized", OPTIMIZED_COLOUR))
     ]
     line = (
-        [] if relative is None else [Line2D([], [], color=MUTED, linestyle=":", label="slope / J")]
+        []
+        if relative is None
+        else [Line2D([], [], color=MUTED_COLOUR, linestyle=":", label="slope / J")]
     )
     told = (
         " Dashed: the barrier of the limits gets sharper; slope and cost are then of log J and barrier."
         if mus.any()
         else ""
     )
-    headline(figure, "Convergence", [*dots, *line], f"{design.status.value}.{told}")
+    add_title(figure, "Convergence", [*dots, *line], f"{design.status.value}.{told}")
     return figure

@@ -17,22 +17,22 @@ from mjfim.errors import MjfimError
 from mjfim.model.coordinates import split_unit
 from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
-    FAINT,
-    INK,
-    MEASURED,
-    MUTED,
-    NORMAL,
-    OTHER,
-    SMALL,
-    STYLES,
-    dress,
-    headline,
+    GRID_COLOUR,
+    MEASURED_COLOUR,
+    MUTED_COLOUR,
+    NORMAL_FONT,
+    OTHER_COLOUR,
+    SMALL_FONT,
+    TEXT_COLOUR,
+    TRAJECTORY_STYLES,
+    add_title,
+    break_before_unit,
+    format_axes,
+    format_number,
     new_figure,
-    number,
-    per,
-    say,
-    squared,
-    two_lines,
+    quotient_unit,
+    squared_unit,
+    write_message,
 )
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
@@ -76,11 +76,11 @@ def normal(x: Array, mean: float, std: float) -> Array:
 
 def describe(trials: TrialStatistics, index: int, unit: str, hidden: int) -> str:
     """Variance, bound, efficiency and counts of one panel."""
-    low, high = (number(float(v)) for v in trials.efficiency_interval[index])
-    square = f" {squared(unit)}".rstrip()
-    text = f"variance {number(float(trials.covariance[index, index]))}{square}\n"
-    text += f"bound {number(float(trials.crlb[index, index]))}{square}\n"
-    text += f"efficiency {number(float(trials.efficiency[index]))}, 95 % interval [{low}, {high}]\n"
+    low, high = (format_number(float(v)) for v in trials.efficiency_interval[index])
+    square = f" {squared_unit(unit)}".rstrip()
+    text = f"variance {format_number(float(trials.covariance[index, index]))}{square}\n"
+    text += f"bound {format_number(float(trials.crlb[index, index]))}{square}\n"
+    text += f"efficiency {format_number(float(trials.efficiency[index]))}, 95 % interval [{low}, {high}]\n"
     text += f"{trials.trials} trials, {trials.failed} failed" + (
         f", {hidden} outside this range" if hidden else ""
     )
@@ -93,9 +93,9 @@ def draw_panel(
     """Histogram of one trajectory on its own range, with true value and the normal curve of the bound."""
     name, colour = style
     values = finite_column(trials, index)
-    axes.set_title(name, loc="left", fontsize=NORMAL + 1, color=colour, weight="bold", pad=49)
+    axes.set_title(name, loc="left", fontsize=NORMAL_FONT + 1, color=colour, weight="bold", pad=49)
     if not values.size:
-        say(axes, "no successful trials")
+        write_message(axes, "no successful trials")
         return
     std = float(np.sqrt(trials.crlb[index, index]))
     limits = central_range(values, theta, std)
@@ -104,13 +104,21 @@ def draw_panel(
     axes.stairs(heights, edges, color=colour, linewidth=0.8)
     if np.isfinite(std) and std > 0.0:
         x = np.linspace(*limits, 400)
-        axes.plot(x, normal(x, theta, std), color=INK, linewidth=1.4)
-    axes.axvline(theta, color=INK, linewidth=1.2, linestyle="--")
+        axes.plot(x, normal(x, theta, std), color=TEXT_COLOUR, linewidth=1.4)
+    axes.axvline(theta, color=TEXT_COLOUR, linewidth=1.2, linestyle="--")
     axes.set_xlim(*limits)
     axes.locator_params(axis="x", nbins=6)
     hidden = int(np.sum((values < limits[0]) | (values > limits[1])))
     note = describe(trials, index, unit, hidden)
-    axes.text(0.0, 1.02, note, transform=axes.transAxes, va="bottom", fontsize=SMALL, color=MUTED)
+    axes.text(
+        0.0,
+        1.02,
+        note,
+        transform=axes.transAxes,
+        va="bottom",
+        fontsize=SMALL_FONT,
+        color=MUTED_COLOUR,
+    )
 
 
 def draw_overlay(axes: Axes, study: MonteCarloStudy, index: int) -> None:
@@ -126,16 +134,16 @@ def draw_overlay(axes: Axes, study: MonteCarloStudy, index: int) -> None:
         if values.size
     ]
     if not ranges:
-        say(axes, "no successful trials")
+        write_message(axes, "no successful trials")
         return
     for name, values in columns.items():
         if values.size:
-            colour = STYLES.get(name, (name, OTHER))[1]
+            colour = TRAJECTORY_STYLES.get(name, (name, OTHER_COLOUR))[1]
             heights, edges = densities(values, central_range(values, theta, np.inf))
             axes.stairs(
                 heights / max(heights.max(), 1e-300), edges, fill=True, color=colour, alpha=0.5
             )
-    axes.axvline(theta, color=INK, linewidth=1.2, linestyle="--")
+    axes.axvline(theta, color=TEXT_COLOUR, linewidth=1.2, linestyle="--")
     axes.set_xlim(min(r[0] for r in ranges), max(r[1] for r in ranges))
     axes.set_ylim(0.0, 1.08)
 
@@ -149,26 +157,40 @@ def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Figure:
     figure = new_figure(max(4.1 * len(study.sets), 5.0), 5.3)
     grid = figure.add_gridspec(2, len(study.sets), height_ratios=(2.6, 1.0))
     for k, (name, trials) in enumerate(study.sets.items()):
-        axes = dress(
-            figure.add_subplot(grid[0, k]), labels.parameter(index), f"density [{per('', unit)}]"
+        axes = format_axes(
+            figure.add_subplot(grid[0, k]),
+            labels.parameter(index),
+            f"density [{quotient_unit('', unit)}]",
         )
-        draw_panel(axes, trials, index, theta, unit, STYLES.get(name, (name, OTHER)))
-    overlay = dress(figure.add_subplot(grid[1, :]), labels.parameter(index), "density / peak [–]")
+        draw_panel(
+            axes, trials, index, theta, unit, TRAJECTORY_STYLES.get(name, (name, OTHER_COLOUR))
+        )
+    overlay = format_axes(
+        figure.add_subplot(grid[1, :]), labels.parameter(index), "density / peak [–]"
+    )
     draw_overlay(overlay, study, index)
-    overlay.set_title("common axis", loc="left", fontsize=SMALL, color=MUTED)
+    overlay.set_title("common axis", loc="left", fontsize=SMALL_FONT, color=MUTED_COLOUR)
     handles = [
-        Patch(facecolor=STYLES.get(n, (n, OTHER))[1], alpha=0.5, label=STYLES.get(n, (n, OTHER))[0])
+        Patch(
+            facecolor=TRAJECTORY_STYLES.get(n, (n, OTHER_COLOUR))[1],
+            alpha=0.5,
+            label=TRAJECTORY_STYLES.get(n, (n, OTHER_COLOUR))[0],
+        )
         for n in study.sets
     ]
     lines = [
         Line2D(
-            [], [], color=INK, linestyle="--", label=f"true value {number(theta)} {unit}".rstrip()
+            [],
+            [],
+            color=TEXT_COLOUR,
+            linestyle="--",
+            label=f"true value {format_number(theta)} {unit}".rstrip(),
         ),
-        Line2D([], [], color=INK, label="normal curve of the Cramér–Rao bound"),
+        Line2D([], [], color=TEXT_COLOUR, label="normal curve of the Cramér–Rao bound"),
     ]
     title = f"Monte-Carlo estimates of {labels.parameters[index]}"
     note = "Simulated noise of the stated sigma on the model itself; the panels above have different ranges."
-    headline(figure, title, [*handles, *lines], note)
+    add_title(figure, title, [*handles, *lines], note)
     return figure
 
 
@@ -184,24 +206,26 @@ def draw_fit(axes: Axes, recording: Recording, predicted: Array, column: int) ->
     """Measured dots and predicted line of one output."""
     rows = evenly_spread_indices(len(recording.t), MAX_ROWS)
     size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
-    axes.plot(recording.t[rows], recording.y[rows, column], ".", color=MEASURED, markersize=size)
-    axes.plot(recording.t[rows], predicted[rows, column], color=INK, linewidth=1.2)
+    axes.plot(
+        recording.t[rows], recording.y[rows, column], ".", color=MEASURED_COLOUR, markersize=size
+    )
+    axes.plot(recording.t[rows], predicted[rows, column], color=TEXT_COLOUR, linewidth=1.2)
 
 
 def draw_residual(axes: Axes, t: Array, residual: Array, sigma: float) -> None:
     """Measured minus predicted with the band of two sigma, and the share outside it."""
     known = residual[np.isfinite(residual)]
-    axes.axhspan(-2.0 * sigma, 2.0 * sigma, color=FAINT, alpha=0.8, linewidth=0)
-    axes.axhline(0.0, color=INK, linewidth=0.8)
+    axes.axhspan(-2.0 * sigma, 2.0 * sigma, color=GRID_COLOUR, alpha=0.8, linewidth=0)
+    axes.axhline(0.0, color=TEXT_COLOUR, linewidth=0.8)
     rows = evenly_spread_indices(len(t), MAX_ROWS)
     size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
-    axes.plot(t[rows], residual[rows], ".", color=MEASURED, markersize=size)
+    axes.plot(t[rows], residual[rows], ".", color=MEASURED_COLOUR, markersize=size)
     if not known.size:
-        say(axes, "not measured")
+        write_message(axes, "not measured")
         return
     outside = 100.0 * float(np.mean(np.abs(known) > 2.0 * sigma))
     text = f"rms / σ = {np.sqrt(np.mean(known**2)) / sigma:.2f},  {outside:.1f} % outside"
-    axes.set_title(text, loc="right", fontsize=SMALL, color=MUTED, pad=3)
+    axes.set_title(text, loc="right", fontsize=SMALL_FONT, color=MUTED_COLOUR, pad=3)
 
 
 def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] | Array) -> Figure:
@@ -227,17 +251,17 @@ def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] |
         label = labels.output(recording.outputs[column])
         draw_fit(left, recording, predicted, int(column))
         draw_residual(right, recording.t, residual[:, column], float(noise[column]))
-        dress(left, ylabel=two_lines(label))
-        dress(right, ylabel=f"residual [{split_unit(label)[1]}]")
+        format_axes(left, ylabel=break_before_unit(label))
+        format_axes(right, ylabel=f"residual [{split_unit(label)[1]}]")
     for axes in grid[-1]:
         axes.set_xlabel("time [s]")
     handles = [
-        Line2D([], [], color=MEASURED, marker=".", linestyle="", label="measured"),
-        Line2D([], [], color=INK, label="predicted"),
-        Patch(color=FAINT, label="±2σ of the noise"),
+        Line2D([], [], color=MEASURED_COLOUR, marker=".", linestyle="", label="measured"),
+        Line2D([], [], color=TEXT_COLOUR, label="predicted"),
+        Patch(color=GRID_COLOUR, label="±2σ of the noise"),
     ]
     note = "Residual: measured − predicted; 4.6 % outside ±2σ is expected if the model and the noise are right."
     if len(columns) < len(recording.outputs):
         note += f" Shown: the {len(columns)} of {len(recording.outputs)} outputs with the largest residual over sigma."
-    headline(figure, f"Fit to {Path(recording.name).name}", handles, note)
+    add_title(figure, f"Fit to {Path(recording.name).name}", handles, note)
     return figure

@@ -7,15 +7,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjfim.output.plots.style import (
-    FAINT,
-    INK,
-    MUTED,
-    OPTIMIZED,
-    SMALL,
-    dress,
-    headline,
+    GRID_COLOUR,
+    MUTED_COLOUR,
+    OPTIMIZED_COLOUR,
+    SMALL_FONT,
+    TEXT_COLOUR,
+    add_title,
+    format_axes,
+    format_number,
     new_figure,
-    number,
     shorten,
 )
 from mjfim.records.design import Design, LimitUsage
@@ -44,7 +44,7 @@ def limits(design: Design) -> Figure:
         axes = figure.add_subplot(grid[divmod(i, columns)])
         draw_usage(axes, [u for u in design.usage if u.kind == kind], kind == "clearance")
         bottom = i + columns >= len(kinds)
-        dress(
+        format_axes(
             axes,
             "time [s]" if bottom else "",
             "least / distance" if kind == "clearance" else "half ranges",
@@ -53,8 +53,8 @@ def limits(design: Design) -> Figure:
         axes.set_title(
             _said(kind, margin),
             loc="left",
-            fontsize=SMALL + 1,
-            color=OPTIMIZED if margin < 0.0 else INK,
+            fontsize=SMALL_FONT + 1,
+            color=OPTIMIZED_COLOUR if margin < 0.0 else TEXT_COLOUR,
             pad=17,
         )
     ends = [
@@ -63,13 +63,13 @@ def limits(design: Design) -> Figure:
     note = "Every engine step of the untouched model; the grey zones are out of bounds."
     if ends:
         note += f" At the end: {', '.join(ends)}."
-    headline(figure, "How much of each limit the design uses", [], note)
+    add_title(figure, "How much of each limit the design uses", [], note)
     return figure
 
 
 def _said(kind: str, margin: float) -> str:
     """A margin in words."""
-    return f"{kind.replace('_', ' ')}: {'kept by' if margin >= 0.0 else 'MISSED by'} {number(abs(margin))}"
+    return f"{kind.replace('_', ' ')}: {'kept by' if margin >= 0.0 else 'MISSED by'} {format_number(abs(margin))}"
 
 
 def draw_usage(axes: Axes, curves: list[LimitUsage], one_sided: bool) -> None:
@@ -77,7 +77,7 @@ def draw_usage(axes: Axes, curves: list[LimitUsage], one_sided: bool) -> None:
     order = sorted(curves, key=lambda u: -float(np.abs(u.share).max()))
     for rank, curve in enumerate(order):
         strong = rank < CLOSEST
-        colour = (OPTIMIZED, "#ee7733", "#aa3377")[rank] if strong else MUTED
+        colour = (OPTIMIZED_COLOUR, "#ee7733", "#aa3377")[rank] if strong else MUTED_COLOUR
         label = (
             f"{shorten(curve.name, 24)} {100 * float(np.abs(curve.share).max()):.5g} %"
             if strong
@@ -96,15 +96,15 @@ def draw_usage(axes: Axes, curves: list[LimitUsage], one_sided: bool) -> None:
     reach = max(1.08, 1.05 * float(np.abs(order[0].share).max()))
     low = 0.0 if one_sided else -reach
     axes.set_ylim(low, reach)
-    axes.axhspan(1.0, reach, color=FAINT, zorder=0)
-    axes.axhline(1.0, color=INK, linewidth=0.8, zorder=1)
+    axes.axhspan(1.0, reach, color=GRID_COLOUR, zorder=0)
+    axes.axhline(1.0, color=TEXT_COLOUR, linewidth=0.8, zorder=1)
     if not one_sided:
-        axes.axhspan(-reach, -1.0, color=FAINT, zorder=0)
-        axes.axhline(-1.0, color=INK, linewidth=0.8, zorder=1)
+        axes.axhspan(-reach, -1.0, color=GRID_COLOUR, zorder=0)
+        axes.axhline(-1.0, color=TEXT_COLOUR, linewidth=0.8, zorder=1)
     axes.legend(
         loc="upper left",
         bbox_to_anchor=(-0.01, 1.17),
         ncols=CLOSEST,
-        fontsize=SMALL - 1,
+        fontsize=SMALL_FONT - 1,
         frameon=False,
     )

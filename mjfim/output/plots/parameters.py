@@ -13,19 +13,19 @@ from mjfim.arrays import Array
 from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
     BEST_CASE,
-    INITIAL,
-    INK,
-    NORMAL,
-    OPTIMIZED,
-    SMALL,
-    brief,
-    dress,
-    headline,
+    INITIAL_COLOUR,
+    NORMAL_FONT,
+    OPTIMIZED_COLOUR,
+    SMALL_FONT,
+    TEXT_COLOUR,
+    add_title,
+    format_axes,
+    format_number,
+    format_percent,
+    format_with_uncertainty,
     new_figure,
-    number,
-    percent,
     shorten,
-    with_error,
+    shorten_label,
 )
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
@@ -51,7 +51,9 @@ def draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
     known = np.isfinite(std)
     if len(std) <= ROOMY:
         for x, y in zip(std[known], places[known], strict=True):
-            axes.text(x, y, f" {number(float(x))}", va="center", fontsize=SMALL, color=colour)
+            axes.text(
+                x, y, f" {format_number(float(x))}", va="center", fontsize=SMALL_FONT, color=colour
+            )
     axes.barh(places[known], std[known], height=0.36, color=colour)
     axes.barh(
         places[~known],
@@ -69,7 +71,7 @@ def draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
             "∞ ",
             ha="right",
             va="center",
-            fontsize=NORMAL,
+            fontsize=NORMAL_FONT,
             color=colour,
             backgroundcolor="white",
         )
@@ -81,9 +83,14 @@ def annotate_bars(axes: Axes, values: Array, before: Array, after: Array) -> Non
         relative = [np.abs(std / values) for std in (before, after)]
         ratio = before / after
     cells = [
-        (62.0, INITIAL, "of value", [percent(v) for v in relative[0]]),
-        (122.0, OPTIMIZED, "of value", [percent(v) for v in relative[1]]),
-        (178.0, INK, "ratio", [f"{number(v)}×" if np.isfinite(v) else number(v) for v in ratio]),
+        (62.0, INITIAL_COLOUR, "of value", [format_percent(v) for v in relative[0]]),
+        (122.0, OPTIMIZED_COLOUR, "of value", [format_percent(v) for v in relative[1]]),
+        (
+            178.0,
+            TEXT_COLOUR,
+            "ratio",
+            [f"{format_number(v)}×" if np.isfinite(v) else format_number(v) for v in ratio],
+        ),
     ]
     for x, colour, title, texts in cells:
         place_text(axes, (1.0, 1.0), "axes fraction", (x, 6.0), title, colour)
@@ -108,7 +115,7 @@ def place_text(
         textcoords="offset points",
         ha="right",
         va="center",
-        fontsize=NORMAL,
+        fontsize=NORMAL_FONT,
         color=colour,
         annotation_clip=False,
     )
@@ -119,7 +126,7 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     labels.check(parameters=len(design.theta))
     shown = list(design.wanted)
     names = [
-        *(brief(labels.parameter(j)) for j in shown),
+        *(shorten_label(labels.parameter(j)) for j in shown),
         *(shorten(c.expression) for c in design.combined),
     ]
     values = np.array([*design.theta[shown], *(c.value for c in design.combined)])
@@ -131,17 +138,20 @@ def std_bars(design: Design, labels: Labels) -> Figure:
     axes.set_xscale("log")
     axes.set_xlim(*bar_limits(before, after))
     axes.set_ylim(count - 0.45, -0.55)
-    draw_bars(axes, before, -0.19, INITIAL)
-    draw_bars(axes, after, 0.19, OPTIMIZED)
-    dress(axes, "predicted standard deviation [unit of the parameter]")
+    draw_bars(axes, before, -0.19, INITIAL_COLOUR)
+    draw_bars(axes, after, 0.19, OPTIMIZED_COLOUR)
+    format_axes(axes, "predicted standard deviation [unit of the parameter]")
     axes.grid(False, axis="y")
     axes.set_yticks(range(count), names)
     annotate_bars(axes, values, before, after)
     note = BEST_CASE
-    handles = [Patch(color=INITIAL, label="initial"), Patch(color=OPTIMIZED, label="optimized")]
+    handles = [
+        Patch(color=INITIAL_COLOUR, label="initial"),
+        Patch(color=OPTIMIZED_COLOUR, label="optimized"),
+    ]
     if not np.isfinite(np.concatenate([before, after])).all():
         note += " ∞: this trajectory does not determine the parameter by itself."
-    headline(figure, "Predicted accuracy (Cramér–Rao)", handles, note)
+    add_title(figure, "Predicted accuracy (Cramér–Rao)", handles, note)
     return figure
 
 
@@ -165,17 +175,21 @@ def draw_interval(
     low, high = axes.get_xlim()
     if np.isfinite(half):
         inner = (max(centre - half, low), min(centre + half, high))
-        axes.plot(inner, (y, y), color=OPTIMIZED, linewidth=5.0, solid_capstyle="butt", alpha=0.3)
+        axes.plot(
+            inner, (y, y), color=OPTIMIZED_COLOUR, linewidth=5.0, solid_capstyle="butt", alpha=0.3
+        )
     ends = (max(wide[0], low), min(wide[1], high))
-    axes.plot(ends, (y, y), color=OPTIMIZED, linewidth=1.4, solid_capstyle="butt")
+    axes.plot(ends, (y, y), color=OPTIMIZED_COLOUR, linewidth=1.4, solid_capstyle="butt")
     for end, marker, cut in ((ends[0], "<", wide[0] < low), (ends[1], ">", wide[1] > high)):
-        axes.plot(end, y, marker if cut else "|", color=OPTIMIZED, markersize=7, clip_on=False)
-    face = "white" if bound else OPTIMIZED
+        axes.plot(
+            end, y, marker if cut else "|", color=OPTIMIZED_COLOUR, markersize=7, clip_on=False
+        )
+    face = "white" if bound else OPTIMIZED_COLOUR
     axes.plot(
         centre,
         y,
         "s" if bound else "o",
-        color=OPTIMIZED,
+        color=OPTIMIZED_COLOUR,
         markerfacecolor=face,
         markersize=6.5,
         zorder=3,
@@ -186,7 +200,8 @@ def interval_text(estimate: Estimate, j: int, unit: str) -> str:
     """Guess, estimate and half width of the honest interval in the parameter's unit."""
     low, high = estimate.interval[j]
     half = 0.5 * float(high - low) if np.isfinite(estimate.std[j]) else np.inf
-    text = f"{number(float(estimate.initial_theta[j]), 4)} → {with_error(float(estimate.theta[j]), half)} {unit}"
+    guess = format_number(float(estimate.initial_theta[j]), 4)
+    text = f"{guess} → {format_with_uncertainty(float(estimate.theta[j]), half)} {unit}"
     return text.rstrip() + (
         "   at its bound" if estimate.parameters[j] in estimate.at_bound else ""
     )
@@ -203,7 +218,7 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
     figure = new_figure(9.5, 1.9 + (0.42 if count <= 12 else 0.27) * count)
     axes = figure.subplots()
     axes.set(xlim=relative_axis(offset, wide), ylim=(count - 0.4, -0.6))
-    axes.axvline(0.0, color=INITIAL, linewidth=1.6)
+    axes.axvline(0.0, color=INITIAL_COLOUR, linewidth=1.6)
     for j in range(count):
         if np.isfinite(offset[j]):
             ends = (float(wide[j, 0]), float(wide[j, 1]))
@@ -216,19 +231,21 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
             text,
             transform=axes.get_yaxis_transform(),
             va="center",
-            fontsize=SMALL,
-            color=INK,
+            fontsize=SMALL_FONT,
+            color=TEXT_COLOUR,
         )
-    dress(axes, "difference from the guess [% of the guess]")
-    axes.set_yticks(range(count), [brief(labels.parameter(j)) for j in range(count)])
+    format_axes(axes, "difference from the guess [% of the guess]")
+    axes.set_yticks(range(count), [shorten_label(labels.parameter(j)) for j in range(count)])
     handles = [
-        Line2D([], [], color=INITIAL, label="guess", linewidth=1.6),
-        Line2D([], [], color=OPTIMIZED, marker="o", alpha=0.9, label="estimate, 95 % interval"),
-        Line2D([], [], color=OPTIMIZED, linewidth=5.0, alpha=0.3, label="formal 95 %"),
+        Line2D([], [], color=INITIAL_COLOUR, label="guess", linewidth=1.6),
+        Line2D(
+            [], [], color=OPTIMIZED_COLOUR, marker="o", alpha=0.9, label="estimate, 95 % interval"
+        ),
+        Line2D([], [], color=OPTIMIZED_COLOUR, linewidth=5.0, alpha=0.3, label="formal 95 %"),
         Line2D(
             [],
             [],
-            color=OPTIMIZED,
+            color=OPTIMIZED_COLOUR,
             marker="s",
             markerfacecolor="white",
             linestyle="",
@@ -240,5 +257,5 @@ def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
         note += " Here the residuals are not noise: no interval covers what a wrong model does to the parameters."
     if np.isnan(scale).any():
         note += " A guess of 0 has no relative scale and is given as text only."
-    headline(figure, "Estimated parameters", handles, note)
+    add_title(figure, "Estimated parameters", handles, note)
     return figure

@@ -16,20 +16,20 @@ from mjfim.model.coordinates import split_unit
 from mjfim.output.labels import Labels
 from mjfim.output.plots.estimates import shown_outputs
 from mjfim.output.plots.style import (
-    FAINT,
-    INITIAL,
-    INK,
-    MEASURED,
-    MUTED,
-    OPTIMIZED,
-    SMALL,
-    dress,
-    headline,
+    GRID_COLOUR,
+    INITIAL_COLOUR,
+    MEASURED_COLOUR,
+    MUTED_COLOUR,
+    OPTIMIZED_COLOUR,
+    SMALL_FONT,
+    TEXT_COLOUR,
+    add_title,
+    break_before_unit,
+    format_axes,
+    format_number,
     new_figure,
-    number,
-    say,
     shorten,
-    two_lines,
+    write_message,
 )
 from mjfim.records.estimate import Estimate, Prediction
 
@@ -64,23 +64,23 @@ def draw_spectrum(axes: Axes, estimate: Estimate, column: int, sigma: float) -> 
         parts.append((recording.t[seen], r[seen] / sigma))
     freq, power, count = spectrum([(t, r) for t, r in parts if len(t) > 8])
     if not count or not (power > 0.0).any():
-        say(axes, "not measured")
+        write_message(axes, "not measured")
         return
     level = 1.0 / max(float(freq[-1]), 1e-300)  # one-sided density of unit white noise
     low, high = chi2.ppf([0.025, 0.975], 2.0 * count) / (2.0 * count)
-    axes.axhspan(low, high, color=FAINT, alpha=0.8, linewidth=0)
-    axes.axhline(1.0, color=INK, linewidth=0.8)
+    axes.axhspan(low, high, color=GRID_COLOUR, alpha=0.8, linewidth=0)
+    axes.axhline(1.0, color=TEXT_COLOUR, linewidth=0.8)
     axes.plot(
-        freq[1:-1], power[1:-1] / level, color=MEASURED, linewidth=1.1
+        freq[1:-1], power[1:-1] / level, color=MEASURED_COLOUR, linewidth=1.1
     )  # the two ends have half the power
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.yaxis.set_minor_formatter(NullFormatter())
     own = estimate.whiteness[column] if column < len(estimate.whiteness) else None
     if own is not None:
-        chance = "below 10⁻⁶" if own.p < 1e-6 else number(own.p, 2)
+        chance = "below 10⁻⁶" if own.p < 1e-6 else format_number(own.p, 2)
         text = f"one to the next {own.correlation:+.2f},  p(white) {chance}"
-        axes.set_title(text, loc="right", fontsize=SMALL, color=MUTED, pad=3)
+        axes.set_title(text, loc="right", fontsize=SMALL_FONT, color=MUTED_COLOUR, pad=3)
 
 
 def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
@@ -98,20 +98,20 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
     for axes in grid.ravel()[len(columns) :]:
         axes.set_visible(False)
     for axes, column in zip(grid.ravel(), columns, strict=False):
-        dress(
+        format_axes(
             axes,
-            ylabel=f"{two_lines(split_unit(labels.output(outputs[column]))[0])}\nover white noise [–]",
+            ylabel=f"{break_before_unit(split_unit(labels.output(outputs[column]))[0])}\nover white noise [–]",
         )
         draw_spectrum(axes, estimate, int(column), float(sigma[column]))
     for axes in grid[-1]:
         axes.set_xlabel("frequency [Hz]")
     handles = [
-        Line2D([], [], color=MEASURED, label="residual"),
-        Line2D([], [], color=INK, label="white noise of σ"),
-        Patch(color=FAINT, label="95 % of white noise"),
+        Line2D([], [], color=MEASURED_COLOUR, label="residual"),
+        Line2D([], [], color=TEXT_COLOUR, label="white noise of σ"),
+        Patch(color=GRID_COLOUR, label="95 % of white noise"),
     ]
     note = "Above the band at low frequencies: the model misses something slow. Rows count as evenly spaced."
-    headline(figure, "Spectra of the residuals", handles, note)
+    add_title(figure, "Spectra of the residuals", handles, note)
     return figure
 
 
@@ -131,28 +131,36 @@ def predictions(estimate: Estimate, labels: Labels) -> Figure:
     grid = figure.subplots(len(outputs), 1, squeeze=False)[:, 0]
     names = [shorten(p.name.rsplit("/", 1)[-1], 34) + ("" if p.held_out else " *") for p in found]
     for axes, j in zip(grid, outputs, strict=True):
-        dress(axes, ylabel=two_lines(split_unit(labels.output(names_of[j]))[0]))
+        format_axes(axes, ylabel=break_before_unit(split_unit(labels.output(names_of[j]))[0]))
         place = np.arange(len(found))
-        axes.barh(place - 0.19, [p.nominal.rms[j] for p in found], 0.34, color=INITIAL, alpha=0.75)
         axes.barh(
-            place + 0.19, [p.identified.rms[j] for p in found], 0.34, color=OPTIMIZED, alpha=0.85
+            place - 0.19, [p.nominal.rms[j] for p in found], 0.34, color=INITIAL_COLOUR, alpha=0.75
+        )
+        axes.barh(
+            place + 0.19,
+            [p.identified.rms[j] for p in found],
+            0.34,
+            color=OPTIMIZED_COLOUR,
+            alpha=0.85,
         )
         axes.set_yticks(place, names)
         axes.set_ylim(len(found) - 0.5, -0.5)
         axes.grid(False, axis="y")
         for k, p in enumerate(found):
-            text = f"{number(float(p.identified.rms[j]))}  (× {number(_share(p, j), 2)})"
+            text = (
+                f"{format_number(float(p.identified.rms[j]))}  (× {format_number(_share(p, j), 2)})"
+            )
             where = {"transform": axes.get_yaxis_transform(), "va": "center"}
-            axes.text(1.01, k, text, fontsize=SMALL, color=INK, **where)
+            axes.text(1.01, k, text, fontsize=SMALL_FONT, color=TEXT_COLOUR, **where)
         axes.set_xlabel(
             f"rms prediction error [{split_unit(labels.output(names_of[j]))[1] or '–'}]"
         )
     handles = [
-        Patch(color=INITIAL, label="nominal model"),
-        Patch(color=OPTIMIZED, label="identified model"),
+        Patch(color=INITIAL_COLOUR, label="nominal model"),
+        Patch(color=OPTIMIZED_COLOUR, label="identified model"),
     ]
     note = "The identified parameters were fitted to everything but what is predicted; only its start is found from it."
     if not all(p.held_out for p in found):
         note += " *: fitted in the end; predicted here by a fit to the rest."
-    headline(figure, "Predictions of what was not fitted", handles, note)
+    add_title(figure, "Predictions of what was not fitted", handles, note)
     return figure

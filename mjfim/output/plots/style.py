@@ -22,45 +22,45 @@ from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
 from mjfim.model.coordinates import split_unit
 
-INITIAL = "#0077bb"
-OPTIMIZED = "#cc3311"
-INK = "#222222"
-MUTED = "#6b7076"
-FAINT = "#d9dcdf"
-OTHER = "#8a6d3b"
-MEASURED = "#009988"
+INITIAL_COLOUR = "#0077bb"
+OPTIMIZED_COLOUR = "#cc3311"
+TEXT_COLOUR = "#222222"
+MUTED_COLOUR = "#6b7076"
+GRID_COLOUR = "#d9dcdf"
+OTHER_COLOUR = "#8a6d3b"
+MEASURED_COLOUR = "#009988"
 
 
-SMALL, NORMAL, LARGE = 8.0, 9.0, 11.0
+SMALL_FONT, NORMAL_FONT, LARGE_FONT = 8.0, 9.0, 11.0
 
 
 # How the two trajectories of a design or study are named and coloured.
-STYLES: dict[str, tuple[str, str]] = {
-    "initial": ("initial", INITIAL),
-    "final": ("optimized", OPTIMIZED),
+TRAJECTORY_STYLES: dict[str, tuple[str, str]] = {
+    "initial": ("initial", INITIAL_COLOUR),
+    "final": ("optimized", OPTIMIZED_COLOUR),
 }
 BEST_CASE = "Predicted standard deviations are a best case: they hold if the model and the stated noise are right."
 
 
-def per(unit: str, divisor: str) -> str:
-    """Unit of a quotient: per("m", "kg") is "m/kg"; compound units are bracketed."""
+def quotient_unit(unit: str, divisor: str) -> str:
+    """Unit of a quotient: quotient_unit("m", "kg") is "m/kg"; compound units are bracketed."""
     top = unit or "1"
     if not divisor:
         return top
-    return f"{bracketed(top)}/{bracketed(divisor)}"
+    return f"{bracketed_unit(top)}/{bracketed_unit(divisor)}"
 
 
-def bracketed(unit: str) -> str:
+def bracketed_unit(unit: str) -> str:
     """A unit that may be divided or raised as a whole."""
     return f"({unit})" if any(c in unit for c in " /·*^²³") else unit
 
 
-def squared(unit: str) -> str:
+def squared_unit(unit: str) -> str:
     """Unit of a variance: "kg" becomes "kg²"."""
-    return f"{bracketed(unit)}²" if unit else ""
+    return f"{bracketed_unit(unit)}²" if unit else ""
 
 
-def number(value: float, digits: int = 3) -> str:
+def format_number(value: float, digits: int = 3) -> str:
     """Significant digits without trailing exponent code: 0.874, 1.65×10⁴, ∞; a dash for NaN."""
     if np.isnan(value):
         return "–"
@@ -75,17 +75,17 @@ def number(value: float, digits: int = 3) -> str:
     return f"{mantissa}×10{raised}".replace("-", "−")
 
 
-def with_error(value: float, half: float) -> str:
+def format_with_uncertainty(value: float, half: float) -> str:
     """`0.994 ± 0.012`: the value to the digits that its half width leaves."""
     if not np.isfinite(half) or half <= 0.0 or not 1e-3 <= max(abs(value), half) < 1e5:
-        return f"{number(value, 4)} ± {number(half, 2)}"
+        return f"{format_number(value, 4)} ± {format_number(half, 2)}"
     decimals = int(np.clip(1 - np.floor(np.log10(half)), 0, 8))
     return f"{value:.{decimals}f} ± {half:.{decimals}f}".replace("-", "−")
 
 
-def percent(value: float) -> str:
+def format_percent(value: float) -> str:
     """A fraction as percent with two significant digits."""
-    return f"{number(100.0 * value, 2)} %" if np.isfinite(value) else number(value)
+    return f"{format_number(100.0 * value, 2)} %" if np.isfinite(value) else format_number(value)
 
 
 def shorten(text: str, width: int = 28) -> str:
@@ -94,13 +94,13 @@ def shorten(text: str, width: int = 28) -> str:
     return text if len(text) <= width else f"{text[:keep]}…{text[-keep:]}"
 
 
-def two_lines(label: str, width: int = 18) -> str:
+def break_before_unit(label: str, width: int = 18) -> str:
     """`name [unit]` for the side of a low panel: a long label breaks before its unit."""
     name, unit = split_unit(label)
     return label if len(label) <= width or not unit else f"{shorten(name, width)}\n[{unit}]"
 
 
-def brief(label: str, width: int = 28) -> str:
+def shorten_label(label: str, width: int = 28) -> str:
     """`name [unit]` with a shortened name and the whole unit."""
     name, unit = split_unit(label)
     return f"{shorten(name, width)} [{unit}]" if unit else shorten(name, width)
@@ -114,19 +114,19 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def dress(axes: Axes, xlabel: str = "", ylabel: str = "") -> Axes:
+def format_axes(axes: Axes, xlabel: str = "", ylabel: str = "") -> Axes:
     """Open frame, faint grid, small ticks, labels."""
     axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(MUTED)
-    axes.grid(True, color=FAINT, linewidth=0.6)
+    axes.spines[["left", "bottom"]].set_color(MUTED_COLOUR)
+    axes.grid(True, color=GRID_COLOUR, linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.tick_params(labelsize=SMALL, color=MUTED, labelcolor=INK)
-    axes.set_xlabel(xlabel, fontsize=NORMAL, color=INK)
-    axes.set_ylabel(ylabel, fontsize=NORMAL, color=INK)
+    axes.tick_params(labelsize=SMALL_FONT, color=MUTED_COLOUR, labelcolor=TEXT_COLOUR)
+    axes.set_xlabel(xlabel, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
+    axes.set_ylabel(ylabel, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
     return axes
 
 
-def say(axes: Axes, sentence: str) -> None:
+def write_message(axes: Axes, sentence: str) -> None:
     """A sentence in the middle of a panel that has nothing to draw."""
     axes.text(
         0.5,
@@ -135,16 +135,18 @@ def say(axes: Axes, sentence: str) -> None:
         transform=axes.transAxes,
         ha="center",
         va="center",
-        fontsize=NORMAL,
-        color=MUTED,
+        fontsize=NORMAL_FONT,
+        color=MUTED_COLOUR,
     )
 
 
-def headline(figure: Figure, title: str, handles: Sequence[Artist] = (), note: str = "") -> None:
+def add_title(figure: Figure, title: str, handles: Sequence[Artist] = (), note: str = "") -> None:
     """Title at the top left, legend under it, wrapped footnote at the bottom left."""
     left = 0.12 / figure.get_figwidth()
     # The title's second, empty line keeps room for the legend.
-    figure.suptitle(f"{title}\n ", x=left, ha="left", fontsize=LARGE, color=INK, linespacing=1.3)
+    figure.suptitle(
+        f"{title}\n ", x=left, ha="left", fontsize=LARGE_FONT, color=TEXT_COLOUR, linespacing=1.3
+    )
     if handles:
         figure.legend(
             handles=list(handles),
@@ -152,19 +154,20 @@ def headline(figure: Figure, title: str, handles: Sequence[Artist] = (), note: s
             bbox_to_anchor=(left, 1.0 - 0.27 / figure.get_figheight()),
             ncols=len(handles),
             frameon=False,
-            fontsize=NORMAL,
+            fontsize=NORMAL_FONT,
             borderaxespad=0.0,
             borderpad=0.2,
         )
     if note:
         wrapped = textwrap.fill(note, int(figure.get_figwidth() * 17))
-        figure.supxlabel(wrapped, x=left, ha="left", fontsize=SMALL - 0.5, color=MUTED)
+        figure.supxlabel(wrapped, x=left, ha="left", fontsize=SMALL_FONT - 0.5, color=MUTED_COLOUR)
 
 
-def pair_handles() -> list[Line2D]:
+def trajectory_handles() -> list[Line2D]:
     """Legend entries of the two trajectories."""
     return [
-        Line2D([], [], color=colour, label=name, linewidth=2.0) for name, colour in STYLES.values()
+        Line2D([], [], color=colour, label=name, linewidth=2.0)
+        for name, colour in TRAJECTORY_STYLES.values()
     ]
 
 

@@ -12,17 +12,17 @@ from matplotlib.font_manager import FontProperties, findfont, get_font
 from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
     BEST_CASE,
-    INK,
-    LARGE,
-    MUTED,
-    NORMAL,
-    OTHER,
-    SMALL,
-    STYLES,
-    brief,
+    LARGE_FONT,
+    MUTED_COLOUR,
+    NORMAL_FONT,
+    OTHER_COLOUR,
+    SMALL_FONT,
+    TEXT_COLOUR,
+    TRAJECTORY_STYLES,
+    format_number,
     new_figure,
-    number,
     shorten,
+    shorten_label,
 )
 from mjfim.output.summaries import MAX_MATRIX, describe_design, describe_study
 from mjfim.output.summary_parts import Cell, Name, Quantity, SummaryTable
@@ -101,8 +101,8 @@ def draw_tables(title: str, tables: Sequence[SummaryTable], notes: Sequence[str]
         tables: The tables.
         notes: Lines below the tables.
     """
-    widths = [text_width(title, LARGE)]
-    widths += [text_width(note, SMALL - 0.5) for note in notes]
+    widths = [text_width(title, LARGE_FONT)]
+    widths += [text_width(note, SMALL_FONT - 0.5) for note in notes]
     widths += [column_edges(table)[-1] for table in tables]
     table_width = max(widths)
 
@@ -115,7 +115,7 @@ def draw_tables(title: str, tables: Sequence[SummaryTable], notes: Sequence[str]
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0.0, width), ylim=(height, 0.0))
     axes.set_axis_off()
-    axes.text(MARGIN, 0.3, title, fontsize=LARGE, color=INK, va="center")
+    axes.text(MARGIN, 0.3, title, fontsize=LARGE_FONT, color=TEXT_COLOUR, va="center")
 
     top = TITLE_HEIGHT
     for table in tables:
@@ -123,7 +123,7 @@ def draw_tables(title: str, tables: Sequence[SummaryTable], notes: Sequence[str]
         top += table_height(table)
     for k, note in enumerate(notes):
         y = top + 0.1 + NOTE_HEIGHT * k
-        axes.text(MARGIN, y, note, fontsize=SMALL - 0.5, color=MUTED, va="center")
+        axes.text(MARGIN, y, note, fontsize=SMALL_FONT - 0.5, color=MUTED_COLOUR, va="center")
     return figure
 
 
@@ -139,8 +139,10 @@ def draw_table(axes: Axes, table: SummaryTable, top: float, width: float) -> Non
     edges = [MARGIN + edge for edge in column_edges(table, width)]
 
     y = top + 0.7 * ROW_HEIGHT
-    title_size = NORMAL + 0.5
-    axes.text(MARGIN, y, table.title, fontsize=title_size, color=INK, va="center", weight="bold")
+    title_size = NORMAL_FONT + 0.5
+    axes.text(
+        MARGIN, y, table.title, fontsize=title_size, color=TEXT_COLOUR, va="center", weight="bold"
+    )
     y += 0.75 * ROW_HEIGHT
     rule(axes, MARGIN, edges[-1], y - 0.1 * ROW_HEIGHT, 1.2)
 
@@ -150,14 +152,14 @@ def draw_table(axes: Axes, table: SummaryTable, top: float, width: float) -> Non
         y += 0.55 * ROW_HEIGHT
 
     y += 0.5 * ROW_HEIGHT
-    _draw_cells(axes, _headings(table), edges, y, INK)
+    _draw_cells(axes, _headings(table), edges, y, TEXT_COLOUR)
     rule(axes, MARGIN, edges[-1], y + 0.52 * ROW_HEIGHT, 0.7)
 
     y += 0.15 * ROW_HEIGHT
     for row in table.rows:
         y += ROW_HEIGHT
         # A row that belongs to one trajectory has the colour of that trajectory.
-        colour = _trajectory_colour(row.trajectory) if row.trajectory else INK
+        colour = _trajectory_colour(row.trajectory) if row.trajectory else TEXT_COLOUR
         _draw_cells(axes, [_drawn(cell) for cell in row.cells], edges, y, colour)
     rule(axes, MARGIN, edges[-1], y + 0.6 * ROW_HEIGHT, 1.2)
 
@@ -195,7 +197,7 @@ def column_edges(table: SummaryTable, width: float = 0.0) -> list[float]:
     return [float(edge) for edge in edges + spare * np.arange(len(edges))]
 
 
-def text_width(text: str, size: float = NORMAL) -> float:
+def text_width(text: str, size: float = NORMAL_FONT) -> float:
     """Return the printed width of a text [inch].
 
     Args:
@@ -218,7 +220,7 @@ def rule(axes: Axes, first: float, last: float, y: float, width: float) -> None:
         y: Its height [inch].
         width: Its width [points].
     """
-    axes.plot([first, last], [y, y], color=INK, linewidth=width, solid_capstyle="butt")
+    axes.plot([first, last], [y, y], color=TEXT_COLOUR, linewidth=width, solid_capstyle="butt")
 
 
 def _draw_groups(axes: Axes, table: SummaryTable, edges: Sequence[float], y: float) -> None:
@@ -230,7 +232,7 @@ def _draw_groups(axes: Axes, table: SummaryTable, edges: Sequence[float], y: flo
             (left + right) / 2,
             y,
             _trajectory_name(group.trajectory),
-            fontsize=NORMAL,
+            fontsize=NORMAL_FONT,
             color=_trajectory_colour(group.trajectory),
             ha="center",
             va="center",
@@ -244,8 +246,8 @@ def _draw_cells(
     """Draw one line of a table."""
     for c, (text, edge) in enumerate(zip(texts, edges, strict=True)):
         x, side = (MARGIN, "left") if c == 0 else (edge, "right")
-        colour = first_colour if c == 0 else INK
-        axes.text(x, y, text, fontsize=NORMAL, color=colour, ha=side, va="center")
+        colour = first_colour if c == 0 else TEXT_COLOUR
+        axes.text(x, y, text, fontsize=NORMAL_FONT, color=colour, ha=side, va="center")
 
 
 def _headings(table: SummaryTable) -> list[str]:
@@ -261,17 +263,17 @@ def _drawn(cell: Cell) -> str:
     """Return a cell as figures write it: powers of ten raised, units in brackets."""
     if isinstance(cell, Quantity):
         suffix = cell.suffix if np.isfinite(cell.value) else ""
-        return number(cell.value, cell.digits) + suffix
+        return format_number(cell.value, cell.digits) + suffix
     if isinstance(cell, Name):
-        return brief(f"{cell.name} [{cell.unit or 'model unit'}]")
+        return shorten_label(f"{cell.name} [{cell.unit or 'model unit'}]")
     return shorten(cell)
 
 
 def _trajectory_name(trajectory: str) -> str:
     """Return the name of a trajectory in figures."""
-    return STYLES.get(trajectory, (trajectory, OTHER))[0]
+    return TRAJECTORY_STYLES.get(trajectory, (trajectory, OTHER_COLOUR))[0]
 
 
 def _trajectory_colour(trajectory: str) -> str:
     """Return the colour of a trajectory in figures."""
-    return STYLES.get(trajectory, (trajectory, OTHER))[1]
+    return TRAJECTORY_STYLES.get(trajectory, (trajectory, OTHER_COLOUR))[1]
