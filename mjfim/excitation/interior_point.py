@@ -290,7 +290,7 @@ class InteriorPointMethod:
         )
 
     def _direction(self) -> StructuredBFGS:
-        N = len(self.base.running.desired) - 1
+        N = len(self.base.running.desired_state) - 1
         ridge = 0.03 / N / self.constraints.control.bounds.scale**2
         return StructuredBFGS(ridge, self.basis)
 

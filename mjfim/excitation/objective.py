@@ -1,9 +1,4 @@
-"""The extended system of the paper: states (x, psi), with the linearisation of its section IV-E.3.
-
-    z' = A z + B v,   zeta_j' = (D_x DF[psi_j, e_j]) (z, v) + A zeta_j        for each parameter j
-
-`n_x (1 + p)` states; meant for small systems, where a metric may weigh psi.
-"""
+"""The cost of a design: a criterion of the Fisher information plus a running cost, along a trajectory."""
 
 from __future__ import annotations
 
@@ -30,61 +25,65 @@ from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
 
-def extend(full: Bilinear, a: Array, b: Array, a_psi: Array) -> Expansion:
-    """Expansion over (x, psi_1, ..., psi_p).
-
-    full: bilinear along the unit directions of theta;  a: (N+1, nx);  b: (N, nu);  a_psi: (N+1, nx, p)
-    """
-    N, nx, nu = full.B.shape
-    p = a_psi.shape[2]
-    A = np.zeros((N, nx * (1 + p), nx * (1 + p)))
-    B = np.zeros((N, nx * (1 + p), nu))
-    A[:, :nx, :nx], B[:, :nx] = full.A, full.B
-    for j in range(p):
-        block = slice(nx * (1 + j), nx * (2 + j))
-        mixed = np.swapaxes(full.F_mixed[j], 1, 2)
-        A[:, block, block] = full.A
-        A[:, block, :nx] = mixed[:, :, :nx]
-        B[:, block] = mixed[:, :, nx:]
-    stacked = np.swapaxes(a_psi, 1, 2).reshape(N + 1, nx * p)
-    return Expansion(A=A, B=B, a=np.concatenate([a, stacked], axis=1), b=np.array(b))
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RunningCost:
-    """`1/2 sum_k dt [(x_{k+1} - x_d)' Q (x_{k+1} - x_d) + (u_k - u_d)' R (u_k - u_d)]` over k = 0 ... N-1; x_0 is given.
+    """Weighted squares of the deviations from a desired trajectory and a desired control.
 
-    desired: x_d, (N+1, ns);  Q: (nx,) and R: (nu,) diagonals, not yet multiplied by dt;  rest: u_d, (nu,)
+        1/2 sum_k dt [(x_{k+1} - x_d)' Q (x_{k+1} - x_d) + (u_k - u_d)' R (u_k - u_d)],   k = 0 ... N-1
+
+    The initial state is given and costs nothing.
+
+    Attributes:
+        space: Layout of the state.
+        dt: Sample period [s].
+        desired_state: x_d, (N+1, ns).
+        Q: (nx,) diagonal of the weight on the state, not yet multiplied by dt [1 / (x-unit^2 s)].
+        R: (nu,) diagonal of the weight on the control, not yet multiplied by dt [1 / (u-unit^2 s)].
+        desired_control: u_d, (nu,) [u-unit].
     """
 
     space: StateSpace
     dt: float
-    desired: Array
+    desired_state: Array
     Q: Array
     R: Array
-    rest: Array
+    desired_control: Array
 
     def value(self, trajectory: Trajectory) -> float:
-        """The integral."""
-        dx = self.space.minus(trajectory.state, self.desired)[1:]
-        return float(
-            0.5
-            * self.dt
-            * (np.sum(dx**2 * self.Q) + np.sum((trajectory.ctrl - self.rest) ** 2 * self.R))
-        )
+        """The running cost along a trajectory."""
+        dx = self.space.minus(trajectory.state, self.desired_state)[1:]
+        du = trajectory.ctrl - self.desired_control
+        return float(0.5 * self.dt * (np.sum(dx**2 * self.Q) + np.sum(du**2 * self.R)))
 
     def gradient(self, trajectory: Trajectory) -> tuple[Array, Array]:
-        """(a, b): derivative by x_k (N+1, nx) and u_k (N, nu)."""
-        a = self.dt * self.space.minus(trajectory.state, self.desired) * self.Q
+        """Gradient of the running cost.
+
+        Args:
+            trajectory: The trajectory.
+
+        Returns:
+            (N+1, nx) derivative by the state and (N, nu) derivative by the control.
+        """
+        a = self.dt * self.space.minus(trajectory.state, self.desired_state) * self.Q
         a[0] = 0.0
-        return a, self.dt * (trajectory.ctrl - self.rest) * self.R
+        b = self.dt * (trajectory.ctrl - self.desired_control) * self.R
+        return a, b
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class DesignPoint:
-    """A trajectory with everything computed along it. A diverged trial has no trajectory and infinite cost.
+    """A trajectory with everything that is computed along it.
 
-    others: the same control at the further parameter samples of a robust design
+    A trial that diverges has no trajectory and an infinite cost.
+
+    Attributes:
+        trajectory: The trajectory, or None.
+        sensitivity: Sensitivities of states and outputs to the parameters, or None.
+        information: (p, p) Fisher information with the prior [1 / (theta_i theta_j unit)], or None.
+        criterion: The criterion of the information with its derivative, or None.
+        cost: J.
+        accuracy: Differences with which the point is expanded.
+        others: Points of the same control at the further parameter samples of a robust design; their cost is left open.
     """
 
     trajectory: Trajectory | None
@@ -97,98 +96,128 @@ class DesignPoint:
 
     @property
     def phi(self) -> tuple[float, ...]:
-        """The criterion here and at the other samples."""
-        return tuple(
-            np.inf if p.criterion is None else p.criterion.value for p in (self, *self.others)
-        )
+        """The criterion at this parameter value and at the further samples; infinite where it is not known."""
+        points = (self, *self.others)
+        return tuple(np.inf if p.criterion is None else p.criterion.value for p in points)
 
 
-DIVERGED = DesignPoint(None, None, None, None, np.inf, FORWARD_DIFFERENCES)
+DIVERGED = DesignPoint(
+    trajectory=None,
+    sensitivity=None,
+    information=None,
+    criterion=None,
+    cost=np.inf,
+    accuracy=FORWARD_DIFFERENCES,
+)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class DesignProblem:
-    """J(theta fixed) as Algorithm 1 wants it: a `pronto.Problem` over `Point`s.
+    """The cost J as Algorithm 1 of the paper minimises it: a `projection_operator.Problem` over `DesignPoint`s.
 
-    extended: expansions also carry psi as a state;  draft: never refine the differences (coarse levels)
-    parameter_samples: of a robust design, its first sample theta itself; each sample is driven by the same control, open loop
+    Attributes:
+        plant: The plant.
+        theta: (p,) parameter values at which the information is computed.
+        information: Fisher information of the measured samples, and the criterion.
+        running: Running cost.
+        forward_differences_only: The differences are never refined; for coarse levels.
+        parameter_samples: Samples over which a robust design pools the criterion, theta first, or None. The same control
+            drives every sample, open loop.
     """
 
     plant: Plant
     theta: Array
     information: FisherInformation
     running: RunningCost
-    extended: bool = False
-    draft: bool = False
+    forward_differences_only: bool = False
     parameter_samples: ParameterSamples | None = None
 
     def point(
         self, trajectory: Trajectory, accuracy: DifferenceAccuracy = FORWARD_DIFFERENCES
     ) -> DesignPoint:
-        """Evaluate J along a trajectory."""
-        point = self._sensed(self.theta, trajectory, accuracy)
+        """Evaluate the cost along a trajectory.
+
+        Args:
+            trajectory: A trajectory of the plant at theta.
+            accuracy: Differences with which sensitivities are computed.
+
+        Returns:
+            The point; `DIVERGED` where a simulation with moved parameters diverges.
+        """
+        point = self._point_without_cost(self.theta, trajectory, accuracy)
         if point.criterion is None:
             return DIVERGED
+
         others = []
-        for theta in () if self.parameter_samples is None else self.parameter_samples.thetas[1:]:
+        for theta in self._further_samples():
             try:
-                others.append(
-                    self._sensed(theta, self.plant.simulate(theta, trajectory.ctrl), accuracy)
-                )
+                moved = self.plant.simulate(theta, trajectory.ctrl)
             except SimulationDivergedError:
                 return DIVERGED
-        return self._priced(replace(point, others=tuple(others)))
+            others.append(self._point_without_cost(theta, moved, accuracy))
+        return self._with_cost(replace(point, others=tuple(others)))
 
     def reevaluated(self, point: DesignPoint) -> DesignPoint:
-        """A point of a problem that differs from this one in the criterion alone."""
-        here, *others = (
-            p
-            if p.information is None
-            else replace(p, criterion=self.information.evaluate(p.information))
-            for p in (point, *point.others)
-        )
-        return (
-            point if here.criterion is None else self._priced(replace(here, others=tuple(others)))
-        )
+        """Evaluate the criterion and the cost anew, for a point of a problem that differs in the criterion only."""
+        if point.information is None:
+            return point
 
-    def _priced(self, point: DesignPoint) -> DesignPoint:
+        others = tuple(self._with_criterion(other) for other in point.others)
+        return self._with_cost(replace(self._with_criterion(point), others=others))
+
+    def _with_criterion(self, point: DesignPoint) -> DesignPoint:
+        """A point with the criterion of its information."""
+        if point.information is None:
+            return point
+        return replace(point, criterion=self.information.evaluate(point.information))
+
+    def _with_cost(self, point: DesignPoint) -> DesignPoint:
+        """A point with the cost that its criteria make."""
         trajectory, _, criterion = _computed(point)
-        phi = (
-            criterion.value
-            if self.parameter_samples is None
-            else self.parameter_samples.value(point.phi)
-        )
+        phi = criterion.value
+        if self.parameter_samples is not None:
+            phi = self.parameter_samples.value(point.phi)
         return replace(point, cost=phi + self.running.value(trajectory))
 
-    def _sensed(
+    def _further_samples(self) -> Array:
+        """(S-1, p) parameter samples besides theta."""
+        if self.parameter_samples is None:
+            return np.zeros((0, len(self.theta)))
+        return self.parameter_samples.thetas[1:]
+
+    def _point_without_cost(
         self, theta: Array, trajectory: Trajectory, accuracy: DifferenceAccuracy
     ) -> DesignPoint:
-        """A trajectory of the model at theta with its information; its cost is left open."""
-        sensitivity = self.plant.derivatives.sensitivity(
-            theta, trajectory, central=not accuracy.shared_origin
-        )
+        """Information along a trajectory of the plant at theta: (p,); the cost is left open."""
+        central = not accuracy.shared_origin
+        sensitivity = self.plant.derivatives.sensitivity(theta, trajectory, central=central)
         if sensitivity is None:
             return DIVERGED
+
         information = self.information.matrix(sensitivity)
         return DesignPoint(
-            trajectory,
-            sensitivity,
-            information,
-            self.information.evaluate(information),
-            np.inf,
-            accuracy,
+            trajectory=trajectory,
+            sensitivity=sensitivity,
+            information=information,
+            criterion=self.information.evaluate(information),
+            cost=np.inf,
+            accuracy=accuracy,
         )
 
     def value(self, point: DesignPoint) -> float:
-        """J; infinite for a diverged trial."""
+        """J; infinite for a trial that diverges."""
         return point.cost
 
     def size(self, point: DesignPoint) -> float:
-        """J; for D-optimality, whose J has no natural zero, one nat per parameter and the running cost."""
+        """Size of J, which makes slopes relative.
+
+        The logarithm of D-optimality has no natural zero: one nat per parameter counts instead, plus the running cost.
+        """
         if self.information.criterion != "D":
             return point.cost
         trajectory, _, criterion = _computed(point)
-        return self.information.weight * len(criterion.eigenvalues) + self.running.value(trajectory)
+        nats = len(criterion.eigenvalues)
+        return self.information.weight * nats + self.running.value(trajectory)
 
     def expand(self, point: DesignPoint) -> Expansion:
         """Expansion of J about a point: mixed differences for the information, closed form for the rest."""
@@ -197,57 +226,79 @@ class DesignProblem:
     def expand_observed(
         self, point: DesignPoint, observations: SubstepObservations | None
     ) -> tuple[Expansion, Array | None]:
-        """The expansion, and the derivatives (N, looked-at substeps, w, nx+nu) of the observations, from the same steps."""
+        """Expansion of J together with derivatives of observations, from the same simulations.
+
+        Args:
+            point: The point.
+            observations: The w quantities to observe at S engine steps of every sample, or None.
+
+        Returns:
+            The expansion, and (N, S, w, nx+nu) derivatives of the observations by state and control, or None.
+        """
         trajectory, sensitivity, criterion = _computed(point)
-        bilinear, a, b = self._slope(self.theta, point, observations)
-        spectral = None
-        if (
-            self.parameter_samples is None
-            and np.isfinite(criterion.power)
-            and observations is not None
-        ):
-            spectral = self.information.spectral(criterion, sensitivity, bilinear, point.cost)
+        bilinear, a, b = self._criterion_gradient(self.theta, point, observations)
+
+        # Under hard limits the smooth E-criterion gets a model of its eigenvalues beside the gradient.
+        model = None
+        under_limits = observations is not None
+        if under_limits and self.parameter_samples is None and np.isfinite(criterion.power):
+            model = self.information.spectral(criterion, sensitivity, bilinear, point.cost)
+
         if self.parameter_samples is not None:
-            weights = self.parameter_samples.weights(point.phi)
-            a, b = weights[0] * a, weights[0] * b
-            for weight, theta, other in zip(
-                weights[1:], self.parameter_samples.thetas[1:], point.others, strict=True
-            ):
-                own, a_own, b_own = self._slope(theta, other)
-                open_loop = np.zeros((len(b_own), b_own.shape[1], a_own.shape[1]))
-                b += weight * Expansion(A=own.A, B=own.B, a=a_own, b=b_own).gradient(open_loop)
+            a, b = self._pooled_gradient(self.parameter_samples, point, a, b)
+
         a_running, b_running = self.running.gradient(trajectory)
-        extended = None
-        if self.extended:
-            full = self.plant.derivatives.bilinear(
-                self.theta, trajectory, sensitivity.psi, np.eye(len(self.theta)), point.accuracy
-            )
-            a_psi, a_h, b_h = self.information.partials(criterion, sensitivity, full)
-            extended = extend(full, a_running + a_h, b_running + b_h, a_psi)
-        return Expansion(
+        expansion = Expansion(
             A=bilinear.A,
             B=bilinear.B,
             a=a + a_running,
             b=b + b_running,
-            extended=extended,
+            extended=None,
             barrier=None,
-            eigenvalue_model=spectral,
-        ), bilinear.observation_jacobian
+            eigenvalue_model=model,
+        )
+        return expansion, bilinear.observation_jacobian
 
-    def _slope(
+    def _pooled_gradient(
+        self, samples: ParameterSamples, point: DesignPoint, a: Array, b: Array
+    ) -> tuple[Array, Array]:
+        """Gradient of the pooled criterion, from the gradient (a, b) of the criterion at theta.
+
+        The trajectories of the further samples are functions of the control alone, so that they add to b only.
+        """
+        weights = samples.weights(point.phi)
+        a, b = weights[0] * a, weights[0] * b
+
+        further = zip(weights[1:], self._further_samples(), point.others, strict=True)
+        for weight, theta, other in further:
+            bilinear, a_other, b_other = self._criterion_gradient(theta, other)
+            open_loop = np.zeros((len(b_other), b_other.shape[1], a_other.shape[1]))
+            expansion = Expansion(A=bilinear.A, B=bilinear.B, a=a_other, b=b_other)
+            b += weight * expansion.gradient(open_loop)
+        return a, b
+
+    def _criterion_gradient(
         self, theta: Array, point: DesignPoint, observations: SubstepObservations | None = None
     ) -> tuple[Bilinear, Array, Array]:
-        """Derivatives at a point, and those of phi by x (N+1, nx) and u (N, nu)."""
+        """Derivatives of the plant at a point, and of the criterion by the state (N+1, nx) and the control (N, nu)."""
         trajectory, sensitivity, criterion = _computed(point)
         bilinear = self.plant.derivatives.bilinear(
             theta, trajectory, sensitivity.psi, criterion.directions, point.accuracy, observations
         )
-        return bilinear, *self.information.gradient(criterion, sensitivity, bilinear)
+        a, b = self.information.gradient(criterion, sensitivity, bilinear)
+        return bilinear, a, b
 
     def project(
         self, point: DesignPoint, zeta: TangentCurve, gamma: float, K: Array
     ) -> DesignPoint:
-        """P(xi + gamma zeta), evaluated."""
+        """Evaluate the trajectory P(xi + gamma zeta).
+
+        Args:
+            point: The point at xi.
+            zeta: Direction, a tangent curve.
+            gamma: Step length.
+            K: (N, nu, nx) gain of the projection operator [u-unit / x-unit].
+        """
         trajectory, _, _ = _computed(point)
         moved = self.plant.project(self.theta, trajectory, zeta, gamma, K)
         return DIVERGED if moved is None else self.point(moved, point.accuracy)
@@ -257,17 +308,15 @@ class DesignProblem:
         return self.plant.difference(_computed(new)[0], _computed(old)[0])
 
     def refine(self, point: DesignPoint) -> DesignPoint | None:
-        """The same point, to be expanded with central differences."""
-        if self.draft or point.accuracy is CENTRAL_DIFFERENCES:
+        """The point, to be expanded with central differences; None where that is done already or not wanted."""
+        if self.forward_differences_only or point.accuracy is CENTRAL_DIFFERENCES:
             return None
-        return replace(
-            point,
-            accuracy=CENTRAL_DIFFERENCES,
-            others=tuple(replace(o, accuracy=CENTRAL_DIFFERENCES) for o in point.others),
-        )
+        others = tuple(replace(other, accuracy=CENTRAL_DIFFERENCES) for other in point.others)
+        return replace(point, accuracy=CENTRAL_DIFFERENCES, others=others)
 
 
 def _computed(point: DesignPoint) -> tuple[Trajectory, Sensitivity, Criterion]:
+    """What is computed along a trajectory. Raises ValueError for a trial that diverges."""
     if point.trajectory is None or point.sensitivity is None or point.criterion is None:
         raise ValueError("a diverged trial has no expansion")
     return point.trajectory, point.sensitivity, point.criterion

@@ -266,18 +266,18 @@ class DesignTask:
     def problem(self) -> DesignProblem:
         """The cost, as Algorithm 1 of the paper minimises it."""
         running = RunningCost(
-            self.space,
-            self.dt,
-            self.initial.state,
-            self.tracking,
-            self.control_weight,
-            self.control_about,
+            space=self.space,
+            dt=self.dt,
+            desired_state=self.initial.state,
+            Q=self.tracking,
+            R=self.control_weight,
+            desired_control=self.control_about,
         )
         return DesignProblem(
-            self.plant,
-            self.theta,
-            self.information,
-            running,
+            plant=self.plant,
+            theta=self.theta,
+            information=self.information,
+            running=running,
             parameter_samples=self.samples_of_parameters,
         )
 

@@ -11,6 +11,7 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.constraints import ConstraintSet
+from mjfim.excitation.extended_system import ExtendedDesignProblem
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
@@ -35,7 +36,9 @@ class Stage:
         problem = self.task.problem
         information = replace(problem.information, basis=self.basis, power=self.power)
         return replace(
-            problem, information=information, draft=self.task.system.variant.sample_factor > 1
+            problem,
+            information=information,
+            forward_differences_only=self.task.system.variant.sample_factor > 1,
         )
 
 
@@ -75,7 +78,7 @@ def direction_for(stage: Stage) -> tuple[Direction, DesignProblem]:
         return MetricDescent(Q, R, Q), stage.problem
     nx, p = len(Q), len(task.parameters)
     wide = np.diag(np.concatenate([np.diag(Q), np.full(nx * p, d.psi_weight * dt)]))
-    return ExtendedMetricDescent(wide, R, wide), replace(stage.problem, extended=True)
+    return ExtendedMetricDescent(wide, R, wide), ExtendedDesignProblem.of(stage.problem)
 
 
 CALM = 10.0

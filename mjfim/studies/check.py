@@ -126,7 +126,7 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
 def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:
     """The cost of a task whose tracking term refers to the given trajectory, and the cost's value there."""
     problem = task.problem
-    problem = replace(problem, running=replace(problem.running, desired=curve.state))
+    problem = replace(problem, running=replace(problem.running, desired_state=curve.state))
     return problem, problem.point(curve, CENTRAL_DIFFERENCES)
 
 

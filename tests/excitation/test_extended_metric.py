@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mjfim.excitation.design import design_task
-from mjfim.excitation.objective import extend
+from mjfim.excitation.extended_system import ExtendedDesignProblem, extend
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import Stage, direction_for
 from mjfim.information.fisher import FisherInformation
@@ -29,7 +28,7 @@ CORRELATED = ({"outputs": ("angle", "drive"), "covariance": ((1e-4, 5e-4), (5e-4
 
 def expanded(task: DesignTask) -> Expansion:
     """Expansion of J about the initial trajectory, psi among the states."""
-    problem = replace(task.problem, extended=True)
+    problem = ExtendedDesignProblem.of(task.problem)
     return problem.expand(problem.point(task.initial, CENTRAL_DIFFERENCES))
 
 
@@ -237,7 +236,7 @@ def test_the_experiment_chooses_the_extended_metric_and_it_lowers_the_cost(tmp_p
     )
     direction, problem = direction_for(Stage(task, None))
     assert isinstance(direction, ExtendedMetricDescent)
-    assert problem.extended
+    assert isinstance(problem, ExtendedDesignProblem)
     assert direction.Q.shape == (16, 16)
     assert np.count_nonzero(np.diag(direction.Q)[4:] == 1e-4 * task.dt) == 12
     result = design_task(task)
