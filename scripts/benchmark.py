@@ -247,7 +247,7 @@ def monte_carlo_table(design: Design, trials: int) -> Table:
         "seconds",
     )
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    study = mjfim.monte_carlo(experiment("b"), curves, trials, seed=0)
+    study = mjfim.monte_carlo(experiment("b"), curves, trials=trials, seed=0)
     for name, s in study.sets.items():
         rows.add_row(name, str(s.failed), f"{s.seconds:.1f} s")
     return rows

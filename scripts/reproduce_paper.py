@@ -193,7 +193,9 @@ def main() -> None:
     console.print(table_one(design))
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
     studies = {
-        rate: mjfim.monte_carlo(task.experiment, curves, args.trials, args.seed, measure_rate=rate)
+        rate: mjfim.monte_carlo(
+            task.experiment, curves, trials=args.trials, seed=args.seed, measure_rate=rate
+        )
         for rate in (25.0, 100.0)
     }
     for name in PAPER:

@@ -77,6 +77,12 @@ def root(
     """Design the experiment that identifies a MuJoCo model's parameters, then identify them."""
 
 
+def interrupted_without_result() -> typer.Exit:
+    """Say that there is nothing to write, and return the exit that says so to the shell."""
+    errors.print("mjfim: interrupted before there was a result; nothing was written")
+    return typer.Exit(1)
+
+
 def verb(function: Callable[..., None]) -> Callable[..., None]:
     """Turn misuse into one message and exit code 2, and Ctrl-C before any result into exit code 1."""
 
@@ -100,8 +106,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
             )
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
-            errors.print("mjfim: interrupted before there was a result; nothing was written")
-            raise typer.Exit(1) from None
+            raise interrupted_without_result() from None
 
     app.command()(wrapped)
     return wrapped

@@ -15,6 +15,7 @@ from mjfim.cli.common import (
     Folder,
     _say,
     errors,
+    interrupted_without_result,
     progress,
     verb,
     writing,
@@ -25,6 +26,7 @@ from mjfim.output import archive
 from mjfim.output.folders import check_file, check_folder
 from mjfim.output.summaries import describe_study
 from mjfim.output.text import render
+from mjfim.records.events import Event, StudyEvent
 from mjfim.studies.monte_carlo import monte_carlo_system
 
 
@@ -70,12 +72,17 @@ def montecarlo(
     with progress() as bar:
         tasks = {name: bar.add_task(f"{trials} trials, {name}", total=1.0) for name in named}
 
-        def tell(name: str, share: float) -> None:
-            bar.update(tasks[name], completed=share)
-            if not errors.is_terminal:
-                errors.print(f"{name}: {100 * share:.0f} %")
+        def show(event: Event) -> None:
+            """Show how many trials of a trajectory are done."""
+            if isinstance(event, StudyEvent):
+                bar.update(tasks[event.part], completed=event.share)
+                if not errors.is_terminal:
+                    errors.print(f"{event.part}: {100 * event.share:.0f} %")
 
-        study = monte_carlo_system(system, named, trials, seed, tell)
+        study = monte_carlo_system(system, named, trials=trials, seed=seed, callback=show)
+
+    if not study.sets:
+        raise interrupted_without_result()
     with writing(output) as results:
         results.leave_study(output, study, system)
     _say(as_json, study.summary(), render(describe_study(study, system.units)))

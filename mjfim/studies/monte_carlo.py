@@ -1,10 +1,10 @@
-"""Monte-Carlo studies of the estimator against the Cramer-Rao bound, all trials stepped together.
+"""Monte-Carlo studies of the estimator against the Cramér-Rao bound, with all trials stepped together.
 
-Every trial minimises its own squared residual. The way there is shared: a fit of the mean measurement leads from the
-guess to the neighbourhood of all minima, Gauss-Newton steps with the Jacobian expanded to second order about that point
-bring each trial close, and a step with the trial's own Jacobian finishes it. A trial counts as converged when its last
-own step is small against its standard deviation; the few others go one by one through the least-squares solver of
-`identify`, and what that does not solve is a failed trial.
+Every trial minimises its own squared residual, but the trials share most of the way. A fit of the mean measurement leads
+from the guess to the neighbourhood of all minima. Gauss-Newton steps whose Jacobian is expanded to second order about that
+fit bring each trial close, and steps with the trial's own Jacobian finish it. A trial has converged when its last step is
+small compared with its standard deviation. The few others are solved one by one with the least-squares solver of
+`identify`; a trial that this does not solve has failed.
 """
 
 from __future__ import annotations
@@ -17,66 +17,114 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.identify import least_squares, newton_raphson
 from mjfim.identification.residuals import FitProblem
 from mjfim.information.identifiability import require_visible
+from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
-CONVERGED = 0.03
+# Length of the last step, in standard deviations, below which a trial has converged.
+CONVERGED_STEP = 0.03
+
+# Gauss-Newton steps with the shared Jacobian, the first one from the fit of the mean measurement included.
 SHARED_STEPS = 3
+
+# Gauss-Newton steps with a trial's own Jacobian, at most.
 OWN_STEPS = 12
-CHUNK_BYTES = 1e8  # of one Jacobian of all trials of a chunk
-Progress = Callable[[str, float], None]
+
+# Size of one Jacobian of all trials that are stepped together, at most [bytes].
+CHUNK_BYTES = 1e8
+
+# Trials that are stepped together, at least.
+MIN_CHUNK = 64
+
+# Difference step for a trial's own Jacobian, relative to the size of each parameter.
+JACOBIAN_STEP = 1e-6
+
+# Difference step for the derivative of the shared Jacobian, relative to the size of each parameter.
+CURVATURE_STEP = 1e-3
 
 
 def monte_carlo(
     experiment: Experiment,
     trajectory: Trajectory | Mapping[str, Trajectory],
+    *,
     trials: int = 1500,
     seed: int = 0,
     measure_rate: float | None = None,
-    progress: Progress | None = None,
+    callback: Callback | None = None,
+    threads: int | None = None,
+    stop: StopToken | None = None,
 ) -> MonteCarloStudy:
-    """Estimate the parameters from many noisy repetitions of one or several trajectories (name -> trajectory).
+    """Estimate the parameters from many noisy repetitions of one or several trajectories.
 
-    Parameters are searched without bounds and priors: the study holds the data's information alone. Ctrl-C returns the
-    sets that are finished. Raises ExperimentError for fewer than two trials, UnidentifiableError where a parameter does
-    not show in the data.
+    Parameters are estimated without bounds and priors: the study holds the information of the data alone.
+
+    Args:
+        experiment: Experiment with the true values.
+        trajectory: One trajectory, which gets the name "final", or several by name.
+        trials: Repetitions per trajectory.
+        seed: Seed of the noise.
+        measure_rate: Measurement rate instead of the experiment's [Hz].
+        callback: Called with a `StudyEvent` whenever all trials have made a step.
+        threads: Threads of MuJoCo; None for all cores.
+        stop: Ends the study early, as Ctrl-C does; the trajectories that are finished are returned.
+
+    Raises:
+        ExperimentError: Fewer than two trials.
+        SimulationDivergedError: The model diverges at the true values.
+        UnidentifiableError: A parameter has no effect on the data.
     """
     if measure_rate is not None:
         experiment = experiment.replace(measure_rate=measure_rate)
-    return monte_carlo_system(System.resolve(experiment), trajectory, trials, seed, progress)
+    system = System.resolve(experiment, threads=threads)
+
+    return monte_carlo_system(
+        system, trajectory, trials=trials, seed=seed, callback=callback, stop=stop
+    )
 
 
 def monte_carlo_system(
     system: System,
     trajectory: Trajectory | Mapping[str, Trajectory],
+    *,
     trials: int = 1500,
     seed: int = 0,
-    progress: Progress | None = None,
+    callback: Callback | None = None,
+    stop: StopToken | None = None,
 ) -> MonteCarloStudy:
     """Study the estimator on a resolved system. See `monte_carlo`."""
     if trials < 2:
         raise ExperimentError(f"trials: {trials} is too few; a covariance needs at least 2")
     named = {"final": trajectory} if isinstance(trajectory, Trajectory) else dict(trajectory)
+
+    # Fail before the first trial where a trajectory cannot be simulated.
     for curve in named.values():
-        _exact(system, curve)
-    system = system.calibrated(system.theta, next(iter(named.values())).ctrl)
-    sets, information = {}, {}
-    try:
-        for rng, (name, curve) in zip(
-            np.random.default_rng(seed).spawn(len(named)), named.items(), strict=True
-        ):
-            tell = None if progress is None else (lambda share, name=name: progress(name, share))
-            sets[name], information[name] = _trial_set(system, curve, trials, rng, tell)
-    except KeyboardInterrupt:
-        if not sets:
-            raise
+        _exact_outputs(system, curve)
+
+    first_control = next(iter(named.values())).ctrl
+    system = system.calibrated(system.theta, first_control)
+    generators = np.random.default_rng(seed).spawn(len(named))
+
+    sets: dict[str, TrialStatistics] = {}
+    information: dict[str, Array] = {}
+    with stop_on_interrupt(stop) as token:
+        budget = Budget(stop=token)
+        for i, (name, curve) in enumerate(named.items()):
+            progress = _Progress(callback=callback, part=name, index=i, count=len(named))
+            found = _trial_set(system, curve, trials, generators[i], progress, budget)
+
+            # An interrupted set is incomplete and therefore left out.
+            if found is None:
+                break
+            sets[name], information[name] = found
+
     return MonteCarloStudy(
         parameters=system.parameters.names,
         theta=system.parameters.true,
@@ -86,41 +134,137 @@ def monte_carlo_system(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Shared:
-    """What all trials share, at the fit of the mean measurement.
+@dataclass(frozen=True, kw_only=True)
+class _Progress:
+    """Reports the progress of the trials of one trajectory.
 
-    theta: (p,);  J: (n, p) whitened Jacobian;  bend: (p, n, p) its derivative by theta;  std: (p,)
+    Attributes:
+        callback: Called with every event, or None.
+        part: Name of the trajectory.
+        index: Number of the trajectory, from 0.
+        count: Number of trajectories.
+        begin: Share that was done before the current chunk of trials.
+        width: Share of the current chunk.
+    """
+
+    callback: Callback | None
+    part: str
+    index: int
+    count: int
+    begin: float = 0.0
+    width: float = 1.0
+
+    def chunk(self, number: int, count: int) -> _Progress:
+        """Progress of one of several chunks of trials."""
+        return _Progress(
+            callback=self.callback,
+            part=self.part,
+            index=self.index,
+            count=self.count,
+            begin=number / count,
+            width=1.0 / count,
+        )
+
+    def report(self, share: float) -> None:
+        """Report that a share of the chunk, 0 to 1, is done."""
+        if self.callback is None:
+            return
+
+        event = StudyEvent(
+            study="monte_carlo",
+            part=self.part,
+            index=self.index,
+            count=self.count,
+            share=self.begin + self.width * share,
+        )
+        self.callback(event)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _SharedFit:
+    """Fit of the mean measurement, from which all trials start.
+
+    Attributes:
+        theta: (p,) estimate [theta-unit].
+        J: (n, p) whitened Jacobian of the outputs [1 / theta-unit].
+        curvature: (p, n, p) derivative of the Jacobian by theta [1 / theta-unit^2].
+        std: (p,) standard deviations [theta-unit].
     """
 
     theta: Array
     J: Array
-    bend: Array
+    curvature: Array
     std: Array
 
     def jacobian(self, theta: Array) -> Array:
-        """(m, n, p) second-order Jacobians at theta: (m, p)."""
-        return np.asarray(self.J + np.tensordot(theta - self.theta, self.bend, axes=(1, 0)))
+        """(m, n, p) second-order expansion of the Jacobian at theta: (m, p) [theta-unit]."""
+        change = np.tensordot(theta - self.theta, self.curvature, axes=(1, 0))
+        return np.asarray(self.J + change)
 
 
-class Trials:
-    """Many repetitions of one control with their own noise. measured: (m, n) whitened measurements of all trials."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Trials:
+    """Repetitions of one control that differ by their noise.
 
-    def __init__(self, system: System, ctrl: Array, measured: Array) -> None:
-        self.system, self.ctrl, self.measured = system, ctrl, measured
+    Attributes:
+        system: System that is repeated.
+        ctrl: (N, nu) control [unit of the actuator].
+        measured: (m, n) whitened measurements of m trials.
+    """
+
+    system: System
+    ctrl: Array
+    measured: Array
 
     def outputs(self, theta: Array) -> tuple[Array, np.ndarray]:
-        """Whitened predictions (m, n) at theta: (m, p), and which of them are finite."""
-        y, finite = self.system.plant.measure(theta, self.ctrl)
-        return self.system.noise.whitened_rows(np.moveaxis(y, 0, -1)).T, finite
+        """Predict the whitened measurements.
 
-    def recording(self, measured: Array) -> Recording:
-        """One trial, (n,) whitened, as a recording."""
+        Args:
+            theta: (m, p) parameters of every trial [theta-unit].
+
+        Returns:
+            (m, n) whitened predictions, and (m,) booleans, False where a prediction diverges.
+        """
+        y, finite = self.system.plant.measure(theta, self.ctrl)
+        trials_last = np.moveaxis(y, 0, -1)
+        whitened = self.system.noise.whitened_rows(trials_last)
+        return whitened.T, finite
+
+    def jacobian(self, theta: Array, predicted: Array) -> Array:
+        """Differentiate the predictions by one-sided differences.
+
+        Args:
+            theta: (m, p) parameters of every trial [theta-unit].
+            predicted: (m, n) whitened predictions there.
+
+        Returns:
+            (m, n, p) Jacobian of every trial [1 / theta-unit].
+        """
+        columns = []
+        for j, step in enumerate(JACOBIAN_STEP * self.system.parameters.magnitude):
+            moved = np.array(theta)
+            moved[:, j] += step
+            outputs, _ = self.outputs(moved)
+            columns.append((outputs - predicted) / step)
+
+        return np.stack(columns, axis=2)
+
+    def part(self, indices: np.ndarray) -> _Trials:
+        """Some of the trials."""
+        return _Trials(system=self.system, ctrl=self.ctrl, measured=self.measured[indices])
+
+    def fit_problem(self, measured: Array) -> FitProblem:
+        """Least-squares problem of one trial's whitened measurement: (n,), without priors."""
+        return FitProblem.of(self.system, [self._recording(measured)], data_only=True)
+
+    def _recording(self, measured: Array) -> Recording:
+        """One whitened measurement: (n,) as a recording in units of the outputs."""
         noise = self.system.noise
         mask = noise.measured(len(self.ctrl)) > 0
-        y = np.zeros(mask.shape)
-        y[mask] = measured
-        y = np.where(mask, y @ noise.factor.T, np.nan)
+        whitened = np.zeros(mask.shape)
+        whitened[mask] = measured
+        y = np.where(mask, whitened @ noise.factor.T, np.nan)
+
         return Recording(
             t=np.arange(len(y), dtype=np.float64) * self.system.dt,
             ctrl=self.ctrl,
@@ -129,44 +273,45 @@ class Trials:
             name="trial",
         )
 
-    def jacobian(self, theta: Array, predicted: Array, relative: float = 1e-6) -> Array:
-        """(m, n, p) by one-sided differences about predictions already made."""
-        steps = relative * self.system.parameters.magnitude
-        columns = []
-        for j, h in enumerate(steps):
-            moved = np.array(theta)
-            moved[:, j] += h
-            columns.append((self.outputs(moved)[0] - predicted) / h)
-        return np.stack(columns, axis=2)
-
 
 def _trial_set(
     system: System,
     curve: Trajectory,
     count: int,
     rng: np.random.Generator,
-    tell: Callable[[float], None] | None,
-) -> tuple[TrialStatistics, Array]:
-    clock = time.perf_counter()
-    y, G = _exact(system, curve)
+    progress: _Progress,
+    budget: Budget,
+) -> tuple[TrialStatistics, Array] | None:
+    """Statistics of all trials along one trajectory and its (p, p) information; None where the study was interrupted."""
+    begun = time.perf_counter()
+    y, G = _exact_outputs(system, curve)
+    exact = system.noise.whitened_rows(y)
     J = system.noise.whitened_rows(G)
     information = np.asarray(J.T @ J)
     require_visible(system.parameters, system.parameters.prior_information, J)
+
+    # As many trials at once as memory allows.
+    chunk = max(MIN_CHUNK, int(CHUNK_BYTES / (8 * J.size)))
+    firsts = range(0, count, chunk)
     estimates = []
-    chunk = max(64, int(CHUNK_BYTES / (8 * J.size)))
-    for first in range(0, count, chunk):
+    for number, first in enumerate(firsts):
         m = min(chunk, count - first)
-        whitened = system.noise.whitened_rows(y) + rng.standard_normal((m, J.shape[0]))
-        trials = Trials(system, curve.ctrl, whitened)
-        estimates.append(_solve(trials, _shared(system, trials), tell))
-    every = np.concatenate(estimates)
-    return _statistics(
-        every, np.asarray(np.linalg.inv(information)), time.perf_counter() - clock
-    ), information
+        measured = exact + rng.standard_normal((m, J.shape[0]))
+        trials = _Trials(system=system, ctrl=curve.ctrl, measured=measured)
+
+        report = progress.chunk(number, len(firsts)).report
+        found = _estimate(trials, _fit_mean(trials), report, budget)
+        if found is None:
+            return None
+        estimates.append(found)
+
+    crlb = np.asarray(np.linalg.inv(information))
+    seconds = time.perf_counter() - begun
+    return _statistics(np.concatenate(estimates), crlb, seconds), information
 
 
-def _exact(system: System, curve: Trajectory) -> tuple[Array, Array]:
-    """Noise-free outputs (N+1, ny) at the true values and their derivative (N+1, ny, p)."""
+def _exact_outputs(system: System, curve: Trajectory) -> tuple[Array, Array]:
+    """Outputs (N+1, ny) [output-unit] at the true values without noise, and their derivative (N+1, ny, p)."""
     exact = system.plant.derivatives.predict(system.parameters.true, curve.ctrl)
     if exact is None:
         raise SimulationDivergedError(
@@ -175,13 +320,14 @@ def _exact(system: System, curve: Trajectory) -> tuple[Array, Array]:
     return exact
 
 
-def _shared(system: System, trials: Trials) -> Shared:
-    """Fit of the mean measurement from the guess, with its Jacobian and the Jacobian's derivative."""
-    fit = FitProblem.of(system, [trials.recording(trials.measured.mean(axis=0))], data_only=True)
+def _fit_mean(trials: _Trials) -> _SharedFit:
+    """Fit the mean measurement from the guess, and differentiate its Jacobian."""
+    system = trials.system
+    fit = trials.fit_problem(trials.measured.mean(axis=0))
     theta = newton_raphson(fit, system.parameters.guess).unknowns.theta
-    h = 1e-3 * system.parameters.magnitude
 
     def jacobian(at: Array) -> Array:
+        """(n, p) whitened Jacobian at (p,) parameters."""
         predicted = system.plant.derivatives.predict(at, trials.ctrl)
         if predicted is None:
             raise SimulationDivergedError(
@@ -190,77 +336,136 @@ def _shared(system: System, trials: Trials) -> Shared:
         return system.noise.whitened_rows(predicted[1])
 
     J = jacobian(theta)
-    bend = np.stack(
-        [(jacobian(theta + e) - jacobian(theta - e)) / (2 * e.max()) for e in np.diag(h)]
+    curvature = []
+    for step in np.diag(CURVATURE_STEP * system.parameters.magnitude):
+        change = jacobian(theta + step) - jacobian(theta - step)
+        curvature.append(change / (2 * step.max()))
+
+    return _SharedFit(
+        theta=theta,
+        J=J,
+        curvature=np.stack(curvature),
+        std=np.sqrt(np.diag(np.linalg.inv(J.T @ J))),
     )
-    return Shared(theta, J, bend, np.sqrt(np.diag(np.linalg.inv(J.T @ J))))
 
 
-def _solve(trials: Trials, shared: Shared, tell: Callable[[float], None] | None) -> Array:
-    """(m, p) estimates; NaN where a trial failed."""
-    m = len(trials.measured)
-    theta = (
-        shared.theta
-        + (trials.measured - trials.outputs(shared.theta[None])[0]) @ np.linalg.pinv(shared.J).T
-    )
-    for k in range(SHARED_STEPS - 1):
-        predicted, finite = trials.outputs(theta)
-        step = _gauss_newton(shared.jacobian(theta), trials.measured - predicted)
-        theta = np.where(finite[:, None], theta + step, shared.theta)
-        if tell is not None:
-            tell((k + 1) / (SHARED_STEPS + 3))
-    active = np.arange(m)
-    for k in range(OWN_STEPS):
-        own = Trials(trials.system, trials.ctrl, trials.measured[active])
-        predicted, finite = own.outputs(theta[active])
-        step = _gauss_newton(own.jacobian(theta[active], predicted), own.measured - predicted)
-        step[~finite] = np.nan
-        theta[active] = np.where(np.isfinite(step), theta[active] + step, shared.theta)
-        small = np.nan_to_num(np.abs(step) / shared.std, nan=np.inf).max(axis=1) < CONVERGED
-        active = active[~small]
-        if tell is not None:
-            tell(1.0 if not len(active) else (SHARED_STEPS + k + 1) / (SHARED_STEPS + k + 2))
-        if not len(active):
-            break
-    for i in active:
-        fit = FitProblem.of(trials.system, [trials.recording(trials.measured[i])], data_only=True)
-        solution = least_squares(fit, shared.theta)
+def _estimate(
+    trials: _Trials, shared: _SharedFit, report: Callable[[float], None], budget: Budget
+) -> Array | None:
+    """(m, p) estimates of all trials, NaN where one failed; None where the study was interrupted."""
+    theta = _shared_steps(trials, shared, report, budget)
+    if theta is None:
+        return None
+    unfinished = _own_steps(trials, shared, theta, report, budget)
+
+    # Trials that have not converged go through the general solver, one by one.
+    for i in unfinished:
+        if budget.exhausted:
+            return None
+        solution = least_squares(trials.fit_problem(trials.measured[i]), shared.theta)
         theta[i] = solution.unknowns.theta if solution.success else np.nan
+
     return theta
 
 
-def _gauss_newton(J: Array, r: Array) -> Array:
-    """(m, p) steps `(J'J)^-1 J'r`; J: (m, n, p), r: (m, n)."""
+def _shared_steps(
+    trials: _Trials, shared: _SharedFit, report: Callable[[float], None], budget: Budget
+) -> Array | None:
+    """(m, p) estimates after the steps with the shared Jacobian; None where the study was interrupted."""
+    predicted, _ = trials.outputs(shared.theta[None])
+    theta = shared.theta + (trials.measured - predicted) @ np.linalg.pinv(shared.J).T
+
+    for k in range(SHARED_STEPS - 1):
+        if budget.exhausted:
+            return None
+        predicted, finite = trials.outputs(theta)
+        step = _gauss_newton(shared.jacobian(theta), trials.measured - predicted)
+
+        # A trial whose simulation diverges starts again from the shared fit.
+        theta = np.where(finite[:, None], theta + step, shared.theta)
+        report((k + 1) / (SHARED_STEPS + 3))
+
+    return np.asarray(theta)
+
+
+def _own_steps(
+    trials: _Trials,
+    shared: _SharedFit,
+    theta: Array,
+    report: Callable[[float], None],
+    budget: Budget,
+) -> np.ndarray:
+    """Step trials with their own Jacobians, in place of theta: (m, p); return indices of those that have not converged."""
+    active = np.arange(len(trials.measured))
+    for k in range(OWN_STEPS):
+        if budget.exhausted:
+            break
+        moving = trials.part(active)
+        predicted, finite = moving.outputs(theta[active])
+        J = moving.jacobian(theta[active], predicted)
+        step = _gauss_newton(J, moving.measured - predicted)
+
+        # A trial whose simulation diverges starts again from the shared fit.
+        step[~finite] = np.nan
+        theta[active] = np.where(np.isfinite(step), theta[active] + step, shared.theta)
+
+        relative = np.nan_to_num(np.abs(step) / shared.std, nan=np.inf)
+        active = active[relative.max(axis=1) >= CONVERGED_STEP]
+        if not len(active):
+            report(1.0)
+            break
+        report((SHARED_STEPS + k + 1) / (SHARED_STEPS + k + 2))
+
+    return active
+
+
+def _gauss_newton(J: Array, residual: Array) -> Array:
+    """Gauss-Newton steps `(J'J)^-1 J'r` of all trials.
+
+    Args:
+        J: (m, n, p) Jacobians [1 / theta-unit].
+        residual: (m, n) whitened residuals.
+
+    Returns:
+        (m, p) steps [theta-unit]; NaN where a Jacobian or a residual is not finite.
+    """
     JT = np.swapaxes(J, 1, 2)
-    gram, rhs = JT @ J, JT @ r[:, :, None]
-    usable = np.isfinite(gram).all(axis=(1, 2)) & np.isfinite(rhs).all(axis=(1, 2))
+    gram = JT @ J
+    projected = JT @ residual[:, :, None]
+
+    usable = np.isfinite(gram).all(axis=(1, 2)) & np.isfinite(projected).all(axis=(1, 2))
+    inverse = np.linalg.pinv(gram[usable], hermitian=True)
     step = np.full((len(J), J.shape[2]), np.nan)
-    step[usable] = (np.linalg.pinv(gram[usable], hermitian=True) @ rhs[usable])[:, :, 0]
+    step[usable] = (inverse @ projected[usable])[:, :, 0]
     return step
 
 
 def _statistics(estimates: Array, crlb: Array, seconds: float) -> TrialStatistics:
+    """Compare the scatter of estimates with the Cramér-Rao bound.
+
+    Args:
+        estimates: (m, p) estimates, NaN where a trial failed [theta-unit].
+        crlb: (p, p) Cramér-Rao bound [theta-unit^2].
+        seconds: Time that the trials took [s].
+    """
     good = estimates[np.isfinite(estimates).all(axis=1)]
     n, p = len(good), estimates.shape[1]
-    if n < 2:
-        blank = np.full(p, np.nan)
-        return TrialStatistics(
-            estimates=estimates,
-            mean=blank,
-            covariance=np.full((p, p), np.nan),
-            crlb=crlb,
-            efficiency=blank,
-            efficiency_interval=np.full((p, 2), np.nan),
-            trials=len(estimates),
-            failed=len(estimates) - n,
-            seconds=seconds,
-        )
-    covariance = np.atleast_2d(np.cov(good, rowvar=False))
-    efficiency = np.diag(crlb) / np.diag(covariance)
-    interval = efficiency[:, None] * chi2_distribution.ppf([0.025, 0.975], n - 1) / (n - 1)
+
+    mean = efficiency = np.full(p, np.nan)
+    covariance = np.full((p, p), np.nan)
+    interval = np.full((p, 2), np.nan)
+
+    # A covariance needs two estimates; its 95 % interval follows the chi-squared distribution.
+    if n >= 2:
+        mean = good.mean(axis=0)
+        covariance = np.atleast_2d(np.cov(good, rowvar=False))
+        efficiency = np.diag(crlb) / np.diag(covariance)
+        quantiles = chi2_distribution.ppf([0.025, 0.975], n - 1) / (n - 1)
+        interval = efficiency[:, None] * quantiles
+
     return TrialStatistics(
         estimates=estimates,
-        mean=good.mean(axis=0),
+        mean=mean,
         covariance=covariance,
         crlb=crlb,
         efficiency=efficiency,

@@ -7,11 +7,13 @@ import pytest
 from scipy.stats import chi2, kstest, norm
 
 import mjfim
+from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, UnidentifiableError
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify, identify_system
+from mjfim.records.events import Event, StudyEvent
 from mjfim.records.recording import Recording
 from mjfim.studies.monte_carlo import _statistics, monte_carlo, monte_carlo_system
 from tests.support.paths import ROOT
@@ -69,7 +71,7 @@ def test_each_trial_is_its_own_least_squares_estimate(
         )
 
 
-def test_seed_decides_the_result(experiment: Experiment, design: mjfim.Design) -> None:
+def test_the_seed_determines_the_result(experiment: Experiment, design: mjfim.Design) -> None:
     runs = [
         monte_carlo(experiment, design.trajectory, trials=8, seed=seed).sets["final"].estimates
         for seed in (1, 1, 2)
@@ -78,7 +80,7 @@ def test_seed_decides_the_result(experiment: Experiment, design: mjfim.Design) -
     assert not np.array_equal(runs[0], runs[2])
 
 
-def test_statistics_know_an_efficient_and_an_inefficient_estimator() -> None:
+def test_statistics_distinguish_an_efficient_from_an_inefficient_estimator() -> None:
     rng, bound = np.random.default_rng(0), np.diag([4.0, 0.25])
     good = rng.standard_normal((4000, 2)) * [2.0, 0.5]
     efficient = _statistics(good, bound, 0.0)
@@ -195,7 +197,7 @@ def test_too_few_trials_are_refused(experiment: Experiment, design: mjfim.Design
         monte_carlo(experiment, design.trajectory, trials=1)
 
 
-def test_a_parameter_known_by_its_prior_alone_is_named(
+def test_a_parameter_that_only_its_prior_determines_is_named(
     design: mjfim.Design, experiment: Experiment
 ) -> None:
     blind = {"target": "body/cart:inertia[0]", "guess": 0.01, "prior": 1e-4}
@@ -212,12 +214,20 @@ def test_priors_do_not_enter_the_study(design: mjfim.Design, experiment: Experim
     np.testing.assert_allclose(np.linalg.inv(prior.information["final"]), prior.sets["final"].crlb)
 
 
-def test_interruption_keeps_the_finished_sets(design: mjfim.Design, experiment: Experiment) -> None:
+def test_a_request_to_stop_keeps_the_finished_sets(
+    design: mjfim.Design, experiment: Experiment
+) -> None:
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
+    token = StopToken()
+    events: list[StudyEvent] = []
 
-    def stop(name: str, share: float) -> None:
-        if name == "final":
-            raise KeyboardInterrupt
+    def stop_in_the_second_set(event: Event) -> None:
+        assert isinstance(event, StudyEvent)
+        events.append(event)
+        if event.part == "final":
+            token.request()
 
-    study = monte_carlo(experiment, curves, trials=6, progress=stop)
+    study = monte_carlo(experiment, curves, trials=6, callback=stop_in_the_second_set, stop=token)
     assert set(study.sets) == {"initial"}
+    assert [event.share for event in events if event.part == "initial"][-1] == 1.0
+    assert {(event.index, event.count) for event in events} == {(0, 2), (1, 2)}
