@@ -146,7 +146,7 @@ def smoothed(task: DesignTask, combinations: Array | None) -> DesignProblem:
     """The cost as it is descended under hard limits: smooth where it is E's, without faint directions."""
     power = POWER if task.experiment.cost.criterion == "E" else np.inf
     smooth = Stage(task, combinations, power).problem
-    return replace(smooth, information=replace(smooth.information, faint=FAINT))
+    return replace(smooth, information=replace(smooth.information, negligible_weight=FAINT))
 
 
 def _stated(task: DesignTask, ctrl: Array, fine: Array | None) -> Array:

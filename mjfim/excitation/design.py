@@ -323,7 +323,7 @@ def _conclude(
         ),
         prior=task.prior,
         data=shared(
-            information.visible(final.information - task.prior),
+            information.without_round_off(final.information - task.prior),
             task.parameters.prior_information,
             task.parameters.recording_specific,
         ),
@@ -357,7 +357,7 @@ def require_designable(task: DesignTask, seen: Identifiability) -> None:
         )
     if task.contrast is not None:
         information = replace(task.information, basis=seen.basis)
-        if not information.estimable(task.contrast).all():
+        if not information.is_estimable(task.contrast).all():
             raise UnidentifiableError(
                 "cost.combination or cost.subset asks for what cannot be identified; what can is: "
                 + "; ".join(str(group) for group in seen.groups_along_all)

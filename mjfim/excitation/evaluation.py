@@ -46,7 +46,7 @@ def evaluate(stage: Stage, point: DesignPoint) -> Evaluation:
         information=point.information,
         eigenvalues=point.criterion.eigenvalues,
         std=information.std(point.information),
-        min_eigenvalue=information.accumulated(point.sensitivity),
+        min_eigenvalue=information.accumulated_eigenvalue(point.sensitivity),
         criterion=point.criterion.value,
         cost=point.cost,
         growth=largest_amplification(A),

@@ -43,7 +43,7 @@ class ExtendedDesignProblem(DesignProblem):
         full = self.plant.derivatives.bilinear(
             self.theta, trajectory, sensitivity.psi, np.eye(len(self.theta)), point.accuracy
         )
-        a_psi, a, b = self.information.partials(criterion, sensitivity, full)
+        a_psi, a, b = self.information.partial_derivatives(criterion, sensitivity, full)
         a_running, b_running = self.running.gradient(trajectory)
         return extend(full, a_running + a, b_running + b, a_psi)
 

@@ -74,7 +74,7 @@ def _data(task: DesignTask) -> Array:
     )
     p = task.parameters
     return shared(
-        information.visible(point.information - task.information.prior),
+        information.without_round_off(point.information - task.information.prior),
         p.prior_information,
         p.recording_specific,
     )

@@ -242,7 +242,7 @@ class DesignProblem:
         model = None
         under_limits = observations is not None
         if under_limits and self.parameter_samples is None and np.isfinite(criterion.power):
-            model = self.information.spectral(criterion, sensitivity, bilinear, point.cost)
+            model = self.information.eigenvalue_model(criterion, sensitivity, bilinear, point.cost)
 
         if self.parameter_samples is not None:
             a, b = self._pooled_gradient(self.parameter_samples, point, a, b)

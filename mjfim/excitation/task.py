@@ -240,15 +240,15 @@ class DesignTask:
         all_wanted = len(parameters.interest) == len(parameters)
 
         return FisherInformation(
-            self.system.noise,
-            measure_rate,
-            parameters.scale,
-            self.prior * per_sample,
-            experiment.cost.criterion,
-            experiment.cost.information,
-            None if all_wanted else parameters.interest,
+            noise=self.system.noise,
+            measure_rate=measure_rate,
+            scale=parameters.scale,
+            prior=self.prior * per_sample,
+            criterion=experiment.cost.criterion,
+            weight=experiment.cost.information,
+            interest=None if all_wanted else parameters.interest,
             contrast=self.contrast,
-            told=np.diag(parameters.prior_information),
+            stated_prior=np.diag(parameters.prior_information),
         )
 
     @property

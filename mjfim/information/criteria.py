@@ -9,16 +9,24 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-SINGULAR = 1e-14
-NEGLIGIBLE = 1e-9  # of the largest weight
+# Smallest eigenvalue over the largest one, at and below which an information matrix counts as singular.
+SINGULAR_RATIO = 1e-14
+
+# Weight of an eigenvector in a derivative, relative to the largest one, below which it is left out.
+NEGLIGIBLE_WEIGHT = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Criterion:
-    """Value of phi and its derivative `M = sum_r weights_r directions_r directions_r'`.
+    """Value of a criterion phi and its derivative `M = sum_r weights_r directions_r directions_r'`.
 
-    weights: (r,);  directions: (r, p);  eigenvalues: (p,) ascending
-    power: q of `(sum lambda^-q)^(1/q)`, whose first directions belong to the first eigenvalues; infinite for other criteria
+    Attributes:
+        value: phi; infinite where the information is singular.
+        weights: (r,) weights m of the derivative.
+        directions: (r, p) directions w of the derivative.
+        eigenvalues: (p,) eigenvalues of the information, ascending.
+        power: Exponent q of `(sum lambda^-q)^(1/q)`, whose first directions belong to the first eigenvalues; infinite for the
+            other criteria.
     """
 
     value: float
@@ -29,68 +37,126 @@ class Criterion:
 
 
 def _spectrum(information: Array) -> tuple[Array, Array, bool]:
+    """Ascending eigenvalues (p,), eigenvectors (p, p) as columns, and whether the matrix is regular."""
     values, vectors = np.linalg.eigh(information)
-    return values, vectors, bool(values[0] > SINGULAR * values[-1])
+    return values, vectors, bool(values[0] > SINGULAR_RATIO * values[-1])
 
 
-def _blind(values: Array, vectors: Array) -> Criterion:
-    return Criterion(np.inf, np.zeros(1), vectors[:, :1].T, values)
-
-
-def e_optimality(information: Array) -> Criterion:
-    """`1 / lambda_min`, by Nelson's formula. information: (p, p)."""
-    values, vectors, sound = _spectrum(information)
-    if not sound:
-        return _blind(values, vectors)
+def _singular(values: Array, vectors: Array) -> Criterion:
+    """The infinite criterion of a singular matrix, with the direction of its smallest eigenvalue and no weight."""
     return Criterion(
-        float(1.0 / values[0]), np.array([-(values[0] ** -2)]), vectors[:, :1].T, values
+        value=np.inf, weights=np.zeros(1), directions=vectors[:, :1].T, eigenvalues=values
     )
 
 
-def smooth_e_optimality(information: Array, power: float, faint: float = NEGLIGIBLE) -> Criterion:
-    """`(sum_i lambda_i^-q)^(1/q)`, Kiefer's criterion: differentiable where eigenvalues meet, 1/lambda_min as q grows.
+def e_optimality(information: Array) -> Criterion:
+    """E-optimality, `1 / lambda_min`, with its derivative by Nelson's formula.
 
-    At most `p^(1/q)` times 1/lambda_min. Every eigenvector of more than faint weight is among the directions.
+    Args:
+        information: (p, p) information.
     """
-    values, vectors, sound = _spectrum(information)
-    if not sound:
-        return _blind(values, vectors)
+    values, vectors, regular = _spectrum(information)
+    if not regular:
+        return _singular(values, vectors)
+
+    return Criterion(
+        value=float(1.0 / values[0]),
+        weights=np.array([-(values[0] ** -2)]),
+        directions=vectors[:, :1].T,
+        eigenvalues=values,
+    )
+
+
+def smooth_e_optimality(
+    information: Array, power: float, negligible_weight: float = NEGLIGIBLE_WEIGHT
+) -> Criterion:
+    """Kiefer's criterion `(sum_i lambda_i^-q)^(1/q)`: differentiable where eigenvalues meet, 1/lambda_min as q grows.
+
+    It is at most `p^(1/q)` times 1/lambda_min.
+
+    Args:
+        information: (p, p) information.
+        power: Exponent q.
+        negligible_weight: Weight of an eigenvector, relative to the largest one, below which it is left out of the derivative.
+    """
+    values, vectors, regular = _spectrum(information)
+    if not regular:
+        return _singular(values, vectors)
+
+    # Powers of the ratio, not of the eigenvalues, which would overflow.
     ratio = values[0] / values
     total = float(np.sum(ratio**power))
     weights = total ** (1.0 / power - 1.0) * ratio ** (power + 1.0) / values[0] ** 2
-    kept = weights > faint * weights[0]
+    kept = weights > negligible_weight * weights[0]
+
     return Criterion(
-        total ** (1.0 / power) / values[0], -weights[kept], vectors.T[kept], values, power
+        value=total ** (1.0 / power) / values[0],
+        weights=-weights[kept],
+        directions=vectors.T[kept],
+        eigenvalues=values,
+        power=power,
     )
 
 
 def a_optimality(information: Array) -> Criterion:
-    """`trace I^-1`."""
-    values, vectors, sound = _spectrum(information)
-    if not sound:
-        return _blind(values, vectors)
+    """A-optimality, `trace I^-1`.
+
+    Args:
+        information: (p, p) information.
+    """
+    values, vectors, regular = _spectrum(information)
+    if not regular:
+        return _singular(values, vectors)
+
     weights = values**-2.0
-    kept = weights > NEGLIGIBLE * weights[0]
-    return Criterion(float(np.sum(1.0 / values)), -weights[kept], vectors.T[kept], values)
+    kept = weights > NEGLIGIBLE_WEIGHT * weights[0]
+    return Criterion(
+        value=float(np.sum(1.0 / values)),
+        weights=-weights[kept],
+        directions=vectors.T[kept],
+        eigenvalues=values,
+    )
 
 
 def d_optimality(information: Array) -> Criterion:
-    """`-log det I`."""
-    values, vectors, sound = _spectrum(information)
-    if not sound:
-        return _blind(values, vectors)
-    return Criterion(float(-np.sum(np.log(values))), -1.0 / values, vectors.T, values)
+    """D-optimality, `-log det I`.
+
+    Args:
+        information: (p, p) information.
+    """
+    values, vectors, regular = _spectrum(information)
+    if not regular:
+        return _singular(values, vectors)
+
+    return Criterion(
+        value=float(-np.sum(np.log(values))),
+        weights=-1.0 / values,
+        directions=vectors.T,
+        eigenvalues=values,
+    )
 
 
 def c_optimality(information: Array, contrast: Array) -> Criterion:
-    """`trace C' I^-1 C`, the summed variance of stated combinations. contrast: C, (p, c)."""
-    values, vectors, sound = _spectrum(information)
-    if not sound:
-        return _blind(values, vectors)
+    """The summed variance of stated combinations, `trace C' I^-1 C`.
+
+    Args:
+        information: (p, p) information.
+        contrast: C, (p, c) combinations of the parameters.
+    """
+    values, vectors, regular = _spectrum(information)
+    if not regular:
+        return _singular(values, vectors)
+
     Y = np.asarray(np.linalg.solve(information, contrast).T, dtype=np.float64)
-    return Criterion(float(np.sum(Y * contrast.T)), -np.ones(len(Y)), Y, values)
+    return Criterion(
+        value=float(np.sum(Y * contrast.T)),
+        weights=-np.ones(len(Y)),
+        directions=Y,
+        eigenvalues=values,
+    )
 
 
+# Criteria of an information matrix alone, by the name that an experiment states.
 CRITERIA: dict[str, Callable[[Array], Criterion]] = {
     "E": e_optimality,
     "A": a_optimality,

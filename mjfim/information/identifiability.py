@@ -85,7 +85,9 @@ class Identifiability:
             for group in self.groups_along_all
             for combination in group.combinations
         ]
-        initial, final = (information.spread(matrix, rows).tolist() for matrix in (before, after))
+        initial, final = (
+            information.combination_std(matrix, rows).tolist() for matrix in (before, after)
+        )
 
         return tuple(
             CombinationAccuracy(expression=text, value=value, std_initial=first, std_final=last)

@@ -100,11 +100,17 @@ def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None
     )
     S = Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, ny, p)))
     noise = Noise.independent([0.3, 2.0])
-    made = FisherInformation(noise, 20.0, np.array([1.0, 0.5, 3.0]), np.zeros((p, p)), criterion)
+    made = FisherInformation(
+        noise=noise,
+        measure_rate=20.0,
+        scale=np.array([1.0, 0.5, 3.0]),
+        prior=np.zeros((p, p)),
+        criterion=criterion,
+    )
     found = made.evaluate(made.matrix(S))
     F, h = (np.einsum("rj,jkzx->rkzx", found.directions, m) for m in (unit.F_mixed, unit.h_mixed))
     a, b = made.gradient(found, S, Bilinear(A=A, B=B, C=C, D=D, F_mixed=F, h_mixed=h))
-    a_psi, a_h, b_h = made.partials(found, S, unit)
+    a_psi, a_h, b_h = made.partial_derivatives(found, S, unit)
     wide = extend(unit, a_h, b_h, a_psi)
     v = rng.normal(size=(N, nu))
     z = LinearRecursion(A).forward(np.zeros(nx), np.einsum("kij,kj->ki", B, v))

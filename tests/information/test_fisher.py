@@ -32,7 +32,12 @@ def information(stride: int = 1, criterion: str = "E", **changes) -> FisherInfor
     """Three outputs, four parameters of different scale, no prior."""
     noise = Noise.independent(SIGMA, stride)
     base = FisherInformation(
-        noise, 50.0, np.array([1.0, 2.0, 0.1, 5.0]), np.zeros((4, 4)), criterion, 1.0
+        noise=noise,
+        measure_rate=50.0,
+        scale=np.array([1.0, 2.0, 0.1, 5.0]),
+        prior=np.zeros((4, 4)),
+        criterion=criterion,
+        weight=1.0,
     )
     return replace(base, **changes)
 
@@ -229,7 +234,9 @@ def test_correlated_noise_at_several_rates_weighs_every_sample_with_its_own_cova
         total += S.G[k][rows].T @ np.linalg.inv(covariance[np.ix_(rows, rows)]) @ S.G[k][rows]
     made = replace(information(), noise=Noise(covariance=covariance, strides=strides))
     assert relative_error(made.matrix(S), total) < 1e-13
-    assert made.accumulated(S)[-1] == pytest.approx(made.evaluate(total).eigenvalues[0], rel=1e-9)
+    assert made.accumulated_eigenvalue(S)[-1] == pytest.approx(
+        made.evaluate(total).eigenvalues[0], rel=1e-9
+    )
     alone = replace(made, noise=Noise(covariance=np.diag(np.diag(covariance)), strides=strides))
     assert relative_error(alone.matrix(S), total) > 0.1
 
@@ -289,7 +296,7 @@ def test_singular_information_costs_infinity_without_a_warning(criterion: str) -
 def test_accumulated_smallest_eigenvalue_is_monotone_and_ends_at_the_whole() -> None:
     for stride in (1, 3):
         S, made = random_sensitivity(7), information(stride)
-        series = made.accumulated(S)
+        series = made.accumulated_eigenvalue(S)
         assert series.shape == (13,)
         assert (np.diff(series) >= -1e-12 * series[-1]).all()
         assert series[0] == 0.0
@@ -303,7 +310,7 @@ def test_accumulated_smallest_eigenvalue_is_monotone_and_ends_at_the_whole() -> 
 def test_accumulated_starts_at_the_prior() -> None:
     prior = np.diag([9.0, 4.0, 400.0, 1.0])
     made = information(prior=prior)
-    assert made.accumulated(random_sensitivity(8))[0] == pytest.approx(4.0 / 50.0)
+    assert made.accumulated_eigenvalue(random_sensitivity(8))[0] == pytest.approx(4.0 / 50.0)
 
 
 def test_the_stated_rate_divides_the_sum_so_that_weights_mean_the_same_at_every_rate(

@@ -117,7 +117,9 @@ def test_slopes_agree_with_the_logarithm_of_simulated_information(
     limits = {"control": {"force": (-9.0, 9.0)}}
     task: DesignTask = cart_task(tmp_path, limits=limits, **tables).relaxed()
     problem = task.problem
-    problem = replace(problem, information=replace(problem.information, power=3.0, faint=0.0))
+    problem = replace(
+        problem, information=replace(problem.information, power=3.0, negligible_weight=0.0)
+    )
     point = problem.point(task.initial)
     expansion, _ = problem.expand_observed(point, constraint_set_of(task).observations)
     model = expansion.eigenvalue_model
