@@ -45,7 +45,7 @@ FEW_SAMPLES = 60
 SINGLE_STEP_DIFFERENCES = (1e-4, 4e-4)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Identifiability:
     """Directions of the wanted parameters that nothing measured can show.
 
@@ -179,16 +179,16 @@ def _look(
     observer: Observer, trajectory: Trajectory, J: Array, error: Array, single_steps: Array | None
 ) -> Identifiability:
     """Null space of given rows, and what random trajectories leave of it."""
-    here = _null_space(observer, [J], [error], single_steps)
-    if not here.count:
-        return _in_words(observer, here, here)
+    along_trajectory = _null_space(observer, [J], [error], single_steps)
+    if not along_trajectory.count:
+        return _in_words(observer, along_trajectory, along_trajectory)
 
     tried = list(observer.probes(PROBES))
-    always = _single_step_null_space(observer, [trajectory, *tried])
+    known = _single_step_null_space(observer, [trajectory, *tried])
     stack, errors = [J], [error]
 
     # Whole motions are differentiated only where single steps do not explain the null space already.
-    if always is None or here.count > always.shape[1]:
+    if known is None or along_trajectory.count > known.shape[1]:
         for probe in tried:
             fine = observer.plant.derivatives.sensitivity(observer.theta, probe)
             if fine is None:
@@ -197,7 +197,8 @@ def _look(
             stack.append(rows)
             errors.append(change)
 
-    return _in_words(observer, here, _null_space(observer, stack, errors, always))
+    along_all = _null_space(observer, stack, errors, known)
+    return _in_words(observer, along_trajectory, along_all)
 
 
 def _single_step_null_space(observer: Observer, trajectories: Sequence[Trajectory]) -> Array | None:
@@ -259,7 +260,9 @@ def _step_effects(
     return (np.concatenate(stack), np.concatenate(errors)) if stack else None
 
 
-def _in_words(observer: Observer, here: NullSpace, always: NullSpace) -> Identifiability:
+def _in_words(
+    observer: Observer, along_trajectory: NullSpace, along_all: NullSpace
+) -> Identifiability:
     """Two null spaces in the names of the wanted parameters."""
     parameters = observer.parameters
     interest = parameters.interest
@@ -268,11 +271,11 @@ def _in_words(observer: Observer, here: NullSpace, always: NullSpace) -> Identif
     units = [parameters.parameters[j].unit for j in interest]
 
     return Identifiability(
-        names,
-        here,
-        always,
-        parameter_groups(here, names, size, units),
-        parameter_groups(always, names, size, units),
+        names=names,
+        along_trajectory=along_trajectory,
+        along_all=along_all,
+        groups_along_trajectory=parameter_groups(along_trajectory, names, size, units),
+        groups_along_all=parameter_groups(along_all, names, size, units),
     )
 
 
@@ -296,7 +299,7 @@ def _null_space(
         parameters.scale,
         parameters.interest,
         observer.prior,
-        known,
+        known=known,
     )
 
 

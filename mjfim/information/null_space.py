@@ -1,8 +1,8 @@
-"""Which combinations of parameters show in the measurements at all, told apart from round-off by a second difference step.
+"""The null space of sensitivities: combinations of parameters that no measurement shows, told apart from round-off.
 
-A direction n with `G n = 0` at every sample is invisible. The columns of the stacked, whitened G are brought to unit length,
-so that a weak parameter is not mistaken for an invisible one; singular values below the error of G (the change of G with a
-four times longer step) count as zero.
+A direction n with `G n = 0` at every sample is in the null space. The columns of the stacked, whitened G are brought to unit
+length, so that a weak parameter is not mistaken for one without effect. Singular values below the error of G, which is its change
+with a four times longer difference step, count as zero.
 """
 
 from __future__ import annotations
@@ -15,24 +15,54 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.records.combinations import Combination, ParameterGroup
 
-COARSER_STEP_FACTOR = 4.0  # the second step, times the first
-CLEAR_SINGULAR_VALUE = 1e-4  # a normalised singular value above it needs no second look
-TOLERANCE = (1e-9, 1e-5)
-LEAST_EFFECT = 1e-6  # standard deviations that the data move when a parameter changes by all its size: no effect
-LEAST_RELATIVE_EFFECT = (
-    1e-7  # of the strongest column; an error of the difference may exceed a column only below it
-)
-LEAST_COEFFICIENT = 1e-4  # coefficients of a combination below it, in natural units, are round-off
+# The second difference step, whose change of G is the error of G, over the first one.
+COARSER_STEP_FACTOR = 4.0
+
+# A normalised singular value above it is certainly no round-off, so that one difference step is enough.
+CLEAR_SINGULAR_VALUE = 1e-4
+
+# Normalised singular values that count as zero: below the first in any case, above the second in no case.
+ZERO_SINGULAR_VALUES = (1e-9, 1e-5)
+
+# A singular value below this multiple of the error of G counts as zero.
+ERROR_FACTOR = 3.0
+
+# Standard deviations by which the data move when a parameter changes by its size, up to which it has no effect.
+LEAST_EFFECT = 1e-6
+
+# A column is compared with its error only where it is below this share of the strongest column.
+LEAST_RELATIVE_EFFECT = 1e-7
+
+# A column that is so weak counts as zero below this multiple of its error.
+COLUMN_ERROR_FACTOR = 5.0
+
+# Coefficients of a combination, relative to the largest one in units of the sizes, below which they are round-off.
+LEAST_COEFFICIENT = 1e-4
+
+# Directions are linearly dependent below this singular value, relative to the largest one.
+DEPENDENT = 1e-6
+
+# Norm that replaces zero where a column is divided by its norm.
+SMALLEST_NORM = 1e-300
+
+# Parameters are lumped into others where the remainder of their row exceeds these shares of the longest row, tried in turn:
+# rows that stand out come first, or the coefficients would explode.
+LUMPING_SHARES = (0.05, 1e-3, 1e-6)
+
+# Order in which parameters are lumped into others, by unit, as is usual for chains of bodies; other units come last.
+LUMPING_ORDER = {"kg": 0, "kg m": 1, "kg m²": 2}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NullSpace:
-    """Invisible directions of the t wanted parameters.
+    """Directions of the t wanted parameters without any effect.
 
-    directions: (t, k) in raw units;  silent: indices of wanted parameters that change nothing by themselves
-    basis: (t, t-k) orthonormal, the visible combinations in scaled units
-    smallest: least singular value of the visible part, columns normalised, times the least share of a column that nuisance
-    leaves (1: orthogonal; 0: none to be told from zero)
+    Attributes:
+        directions: (t, k) directions [theta-unit].
+        silent: Indices of the wanted parameters that have no effect by themselves.
+        basis: (t, t-k) orthonormal combinations with an effect, in scaled units.
+        smallest: Least singular value of the rest, columns normalised, times the least share of a column that the nuisance
+            parameters leave: 1 where all are orthogonal, 0 where one cannot be told from zero.
     """
 
     directions: Array
@@ -42,8 +72,23 @@ class NullSpace:
 
     @property
     def count(self) -> int:
-        """Number k of invisible directions."""
+        """Number k of directions without effect."""
         return int(self.directions.shape[1])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Columns:
+    """Columns of G for the t wanted parameters, nuisance parameters projected out.
+
+    Attributes:
+        J: (n, t) effect of each parameter changed by its size [standard deviations].
+        error: (n, t) error of these columns.
+        length_before: (t,) length of each column before the projection.
+    """
+
+    J: Array
+    error: Array
+    length_before: Array
 
 
 def find_null_space(
@@ -53,159 +98,251 @@ def find_null_space(
     scale: Array,
     interest: np.ndarray,
     prior: Array,
+    *,
     known: Array | None = None,
 ) -> NullSpace:
-    """Invisible directions of stacked, whitened rows of G.
+    """Find the null space of stacked, whitened rows of G.
 
-    J: (n, p);  error: (n, p) its change with a longer difference step, None where that is not known
-    size: (p,) the parameters' own magnitudes;  scale: (p,) units of the basis;  interest: (t,) indices
-    prior: (p, p), whose nuisance part counts as data;  known: (t, k) directions that are invisible for another reason
+    Args:
+        J: (n, p) rows [1 / theta-unit].
+        error: (n, p) their change with a longer difference step, None where it is not known.
+        size: (p,) magnitudes of the parameters [theta-unit].
+        scale: (p,) units of the basis [theta-unit].
+        interest: (t,) indices of the wanted parameters.
+        prior: (p, p) prior information, whose diagonal counts as data for the nuisance parameters.
+        known: (t, k) directions that are known to have no effect.
+
+    Returns:
+        The null space of the wanted parameters.
     """
-    J, error = J * size, np.zeros_like(J) if error is None else error * size
-    whole = np.linalg.norm(J[:, interest], axis=0)
+    columns = _wanted_columns(J, error, size, interest, prior)
+    J, error = columns.J, columns.error
+    length = np.linalg.norm(J, axis=0)
+    dead = _dead_columns(columns)
+    left_by_nuisance = length / np.maximum(columns.length_before, SMALLEST_NORM)
+    least_share = float(left_by_nuisance[~dead].min(initial=1.0))
+
+    # Dead columns and known directions are in the null space; the search goes on across them.
+    t = len(interest)
+    found = np.eye(t)[:, dead]
+    if known is not None and known.shape[1]:
+        found = _independent(np.concatenate([found, known / size[interest][:, None]], axis=1))
+        Q = np.linalg.qr(found)[0]
+        J, error = J - (J @ Q) @ Q.T, error - (error @ Q) @ Q.T
+
+    live = ~dead & (np.linalg.norm(J, axis=0) > ZERO_SINGULAR_VALUES[0] * length)
+    hidden, smallest = _hidden_directions(J, error, live)
+    found = _independent(np.concatenate([found, hidden], axis=1))
+    directions = found * size[interest][:, None]
+
+    return NullSpace(
+        directions=directions,
+        silent=_silent_parameters(found),
+        basis=_complement(directions / scale[interest][:, None]),
+        smallest=smallest * least_share,
+    )
+
+
+def _wanted_columns(
+    J: Array, error: Array | None, size: Array, interest: np.ndarray, prior: Array
+) -> _Columns:
+    """Columns of the wanted parameters; what nuisance parameters explain is projected out. Arguments as above."""
+    J = J * size
+    error = np.zeros_like(J) if error is None else error * size
+    length_before = np.linalg.norm(J[:, interest], axis=0)
+
     nuisance = np.setdiff1d(np.arange(len(size)), interest)
     if len(nuisance):
-        told = np.sqrt(np.diag(np.diag(prior)))[nuisance] * size
-        J, error = np.concatenate([J, told]), np.concatenate([error, np.zeros_like(told)])
+        # The priors of nuisance parameters are further rows of data, without error.
+        prior_rows = np.sqrt(np.diag(np.diag(prior)))[nuisance] * size
+        J = np.concatenate([J, prior_rows])
+        error = np.concatenate([error, np.zeros_like(prior_rows)])
+
         Q = _range(J[:, nuisance])
         J, error = J - Q @ (Q.T @ J), error - Q @ (Q.T @ error)
-    J, error, t = J[:, interest], error[:, interest], len(interest)
-    length, doubt = np.linalg.norm(J, axis=0), np.linalg.norm(error, axis=0)
-    dead = (length <= LEAST_EFFECT) | (length <= TOLERANCE[0] * whole)
-    dead |= (length <= 5.0 * doubt) & (length <= LEAST_RELATIVE_EFFECT * whole.max(initial=0.0))
-    share = float((length / np.maximum(whole, 1e-300))[~dead].min(initial=1.0))
-    own = np.eye(t)[:, dead]
-    if known is not None and known.shape[1]:
-        own = _independent(np.concatenate([own, known / size[interest][:, None]], axis=1))
-        Q = np.linalg.qr(own)[0]
-        J, error = J - (J @ Q) @ Q.T, error - (error @ Q) @ Q.T
-    live = ~dead & (np.linalg.norm(J, axis=0) > TOLERANCE[0] * length)
-    found, smallest = _hidden(J, error, live)
-    own = _independent(np.concatenate([own, found], axis=1))
-    raw = own * size[interest][:, None]
-    k = raw.shape[1]
-    full = np.linalg.qr(raw / scale[interest][:, None], mode="complete")[0] if k else np.eye(t)
-    silent = (
-        np.sum(np.linalg.qr(own)[0] ** 2, axis=1) > 1.0 - LEAST_COEFFICIENT**2
-        if k
-        else np.zeros(t, dtype=bool)
-    )
-    return NullSpace(
-        raw, tuple(int(i) for i in np.flatnonzero(silent)), full[:, k:], smallest * share
-    )
+
+    return _Columns(J=J[:, interest], error=error[:, interest], length_before=length_before)
 
 
-def _hidden(J: Array, error: Array, live: np.ndarray) -> tuple[Array, float]:
-    """Directions (t, k) among the live columns whose effect is no larger than the error, and the least effect of the rest."""
+def _dead_columns(columns: _Columns) -> np.ndarray:
+    """(t,) True where a parameter has no effect by itself, or none that nuisance parameters do not have."""
+    length = np.linalg.norm(columns.J, axis=0)
+    doubt = np.linalg.norm(columns.error, axis=0)
+    strongest = columns.length_before.max(initial=0.0)
+
+    no_effect = length <= LEAST_EFFECT
+    explained = length <= ZERO_SINGULAR_VALUES[0] * columns.length_before
+    round_off = length <= COLUMN_ERROR_FACTOR * doubt
+    weak = length <= LEAST_RELATIVE_EFFECT * strongest
+    return np.asarray(no_effect | explained | (round_off & weak))
+
+
+def _hidden_directions(J: Array, error: Array, live: np.ndarray) -> tuple[Array, float]:
+    """Directions among the live columns whose effect is no larger than the error.
+
+    Args:
+        J: (n, t) columns.
+        error: (n, t) their error.
+        live: (t,) True for the columns to combine.
+
+    Returns:
+        (t, k) unit directions, and the least normalised singular value of the rest.
+    """
     columns = np.flatnonzero(live)
     if not len(columns):
         return np.zeros((len(live), 0)), 0.0
-    unit = np.maximum(np.linalg.norm(J[:, columns], axis=0), 1e-300)
-    values, V = np.linalg.svd(np.linalg.qr(J[:, columns] / unit, mode="r"))[1:]
+
+    norm = np.maximum(np.linalg.norm(J[:, columns], axis=0), SMALLEST_NORM)
+    triangle = np.linalg.qr(J[:, columns] / norm, mode="r")
+    _, values, V = np.linalg.svd(triangle)
     values = np.concatenate([values, np.zeros(len(columns) - len(values))])
-    hidden = values <= np.clip(3.0 * np.linalg.norm(error[:, columns] / unit, 2), *TOLERANCE)
-    found = np.zeros((len(live), int(hidden.sum())))
-    found[columns] = V[hidden].T / unit[:, None]
-    return found / np.maximum(np.linalg.norm(found, axis=0), 1e-300), float(
-        values[~hidden].min(initial=1.0)
-    )
+
+    size_of_error = np.linalg.norm(error[:, columns] / norm, 2)
+    zero = values <= np.clip(ERROR_FACTOR * size_of_error, *ZERO_SINGULAR_VALUES)
+
+    found = np.zeros((len(live), int(zero.sum())))
+    found[columns] = V[zero].T / norm[:, None]
+    unit = found / np.maximum(np.linalg.norm(found, axis=0), SMALLEST_NORM)
+    return unit, float(values[~zero].min(initial=1.0))
+
+
+def _silent_parameters(directions: Array) -> tuple[int, ...]:
+    """Indices of the parameters whose axis lies in the span of (t, k) directions."""
+    if not directions.shape[1]:
+        return ()
+    inside = np.sum(np.linalg.qr(directions)[0] ** 2, axis=1)
+    return tuple(np.flatnonzero(inside > 1.0 - LEAST_COEFFICIENT**2).tolist())
+
+
+def _complement(directions: Array) -> Array:
+    """(t, t-k) orthonormal directions across (t, k) directions."""
+    t, k = directions.shape
+    if not k:
+        return np.eye(t)
+    return np.asarray(np.linalg.qr(directions, mode="complete")[0][:, k:])
 
 
 def _independent(directions: Array) -> Array:
-    """Orthonormal columns that span the same directions."""
+    """Orthonormal columns that span the space of (t, m) directions."""
     U, s, _ = np.linalg.svd(directions, full_matrices=False)
-    return np.asarray(U[:, s > 1e-6 * max(s.max(initial=0.0), 1e-300)])
+    return np.asarray(U[:, s > DEPENDENT * max(s.max(initial=0.0), SMALLEST_NORM)])
 
 
 def _range(A: Array) -> Array:
-    """Orthonormal basis of the range of A, columns compared at unit length."""
+    """Orthonormal basis of the range of A: (n, m), columns compared at unit length."""
     length = np.linalg.norm(A, axis=0)
-    some = length > 0.0
-    U, s, _ = np.linalg.svd(A[:, some] / length[some], full_matrices=False)
-    return np.asarray(U[:, s > TOLERANCE[0]])
+    nonzero = length > 0.0
+    U, s, _ = np.linalg.svd(A[:, nonzero] / length[nonzero], full_matrices=False)
+    return np.asarray(U[:, s > ZERO_SINGULAR_VALUES[0]])
 
 
 def parameter_groups(
     null: NullSpace, names: Sequence[str], size: Array, units: Sequence[str]
 ) -> tuple[ParameterGroup, ...]:
-    """The invisible directions in the user's words: groups of parameters and the combinations that remain of them.
+    """Write a null space in the names of the parameters: groups, and the combinations that remain identifiable in each.
 
-    names, size, units: of the t wanted parameters; sizes decide which coefficients are round-off. Parameters without any
-    effect make one group.
+    Args:
+        null: The null space.
+        names: Names of the t wanted parameters.
+        size: (t,) their magnitudes, which decide which coefficients are round-off [theta-unit].
+        units: Their units, which decide which parameters are lumped into others.
+
+    Returns:
+        The groups; parameters without any effect make the last one, without combinations.
     """
-    N = null.directions
     if not null.count:
         return ()
-    lumped = _lumped(N / size[:, None], units)
+
+    N = null.directions
+    lumped = _lumped_parameters(N / size[:, None], units)
     base = np.setdiff1d(np.arange(len(N)), lumped)
-    coefficients = -N[base] @ np.linalg.inv(N[lumped])
-    relative = coefficients * size[lumped] / size[base][:, None]
-    coefficients = np.where(
-        np.abs(relative) > LEAST_COEFFICIENT * max(1.0, np.abs(relative).max(initial=0.0)),
-        coefficients,
-        0.0,
-    )
-    links = [
-        {int(f), *(int(b) for b, c in zip(base, coefficients[:, j], strict=True) if c)}
-        for j, f in enumerate(lumped)
-    ]
-    groups, none = [], [names[m] for m in null.silent]
+    coefficients = _lumping_coefficients(N, size, lumped, base)
+
+    # Lumped parameters and those that they are lumped into belong together.
+    links = []
+    for j, f in enumerate(lumped.tolist()):
+        partners = base[coefficients[:, j] != 0.0].tolist()
+        links.append({f, *partners})
+
+    groups = []
     for members in _joined(links):
         if members <= set(null.silent):
             continue
-        rows = []
-        for i, b in enumerate(base):
-            if b in members:
-                parts = [
-                    (int(f), float(coefficients[i, j]))
-                    for j, f in enumerate(lumped)
-                    if coefficients[i, j]
-                ]
-                rows.append(
-                    Combination(
-                        members=(names[b], *(names[f] for f, _ in parts)),
-                        coefficients=(1.0, *(c for _, c in parts)),
-                    )
-                )
-        groups.append(
-            ParameterGroup(
-                members=tuple(names[m] for m in sorted(members)), combinations=tuple(rows)
-            )
-        )
-    return (
-        (*groups, ParameterGroup(members=tuple(none), combinations=())) if none else tuple(groups)
+        rows = [
+            _combination(names, b, lumped, coefficients[i])
+            for i, b in enumerate(base.tolist())
+            if b in members
+        ]
+        member_names = tuple(names[m] for m in sorted(members))
+        groups.append(ParameterGroup(members=member_names, combinations=tuple(rows)))
+
+    if null.silent:
+        silent = tuple(names[m] for m in null.silent)
+        groups.append(ParameterGroup(members=silent, combinations=()))
+    return tuple(groups)
+
+
+def _lumping_coefficients(N: Array, size: Array, lumped: np.ndarray, base: np.ndarray) -> Array:
+    """(b, k) coefficients with which the k lumped parameters add to the b others; round-off is set to zero.
+
+    Args:
+        N: (t, k) directions of the null space [theta-unit].
+        size: (t,) magnitudes of the parameters [theta-unit].
+        lumped: (k,) indices of the lumped parameters.
+        base: (b,) indices of the others.
+    """
+    coefficients = -N[base] @ np.linalg.inv(N[lumped])
+    relative = np.abs(coefficients * size[lumped] / size[base][:, None])
+    threshold = LEAST_COEFFICIENT * max(1.0, relative.max(initial=0.0))
+    return np.where(relative > threshold, coefficients, 0.0)
+
+
+def _combination(
+    names: Sequence[str], base: int, lumped: np.ndarray, coefficients: Array
+) -> Combination:
+    """The base parameter plus the lumped parameters with their nonzero coefficients: (k,)."""
+    used = np.flatnonzero(coefficients).tolist()
+    return Combination(
+        members=(names[base], *(names[lumped[j]] for j in used)),
+        coefficients=(1.0, *(float(coefficients[j]) for j in used)),
     )
 
 
-def _lumped(N: Array, units: Sequence[str]) -> np.ndarray:
-    """k parameters that are lumped into the others: independent rows of N: (t, k).
+def _lumped_parameters(N: Array, units: Sequence[str]) -> np.ndarray:
+    """Choose k parameters that are lumped into the others: independent rows of N.
 
-    As is usual for chains of bodies, masses go first, then first moments and inertias, those declared last before the others.
+    Masses go first, then first moments and inertias; of equal units, those declared last go before the others.
+
+    Args:
+        N: (t, k) directions of the null space, relative to the sizes of the parameters.
+        units: Units of the t parameters.
+
+    Returns:
+        (k,) indices, ascending.
     """
-    rank = {"kg": 0, "kg m": 1, "kg m²": 2}
-    order = sorted(range(len(N)), key=lambda i: (rank.get(units[i], 3), -i))
+    last = len(LUMPING_ORDER)
+    order = sorted(range(len(N)), key=lambda i: (LUMPING_ORDER.get(units[i], last), -i))
+    longest = np.linalg.norm(N, axis=1).max()
     chosen: list[int] = []
-    found = np.zeros((0, N.shape[1]))
-    for least in (
-        0.05,
-        1e-3,
-        1e-6,
-    ):  # rows that stand out come first, lest the coefficients explode
+    spanned = np.zeros((0, N.shape[1]))
+
+    for share in LUMPING_SHARES:
         for i in order:
             if len(chosen) == N.shape[1]:
                 break
-            row = N[i] - found.T @ (found @ N[i])
-            length = np.linalg.norm(row)
-            if i not in chosen and length > least * np.linalg.norm(N, axis=1).max():
+            remainder = N[i] - spanned.T @ (spanned @ N[i])
+            length = np.linalg.norm(remainder)
+            if i not in chosen and length > share * longest:
                 chosen.append(i)
-                found = np.concatenate([found, (row / length)[None]])
+                spanned = np.concatenate([spanned, (remainder / length)[None]])
     return np.sort(np.array(chosen, dtype=np.intp))
 
 
 def _joined(sets: list[set[int]]) -> list[set[int]]:
-    """Unions of sets that share members, in the order of their least member."""
-    out: list[set[int]] = []
+    """Unions of sets that share members, in the order of their least members."""
+    joined: list[set[int]] = []
     for new in sets:
-        touching = [s for s in out if s & new]
-        out = [s for s in out if not s & new] + [new.union(*touching)]
-    return sorted(out, key=min)
+        touching = [other for other in joined if other & new]
+        apart = [other for other in joined if not other & new]
+        joined = [*apart, new.union(*touching)]
+    return sorted(joined, key=min)

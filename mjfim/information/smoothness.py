@@ -1,4 +1,4 @@
-"""Where derivatives do not exist: contacts, dry friction, limits and clamps make two difference steps disagree."""
+"""Detection of derivatives that do not exist: at contacts, dry friction, limits and clamps two difference steps disagree."""
 
 from __future__ import annotations
 
@@ -16,18 +16,43 @@ from mjfim.plant.plant import Plant
 from mjfim.records.check import Roughness
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
-LONGER = 300.0  # the second step, times the first: a change of 0.3 %
-LEAST = 3.0  # the same for parameters so weak that the first step is long already
-DISAGREEMENT_TOLERANCE = 1e-2  # relative disagreement that is told
-CURVED = 6.0  # by how much the disagreement at least falls with a third of the step where a derivative exists
-MINOR = 1e-3  # of the largest effect of a parameter; an output that shows less of it tells nothing
+# The second difference step over the first one: it changes a parameter by 0.3 %.
+LONGER_STEP_FACTOR = 300.0
+
+# The least factor, for parameters that are so weak that their first step is long already.
+LEAST_STEP_FACTOR = 3.0
+
+# The third step is the second one divided by this number, and at least `LEAST_MEDIUM_FACTOR` times the first one.
+MEDIUM_STEP_DIVISOR = 3.0
+LEAST_MEDIUM_FACTOR = 1.5
+
+# Where a derivative exists, the disagreement falls at least by this factor from the second to the third step.
+SMOOTH_DECREASE = 6.0
+
+# Relative disagreement of two derivatives above which the trajectory counts as rough.
+DISAGREEMENT_TOLERANCE = 1e-2
+
+# An output whose derivative is below this share of the largest one of a parameter does not count.
+NEGLIGIBLE_OUTPUT = 1e-3
+
+# Samples before the first disagreement at which its causes are looked for as well.
+SAMPLES_BEFORE = 2
 
 
 def disagreement(fine: Array, coarse: Array) -> Array:
-    """(N+1, p) relative disagreement of two derivatives G: (N+1, ny, p), each output's against its own largest value."""
+    """Relative disagreement of two derivatives of the outputs.
+
+    Args:
+        fine: (N+1, ny, p) whitened derivatives by the shorter step.
+        coarse: (N+1, ny, p) whitened derivatives by the longer step.
+
+    Returns:
+        (N+1, p) largest difference over all outputs, each relative to its largest value over time.
+    """
     size = np.maximum(np.abs(fine).max(axis=0), np.abs(coarse).max(axis=0))
-    size = np.maximum(size, MINOR * size.max(axis=0, initial=0.0))
-    return np.asarray((np.abs(fine - coarse) / np.where(size > 0.0, size, 1.0)).max(axis=1))
+    size = np.maximum(size, NEGLIGIBLE_OUTPUT * size.max(axis=0, initial=0.0))
+    relative = np.abs(fine - coarse) / np.where(size > 0.0, size, 1.0)
+    return np.asarray(relative.max(axis=1))
 
 
 def roughness(
@@ -43,7 +68,7 @@ def roughness(
     Args:
         plant: The plant.
         noise: Noise of the measured outputs.
-        model: The user's model at theta, in which the causes are looked for.
+        model: The user's model (MjModel) at theta, in which the causes are looked for.
         theta: (p,) parameter values.
         trajectory: The trajectory.
         fine: Its sensitivity by the shorter step, if it is known.
@@ -51,16 +76,21 @@ def roughness(
     Returns:
         The worst disagreement and what causes it; None where it is below `DISAGREEMENT_TOLERANCE`.
     """
-    parameters = plant.parameters
-    fine = plant.derivatives.sensitivity(theta, trajectory) if fine is None else fine
-    longer = np.maximum(LONGER * parameters.magnitude / plant.derivatives.parameter_scale, LEAST)
-    coarse = plant.derivatives.sensitivity(theta, trajectory, longer * SENSITIVITY_STEP)
-    names = parameters.names
+    parameters, derivatives = plant.parameters, plant.derivatives
+    if fine is None:
+        fine = derivatives.sensitivity(theta, trajectory)
+    factors = LONGER_STEP_FACTOR * parameters.magnitude / derivatives.parameter_scale
+    factors = np.maximum(factors, LEAST_STEP_FACTOR)
+    coarse = derivatives.sensitivity(theta, trajectory, factors * SENSITIVITY_STEP)
 
+    # A trajectory that diverges when the parameters move a little is as rough as can be.
     if fine is None or coarse is None:
-        causes = active_constraints(model, trajectory, range(trajectory.samples))
         return Roughness(
-            error=np.inf, parameter=", ".join(names), sample=0, time=0.0, causes=causes
+            error=np.inf,
+            parameter=", ".join(parameters.names),
+            sample=0,
+            time=0.0,
+            causes=active_constraints(model, trajectory, range(trajectory.samples)),
         )
 
     G = noise.whiten(fine.G)
@@ -75,28 +105,34 @@ def roughness(
 
     # Where a derivative exists, the error of central differences falls ninefold with a third of the step:
     # the trajectory is strongly curved, but smooth.
-    medium = np.maximum(longer / 3.0, 1.5) * SENSITIVITY_STEP
-    between = plant.derivatives.sensitivity(theta, trajectory, medium)
+    medium = np.maximum(factors / MEDIUM_STEP_DIVISOR, LEAST_MEDIUM_FACTOR)
+    between = derivatives.sensitivity(theta, trajectory, medium * SENSITIVITY_STEP)
     if between is not None:
         smaller = disagreement(G, noise.whiten(between.G))[:, visible]
-        if (smaller.max(axis=0) * CURVED <= error.max(axis=0)).all():
+        if (smaller.max(axis=0) * SMOOTH_DECREASE <= error.max(axis=0)).all():
             return None
 
     first = int(np.argmax(error[:, worst] > DISAGREEMENT_TOLERANCE))
-    near = range(max(first - 2, 0), min(first + 1, trajectory.samples))
-    causes = active_constraints(model, trajectory, near)
+    nearby = range(max(first - SAMPLES_BEFORE, 0), min(first + 1, trajectory.samples))
     return Roughness(
         error=float(error[:, worst].max()),
-        parameter=names[visible[worst]],
+        parameter=parameters.names[visible[worst]],
         sample=first,
         time=float(trajectory.t[first]),
-        causes=causes,
+        causes=active_constraints(model, trajectory, nearby),
     )
 
 
 def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:
-    """(p,) True where a parameter has an effect that stands out of round-off. G: (N+1, ny, p), whitened."""
+    """Tell which parameters have an effect that stands out of round-off.
+
+    Args:
+        parameters: The p parameters.
+        G: (N+1, ny, p) whitened derivatives of the outputs.
+
+    Returns:
+        (p,) True where a parameter has such an effect.
+    """
     length = np.linalg.norm(G, axis=(0, 1)) * parameters.magnitude
-    return np.asarray(
-        (length > LEAST_EFFECT) & (length > LEAST_RELATIVE_EFFECT * length.max(initial=0.0))
-    )
+    strongest = length.max(initial=0.0)
+    return np.asarray((length > LEAST_EFFECT) & (length > LEAST_RELATIVE_EFFECT * strongest))

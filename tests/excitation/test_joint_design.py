@@ -59,7 +59,9 @@ def test_what_one_experiment_cannot_see_another_may(tmp_path) -> None:
         design_task(blind)
     told = seeing.problem.point(seeing.initial).information
     helped = design_task(
-        DesignTask.resolve(blind.experiment.replace(descent={"max_iterations": 2}), added=told)
+        DesignTask.resolve(
+            blind.experiment.replace(descent={"max_iterations": 2}), added_information=told
+        )
     )
     assert np.isfinite(helped.final.std).all()
 
