@@ -427,7 +427,11 @@ def _looked_at(task: DesignTask) -> tuple[Limit, ...]:
     """All limits, those that are held within samples first, in the order of the observations."""
     within = [limit for kind in SUBSTEP_KINDS for limit in task.limits if limit.kind == kind]
     least = task.experiment.limits.clearance
-    near = [] if least is None else [Limit("clearance", "nearest pair", 0, least, np.inf)]
+    near = (
+        []
+        if least is None
+        else [Limit(kind="clearance", name="nearest pair", index=0, lower=least, upper=np.inf)]
+    )
     return (*within, *(limit for limit in task.limits if limit.kind not in SUBSTEP_KINDS), *near)
 
 

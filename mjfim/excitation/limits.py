@@ -1,4 +1,4 @@
-"""Limits of an experiment: the MJCF's ranges and those that the file states, both hold where there are both."""
+"""Limits of an experiment: the ranges of the MJCF and those that the experiment file states; both hold where there are both."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from mjfim.experiment.task_tables import Limits
 from mjfim.model.coordinates import ScalarJoint, actuator_names
 
 Range = tuple[float, float]
-JOINTS = (
-    "position",
-    "velocity",
-    "acceleration",
-    "joint_force",
-)  # kinds by joint; the others are by actuator
+
+# Kinds of limits that are stated by joint; the others are stated by actuator.
+JOINT_KINDS = ("position", "velocity", "acceleration", "joint_force")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Limit:
-    """One scalar range.
+    """Range of one scalar.
 
-    kind: position, velocity, acceleration, control, control_rate, force or joint_force
-    index: place in qpos, qvel, qacc, ctrl, ctrl, actuator_force and qfrc_actuator, in this order
+    Attributes:
+        kind: "position", "velocity", "acceleration", "control", "control_rate", "force" or "joint_force".
+        name: Name of the joint or the actuator.
+        index: Address in qpos, qvel, qacc, ctrl, ctrl, actuator_force or qfrc_actuator, for the kinds in this order.
+        lower: Lower bound, -inf without one [unit of the kind].
+        upper: Upper bound, inf without one [unit of the kind].
     """
 
     kind: str
@@ -44,124 +45,185 @@ class Limit:
 
     @property
     def scale(self) -> float:
-        """Half of the range, what margins are compared with."""
-        finite = [abs(b) for b in (self.lower, self.upper) if np.isfinite(b)]
-        return 0.5 * (self.upper - self.lower) if len(finite) == 2 else max(*finite, 1.0)
+        """Half of the range, which makes margins relative; the magnitude of a single bound, at least 1."""
+        finite = [abs(bound) for bound in (self.lower, self.upper) if np.isfinite(bound)]
+        if len(finite) == 2:
+            return 0.5 * (self.upper - self.lower)
+        return max(*finite, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _KindOfLimit:
+    """One kind of limit before names are resolved.
+
+    Attributes:
+        kind: Name of the kind.
+        stated: What the experiment file states: one number for all, or a table by name.
+        addresses: Address of each joint or actuator that can have such a limit, by name.
+        model_ranges: Ranges of the MJCF, by name.
+    """
+
+    kind: str
+    stated: float | Mapping[str, float | Range]
+    addresses: Mapping[str, int]
+    model_ranges: Mapping[str, Range]
 
 
 def limits_of(
     model: Any, coordinates: tuple[ScalarJoint, ...], controls: tuple[str, ...], stated: Limits
 ) -> tuple[Limit, ...]:
-    """All limits. Raises ExperimentError for unknown names, inverted ranges and ranges that exclude the MJCF's."""
+    """Collect all limits, ordered by kind.
+
+    Args:
+        model: MjModel.
+        coordinates: Its slide and hinge joints.
+        controls: Names of its nu controls.
+        stated: The `[limits]` table of the experiment file.
+
+    Returns:
+        The limits; where MJCF and file both have a range, what both allow.
+
+    Raises:
+        ExperimentError: A name is unknown, a range is inverted, or a stated range excludes that of the MJCF.
+    """
     joints = {c.name: c for c in coordinates}
-    scalar = {
+    scalar_actuators = {
         name: i
         for i, name in enumerate(actuator_names(model))
         if int(model.actuator_outnum[i]) == 1
     }
-    tables = {
-        "position": (
-            stated.position,
-            {c.name: c.q for c in coordinates},
-            _position(model, coordinates),
+    dofs = {name: c.v for name, c in joints.items()}
+    inputs = {name: i for i, name in enumerate(controls)}
+
+    kinds = (
+        _KindOfLimit(
+            kind="position",
+            stated=stated.position,
+            addresses={name: c.q for name, c in joints.items()},
+            model_ranges=_position_ranges(model, coordinates),
         ),
-        "velocity": (stated.velocity, {c.name: c.v for c in coordinates}, {}),
-        "acceleration": (stated.acceleration, {c.name: c.v for c in coordinates}, {}),
-        "control": (
-            stated.control,
-            {name: i for i, name in enumerate(controls)},
-            _control(model, controls),
+        _KindOfLimit(kind="velocity", stated=stated.velocity, addresses=dofs, model_ranges={}),
+        _KindOfLimit(
+            kind="acceleration", stated=stated.acceleration, addresses=dofs, model_ranges={}
         ),
-        "control_rate": (stated.control_rate, {name: i for i, name in enumerate(controls)}, {}),
-        "force": (
-            stated.force,
-            {n: int(model.actuator_outadr[i]) for n, i in scalar.items()},
-            _force(model, scalar),
+        _KindOfLimit(
+            kind="control",
+            stated=stated.control,
+            addresses=inputs,
+            model_ranges=_control_ranges(model, controls),
         ),
-        "joint_force": ({}, {c.name: c.v for c in coordinates}, _joint_force(model, joints)),
-    }
-    found: list[Limit] = []
-    for kind, (wanted, index, given) in tables.items():
-        found += _rows(kind, _ranges(kind, wanted, list(index)), index, given)
-    return tuple(found)
+        _KindOfLimit(
+            kind="control_rate", stated=stated.control_rate, addresses=inputs, model_ranges={}
+        ),
+        _KindOfLimit(
+            kind="force",
+            stated=stated.force,
+            addresses={n: int(model.actuator_outadr[i]) for n, i in scalar_actuators.items()},
+            model_ranges=_force_ranges(model, scalar_actuators),
+        ),
+        _KindOfLimit(
+            kind="joint_force",
+            stated={},
+            addresses=dofs,
+            model_ranges=_joint_force_ranges(model, joints),
+        ),
+    )
+    return tuple(limit for kind in kinds for limit in _limits_of_kind(kind))
 
 
-def _ranges(
-    kind: str, stated: float | Mapping[str, float | Range], names: list[str]
-) -> dict[str, Range]:
-    """Ranges by name from one number, or from a table of numbers and ranges."""
-    table = stated if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
-    for name in table:
-        if name not in names:
-            raise ExperimentError(
-                f"limits.{kind}: {unknown('joint' if kind in JOINTS else 'actuator', name, names)}"
-            )
-    return {name: v if isinstance(v, tuple) else (-v, v) for name, v in table.items()}
+def _limits_of_kind(kind: _KindOfLimit) -> list[Limit]:
+    """All limits of one kind, in the order of the addresses."""
+    stated = _stated_ranges(kind)
+    limits = []
 
-
-def _rows(
-    kind: str, stated: Mapping[str, Range], index: Mapping[str, int], given: Mapping[str, Range]
-) -> list[Limit]:
-    rows = []
-    for name, place in index.items():
+    for name, index in kind.addresses.items():
+        # A stated range has to be valid by itself, before it meets that of the MJCF.
         if name in stated:
-            Limit(kind, name, place, *(float(b) for b in stated[name]))
-        both = [table[name] for table in (stated, given) if name in table]
-        if not both:
+            lower, upper = stated[name]
+            Limit(kind=kind.kind, name=name, index=index, lower=float(lower), upper=float(upper))
+
+        ranges = [table[name] for table in (stated, kind.model_ranges) if name in table]
+        if not ranges:
             continue
-        lower, upper = float(max(low for low, _ in both)), float(min(high for _, high in both))
-        if len(both) == 2 and not lower < upper:
-            own, models = (f"[{low:g}, {high:g}]" for low, high in both)
+
+        lower = float(max(low for low, _ in ranges))
+        upper = float(min(high for _, high in ranges))
+        if len(ranges) == 2 and not lower < upper:
+            from_file, from_model = (f"[{low:g}, {high:g}]" for low, high in ranges)
             raise ExperimentError(
-                f"limits.{kind}.{name}: {own} and the MJCF's range {models} exclude each other"
+                f"limits.{kind.kind}.{name}: {from_file} and the MJCF's range {from_model} exclude each other"
             )
         if np.isfinite(lower) or np.isfinite(upper):
-            rows.append(Limit(kind, name, place, lower, upper))
-    return rows
+            limits.append(Limit(kind=kind.kind, name=name, index=index, lower=lower, upper=upper))
+    return limits
 
 
-def _position(model: Any, coordinates: tuple[ScalarJoint, ...]) -> dict[str, Range]:
+def _stated_ranges(kind: _KindOfLimit) -> dict[str, Range]:
+    """Ranges of the experiment file by name: a number is a range about zero, one number holds for all names.
+
+    Raises:
+        ExperimentError: A name is unknown.
+    """
+    names, stated = list(kind.addresses), kind.stated
+    table = stated if isinstance(stated, Mapping) else dict.fromkeys(names, stated)
+
+    for name in table:
+        if name not in names:
+            element = "joint" if kind.kind in JOINT_KINDS else "actuator"
+            raise ExperimentError(f"limits.{kind.kind}: {unknown(element, name, names)}")
     return {
-        c.name: tuple(model.jnt_range[c.joint]) for c in coordinates if model.jnt_limited[c.joint]
+        name: value if isinstance(value, tuple) else (-value, value)
+        for name, value in table.items()
     }
 
 
-def _control(model: Any, controls: tuple[str, ...]) -> dict[str, Range]:
-    return {
-        name: tuple(model.actuator_ctrlrange[i])
-        for i, name in enumerate(controls)
-        if model.actuator_ctrllimited[i]
-    }
+def _position_ranges(model: Any, coordinates: tuple[ScalarJoint, ...]) -> dict[str, Range]:
+    """Ranges of the joints in the MJCF, by name."""
+    limited = [c for c in coordinates if model.jnt_limited[c.joint]]
+    return {c.name: tuple(model.jnt_range[c.joint]) for c in limited}
 
 
-def _force(model: Any, scalar: Mapping[str, int]) -> dict[str, Range]:
-    return {
-        name: tuple(model.actuator_forcerange[i])
-        for name, i in scalar.items()
-        if model.actuator_forcelimited[i]
-    }
+def _control_ranges(model: Any, controls: tuple[str, ...]) -> dict[str, Range]:
+    """Ranges of the controls in the MJCF, by name."""
+    limited = [i for i in range(len(controls)) if model.actuator_ctrllimited[i]]
+    return {controls[i]: tuple(model.actuator_ctrlrange[i]) for i in limited}
 
 
-def _joint_force(model: Any, joints: Mapping[str, ScalarJoint]) -> dict[str, Range]:
+def _force_ranges(model: Any, actuators: Mapping[str, int]) -> dict[str, Range]:
+    """Ranges of the actuator forces in the MJCF, by name."""
+    limited = {name: i for name, i in actuators.items() if model.actuator_forcelimited[i]}
+    return {name: tuple(model.actuator_forcerange[i]) for name, i in limited.items()}
+
+
+def _joint_force_ranges(model: Any, joints: Mapping[str, ScalarJoint]) -> dict[str, Range]:
+    """Ranges of the summed actuator forces on joints in the MJCF, by name."""
     limited = {name: c.joint for name, c in joints.items() if model.jnt_actfrclimited[c.joint]}
-    return {name: tuple(model.jnt_actfrcrange[j]) for name, j in limited.items()}
+    return {name: tuple(model.jnt_actfrcrange[joint]) for name, joint in limited.items()}
 
 
 def unsupported_ranges(model: Any) -> tuple[str, ...]:
-    """What has a range in the MJCF that is not among the limits: ball joints, tendons, activations."""
+    """Elements with a range in the MJCF that cannot be a limit: ball joints, tendons and activations.
 
-    def named(kind: Any, rows: Any) -> list[str]:
-        return [
-            mujoco.mj_id2name(model, kind, i) or f"number {i}"
-            for i in np.flatnonzero(rows).tolist()
-        ]
+    Args:
+        model: MjModel.
 
-    ball = (model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)) & (model.jnt_limited != 0)
+    Returns:
+        Their names in words.
+    """
+    kinds = mujoco.mjtObj
+    is_ball = model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)
+    balls = _names(model, kinds.mjOBJ_JOINT, is_ball & (model.jnt_limited != 0))
+    tendons = _names(model, kinds.mjOBJ_TENDON, model.tendon_limited)
+    actuators = _names(model, kinds.mjOBJ_ACTUATOR, model.actuator_actlimited)
+
     return (
-        *(f"ball joint {name}" for name in named(mujoco.mjtObj.mjOBJ_JOINT, ball)),
-        *(f"tendon {name}" for name in named(mujoco.mjtObj.mjOBJ_TENDON, model.tendon_limited)),
-        *(
-            f"the activation of {name}"
-            for name in named(mujoco.mjtObj.mjOBJ_ACTUATOR, model.actuator_actlimited)
-        ),
+        *(f"ball joint {name}" for name in balls),
+        *(f"tendon {name}" for name in tendons),
+        *(f"the activation of {name}" for name in actuators),
     )
+
+
+def _names(model: Any, kind: Any, chosen: Any) -> list[str]:
+    """Names of the chosen elements (n,) of a kind, or their numbers."""
+    indices = np.flatnonzero(chosen).tolist()
+    return [mujoco.mj_id2name(model, kind, i) or f"number {i}" for i in indices]

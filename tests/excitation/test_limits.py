@@ -70,8 +70,8 @@ def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajecto
 def test_model_ranges_are_the_default(model: mujoco.MjModel) -> None:
     """Ranges of joints and controls; what has none is free. Columns skip the ball joint."""
     assert limits(model) == (
-        Limit("position", "lift", 4, -0.5, 0.25),
-        Limit("control", "push", 0, -2.0, 3.0),
+        Limit(kind="position", name="lift", index=4, lower=-0.5, upper=0.25),
+        Limit(kind="control", name="push", index=0, lower=-2.0, upper=3.0),
     )
 
 
@@ -84,12 +84,12 @@ def test_file_narrows_and_adds(model: mujoco.MjModel) -> None:
         control={"twist": (-5, 5), "push": (-9, 1)},
     )
     assert set(found) == {
-        Limit("position", "lift", 4, -0.1, 0.1),
-        Limit("position", "turn", 5, -1.0, 2.0),
-        Limit("velocity", "lift", 3, -2.0, 2.0),
-        Limit("velocity", "turn", 4, -1.0, 4.0),
-        Limit("control", "push", 0, -2.0, 1.0),
-        Limit("control", "twist", 1, -5.0, 5.0),
+        Limit(kind="position", name="lift", index=4, lower=-0.1, upper=0.1),
+        Limit(kind="position", name="turn", index=5, lower=-1.0, upper=2.0),
+        Limit(kind="velocity", name="lift", index=3, lower=-2.0, upper=2.0),
+        Limit(kind="velocity", name="turn", index=4, lower=-1.0, upper=4.0),
+        Limit(kind="control", name="push", index=0, lower=-2.0, upper=1.0),
+        Limit(kind="control", name="twist", index=1, lower=-5.0, upper=5.0),
     }
 
 
@@ -99,17 +99,19 @@ def test_one_number_stands_for_all_names(model: mujoco.MjModel) -> None:
     joints, places = (("lift", 3), ("turn", 4)), (("push", 0), ("twist", 1))
     assert set(found) - set(limits(model)) == {
         *(
-            Limit(kind, name, v, -b, b)
+            Limit(kind=kind, name=name, index=v, lower=-b, upper=b)
             for kind, b in (("velocity", 2.0), ("acceleration", 9.0))
             for name, v in joints
         ),
         *(
-            Limit(kind, name, u, -b, b)
+            Limit(kind=kind, name=name, index=u, lower=-b, upper=b)
             for kind, b in (("control_rate", 7.0), ("force", 1.5))
             for name, u in places
         ),
     }
-    assert limits(model, force={"push": (-1.0, 2.0)})[-1] == Limit("force", "push", 0, -1.0, 2.0)
+    assert limits(model, force={"push": (-1.0, 2.0)})[-1] == Limit(
+        kind="force", name="push", index=0, lower=-1.0, upper=2.0
+    )
 
 
 def test_every_range_of_the_model_is_a_limit() -> None:
@@ -120,9 +122,9 @@ def test_every_range_of_the_model_is_a_limit() -> None:
     text = text.replace('joint="turn"/>', 'joint="turn" forcerange="-1 8"/>')
     found = limits(mujoco.MjModel.from_xml_string(text), force=5.0)
     assert {x for x in found if "force" in x.kind} == {
-        Limit("force", "push", 0, -5.0, 5.0),
-        Limit("force", "twist", 1, -1.0, 5.0),
-        Limit("joint_force", "turn", 4, -6.0, 7.0),
+        Limit(kind="force", name="push", index=0, lower=-5.0, upper=5.0),
+        Limit(kind="force", name="twist", index=1, lower=-1.0, upper=5.0),
+        Limit(kind="joint_force", name="turn", index=4, lower=-6.0, upper=7.0),
     }
 
 
@@ -260,11 +262,13 @@ SERVOED = """
 def test_every_control_of_an_actuator_has_its_range() -> None:
     """MuJoCo keeps ranges of controls per control. The range of a single force is a limit too, that of a norm is none."""
     found = limits(mujoco.MjModel.from_xml_string(SERVOED))
-    aims = [Limit("control", f"aim[{i}]", i, -1.0, 1.0) for i in range(3)]
+    aims = [
+        Limit(kind="control", name=f"aim[{i}]", index=i, lower=-1.0, upper=1.0) for i in range(3)
+    ]
     assert found == (
         *aims,
-        Limit("control", "actuator1", 3, -5.0, 5.0),
-        Limit("force", "actuator1", 3, -3.0, 4.0),
+        Limit(kind="control", name="actuator1", index=3, lower=-5.0, upper=5.0),
+        Limit(kind="force", name="actuator1", index=3, lower=-3.0, upper=4.0),
     )
 
 
