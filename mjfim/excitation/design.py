@@ -129,7 +129,10 @@ def _free(
         runs.append(Run(begin.name))
         elsewhere = sum(run.steps for run in runs)
         for row in descend(
-            [Stage(level, stage.basis) for level in levels], begin.whole, runs[-1], constraints
+            [Stage(level, stage.basis) for level in levels],
+            begin.over_horizon,
+            runs[-1],
+            constraints,
         ):
             spent = sum(level.plant.engine_steps for level in levels) - begun
             told = replace(row, seconds=time.perf_counter() - clock, steps=spent)
@@ -161,7 +164,7 @@ def _enclosed(
         left = runs.pop()
         starts, elsewhere = starts[len(runs) :], left.steps
         if left.control is not None:  # as far as it came without a barrier
-            starts[0] = InitialControl(starts[0].name, left.control)
+            starts[0] = InitialControl(name=starts[0].name, control=left.control)
     free = task.relaxed()
     chases: list[Chase] = []
     multistart = Multistart(

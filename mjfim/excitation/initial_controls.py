@@ -1,4 +1,4 @@
-"""Where a design may begin: the initial control, random multisines, Fourier series to be optimised first, earlier designs."""
+"""Initial controls of a design: the stated one, random multisines, Fourier series to be optimised first, earlier designs."""
 
 from __future__ import annotations
 
@@ -14,16 +14,23 @@ from mjfim.excitation.task import DesignTask
 from mjfim.recordings.control_table import read_control
 from mjfim.signals import fourier_basis
 
-HARMONICS = 10  # of random multisines
-SERIES = 15  # harmonics of a Fourier series that is optimised first
-SWELL = 0.1  # share of the horizon over which a random start swells from rest and fades to it
+# Most harmonics of a Fourier series that is optimised first.
+MAX_SERIES_HARMONICS = 15
+
+# Amplitudes of random multisines, relative to that of the initial control.
+LEAST_RANDOM_AMPLITUDE = 1.0
+MOST_RANDOM_AMPLITUDE = 6.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class InitialControl:
-    """A control to begin with. control: (N, nu);  basis: (N, M) what it is optimised within at first, or None: anything
+    """A control from which an optimisation starts.
 
-    repeats: times that the horizon is longer than the control, which is optimised alone at first, then played so many times
+    Attributes:
+        name: Its name in histories and messages.
+        control: (N / repeats, nu) control [u-unit].
+        basis: (N, M) curves within which the control is optimised first, or None for any control.
+        repeats: Number of times that the control is played over the horizon; it is optimised alone first.
     """
 
     name: str
@@ -32,66 +39,100 @@ class InitialControl:
     repeats: int = 1
 
     @property
-    def whole(self) -> Array:
-        """(N, nu) over the whole horizon."""
+    def over_horizon(self) -> Array:
+        """(N, nu) control over the whole horizon."""
         return np.tile(self.control, (self.repeats, 1))
 
 
 def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[InitialControl]:
-    """The given or initial control, then what the experiment's [descent] asks for. Raises for what is not there at once."""
-    e, d = task.experiment, task.experiment.descent
-    found = [
-        InitialControl("initial control", task.control)
-        if given is None
-        else InitialControl("given control", given)
-    ]
-    found += [
-        InitialControl(f"previous design {path}", previous(task, path))
-        for path in dict.fromkeys(d.previous)
-    ]
-    begins, ends = e.boundary.start == "rest", e.boundary.end == "rest"
-    rng = np.random.default_rng(d.seed)
-    for frequency in dict.fromkeys(d.fourier):
-        most = e.limits.bandwidth or 0.5 * e.rate
-        harmonics = int(min(SERIES, most / frequency))
-        if harmonics < 1:
-            raise ExperimentError(
-                f"{e.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of {most:g} Hz"
-            )
-        series = fourier_basis(task.t, task.horizon, frequency, harmonics, begins, ends)
-        fitted = series @ np.linalg.lstsq(series, _random(task, rng) - task.centre)[0]
-        found.append(
-            InitialControl(f"Fourier series of {frequency:g} Hz", task.centre + fitted, series)
-        )
-    for count in dict.fromkeys(d.repeats):
-        found.append(
-            InitialControl(
-                f"{count} times a design of {task.horizon / count:g} s",
-                _part(task, count),
-                repeats=count,
-            )
-        )
-    multisines = (
-        InitialControl(f"multisine {i} of {d.starts - 1}", _random(task, rng))
-        for i in range(1, d.starts)
-    )
-    return chain(found, multisines)
+    """Collect the controls from which a design starts.
+
+    Args:
+        task: The task.
+        given: (N, nu) control that replaces the initial one, or None.
+
+    Returns:
+        The given or the initial control, then those that `[descent]` asks for: earlier designs, Fourier series, repeated
+        parts, random multisines. The multisines are made one by one.
+
+    Raises:
+        ExperimentError: A file, a frequency or a number of repeats cannot be used; this is found at once.
+    """
+    descent = task.experiment.descent
+    first = InitialControl(name="initial control", control=task.control)
+    if given is not None:
+        first = InitialControl(name="given control", control=given)
+
+    found = [first]
+    for path in dict.fromkeys(descent.previous):
+        control = control_of_earlier_design(task, path)
+        found.append(InitialControl(name=f"previous design {path}", control=control))
+
+    # Fourier series and multisines share one source of random numbers, in this order.
+    rng = np.random.default_rng(descent.seed)
+    frequencies = dict.fromkeys(descent.fourier)
+    found.extend(_fourier_series(task, frequency, rng) for frequency in frequencies)
+    for count in dict.fromkeys(descent.repeats):
+        name = f"{count} times a design of {task.horizon / count:g} s"
+        part = _first_part(task, count)
+        found.append(InitialControl(name=name, control=part, repeats=count))
+
+    return chain(found, _multisines(task, rng))
 
 
-def previous(task: DesignTask, path: str) -> Array:
+def control_of_earlier_design(task: DesignTask, path: str) -> Array:
     """(N, nu) control of an earlier design's design.csv, repeated where it is shorter."""
     file = task.experiment.directory / path
     return read_control(file, task.t, task.dt, task.controls, repeat=True)
 
 
-def _part(task: DesignTask, count: int) -> Array:
-    """(N / count, nu) first part of the initial control. Raises ExperimentError where it is no part."""
+def _multisines(task: DesignTask, rng: np.random.Generator) -> Iterator[InitialControl]:
+    """The random multisines that `descent.starts` asks for."""
+    last = task.experiment.descent.starts - 1
+    for i in range(1, last + 1):
+        yield InitialControl(name=f"multisine {i} of {last}", control=_multisine(task, rng))
+
+
+def _multisine(task: DesignTask, rng: np.random.Generator) -> Array:
+    """(N, nu) random multisine about the middle of the initial control, inside the ranges of the controls."""
+    return task.random_control(rng, LEAST_RANDOM_AMPLITUDE, MOST_RANDOM_AMPLITUDE)
+
+
+def _fourier_series(task: DesignTask, frequency: float, rng: np.random.Generator) -> InitialControl:
+    """The Fourier series of a frequency [Hz] that is nearest to a random multisine.
+
+    Raises:
+        ExperimentError: The frequency is above the bandwidth.
+    """
+    experiment = task.experiment
+    bandwidth = experiment.limits.bandwidth or 0.5 * experiment.rate
+    harmonics = int(min(MAX_SERIES_HARMONICS, bandwidth / frequency))
+    if harmonics < 1:
+        raise ExperimentError(
+            f"{experiment.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of {bandwidth:g} Hz"
+        )
+
+    starts_at_rest = experiment.boundary.start == "rest"
+    ends_at_rest = experiment.boundary.end == "rest"
+    basis = fourier_basis(task.t, task.horizon, frequency, harmonics, starts_at_rest, ends_at_rest)
+    coefficients = np.linalg.lstsq(basis, _multisine(task, rng) - task.centre)[0]
+    control = task.centre + basis @ coefficients
+    return InitialControl(name=f"Fourier series of {frequency:g} Hz", control=control, basis=basis)
+
+
+def _first_part(task: DesignTask, count: int) -> Array:
+    """(N / count, nu) first part of the initial control, faded where it has to begin and end at rest.
+
+    Raises:
+        ExperimentError: The horizon cannot be divided into this number of parts.
+    """
     source = task.experiment.source
     samples = task.samples // count
     if task.samples % count:
         raise ExperimentError(
             f"{source}: descent.repeats: {count} does not divide the {task.samples} samples"
         )
+
     fewest = max(2, task.system.grid.stride)
     if samples < fewest:
         raise ExperimentError(
@@ -101,9 +142,6 @@ def _part(task: DesignTask, count: int) -> Array:
         raise ExperimentError(
             f"{source}: descent.repeats needs hard limits; without, start from a shorter design (previous)"
         )
-    return np.asarray(task.centre + task.fade(samples) * (task.control[:samples] - task.centre))
 
-
-def _random(task: DesignTask, rng: np.random.Generator) -> Array:
-    """A multisine about the middle of the initial control, up to six times its size, inside the controls' ranges."""
-    return task.random_control(rng, 1.0, 6.0)
+    deviation = task.control[:samples] - task.centre
+    return np.asarray(task.centre + task.fade(samples) * deviation)

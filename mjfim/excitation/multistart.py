@@ -130,7 +130,9 @@ class Multistart:
         kept = order[: max(1, len(chases) // KEPT)]
         if not kept:
             return
-        again = [InitialControl(chases[i].name, np.asarray(leads[i].control)) for i in kept]
+        again = [
+            InitialControl(name=chases[i].name, control=np.asarray(leads[i].control)) for i in kept
+        ]
         for i in order[len(kept) :]:
             if np.isfinite(leads[i].cost):
                 chases[i].status = Status.LEFT
@@ -171,7 +173,7 @@ class Multistart:
             i, shares = leaking
             held = updated_tightening(held, shares)
             best, again = chases[i], list[Chase]()
-            start = InitialControl(best.name, np.asarray(best.control))
+            start = InitialControl(name=best.name, control=np.asarray(best.control))
             try:
                 yield from self._round(
                     self.fine,
@@ -213,7 +215,7 @@ class Multistart:
         Returns what to go on with: that, or what leaks here as the coarse level saw it, since the second round brings it back.
         """
         lead = Lead(chase.control, chase.cost)
-        found = [control for control in (chase.control, start.whole) if control is not None]
+        found = [control for control in (chase.control, start.over_horizon) if control is not None]
         costs = [self._worth(control) for control in found]
         best = int(np.argmin(costs))
         chase.cost = costs[best]

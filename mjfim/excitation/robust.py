@@ -1,7 +1,9 @@
-"""Robust design: the guess is wrong by assumption, so phi is pooled over samples of the parameters.
+"""Robust design: the guess of the parameters is known to be wrong, so that the criterion phi is pooled over samples of them.
 
-mean    1/S sum_s phi_s
-worst   (1/S sum_s phi_s^q)^(1/q), a smooth maximum; for D-optimality, whose phi is a logarithm, log-mean-exp of q phi
+    mean    1/S sum_s phi_s
+    worst   (1/S sum_s phi_s^q)^(1/q), a smooth maximum
+
+The phi of D-optimality is a logarithm already; its smooth maximum is `log(1/S sum_s exp(q phi_s)) / q`.
 """
 
 from __future__ import annotations
@@ -15,14 +17,18 @@ from scipy.special import logsumexp
 
 from mjfim.arrays import Array
 
+# Exponent q of the smooth maximum.
 POOLING_EXPONENT = 20.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ParameterSamples:
-    """How phi at several parameter values becomes one number.
+    """Parameter values, and how the criterion at them becomes one number.
 
-    thetas: (S, p), the guess first;  over: mean or worst;  logarithmic: True for D-optimality
+    Attributes:
+        thetas: (S, p) parameter values, the guess first [theta-unit].
+        over: "mean" or "worst".
+        logarithmic: phi is a logarithm, as that of D-optimality is.
     """
 
     thetas: Array
@@ -30,27 +36,44 @@ class ParameterSamples:
     logarithmic: bool = False
 
     def value(self, phi: Sequence[float]) -> float:
-        """The pooled criterion; infinite where one of them is."""
+        """Pooled criterion.
+
+        Args:
+            phi: S values of the criterion.
+
+        Returns:
+            The pooled value; infinite where one of them is not finite.
+        """
+        q = POOLING_EXPONENT
         values = np.asarray(phi, dtype=np.float64)
         if not np.isfinite(values).all():
             return np.inf
+
         if self.over == "mean":
             return float(values.mean())
         if self.logarithmic:
-            return float(
-                (logsumexp(POOLING_EXPONENT * values) - np.log(len(values))) / POOLING_EXPONENT
-            )
-        top = values.max()
-        return float(top * np.mean((values / top) ** POOLING_EXPONENT) ** (1.0 / POOLING_EXPONENT))
+            return float((logsumexp(q * values) - np.log(len(values))) / q)
+
+        # Relative to the largest value: its power neither overflows nor vanishes.
+        largest = values.max()
+        return float(largest * np.mean((values / largest) ** q) ** (1.0 / q))
 
     def weights(self, phi: Sequence[float]) -> Array:
-        """(S,) derivative of the pooled criterion by each phi."""
+        """Derivative of the pooled criterion.
+
+        Args:
+            phi: S values of the criterion, all finite.
+
+        Returns:
+            (S,) derivative by each of them.
+        """
+        q = POOLING_EXPONENT
         values = np.asarray(phi, dtype=np.float64)
+
         if self.over == "mean":
             return np.full(len(values), 1.0 / len(values))
         if self.logarithmic:
-            return np.asarray(
-                np.exp(POOLING_EXPONENT * values - logsumexp(POOLING_EXPONENT * values))
-            )
+            return np.asarray(np.exp(q * values - logsumexp(q * values)))
+
         pooled = self.value(phi)
-        return np.asarray((values / pooled) ** (POOLING_EXPONENT - 1.0) / len(values))
+        return np.asarray((values / pooled) ** (q - 1.0) / len(values))

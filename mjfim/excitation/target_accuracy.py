@@ -1,4 +1,4 @@
-"""The standard deviations that the user aims at, and how far a result is from them."""
+"""Standard deviations that the user aims at, and how far a result is from them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,21 @@ from mjfim.records.design import Design
 
 
 def target_accuracies(task: DesignTask) -> Array:
-    """(p,) standard deviations aimed at, infinite where none is. Raises ExperimentError where no parameter states one."""
+    """Standard deviations that the experiment aims at.
+
+    Args:
+        task: The task.
+
+    Returns:
+        (p,) standard deviations [theta-unit], infinite for a parameter without a target.
+
+    Raises:
+        ExperimentError: No parameter states a target.
+    """
     stated = [None if q.nuisance else q.wanted for q in task.parameters.parameters]
     if not any(stated):
-        name = next(
-            (n for n, spec in task.experiment.parameters.items() if spec.inertial is None),
-            "<name>",
-        )
+        tables = task.experiment.parameters.items()
+        name = next((n for n, table in tables if table.inertial is None), "<name>")
         raise ExperimentError(
             f"{task.experiment.source}: no parameter states which standard deviation is wanted; state it in the "
             f"parameter's unit, for example parameters.{name}.wanted = 0.01"
@@ -26,18 +34,37 @@ def target_accuracies(task: DesignTask) -> Array:
 
 
 def largest_ratio_to_target(std: Array, wanted: Array) -> tuple[float, int]:
-    """Largest standard deviation over the wanted one, at most 1 where all are reached, and whose it is. Both (p,)."""
-    share = np.where(np.isfinite(wanted), std / wanted, 0.0)
-    return float(share.max()), int(np.argmax(share))
+    """Largest standard deviation relative to its target.
+
+    Args:
+        std: (p,) standard deviations [theta-unit].
+        wanted: (p,) targets, infinite where there is none [theta-unit].
+
+    Returns:
+        The ratio, at most 1 where all targets are reached, and the index of its parameter.
+    """
+    ratio = np.where(np.isfinite(wanted), std / wanted, 0.0)
+    return float(ratio.max()), int(np.argmax(ratio))
 
 
 def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
-    """Raise UnidentifiableError where a wanted parameter cannot be told alone, however often a design is repeated."""
-    lost = np.flatnonzero(np.isfinite(wanted) & ~np.isfinite(design.final.std))
-    if len(lost):
-        names = ", ".join(task.parameters.names[j] for j in lost)
-        known = f": {'; '.join(design.combinations)}" if design.combinations else ""
-        raise UnidentifiableError(
-            f"{task.experiment.source}: no standard deviation of {names} can be reached, because this experiment does not "
-            f"tell every parameter alone{known}. Take one of them out, give it a prior, or measure something else"
-        )
+    """Raise where the target of a parameter cannot be reached, however often a design is repeated.
+
+    Args:
+        task: The task.
+        design: A design of the task.
+        wanted: (p,) targets, infinite where there is none [theta-unit].
+
+    Raises:
+        UnidentifiableError: A parameter with a target cannot be identified by itself.
+    """
+    unreachable = np.flatnonzero(np.isfinite(wanted) & ~np.isfinite(design.final.std))
+    if not len(unreachable):
+        return
+
+    names = ", ".join(task.parameters.names[j] for j in unreachable)
+    known = f": {'; '.join(design.combinations)}" if design.combinations else ""
+    raise UnidentifiableError(
+        f"{task.experiment.source}: no standard deviation of {names} can be reached, because this experiment does not "
+        f"identify every parameter by itself{known}. Take one of them out, give it a prior, or measure something else"
+    )

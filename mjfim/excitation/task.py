@@ -602,4 +602,5 @@ def _parameter_samples(system: System) -> ParameterSamples | None:
     thetas = sample_parameters(
         system.parameters, system.theta, robust.samples, robust.seed, system.impossible
     )
-    return ParameterSamples(thetas, robust.over, experiment.cost.criterion == "D")
+    logarithmic = experiment.cost.criterion == "D"
+    return ParameterSamples(thetas=thetas, over=robust.over, logarithmic=logarithmic)

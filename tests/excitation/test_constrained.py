@@ -273,7 +273,9 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     task = cart_inside(tmp_path, descent={"max_iterations": 4})
     search = ConstrainedSearch(
         task.experiment,
-        InitialControl("wild", 1e9 * np.ones((100, 1)) * np.sin(9.0 * task.t)[:, None]),
+        InitialControl(
+            name="wild", control=1e9 * np.ones((100, 1)) * np.sin(9.0 * task.t)[:, None]
+        ),
         BarrierSchedule(),
         4,
     )
@@ -282,7 +284,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     assert chase.cost == np.inf
     # beside it another start goes on
     chases: list[Chase] = []
-    starts = [search.start, InitialControl("initial control", task.control)]
+    starts = [search.start, InitialControl(name="initial control", control=task.control)]
     rows = list(Multistart(Stage(task.relaxed(), None), None).run(starts, chases))
     assert rows
     assert np.isfinite(chases[1].cost)
@@ -714,7 +716,7 @@ def test_what_leaks_a_little_goes_on_and_the_start_is_kept_beside_it(tmp_path: P
     free = cart_inside(tmp_path).relaxed()
     rivals = Multistart(Stage(free, None), None)
     start, leaking, inside = (
-        InitialControl("x", s * free.control) for s in (0.2, 3.0, 0.1)
+        InitialControl(name="x", control=s * free.control) for s in (0.2, 3.0, 0.1)
     )  # here the smaller one tells more
     chase = Chase("x", leaking.control, 1e-3)
     lead = rivals._judge(chase, start)

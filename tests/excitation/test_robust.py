@@ -28,7 +28,8 @@ KINDS = {
 
 def pool(kind: str, count: int = 4) -> ParameterSamples:
     """Over any parameter values."""
-    return ParameterSamples(np.zeros((count, 1)), *KINDS[kind])
+    over, logarithmic = KINDS[kind]
+    return ParameterSamples(thetas=np.zeros((count, 1)), over=over, logarithmic=logarithmic)
 
 
 def unknowns(*parameters: dict) -> ParameterSet:

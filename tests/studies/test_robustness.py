@@ -19,7 +19,7 @@ from scipy.stats import binom
 import mjfim
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.design import design_task
-from mjfim.excitation.initial_controls import previous
+from mjfim.excitation.initial_controls import control_of_earlier_design
 from mjfim.excitation.task import DesignTask
 from mjfim.model.coordinates import tangent_names
 from mjfim.optimize.lq import regulator
@@ -232,7 +232,8 @@ def test_a_design_leaves_both_tables(tmp_path: Path) -> None:
     )
     np.testing.assert_array_equal(again.control, design.trajectory.ctrl)
     np.testing.assert_array_equal(
-        previous(task, str(tmp_path / "out" / "design.csv")), design.trajectory.ctrl
+        control_of_earlier_design(task, str(tmp_path / "out" / "design.csv")),
+        design.trajectory.ctrl,
     )
 
 

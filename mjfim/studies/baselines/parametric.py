@@ -184,7 +184,7 @@ def own(arena: Arena, series: Series, last: float, limit: float) -> None:
     left = (
         (1.0 - arena.used) * job.seconds if limit >= 1.0 else np.inf
     )  # else sharper barriers would come too early
-    start = InitialControl(series.name, series.control, series.basis)
+    start = InitialControl(name=series.name, control=series.control, basis=series.basis)
     schedule = BarrierSchedule(first=series.mu, last=last)
     search = ConstrainedSearch(
         job.experiment,
