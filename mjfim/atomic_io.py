@@ -17,7 +17,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """Write a file under a temporary name and rename it at the end.
 
     The file appears under its name if the block succeeds. If the block fails, the temporary file is removed and an existing
-    file stays as it was. Missing parent folders are created.
+    file remains unchanged. Missing parent folders are created.
 
     Args:
         path: Name of the final file.

@@ -1,4 +1,4 @@
-"""How long work may go on: a budget of time, engine steps and iterations, and a token that asks it to stop.
+"""Budget of time, engine steps and iterations for long work, and a token that asks it to stop.
 
 Long work asks `budget.exhausted` in its loops and returns the best result so far; nothing is raised to stop it.
 Ctrl-C becomes a token at the edge, in the verbs and the command line, by `stop_on_interrupt`.
@@ -20,7 +20,7 @@ import numpy as np
 
 
 class StopReason(Enum):
-    """Why work ended before it was done. The value is the sentence that a user reads."""
+    """Reason for which work ended early. The value is the sentence that a user reads."""
 
     REQUESTED = "interrupted by the user"
     SECONDS = "the time is used up"
@@ -34,7 +34,7 @@ class StopToken:
     A token may be set from another thread, from a signal handler or from a callback.
 
     Args:
-        also: Asked as well; lets a worker process see the request of the process that started it.
+        also: Function that returns True where work has to stop as well, for example at the request of a parent process.
     """
 
     def __init__(self, also: Callable[[], bool] | None = None) -> None:
@@ -55,7 +55,7 @@ class Budget:
     """Time, engine steps and iterations that work may use; asked in its loops.
 
     Args:
-        seconds: Time from now on [s]; infinite without a limit.
+        seconds: Time from the creation of the budget [s]; infinite without a limit.
         steps: Engine steps; None without a limit.
         iterations: Iterations; None without a limit.
         stop: Token that ends the work early.
@@ -84,7 +84,7 @@ class Budget:
 
     @property
     def seconds_left(self) -> float:
-        """Time that is left [s], never negative; infinite without a limit."""
+        """Remaining time [s], never negative; infinite without a limit."""
         return max(self.deadline - time.monotonic(), 0.0)
 
     @property
@@ -104,7 +104,7 @@ class Budget:
 
     @property
     def exhausted(self) -> StopReason | None:
-        """Why the work has to stop, or None while it may go on."""
+        """Reason to stop the work, or None while it may continue."""
         if self.stop.requested:
             return StopReason.REQUESTED
         if time.monotonic() >= self.deadline:
@@ -120,7 +120,7 @@ class Budget:
         """A budget for a part of the work, with the same token.
 
         Args:
-            fraction: Share of the time and of the engine steps that are left.
+            fraction: Share of the remaining time and of the remaining engine steps.
             iterations: Iterations of the part; None without a limit.
 
         Returns:
@@ -135,14 +135,14 @@ class Budget:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """State for another process, whose monotonic clock may differ and which has a stop token of its own."""
+        """State for another process, which has another stop token and whose monotonic clock may differ."""
         state = dict(self.__dict__)
         state["stop"] = None
         state["moment"] = time.time(), time.monotonic()
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore in another process; `stop` is a new token, which the worker replaces by its own."""
+        """Restore in another process; `stop` is a new token, which the worker replaces."""
         wall, monotonic = state.pop("moment")
         self.__dict__.update(state)
         shift = (time.monotonic() - monotonic) - (time.time() - wall)
@@ -156,16 +156,16 @@ _active: ContextVar[StopToken | None] = ContextVar("mjfim_stop_token", default=N
 
 @contextmanager
 def stop_on_interrupt(stop: StopToken | None = None) -> Iterator[StopToken]:
-    """Turn the first Ctrl-C into a request to stop, as long as the context lasts; a second one interrupts as usual.
+    """Turn the first Ctrl-C inside the context into a request to stop; a second one interrupts as usual.
 
     Nested contexts share the token of the outermost one. Outside the main thread, where Python delivers no signals,
-    the token is only handed on.
+    the token is only yielded.
 
     Args:
         stop: Token to set; default: that of the surrounding context, or a new one.
 
     Yields:
-        The token that the work has to ask.
+        The token that the work has to check.
     """
     outer = _active.get()
     token = stop or outer or StopToken()

@@ -7,7 +7,7 @@ from difflib import get_close_matches
 
 
 class MjfimError(Exception):
-    """Root of every error that mjfim raises on purpose; the command line turns it into exit code 2."""
+    """Base class of every error that mjfim raises for misuse; the command line turns it into exit code 2."""
 
 
 class ExperimentError(MjfimError):
@@ -23,7 +23,7 @@ class RecordingError(MjfimError):
 
 
 class UnidentifiableError(MjfimError):
-    """The starting trajectory carries no information about some direction of the parameters."""
+    """The initial trajectory carries no information about some direction of the parameters."""
 
 
 class SimulationDivergedError(MjfimError):

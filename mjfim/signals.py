@@ -49,7 +49,7 @@ def spline_basis(
     Args:
         t: (N,) times [s].
         horizon: Duration of the curves [s].
-        bandwidth: Highest frequency that the splines have to follow [Hz].
+        bandwidth: Highest frequency that the splines have to represent [Hz].
         starts_at_rest: Whether value and slope are zero at the beginning.
         ends_at_rest: Whether value and slope are zero at the end.
         periodic: Whether the end continues at the beginning with two derivatives.
@@ -60,7 +60,7 @@ def spline_basis(
     intervals = max(int(np.ceil(2.0 * bandwidth * horizon)), SPLINE_DEGREE + 1)
     knots = horizon / intervals * np.arange(-SPLINE_DEGREE, intervals + SPLINE_DEGREE + 1)
 
-    # Splines that leave at the end of the horizon come back at its beginning.
+    # Splines that extend beyond the end of the horizon continue at its beginning.
     if periodic:
         values = BSpline.design_matrix(t, knots, SPLINE_DEGREE).toarray()
         values[:, :SPLINE_DEGREE] += values[:, intervals:]
@@ -294,7 +294,7 @@ class Multisine:
         return np.asarray(relative_amplitudes(amplitude) * curve / np.abs(curve).max(axis=0))
 
     def _base_frequency(self, z: float) -> float:
-        """Base frequency [Hz] that leaves room for at least two harmonics, where the range of frequencies allows it."""
+        """Base frequency [Hz], low enough for at least two harmonics where the range of frequencies allows them."""
         lowest = self.settings.min_frequency
         highest = self.settings.max_frequency
         if highest <= 2.0 * lowest:

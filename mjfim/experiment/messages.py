@@ -34,7 +34,7 @@ def explain(
         keys, _ = _walk(table, fault["loc"])
         faults_by_key.setdefault(".".join(keys), []).append(fault)
 
-    # A fault inside a table is repeated for the table itself; the innermost one says most.
+    # A fault inside a table is repeated for the table itself; the innermost one is the most specific.
     innermost = [
         key
         for key in faults_by_key
@@ -58,7 +58,7 @@ def valid_keys(table: Any, hidden: Sequence[str] = ()) -> list[str]:
 
 
 def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) -> str:
-    """Say what is wrong with one key, about which every branch of a union complains."""
+    """Say what is wrong with one key, for which every branch of a union has reported a fault."""
     # A branch whose type fits but whose value does not is the one that the user meant.
     fault = next((f for f in faults if not f["type"].endswith(WRONG_TYPE)), faults[0])
 

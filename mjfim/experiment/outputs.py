@@ -91,7 +91,7 @@ class _NoiseTable:
     def __init__(
         self, components: Mapping[str, StateComponent], columns: list[str], stride: int
     ) -> None:
-        """Nothing is measured yet. stride: samples from one measurement to the next unless stated otherwise."""
+        """Begin without measured columns. stride: samples from one measurement to the next unless stated otherwise."""
         n = len(columns)
         self.columns = columns
         self.covariance = np.zeros((n, n))
@@ -141,14 +141,14 @@ class _NoiseTable:
         rows = self.places(block.outputs)
         listed = ", ".join(block.outputs)
         if len(set(rows.tolist())) < len(rows):
-            raise ExperimentError(f"correlated.outputs: an output stands there twice: {listed}")
+            raise ExperimentError(f"correlated.outputs: an output is listed twice: {listed}")
         if len(set(self.strides[rows].tolist())) > 1:
             raise ExperimentError(f"correlated.outputs: {listed} are measured at different rates")
 
         others = np.setdiff1d(np.arange(len(self.columns)), rows)
         if np.any(self.covariance[np.ix_(rows, others)]):
             raise ExperimentError(
-                "correlated.outputs: one of them is already correlated with an output outside"
+                "correlated.outputs: one of them is already correlated with an output that is not listed"
             )
 
         self.covariance[np.ix_(rows, rows)] = _checked_covariance(
@@ -224,13 +224,13 @@ def _key_covariance(key: str, spec: NoiseSpec, sigma_factors: Array) -> Array:
     n = len(sigma_factors)
     if spec.covariance is not None:
         if (sigma_factors != 1.0).any():
-            raise ExperimentError(f"{key}: orientations take one sigma [rad], no covariance")
+            raise ExperimentError(f"{key}: an orientation takes one sigma [rad] and no covariance")
         return _checked_covariance(f"{key}.covariance", spec.covariance, n)
 
     sigma = np.asarray(spec.sigma, dtype=np.float64)
     if sigma.ndim and len(sigma) != n:
         raise ExperimentError(
-            f"{key}.sigma: {len(sigma)} numbers, wanted one, or one for each of {n} components"
+            f"{key}.sigma: {len(sigma)} numbers; expected one, or one for each of {n} components"
         )
     return np.diag((sigma * sigma_factors) ** 2)
 
@@ -238,7 +238,7 @@ def _key_covariance(key: str, spec: NoiseSpec, sigma_factors: Array) -> Array:
 def _checked_covariance(key: str, rows: tuple[tuple[float, ...], ...], n: int) -> Array:
     """(n, n) stated covariance. Raises ExperimentError unless it is symmetric and positive definite."""
     if len(rows) != n or any(len(row) != n for row in rows):
-        raise ExperimentError(f"{key}: wanted {n} rows of {n} numbers, one per output")
+        raise ExperimentError(f"{key}: expected {n} rows of {n} numbers, one per output")
 
     matrix = np.array(rows, dtype=np.float64)
     if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):

@@ -63,7 +63,7 @@ def resolve_parameters(
 
     if all(parameter.nuisance for parameter in resolved):
         raise ExperimentError(
-            "parameters: all are nuisance; a design needs at least one that is wanted"
+            "parameters: all are nuisance parameters; at least one must be of interest"
         )
     return resolved
 
@@ -91,7 +91,7 @@ def _single_parameter(
             unit = unit_of(model, first.path)
 
     if guess is None:
-        raise ExperimentError(f"parameters.{name}.guess: a function needs one")
+        raise ExperimentError(f"parameters.{name}.guess: a function needs a guess")
 
     bounds = spec.bounds or (-np.inf, np.inf)
     if not bounds[0] <= guess <= bounds[1]:

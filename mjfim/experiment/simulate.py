@@ -24,10 +24,10 @@ def simulate(
         seed: Seed of the noise, or a generator of random numbers.
 
     Returns:
-        The recording; what is not measured at a sample is NaN.
+        The recording; outputs that are not measured at a sample are NaN.
 
     Raises:
-        SimulationDiverged: The simulation diverges under this control.
+        SimulationDivergedError: The simulation diverges under this control.
     """
     return simulate_system(System.resolve(experiment), trajectory, seed)
 

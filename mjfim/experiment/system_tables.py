@@ -155,7 +155,7 @@ class ParameterSpec(Section):
     )
     per_recording: bool = Field(
         default=False,
-        description="Each recording has a value of this parameter of its own. Needs `nuisance = true`.",
+        description="Each recording has a separate value of this parameter. Needs `nuisance = true`.",
     )
     wanted: Positive | None = Field(
         default=None,
@@ -266,7 +266,7 @@ class Correlated(Section):
 
 
 class Nuisance(Section):
-    """Unknowns that every experiment has but nobody asks for.
+    """Unknowns that affect the measurements but are of no interest by themselves.
 
     Each value is the standard deviation with which zero is known beforehand, or `true` where nothing is known.
     """
@@ -286,5 +286,5 @@ class Nuisance(Section):
     )
     per_recording: bool = Field(
         default=False,
-        description="Each recording has a bias and a delay of its own, as it always has its own initial state.",
+        description="Each recording has a separate bias and a separate delay. Its initial state is always separate.",
     )

@@ -1,4 +1,4 @@
-"""Names and units of the coordinates of a model: the one place where names of columns and components are made.
+"""Names and units of the coordinates of a model; the only module that makes names of columns and components.
 
 A coordinate of a slide or hinge joint is called `qpos:<joint>` and `qvel:<joint>`. Ball and free joints have parts,
 `qpos:<joint>.<part>`:
@@ -6,7 +6,7 @@ A coordinate of a slide or hinge joint is called `qpos:<joint>` and `qvel:<joint
 - columns of the state hold the orientation as a quaternion: `x y z qw qx qy qz`;
 - deviations from a state (gains, deviations of the initial state, velocities) hold a rotation vector: `x y z rx ry rz`.
 
-Activations are called `act:<actuator>`. Sensors keep MuJoCo's indices, `gyro[0]`.
+Activations are called `act:<actuator>`. Components of sensors have MuJoCo's indices, `gyro[0]`.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def control_names(model: Any) -> tuple[str, ...]:
 
 
 def control_labels(model: Any) -> tuple[str, ...]:
-    """Labels of the nu controls for axes: with the unit where the model shows it, else with `(control)`."""
+    """Labels of the nu controls for axes: with the unit where the model determines it, else with `(control)`."""
     labels: list[str] = []
     for i, name in enumerate(actuator_names(model)):
         count = int(model.actuator_ctrlnum[i])
@@ -383,5 +383,5 @@ def _names_with_parts(joint_column: str, valid: Sequence[str]) -> list[str]:
 
 
 def _indexed(name: str, count: int) -> list[str]:
-    """Names of the components of one thing: its own name where there is one, else `<name>[<i>]`."""
+    """Names of the components of one element: its name if there is one component, else `<name>[<i>]`."""
     return [name] if count == 1 else [f"{name}[{i}]" for i in range(count)]

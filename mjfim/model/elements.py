@@ -53,7 +53,7 @@ def unnamed_count(model: Any, kind: str) -> int:
 
 
 def unique_names(model: Any, kind: str) -> tuple[str, ...]:
-    """Names of all elements of a kind, no two alike.
+    """Unique names of all elements of a kind.
 
     An element without a name is called `<kind><number>`; underscores are appended where another element has that name.
 

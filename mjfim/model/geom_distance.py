@@ -1,6 +1,6 @@
 """Distances of a robot to itself and to the world at many configurations, with their slopes.
 
-Bounding spheres tell for all configurations at once which geoms could be within reach; only those ask MuJoCo.
+Bounding spheres show, for all configurations at once, which geoms could be within reach; MuJoCo is called for these only.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mjfim.model.elements import unique_names
 from mjfim.model.geom_pairs import GeomPair
 from mjfim.model.pair_distance import INFINITE_DISTANCE, Indices, PairDistances
 
-# Bounds of distances that are held in memory at a time; more configurations are taken in blocks.
+# Largest number of bounds that are held in memory at once; more configurations are processed in blocks.
 MAX_BOUNDS_AT_ONCE = 1 << 18
 
 
@@ -49,10 +49,10 @@ class GeomDistances:
     def __init__(
         self, model: Any, chosen: Sequence[GeomPair], reach: float, grouped: bool = True
     ) -> None:
-        """Prepare for pairs of a model.
+        """Prepare the computation for pairs of geoms of a model.
 
         Args:
-            model: The model (`mujoco.MjModel`), which is copied; mocap bodies stay where it puts them.
+            model: The model (`mujoco.MjModel`), which is copied; mocap bodies keep the poses that it states.
             chosen: Pairs by `find_geom_pairs`, at least one.
             reach: Distance beyond which nothing is measured [m].
             grouped: Columns are pairs of bodies (the minimum over their pairs of geoms) instead of pairs of geoms.
@@ -70,7 +70,7 @@ class GeomDistances:
             )
         self.reach = float(reach)
 
-        # Pairs of one column stand together, columns in the order in which they first appear.
+        # Pairs of one column are adjacent, columns in the order in which they first appear.
         body = model.geom_bodyid
         keys = [
             (int(body[p.first]), int(body[p.second])) if grouped else (p.first, p.second)
@@ -136,7 +136,7 @@ class GeomDistances:
         bounds, _ = self._distances.lower_bounds(positions, frames)
         best, row, pair = np.inf, 0, self.pairs[0]
 
-        # In the order of their bounds, until a bound exceeds the smallest distance so far.
+        # Measure in ascending order of the bounds, until a bound exceeds the smallest distance so far.
         ascending = np.unravel_index(np.argsort(bounds, axis=None), bounds.shape)
         for k, p in zip(*ascending, strict=True):
             distance = float(bounds[k, p])
@@ -150,7 +150,7 @@ class GeomDistances:
         return best, row, pair
 
     def _block(self, qpos: Array, slopes: bool) -> SignedDistances:
-        """As `__call__`, of configurations (n, nq) whose bounds fit into memory."""
+        """Distances at configurations: (n, nq) whose bounds fit into memory. See `__call__`."""
         finite = np.asarray(np.isfinite(qpos).all(axis=1))
         safe = np.where(finite[:, None], qpos, self._model.qpos0)
         positions, frames, screws = self._poses(safe, slopes)

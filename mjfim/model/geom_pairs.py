@@ -12,7 +12,7 @@ import mujoco
 from mjfim.errors import ExperimentError, unknown
 from mjfim.model.elements import element_name, unique_names
 
-# Types of geoms to which MuJoCo has no reliable distance, in words.
+# Types of geoms for which MuJoCo has no reliable distance, in words.
 REFUSED_TYPES = {
     int(mujoco.mjtGeom.mjGEOM_HFIELD): "height field",
     int(mujoco.mjtGeom.mjGEOM_SDF): "signed distance field",
@@ -25,7 +25,7 @@ class GeomPair:
 
     Attributes:
         first: Number of a geom that can move.
-        second: Number of the other geom; one that cannot move stands here.
+        second: Number of the other geom; a geom that cannot move is always the second one.
         name: Name of the pair, `<geom> - <geom>`.
     """
 
@@ -37,9 +37,9 @@ class GeomPair:
 def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[GeomPair, ...]:
     """All pairs of geoms that move relative to each other and that MuJoCo would let collide, contacts enabled or not.
 
-    As MuJoCo selects: no geoms of bodies welded together, of parent and child (unless the parent is fixed in the world or the
-    flag filterparent is off) or of an `<exclude>`; contype and conaffinity must match. An explicit `<pair>` overrules all of
-    these. Flexes have no geoms and are left out.
+    The selection is MuJoCo's: no geoms of bodies welded together, of parent and child (unless the parent is fixed in
+    the world or the flag filterparent is off) or of an `<exclude>`; contype and conaffinity must match. An explicit
+    `<pair>` overrules all of these. Flexes have no geoms and are left out.
 
     Args:
         model: The model (`mujoco.MjModel`).
@@ -83,11 +83,11 @@ def _check_ignored(ignored: Collection[frozenset[str]], bodies: tuple[str, ...])
 
 
 def _check_type(model: Any, geom: int, label: str, first_body: str, second_body: str) -> None:
-    """Raise where MuJoCo has no reliable distance to a geom. first_body, second_body: bodies of its pair."""
+    """Raise where MuJoCo has no reliable distance for a geom. first_body, second_body: bodies of its pair."""
     refused = REFUSED_TYPES.get(int(model.geom_type[geom]))
     if refused is not None:
         raise ExperimentError(
-            f"clearance: {label} is a {refused}, to which MuJoCo knows no reliable distance; ignore the bodies "
+            f"clearance: {label} is a {refused}, for which MuJoCo has no reliable distance; ignore the bodies "
             f"{first_body!r} and {second_body!r}, or use boxes or meshes"
         )
 
@@ -96,7 +96,7 @@ class _Selection:
     """MuJoCo's selection of pairs of geoms that may collide."""
 
     def __init__(self, model: Any) -> None:
-        """Read what the selection rests on from a model."""
+        """Read from a model the properties on which the selection depends."""
         self._model = model
         self._body = model.geom_bodyid.tolist()
         self._tree = model.body_treeid.tolist()
@@ -132,7 +132,7 @@ class _Selection:
         return self._bits_match(first, second)
 
     def _are_parent_and_child(self, a: int, b: int) -> bool:
-        """Whether MuJoCo filters two bodies as parent and child; what is fixed in the world is nobody's parent."""
+        """Whether MuJoCo filters two bodies as parent and child; a body that is fixed in the world does not count as a parent."""
         if not self._filters_parents:
             return False
         a = self._weld[a]

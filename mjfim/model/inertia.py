@@ -42,7 +42,7 @@ class BodyInertia:
 
     @staticmethod
     def from_principal(mass: float, com: Array, moments: Array, quaternion: Array) -> BodyInertia:
-        """From MuJoCo's principal moments.
+        """Build an inertia from MuJoCo's principal moments.
 
         Args:
             mass: Mass [kg].
@@ -130,7 +130,7 @@ def to_logcholesky(body: BodyInertia) -> Array:
 
 
 def from_logcholesky(values: Array) -> BodyInertia:
-    """Inverse of `to_logcholesky`; physical for every values: (10,)."""
+    """Inverse of `to_logcholesky`; the result is physical for any values: (10,)."""
     U = np.diag(np.exp(values[1:4]))
     U[0, 1] = values[4]
     U[1, 2] = values[5]
@@ -160,7 +160,7 @@ def _steiner(mass: float, com: Array) -> Array:
 
     Args:
         mass: The mass [kg].
-        com: (3,) its place [m].
+        com: (3,) its position [m].
     """
     squared = com @ com
     return np.asarray(mass * (squared * np.eye(3) - np.outer(com, com)))

@@ -31,7 +31,7 @@ def compile_spec(spec: Any, path: Path) -> Any:
         raise ModelError(f"{path}: MuJoCo cannot compile the model: {str(error).strip()}") from None
 
 
-# Compiled models of edited specs that a source keeps. They are small; a search revisits few parameter values.
+# Largest number of compiled models of edited specs that a source keeps; a search revisits few parameter values.
 MAX_EDITED_MODELS = 512
 
 
@@ -43,7 +43,7 @@ class ModelSource:
     Attributes:
         path: The MJCF file.
         spec: The parsed model (MjSpec), never changed.
-        model: The user's model (MjModel) as it compiles, never changed.
+        model: The user's compiled model (MjModel), never changed.
     """
 
     def __init__(self, path: Path, spec: Any = None) -> None:
@@ -85,7 +85,7 @@ class ModelSource:
 
         Args:
             moved_bodies: As for `compiled`.
-            key: Names the edit; the same key gives the same model again.
+            key: Identifies the edit; for a known key the kept model is returned.
             edit: Changes an MjSpec in place.
 
         Returns:
@@ -113,7 +113,7 @@ class ModelSource:
 
 
 def decoration(spec: Any, model: Any) -> frozenset[str]:
-    """Names of geoms that neither collide nor give their body its inertia: their size and place move nothing else."""
+    """Names of geoms without collisions and without influence on inertia: their size and position affect nothing else."""
     forced = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     return frozenset(

@@ -1,4 +1,4 @@
-"""MuJoCo's own warnings, kept off the console and out of log files where mjfim reports trouble by value."""
+"""Suppression of MuJoCo's warnings on the console and in log files, where mjfim reports problems by return values."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import mujoco
 # Guards the settings of MuJoCo's log, which all threads share.
 _lock = Lock()
 
-# One entry for each block that is open in any thread: the settings from before the first of them.
+# One entry for each block that is open in any thread: the settings before the first of them.
 _open_blocks: list[Any] = []
 
 
 @contextmanager
 def silence_mujoco_log() -> Iterator[None]:
-    """No MuJoCo message inside the block.
+    """Suppress MuJoCo's messages inside the block.
 
-    The settings from before come back when the last open block of all threads ends.
+    The previous settings are restored when the last open block of all threads ends.
 
     Yields:
         Nothing.

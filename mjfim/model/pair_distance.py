@@ -1,10 +1,11 @@
-"""Distances of single pairs of geoms, asked of MuJoCo only in the ways in which its answers are right.
+"""Distances of single pairs of geoms, computed by MuJoCo only where its results are correct.
 
-Where `mj_geomDistance` is wrong it is not asked:
+`mj_geomDistance` is not used where it is wrong:
 
-- planes are exact here (MuJoCo takes a wrong corner of a box that stands on its edge);
-- capsules in boxes are asked about their axis (the primitive collider reports deep penetration as separation);
-- geoms that touch are parted a little to see the normal of their surfaces.
+- distances to planes are computed exactly here (MuJoCo takes a wrong corner of a box that stands on its edge);
+- between a capsule and a box, MuJoCo measures the capsule's axis, and the radius is subtracted (the primitive collider
+  reports deep penetration as separation);
+- geoms that touch are moved apart a little to find the normal of their surfaces.
 
 Height fields and signed distance fields are refused (`mjfim.model.geom_pairs`).
 """
@@ -46,10 +47,10 @@ INFINITE_DISTANCE = 1e6
 # Radius of a capsule's axis [m]; with radius 0 the collider now and then reports deep penetration as touching.
 AXIS_RADIUS = 1e-9
 
-# Distance below which the nearest points of two surfaces do not show their normal [m].
+# Distance below which the nearest points of two surfaces do not determine their normal [m].
 TOUCHING_DISTANCE = 1e-8
 
-# Distance by which touching geoms are parted to see the normal [m].
+# Distance by which touching geoms are moved apart to find the normal [m].
 PARTING_DISTANCE = 1e-5
 
 
@@ -64,7 +65,7 @@ class PairDistances:
     """
 
     def __init__(self, model: Any, pairs: Sequence[GeomPair]) -> None:
-        """Prepare for pairs of a model, which is copied."""
+        """Prepare the computation for pairs of geoms of a model, which is copied."""
         self._model = copy.copy(model)
         self._model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         self._model.opt.ccd_tolerance = min(self._model.opt.ccd_tolerance, CCD_TOLERANCE)
@@ -83,13 +84,13 @@ class PairDistances:
         bounding_radii = self._model.geom_rbound
         self._radii = bounding_radii[self.first] + bounding_radii[self.second]
 
-        # A capsule and a box are asked about the capsule's axis; its radius is taken off the answer.
+        # Between a capsule and a box MuJoCo measures the capsule's axis; the radius is subtracted from the distance.
         by_axis = (np.sort(kinds, axis=0) == [[CAPSULE], [BOX]]).all(axis=0)
         capsule = np.where(kinds[0] == CAPSULE, self.first, self.second)
         self._axis_offset = np.where(by_axis, self._model.geom_size[capsule, 0], 0.0)
         axis_model = _with_capsule_axes(self._model)
 
-        # All that a call of MuJoCo needs, pair by pair.
+        # Arguments of MuJoCo's function, pair by pair.
         self._calls = [
             (axis_model if axis else self._model, pair.first, pair.second, float(offset))
             for pair, axis, offset in zip(pairs, by_axis, self._axis_offset, strict=True)
@@ -211,7 +212,7 @@ class PairDistances:
         return np.asarray(normals / np.where(length > 0.0, length, 1.0))
 
     def _normal_when_parted(self, p: int, positions: Array, frames: Array, reach: float) -> Array:
-        """(3,) vector from the first to the second geom of a touching pair, after they are parted a little."""
+        """(3,) vector from the first to the second geom of a touching pair, after they are moved apart a little."""
         model, first, second, offset = self._calls[p]
         parted = positions.copy()
         between = parted[second] - parted[first]

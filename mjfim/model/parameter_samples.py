@@ -12,10 +12,10 @@ from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.model.parameters import Parameter, ParameterSet
 
-# Standard deviations within which samples of a prior keep.
+# Largest deviation of a sample from the centre of its prior [standard deviations].
 MAX_DEVIATION = 2.5
 
-# How often the distance of a sample from the guess is halved until its bodies are physical; then it is set to zero.
+# Number of times that the distance of a sample from the guess is halved until its bodies are physical; then it is set to zero.
 MAX_HALVINGS = 20
 
 # Smallest share of a scalar's value that a sample of its prior keeps, so that it does not change its sign.
@@ -31,9 +31,9 @@ def sample_parameters(
 ) -> Array:
     """Sample the parameters: theta itself, then a Latin hypercube over priors (normal) or bounds (uniform).
 
-    Normal samples keep within the bounds, within 2.5 standard deviations, and do not change the sign of a scalar (a mass, a
+    Normal samples stay within the bounds, within 2.5 standard deviations, and do not change the sign of a scalar (a mass, a
     damping). Parameters with neither prior nor bounds, and those outside the model, stay at theta. Where bodies of a sample
-    are unphysical, the parameters that determine them go half of their way back to theta until they are physical.
+    are unphysical, the distance of the parameters that determine them from theta is halved until they are physical.
 
     Args:
         parameters: The parameters.
@@ -105,7 +105,7 @@ def _make_physical(
         sample[columns] = 0.5 * (sample[columns] + theta[columns])
 
     while columns := list(unphysical(sample)):
-        # At theta itself nothing is left to move.
+        # A sample at theta cannot be moved any closer.
         if np.array_equal(sample[columns], theta[columns]):
             return
         sample[columns] = theta[columns]

@@ -1,7 +1,7 @@
 """The only writer of parameter values into models.
 
-Values are written into private copies in place, followed by `mj_setConst`. What only a compile can follow (sizes of geoms,
-functions of an MjSpec) is compiled anew. Tests hold one against the other.
+Values are written into private copies in place, followed by `mj_setConst`. Values that need a compile (sizes of
+geoms, functions of an MjSpec) are written into an MjSpec, which is compiled anew. Tests compare both ways.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from mjfim.model.variants import PlantModel
 if TYPE_CHECKING:
     from mjfim.model.parameters import ParameterSet
 
-# How much the largest principal moment of inertia may exceed the sum of the other two, relative to it: the moments of a
-# plate or rod are often typed with few digits.
+# Relative amount by which the largest principal moment of inertia may exceed the sum of the other two: the moments of a
+# plate or rod are often stated with few digits.
 MOMENT_ROUNDING = 1e-6
 
 
@@ -34,7 +34,7 @@ class ParameterWriter:
     """Writes values theta: (p,) of a set of parameters into models."""
 
     def __init__(self, parameters: ParameterSet) -> None:
-        """Prepare for a set of parameters."""
+        """Prepare the writer for a set of parameters."""
         self._parameters = parameters
         self._scratch: Any = None
 
@@ -68,11 +68,11 @@ class ParameterWriter:
     def write(self, model: Any, theta: Array) -> None:
         """Write theta: (p,) into a model that the caller owns, in place, then recompute MuJoCo's derived constants.
 
-        What needs a compile is not written here (`model`).
+        Values that need a compile are not written here, but by `model`.
         """
         mocap = self._parameters.mocap
 
-        # MuJoCo derives constants from the places at which mocap bodies compile.
+        # MuJoCo derives constants from the compiled poses of mocap bodies.
         if mocap is not None:
             mocap.put(model, mocap.compiled)
 
@@ -93,7 +93,7 @@ class ParameterWriter:
     def unphysical_bodies(
         self, base: PlantModel | Any, theta: Array
     ) -> list[tuple[tuple[int, ...], str]]:
-        """Bodies whose inertia at theta no body can have.
+        """Bodies whose inertia at theta is unphysical.
 
         Args:
             base: A `PlantModel`, or an MjModel where nothing needs a compile.
@@ -132,8 +132,8 @@ class ParameterWriter:
         """Write every single number in place.
 
         Returns:
-            What is written as a whole: (10,) coordinates of inertias by (parametrisation, body), and (3,) rotation vectors by
-            (array, row).
+            Values that are written as a whole: (10,) coordinates of inertias by (parametrisation, body), and (3,)
+            rotation vectors by (array, row).
         """
         p = self._parameters
         whole: dict[tuple[str, int], Array] = {}
@@ -183,7 +183,7 @@ class ParameterWriter:
 def _write_inertia(model: Any, body: int, kind: str, values: Array) -> None:
     """Set the inertia of a body from its coordinates: (10,) in a parametrisation, in place.
 
-    The central parametrisation leaves mass and centre of mass to their own fields.
+    With the central parametrisation, mass and centre of mass are written separately, as numbers of their fields.
     """
     inertia = INERTIA_PARAMETRISATIONS[kind].inertia(values)
     moments, quaternion = inertia.principal_axes()
@@ -199,9 +199,9 @@ def _write_inertia(model: Any, body: int, kind: str, values: Array) -> None:
 
 
 def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> str:
-    """Words that say why no body can have this inertia; empty where a body can.
+    """Reason why this inertia is unphysical, in words; empty where it is physical.
 
-    A body that is fixed to others with mass may itself have none.
+    A body that is welded to bodies with mass may be massless.
 
     Args:
         model: The model with the numbers of theta.
@@ -236,5 +236,5 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> st
     listed = ", ".join(f"{moment:.4g}" for moment in moments)
     wanted = "all must be > 0"
     if moments[0] >= least:
-        wanted = "the smaller two must add up to the largest at least (its pseudo-inertia is not positive semidefinite)"
+        wanted = "the sum of the smaller two must be at least the largest (its pseudo-inertia is not positive semidefinite)"
     return f"principal moments of inertia {listed} kg m²; {wanted}"

@@ -52,7 +52,7 @@ class Target:
     Attributes:
         path: Parameter path of the number.
         scale: Factor of the parameter.
-        offset: What is added [unit of the number].
+        offset: Constant that is added [unit of the number].
     """
 
     path: str
@@ -115,8 +115,8 @@ class ParameterSet:
     Attributes:
         parameters: The parameters.
         fields: For each parameter, the fields that its targets lead to.
-        nominal: Values in the model of what is written as a whole: (10,) coordinates of an inertia by (parametrisation,
-            body), (4,) quaternions by (array, row).
+        nominal: Values in the model of quantities that are written as a whole: (10,) coordinates of an inertia by
+            (parametrisation, body), (4,) quaternions by (array, row).
         mocap: Where mocap bodies start; None where they start as compiled.
     """
 
@@ -143,7 +143,7 @@ class ParameterSet:
             mocap: Where mocap bodies start; None where they start as compiled.
 
         Raises:
-            ExperimentError: A target leads nowhere, or two parameters contradict each other; the message names them.
+            ExperimentError: A target does not exist, or two parameters contradict each other; the message names them.
         """
         resolved: list[tuple[TargetField, ...]] = []
         for parameter in parameters:
@@ -281,7 +281,7 @@ class ParameterSet:
         return np.array([p.function is not None for p in self.parameters], dtype=bool)
 
     def _values(self, pick: Callable[[Parameter], float]) -> Array:
-        """(p,) one number of every parameter."""
+        """(p,) values of one attribute of all parameters."""
         return np.array([pick(p) for p in self.parameters])
 
     def _has_field(self, kinds: type | tuple[type, ...]) -> np.ndarray:
@@ -381,7 +381,7 @@ def _require_one_owner(
             if other is not None:
                 raise _parameter_error(
                     parameter,
-                    f"target {target.path!r} already belongs to parameters.{other}; one number takes one parameter",
+                    f"target {target.path!r} already belongs to parameters.{other}; two parameters cannot set one number",
                 )
 
             owner_of_field[target_field] = parameter.name
@@ -391,7 +391,7 @@ def _require_one_owner(
 def _require_movable(
     model: Any, parameter: Parameter, target_field: TargetField, mocap: MocapPlacement | None
 ) -> None:
-    """Raise where a parameter moves a mocap body whose place a keyframe states."""
+    """Raise where a parameter moves a mocap body whose pose a keyframe states."""
     if isinstance(target_field, RotationField):
         array, row = target_field.array, target_field.row
     elif isinstance(target_field, ModelField):
@@ -403,8 +403,8 @@ def _require_movable(
         name = element_name(model, "body", row)
         raise _parameter_error(
             parameter,
-            f"the keyframe states where mocap body {name!r} is; take its mpos and mquat out of the keyframe, or the "
-            "parameter out of the experiment",
+            f"the keyframe states the pose of mocap body {name!r}; remove its mpos and mquat from the keyframe, or the "
+            "parameter from the experiment",
         )
 
 

@@ -186,7 +186,7 @@ def resolve(
             changed without a compile.
 
     Raises:
-        ExperimentError: The path leads nowhere; the message lists the valid kinds, names, fields or indices.
+        ExperimentError: The path names nothing in the model; the message lists the valid kinds, names, fields or indices.
     """
     path = ParameterPath.parse(text)
     if path.kind not in KINDS:
@@ -217,7 +217,7 @@ def unit_of(model: Any, text: str) -> str:
         return INERTIA_PARAMETRISATIONS[parametrisation].units[first + path.component]
 
     if path.kind == "initial":
-        # An index [0] may stand on coordinates that have one component.
+        # Coordinates with one component may have the index [0].
         plain = text.removesuffix("[0]")
         return next((c.unit for c in tangent_components(model) if c.path == plain), "")
 
@@ -339,7 +339,7 @@ def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
     bias = model.actuator_biasprm[actuator]
     rows = (actuator,)
 
-    # The gain of a PID actuator itself is the integral one; kp and kv stand in its bias.
+    # The gain of a PID actuator is its integral gain; kp and kv are entries of its bias.
     if int(model.actuator_gaintype[actuator]) == int(mujoco.mjtGain.mjGAIN_PID):
         column = {"kp": 1, "kv": 2}[path.field]
         return ModelField(array="actuator_biasprm", rows=rows, column=column, factor=-1.0)
@@ -373,7 +373,7 @@ def _array_field(model: Any, path: ParameterPath, number: int) -> ModelField:
     else:
         path.component_of(1)
 
-    # A rest length without an index stands for both ends of the range where these are equal.
+    # A rest length without an index sets both ends of the range where these are equal.
     one_length = path.field == "springlength" and holder[number, 0] == holder[number, 1]
     if one_length and path.index is None:
         follower = (array, number, 1, 1.0)

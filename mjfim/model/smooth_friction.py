@@ -1,9 +1,10 @@
 """Dry friction, smoothed near zero velocity so that derivatives of a trajectory exist.
 
 The engine's dry friction changes its sign from one step to the next, and sticks for some steps. The information of a
-trajectory then jumps by that of such a step, and no small difference shows it. Smoothed friction is the viscous force that
-saturates, `f clip(v / s, -1, 1)`. It is nearly the engine's where joints move, and smooth where they reverse: at a speed s
-that takes several steps to cross it averages over them.
+trajectory then jumps by the contribution of such a step, and small differences do not show the jump. Smoothed
+friction is a viscous force that saturates, `f clip(v / s, -1, 1)`. It is nearly the engine's friction where joints
+move, and smooth where they reverse: a joint stays below the speed s for several engine steps, over which the force
+averages.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from mjfim.arrays import Array
 # Smoothing speed s of a degree of freedom over its fastest speed.
 SMOOTHING_SPEED_FRACTION = 0.02
 
-# Impedance of the smoothed friction constraint, so low that it answers velocities and not accelerations.
+# Impedance of the smoothed friction constraint, so low that the force follows velocities and not accelerations.
 SMOOTHED_IMPEDANCE = 1e-3
 
 # Smallest impedance that MuJoCo uses.
@@ -78,7 +79,7 @@ def smooth_dry_friction(model: Any, speeds: tuple[float, ...]) -> None:
         s, remaining = remaining[: len(loss)], remaining[len(loss) :]
         smoothed = (loss > 0.0) & (s > 0.0)
 
-        # A longer timestep bears no steeper law.
+        # A steeper law would be unstable with this timestep.
         s = np.maximum(s, loss * weight * model.opt.timestep)
 
         resistance = (1.0 - SMOOTHED_IMPEDANCE) / SMOOTHED_IMPEDANCE * weight

@@ -1,4 +1,4 @@
-"""Parameter values written into an MjSpec, for what only a compile can follow and for the identified MJCF."""
+"""Parameter values written into an MjSpec, for values that need a compile and for the identified MJCF."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ def write_element(spec: Any, compiled: Any, wanted: Any, text: str, value: float
 
     Args:
         spec: The spec (`mujoco.MjSpec`).
-        compiled: The model of this spec. A body whose inertia came from geoms gets it stated before it is changed.
+        compiled: The model of this spec. Where the inertia of a body comes from geoms, it is stated explicitly
+            before it is changed.
         wanted: The model at the values, from which inertias and orientations are taken as a whole.
         text: The parameter path. Paths of the initial state and of the measurement write nothing.
         value: The value of the number.
@@ -45,7 +46,7 @@ def write_element(spec: Any, compiled: Any, wanted: Any, text: str, value: float
         element.gainprm = wanted.actuator_gainprm[element.id]
         element.biasprm = wanted.actuator_biasprm[element.id]
     elif path.field == "springlength":
-        # One rest length may stand for both ends of the range.
+        # One rest length may set both ends of the range.
         element.springlength = wanted.tendon_lengthspring[element.id]
     else:
         _write_number(spec, compiled, element, path, value)
@@ -84,7 +85,7 @@ def _assign(element: Any, field: str, index: int, value: float) -> None:
 
 
 def leave_frame(element: Any, found: Any, text: str) -> None:
-    """Give the place of an element in the coordinates of its body instead of those of a `<frame>`.
+    """State the pose of an element in the coordinates of its body instead of those of a `<frame>`.
 
     Args:
         element: The element of the spec, changed in place.
@@ -159,7 +160,7 @@ def state_derived_values(spec: Any, compiled: Any) -> None:
 
 
 def _with_first(polynomial: Any, value: float) -> Array:
-    """The coefficients of a polynomial with another first one."""
+    """The coefficients of a polynomial, of which the first one is replaced."""
     changed = np.array(polynomial, dtype=np.float64)
     changed[0] = value
     return changed

@@ -40,7 +40,7 @@ class ModelField:
         rows: Rows that all take the number. Scalar options ignore them.
         column: Column of the number; None for arrays with one dimension.
         in_options: Whether the array belongs to `model.opt`.
-        factor: What stands in the array is this times the value.
+        factor: The array holds this factor times the value.
         followers: Further numbers (array, row, column, factor) that are written with it, as the bias of a servo follows
             its gain.
     """
@@ -137,7 +137,7 @@ class InertiaField:
 
 
 class DeviationField:
-    """A number that is counted from the stated model, so that its value there is zero.
+    """A difference from the stated model, so that its value there is zero.
 
     Attributes:
         natural_magnitude: Size with which a change is compared, in the unit of the number.

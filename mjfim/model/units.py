@@ -1,6 +1,6 @@
 """Units of joints, sensors, controls and model fields: every unit table of the package.
 
-The units of the ten inertial parameters of a body stand with their definition in `mjfim.model.inertia`.
+The units of the ten inertial parameters of a body are defined in `mjfim.model.inertia`.
 """
 
 from __future__ import annotations

@@ -15,10 +15,10 @@ from mjfim.errors import ExperimentError, ModelError
 from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource, unconstrained
 from mjfim.model.smooth_friction import smooth_dry_friction
 
-# Tolerance of the constraint solver in private copies: differences of steps see what a solver leaves undone.
+# Tolerance of the constraint solver in private copies: differences of steps would show the error that a solver leaves.
 SOLVER_TOLERANCE = 1e-14
 
-# Sizes on which the layout of MjData rests. A model with other sizes would write past the end of it.
+# Sizes that determine the layout of MjData. A model with other sizes would write beyond the end of its arrays.
 LAYOUT = (
     "nq",
     "nv",
@@ -49,9 +49,9 @@ class ModelVariant:
     """How the plant of a search differs from the user's model.
 
     Attributes:
-        sample_factor: Timestep and sample period are this many times longer than stated.
-        timestep_factor: The timestep alone is this many times longer; a sample has as many times fewer engine steps.
-        relaxed: Without the clamps, stops and contacts that hard limits keep a design away from.
+        sample_factor: Factor by which timestep and sample period are longer than stated.
+        timestep_factor: Factor by which the timestep alone is longer; a sample has correspondingly fewer engine steps.
+        relaxed: True where clamps, stops and contacts are removed; hard limits keep a design away from them.
         smoothing_speeds: Speed of every degree of freedom, then of every tendon, below which dry friction is viscous
             where derivatives are taken; empty for the engine's own friction. [rad/s or m/s]
         smoothed: Dry friction is viscous below these speeds in the motion as well, not only in its derivatives.
@@ -70,14 +70,14 @@ RELAXED = ModelVariant(relaxed=True)
 
 @dataclass(frozen=True, eq=False)
 class MocapPlacement:
-    """Where a keyframe puts mocap bodies.
+    """Poses of mocap bodies that a keyframe states.
 
-    MjData starts from the places that stand in the model, so the keyframe's are written over the compiled ones. MuJoCo
-    derives constants of equalities and tendons from the compiled places, which must stand in the model meanwhile.
+    MjData takes its initial poses from the model, so the keyframe's poses overwrite the compiled ones. MuJoCo
+    derives constants of equalities and tendons from the compiled poses, which must be in the model while it does so.
 
     Attributes:
         bodies: (n,) ids of the bodies.
-        compiled: (n, 7) position [m] and quaternion (w, x, y, z) at which they compile.
+        compiled: (n, 7) position [m] and quaternion (w, x, y, z) as compiled.
         start: (n, 7) position [m] and quaternion (w, x, y, z) of the keyframe.
     """
 
@@ -87,7 +87,7 @@ class MocapPlacement:
 
     @staticmethod
     def of(model: Any, key: Any) -> MocapPlacement | None:
-        """Placement by a keyframe (`model.key(name)` or None); None where it moves no mocap body."""
+        """Poses that a keyframe states (`model.key(name)` or None); None where it moves no mocap body."""
         if key is None or model.nmocap == 0:
             return None
 
@@ -112,11 +112,11 @@ class Relaxation:
     """Clamps, stops and dry friction that are changed in a private copy, because they hide derivatives.
 
     Attributes:
-        joints: Ids of joints whose range is taken out.
-        joint_forces: Ids of joints whose limit of actuator force is taken out.
-        actuators: Ids of actuators whose force range is taken out.
-        controls: Whether all control ranges are taken out.
-        contacts: Whether all contacts are taken out.
+        joints: Ids of joints whose range is removed.
+        joint_forces: Ids of joints whose limit of actuator force is removed.
+        actuators: Ids of actuators whose force range is removed.
+        controls: Whether all control ranges are removed.
+        contacts: Whether all contacts are removed.
         smoothing_speeds: Speeds below which dry friction is viscous; empty for the engine's own friction.
     """
 
@@ -146,9 +146,9 @@ class PlantModel:
         moved_bodies: Bodies whose inertial frame parameters change, None where any of them may.
         sensors: Whether sensor data is wanted; MuJoCo skips the computation otherwise.
         friction: Whether a parameter is a frictionloss, so that the constraint solver must stay on.
-        timestep_factor: The timestep is this many times longer than stated.
-        mocap: Where mocap bodies start; None for the places at which they compile.
-        relaxation: What is taken out of the copy; None for nothing.
+        timestep_factor: Factor by which the timestep is longer than stated.
+        mocap: Initial poses of mocap bodies; None for the compiled poses.
+        relaxation: Clamps, stops and friction that are changed in the copy; None for no change.
 
     Attributes:
         model: The compiled copy (MjModel).
@@ -184,12 +184,12 @@ class PlantModel:
         """The model of an edited spec, kept under a key.
 
         Args:
-            key: Names the edit; the same key gives the same model again.
+            key: Identifies the edit; for a known key the kept model is returned.
             edit: Changes an MjSpec in place.
 
         Raises:
             ModelError: It no longer compiles, or its sizes change.
-            ExperimentError: The timestep changes, on which rate and samples rest.
+            ExperimentError: The timestep changes, which determines the samples.
         """
         if key not in self._edited:
             if len(self._edited) >= MAX_EDITED_MODELS:
@@ -200,7 +200,7 @@ class PlantModel:
         return self._edited[key]
 
     def refresh(self, model: Any) -> Any:
-        """Write anew, in place, what rests on parameters that were written into a copy of this model."""
+        """Write again, in place, the settings that depend on parameters written into a copy of this model."""
         if self.smoothing_speeds:
             smooth_dry_friction(model, self.smoothing_speeds)
         return model
@@ -219,7 +219,7 @@ class PlantModel:
         if compiled.opt.timestep != stated.opt.timestep:
             raise ExperimentError(
                 f"parameters: a function changes option.timestep of {path} from {stated.opt.timestep:g} s to "
-                f"{compiled.opt.timestep:g} s; rate and samples rest on it: state the timestep in the MJCF"
+                f"{compiled.opt.timestep:g} s; it determines the samples: state the timestep in the MJCF"
             )
 
     def _adapted(self, compiled: Any) -> Any:
@@ -237,7 +237,7 @@ class PlantModel:
 
         model.opt.timestep *= self._timestep_factor
 
-        # Differences of steps must not see where the solver starts from, nor what it leaves undone.
+        # Differences of steps must depend neither on the solver's initial guess nor on the error that it leaves.
         model.opt.tolerance = min(model.opt.tolerance, SOLVER_TOLERANCE)
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
 

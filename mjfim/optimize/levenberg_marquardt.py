@@ -19,7 +19,7 @@ from mjfim.optimize.condensed_least_squares import Condensed, Step
 # Damping of the first step, relative to the squared column norms of the Jacobian.
 INITIAL_DAMPING = 1e-3
 
-# Damping of the step that predicts how far away the minimum is; nearly none.
+# Damping (nearly zero) of the step whose length estimates the distance to the minimum.
 WEAK_DAMPING = 1e-6
 
 # Damping above which the search gives up: no step lowers the cost.

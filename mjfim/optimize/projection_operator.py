@@ -26,7 +26,7 @@ ROUND_OFF = 1e-12
 # A step is shortened at least to this fraction of its predecessor in the line search; the largest fraction is a setting.
 MIN_SHORTENING = 0.1
 
-# The first step may promise a decrease of at most this many times the scale of the cost.
+# Largest predicted decrease of the first step length that is tried, relative to the scale of the cost.
 MAX_PREDICTED_DECREASE = 2.0
 
 
@@ -300,13 +300,13 @@ def optimize(
 
         yield iterate
 
-        # A step that promises to lose more than twice J is too long to try.
+        # The linear model is wrong for a step that predicts a decrease of more than twice J: begin with a shorter one.
         found = None
         if slope < 0.0:
             first = min(1.0, -MAX_PREDICTED_DECREASE * size / slope)
             found = armijo.search(problem, point, zeta, slope, K, first)
 
-        # Without a shorter step that helps: refine the derivatives, then clear the memory, then give up.
+        # If no step length lowers J: refine the derivatives, then clear the memory, then end.
         if found is None:
             better = problem.refine(point)
             if better is not None:

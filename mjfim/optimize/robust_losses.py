@@ -31,7 +31,7 @@ class RobustLoss:
 
     @property
     def outlier_threshold(self) -> float:
-        """Residual [standard deviations] beyond which it says nothing about the noise; infinite without a robust loss."""
+        """Residual [standard deviations] beyond which it counts as an outlier; infinite without a robust loss."""
         return np.inf if self.kind == "linear" else max(self.scale, MIN_OUTLIER_THRESHOLD)
 
     @property

@@ -327,7 +327,7 @@ class StructuredBFGS:
             self.damping = max(self.damping, MIN_DAMPING) * factor
             zeta, relative_length = self._damped_curve(here)
 
-        # Whatever damping did not achieve is achieved by scaling.
+        # A step that is still too long after all trials of the damping is scaled down.
         fraction = 1.0 / max(relative_length, 1.0)
         self._proposed = TangentCurve(z=fraction * zeta.z, v=fraction * zeta.v)
         return self._proposed

@@ -1,7 +1,7 @@
 """Designs, recordings and controls on disk, with the columns that a robot's controller and other programs read.
 
-The records themselves know how they are saved and loaded (`mjfim.records.serialization`); this module adds the tables for
-which the experiment must be known: design.csv, reference.csv, recordings and controls as CSV.
+`mjfim.records.serialization` saves and loads the records; this module adds the tables that need the experiment:
+design.csv, reference.csv, recordings and controls as CSV.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _trajectory(path: Path, prefix: str, arrays: Mapping[str, np.ndarray]) -> Tr
         if array.ndim != wanted_dimensions or len(array) != wanted_rows:
             wanted = f"({wanted_rows},)" if key == "t" else f"({wanted_rows}, columns)"
             raise RecordingError(
-                f"{path}: array '{prefix}{key}' has shape {array.shape}, wanted {wanted}"
+                f"{path}: array '{prefix}{key}' has shape {array.shape}, expected {wanted}"
             )
     return Trajectory(**{key: arrays[prefix + key] for key in TRAJECTORY_ARRAYS})
 

@@ -1,4 +1,4 @@
-"""Folders of results: which files every verb leaves there, and how earlier ones are found."""
+"""Folders of results: which files every verb writes there, and how earlier ones are found."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ def leave_study(folder: Path, study: MonteCarloStudy, system: System) -> None:
 
 
 def _clear(folder: Path, names: str) -> None:
-    """Remove what an earlier run could have left, by the exact names."""
+    """Remove the files that an earlier run may have written, by their exact names."""
     for stale in list(folder.iterdir()):
         if re.fullmatch(names, stale.name):
             stale.unlink()

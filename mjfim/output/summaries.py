@@ -85,7 +85,9 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
     )
     if design.nuisance:
         names = ", ".join(design.nuisance)
-        parts.append(Paragraph(text=f"nuisance parameters, not designed for: {names}"))
+        parts.append(
+            Paragraph(text=f"nuisance parameters, at which the design does not aim: {names}")
+        )
     if design.combinations:
         parts.append(
             Paragraph(
@@ -280,13 +282,17 @@ def describe_estimate(estimate: Estimate) -> Summary:
     """
     parts: list[Part] = [_estimate_table(estimate)]
 
-    # Parameters that every recording has for itself: the table shows the first value only.
+    # Parameters that differ between recordings: the table shows the first value only.
     for name, values in estimate.per_recording.items():
         if len(values) > 1:
             listed = ", ".join(f"{value:.3g}" for value in values)
             parts.append(Paragraph(text=f"{name} of each recording: {listed}"))
 
-    verdict = "no noise: σ is then not accuracy" if estimate.misfit else "as noise explains them"
+    verdict = (
+        "not explained by noise: the formal σ underestimates the errors"
+        if estimate.misfit
+        else "consistent with noise"
+    )
     rms = ", ".join(f"{name} {value:.3g}" for name, value in estimate.residual_rms.items())
     parts.append(
         Paragraph(
@@ -300,8 +306,9 @@ def describe_estimate(estimate: Estimate) -> Summary:
         parts.append(_prediction_table(estimate.predictions))
     parts.append(
         Paragraph(
-            text="The formal σ is accuracy only if model and noise are right. The honest σ is a quarter of the interval, which "
-            "allows for residuals that are not noise and for recordings that disagree, but not for the bias of a wrong model.",
+            text="The formal σ is the true accuracy only if model and noise are right. The honest σ is a quarter of "
+            "the interval, which allows for residuals that are not noise and for recordings that disagree, but not for "
+            "the bias of a wrong model.",
             emphasis=Emphasis.WEAK,
         )
     )
@@ -464,7 +471,7 @@ def _range_cells(found: Sequence[ColumnSummary]) -> tuple[Cell, ...]:
 
 
 def shortened(path: str, width: int) -> str:
-    """Return the end of a path, which tells files apart.
+    """Return the end of a path, which distinguishes files.
 
     Args:
         path: The path.
@@ -797,7 +804,7 @@ def _method_title(comparison: Comparison, row: MethodResult) -> str:
 
 
 def _method_emphasis(comparison: Comparison, row: MethodResult) -> Emphasis:
-    """The design stands out, and so do methods that beat it; results that must not be used recede."""
+    """Emphasis of a method: strong for the design and for methods that are better, weak for results that must not be used."""
     if not row.sound:
         return Emphasis.WEAK
     if row.method == DESIGN:

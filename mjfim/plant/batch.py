@@ -22,13 +22,13 @@ RECORDED_STATE = int(
     | mujoco.mjtState.mjSTATE_QVEL
     | mujoco.mjtState.mjSTATE_ACT
 )
-# Time at which simulations start [s]. MuJoCo resets a diverged state and its time to zero: a late start shows that.
+# Time at which simulations start [s]. MuJoCo resets a diverged state and its time to zero: a later start time reveals that.
 START_TIME = 1.0
 # Magnitude above which MuJoCo replaces controls by zero.
 MAX_CONTROL = float(mujoco.mjMAXVAL)
 # Type of the sensors that show the time.
 CLOCK_SENSOR = int(mujoco.mjtSensor.mjSENS_CLOCK)
-# Largest number of rollouts that use the small batch; the many of a Monte Carlo study have a second one.
+# Largest number of rollouts that use the small batch; more, as in a Monte Carlo study, use a second one.
 SMALL_BATCH = 64
 
 
@@ -157,7 +157,7 @@ class BatchSimulator:
     """Steps many simulations of models that share one memory layout.
 
     Attributes:
-        model: Model copy of the caller with which batches are made.
+        model: Private model copy from which batches are made.
         space: Layout of the state.
         substeps: `mj_step` calls per sample.
         sensors: True if sensor data are requested.
@@ -391,7 +391,7 @@ class BatchSimulator:
         count: int,
         observations: SubstepObservations | None,
     ) -> tuple[Array | None, list[Array]]:
-        """Step a batch over one sample, with a stop wherever something is read.
+        """Step a batch over one sample, in parts between which something is read.
 
         Returns sensor data (count, nsensordata) or None, and (count, w) observations at every derivative substep.
         """

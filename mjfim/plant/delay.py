@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 
 from mjfim.arrays import Array
 
-NODES = 4  # number of samples through which a value is interpolated, by a cubic polynomial
+NODES = 4  # Number of samples through which the cubic polynomial of the interpolation passes.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -53,15 +53,13 @@ SHARED_ORIGIN_SHORT = DifferenceAccuracy(
 # Two-sided in everything: the most accurate differences.
 CENTRAL_DIFFERENCES = DifferenceAccuracy(central=True, coordinate_step=1e-4, direction_step=1e-3)
 
-FIRST_DERIVATIVE_STEP = 1e-6  # relative step of the differences that make A, B, C, D, E, H
-SENSITIVITY_STEP = 1e-5  # relative step of the differences between whole rollouts
-MIN_PARAMETER_EFFECT = 1e-2  # relative effect of a parameter below which its steps are lengthened
-MAX_STEP_FACTOR = 100.0  # largest factor by which the difference step of a parameter is lengthened
-MAX_NUMBERS_AT_ONCE = 8_000_000  # numbers that the states of simulated curves hold at once
-MIN_CONTROL_SIZE = (
-    1e-3  # largest control of an actuator below which its difference step is absolute
-)
-TINY = 1e-300  # keeps a quotient by zero finite
+FIRST_DERIVATIVE_STEP = 1e-6  # Relative step of the differences that make A, B, C, D, E, H
+SENSITIVITY_STEP = 1e-5  # Relative step of the differences between whole rollouts
+MIN_PARAMETER_EFFECT = 1e-2  # Relative effect of a parameter below which its steps are lengthened
+MAX_STEP_FACTOR = 100.0  # Largest factor by which the difference step of a parameter is lengthened
+MAX_NUMBERS_AT_ONCE = 8_000_000  # Largest number of state values in memory at once.
+MIN_CONTROL_SIZE = 1e-3  # Control magnitude below which an actuator's difference step is absolute.
+TINY = 1e-300  # Smallest divisor; protects a division by zero.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -166,7 +164,7 @@ class _ResponseMoves:
     """Moves of theta and of the initial state whose rollouts give the derivatives of a response along q directions.
 
     Attributes:
-        theta: (J, p) moves of theta: none, q forward ones, and q backward ones if two-sided [theta-unit].
+        theta: (J, p) moves of theta: a zero move, q forward ones, and q backward ones if two-sided [theta-unit].
         initial_state: (J, nx) moves of the initial state, in the order of `theta` [x-unit].
         moving: Indices of the parameters among the q directions, which come first.
         widths: (q,) distance between the two moves of a quotient.
@@ -226,7 +224,7 @@ class Derivatives:
         return np.concatenate([position, velocity, activation, control])
 
     def calibrated_step_factors(self, theta: Array, trajectory: Trajectory) -> Array | None:
-        """Factors on the parameters' difference steps with which their effect stands out of round-off.
+        """Factors on the parameters' difference steps with which their effect exceeds round-off.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -313,7 +311,7 @@ class Derivatives:
         delay = plant.output_delay(theta, N + 1)
         needs_origin = states is None or (delay is not None and plant.outputs.needs_sensors)
 
-        # One row of moves per rollout: forward, backward if two-sided, and none for the origin.
+        # One row of moves per rollout: forward, backward if two-sided, and a zero move for the origin.
         h = (step * self.parameter_scale)[moving]
         forward = np.zeros((count, p))
         forward[np.arange(count), moving] = h
@@ -884,7 +882,7 @@ def _all_samples(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 def _with_origin(moves: Array, central: bool) -> Array:
-    """(J, k) moves of rollouts: none, the rows of moves: (q, k), and the opposite ones if differences are two-sided."""
+    """(J, k) moves of rollouts: a zero move, the rows of moves: (q, k), and the opposite ones if differences are two-sided."""
     origin = np.zeros((1, moves.shape[1]))
     backward = -moves if central else moves[:0]
     return np.concatenate([origin, moves, backward])

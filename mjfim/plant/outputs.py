@@ -183,7 +183,7 @@ def outputs_by_state(model: Any, outputs: Outputs) -> dict[int, int]:
         elif kind == int(mujoco.mjtSensor.mjSENS_JOINTVEL):
             sensors[int(model.sensor_adr[s])] = model.nq + int(model.jnt_dofadr[joint])
 
-    # A component that is measured itself counts more than a sensor of it.
+    # A component that is measured directly takes precedence over a sensor of it.
     for i, output in enumerate(outputs.outputs):
         if output.sensor in sensors:
             found.setdefault(sensors[output.sensor], i)

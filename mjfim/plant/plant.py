@@ -21,7 +21,9 @@ from mjfim.plant.derivatives import Derivatives
 from mjfim.plant.outputs import Outputs
 from mjfim.records.trajectory import Trajectory
 
-MAX_CACHED_MODELS = 64  # models at single parameter values that a plant keeps
+MAX_CACHED_MODELS = (
+    64  # Largest number of compiled models at single parameter values that a plant keeps.
+)
 
 
 class Plant:
@@ -95,7 +97,7 @@ class Plant:
         return steps
 
     def calibrated(self, theta: Array, trajectory: Trajectory) -> Plant:
-        """A plant whose difference steps stand out of the round-off of a trajectory; simulator and models are shared.
+        """A plant with difference steps whose effect exceeds the round-off of a trajectory; simulator and models are shared.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].

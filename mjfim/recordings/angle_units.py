@@ -19,7 +19,7 @@ DEGREES = 180.0 / np.pi
 # Relative tolerance of a factor between degrees and radians, and of a joint's range.
 TOLERANCE = 0.2
 
-# Correlation from which on a position and a velocity are taken to show one motion.
+# Correlation above which a position and a velocity count as measurements of one motion.
 MIN_CORRELATION = 0.5
 
 # Time over which positions are differenced [s], so that their resolution and noise have little effect.
@@ -43,7 +43,7 @@ def check_angles(
         model: The compiled MuJoCo model.
         t: (M,) times [s].
         columns: (M,) values by name of the recording's column, NaN where empty.
-        stated: Names of the columns whose unit the experiment file states; they are not questioned.
+        stated: Names of the columns whose unit the experiment file states; they are not checked.
 
     Raises:
         RecordingError: A column is probably in degrees; the message says how to state its unit.

@@ -31,7 +31,7 @@ from mjfim.recordings.validity import (
 )
 from mjfim.records.recording import Recording
 
-# Time by which a row may miss the window [s].
+# Tolerance of the begin and the end of the window [s].
 WINDOW_TOLERANCE = 1e-9
 
 
@@ -161,7 +161,7 @@ def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
 
 
 def _check_names(table: Table, channels: Channels) -> None:
-    """Refuse a column that looks like one of mjfim's but is none of this model, such as a misspelled joint."""
+    """Refuse a column whose name has mjfim's form but does not exist in this model, such as a misspelled joint."""
     known = (*channels.control_columns, *channels.measurable)
     for name in table.names:
         if name.startswith(("ctrl:", "qpos:", "qvel:")) and name not in known:
@@ -207,7 +207,7 @@ def _matrices(channels: Channels) -> dict[str, list[str]]:
 
 
 def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
-    """(M,) times of all rows [s], and the rows from the begin of the window to the first time after its end."""
+    """(M,) times of all rows [s], and the rows from the beginning of the window to the first time after its end."""
     t = table.column(spec.time) * SECONDS[spec.time_unit]
     if spec.window is None or not len(t):
         return t, slice(0, len(t))
@@ -215,7 +215,7 @@ def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
     since = t - t[0]
     begin = _first_true(since >= spec.window[0] - WINDOW_TOLERANCE)
 
-    # Only rows after the begin count: a clock that restarts later must not end the window earlier.
+    # Only rows after the beginning count: a clock that restarts later must not end the window earlier.
     end = begin + _first_true(since[begin:] > spec.window[1] + WINDOW_TOLERANCE)
 
     if end == begin:

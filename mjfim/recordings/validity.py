@@ -20,7 +20,7 @@ TYPICAL_STEP = 5e-3
 # A pause is bridged up to this number of median steps, even where `gap` is shorter.
 MIN_GAP_STEPS = 5.0
 
-# Number of values from which on a measured column of equal values counts as a dead channel.
+# Smallest number of values with which a measured column of equal values counts as a dead channel.
 DEAD_CHANNEL_ROWS = 10
 
 # A clock that falls back below this share of the elapsed time has restarted; above, rows are out of order.

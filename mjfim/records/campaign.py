@@ -20,7 +20,7 @@ class CampaignStatus(Enum):
     """Outcome of a campaign; the value is a sentence for the user."""
 
     REACHED = "reached: every parameter is known as accurately as wanted"
-    DOUBTFUL = "every wanted σ is reached formally, but the fit is in doubt (see warnings): formal σ is not accuracy"
+    DOUBTFUL = "every formal σ reaches its target, but the fit is in doubt (see warnings), so the true errors may be larger"
     EXHAUSTED = "all rounds are used up before every parameter is known as accurately as wanted"
     WAITING = "the next round is designed and waits for its recording"
     INFEASIBLE = "no design keeps the limits at the estimate; nothing more was recorded"

@@ -105,11 +105,11 @@ class Roughness:
         cause = ", ".join(self.causes)
         if not cause:
             cause = "no contact, friction or limit acts there: the motion may be chaotic"
-        size = f"{100 * self.error:.2g} %" if np.isfinite(self.error) else "without bound"
+        size = f"{100 * self.error:.2g} %" if np.isfinite(self.error) else "an unlimited amount"
 
         return (
             f"not smooth: derivatives by two difference steps disagree by {size} for {self.parameter}, first at sample "
-            f"{self.sample} (t = {self.time:.4g} s; {cause}); sigma and design rest on derivatives that hardly exist there"
+            f"{self.sample} (t = {self.time:.4g} s; {cause}); σ and the design are unreliable, because they use these derivatives"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -175,8 +175,8 @@ class Check(SavedRecord):
         eigenvalues: (s,) ascending, of the information that the criterion sees.
         correlation: (t, t) correlation of the estimates of `wanted`; NaN where one is not identifiable alone.
         confounded: Pairs of parameters with strongly correlated estimates.
-        not_separable: Groups of parameters that no experiment with these outputs tells apart.
-        not_excited: Groups that another control would tell apart.
+        not_separable: Groups of parameters that no experiment with these outputs can separate.
+        not_excited: Groups that another control would separate.
         self_test: Test of the derivatives.
         verdict: Sentences for the user.
         combined: Accuracies of the identifiable combinations (`std_initial` and `std_final` are equal).
@@ -212,7 +212,7 @@ class Check(SavedRecord):
     def ok(self) -> bool:
         """True where derivatives agree, every parameter is identifiable and one repetition reaches every stated accuracy."""
         known = {row.name for row in self.rows if np.isfinite(row.std)}
-        # A prior can tell parameters apart that the data cannot: such a group does no harm.
+        # A prior can separate parameters that the data cannot separate; such a group is then no fault.
         separable = all(set(group.members) <= known for group in self.not_separable)
 
         stated = [row for row in self.rows if row.stated and not row.nuisance]

@@ -109,7 +109,7 @@ class Comparison(SavedRecord):
     Attributes:
         source: Name of the experiment.
         criterion: "E", "A", "D" or "c".
-        nats: Of D-optimality: number by which differences of J are divided, so that they mean a single parameter; else 0.
+        nats: For D-optimality: number by which differences of J are divided to obtain the change per parameter; else 0.
         parameters: Names of the p parameters.
         units: Unit of each.
         scale: (p,) scale of each [theta-unit].
@@ -154,18 +154,18 @@ class Comparison(SavedRecord):
 
     @property
     def rival(self) -> MethodResult | None:
-        """The best sound baseline."""
+        """The best baseline whose result is sound."""
         baselines = (row for row in self.rows if row.method != DESIGN and row.sound)
         return min(baselines, key=lambda row: row.cost, default=None)
 
     @property
     def best(self) -> MethodResult | None:
-        """The best sound result of all."""
+        """The best result that is sound, the design included."""
         return min((row for row in self.rows if row.sound), key=lambda row: row.cost, default=None)
 
     @property
     def beating(self) -> tuple[MethodResult, ...]:
-        """Sound baselines that are better than the design, the best first."""
+        """Baselines with sound results that are better than the design, the best first."""
         design = self.design
         if design is None:
             return ()
@@ -186,7 +186,7 @@ class Comparison(SavedRecord):
             other: The other one.
 
         Returns:
-            Fraction of the other's J; of D-optimality: fraction of its geometric mean of variances.
+            Fraction of the other's J; for D-optimality: fraction of its geometric mean of variances.
         """
         if self.nats:
             return float(-np.expm1((row.cost - other.cost) / self.nats))
@@ -194,7 +194,7 @@ class Comparison(SavedRecord):
 
     @property
     def ok(self) -> bool:
-        """True where all methods ran, the design is sound, and nothing beats it."""
+        """True where all methods ran, the design is sound, and no baseline is better."""
         design = self.design
         return not self.interrupted and design is not None and design.sound and not self.beating
 
@@ -229,7 +229,7 @@ def _verdict(comparison: Comparison) -> str:
     """Return a sentence that says whether the design is the best."""
     design, rival = comparison.design, comparison.rival
 
-    # Nothing to compare with, or nothing to compare.
+    # Without a design, or without a sound baseline, there is nothing to compare.
     if design is None:
         return "The design was not run: there is nothing to compare the baselines with."
     if rival is None:

@@ -100,7 +100,7 @@ class HistoryRow:
         criterion: phi, the information term of the cost.
         min_eigenvalue: Smallest eigenvalue of the information per second that the cost sees.
         slope: |DJ . zeta|, predicted change of the cost for a full step.
-        gamma: Step length that led here.
+        gamma: Step length that led to this iterate.
         seconds: Wall time since the optimisation began [s].
         steps: MuJoCo steps since the optimisation began.
         rate: Sample rate of the plant on which the optimisation ran [Hz] (coarse-to-fine).
@@ -172,8 +172,8 @@ class LimitUsage:
         kind: Kind of the limit: "position", "velocity", "control", "clearance", ...
         name: Name of the joint, of the actuator or of the nearest pair of geoms.
         t: (n,) times [s].
-        share: (n,) relative position between the bounds: -1 at the lower bound, 1 at the upper one. Of a clearance: the
-            required distance over the distance.
+        share: (n,) relative position between the bounds: -1 at the lower bound, 1 at the upper one. For a clearance:
+            the required distance over the distance.
     """
 
     kind: str
@@ -221,8 +221,8 @@ class Design(SavedRecord):
         nuisance: Names of the parameters that the design did not aim at.
         combinations: Groups of parameters that are not identifiable alone, in words.
         combined: Accuracies of the identifiable combinations of these groups.
-        prior: (p, p) information put in before this experiment [1 / (unit of theta_i times unit of theta_j)].
-        data: (p, p) information of this experiment alone, its private nuisance parameters marginalised.
+        prior: (p, p) information from before this experiment [1 / (unit of theta_i times unit of theta_j)].
+        data: (p, p) information of this experiment alone, the nuisance parameters of a single experiment marginalised.
     """
 
     status: Status
@@ -278,7 +278,7 @@ class Design(SavedRecord):
         return self.final.trajectory
 
     def summary(self) -> dict[str, Any]:
-        """Return the contents of design.json, but for the name of the experiment file."""
+        """Return the contents of design.json, except for the name of the experiment file."""
         return {
             "status": self.status.name.lower(),
             "message": self.status.value,

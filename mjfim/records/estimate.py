@@ -31,7 +31,7 @@ class Estimate(SavedRecord):
         dof: Degrees of freedom of `chi2`.
         status: How the fit ended, in words.
         success: True where the fit converged and every parameter was determined inside its bounds.
-        misfit: True where the residuals are not noise of the stated size; the formal `std` is then not the accuracy.
+        misfit: True where the residuals are not noise of the stated size; the formal `std` then underestimates the errors.
         iterations: Number of iterations.
         residual_rms: Root mean square residual of each output [unit of the output].
         at_bound: Names of the parameters that ended at a bound.
@@ -43,7 +43,8 @@ class Estimate(SavedRecord):
         std_sandwich: (p,) standard deviations that allow for autocorrelated residuals [theta-unit].
         interval: (p, 2) 95 % interval: the hull of formal, sandwich and bootstrap intervals and of the disagreement between
             recordings [theta-unit].
-        between_recordings: (p,) standard deviation from recording to recording beyond their own scatter [theta-unit].
+        between_recordings: (p,) standard deviation from recording to recording beyond what their standard deviations
+            explain [theta-unit].
         sigma: Noise of each output, stated or estimated [unit of the output].
         reasons: Reasons for `misfit`, in sentences.
         whiteness: Tests of the residuals of each output.
@@ -51,7 +52,7 @@ class Estimate(SavedRecord):
         predictions: Prediction errors on data that were not fitted.
         sloppy: Names of the parameters whose interval is wide for their value.
         missing_terms: Terms missing in the model that would explain the residuals.
-        per_recording: Values in turn of parameters that every recording has for itself; `theta` holds the first.
+        per_recording: Values, recording by recording, of parameters that differ between recordings; `theta` holds the first.
         robust_uncertainty: Robust uncertainty of the common unknowns, or None.
         motion: The first recording's motion as fitted, or None.
         interrupted: True where the user interrupted the fit.
@@ -307,9 +308,9 @@ class Uncertainty:
     Attributes:
         sandwich: (c,) standard deviations that allow for autocorrelated residuals.
         interval: (c, 2) 95 % intervals: the hull of formal, sandwich and bootstrap intervals.
-        between: (c,) standard deviation from recording to recording beyond the scatter that each explains.
+        between: (c,) standard deviation from recording to recording beyond what their standard deviations explain.
         apart: Indices of the unknowns on which recordings disagree.
-        each: (K, c) estimates from every recording alone; NaN where a recording says too little.
+        each: (K, c) estimates from every recording alone; NaN where a recording has too little information.
         blocks: Number of blocks of the bootstrap.
         draws: (n, c) draws of the bootstrap.
     """

@@ -26,7 +26,7 @@ class FitEvent:
     """One iterate of an estimation.
 
     Attributes:
-        phase: What is fitted: "all data", or a part of the search for its starting point.
+        phase: Data to which the model is fitted: "all data", or a part of the search for its starting point.
         iteration: Number of the iterate in this phase.
         cost: Half of the sum of squared whitened residuals.
         step: Length of the last step [standard deviations].

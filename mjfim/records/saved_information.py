@@ -1,4 +1,4 @@
-"""Record of the information that a design or an estimate left behind in its JSON file."""
+"""Record of the information that a design or an estimate saved in its JSON file."""
 
 from __future__ import annotations
 

@@ -6,8 +6,8 @@ A saved record consists of two files with one stem, for example `design`:
 * `design.npz` holds the record itself, complete. Every array has a name of its own; the text array `record` holds everything
   else as JSON, and names the array wherever the record has one.
 
-JSON knows neither infinity nor NaN. Summaries say `null` instead; the text `record` says "inf", "-inf" or "nan", and the type
-of the field tells that this is a number.
+JSON knows neither infinity nor NaN. Summaries contain `null` instead; the text `record` contains "inf", "-inf" or
+"nan", and the type of the field shows that this is a number.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mjfim.errors import RecordingError
 # Name of the text array in an npz file that holds everything of a record that is no array.
 RECORD = "record"
 
-# Words for the numbers that JSON cannot say.
+# Words for the numbers that JSON cannot express.
 NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 

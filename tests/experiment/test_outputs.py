@@ -318,11 +318,11 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "covariance size": (
         {"noise": {"acc": {"covariance": square(2)}}},
-        r"noise\.acc\.covariance: wanted 3 rows of 3",
+        r"noise\.acc\.covariance: expected 3 rows of 3",
     ),
     "covariance ragged": (
         {"noise": {"acc": {"covariance": [[1.0, 0.0, 0.0], [0.0, 1.0], [0.0, 0.0, 1.0]]}}},
-        r"noise\.acc\.covariance: wanted 3 rows of 3",
+        r"noise\.acc\.covariance: expected 3 rows of 3",
     ),
     "covariance skew": (
         {"noise": {"acc": {"covariance": [[1.0, 0.5, 0.0], [0.2, 1.0, 0.0], [0.0, 0.0, 1.0]]}}},
@@ -358,7 +358,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "correlated twice": (
         {"correlated": pair("rate", "rate")},
-        r"correlated\.outputs: an output stands there twice",
+        r"correlated\.outputs: an output is listed twice",
     ),
     "correlated alone": (
         {"correlated": pair("rate")},
@@ -366,7 +366,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "correlated size": (
         {"correlated": pair("rate", "angle", covariance=square(3))},
-        r"correlated\.covariance: wanted 2 rows of 2",
+        r"correlated\.covariance: expected 2 rows of 2",
     ),
     "correlated indefinite": (
         {"correlated": pair("rate", "angle", covariance=[[1.0, 2.0], [2.0, 1.0]])},
@@ -381,7 +381,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "correlated outside": (
         {"noise": {"acc": {"covariance": BLOCK.tolist()}}, "correlated": pair("acc[0]", "rate")},
-        r"correlated\.outputs: one of them is already correlated with an output outside",
+        r"correlated\.outputs: one of them is already correlated with an output that is not listed",
     ),
     "correlated key": (
         {"correlated": [{"outputs": ["rate", "angle"], "matrix": square(2)}]},
@@ -418,7 +418,7 @@ def test_a_covariance_of_an_orientation_is_refused(tmp_path: Path) -> None:
     for key, size in (("qpos:ball", 4), ("qpos:float", 7), ("state", 20)):
         with pytest.raises(
             ExperimentError,
-            match=rf"noise\.{key}: orientations take one sigma \[rad\], no covariance",
+            match=rf"noise\.{key}: an orientation takes one sigma \[rad\] and no covariance",
         ):
             body_task(tmp_path, noise={key: {"covariance": square(size)}})
     found = body_task(tmp_path, noise={"qvel:ball": {"covariance": square(3, 0.25)}})

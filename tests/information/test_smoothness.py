@@ -161,7 +161,7 @@ def test_the_sentence_says_parameter_sample_time_and_cause() -> None:
     ):
         assert part in said
     lost = str(Roughness(error=np.inf, parameter="mass", sample=0, time=0.0, causes=()))
-    assert "without bound" in lost
+    assert "an unlimited amount" in lost
     assert "chaotic" in lost
 
 

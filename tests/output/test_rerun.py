@@ -496,7 +496,7 @@ class TestEstimate:
         )
         assert not [entry for entry in entities(path) if entry.startswith("/robots/measured")]
         text = str(column(path, ("summary",), None, "TextDocument:text")[1][0, 0])
-        assert "no noise: σ is then not accuracy" in text
+        assert "not explained by noise: the formal σ underestimates the errors" in text
         assert "see the report" in text
 
 

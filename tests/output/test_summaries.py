@@ -94,7 +94,7 @@ def test_an_estimate_names_units_bounds_and_warnings(estimate: Estimate) -> None
         assert "c (N m s/rad)" in text
         assert "at bound" in text
         assert "residuals are [odd]" in text
-        assert "no noise: σ is then not accuracy" in text
+        assert "not explained by noise: the formal σ underestimates the errors" in text
     assert "at bound" not in printed(describe_estimate(estimate))
 
 

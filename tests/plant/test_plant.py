@@ -876,7 +876,7 @@ def test_parameters_move_mocap_bodies_without_a_keyframe(tmp_path) -> None:
     np.testing.assert_allclose(found.psi[-1, :, 0], slope, rtol=1e-4, atol=1e-6)
     initial = {"keyframe": "moved", "control": {"kind": "sine"}}
     with pytest.raises(
-        ExperimentError, match=r"parameters\.x: the keyframe states where mocap body 'near' is"
+        ExperimentError, match=r"parameters\.x: the keyframe states the pose of mocap body 'near'"
     ):
         make_task(CARRIED, tmp_path, parameters=place, initial=initial)
 

@@ -331,7 +331,7 @@ def test_headers_that_announce_too_much(tmp_path: Path) -> None:
     """No memory is allocated for numbers that the file does not hold."""
     with zipfile.ZipFile(tmp_path / "log.npz", "w") as archive:
         archive.writestr("t.npy", header((10**13,)))
-    with pytest.raises(RecordingError, match=r"promises more numbers than it holds"):
+    with pytest.raises(RecordingError, match=r"declares more numbers than it holds"):
         read_columns(tmp_path / "log.npz", ALL)
 
 

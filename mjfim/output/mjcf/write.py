@@ -1,4 +1,4 @@
-"""The user's MJCF with identified values; what it compiles to must be the identified model, else it is refused."""
+"""The user's MJCF with identified values. It is refused unless it compiles to the identified model."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ INVERSE_WEIGHT = "body_invweight0"
 
 
 def write_identified(path: Path, system: System, theta: Array) -> str | None:
-    """Write the user's MJCF with parameter values: the text with other numbers in it, with all their digits.
+    """Write the user's MJCF with parameter values: the user's text with the numbers replaced, with all their digits.
 
     Where the text cannot express the values, MuJoCo prints the model (six significant digits).
 
@@ -69,7 +69,7 @@ def write_identified(path: Path, system: System, theta: Array) -> str | None:
         theta: (p,) parameter values.
 
     Returns:
-        A sentence about everything that changes besides the values, None if nothing does.
+        A sentence about everything else that changes, None if nothing does.
 
     Raises:
         ModelError: No MJCF expresses the values.

@@ -174,7 +174,7 @@ class XmlText:
         for tag in {*self._values, *self._names, *self._children}:
             changes += self._changes_of_tag(tag)
 
-        # From the end to the begin, so that positions of later changes stay valid.
+        # From the end to the beginning, so that positions of later changes stay valid.
         text = self._text
         for start, stop, new in sorted(changes, reverse=True):
             text = text[:start] + new + text[stop:]

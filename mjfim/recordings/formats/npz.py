@@ -86,7 +86,7 @@ def _header(path: Path, archive: zipfile.ZipFile, member: str) -> tuple[tuple[in
 
     # NumPy allocates the whole array before it reads the content.
     if math.prod(shape) * dtype.itemsize > archive.getinfo(member).file_size:
-        raise ValueError(f"{member} promises more numbers than it holds")
+        raise ValueError(f"{member} declares more numbers than it holds")
 
     return shape, dtype
 

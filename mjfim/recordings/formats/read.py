@@ -41,8 +41,8 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
     """Read the columns of a log.
 
     Args:
-        path: A file whose ending tells its format, or the folder of a ROS 2 bag.
-        spec: The `[recording]` table; it tells which columns are needed.
+        path: A file whose ending determines its format, or the folder of a ROS 2 bag.
+        spec: The `[recording]` table; it determines which columns are needed.
 
     Returns:
         The columns that are needed, and the names of the others.
@@ -121,7 +121,7 @@ def _parse_csv(path: Path, names: list[str]) -> Any:
         if "conversion error" not in str(error):
             raise
 
-    # Slower, but it tells which columns hold text.
+    # Slower, but it shows which columns hold text.
     return _parse_csv_as(path, names, {})
 
 
@@ -153,7 +153,7 @@ class _SizeCheckedStream(io.RawIOBase):
         self._unpacked_size = 0
 
     def readable(self) -> bool:
-        """Tell the reader that this stream can be read."""
+        """Return True: this stream can be read."""
         return True
 
     def read(self, size: int = -1) -> bytes:

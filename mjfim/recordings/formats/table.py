@@ -34,7 +34,7 @@ class Table:
         source: The file.
         columns: (M,) float64 numbers by column name, NaN where a field is empty.
         faults: Reason why a column cannot be used, by column name, as the end of a sentence (`is not numeric`).
-        unread: Names of the columns that were not read because nobody asked for them.
+        unread: Names of the columns that were not read because they were not requested.
     """
 
     source: Path
@@ -156,7 +156,7 @@ def one_line(error: Exception) -> str:
     Returns:
         The message without line breaks and control characters, at most `MAX_QUOTATION` characters.
     """
-    # A damaged file may hold anything, also sequences that a terminal obeys.
+    # A damaged file may hold anything, including control sequences of a terminal.
     printable = "".join(c if c.isprintable() or c.isspace() else "?" for c in str(error))
 
     line = " ".join(printable.split()) or type(error).__name__
