@@ -298,7 +298,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "one component": ({"noise": {"acc[0]": 0.1}}, r"noise: unknown sensor 'acc\[0\]'"),
     "too few sigmas": (
         {"noise": {"acc": {"sigma": [1.0, 2.0]}}},
-        r"noise\.acc\.sigma: 2 numbers, .* each of 3",
+        r"noise\.acc\.sigma: 2 numbers; .* each of 3",
     ),
     "sigmas of a scalar": (
         {"noise": {"rate": {"sigma": [1.0, 2.0]}}},
