@@ -22,8 +22,8 @@ from mjfim.parallel import collect_finished, workers_of
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import HistoryRow, Status
-from mjfim.studies.baselines.budget import Attempt, Job
-from mjfim.studies.baselines.methods import METHODS, perform
+from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
+from mjfim.studies.baselines.methods import METHODS, run_baseline
 
 OURS = "mjfim's design"
 LATE = 1.05  # share of the seconds after which a design is ended
@@ -84,16 +84,15 @@ def compare_task(
     chosen = (*chosen_methods(task, methods), DESIGN)
     judge = Judge(task, _combinations(task))
     most = np.inf if steps is None else float(steps)
-    job = Job(
-        task.experiment,
-        DESIGN,
-        seconds,
-        most,
-        seed,
-        (0, 1),
-        judge.stage.basis,
-        task.added_information,
-        task.system.threads,
+    job = BaselineSearch(
+        experiment=task.experiment,
+        method=DESIGN,
+        seconds=seconds,
+        steps=most,
+        seed=seed,
+        combinations=judge.stage.basis,
+        added_information=task.added_information,
+        threads=task.system.threads,
     )
     rows: list[MethodResult] = []
     interrupted = False
@@ -130,12 +129,12 @@ def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str
     """Keys of the baselines that are to run. Raises ExperimentError for others."""
     if methods is None:
         return tuple(
-            key for key, baseline in METHODS.items() if task.is_limited or not baseline.limited
+            key for key, baseline in METHODS.items() if task.is_limited or not baseline.needs_limits
         )
     for key in methods:
         if key not in METHODS and key != DESIGN:
             raise ExperimentError(f"methods: {unknown('method', key, [*METHODS, DESIGN])}")
-        if key in METHODS and METHODS[key].limited and not task.is_limited:
+        if key in METHODS and METHODS[key].needs_limits and not task.is_limited:
             raise ExperimentError(
                 f"methods: {key} needs hard limits; {task.experiment.source} has none that hold"
             )
@@ -158,27 +157,27 @@ def _teller(monitor: Monitor | None, title: str, place: int, count: int) -> Tell
     return tell
 
 
-def _tried(job: Job, executor: Executor | None, tell: Tell) -> Attempt:
+def _tried(job: BaselineSearch, executor: Executor | None, tell: Tell) -> SearchResult:
     """A baseline's attempt; with an executor the best of as many as it has workers, each with its share of the steps."""
     if executor is None:
-        return perform(job, lambda used, attempt: tell(used, attempt.cost))
+        return run_baseline(job, lambda used, attempt: tell(used, attempt.cost))
     count = workers_of(executor)
     jobs = [replace(job, part=(i, count), steps=job.steps / count, threads=1) for i in range(count)]
-    futures: list[Future[Attempt]] = []
+    futures: list[Future[SearchResult]] = []
     try:
-        futures += [executor.submit(perform, each) for each in jobs]
+        futures += [executor.submit(run_baseline, each) for each in jobs]
         attempts = [future.result() for future in futures]
     except BaseException:
         collect_finished(executor, futures)
         raise
-    best = min(attempts, key=lambda attempt: (attempt.cost, -attempt.share))
+    best = min(attempts, key=lambda attempt: (attempt.cost, -attempt.margin))
     return replace(
         best, seconds=max(a.seconds for a in attempts), steps=sum(a.steps for a in attempts)
     )
 
 
 def _designed(
-    judge: Judge, job: Job, executor: Executor | None, tell: Tell
+    judge: Judge, job: BaselineSearch, executor: Executor | None, tell: Tell
 ) -> tuple[MethodResult, bool]:
     """The design with the same budget, and whether the user interrupted it."""
     d = job.experiment.descent
@@ -188,14 +187,23 @@ def _designed(
     meter = Meter(job, tell)
     try:
         found = design_task(
-            DesignTask.resolve(stated, threads=job.threads, added_information=job.added),
+            DesignTask.resolve(
+                stated, threads=job.threads, added_information=job.added_information
+            ),
             meter,
             executor=executor,
         )
     except SimulationDivergedError:
-        return judge.row(DESIGN, OURS, Attempt(seconds=meter.seconds, steps=meter.steps)), False
-    attempt = Attempt(
-        found.trajectory.ctrl, found.final.cost, 0.0, found.found_by, found.seconds, found.steps
+        return judge.row(
+            DESIGN, OURS, SearchResult(seconds=meter.seconds, steps=meter.steps)
+        ), False
+    attempt = SearchResult(
+        control=found.trajectory.ctrl,
+        cost=found.final.cost,
+        margin=0.0,
+        found_by=found.found_by,
+        seconds=found.seconds,
+        steps=found.steps,
     )
     row = judge.row(
         DESIGN, OURS, attempt, "" if meter.spent else found.status.value.split(":")[0].split(";")[0]
@@ -206,7 +214,7 @@ def _designed(
 class Meter:
     """Watches a design's iterates and ends it, as Ctrl-C would, where its budget is used up."""
 
-    def __init__(self, job: Job, tell: Tell) -> None:
+    def __init__(self, job: BaselineSearch, tell: Tell) -> None:
         self.job, self.tell = job, tell
         self.clock, self.steps, self.last, self.cost = time.perf_counter(), 0, 0, np.inf
         self.spent = False
@@ -243,7 +251,7 @@ class Judge:
         count = len(p.interest) if combinations is None else combinations.shape[1]
         self.nats = e.cost.information * count if e.cost.criterion == "D" else 0.0
 
-    def row(self, method: str, title: str, attempt: Attempt, note: str = "") -> MethodResult:
+    def row(self, method: str, title: str, attempt: SearchResult, note: str = "") -> MethodResult:
         """What an attempt is worth. A baseline's control that leaves the limits after all is shrunk until it does not."""
         if attempt.control is None:
             return self._nothing(method, title, attempt, note)
@@ -259,7 +267,9 @@ class Judge:
             first = first or found
         return first or self._nothing(method, title, attempt, note)
 
-    def _looked(self, method: str, title: str, attempt: Attempt, note: str) -> MethodResult | None:
+    def _looked(
+        self, method: str, title: str, attempt: SearchResult, note: str
+    ) -> MethodResult | None:
         """None where the simulation diverges."""
         task = self.task
         point = (
@@ -302,7 +312,7 @@ class Judge:
             note=note,
         )
 
-    def _nothing(self, method: str, title: str, attempt: Attempt, note: str) -> MethodResult:
+    def _nothing(self, method: str, title: str, attempt: SearchResult, note: str) -> MethodResult:
         outcome = MethodOutcome.NONE if attempt.control is None else MethodOutcome.NOTHING
         blank = np.full(len(self.task.parameters), np.nan)
         return MethodResult(

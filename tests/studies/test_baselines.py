@@ -1,4 +1,4 @@
-"""Baselines: their shapes, their budgets, the limits they keep by an independent simulation, their gradients."""
+"""Baselines: their curves, their budgets, their limits by an independent simulation, and their gradients."""
 
 from __future__ import annotations
 
@@ -22,15 +22,21 @@ from mjfim.signals import (
     fourier_basis,
     schroeder_phases,
 )
-from mjfim.studies.baselines.budget import Arena, Attempt, Job, Spent
-from mjfim.studies.baselines.methods import METHODS, Shaper, perform, reflected, search
+from mjfim.studies.baselines.evaluator import BaselineSearch, ControlEvaluator, SearchResult
+from mjfim.studies.baselines.methods import (
+    METHODS,
+    ExcitationFitter,
+    random_search,
+    reflected,
+    run_baseline,
+)
 from mjfim.studies.baselines.parametric import (
-    Descent,
-    Series,
-    fourier,
-    scipy_own,
-    splines,
-    tournament,
+    ParametricRun,
+    ScipyDescent,
+    fourier_runs,
+    optimise_many,
+    optimise_with_scipy,
+    spline_runs,
 )
 from mjfim.studies.compare import _tried
 from tests.support.baselines import pendulum, played
@@ -56,10 +62,22 @@ def arm(**limits: Any) -> Experiment:
     )
 
 
+def order(experiment: Experiment, method: str, **options: Any) -> BaselineSearch:
+    """A search of a minute, unless stated otherwise."""
+    return BaselineSearch(
+        **{"experiment": experiment, "method": method, "seconds": 60.0, **options}
+    )
+
+
+def evaluator_of(search: BaselineSearch) -> ControlEvaluator:
+    """The evaluator of a search."""
+    return ControlEvaluator(search=search)
+
+
 @cache
-def found(method: str) -> Attempt:
-    """What a method finds on the cart-pendulum with a small budget of steps."""
-    return perform(Job(pendulum(), method, 60.0, STEPS, seed=1))
+def found(method: str) -> SearchResult:
+    """The result of a method on the cart-pendulum with a small budget of steps."""
+    return run_baseline(order(pendulum(), method, steps=STEPS, seed=1))
 
 
 # ---- shapes
@@ -143,16 +161,16 @@ def test_numbers_are_reflected_at_their_ends() -> None:
     ],
 )
 def test_every_baseline_keeps_the_limits_and_its_budget(method: str) -> None:
-    attempt = found(method)
-    assert attempt.control is not None
-    assert np.isfinite(attempt.cost)
-    qpos, _, ctrl = played(pendulum(), attempt.control)
+    result = found(method)
+    assert result.control is not None
+    assert np.isfinite(result.cost)
+    qpos, _, ctrl = played(pendulum(), result.control)
     assert np.abs(qpos[:, 0]).max() <= 0.5
     assert np.abs(ctrl).max() <= 5.0
-    assert 0.5 * STEPS < attempt.steps < 1.2 * STEPS
+    assert 0.5 * STEPS < result.steps < 1.2 * STEPS
     task = DesignTask.resolve(pendulum())
-    point = task.problem.point(task.plant.simulate(task.theta, attempt.control))
-    assert point.cost == pytest.approx(attempt.cost, rel=1e-3)
+    point = task.problem.point(task.plant.simulate(task.theta, result.control))
+    assert point.cost == pytest.approx(result.cost, rel=1e-3)
     assert (
         point.cost < 0.5 * task.problem.point(task.initial).cost
     )  # of a start that even leaves the limits
@@ -167,14 +185,14 @@ def test_amplitudes_go_up_to_the_limits() -> None:
 
 
 def test_seconds_end_a_search() -> None:
-    attempt = perform(Job(pendulum(), "steps", 0.4))
-    assert attempt.seconds < 2.0
-    assert attempt.control is not None
+    result = run_baseline(order(pendulum(), "steps", seconds=0.4))
+    assert result.seconds < 2.0
+    assert result.control is not None
 
 
 def test_a_budget_of_steps_makes_it_repeatable() -> None:
     first, again, other = (
-        perform(Job(pendulum(), "chirp", 60.0, 30_000, seed=s)) for s in (4, 4, 5)
+        run_baseline(order(pendulum(), "chirp", steps=30_000, seed=s)) for s in (4, 4, 5)
     )
     assert first.control is not None
     assert other.control is not None
@@ -184,9 +202,9 @@ def test_a_budget_of_steps_makes_it_repeatable() -> None:
 
 def test_workers_share_the_steps() -> None:
     with ThreadPoolExecutor(2) as executor:
-        attempt = _tried(Job(pendulum(), "steps", 60.0, 40_000), executor, lambda used, cost: None)
-    assert attempt.control is not None
-    assert attempt.steps < 1.2 * 40_000 + 2 * 8_000
+        result = _tried(order(pendulum(), "steps", steps=40_000), executor, lambda used, cost: None)
+    assert result.control is not None
+    assert result.steps < 1.2 * 40_000 + 2 * 8_000
 
 
 @pytest.mark.parametrize(
@@ -196,29 +214,29 @@ def test_workers_share_the_steps() -> None:
 def test_from_rest_to_rest_without_jolts(method: str) -> None:
     experiment = arm(bandwidth=6.0)
     task = DesignTask.resolve(experiment)
-    attempt = perform(Job(experiment, method, 60.0, 400_000))
-    assert attempt.control is not None
-    assert np.isfinite(attempt.cost)
-    padded = np.concatenate([task.initial_hold[None], attempt.control, task.initial_hold[None]])
+    result = run_baseline(order(experiment, method, steps=400_000))
+    assert result.control is not None
+    assert np.isfinite(result.cost)
+    padded = np.concatenate([task.initial_hold[None], result.control, task.initial_hold[None]])
     assert np.abs(np.diff(padded, axis=0)).max() <= 4.0 / 100.0 + 1e-12
-    qpos, qvel, _ = played(experiment, attempt.control)
+    qpos, qvel, _ = played(experiment, result.control)
     assert np.abs(qvel).max() <= 3.0
     assert np.abs(qpos[-1] - qpos[0]).max() <= 0.02
     assert np.abs(qvel[-1]).max() <= 0.05
-    spectrum = np.abs(np.fft.rfft(attempt.control - task.initial_hold, axis=0, n=1000)) ** 2
+    spectrum = np.abs(np.fft.rfft(result.control - task.initial_hold, axis=0, n=1000)) ** 2
     assert spectrum[np.fft.rfftfreq(1000, 0.01) > 15.0].sum() < 1e-2 * spectrum.sum()
 
 
-def test_what_no_control_keeps_is_told_by_its_margin() -> None:
+def test_limits_that_no_control_keeps_show_in_a_negative_margin() -> None:
     """A pendulum that is let go does not come back to where it was, whatever a chirp does."""
     swinging = pendulum(
         initial={"keyframe": None, "qpos": (0.0, 1.0), "qvel": (0.0, 0.0)},
         boundary={"end": "periodic", "position": 1e-5, "velocity": 1e-5},
     )
-    attempt = perform(Job(swinging, "chirp", 60.0, 40_000))
-    assert attempt.cost == np.inf
-    assert attempt.share < 0.0
-    assert attempt.control is not None
+    result = run_baseline(order(swinging, "chirp", steps=40_000))
+    assert result.cost == np.inf
+    assert result.margin < 0.0
+    assert result.control is not None
 
 
 @pytest.mark.slow
@@ -228,25 +246,25 @@ def test_weights_are_part_of_the_cost() -> None:
     task = DesignTask.resolve(soft)
     assert not task.is_limited
     for method in ("multisine", "fourier5"):
-        attempt = perform(Job(soft, method, 60.0, STEPS))
-        assert attempt.control is not None
-        point = task.problem.point(task.plant.simulate(task.theta, attempt.control))
-        assert point.cost == pytest.approx(attempt.cost, rel=1e-3)
+        result = run_baseline(order(soft, method, steps=STEPS))
+        assert result.control is not None
+        point = task.problem.point(task.plant.simulate(task.theta, result.control))
+        assert point.cost == pytest.approx(result.cost, rel=1e-3)
         assert point.criterion is not None
         assert point.cost < task.problem.point(task.initial).cost
         assert 0.1 < point.criterion.value / point.cost < 0.99  # both terms count
-    assert Shaper(Arena(Job(soft, "chirp", 1.0))).weighted
+    assert ExcitationFitter(evaluator_of(order(soft, "chirp", seconds=1.0))).has_weights
 
 
 # ---- series
 
 
 def test_the_usual_frequencies_come_first_and_stay_within_the_bandwidth() -> None:
-    arena = Arena(Job(pendulum(bandwidth=1.0), "fourier5", 60.0))
-    series = fourier(arena, 5)
-    first = [next(series) for _ in range(7)]
+    evaluator = evaluator_of(order(pendulum(bandwidth=1.0), "fourier5"))
+    runs = fourier_runs(evaluator, 5)
+    first = [next(runs) for _ in range(7)]
     assert [s.name for s in first[:5]] == ["0.2 Hz", "0.1 Hz", "0.4 Hz", "0.8 Hz", "0.15 Hz"]
-    t = arena.task.t
+    t = evaluator.task.t
     for s, frequency, harmonics in zip(
         first, (0.2, 0.1, 0.4, 0.8, 0.15), (5, 5, 2, 1, 5), strict=False
     ):
@@ -255,53 +273,59 @@ def test_the_usual_frequencies_come_first_and_stay_within_the_bandwidth() -> Non
         assert np.abs(left).max() < 1e-3
     assert "at random" in first[5].name
     assert all(
-        s.basis.shape[1] <= 7 for s in (next(splines(arena)) for _ in range(2))
+        s.basis.shape[1] <= 7 for s in (next(spline_runs(evaluator)) for _ in range(2))
     )  # 1 Hz: four pieces
 
 
 def test_slopes_for_scipy_are_the_derivatives() -> None:
-    arena = Arena(Job(pendulum(), "fourier5", 60.0))
-    series = next(s for s in fourier(arena, 3) if s.name.startswith("0.8"))
-    descent = Descent(arena, series, arena.exact, 1.0)
-    s = descent._coefficients(series.control) * 0.7
-    problem = InteriorProblem(arena.exact, arena.constraints, 0.1, 0.03)
-    _, slope = descent._valued(problem, s)
+    evaluator = evaluator_of(order(pendulum(), "fourier5"))
+    run = next(run for run in fourier_runs(evaluator, 3) if run.name.startswith("0.8"))
+    descent = ScipyDescent(evaluator=evaluator, run=run, base=evaluator.exact, limit=1.0)
+    s = descent.coefficients(run.control) * 0.7
+    problem = InteriorProblem(
+        base=evaluator.exact, constraints=evaluator.constraints, mu=0.1, delta=0.03
+    )
+
+    def value(s: Array) -> float:
+        return problem.value(problem.point(descent.control(s)))
+
+    slope = descent.slope(problem, problem.point(descent.control(s)))
+    assert slope is not None
     for i in range(s.size):
         move = np.zeros(s.size)
         move[i] = 1e-4
-        sides = [
-            descent._valued(problem, s + sign * move.reshape(s.shape))[0] for sign in (1.0, -1.0)
-        ]
-        assert (sides[0] - sides[1]) / 2e-4 == pytest.approx(
+        forward, backward = (value(s + sign * move.reshape(s.shape)) for sign in (1.0, -1.0))
+        assert (forward - backward) / 2e-4 == pytest.approx(
             slope[i], rel=5e-3, abs=2e-3 * np.abs(slope).max()
         )
 
 
-def test_a_tournament_ends_with_its_budget_and_sharpens_the_best() -> None:
-    arena = Arena(Job(pendulum(), "fourier5", 60.0, 200_000))
+def test_many_runs_end_with_the_budget_and_the_best_one_gets_the_sharpest_barrier() -> None:
+    evaluator = evaluator_of(order(pendulum(), "fourier5", steps=200_000))
     seen: list[tuple[str, float]] = []
 
-    def optimise(arena: Arena, series: Series, last: float, limit: float) -> None:
-        seen.append((series.name, last))
-        scipy_own(arena, series, last, limit)
+    def optimise(
+        evaluator: ControlEvaluator, run: ParametricRun, last: float, limit: float
+    ) -> None:
+        seen.append((run.name, last))
+        optimise_with_scipy(evaluator, run, last, limit)
 
-    with pytest.raises(Spent):
-        tournament(arena, fourier(arena, 5), 5, optimise)
+    optimise_many(evaluator, fourier_runs(evaluator, 5), 5, optimise)
     assert [name for name, _ in seen[:2]] == [
         "0.2 Hz",
         "0.1 Hz",
     ]  # the budget does not bear all five
     assert seen[-1][1] < seen[0][1]
-    assert 1.0 <= arena.used < 1.2
-    assert arena.attempt.found_by in {name for name, _ in seen}
+    assert 1.0 <= evaluator.used < 1.2
+    assert evaluator.best.found_by in {name for name, _ in seen}
 
 
 def test_the_best_of_a_search_only_gets_better() -> None:
     costs: list[float] = []
-    arena = Arena(
-        Job(pendulum(), "steps", 60.0, 60_000), lambda used, attempt: costs.append(attempt.cost)
+    evaluator = ControlEvaluator(
+        search=order(pendulum(), "steps", steps=60_000),
+        callback=lambda used, best: costs.append(best.cost),
     )
-    with pytest.raises(Spent):
-        search(arena, RandomSteps)
+    random_search(evaluator, RandomSteps)
     assert len(costs) > 3
     assert all(b <= a for a, b in pairwise(costs))

@@ -22,7 +22,7 @@ from mjfim.excitation.verification import verify
 from mjfim.output.plots.compare import compare_figure
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design, HistoryRow
-from mjfim.studies.baselines.budget import Attempt
+from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
 from mjfim.studies.compare import Glance, Judge, Meter, chosen_methods
 from tests.support.baselines import pendulum, played
 from tests.support.cli import loads, names, read, run, write_experiment
@@ -126,22 +126,24 @@ def test_a_control_that_leaks_is_shrunk_until_it_does_not() -> None:
     task, found = DesignTask.resolve(pendulum()), small().rows[0]
     assert found.control is not None
     leaking = task.centre + 1.15 * (found.control - task.centre)
-    r = Judge(task, None).row("chirp", "chirp", Attempt(leaking, 1.0))
+    r = Judge(task, None).row("chirp", "chirp", SearchResult(control=leaking, cost=1.0))
     assert r.outcome is MethodOutcome.INSIDE
     assert "shrunk to" in r.note
     assert min(r.margins.values()) >= 0.0
-    far = Judge(task, None).row("chirp", "chirp", Attempt(leaking, np.inf))
+    far = Judge(task, None).row("chirp", "chirp", SearchResult(control=leaking))
     assert far.outcome is MethodOutcome.NOTHING
     assert min(far.margins.values()) < 0.0
     assert not far.sound
-    nothing = Judge(task, None).row("chirp", "chirp", Attempt())
+    nothing = Judge(task, None).row("chirp", "chirp", SearchResult())
     assert (nothing.outcome, nothing.control) == (MethodOutcome.NONE, None)
 
 
 def test_the_designs_control_is_never_shrunk() -> None:
     task, found = DesignTask.resolve(pendulum()), small().rows[2]
     assert found.control is not None
-    r = Judge(task, None).row(DESIGN, "design", Attempt(1.05 * found.control, 1.0))
+    r = Judge(task, None).row(
+        DESIGN, "design", SearchResult(control=1.05 * found.control, cost=1.0)
+    )
     assert r.outcome is MethodOutcome.OUTSIDE
 
 
@@ -198,7 +200,7 @@ def test_only_methods_that_make_sense() -> None:
 
 def test_a_design_is_stopped_at_its_steps() -> None:
     told: list[float] = []
-    job = compare.Job(pendulum(), DESIGN, 60.0, 1000.0)
+    job = BaselineSearch(experiment=pendulum(), method=DESIGN, seconds=60.0, steps=1000.0)
     meter = Meter(job, lambda used, cost: told.append(used))
 
     def iterate(steps: int) -> HistoryRow:
@@ -376,7 +378,7 @@ def test_an_interrupted_comparison_is_written(
     result = run("compare", study, "-o", tmp_path, "--steps", 10_000, "--methods", "chirp")
     assert result.exit_code == 1
     assert read(tmp_path / "compare.json")["interrupted"] is True
-    monkeypatch.setattr(compare, "perform", interrupted)
+    monkeypatch.setattr(compare, "run_baseline", interrupted)
     nothing = run("compare", study, "-o", tmp_path / "none", "--steps", 10_000)
     assert nothing.exit_code == 1
     assert "interrupted before there was a result" in nothing.stderr

@@ -1,13 +1,13 @@
-"""What else could be played: ways to spend a budget of seconds and MuJoCo steps on finding a control of an experiment.
+"""Baselines that a design is compared with: searches for a control within a budget of time and MuJoCo steps.
 
-All look for it under the same limits, on the same plant, by the same cost J. Chirps, multisines and random steps are
-searched at random over the few numbers that they are made of, each scaled up to the limits; `series` has the others.
+All baselines search under the same limits, on the same plant, with the same cost J. Chirps, multisines and random steps are
+searched at random over the few numbers that describe them, each scaled up to the limits. Fourier series and B-splines are
+in `parametric`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,134 +15,244 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
+from mjfim.budget import StopToken
 from mjfim.excitation.bandwidth import bandwidth_basis
+from mjfim.parallel import stopped
 from mjfim.signals import Chirp, Excitation, ExcitationSettings, Multisine, RandomSteps
-from mjfim.studies.baselines.budget import Arena, Attempt, Job, Monitor, Spent
+from mjfim.studies.baselines.evaluator import (
+    BaselineSearch,
+    ControlEvaluator,
+    SearchCallback,
+    SearchResult,
+)
 from mjfim.studies.baselines.parametric import (
-    BASES,
-    KNOTS,
+    FOURIER_FREQUENCIES,
+    SPLINE_BANDWIDTHS,
     Optimiser,
-    fourier,
-    own,
-    scipy_determinant,
-    scipy_own,
-    splines,
-    tournament,
+    fourier_runs,
+    optimise_determinant_with_scipy,
+    optimise_many,
+    optimise_with_mjfim,
+    optimise_with_scipy,
+    spline_runs,
 )
 
-CYCLES = 40.0  # within the horizon, at most
-LARGEST = 6.0  # size of a control where nothing bounds it, over that of the initial one
-BOUNDED = 2.0  # the same where a range does, over half of it
-SOFTEST = 0.03  # the same where weights make the best one smaller
-STRAY = 0.3  # share of the tries that look anywhere, not about the best
-MUTATED = 0.3  # share of the numbers that change about the best
+# Periods of a wave within the horizon, at most.
+MAX_CYCLES = 40.0
+
+# Largest deviation of a control without a range, over the size of the initial control.
+LARGEST_UNBOUNDED_SCALE = 6.0
+
+# Largest deviation of a control with a range, over half of the range.
+LARGEST_BOUNDED_SCALE = 2.0
+
+# Smallest deviation, over the largest feasible one, where weights in the cost may make a small control the best.
+SMALLEST_WEIGHTED_SCALE = 0.03
+
+# Share of the trials of the random search that are drawn anywhere, not about the best one.
+GLOBAL_SHARE = 0.3
+
+# Share of the numbers that a trial about the best one changes, and the fewest that it changes.
+CHANGED_SHARE = 0.3
+FEWEST_CHANGED = 2.0
+
+# Standard deviation of changes about the best trial at the beginning, and its range.
+FIRST_SPREAD = 0.3
+SPREAD_RANGE = (0.01, 0.5)
+
+# Factors of that standard deviation after a successful and after an unsuccessful trial.
+SPREAD_AFTER_SUCCESS = 1.5
+SPREAD_AFTER_FAILURE = 0.93
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Baseline:
-    """title: in tables;  run: spends the budget;  limited: whether it makes sense under hard limits alone"""
+    """A method that a design is compared with.
 
-    title: str
-    run: Callable[[Arena], None]
-    limited: bool = False
-
-
-def perform(job: Job, monitor: Monitor | None = None) -> Attempt:
-    """Run a baseline from beginning to end; may be sent to an executor."""
-    with threadpool_limits(1, user_api="blas"):
-        arena = Arena(job, monitor)
-        with suppress(Spent):
-            METHODS[job.method].run(arena)
-        return arena.finished()
-
-
-def search(arena: Arena, kind: Callable[[ExcitationSettings], Excitation]) -> None:
-    """Random search over the numbers of an excitation, about the best or anywhere, until the budget is used up."""
-    shaper = Shaper(arena)
-    excitation, rng = kind(shaper.frame), arena.rng
-    best, cost, spread = np.zeros(0), np.inf, 0.3
-    while True:
-        arena.require()
-        z = rng.random(
-            1 + excitation.parameter_count
-        )  # the first one: how large, where weights decide that
-        about = len(best) > 0 and rng.random() > STRAY
-        if about:
-            changed = rng.random(len(z)) < max(MUTATED, 2.0 / len(z))
-            z = reflected(best + spread * changed * rng.normal(size=len(z)))
-        swing = shaper.swing(excitation.curve(z[1:]))
-        scale = arena.largest(swing, shaper.most)
-        if scale == 0.0:
-            continue
-        if shaper.weighted:
-            scale *= SOFTEST ** (1.0 - z[0])
-        found = arena.offer(arena.looking.point(arena.centre + scale * swing))
-        if about:
-            spread = float(np.clip(spread * (1.5 if found < cost else 0.93), 0.01, 0.5))
-        if found < cost:
-            best, cost = z, found
-
-
-def reflected(z: Array) -> Array:
-    """Numbers put back between 0 and 1 as by mirrors there."""
-    return np.asarray(1.0 - np.abs(1.0 - np.abs(z) % 2.0))
-
-
-class Shaper:
-    """Makes waves fit an experiment: from rest to rest, within the bandwidth, as large as the limits allow.
-
-    weighted: the cost has weights, which may make a smaller control the better one
+    Attributes:
+        title: Name for the user.
+        run: Searches until the budget of an evaluator is exhausted.
+        needs_limits: True where the method makes sense under hard limits only.
     """
 
-    def __init__(self, arena: Arena) -> None:
-        self.arena = arena
-        task, constraints = arena.task, arena.constraints
-        e = task.experiment
-        fastest = min(e.limits.bandwidth or np.inf, 0.25 * e.rate, CYCLES / task.horizon)
-        jumps = (
-            constraints.rate is None and e.limits.bandwidth is None and e.boundary.start != "rest"
+    title: str
+    run: Callable[[ControlEvaluator], None]
+    needs_limits: bool = False
+
+
+def run_baseline(
+    search: BaselineSearch,
+    callback: SearchCallback | None = None,
+    stop: StopToken | None = None,
+) -> SearchResult:
+    """Run a baseline until its budget is exhausted. An executor can call this in a worker process.
+
+    Args:
+        search: The order.
+        callback: Called during the search with the used share of the budget and the best result so far.
+        stop: Ends the search early; in a worker process, default: the request of its pool.
+
+    Returns:
+        The best control.
+    """
+    if stop is None:
+        stop = StopToken(also=stopped)
+
+    # Small matrices: threads of the BLAS only wait for each other.
+    with threadpool_limits(1, user_api="blas"):
+        evaluator = ControlEvaluator(search=search, callback=callback, stop=stop)
+        METHODS[search.method].run(evaluator)
+        return evaluator.result()
+
+
+def random_search(
+    evaluator: ControlEvaluator, kind: Callable[[ExcitationSettings], Excitation]
+) -> None:
+    """Search at random over the numbers of an excitation, about the best ones or anywhere.
+
+    Args:
+        evaluator: Evaluates the trials and ends the search.
+        kind: The kind of excitation.
+    """
+    fitter = ExcitationFitter(evaluator)
+    excitation, rng = kind(fitter.settings), evaluator.rng
+    best, best_cost, spread = np.zeros(0), np.inf, FIRST_SPREAD
+
+    while not evaluator.exhausted():
+        # The first number is the size, which matters where weights in the cost decide about it.
+        numbers = rng.random(1 + excitation.parameter_count)
+        is_local = len(best) > 0 and rng.random() > GLOBAL_SHARE
+        if is_local:
+            share = max(CHANGED_SHARE, FEWEST_CHANGED / len(numbers))
+            changed = rng.random(len(numbers)) < share
+            change = spread * changed * rng.normal(size=len(numbers))
+            numbers = reflected(best + change)
+
+        # Scale the excitation up to the limits.
+        deviation = fitter.deviation(excitation.curve(numbers[1:]))
+        scale = evaluator.largest_feasible_scale(deviation, fitter.largest_scale)
+        if scale == 0.0:
+            continue
+        if fitter.has_weights:
+            scale *= SMALLEST_WEIGHTED_SCALE ** (1.0 - numbers[0])
+
+        control = evaluator.centre + scale * deviation
+        cost = evaluator.evaluate(evaluator.problem.point(control))
+
+        # Widen the local search after a success, narrow it after a failure.
+        if is_local:
+            factor = SPREAD_AFTER_SUCCESS if cost < best_cost else SPREAD_AFTER_FAILURE
+            spread = float(np.clip(spread * factor, *SPREAD_RANGE))
+        if cost < best_cost:
+            best, best_cost = numbers, cost
+
+
+def reflected(numbers: Array) -> Array:
+    """Bring numbers, (n,), back between 0 and 1 by reflection at these ends."""
+    return np.asarray(1.0 - np.abs(1.0 - np.abs(numbers) % 2.0))
+
+
+class ExcitationFitter:
+    """Fits excitations to an experiment: from rest to rest, within the bandwidth, in units of the actuators.
+
+    Attributes:
+        settings: Frequencies and duration of the excitations.
+        has_weights: True where the cost has weights, which may make a smaller control the better one.
+        largest_scale: Largest scale of a deviation that is worth trying.
+    """
+
+    def __init__(self, evaluator: ControlEvaluator) -> None:
+        task, constraints = evaluator.task, evaluator.constraints
+        experiment = task.experiment
+        bandwidth = experiment.limits.bandwidth
+
+        fastest = min(bandwidth or np.inf, 0.25 * experiment.rate, MAX_CYCLES / task.horizon)
+        may_jump = (
+            constraints.rate is None and bandwidth is None and experiment.boundary.start != "rest"
         )
-        self.frame = ExcitationSettings(
+        self.settings = ExcitationSettings(
             t=task.t,
             horizon=task.horizon,
             nu=len(task.controls),
             min_frequency=min(0.5 / task.horizon, fastest),
             max_frequency=fastest,
-            may_jump=jumps,
-        )
-        self.weighted = bool(task.control_weight.any() or task.tracking.any()) or not arena.holds
-        self.most = BOUNDED if np.isfinite(constraints.control.bounds.lower).all() else LARGEST
-        self.window = task.fade(task.samples)
-        self.basis = bandwidth_basis(task, task.t)
-        self.fit = None if self.basis is None else np.linalg.pinv(self.basis)
-
-    def swing(self, wave: Array) -> Array:
-        """(N, nu) what is added to the centre; at scale 1 as large as half of the controls' range."""
-        windowed = self.window * wave * self.arena.constraints.control.bounds.scale
-        return (
-            windowed
-            if self.basis is None or self.fit is None
-            else np.asarray(self.basis @ (self.fit @ windowed))
+            may_jump=may_jump,
         )
 
+        has_weights = bool(task.control_weight.any() or task.tracking.any())
+        self.has_weights = has_weights or not evaluator.is_limited
 
-def _harmonics(count: int, optimise: Optimiser) -> Callable[[Arena], None]:
-    return lambda arena: tournament(arena, fourier(arena, count), len(BASES), optimise)
+        bounds = constraints.control.bounds
+        is_bounded = np.isfinite(bounds.lower).all()
+        self.largest_scale = LARGEST_BOUNDED_SCALE if is_bounded else LARGEST_UNBOUNDED_SCALE
+
+        self._size = bounds.scale
+        self._window = task.fade(task.samples)
+        self._basis = bandwidth_basis(task, task.t)
+        self._fit = None if self._basis is None else np.linalg.pinv(self._basis)
+
+    def deviation(self, wave: Array) -> Array:
+        """Deviation from the centre that belongs to a wave.
+
+        Args:
+            wave: (N, nu) wave of size 1.
+
+        Returns:
+            (N, nu) deviation [unit of the actuator]; its size is about half of the range of the control.
+        """
+        windowed = self._window * wave * self._size
+        if self._basis is None or self._fit is None:
+            return windowed
+
+        # The nearest curve within the bandwidth.
+        return np.asarray(self._basis @ (self._fit @ windowed))
 
 
-def _knots(optimise: Optimiser) -> Callable[[Arena], None]:
-    return lambda arena: tournament(arena, splines(arena), len(KNOTS), optimise)
+def _optimise_fourier(count: int, optimise: Optimiser) -> Callable[[ControlEvaluator], None]:
+    """Method that optimises Fourier series of `count` harmonics."""
+
+    def run(evaluator: ControlEvaluator) -> None:
+        """Optimise until the budget is exhausted."""
+        runs = fourier_runs(evaluator, count)
+        optimise_many(evaluator, runs, len(FOURIER_FREQUENCIES), optimise)
+
+    return run
 
 
+def _optimise_splines(optimise: Optimiser) -> Callable[[ControlEvaluator], None]:
+    """Method that optimises B-splines."""
+
+    def run(evaluator: ControlEvaluator) -> None:
+        """Optimise until the budget is exhausted."""
+        optimise_many(evaluator, spline_runs(evaluator), len(SPLINE_BANDWIDTHS), optimise)
+
+    return run
+
+
+# The baselines by their keys, in the order in which a comparison runs them.
 METHODS = {
-    "chirp": Baseline("chirp", partial(search, kind=Chirp)),
-    "multisine": Baseline("multisine (Schroeder)", partial(search, kind=Multisine)),
-    "steps": Baseline("random steps", partial(search, kind=RandomSteps)),
-    "fourier5": Baseline("Fourier 5", _harmonics(5, scipy_own)),
-    "fourier5-D": Baseline("Fourier 5, on D", _harmonics(5, scipy_determinant)),
-    "fourier15": Baseline("Fourier 15", _harmonics(15, scipy_own)),
-    "splines": Baseline("B-splines", _knots(scipy_own)),
-    "splines-D": Baseline("B-splines, on D", _knots(scipy_determinant)),
-    "fourier5-mjfim": Baseline("Fourier 5, mjfim's optimiser", _harmonics(5, own), limited=True),
-    "fourier15-mjfim": Baseline("Fourier 15, mjfim's optimiser", _harmonics(15, own), limited=True),
+    "chirp": Baseline(title="chirp", run=partial(random_search, kind=Chirp)),
+    "multisine": Baseline(
+        title="multisine (Schroeder)", run=partial(random_search, kind=Multisine)
+    ),
+    "steps": Baseline(title="random steps", run=partial(random_search, kind=RandomSteps)),
+    "fourier5": Baseline(title="Fourier 5", run=_optimise_fourier(5, optimise_with_scipy)),
+    "fourier5-D": Baseline(
+        title="Fourier 5, on D", run=_optimise_fourier(5, optimise_determinant_with_scipy)
+    ),
+    "fourier15": Baseline(title="Fourier 15", run=_optimise_fourier(15, optimise_with_scipy)),
+    "splines": Baseline(title="B-splines", run=_optimise_splines(optimise_with_scipy)),
+    "splines-D": Baseline(
+        title="B-splines, on D", run=_optimise_splines(optimise_determinant_with_scipy)
+    ),
+    "fourier5-mjfim": Baseline(
+        title="Fourier 5, mjfim's optimiser",
+        run=_optimise_fourier(5, optimise_with_mjfim),
+        needs_limits=True,
+    ),
+    "fourier15-mjfim": Baseline(
+        title="Fourier 15, mjfim's optimiser",
+        run=_optimise_fourier(15, optimise_with_mjfim),
+        needs_limits=True,
+    ),
 }

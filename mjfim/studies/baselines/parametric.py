@@ -1,14 +1,14 @@
-"""Fourier series and B-splines, optimised with SciPy or with mjfim's own optimiser: many bluntly, the best ones sharply.
+"""Optimised Fourier series and B-splines: many of them roughly, the best ones to the end.
 
-SciPy gets what is best for it: the exact gradient of `log J + mu * barrier`, mu falling in the stages of `barrier_weights`, and
-coefficients whitened by the Gauss-Newton metric of the barrier, anew at every stage.
+They are optimised with SciPy or with mjfim's own optimiser. SciPy gets the best that can be given to it: the exact gradient of
+`log J + mu * barrier`, with mu falling in the stages of a barrier schedule, and coefficients that are whitened at every stage
+by the Gauss-Newton metric of the barrier.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -34,30 +34,62 @@ from mjfim.excitation.unconstrained import regulator_for
 from mjfim.optimize.lq import Weights
 from mjfim.optimize.structured_bfgs import BasisMetric
 from mjfim.signals import fourier_basis, independent_curves
-from mjfim.studies.baselines.budget import Arena, Spent
+from mjfim.studies.baselines.evaluator import ControlEvaluator
 
-BASES = (0.2, 0.1, 0.4, 0.8, 0.15)  # [Hz] of Fourier series, to begin with
-KNOTS = (1.0, 2.0)  # [Hz] bandwidth of B-splines, to begin with
-PERIODS = (0.4, 5.0)  # of the first harmonic of other series within the horizon
-BUSIEST = 5  # harmonics that other series have at least, where the bandwidth allows them
-BLUNT = 0.03  # mu down to which all series are optimised
+# Base frequencies of the first Fourier series [Hz].
+FOURIER_FREQUENCIES = (0.2, 0.1, 0.4, 0.8, 0.15)
+
+# Bandwidths of the first B-splines [Hz].
+SPLINE_BANDWIDTHS = (1.0, 2.0)
+
+# Periods of the first harmonic within the horizon, fewest and most, of Fourier series with random base frequencies.
+RANDOM_PERIODS = (0.4, 5.0)
+
+# Harmonics that series with random base frequencies have at least, where the bandwidth allows them.
+FEWEST_RANDOM_HARMONICS = 5
+
+# Bandwidths of random B-splines, over the smallest and the largest of the first ones.
+RANDOM_BANDWIDTH_FACTORS = (0.5, 2.0)
+
+# Barrier weight mu down to which all series are optimised.
+ROUGH_MU = 0.03
+
+# Shares of the remaining budget after which only the better series continue, and after which only the best one does.
+ROUGH_SHARE, BETTER_SHARE = 0.3, 0.45
+
+# One in three series belongs to the better ones.
+SELECTION_RATE = 3
+
+# Evaluations that every series gets at least; where the budget does not allow them, fewer series take part.
+MIN_EVALUATIONS = 12
+
+# Iterations of mjfim's optimiser: unlimited for practical purposes, the budget ends it.
+UNLIMITED_ITERATIONS = 100_000
+
+# SciPy's method, and the number of curvature pairs that it keeps.
+SCIPY_METHOD = "L-BFGS-B"
+SCIPY_OPTIONS = {"maxcor": 30}
+
+# Value that SciPy sees where the simulation diverges.
+DIVERGED_VALUE = 1e6
+
+# Weight of the control in the whitening metric, over the weight of its barrier.
+RIDGE = 0.03
+
+# Multiple of the mean eigenvalue that is added to the metric, so that its Cholesky factor exists.
+METRIC_JITTER = 1e-12
 
 
-FIRST, SECOND = 0.3, 0.45  # share of the budget after which the better ones go on, and the best one
+@dataclass(eq=False, kw_only=True)
+class ParametricRun:
+    """A parametric excitation and the state of its optimisation.
 
-
-KEPT = 3  # one in so many is a better one
-LEAST = 12  # iterations of each; where the budget does not bear them, fewer series take part
-SCIPY = ("L-BFGS-B", {"maxcor": 30})
-FAR = 1e6  # value of what diverges
-RIDGE = 0.03  # weight of the control in the metric, over that of its barrier
-
-
-@dataclass(eq=False)
-class Series:
-    """Curves, and where the search within them has come to.
-
-    basis: (N, M);  control: (N, nu);  cost: J there, infinite outside the limits;  mu: barrier to go on with
+    Attributes:
+        name: Name for the user.
+        basis: (N, M) curves of which the control minus its centre is made.
+        control: (N, nu) the best control so far [unit of the actuator].
+        cost: J of this control; infinite where it is infeasible.
+        mu: Barrier weight with which the optimisation continues; 0 once it is finished.
     """
 
     name: str
@@ -68,304 +100,488 @@ class Series:
 
     @property
     def finished(self) -> bool:
-        """Down to the sharpest barrier."""
+        """True after the stage with the smallest barrier weight."""
         return self.mu == 0.0
 
+    def finish_schedule(self, last: float) -> None:
+        """Remember that all stages down to a barrier weight are done."""
+        is_rough = last > BarrierSchedule().last
+        self.mu = last if is_rough else 0.0
 
-Optimiser = Callable[
-    [Arena, Series, float, float], None
-]  # to a last mu, or until a share of the budget is used
+    def update(self, evaluator: ControlEvaluator, point: InteriorPoint) -> None:
+        """Keep the control of a point if it is the best one of this run, or of all."""
+        cost = evaluator.evaluate(point, self.name)
+        if cost < self.cost:
+            self.control, self.cost = point.ctrl, cost
 
 
-def fourier(arena: Arena, harmonics: int) -> Iterator[Series]:
-    """Finite Fourier series (Swevers et al. 1997) of the usual base frequencies, then of any."""
-    e = arena.task.experiment
-    fastest = e.limits.bandwidth or 0.5 * e.rate
-    rest = (e.boundary.start == "rest", e.boundary.end == "rest")
+# Optimises a run down to a barrier weight, or until a share of the budget is used: (evaluator, run, last weight, share).
+Optimiser = Callable[[ControlEvaluator, ParametricRun, float, float], None]
 
-    def made(frequency: float) -> Array:
+
+def fourier_runs(evaluator: ControlEvaluator, harmonics: int) -> Iterator[ParametricRun]:
+    """Finite Fourier series (Swevers et al. 1997), with usual base frequencies first and random ones after them.
+
+    Args:
+        evaluator: Scales the initial controls to the limits.
+        harmonics: Number of harmonics, where the bandwidth allows them.
+
+    Yields:
+        Runs without end, until the budget is exhausted.
+    """
+    task = evaluator.task
+    experiment = task.experiment
+    fastest = experiment.limits.bandwidth or 0.5 * experiment.rate
+    from_rest = experiment.boundary.start == "rest"
+    to_rest = experiment.boundary.end == "rest"
+
+    def basis(frequency: float) -> Array:
+        """(N, M) harmonics of a base frequency [Hz] within the bandwidth."""
         count = max(min(harmonics, int(fastest / frequency + 1e-9)), 1)
-        return independent_curves(
-            fourier_basis(arena.task.t, arena.task.horizon, frequency, count, *rest)
-        )
+        curves = fourier_basis(task.t, task.horizon, frequency, count, from_rest, to_rest)
+        return independent_curves(curves)
 
-    ends = tuple(
-        min(periods / arena.task.horizon, fastest / min(harmonics, BUSIEST)) for periods in PERIODS
-    )
-    return _any(arena, [f for f in BASES if f <= fastest], ends, made)
-
-
-def splines(arena: Arena) -> Iterator[Series]:
-    """Uniform cubic B-splines of the usual knots, then of any between."""
-    e = arena.task.experiment
-    fastest = e.limits.bandwidth or 0.5 * e.rate
-
-    def made(bandwidth: float) -> Array:
-        return independent_curves(boundary_splines(arena.task, arena.task.t, bandwidth))
-
-    ends = (min(0.5 * KNOTS[0], fastest), min(2.0 * KNOTS[-1], fastest))
-    return _any(arena, [f for f in KNOTS if f <= fastest], ends, made)
+    usual = [frequency for frequency in FOURIER_FREQUENCIES if frequency <= fastest]
+    highest = fastest / min(harmonics, FEWEST_RANDOM_HARMONICS)
+    ends = [min(periods / task.horizon, highest) for periods in RANDOM_PERIODS]
+    return _runs(evaluator, usual, ends, basis)
 
 
-def _any(
-    arena: Arena, usual: Sequence[float], ends: Sequence[float], made: Callable[[float], Array]
-) -> Iterator[Series]:
-    """The usual frequencies from the initial control, then any between the ends from random coefficients."""
-    i, n = arena.job.part
-    for frequency in usual[i::n]:
-        basis = made(frequency)
-        fitted = basis @ np.linalg.lstsq(basis, arena.task.control - arena.centre)[0]
-        yield started(arena, f"{frequency:.3g} Hz", basis, fitted)
-    size = arena.constraints.control.bounds.scale
+def spline_runs(evaluator: ControlEvaluator) -> Iterator[ParametricRun]:
+    """Uniform cubic B-splines, with usual bandwidths first and random ones after them.
+
+    Args:
+        evaluator: Scales the initial controls to the limits.
+
+    Yields:
+        Runs without end, until the budget is exhausted.
+    """
+    task = evaluator.task
+    experiment = task.experiment
+    fastest = experiment.limits.bandwidth or 0.5 * experiment.rate
+
+    def basis(bandwidth: float) -> Array:
+        """(N, M) splines of a bandwidth [Hz]."""
+        return independent_curves(boundary_splines(task, task.t, bandwidth))
+
+    usual = [bandwidth for bandwidth in SPLINE_BANDWIDTHS if bandwidth <= fastest]
+    lowest, highest = RANDOM_BANDWIDTH_FACTORS
+    ends = [
+        min(lowest * SPLINE_BANDWIDTHS[0], fastest),
+        min(highest * SPLINE_BANDWIDTHS[-1], fastest),
+    ]
+    return _runs(evaluator, usual, ends, basis)
+
+
+def _runs(
+    evaluator: ControlEvaluator,
+    usual: Sequence[float],
+    ends: Sequence[float],
+    basis_of: Callable[[float], Array],
+) -> Iterator[ParametricRun]:
+    """Runs at the usual frequencies [Hz] from the initial control, then at random ones from random coefficients."""
+    part, parts = evaluator.search.part
+    for frequency in usual[part::parts]:
+        if evaluator.exhausted():
+            return
+        basis = basis_of(frequency)
+        initial = evaluator.task.control - evaluator.centre
+        nearest = basis @ np.linalg.lstsq(basis, initial)[0]
+        yield _initial_run(evaluator, f"{frequency:.3g} Hz", basis, nearest)
+
+    size, rng = evaluator.constraints.control.bounds.scale, evaluator.rng
     while True:
-        frequency = float(np.exp(arena.rng.uniform(*np.log(ends))))
-        basis = made(frequency)
-        swing = (
-            basis
-            @ arena.rng.normal(size=(basis.shape[1], len(size)))
-            * size
-            / np.sqrt(basis.shape[1])
-        )
-        yield started(arena, f"{frequency:.3g} Hz, at random", basis, swing)
+        # Log-uniform frequencies between the ends.
+        frequency = float(np.exp(rng.uniform(*np.log(ends))))
+        basis = basis_of(frequency)
+        count = basis.shape[1]
+        coefficients = rng.normal(size=(count, len(size)))
+        deviation = basis @ coefficients * size / np.sqrt(count)
+
+        if evaluator.exhausted():
+            return
+        yield _initial_run(evaluator, f"{frequency:.3g} Hz, at random", basis, deviation)
 
 
-def started(arena: Arena, name: str, basis: Array, swing: Array) -> Series:
-    """Curves with a start, (N, nu) about the centre, as large as the limits allow, up to what it is."""
-    arena.require()
-    scale = arena.largest(swing)
-    series = Series(name, basis, arena.centre + (scale or 1.0) * swing)
+def _initial_run(
+    evaluator: ControlEvaluator, name: str, basis: Array, deviation: Array
+) -> ParametricRun:
+    """A run that begins with a deviation from the centre, (N, nu), scaled down to the limits where it violates them."""
+    scale = evaluator.largest_feasible_scale(deviation)
+    control = evaluator.centre + (scale or 1.0) * deviation
+    run = ParametricRun(name=name, basis=basis, control=control)
     if scale:
-        offered(arena, series, arena.looking.point(series.control))
-    return series
+        run.update(evaluator, evaluator.problem.point(control))
+    return run
 
 
-def offered(arena: Arena, series: Series, point: InteriorPoint) -> None:
-    """Keep a point if it is the best of the series, and of all."""
-    cost = arena.offer(point, series.name)
-    if cost < series.cost:
-        series.control, series.cost = point.ctrl, cost
+def optimise_many(
+    evaluator: ControlEvaluator, runs: Iterator[ParametricRun], count: int, optimise: Optimiser
+) -> None:
+    """Optimise several runs roughly, the better third longer, the best one to the end; repeat until the budget is exhausted.
 
+    Args:
+        evaluator: Evaluates controls and holds the budget.
+        runs: Where further runs come from.
+        count: Runs that are added in each repetition, where the budget allows.
+        optimise: Optimises one run.
+    """
+    known: list[ParametricRun] = []
 
-def tournament(arena: Arena, entrants: Iterator[Series], count: int, optimise: Optimiser) -> None:
-    """Optimise so many series a little and bluntly, the better third more, the best one sharply; again until all is spent."""
-    known: list[Series] = []
+    def advance(run: ParametricRun, last: float, limit: float) -> None:
+        """Optimise a run, unless it has come that far already."""
+        if run.mu > last:
+            optimise(evaluator, run, last, limit)
 
-    def advance(series: Series, last: float, limit: float) -> None:
-        if series.mu > last:
-            with suppress(Spent):
-                optimise(arena, series, last, limit)
-        arena.require()
+    while not evaluator.budget.exhausted:
+        begun = evaluator.used
+        rough_end = begun + ROUGH_SHARE * (1.0 - begun)
+        better_end = begun + BETTER_SHARE * (1.0 - begun)
 
-    def best(many: int) -> list[Series]:
-        return sorted((s for s in known if not s.finished), key=lambda series: series.cost)[:many]
-
-    while True:
-        begun = arena.used
-        first, second = (begun + share * (1.0 - begun) for share in (FIRST, SECOND))
+        # New runs, each with its share of the first part of the budget.
         for i in range(count):
-            known.append(next(entrants))
-            arena.grace = LEAST
-            advance(known[-1], BLUNT, arena.used + (first - arena.used) / (count - i))
-            if arena.used >= first:
+            run = next(runs, None)
+            if run is None:
+                return
+            known.append(run)
+            evaluator.protected_looks = MIN_EVALUATIONS
+            advance(run, ROUGH_MU, evaluator.used + (rough_end - evaluator.used) / (count - i))
+            if evaluator.exhausted():
+                return
+            if evaluator.used >= rough_end:
                 break
-        better = best(-(-len(known) // KEPT))
-        for i, series in enumerate(better):
-            advance(series, BLUNT, arena.used + (second - arena.used) / (len(better) - i))
-        for series in best(1):
-            advance(series, BarrierSchedule().last, 1.0)
+
+        # The better ones of all runs so far.
+        better = _cheapest(known, -(-len(known) // SELECTION_RATE))
+        for i, run in enumerate(better):
+            share = (better_end - evaluator.used) / (len(better) - i)
+            advance(run, ROUGH_MU, evaluator.used + share)
+            if evaluator.exhausted():
+                return
+
+        # The best one, to the end.
+        for run in _cheapest(known, 1):
+            advance(run, BarrierSchedule().last, 1.0)
+            if evaluator.exhausted():
+                return
+
+
+def _cheapest(runs: Sequence[ParametricRun], count: int) -> list[ParametricRun]:
+    """The cheapest runs that are not finished."""
+    open_runs = [run for run in runs if not run.finished]
+    return sorted(open_runs, key=lambda run: run.cost)[:count]
 
 
 # with mjfim's own optimiser ---------------------------------------------------------------------------------------------
 
 
-def own(arena: Arena, series: Series, last: float, limit: float) -> None:
-    """Descend as designs do, within the series."""
-    job, chase = arena.job, Chase(series.name)
-    left = (
-        (1.0 - arena.used) * job.seconds if limit >= 1.0 else np.inf
-    )  # else sharper barriers would come too early
-    start = InitialControl(name=series.name, control=series.control, basis=series.basis)
-    schedule = BarrierSchedule(first=series.mu, last=last)
+def optimise_with_mjfim(
+    evaluator: ControlEvaluator, run: ParametricRun, last: float, limit: float
+) -> None:
+    """Optimise within the curves of a run as designs under hard limits are optimised. See `Optimiser`."""
+    order, chase = evaluator.search, Chase(run.name)
+
+    # Only the last search gets a time limit: with one, the barrier of the others would fall too early.
+    seconds = (1.0 - evaluator.used) * order.seconds if limit >= 1.0 else np.inf
     search = ConstrainedSearch(
-        job.experiment,
-        start,
-        schedule,
-        100_000,
-        left,
-        job.combinations,
-        job.added,
-        threads=job.threads,
+        experiment=order.experiment,
+        start=InitialControl(name=run.name, control=run.control, basis=run.basis),
+        schedule=BarrierSchedule(first=run.mu, last=last),
+        budget=UNLIMITED_ITERATIONS,
+        seconds=seconds,
+        combinations=order.combinations,
+        added_information=order.added_information,
+        threads=order.threads,
     )
-    for row in pursue(search, chase, arena.task):
-        series.mu = min(row.mu, series.mu)
-        if chase.control is not None and chase.cost < series.cost:
-            series.control, series.cost = chase.control, chase.cost
-            arena.keep(chase.control, chase.cost, 0.0, series.name)
-        arena.require(limit)
-    series.mu = last if last > BarrierSchedule().last else 0.0
+    for row in pursue(search, chase, evaluator.task):
+        run.mu = min(row.mu, run.mu)
+        if chase.control is not None and chase.cost < run.cost:
+            run.control, run.cost = chase.control, chase.cost
+            evaluator.record(chase.control, chase.cost, 0.0, run.name)
+        if evaluator.exhausted(limit):
+            return
+
+    run.finish_schedule(last)
 
 
 # with SciPy -------------------------------------------------------------------------------------------------------------
 
 
-def scipy_own(arena: Arena, series: Series, last: float, limit: float) -> None:
-    """Minimise the experiment's own cost."""
-    criterion = arena.task.experiment.cost.criterion
-    base = smoothed(arena.task, arena.job.combinations) if criterion == "E" else arena.exact
-    Descent(arena, series, base, limit).run(BarrierSchedule(first=series.mu, last=last))
+def optimise_with_scipy(
+    evaluator: ControlEvaluator, run: ParametricRun, last: float, limit: float
+) -> None:
+    """Minimise the cost of the experiment within the curves of a run. See `Optimiser`."""
+    base = evaluator.exact
+    if evaluator.task.experiment.cost.criterion == "E":
+        base = smoothed(evaluator.task, evaluator.search.combinations)
+
+    schedule = BarrierSchedule(first=run.mu, last=last)
+    ScipyDescent(evaluator=evaluator, run=run, base=base, limit=limit).descend(schedule)
 
 
-def scipy_determinant(arena: Arena, series: Series, last: float, limit: float) -> None:
-    """Minimise it with `-log det` for its criterion; what is kept is judged by the experiment's own."""
-    base = replace(arena.exact, information=replace(arena.exact.information, criterion="D"))
-    Descent(arena, series, base, limit).run(BarrierSchedule(first=series.mu, last=last))
+def optimise_determinant_with_scipy(
+    evaluator: ControlEvaluator, run: ParametricRun, last: float, limit: float
+) -> None:
+    """Minimise `-log det` instead of the experiment's criterion, by which controls are still compared. See `Optimiser`."""
+    information = replace(evaluator.exact.information, criterion="D")
+    base = replace(evaluator.exact, information=information)
+
+    schedule = BarrierSchedule(first=run.mu, last=last)
+    ScipyDescent(evaluator=evaluator, run=run, base=base, limit=limit).descend(schedule)
 
 
-class Settled(Exception):
-    """A stage of the barrier is done."""
+@dataclass(eq=False, kw_only=True)
+class ScipyDescent:
+    """Minimises a cost with `scipy.optimize.minimize` in the stages of a barrier schedule.
 
+    Attributes:
+        evaluator: Evaluates controls and holds the budget.
+        run: The run; its best control and its barrier weight are kept up to date.
+        base: Cost that is minimised.
+        limit: Share of the budget after which the descent ends.
+        out_of_budget: True once it has ended for that reason.
+        s: (M, nu) coefficients of the curves.
+    """
 
-class Descent:
-    """One series on its way down the barrier's stages with `scipy.optimize.minimize`. base: the cost it minimises"""
+    evaluator: ControlEvaluator
+    run: ParametricRun
+    base: DesignProblem
+    limit: float
+    out_of_budget: bool = False
+    s: Array = field(init=False)
 
-    def __init__(self, arena: Arena, series: Series, base: DesignProblem, limit: float) -> None:
-        self.arena, self.series, self.base, self.limit = arena, series, base, limit
-        self.barrier_weights = InteriorPointMethod(
-            base, arena.constraints, arena.centre, series.basis, regulator_for(arena.task)
+    def __post_init__(self) -> None:
+        evaluator, basis = self.evaluator, self.run.basis
+        self.method = InteriorPointMethod(
+            base=self.base,
+            constraints=evaluator.constraints,
+            centre=evaluator.centre,
+            basis=basis,
+            regulate=regulator_for(evaluator.task),
         )
-        self.K = np.zeros((len(series.basis), len(arena.centre), arena.task.space.nx))
-        self.s = np.zeros((series.basis.shape[1], len(arena.centre)))
+        nu = len(evaluator.centre)
+        self._no_feedback = np.zeros((len(basis), nu, evaluator.task.space.nx))
+        self.s = np.zeros((basis.shape[1], nu))
 
-    def run(self, schedule: BarrierSchedule) -> None:
-        """All stages. Raises Spent."""
-        self.s = self._coefficients(self._begin())
-        held = dict[str, float]()
-        try:
-            for mu in schedule.barrier_weights() if self.arena.holds else [schedule.last]:
-                self.series.mu = mu
-                last = mu <= schedule.last or not self.arena.holds
-                constraints = self.arena.constraints.tightened(held)
-                barrier = mu if self.arena.holds else 0.0
-                self._stage(
-                    InteriorProblem(
-                        self.base, constraints, barrier, min(MAX_RELAXATION, RELAXED * mu)
-                    ),
-                    schedule,
-                    mu,
-                    last,
-                )
-                self._mend()
-                point = self._point(self.arena.looking)
-                if mu <= TIGHTENING_MU and point.values is not None:
-                    held = updated_tightening(
-                        held, self.arena.constraints.relative_margins(point.values)
-                    )
-        except Spent:
-            self._mend()
-            raise
-        self.series.mu = (
-            schedule.last if schedule.last > BarrierSchedule().last and self.arena.holds else 0.0
+    def descend(self, schedule: BarrierSchedule) -> None:
+        """Run all stages of a schedule, or as many as the budget allows."""
+        evaluator = self.evaluator
+        self.s = self.coefficients(self._first_control())
+        if self.out_of_budget:
+            return
+
+        weights = schedule.barrier_weights() if evaluator.is_limited else [schedule.last]
+        tightening: dict[str, float] = {}
+
+        for mu in weights:
+            self.run.mu = mu
+            problem = InteriorProblem(
+                base=self.base,
+                constraints=evaluator.constraints.tightened(tightening),
+                mu=mu if evaluator.is_limited else 0.0,
+                delta=min(MAX_RELAXATION, RELAXED * mu),
+            )
+            is_last = mu <= schedule.last or not evaluator.is_limited
+            is_complete = self._run_stage(problem, schedule, mu, is_last)
+            self._repair()
+            if not is_complete:
+                return
+
+            # Move the limits inwards where the end of a stage violates them.
+            point = self._point(evaluator.problem)
+            if mu <= TIGHTENING_MU and point.values is not None:
+                margins = evaluator.constraints.relative_margins(point.values)
+                tightening = updated_tightening(tightening, margins)
+
+        self.run.finish_schedule(schedule.last if evaluator.is_limited else 0.0)
+
+    def _first_control(self) -> Array:
+        """A feasible control; where none is near, the end of a descent of the barrier alone."""
+        evaluator, control = self.evaluator, self.run.control
+        if not evaluator.is_limited:
+            return control
+
+        inside = self.method.inside(control)
+        if inside is not None:
+            return inside
+
+        self.s = self.coefficients(control)
+        problem = InteriorProblem(
+            base=self.base,
+            constraints=evaluator.constraints,
+            mu=1.0,
+            delta=MAX_RELAXATION,
+            costs=False,
         )
+        self._run_stage(problem, BarrierSchedule(), 1.0, is_last=False)
 
-    def _begin(self) -> Array:
-        """A control inside the limits; where none is near, one on its way there by the barrier alone."""
-        arena, start = self.arena, self.series.control
-        self.s = self._coefficients(start)
-        inner = self.barrier_weights.inside(start) if arena.holds else start
-        if inner is not None:
-            return inner
-        problem = InteriorProblem(self.base, arena.constraints, 1.0, MAX_RELAXATION, costs=False)
-        self._stage(problem, BarrierSchedule(), 1.0, False)
-        inner = self.barrier_weights.inside(self._control(self.s))
-        return self._control(self.s) if inner is None else inner
+        control = self.control(self.s)
+        inside = None if self.out_of_budget else self.method.inside(control)
+        return control if inside is None else inside
 
-    def _stage(
-        self, problem: InteriorProblem, schedule: BarrierSchedule, mu: float, last: bool
-    ) -> None:
-        """Minimise one barrier from where the search is, until little is won."""
+    def _run_stage(
+        self, problem: InteriorProblem, schedule: BarrierSchedule, mu: float, is_last: bool
+    ) -> bool:
+        """Minimise one stage of the barrier until it makes little progress; return False where the budget ended it."""
         point = self._point(problem)
         if point.values is None:
-            return
-        factor = self._whitening(problem, point)
-        enough, patience = (
-            schedule.tolerance if last else schedule.settled * mu,
-            schedule.patience * (2 if last else 1),
+            return True
+
+        stage = _ScipyStage(
+            descent=self,
+            problem=problem,
+            factor=self._whitening_factor(problem, point),
+            values=[problem.value(point)],
+            least_progress=schedule.tolerance if is_last else schedule.settled * mu,
+            patience=schedule.patience * (2 if is_last else 1),
+            window=schedule.window,
         )
-        values, tried = [problem.value(point)], dict[bytes, float]()
+        stage.minimise()
+        return not self.out_of_budget
 
-        def value(y: Array) -> tuple[float, Array]:
-            found, slope = self._valued(
-                problem, solve_triangular(factor.T, y).reshape(self.s.shape)
-            )
-            tried[y.tobytes()] = found
-            return found, solve_triangular(factor, slope, lower=True)
+    def slope(self, problem: InteriorProblem, point: InteriorPoint) -> Array | None:
+        """Derivative of the merit by the coefficients.
 
-        def accepted(y: Array) -> None:
-            self.s = solve_triangular(factor.T, y).reshape(self.s.shape)
-            values.append(tried.get(np.asarray(y).tobytes(), values[-1]))
-            slow = (
-                len(values) > schedule.window and values[-1 - schedule.window] - values[-1] < enough
-            )
-            if slow or len(values) > patience:
-                raise Settled
+        Args:
+            problem: Merit of the current stage.
+            point: Point with finite merit.
 
-        method, options = SCIPY
-        with suppress(Settled):
-            minimize(
-                value,
-                factor.T @ self.s.reshape(-1),
-                jac=True,
-                method=method,
-                options=options,
-                callback=accepted,
-            )
-
-    def _valued(self, problem: InteriorProblem, s: Array) -> tuple[float, Array]:
-        """Value and slope by the coefficients; every point that keeps the limits is offered."""
-        self.arena.require(self.limit)
-        nothing = FAR, np.zeros(s.size)
-        point = problem.point(self._control(s))
-        if point.values is None or not np.isfinite(problem.value(point)):
-            return nothing
-        offered(self.arena, self.series, point)
-        if not problem.costs and self.arena.inside(point):
-            self.s = s
-            raise Settled
+        Returns:
+            (M nu,) derivative; None where the simulation diverges close by.
+        """
         try:
-            slope = self.series.basis.T @ problem.expand(point).gradient(self.K)
+            gradient = problem.expand(point).gradient(self._no_feedback)
         except SimulationDivergedError:
-            return nothing
-        return problem.value(point), slope.reshape(-1)
+            return None
 
-    def _mend(self) -> None:
-        """Shrink what leaks about the centre until it does not."""
-        point = self._point(self.arena.looking)
-        if self.arena.holds and (point.values is None or not self.arena.inside(point)):
-            control = self.barrier_weights.inside(self._control(self.s))
-            point = point if control is None else self.arena.looking.point(control)
-        offered(self.arena, self.series, point)
+        return np.asarray((self.run.basis.T @ gradient).reshape(-1))
 
-    def _whitening(self, problem: InteriorProblem, point: InteriorPoint) -> Array:
-        """Lower Cholesky factor of the barrier's Gauss-Newton Hessian and a ridge on the coefficients."""
-        task, e = self.arena.task, problem.expand(point)
-        if e.barrier is None:
-            raise ValueError("nothing to whiten with")
-        N, w = len(self.series.basis), e.barrier.weights
-        ridge = RIDGE / N / self.arena.constraints.control.bounds.scale**2
+    def _repair(self) -> None:
+        """Shrink an infeasible control about the centre until it is feasible, and keep it if it is the best."""
+        evaluator = self.evaluator
+        point = self._point(evaluator.problem)
+        if evaluator.is_limited and (point.values is None or not evaluator.is_feasible(point)):
+            inside = self.method.inside(self.control(self.s))
+            if inside is not None:
+                point = evaluator.problem.point(inside)
+
+        self.run.update(evaluator, point)
+
+    def _whitening_factor(self, problem: InteriorProblem, point: InteriorPoint) -> Array:
+        """(M nu, M nu) lower Cholesky factor of the barrier's Gauss-Newton Hessian, with a ridge on the control."""
+        evaluator, task = self.evaluator, self.evaluator.task
+        expansion = problem.expand(point)
+        if expansion.barrier is None:
+            raise ValueError("the expansion has no barrier to whiten with")
+
+        N = len(self.run.basis)
+        ridge = RIDGE / N / evaluator.constraints.control.bounds.scale**2
         if problem.costs and point.point is not None and point.point.cost > 0.0:
             ridge = ridge + task.control_weight * task.dt / point.point.cost
-        H = BasisMetric.from_weights(
-            e, Weights(Q=w.Q, S=w.S, R=w.R + np.diag(ridge), W=w.W), self.series.basis
-        ).H
-        return np.asarray(cholesky(H + 1e-12 * np.trace(H) * np.eye(len(H)), lower=True))
 
-    def _control(self, s: Array) -> Array:
-        return np.asarray(self.arena.centre + self.series.basis @ s)
+        barrier = expansion.barrier.weights
+        weights = Weights(Q=barrier.Q, S=barrier.S, R=barrier.R + np.diag(ridge), W=barrier.W)
+        H = BasisMetric.from_weights(expansion, weights, self.run.basis).H
+        jitter = METRIC_JITTER * np.trace(H) * np.eye(len(H))
+        return np.asarray(cholesky(H + jitter, lower=True))
 
-    def _coefficients(self, control: Array) -> Array:
-        return np.asarray(
-            np.linalg.lstsq(self.series.basis, control - self.arena.centre)[0], dtype=np.float64
-        )
+    def control(self, s: Array) -> Array:
+        """(N, nu) control of (M, nu) coefficients [unit of the actuator]."""
+        return np.asarray(self.evaluator.centre + self.run.basis @ s)
+
+    def coefficients(self, control: Array) -> Array:
+        """(M, nu) coefficients of the control that is nearest to a control: (N, nu)."""
+        deviation = control - self.evaluator.centre
+        return np.asarray(np.linalg.lstsq(self.run.basis, deviation)[0], dtype=np.float64)
 
     def _point(self, problem: InteriorProblem) -> InteriorPoint:
-        return problem.point(self._control(self.s))
+        """The current coefficients, evaluated."""
+        return problem.point(self.control(self.s))
+
+
+@dataclass(eq=False, kw_only=True)
+class _ScipyStage:
+    """One stage of the barrier, minimised with SciPy over whitened coefficients y = L^T s.
+
+    Attributes:
+        descent: The descent; its coefficients follow the accepted iterates.
+        problem: Merit of this stage.
+        factor: (M nu, M nu) L, the lower Cholesky factor of the metric.
+        values: Merit of the accepted iterates, the first one included.
+        least_progress: Decrease of the merit over `window` iterates below which the stage ends.
+        patience: Iterates, at most.
+        window: Number of iterates over which progress is measured.
+        ended: True once nothing more has to be evaluated.
+        evaluated: Merit of evaluated coefficients, by their bytes.
+    """
+
+    descent: ScipyDescent
+    problem: InteriorProblem
+    factor: Array
+    values: list[float]
+    least_progress: float
+    patience: int
+    window: int
+    ended: bool = False
+    evaluated: dict[bytes, float] = field(default_factory=dict)
+
+    def minimise(self) -> None:
+        """Run SciPy until the stage ends."""
+        first = self.factor.T @ self.descent.s.reshape(-1)
+        minimize(
+            self._value_and_slope,
+            first,
+            jac=True,
+            method=SCIPY_METHOD,
+            options=SCIPY_OPTIONS,
+            callback=self._accept,
+        )
+
+    def _coefficients(self, y: Array) -> Array:
+        """(M, nu) coefficients of whitened ones: (M nu,)."""
+        return np.asarray(solve_triangular(self.factor.T, y).reshape(self.descent.s.shape))
+
+    def _value_and_slope(self, y: Array) -> tuple[float, Array]:
+        """The merit and its derivative by whitened coefficients: (M nu,); once the stage has ended, no simulation."""
+        descent = self.descent
+        if not self.ended and descent.evaluator.exhausted(descent.limit):
+            descent.out_of_budget = self.ended = True
+
+        # SciPy cannot be stopped here: a large value ends its line search within a few cheap evaluations.
+        diverged = DIVERGED_VALUE, np.zeros(y.size)
+        if self.ended:
+            return diverged
+
+        s = self._coefficients(y)
+        point = self.problem.point(descent.control(s))
+        value = np.inf if point.values is None else self.problem.value(point)
+        self.evaluated[y.tobytes()] = min(value, DIVERGED_VALUE)
+        if not np.isfinite(value):
+            return diverged
+        descent.run.update(descent.evaluator, point)
+
+        # Without a cost, the first control inside all limits is the result.
+        if not self.problem.costs and descent.evaluator.is_feasible(point):
+            descent.s, self.ended = s, True
+            return diverged
+
+        slope = descent.slope(self.problem, point)
+        if slope is None:
+            return diverged
+        return value, np.asarray(solve_triangular(self.factor, slope, lower=True))
+
+    def _accept(self, y: Array) -> None:
+        """Take over an iterate of SciPy; StopIteration is SciPy's way to end a minimisation."""
+        if self.ended:
+            raise StopIteration
+
+        self.descent.s = self._coefficients(y)
+        self.values.append(self.evaluated.get(np.asarray(y).tobytes(), self.values[-1]))
+
+        # End the stage where the last iterates made little progress.
+        if len(self.values) > self.window:
+            progress = self.values[-1 - self.window] - self.values[-1]
+            self.ended = progress < self.least_progress
+        self.ended = self.ended or len(self.values) > self.patience
+        if self.ended:
+            raise StopIteration
