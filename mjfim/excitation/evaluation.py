@@ -1,4 +1,4 @@
-"""What a trajectory tells, and the words of warning about it."""
+"""Evaluation of a trajectory for its information and its cost, and the warnings about a design."""
 
 from __future__ import annotations
 
@@ -18,17 +18,38 @@ from mjfim.records.check import Roughness
 from mjfim.records.design import Evaluation
 from mjfim.records.trajectory import Trajectory
 
+# Growth of a disturbance along a trajectory, played open loop, above which the user is warned.
+UNSTABLE_GROWTH = 1e3
+
 
 def point_at_stated_rate(stage: Stage, control: Array) -> DesignPoint | None:
-    """A coarse level's control at the stated rate; None where it diverges."""
+    """Evaluate a control at the sample rate that the experiment states.
+
+    Args:
+        stage: The task and the criterion.
+        control: (N, nu) control [u-unit].
+
+    Returns:
+        The point; None where the simulation diverges.
+    """
+    task = stage.task
     try:
-        return stage.problem.point(stage.task.plant.simulate(stage.task.theta, control))
+        trajectory = task.plant.simulate(task.theta, control)
     except SimulationDivergedError:
         return None
+    return stage.problem.point(trajectory)
 
 
 def evaluate(stage: Stage, point: DesignPoint) -> Evaluation:
-    """Everything that a trajectory tells, with the regulator about it."""
+    """Collect everything that is known along a trajectory, with the regulator about it.
+
+    Args:
+        stage: The task and the criterion.
+        point: The trajectory with its information and its cost.
+
+    Raises:
+        SimulationDivergedError: The trajectory diverges.
+    """
     task, information = stage.task, stage.problem.information
     if (
         point.trajectory is None
@@ -37,11 +58,12 @@ def evaluate(stage: Stage, point: DesignPoint) -> Evaluation:
         or point.criterion is None
     ):
         raise SimulationDivergedError("the trajectory diverges")
+
     A, B, _, _ = task.plant.derivatives.jacobians(task.theta, point.trajectory)
-    r = regulator_for(task)
+    weights = regulator_for(task)
     return Evaluation(
         trajectory=point.trajectory,
-        gain=regulator(A, B, r.Q, r.R, r.terminal),
+        gain=regulator(A, B, weights.Q, weights.R, weights.terminal),
         sensitivity=point.sensitivity.psi,
         information=point.information,
         eigenvalues=point.criterion.eigenvalues,
@@ -53,7 +75,31 @@ def evaluate(stage: Stage, point: DesignPoint) -> Evaluation:
     )
 
 
-UNSTABLE = 1e3
+def evaluate_trajectory(experiment: Experiment, trajectory: Trajectory) -> Evaluation:
+    """Evaluate the information and the cost along the control of a given trajectory, at the experiment's theta.
+
+    Args:
+        experiment: The experiment.
+        trajectory: The trajectory whose control is simulated.
+
+    Raises:
+        ExperimentError: Something is wrong or missing in the experiment; the message names the key.
+        ModelError: The model cannot be used.
+        SimulationDivergedError: The simulation diverges under this control.
+    """
+    return evaluate_task(DesignTask.resolve(experiment), trajectory)
+
+
+def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
+    """Evaluate the control of a trajectory in a resolved task. See `evaluate_trajectory`."""
+    simulated = task.plant.simulate(task.theta, trajectory.ctrl)
+    point = task.problem.point(simulated, CENTRAL_DIFFERENCES)
+    if point.trajectory is None or point.sensitivity is None:
+        raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
+
+    identifiability = task.observer.identifiability(point.trajectory, point.sensitivity)
+    stage = Stage(task, identifiability.basis)
+    return evaluate(stage, stage.problem.reevaluated(point))
 
 
 def design_warnings(
@@ -63,67 +109,73 @@ def design_warnings(
     clamped: tuple[str, ...],
     rough: Roughness | None,
 ) -> Iterator[str]:
-    """What a user must know about a design before running it. found: its limits at every engine step"""
+    """Sentences that a user must know about a design before running it.
+
+    Args:
+        final: Evaluation of the design.
+        found: Its limits at every engine step of the unmodified model.
+        task: The task of the design.
+        clamped: Names of the actuators that reach their forcerange along it.
+        rough: Where its derivatives do not exist, or None.
+    """
     if rough is not None:
         yield str(rough)
     if clamped:
         yield (
             f"forcerange clamps {', '.join(clamped)} along the design: its derivatives do not hold there, it may rest on "
-            "information that the clamp feigns, and the descent may have stopped early; raise cost.control or start more gently"
+            "spurious information caused by the saturation, and the descent may have stopped early; raise cost.control or "
+            "start more gently"
         )
-    if final.growth > UNSTABLE:
+    if final.growth > UNSTABLE_GROWTH:
         yield (
             f"a small disturbance grows up to {final.growth:.1e}-fold along this trajectory when its control is played "
             "open loop; the predicted sigma assumes that there is none. Play it with the gains of design.npz, or raise "
             "cost.control"
         )
-    for kind, margin in found.margins.items():
-        if margin < 0.0:
-            advice = "widen it, start more gently, or give the design more time"
-            if kind in found.unenforced:
-                advice = (
-                    "they are checked, not enforced; raise cost.control or cost.tracking until they hold before running "
-                    "this on hardware"
-                )
-            yield f"{kind} limits are exceeded by {-margin:.3g}: {advice}"
+    yield from _limit_warnings(found)
     yield from open_boundary_warnings(task)
     if found.deviation > SAME_STATE_TOLERANCE:
         yield (
-            f"played on the untouched model, the design deviates by up to {found.deviation:.2g}: a clamp, stop or contact acts"
+            f"played on the unmodified model, the design deviates by up to {found.deviation:.2g}: a clamp, stop or contact acts"
         )
 
 
+def _limit_warnings(found: Verification) -> Iterator[str]:
+    """One sentence for each kind of limit that is violated."""
+    for kind, margin in found.margins.items():
+        if not margin < 0.0:
+            continue
+        advice = "widen it, start more gently, or give the design more time"
+        if kind in found.unenforced:
+            advice = (
+                "they are checked, not enforced; raise cost.control or cost.tracking until they hold before running "
+                "this on hardware"
+            )
+        yield f"{kind} limits are exceeded by {-margin:.3g}: {advice}"
+
+
 def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
-    """What the limits and boundaries that an experiment states leave open."""
-    e, model = task.experiment, task.system.model
-    rates = (
-        {limit.name for limit in task.limits if limit.kind == "control_rate"}
-        if e.limits.enforce
-        else set()
-    )
-    jumps = e.limits.bandwidth is None and not rates.issuperset(task.controls)
-    if "rest" in (e.boundary.start, e.boundary.end) and jumps:
+    """Sentences about motions that the stated limits and boundaries do not rule out.
+
+    Args:
+        task: The task.
+    """
+    experiment = task.experiment
+    enforced = task.limits if experiment.limits.enforce else ()
+    with_rate = {limit.name for limit in enforced if limit.kind == "control_rate"}
+
+    at_rest = "rest" in (experiment.boundary.start, experiment.boundary.end)
+    may_jump = experiment.limits.bandwidth is None and not with_rate.issuperset(task.controls)
+    if at_rest and may_jump:
         yield (
             "the control may jump where the design begins and ends at rest: for a smooth start state limits.control_rate or "
             "limits.bandwidth"
         )
-    if e.limits.enforce:
-        unseen = unsupported_ranges(model)
-        if unseen:
-            yield f"the MJCF's ranges of {', '.join(unseen)} are no limits of the design: the simulation runs into them as it is"
 
-
-def evaluate_trajectory(experiment: Experiment, trajectory: Trajectory) -> Evaluation:
-    """Evaluate the information and the cost along the control of a given trajectory, at the experiment's theta."""
-    return evaluate_task(DesignTask.resolve(experiment), trajectory)
-
-
-def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
-    """Evaluate the control of a trajectory in a resolved task. See `evaluate_trajectory`."""
-    point = task.problem.point(
-        task.plant.simulate(task.theta, trajectory.ctrl), CENTRAL_DIFFERENCES
-    )
-    if point.trajectory is None or point.sensitivity is None:
-        raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
-    stage = Stage(task, task.observer.identifiability(point.trajectory, point.sensitivity).basis)
-    return evaluate(stage, stage.problem.reevaluated(point))
+    if experiment.limits.enforce:
+        unsupported = unsupported_ranges(task.system.model)
+        if unsupported:
+            yield (
+                f"the MJCF's ranges of {', '.join(unsupported)} are not among the limits of the design: "
+                "it may run into them"
+            )
