@@ -179,26 +179,36 @@ def _stated_ranges(kind: _KindOfLimit) -> dict[str, Range]:
 
 def _position_ranges(model: Any, coordinates: tuple[ScalarJoint, ...]) -> dict[str, Range]:
     """Ranges of the joints in the MJCF, by name."""
-    limited = [c for c in coordinates if model.jnt_limited[c.joint]]
-    return {c.name: tuple(model.jnt_range[c.joint]) for c in limited}
+    joints = {c.name: c.joint for c in coordinates}
+    return _model_ranges(joints, model.jnt_limited, model.jnt_range)
 
 
 def _control_ranges(model: Any, controls: tuple[str, ...]) -> dict[str, Range]:
     """Ranges of the controls in the MJCF, by name."""
-    limited = [i for i in range(len(controls)) if model.actuator_ctrllimited[i]]
-    return {controls[i]: tuple(model.actuator_ctrlrange[i]) for i in limited}
+    actuators = {name: i for i, name in enumerate(controls)}
+    return _model_ranges(actuators, model.actuator_ctrllimited, model.actuator_ctrlrange)
 
 
 def _force_ranges(model: Any, actuators: Mapping[str, int]) -> dict[str, Range]:
     """Ranges of the actuator forces in the MJCF, by name."""
-    limited = {name: i for name, i in actuators.items() if model.actuator_forcelimited[i]}
-    return {name: tuple(model.actuator_forcerange[i]) for name, i in limited.items()}
+    return _model_ranges(actuators, model.actuator_forcelimited, model.actuator_forcerange)
 
 
 def _joint_force_ranges(model: Any, joints: Mapping[str, ScalarJoint]) -> dict[str, Range]:
     """Ranges of the summed actuator forces on joints in the MJCF, by name."""
-    limited = {name: c.joint for name, c in joints.items() if model.jnt_actfrclimited[c.joint]}
-    return {name: tuple(model.jnt_actfrcrange[joint]) for name, joint in limited.items()}
+    indices = {name: c.joint for name, c in joints.items()}
+    return _model_ranges(indices, model.jnt_actfrclimited, model.jnt_actfrcrange)
+
+
+def _model_ranges(indices: Mapping[str, int], limited: Any, ranges: Any) -> dict[str, Range]:
+    """Ranges by name of the elements that the model limits.
+
+    Args:
+        indices: Index of each element, by name.
+        limited: (n,) nonzero where the model limits an element.
+        ranges: (n, 2) ranges of all elements.
+    """
+    return {name: tuple(ranges[i]) for name, i in indices.items() if limited[i]}
 
 
 def unsupported_ranges(model: Any) -> tuple[str, ...]:

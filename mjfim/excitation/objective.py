@@ -53,7 +53,8 @@ class RunningCost:
         """The running cost along a trajectory."""
         dx = self.space.minus(trajectory.state, self.desired_state)[1:]
         du = trajectory.ctrl - self.desired_control
-        return float(0.5 * self.dt * (np.sum(dx**2 * self.Q) + np.sum(du**2 * self.R)))
+        weighted_squares = np.sum(dx**2 * self.Q) + np.sum(du**2 * self.R)
+        return float(0.5 * self.dt * weighted_squares)
 
     def gradient(self, trajectory: Trajectory) -> tuple[Array, Array]:
         """Gradient of the running cost.
@@ -316,7 +317,7 @@ class DesignProblem:
 
 
 def _computed(point: DesignPoint) -> tuple[Trajectory, Sensitivity, Criterion]:
-    """What is computed along a trajectory. Raises ValueError for a trial that diverges."""
+    """Trajectory, sensitivity and criterion of a point. Raises ValueError for a trial that diverges."""
     if point.trajectory is None or point.sensitivity is None or point.criterion is None:
         raise ValueError("a diverged trial has no expansion")
     return point.trajectory, point.sensitivity, point.criterion

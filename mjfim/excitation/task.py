@@ -38,6 +38,13 @@ MAX_SAMPLES = 10_000_000
 # Harmonics of a random multisine.
 RANDOM_HARMONICS = 10
 
+# Amplitudes of random controls that look for identifiable parameters, relative to that of the initial control.
+LEAST_PROBE_AMPLITUDE = 1.0
+MOST_PROBE_AMPLITUDE = 2.0
+
+# Relative deviation of the number of samples from a whole number that is round-off.
+SAMPLE_COUNT_TOLERANCE = 1e-6
+
 # Share of the horizon over which a random control rises from rest, and fades to it.
 FADE_SHARE = 0.1
 
@@ -55,7 +62,7 @@ class DesignTask:
         control_weight: (nu,) diagonal of R_tau, the weight on the control.
         control_about: (nu,) control that costs nothing.
         contrast: (t, c) combinations of the scaled wanted parameters whose variances criterion "c" sums, or None.
-        prior_information: (p, p) what earlier experiments tell, without the priors of the parameters.
+        prior_information: (p, p) information of earlier experiments, without the priors of the parameters.
         added_information: (p, p) the part of it that the caller added to the experiment's `earlier` files, or None.
         samples_of_parameters: Parameter values over which a robust design pools its criterion, or None.
     """
@@ -84,7 +91,7 @@ class DesignTask:
         """Resolve an experiment into the task of designing its control.
 
         Args:
-            experiment: What the user states.
+            experiment: The experiment as the user states it.
             threads: Threads for the engine; default: one per core.
             added_information: (p, p) information of other experiments besides the stated `earlier` files.
             variant: How the plant differs from the user's model; default: it does not.
@@ -100,7 +107,15 @@ class DesignTask:
 
     @classmethod
     def of(cls, system: System, *, added_information: Array | None = None) -> DesignTask:
-        """The task that the experiment of a system states. Raises as `resolve` does."""
+        """Resolve the task that the experiment of a system states.
+
+        Args:
+            system: The system.
+            added_information: (p, p) information of other experiments besides the stated `earlier` files.
+
+        Raises:
+            ExperimentError: Something is wrong or missing in the experiment; the message names the key.
+        """
         experiment = system.experiment
         _require_design_keys(experiment)
         try:
@@ -161,7 +176,7 @@ class DesignTask:
 
     @property
     def experiment(self) -> Experiment:
-        """What the user states."""
+        """The experiment as the user states it."""
         return self.system.experiment
 
     @property
@@ -283,7 +298,7 @@ class DesignTask:
 
     @property
     def observer(self) -> Observer:
-        """What tells identifiable parameters from the others, along trajectories of this task."""
+        """Finds the parameters that cannot be identified, along trajectories of this task."""
         return Observer(
             plant=self.plant,
             parameters=self.parameters,
@@ -315,7 +330,7 @@ class DesignTask:
 
     @property
     def centre(self) -> Array:
-        """(nu,) control about which controls vary: what holds the initial state, or the mean of the initial control."""
+        """(nu,) control about which controls vary: the one that holds the initial state, or the mean of the initial control."""
         if self.experiment.boundary.start == "rest":
             return self.initial_hold
         return np.asarray(self.control.mean(axis=0))
@@ -391,18 +406,33 @@ class DesignTask:
         return np.asarray(window)
 
     def probes(self, count: int) -> Iterator[Trajectory]:
-        """Trajectories of random controls, up to twice as large as the initial one; those that diverge are left out."""
+        """Simulate random controls.
+
+        Args:
+            count: Number of controls.
+
+        Yields:
+            Trajectories of controls up to twice as large as the initial one; those that diverge are left out.
+        """
         rng = np.random.default_rng(self.experiment.descent.seed)
         for _ in range(count):
+            control = self.random_control(rng, LEAST_PROBE_AMPLITUDE, MOST_PROBE_AMPLITUDE)
             try:
-                yield self.plant.simulate(self.theta, self.random_control(rng, 1.0, 2.0))
+                yield self.plant.simulate(self.theta, control)
             except SimulationDivergedError:
                 continue
 
     # Variants of the plant
 
     def with_variant(self, variant: ModelVariant) -> DesignTask:
-        """The same task on another plant."""
+        """This task on another plant.
+
+        Args:
+            variant: How the plant differs from the user's model.
+
+        Returns:
+            A task with the control averaged over longer samples, where the variant has these.
+        """
         before = self.system.variant.sample_factor
         stated = np.repeat(self.control, before, axis=0) if before > 1 else self.control
         samples = len(stated) // variant.sample_factor
@@ -428,22 +458,22 @@ class DesignTask:
         return task.with_variant(self.system.variant)
 
     def coarser(self, factor: int) -> DesignTask:
-        """The same task with a timestep and a sample period that are `factor` times longer."""
+        """This task with a timestep and a sample period that are `factor` times longer."""
         return self.with_variant(replace(self.system.variant, sample_factor=factor))
 
     def relaxed(self) -> DesignTask:
-        """The same task on a plant without the clamps and stops that its hard limits keep a design away from."""
+        """This task on a plant without the clamps and stops that its hard limits keep a design away from."""
         variant = replace(
             self.system.variant, relaxed=True, smoothing_speeds=self._smoothing_speeds()
         )
         return self.with_variant(variant)
 
     def stretched(self, factor: int) -> DesignTask:
-        """The same task with a timestep that is `factor` times longer and the same samples."""
+        """This task with a timestep that is `factor` times longer; the samples stay."""
         return self.with_variant(replace(self.system.variant, timestep_factor=factor))
 
     def smoothed(self) -> DesignTask:
-        """The same task with smoothed dry friction in the motion as well, not only in its derivatives."""
+        """This task with smoothed dry friction in the motion as well, not only in its derivatives."""
         return self.with_variant(replace(self.system.variant, smoothed=True))
 
     def _smoothing_speeds(self) -> tuple[float, ...]:
@@ -486,7 +516,7 @@ class DesignTask:
 def _calibrated(system: System, control: Array) -> tuple[System, Trajectory | None]:
     """The system with difference steps that suit the trajectory of a control, and the trajectory.
 
-    Where the trajectory diverges it is None: whoever needs it will say so.
+    A trajectory that diverges is None here; the step that needs it raises.
     """
     try:
         trajectory = system.plant.simulate(system.theta, control)
@@ -515,7 +545,7 @@ def _samples(experiment: Experiment, stride: int) -> int:
     exact = horizon * experiment.rate
     count = round(exact)
 
-    if count < 2 or abs(exact - count) > 1e-6 * count:
+    if count < 2 or abs(exact - count) > SAMPLE_COUNT_TOLERANCE * count:
         near = f"{max(count, 2) * period:g} s, {(max(count, 2) + 1) * period:g} s"
         raise ExperimentError(
             f"horizon: {horizon:g} s is not a whole number (>= 2) of samples of {period:g} s; "

@@ -28,7 +28,7 @@ CONTACT_DISTANCE = 1e-9
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Verification:
-    """How a control keeps the limits when it is played open loop on the unmodified model.
+    """Margins of all limits when a control is played open loop on the unmodified model.
 
     Attributes:
         margins: Smallest margin of each kind over all engine steps, negative outside [unit of the kind].
@@ -239,7 +239,7 @@ def _require_held(task: DesignTask, where: str, state: Array, hold: Array) -> No
 
 
 def _key_of(limit: Limit) -> str:
-    """Where a user states a limit."""
+    """The key or range by which a user states a limit."""
     if limit.kind == "joint_force":
         return "limits.force or the MJCF's actuatorfrcrange"
     return f"limits.{limit.kind}"

@@ -44,7 +44,7 @@ NO_ROTATION = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class TimeGrid:
-    """How samples, measurements and engine steps divide the time.
+    """Division of the time into samples, measurements and engine steps.
 
     Attributes:
         dt: Sample period, for which a control is held [s].
@@ -93,7 +93,7 @@ class System:
     """A model with unknown parameters, measured outputs, noise, and the plant that simulates it.
 
     Attributes:
-        experiment: What the user states.
+        experiment: The experiment as the user states it.
         source: The user's model, parsed once.
         stated_grid: The time grid that the experiment states.
         parameters: The p unknown parameters.
@@ -127,7 +127,7 @@ class System:
         """Resolve an experiment against its model.
 
         Args:
-            experiment: What the user states.
+            experiment: The experiment as the user states it.
             threads: Threads for the engine; default: one per core.
             source: The model of the experiment, where it is parsed already.
 
@@ -188,7 +188,7 @@ class System:
         )
 
     def with_variant(self, variant: ModelVariant, relaxation: Relaxation | None = None) -> System:
-        """The same system on another plant; parameters, outputs and the parsed model are shared.
+        """This system on another plant; parameters, outputs and the parsed model are shared.
 
         Args:
             variant: How the plant differs from the user's model.
@@ -225,14 +225,14 @@ class System:
         return replace(self, variant=variant, plant=plant((), plant(speeds, None)))
 
     def calibrated(self, theta: Array, ctrl: Array) -> System:
-        """The same system with difference steps that suit the trajectory of a control.
+        """This system with difference steps that suit the trajectory of a control.
 
         Args:
             theta: (p,) parameter values.
             ctrl: (N, nu) control.
 
         Returns:
-            This system, where the trajectory diverges: whoever needs it will say so.
+            The calibrated system; this system unchanged where the trajectory diverges.
         """
         try:
             return self.calibrated_along(theta, self.plant.simulate(theta, ctrl))
@@ -240,7 +240,12 @@ class System:
             return self
 
     def calibrated_along(self, theta: Array, trajectory: Trajectory) -> System:
-        """The same system with difference steps that suit a trajectory at theta: (p,)."""
+        """This system with difference steps that suit a trajectory.
+
+        Args:
+            theta: (p,) parameter values [theta-unit].
+            trajectory: A trajectory of the plant at theta.
+        """
         return replace(self, plant=self.plant.calibrated(theta, trajectory))
 
     @cached_property
