@@ -725,12 +725,20 @@ def describe_comparison(comparison: Comparison) -> Summary:
     return Summary(title="", outcome="", parts=tuple(parts))
 
 
-def _method_table(comparison: Comparison) -> SummaryTable:
-    """Tabulate cost, criterion, worst standard deviation, effort and margin of each method."""
+def budget_in_words(comparison: Comparison) -> str:
+    """Return the time and the MuJoCo steps that each method had.
+
+    Args:
+        comparison: The comparison.
+    """
     budget = f"{comparison.seconds:g} s"
     if np.isfinite(comparison.steps):
         budget += f" or {comparison.steps / 1e6:.3g} million MuJoCo steps"
+    return budget
 
+
+def _method_table(comparison: Comparison) -> SummaryTable:
+    """Tabulate cost, criterion, worst standard deviation, effort and margin of each method."""
     headings = ["method"]
     if comparison.weighted:
         headings.append("J")
@@ -738,7 +746,7 @@ def _method_table(comparison: Comparison) -> SummaryTable:
     headings += ["time", "steps", "worst margin"]
     return SummaryTable(
         key="methods",
-        title=f"{comparison.source}: each method with {budget}",
+        title=f"{comparison.source}: each method with {budget_in_words(comparison)}",
         columns=columns(*headings),
         rows=tuple(
             Row(cells=_method_cells(comparison, row), emphasis=_method_emphasis(comparison, row))

@@ -1,6 +1,6 @@
-"""Every figure of the package, each a function from records to a matplotlib Figure; `save` writes it as PNG.
+"""Every figure of the package: each function turns records into a matplotlib Figure, and `save` writes it as PNG.
 
-This package is the only importer of matplotlib.
+Only the modules of this package import matplotlib.
 """
 
 from __future__ import annotations
@@ -8,9 +8,10 @@ from __future__ import annotations
 from mjfim.output.plots.check import check_figure
 from mjfim.output.plots.compare import compare_figure
 from mjfim.output.plots.design import convergence, sensitivity_phase, trajectories
-from mjfim.output.plots.estimates import fit, histogram
-from mjfim.output.plots.limits import limits
+from mjfim.output.plots.limit_usage import limits
+from mjfim.output.plots.monte_carlo import histogram
 from mjfim.output.plots.parameters import parameter_intervals, std_bars
+from mjfim.output.plots.recording_fit import fit
 from mjfim.output.plots.residuals import predictions, residual_spectra
 from mjfim.output.plots.style import save
 from mjfim.output.plots.tables import design_table, study_table

@@ -1,10 +1,13 @@
-"""Methods side by side: what each knows of every parameter, and of the worst combination."""
+"""Figure of a comparison: standard deviations of all methods side by side, and that of the worst combination."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 
 from mjfim.arrays import Array
@@ -25,187 +28,298 @@ from mjfim.output.plots.style import (
     shorten,
     write_message,
 )
+from mjfim.output.summaries import budget_in_words
 from mjfim.records.comparison import DESIGN, Comparison, MethodResult
 
-READABLE = 12  # parameters up to which numbers are written into the cells
-SPAN = 3.0  # ratio at which the colours end
-WIDE = 8.0  # ratio of bars from which on their axis is logarithmic
-WIDTH = 34  # characters of a method's name
+# Largest number of parameters for which ratios are written into the cells.
+MAX_WRITTEN_CELLS = 12
+
+# Ratio of standard deviations to the design's at which the colours of the cells end.
+LARGEST_COLOURED_RATIO = 3.0
+
+# Ratio of the longest to the shortest bar above which their axis is logarithmic.
+LOGARITHMIC_RATIO = 8.0
+
+# Characters to which the names of methods and of parameters are shortened.
+METHOD_NAME_WIDTH, PARAMETER_NAME_WIDTH = 34, 18
+
+# Mean number of characters above which the names of parameters are turned upright.
+MAX_LEVEL_CHARACTERS = 8
+
+# Largest number of parameters whose names are written in the usual size, and the font size of more [points].
+MAX_USUAL_FONT, MANY_PARAMETERS_FONT = 30, 5.0
+
+# Share of the coloured range above which a cell is so dark that its number is white.
+DARK_CELL = 0.6
+
+# Ratios that the colour bar can mark.
+COLOUR_BAR_RATIOS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 
 
 def compare_figure(comparison: Comparison) -> Figure:
-    """Standard deviation of every parameter by method, over the design's (cells), beside that of the worst combination (bars)."""
-    rows, count = comparison.rows, len(comparison.wanted)
-    figure = new_figure(
-        float(np.clip(8.4 + 0.5 * count, 10.0, 20.0)),
-        float(np.clip(1.9 + 0.36 * len(rows), 3.2, 12.0)),
+    """Draw each method's standard deviations over the design's (cells), and that of the worst combination (bars).
+
+    Args:
+        comparison: The comparison.
+    """
+    count = len(comparison.wanted)
+    width = float(np.clip(8.4 + 0.5 * count, 10.0, 20.0))
+    height = float(np.clip(1.9 + 0.36 * len(comparison.rows), 3.2, 12.0))
+    cells_width = float(np.clip(0.55 * count, 2.2, 9.0))
+
+    figure = new_figure(width, height)
+    left, right = figure.subplots(1, 2, width_ratios=[cells_width, 3.6])
+    _draw_cells(left, comparison)
+    _draw_worst_combination(right, comparison)
+
+    note = (
+        f"{' '.join(comparison.verdict)} Each method had {budget_in_words(comparison)}. "
+        "Predicted standard deviations are a best case."
     )
-    left, right = figure.subplots(1, 2, width_ratios=[float(np.clip(0.55 * count, 2.2, 9.0)), 3.6])
-    _cells(left, comparison)
-    _bars(right, comparison)
-    handles = [
-        Patch(color=OPTIMIZED_COLOUR, label="design"),
-        Patch(color=INITIAL_COLOUR, label="baseline"),
-        Patch(color=OTHER_COLOUR, label="baseline that beats the design"),
-        Patch(facecolor="white", edgecolor=MUTED_COLOUR, hatch="////", label="may not be played"),
-    ]
-    used = {_colour(comparison, row) for row in rows if row.sound}
-    kept = [
-        h
-        for h, c in zip(handles, (OPTIMIZED_COLOUR, INITIAL_COLOUR, OTHER_COLOUR), strict=False)
-        if c in used
-    ]
-    kept += (
-        handles[3:]
-        if any(not row.sound and np.isfinite(row.worst_relative_std) for row in rows)
-        else []
-    )
-    budget = f"{comparison.seconds:g} s"
-    if np.isfinite(comparison.steps):
-        budget += f" or {format_number(comparison.steps / 1e6)} million MuJoCo steps"
-    note = f"{' '.join(comparison.verdict)} Each method had {budget}. Predicted standard deviations are a best case."
-    add_title(figure, "The design against what else could be played", kept, note)
+    add_title(figure, "The design compared with other methods", _handles(comparison), note)
     return figure
 
 
-def _colour(comparison: Comparison, row: MethodResult) -> str:
+def _handles(comparison: Comparison) -> list[Patch]:
+    """Return legend entries of the kinds of methods that are present."""
+    names = {
+        OPTIMIZED_COLOUR: "design",
+        INITIAL_COLOUR: "baseline",
+        OTHER_COLOUR: "baseline that beats the design",
+    }
+    used = {_method_colour(comparison, row) for row in comparison.rows if row.sound}
+    handles = [
+        Patch(color=colour, label=label) for colour, label in names.items() if colour in used
+    ]
+
+    hatched = [
+        row for row in comparison.rows if not row.sound and np.isfinite(row.worst_relative_std)
+    ]
+    if hatched:
+        unusable = Patch(
+            facecolor="white", edgecolor=MUTED_COLOUR, hatch="////", label="not usable"
+        )
+        handles.append(unusable)
+    return handles
+
+
+def _method_colour(comparison: Comparison, row: MethodResult) -> str:
+    """Return the colour of a method."""
     if row.method == DESIGN:
         return OPTIMIZED_COLOUR
     return OTHER_COLOUR if row in comparison.beating else INITIAL_COLOUR
 
 
-def _reference(comparison: Comparison) -> tuple[Array, str]:
-    """(t,) standard deviations that others are divided by: the design's, else the parameters' scales; and what that is."""
-    wanted, ours = list(comparison.wanted), comparison.design
-    if ours is not None and np.isfinite(ours.std[wanted]).any():
-        return ours.std[wanted], "σ of each parameter over the design's"
-    return comparison.scale[wanted], "σ of each parameter over its scale"
+# ---- cells: ratios by method and parameter
 
 
-def _cells(axes: Axes, comparison: Comparison) -> None:
-    """Ratios by method and parameter; white is 1, red worse, blue better."""
-    wanted, rows = list(comparison.wanted), comparison.rows
-    reference, title = _reference(comparison)
-    ratios = np.array([row.std[wanted] for row in rows]).reshape(len(rows), len(wanted)) / reference
-    if not np.isfinite(ratios).any():
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Ratios:
+    """Standard deviations of all methods, divided by a reference.
+
+    Attributes:
+        values: (methods, wanted parameters) ratios.
+        title: Sentence that says what was divided by what.
+        middle: Logarithm of the ratio that is white.
+        half_range: Distance from it at which the colours end, as a logarithm.
+    """
+
+    values: Array
+    title: str
+    middle: float
+    half_range: float
+
+    @property
+    def logarithms(self) -> Array:
+        """(methods, wanted parameters) logarithms of the ratios, NaN where they are not finite."""
+        return np.log(np.where(np.isfinite(self.values), self.values, np.nan))
+
+
+def _ratios(comparison: Comparison) -> _Ratios | None:
+    """Divide standard deviations by the design's, else by the scales; None if no parameter is identifiable alone."""
+    wanted = list(comparison.wanted)
+    design = comparison.design
+    against_design = design is not None and bool(np.isfinite(design.std[wanted]).any())
+
+    reference = comparison.scale[wanted]
+    title = "σ of each parameter over its scale"
+    if design is not None and against_design:
+        reference = design.std[wanted]
+        title = "σ of each parameter over the design's"
+
+    std = np.array([row.std[wanted] for row in comparison.rows])
+    values = std.reshape(len(comparison.rows), len(wanted)) / reference
+    finite = np.isfinite(values)
+    if not finite.any():
+        return None
+
+    # White is the design's standard deviation; without one, it is the mean of what is shown.
+    middle, half_range = 0.0, float(np.log(LARGEST_COLOURED_RATIO))
+    if not against_design:
+        logarithms = np.log(np.where(finite, values, np.nan))
+        middle = float(np.nanmean(logarithms))
+        half_range = max(float(np.nanstd(logarithms)) * 2.0, 0.1)
+    return _Ratios(values=values, title=title, middle=middle, half_range=half_range)
+
+
+def _draw_cells(axes: Axes, comparison: Comparison) -> None:
+    """Draw ratios by method and parameter: red is worse than the middle, blue is better."""
+    ratios = _ratios(comparison)
+    if ratios is None:
         axes.set_axis_off()
-        write_message(axes, "no parameter is known alone")
+        write_message(axes, "no parameter is identifiable alone")
         return
-    relative = comparison.design is not None and np.isfinite(comparison.design.std[wanted]).any()
-    logs = np.log(np.where(np.isfinite(ratios), ratios, np.nan))
-    middle, span = (
-        (0.0, np.log(SPAN))
-        if relative
-        else (float(np.nanmean(logs)), max(float(np.nanstd(logs)) * 2.0, 0.1))
-    )
+
     axes.set_facecolor(GRID_COLOUR)
     image = axes.imshow(
-        np.ma.masked_invalid(logs),
+        np.ma.masked_invalid(ratios.logarithms),
         cmap="RdBu_r",
-        vmin=middle - span,
-        vmax=middle + span,
+        vmin=ratios.middle - ratios.half_range,
+        vmax=ratios.middle + ratios.half_range,
         aspect="auto",
     )
-    names = [shorten(comparison.parameters[j], 18) for j in wanted]
-    upright = sum(len(name) for name in names) > 8 * len(names) or len(names) > READABLE
-    axes.set_xticks(
-        range(len(names)),
-        names,
-        fontsize=SMALL_FONT if len(names) <= 30 else 5.0,
-        rotation=90 if upright else 0,
-    )
-    axes.set_yticks(
-        range(len(rows)),
-        [shorten(row.title, WIDTH) for row in rows],
-        fontsize=NORMAL_FONT,
-        color=TEXT_COLOUR,
-    )
-    for label, row in zip(axes.get_yticklabels(), rows, strict=True):
-        label.set_color(_colour(comparison, row) if row.sound else MUTED_COLOUR)
-        label.set_fontweight("bold" if row.method == DESIGN else "normal")
+    _name_parameters(axes, comparison)
+    _name_methods(axes, comparison)
     axes.tick_params(length=0.0)
     axes.spines[:].set_visible(False)
-    axes.set_title(title, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
-    if len(names) > READABLE:
-        bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.015, aspect=30)
-        ticks = [t for t in (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8) if abs(np.log(t) - middle) <= span]
-        bar.set_ticks(np.log(ticks).tolist(), labels=[f"{t:g}" for t in ticks])
-        bar.ax.tick_params(labelsize=SMALL_FONT, color=MUTED_COLOUR)
-        return
-    for (i, j), ratio in np.ndenumerate(ratios):
-        strong = np.isfinite(ratio) and abs(logs[i, j] - middle) > 0.6 * span
-        text = format_number(float(ratio), 3) if np.isfinite(ratio) else "–"
+    axes.set_title(ratios.title, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
+
+    # Numbers of many parameters would not fit into the cells.
+    if len(comparison.wanted) > MAX_WRITTEN_CELLS:
+        _add_colour_bar(axes, image, ratios)
+    else:
+        _write_ratios(axes, ratios)
+
+
+def _name_parameters(axes: Axes, comparison: Comparison) -> None:
+    """Write the names of the parameters below the cells."""
+    names = [shorten(comparison.parameters[j], PARAMETER_NAME_WIDTH) for j in comparison.wanted]
+    count = len(names)
+    characters = sum(len(name) for name in names)
+    upright = characters > MAX_LEVEL_CHARACTERS * count or count > MAX_WRITTEN_CELLS
+
+    axes.set_xticks(
+        range(count),
+        names,
+        fontsize=SMALL_FONT if count <= MAX_USUAL_FONT else MANY_PARAMETERS_FONT,
+        rotation=90 if upright else 0,
+    )
+
+
+def _name_methods(axes: Axes, comparison: Comparison) -> None:
+    """Write the names of the methods beside the cells, each in its colour."""
+    titles = [shorten(row.title, METHOD_NAME_WIDTH) for row in comparison.rows]
+    axes.set_yticks(range(len(titles)), titles, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
+    for label, row in zip(axes.get_yticklabels(), comparison.rows, strict=True):
+        label.set_color(_method_colour(comparison, row) if row.sound else MUTED_COLOUR)
+        label.set_fontweight("bold" if row.method == DESIGN else "normal")
+
+
+def _add_colour_bar(axes: Axes, image: AxesImage, ratios: _Ratios) -> None:
+    """Add a bar that says which colour stands for which ratio."""
+    bar = axes.figure.colorbar(image, ax=axes, shrink=0.8, pad=0.015, aspect=30)
+    marked = [
+        ratio
+        for ratio in COLOUR_BAR_RATIOS
+        if abs(np.log(ratio) - ratios.middle) <= ratios.half_range
+    ]
+    bar.set_ticks(np.log(marked).tolist(), labels=[f"{ratio:g}" for ratio in marked])
+    bar.ax.tick_params(labelsize=SMALL_FONT, color=MUTED_COLOUR)
+
+
+def _write_ratios(axes: Axes, ratios: _Ratios) -> None:
+    """Write every ratio into its cell."""
+    distances = np.abs(ratios.logarithms - ratios.middle)
+    for (i, j), ratio in np.ndenumerate(ratios.values):
+        dark = distances[i, j] > DARK_CELL * ratios.half_range
         axes.text(
             j,
             i,
-            text,
+            format_number(float(ratio), 3) if np.isfinite(ratio) else "–",
             ha="center",
             va="center",
             fontsize=SMALL_FONT,
-            color="white" if strong else TEXT_COLOUR,
+            color="white" if dark else TEXT_COLOUR,
         )
 
 
-def _bars(axes: Axes, comparison: Comparison) -> None:
-    """Worst relative standard deviation by method, and its tightest limit."""
+# ---- bars: the worst combination of parameters
+
+
+def _draw_worst_combination(axes: Axes, comparison: Comparison) -> None:
+    """Draw the relative standard deviation of the worst combination by method, and its tightest limit in words."""
     rows = comparison.rows
     worst = np.array([row.worst_relative_std for row in rows])
     known = worst[np.isfinite(worst)]
+
     format_axes(axes, "standard deviation, relative to the parameters' scales [–]")
     axes.grid(False, axis="y")
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_yticks([])
-    axes.set_title(
-        "σ of the worst combination, and the worst margin of all limits",
-        fontsize=NORMAL_FONT,
-        color=TEXT_COLOUR,
-    )
+    title = "σ of the worst combination, and the worst margin of all limits"
+    axes.set_title(title, fontsize=NORMAL_FONT, color=TEXT_COLOUR)
     if not len(known):
-        write_message(axes, "nothing found")
+        write_message(axes, "no method found a usable control")
         return
-    low, high = 0.0, float(known.max())
-    if high > WIDE * known.min():
-        low = 0.5 * float(known.min())
-        axes.set_xscale("log")
-    room = high * (high / low) ** 0.75 if low else 1.7 * high
-    axes.set_xlim(low, room)
+
+    low, high = _bar_range(axes, known)
     axes.tick_params(which="both", labelsize=SMALL_FONT, color=MUTED_COLOUR, labelcolor=TEXT_COLOUR)
-    for i, row in enumerate(rows):
-        if not np.isfinite(row.worst_relative_std):
+    for place, row in enumerate(rows):
+        if np.isfinite(row.worst_relative_std):
+            _draw_bar(axes, place, row, low, _method_colour(comparison, row))
+        else:
             axes.text(
                 low + 0.02 * (high - low),
-                i,
+                place,
                 row.outcome.value,
                 va="center",
                 fontsize=SMALL_FONT,
                 color=MUTED_COLOUR,
             )
-            continue
-        colour = _colour(comparison, row)
-        bar = axes.barh(
-            i, row.worst_relative_std - low, left=low, height=0.62, color=colour, linewidth=0.8
-        )
-        if not row.sound:
-            bar[0].set(facecolor="white", edgecolor=MUTED_COLOUR, hatch="////")
-        text = axes.text(
-            row.worst_relative_std,
-            i,
-            f"  {format_number(row.worst_relative_std)}",
-            va="center",
-            fontsize=SMALL_FONT,
-            color=TEXT_COLOUR,
-        )
-        kind, share = row.tightest
-        said = (
-            f"  {format_percent(share)} {kind.replace('_', ' ')}"
-            if kind and np.isfinite(share)
-            else ""
-        )
-        axes.annotate(
-            said,
-            (1.0, 0.5),
-            xycoords=text,
-            va="center",
-            fontsize=SMALL_FONT - 1.0,
-            color=MUTED_COLOUR,
-        )
+
+
+def _bar_range(axes: Axes, known: Array) -> tuple[float, float]:
+    """Set the axis of the bars, with room for text behind them. known: (n,) finite standard deviations.
+
+    Returns:
+        Left end of the axis and right end of the longest bar.
+    """
+    high = float(known.max())
+    if high > LOGARITHMIC_RATIO * known.min():
+        low = 0.5 * float(known.min())
+        axes.set_xscale("log")
+        axes.set_xlim(low, high * (high / low) ** 0.75)
+        return low, high
+
+    axes.set_xlim(0.0, 1.7 * high)
+    return 0.0, high
+
+
+def _draw_bar(axes: Axes, place: int, row: MethodResult, left: float, colour: str) -> None:
+    """Draw the bar of one method, with its value and its tightest limit behind it."""
+    length = row.worst_relative_std - left
+    bar = axes.barh(place, length, left=left, height=0.62, color=colour, linewidth=0.8)
+    if not row.sound:
+        bar[0].set(facecolor="white", edgecolor=MUTED_COLOUR, hatch="////")
+
+    value = axes.text(
+        row.worst_relative_std,
+        place,
+        f"  {format_number(row.worst_relative_std)}",
+        va="center",
+        fontsize=SMALL_FONT,
+        color=TEXT_COLOUR,
+    )
+    kind, margin = row.tightest
+    if not kind or not np.isfinite(margin):
+        return
+
+    # The margin stands behind the value, wherever that ends.
+    axes.annotate(
+        f"  {format_percent(margin)} {kind.replace('_', ' ')}",
+        (1.0, 0.5),
+        xycoords=value,
+        va="center",
+        fontsize=SMALL_FONT - 1.0,
+        color=MUTED_COLOUR,
+    )

@@ -1,6 +1,8 @@
-"""Figures of a design: trajectories, sensitivities, convergence."""
+"""Figures of a design: trajectories, sensitivities of the motion to the parameters, convergence of the optimisation."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 from mjfim.model.coordinates import split_unit
+from mjfim.model.units import per_second
 from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
     GRID_COLOUR,
@@ -30,47 +33,137 @@ from mjfim.output.plots.style import (
 )
 from mjfim.records.design import Design, Evaluation
 
-MAX_PHASE_PARAMETERS = 6
-MAX_PHASE_DOFS = 4
-ZOOM = 4.0
+# Largest number of panels of the trajectories that stand in two columns; more stand in four.
+MAX_PANELS_IN_TWO_COLUMNS = 9
+
+# Largest number of parameters and of degrees of freedom in the phase plots of the sensitivities.
+MAX_PHASE_PARAMETERS, MAX_PHASE_DOFS = 6, 4
+
+# Characters to which the names of parameters are shortened in the phase plots.
+PARAMETER_NAME_WIDTH = 18
+
+# Ratio of the optimized to the initial loop of sensitivities above which the initial one is drawn enlarged.
+ENLARGING_RATIO = 4.0
+
+# Height that a panel gains for the enlarged loop, as a share of its own height.
+ENLARGED_LOOP_HEIGHT = 0.62
 
 
-def pair(design: Design) -> tuple[tuple[Evaluation, str, float], ...]:
-    """Both evaluations with colour and line width."""
+# ---- trajectories
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Panel:
+    """One panel of the trajectories.
+
+    Attributes:
+        quantity: Field of the trajectory: "qpos", "qvel" or "ctrl".
+        column: Column of that field.
+        label: Label `name [unit]`.
+    """
+
+    quantity: str
+    column: int
+    label: str
+
+
+def trajectories(design: Design, labels: Labels) -> Figure:
+    """Draw states, controls, and the root of the information's smallest eigenvalue up to time t (the paper's figure 2).
+
+    Args:
+        design: The design.
+        labels: Labels of the model's columns.
+
+    Raises:
+        MjfimError: The labels do not fit the design.
+    """
+    trajectory = design.trajectory
+    labels.check(
+        qpos=trajectory.qpos.shape[1],
+        velocities=trajectory.qvel.shape[1],
+        controls=trajectory.ctrl.shape[1],
+    )
+    panels = _state_panels(labels)
+    columns = 2 if len(panels) <= MAX_PANELS_IN_TWO_COLUMNS else 4
+    rows = len(panels) // columns + 1
+    width = 7.4 if columns == 2 else 12.0
+
+    figure = new_figure(width, 1.55 * rows + 0.9)
+    grid = figure.add_gridspec(rows, columns)
+    first: Axes | None = None
+    for k, panel in enumerate(panels):
+        axes = figure.add_subplot(grid[divmod(k, columns)], sharex=first)
+        first = first or axes
+        _draw_state(axes, design, panel)
+
+        in_last_row = k // columns == rows - 1
+        format_axes(axes, ylabel=break_before_unit(panel.label))
+        axes.tick_params(labelbottom=in_last_row)
+        axes.set_xlabel("time [s]" if in_last_row else "")
+
+    # The information takes the rest of the last row.
+    axes = figure.add_subplot(grid[rows - 1, len(panels) % columns :], sharex=first)
+    _draw_information(axes, design)
+    format_axes(
+        axes, "time [s]", r"$\sqrt{\lambda_{\min}}$  [$\sqrt{\mathrm{s}}$ / unit of $\theta$]"
+    )
+
+    note = (
+        "λ_min: smallest eigenvalue of the Fisher information per measurement rate, "
+        "accumulated up to time t."
+    )
+    add_title(figure, "Trajectories and the information they gather", trajectory_handles(), note)
+    return figure
+
+
+def _state_panels(labels: Labels) -> list[_Panel]:
+    """Return a panel for every state and control; position and velocity alternate where they pair up."""
+    positions = _panels("qpos", labels.qpos)
+    velocities = _panels("qvel", labels.velocities)
+    controls = _panels("ctrl", labels.controls)
+
+    if len(positions) != len(velocities):
+        return [*positions, *velocities, *controls]
+    states = []
+    for position, velocity in zip(positions, velocities, strict=True):
+        states += [position, velocity]
+    return [*states, *controls]
+
+
+def _panels(quantity: str, labels: tuple[str, ...]) -> list[_Panel]:
+    """Return a panel for every column of a field of the trajectory."""
+    return [_Panel(quantity=quantity, column=i, label=label) for i, label in enumerate(labels)]
+
+
+def _styled_evaluations(design: Design) -> tuple[tuple[Evaluation, str, float], ...]:
+    """Return both evaluations of a design, each with its colour and its line width [points]."""
     return (design.initial, INITIAL_COLOUR, 1.5), (design.final, OPTIMIZED_COLOUR, 1.7)
 
 
-def state_panels(design: Design, labels: Labels) -> list[tuple[str, str, int]]:
-    """(field, label, column) of every state and control; position and velocity alternate where they pair up."""
-    positions = [("qpos", label, i) for i, label in enumerate(labels.qpos)]
-    velocities = [("qvel", label, i) for i, label in enumerate(labels.velocities)]
-    controls = [("ctrl", label, i) for i, label in enumerate(labels.controls)]
-    if len(positions) == len(velocities):
-        states = [panel for both in zip(positions, velocities, strict=True) for panel in both]
-    else:
-        states = positions + velocities
-    return states + controls
+def _draw_state(axes: Axes, design: Design, panel: _Panel) -> None:
+    """Draw one coordinate or control of both trajectories over time."""
+    for evaluation, colour, width in _styled_evaluations(design):
+        trajectory = evaluation.trajectory
+        values = getattr(trajectory, panel.quantity)[:, panel.column]
 
-
-def draw_state(axes: Axes, design: Design, name: str, column: int) -> None:
-    """One coordinate or control of both trajectories over time."""
-    for evaluation, colour, width in pair(design):
-        curve = evaluation.trajectory
-        values = getattr(curve, name)[:, column]
-        if name == "ctrl":
-            axes.stairs(values, curve.t, baseline=None, color=colour, linewidth=width, snap=False)
+        # A control is held from each sample to the next.
+        if panel.quantity == "ctrl":
+            axes.stairs(
+                values, trajectory.t, baseline=None, color=colour, linewidth=width, snap=False
+            )
         else:
-            axes.plot(curve.t, values, color=colour, linewidth=width)
+            axes.plot(trajectory.t, values, color=colour, linewidth=width)
 
 
-def draw_information(axes: Axes, design: Design) -> None:
-    """Root of the smallest eigenvalue accumulated up to each time, with its end value."""
-    for evaluation, colour, width in pair(design):
+def _draw_information(axes: Axes, design: Design) -> None:
+    """Draw the root of the smallest eigenvalue accumulated up to each time, with its value at the end."""
+    for evaluation, colour, width in _styled_evaluations(design):
+        t = evaluation.trajectory.t
         root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
-        axes.plot(evaluation.trajectory.t, root, color=colour, linewidth=width)
+        axes.plot(t, root, color=colour, linewidth=width)
         axes.annotate(
             format_number(float(root[-1])),
-            (float(evaluation.trajectory.t[-1]), float(root[-1])),
+            (float(t[-1]), float(root[-1])),
             xytext=(4, 0),
             textcoords="offset points",
             va="center",
@@ -80,170 +173,227 @@ def draw_information(axes: Axes, design: Design) -> None:
         )
 
 
-def trajectories(design: Design, labels: Labels) -> Figure:
-    """States, controls and the root of the smallest eigenvalue of the information up to time t (paper's figure 2)."""
-    curve = design.trajectory
-    labels.check(
-        qpos=curve.qpos.shape[1], velocities=curve.qvel.shape[1], controls=curve.ctrl.shape[1]
+# ---- sensitivities
+
+
+def sensitivity_phase(design: Design, labels: Labels) -> Figure:
+    """Draw phase plots of the sensitivities psi: a row per degree of freedom, a column per parameter (figure 3).
+
+    Args:
+        design: The design.
+        labels: Labels of the model's columns and of the parameters.
+
+    Raises:
+        MjfimError: The labels do not fit the design.
+    """
+    nv = design.trajectory.qvel.shape[1]
+    count = len(design.theta)
+    labels.check(positions=nv, velocities=nv, parameters=count)
+    dofs = _most_sensitive_dofs(design, nv)
+    parameters = _least_known_parameters(design)
+
+    figure = new_figure(max(2.9 * len(parameters), 4.6), 2.6 * len(dofs) + 0.9)
+    grid = figure.add_gridspec(len(dofs), len(parameters))
+    for row, dof in enumerate(dofs):
+        for column, j in enumerate(parameters):
+            axes = figure.add_subplot(grid[row, column])
+            loops = _loops(design, int(dof), int(j))
+            _draw_loops(axes, loops)
+            _enlarge_initial_loop(axes, loops)
+            _label_phase_axes(axes, labels, int(dof), int(j))
+
+    note = (
+        "Each loop starts at the dot (time 0, no sensitivity); ′ is the time derivative. "
+        "Blue boxes enlarge the initial loop."
     )
-    panels = state_panels(design, labels)
-    columns = 2 if len(panels) <= 9 else 4
-    rows = len(panels) // columns + 1
-    figure = new_figure(3.7 * columns if columns == 2 else 12.0, 1.55 * rows + 0.9)
-    grid = figure.add_gridspec(rows, columns)
-    first: Axes | None = None
-    for k, (name, label, column) in enumerate(panels):
-        axes = figure.add_subplot(grid[divmod(k, columns)], sharex=first)
-        first = first or axes
-        draw_state(axes, design, name, column)
-        format_axes(axes, ylabel=break_before_unit(label))
-        last = k // columns == rows - 1
-        axes.tick_params(labelbottom=last)
-        axes.set_xlabel("time [s]" if last else "")
-    # The information takes whatever the last row has left.
-    axes = figure.add_subplot(grid[rows - 1, len(panels) % columns :], sharex=first)
-    draw_information(axes, design)
-    format_axes(
-        axes, "time [s]", r"$\sqrt{\lambda_{\min}}$  [$\sqrt{\mathrm{s}}$ / unit of $\theta$]"
+    if len(dofs) < nv or len(parameters) < count:
+        note += (
+            f" Shown: {len(dofs)} of {nv} degrees of freedom (most sensitive), "
+            f"{len(parameters)} of {count} parameters (largest predicted relative standard deviation)."
+        )
+    start = Line2D(
+        [], [], color=TEXT_COLOUR, marker="o", markersize=3.5, linestyle="", label="start"
     )
-    note = "λ_min: smallest eigenvalue of the Fisher information per measurement rate, accumulated up to time t."
-    add_title(figure, "Trajectories and the information they gather", trajectory_handles(), note)
+    handles = [*trajectory_handles(), start]
+    add_title(figure, "Sensitivity of the motion to each parameter", handles, note)
     return figure
 
 
-def phase_choice(design: Design, dofs: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Dofs of largest sensitivity and parameters of largest predicted relative std, in their own order."""
-    scale = np.where(design.theta == 0.0, 1.0, np.abs(design.theta))
+def _parameter_sizes(design: Design) -> Array:
+    """Return the (p,) sizes of the parameters [theta-unit]; 1 for a parameter of 0."""
+    return np.where(design.theta == 0.0, 1.0, np.abs(design.theta))
+
+
+def _least_known_parameters(design: Design) -> NDArray[np.intp]:
+    """Return the wanted parameters of the largest predicted relative standard deviations, in ascending order."""
     wanted = np.array(design.wanted, dtype=np.intp)
-    known = np.where(np.isfinite(design.final.std), design.final.std, 0.0) / scale
-    worst = wanted[np.argsort(-known[wanted], kind="stable")][:MAX_PHASE_PARAMETERS]
-    psi = np.abs(design.final.sensitivity[:, :dofs] * scale)
-    strongest = np.argsort(-psi.max(axis=(0, 2)), kind="stable")[:MAX_PHASE_DOFS]
-    return np.sort(strongest), np.sort(worst)
+
+    # A parameter that the design does not determine has nothing to show.
+    std = design.final.std
+    relative_std = np.where(np.isfinite(std), std, 0.0) / _parameter_sizes(design)
+
+    descending = np.argsort(-relative_std[wanted], kind="stable")
+    return np.sort(wanted[descending][:MAX_PHASE_PARAMETERS])
 
 
-def draw_phase(axes: Axes, design: Design, dof: int, dofs: int, j: int) -> None:
-    """Loop of (dq_i/dtheta_j, dv_i/dtheta_j) for both trajectories; the initial one lies on top, being the smaller."""
-    for (evaluation, colour, width), order in zip(pair(design), (3, 2), strict=True):
-        psi = evaluation.sensitivity
-        axes.plot(
-            psi[:, dof, j], psi[:, dofs + dof, j], color=colour, linewidth=width, zorder=order
-        )
+def _most_sensitive_dofs(design: Design, nv: int) -> NDArray[np.intp]:
+    """Return the degrees of freedom whose positions are most sensitive to relative changes, in ascending order."""
+    relative_psi = np.abs(design.final.sensitivity[:, :nv] * _parameter_sizes(design))
+    largest = relative_psi.max(axis=(0, 2))
+    descending = np.argsort(-largest, kind="stable")
+    return np.sort(descending[:MAX_PHASE_DOFS])
+
+
+def _loops(design: Design, dof: int, j: int) -> tuple[Array, Array]:
+    """Return the sensitivities of position and velocity of a degree of freedom to parameter j.
+
+    Returns:
+        (N+1, 2) of the initial and of the optimized trajectory [x-unit / theta-unit].
+    """
+    nv = design.trajectory.qvel.shape[1]
+    columns = [dof, nv + dof]
+    return design.initial.sensitivity[:, columns, j], design.final.sensitivity[:, columns, j]
+
+
+def _draw_loops(axes: Axes, loops: tuple[Array, Array]) -> None:
+    """Draw both loops; the initial one lies on top, because it is the smaller one."""
+    initial, optimized = loops
+    axes.plot(*initial.T, color=INITIAL_COLOUR, linewidth=1.5, zorder=3)
+    axes.plot(*optimized.T, color=OPTIMIZED_COLOUR, linewidth=1.7, zorder=2)
     axes.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=3.5, zorder=4)
 
 
-def enlarge_initial(axes: Axes, design: Design, dof: int, dofs: int, j: int) -> None:
-    """Where the initial loop is tiny, draw it again in a box above the other one."""
-    columns = [dof, dofs + dof]
-    small, large = (
-        np.ptp(e.sensitivity[:, columns, j], axis=0) for e in (design.initial, design.final)
-    )
-    if not (ZOOM * small < large).all() or not (small > 0.0).all():
+def _enlarge_initial_loop(axes: Axes, loops: tuple[Array, Array]) -> None:
+    """Draw a tiny initial loop once more, enlarged, in a box above the other one."""
+    initial, optimized = loops
+    initial_extent = np.ptp(initial, axis=0)
+    optimized_extent = np.ptp(optimized, axis=0)
+    tiny = (ENLARGING_RATIO * initial_extent < optimized_extent).all()
+    if not tiny or not (initial_extent > 0.0).all():
         return
+
+    # The axes grow upwards, but keep their ticks.
     low, high = axes.get_ylim()
     axes.set_yticks([tick for tick in axes.get_yticks() if low <= tick <= high])
-    axes.set_ylim(low, high + 0.62 * (high - low))
+    axes.set_ylim(low, high + ENLARGED_LOOP_HEIGHT * (high - low))
+
     box = axes.inset_axes((0.2, 0.72, 0.6, 0.27))
-    box.plot(*design.initial.sensitivity[:, columns, j].T, color=INITIAL_COLOUR, linewidth=1.2)
+    box.plot(*initial.T, color=INITIAL_COLOUR, linewidth=1.2)
     box.plot(0.0, 0.0, "o", color=TEXT_COLOUR, markersize=2.5)
     box.tick_params(
-        labelsize=SMALL_FONT - 2.5, color=MUTED_COLOUR, labelcolor=MUTED_COLOUR, length=2, pad=1.5
+        labelsize=SMALL_FONT - 2.5,
+        color=MUTED_COLOUR,
+        labelcolor=MUTED_COLOUR,
+        length=2,
+        pad=1.5,
     )
     box.locator_params(nbins=3)
     box.spines[:].set_color(INITIAL_COLOUR)
     box.spines[:].set_linewidth(0.7)
 
 
-def sensitivity_phase(design: Design, labels: Labels) -> Figure:
-    """Phase plots of the sensitivities psi, one row per dof, one column per parameter (paper's figure 3)."""
-    dofs = design.trajectory.qvel.shape[1]
-    count = len(design.theta)
-    labels.check(velocities=dofs, parameters=count)
-    rows, columns = phase_choice(design, dofs)
-    figure = new_figure(max(2.9 * len(columns), 4.6), 2.6 * len(rows) + 0.9)
-    grid = figure.add_gridspec(len(rows), len(columns))
-    for a, dof in enumerate(rows):
-        name, rate = split_unit(labels.velocities[dof])
-        unit = rate[:-2] if rate.endswith("/s") else f"{rate} s"
-        if len(labels.positions) == dofs:
-            name = split_unit(labels.positions[dof])[0]
-        for b, j in enumerate(columns):
-            axes = figure.add_subplot(grid[a, b])
-            draw_phase(axes, design, int(dof), dofs, int(j))
-            enlarge_initial(axes, design, int(dof), dofs, int(j))
-            theta, divisor = shorten(labels.parameters[j], 18), labels.parameter_units[j]
-            format_axes(
-                axes,
-                f"∂{name}/∂{theta}\n[{quotient_unit(unit, divisor)}]",
-                f"∂{name}′/∂{theta}\n[{quotient_unit(rate, divisor)}]",
-            )
-    note = "Each loop starts at the dot (time 0, no sensitivity); ′ is the time derivative."
-    note += " Blue boxes enlarge the initial loop."
-    if len(rows) < dofs or len(columns) < count:
-        note += f" Shown: {len(rows)} of {dofs} degrees of freedom (most sensitive), {len(columns)} of {count}"
-        note += " parameters (largest predicted relative standard deviation)."
-    start = Line2D(
-        [], [], color=TEXT_COLOUR, marker="o", markersize=3.5, linestyle="", label="start"
+def _label_phase_axes(axes: Axes, labels: Labels, dof: int, j: int) -> None:
+    """Label the axes with the derivatives of position and velocity with respect to parameter j."""
+    name, unit = split_unit(labels.positions[dof])
+    parameter = shorten(labels.parameters[j], PARAMETER_NAME_WIDTH)
+    divisor = labels.parameter_units[j]
+    format_axes(
+        axes,
+        f"∂{name}/∂{parameter}\n[{quotient_unit(unit, divisor)}]",
+        f"∂{name}′/∂{parameter}\n[{quotient_unit(per_second(unit), divisor)}]",
     )
-    add_title(
-        figure, "Sensitivity of the motion to each parameter", [*trajectory_handles(), start], note
-    )
-    return figure
 
 
-def draw_history(
-    axes: Axes, iterations: Array, values: Array, relative: Array | None = None
-) -> None:
-    """One quantity over the iterations on a log axis (linear if it is never positive), ends in the pair's colours."""
-    positive = np.where(values > 0.0, values, np.nan)
-    usable = np.isfinite(positive)
-    if not usable.any():
-        if not np.isfinite(values).any():
-            write_message(axes, "no iterations recorded")
-            return
-        positive, usable = values, np.isfinite(values)
-    else:
-        axes.set_yscale("log")
-    axes.plot(iterations, positive, color=MUTED_COLOUR, linewidth=1.3, marker=".", markersize=3)
-    if relative is not None:
-        axes.plot(
-            iterations,
-            np.where(relative > 0.0, relative, np.nan),
-            color=MUTED_COLOUR,
-            linewidth=1.0,
-            linestyle=":",
-        )
-    for k, colour in (
-        (np.flatnonzero(usable)[0], INITIAL_COLOUR),
-        (np.flatnonzero(usable)[-1], OPTIMIZED_COLOUR),
-    ):
-        axes.plot(iterations[k], positive[k], "o", color=colour, markersize=6)
-    ends = positive[usable]
-    text = f"{format_number(float(ends[0]))} → {format_number(float(ends[-1]))}"
-    axes.set_title(text, loc="right", fontsize=SMALL_FONT, color=MUTED_COLOUR, pad=4)
+# ---- convergence
 
 
 def convergence(design: Design) -> Figure:
-    """Cost, slope and smallest eigenvalue over the iterations, logarithmic."""
+    """Draw cost, slope and smallest eigenvalue over the iterations, logarithmically.
+
+    Args:
+        design: The design.
+    """
     history = design.history
     iterations = np.array([row.iteration for row in history], dtype=np.float64)
     cost = np.array([row.cost for row in history], dtype=np.float64)
     slope = np.abs(np.array([row.slope for row in history], dtype=np.float64))
-    smallest = np.array([row.min_eigenvalue for row in history], dtype=np.float64)
+    eigenvalue = np.array([row.min_eigenvalue for row in history], dtype=np.float64)
+
+    # With a barrier the slope is that of log J, which is relative already.
+    has_barrier = any(row.mu for row in history)
+    relative_slope = None
+    if not has_barrier:
+        relative_slope = slope / np.where(cost == 0.0, np.nan, np.abs(cost))
+
     figure = new_figure(10.0, 3.3)
-    top = figure.subplots(1, 3)
-    draw_history(top[0], iterations, cost)
-    mus = np.array([row.mu for row in history])
-    relative = (
-        None if mus.any() else slope / np.where(cost == 0.0, np.nan, np.abs(cost))
-    )  # of log J it is that already
-    draw_history(top[1], iterations, slope, relative)
-    draw_history(top[2], iterations, smallest)
-    rates = np.array([row.rate for row in history])
+    panels = figure.subplots(1, 3)
+    _draw_history(panels[0], iterations, cost)
+    _draw_history(panels[1], iterations, slope, relative_slope)
+    _draw_history(panels[2], iterations, eigenvalue)
+    _mark_rates(panels, design, iterations)
+    _mark_barrier_stages(panels, design, iterations)
+
+    names = ("cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]")
+    for axes, name in zip(panels, names, strict=True):
+        format_axes(axes, "iteration [–]", name)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+
+    handles = [
+        Line2D([], [], color=INITIAL_COLOUR, marker="o", linestyle="", label="initial"),
+        Line2D([], [], color=OPTIMIZED_COLOUR, marker="o", linestyle="", label="optimized"),
+    ]
+    if relative_slope is not None:
+        handles.append(Line2D([], [], color=MUTED_COLOUR, linestyle=":", label="slope / J"))
+    note = f"{design.status.value}."
+    if has_barrier:
+        note += (
+            " Dashed: a new barrier stage of the limits begins; "
+            "slope and cost are then of log J and barrier."
+        )
+    add_title(figure, "Convergence", handles, note)
+    return figure
+
+
+def _draw_history(
+    axes: Axes, iterations: Array, values: Array, relative: Array | None = None
+) -> None:
+    """Draw one quantity over the iterations, with its first and last value in the colours of the trajectories.
+
+    Args:
+        axes: Axes of the panel; they become logarithmic unless no value is positive.
+        iterations: (n,) numbers of the iterations.
+        values: (n,) values; of a logarithmic axis, the positive ones are shown.
+        relative: (n,) values of a second, dotted curve.
+    """
+    if not np.isfinite(values).any():
+        write_message(axes, "no iterations recorded")
+        return
+
+    shown = np.where(values > 0.0, values, np.nan)
+    if np.isfinite(shown).any():
+        axes.set_yscale("log")
+    else:
+        shown = values
+    axes.plot(iterations, shown, color=MUTED_COLOUR, linewidth=1.3, marker=".", markersize=3)
+    if relative is not None:
+        positive = np.where(relative > 0.0, relative, np.nan)
+        axes.plot(iterations, positive, color=MUTED_COLOUR, linewidth=1.0, linestyle=":")
+
+    usable = np.flatnonzero(np.isfinite(shown))
+    first, last = usable[0], usable[-1]
+    axes.plot(iterations[first], shown[first], "o", color=INITIAL_COLOUR, markersize=6)
+    axes.plot(iterations[last], shown[last], "o", color=OPTIMIZED_COLOUR, markersize=6)
+    text = f"{format_number(float(shown[first]))} → {format_number(float(shown[last]))}"
+    axes.set_title(text, loc="right", fontsize=SMALL_FONT, color=MUTED_COLOUR, pad=4)
+
+
+def _mark_rates(panels: NDArray[np.object_], design: Design, iterations: Array) -> None:
+    """Mark the iterations at which the time grid becomes finer, with the rates before and after it [Hz]."""
+    rates = np.array([row.rate for row in design.history])
     for k in np.flatnonzero(np.diff(rates)):
-        for axes in top:
+        for axes in panels:
             axes.axvline(iterations[k + 1], color=GRID_COLOUR, linewidth=2.0, zorder=0)
-        top[0].annotate(
+        panels[0].annotate(
             f" {rates[k]:g} Hz | {rates[k + 1]:g} Hz",
             (iterations[k + 1], 0.97),
             xycoords=("data", "axes fraction"),
@@ -252,28 +402,13 @@ def convergence(design: Design) -> Figure:
             fontsize=SMALL_FONT,
             color=MUTED_COLOUR,
         )
-    for k in np.flatnonzero(mus[1:] != mus[:-1]):
-        for axes in top:
+
+
+def _mark_barrier_stages(panels: NDArray[np.object_], design: Design, iterations: Array) -> None:
+    """Mark the iterations at which a new barrier stage begins."""
+    mu = np.array([row.mu for row in design.history])
+    for k in np.flatnonzero(mu[1:] != mu[:-1]):
+        for axes in panels:
             axes.axvline(
                 iterations[k + 1], color=GRID_COLOUR, linewidth=1.0, linestyle="--", zorder=0
             )
-    names = ("cost J [–]", "slope |DJ·ζ| [–]", r"$\lambda_{\min}$  [s / (unit of $\theta$)$^2$]")
-    for axes, name in zip(top, names, strict=True):
-        format_axes(axes, "iteration [–]", name)
-        axes.xaxis.get_major_locator().set_params(integer=True)
-    dots = [
-        Line2D([], [], color=colour, marker="o", linestyle="", label=name)
-        for name, colour in (("initial", INITIAL_COLOUR), ("optimized", OPTIMIZED_COLOUR))
-    ]
-    line = (
-        []
-        if relative is None
-        else [Line2D([], [], color=MUTED_COLOUR, linestyle=":", label="slope / J")]
-    )
-    told = (
-        " Dashed: the barrier of the limits gets sharper; slope and cost are then of log J and barrier."
-        if mus.any()
-        else ""
-    )
-    add_title(figure, "Convergence", [*dots, *line], f"{design.status.value}.{told}")
-    return figure

@@ -1,6 +1,8 @@
-"""Figures with one row per parameter: predicted standard deviations, estimates with their intervals."""
+"""Figures with a row per parameter: predicted standard deviations, and estimates with their intervals."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +14,6 @@ from matplotlib.transforms import Transform
 from mjfim.arrays import Array
 from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
-    BEST_CASE,
     INITIAL_COLOUR,
     NORMAL_FONT,
     OPTIMIZED_COLOUR,
@@ -27,47 +28,144 @@ from mjfim.output.plots.style import (
     shorten,
     shorten_label,
 )
+from mjfim.output.summaries import BEST_CASE
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 
+# Half width of the 95 % interval of a normal distribution, in standard deviations.
 QUANTILE_95 = 1.959964
-ROOMY = 12
+
+# Largest number of rows that are high; more rows are lower and their bars have no numbers.
+MAX_HIGH_ROWS = 12
+
+# Height of a bar, and distance of the two bars of a row from its middle, as shares of the height of a row.
+BAR_HEIGHT, BAR_OFFSET = 0.36, 0.19
+
+# Median half widths beyond which an interval is cut off, so that the others stay visible.
+MAX_RELATIVE_WIDTH = 5.0
 
 
-def bar_limits(*stds: Array) -> tuple[float, float]:
-    """Log-axis limits around all finite positive values."""
-    values = np.concatenate(stds)
-    finite = values[np.isfinite(values) & (values > 0.0)]
+# ---- predicted standard deviations
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Accuracies:
+    """Predicted accuracy of n parameters and combinations along both trajectories.
+
+    Attributes:
+        names: n names with units.
+        values: (n,) values [theta-unit].
+        std_initial: (n,) standard deviations along the initial trajectory [theta-unit].
+        std_final: (n,) standard deviations along the optimized trajectory [theta-unit].
+    """
+
+    names: list[str]
+    values: Array
+    std_initial: Array
+    std_final: Array
+
+
+def std_bars(design: Design, labels: Labels) -> Figure:
+    """Draw the predicted standard deviation of every wanted parameter and combination along both trajectories.
+
+    Args:
+        design: The design.
+        labels: Labels of the parameters.
+
+    Raises:
+        MjfimError: The labels do not fit the design.
+    """
+    labels.check(parameters=len(design.theta))
+    accuracies = _accuracies(design, labels)
+    stds = np.concatenate([accuracies.std_initial, accuracies.std_final])
+    count = len(accuracies.names)
+    row_height = 0.5 if count <= MAX_HIGH_ROWS else 0.3
+
+    figure = new_figure(9.0, 1.7 + row_height * count)
+    axes = figure.subplots()
+    axes.set_xscale("log")
+    axes.set_xlim(*_bar_limits(stds))
+    axes.set_ylim(count - 0.45, -0.55)
+    _draw_bars(axes, accuracies.std_initial, -BAR_OFFSET, INITIAL_COLOUR)
+    _draw_bars(axes, accuracies.std_final, BAR_OFFSET, OPTIMIZED_COLOUR)
+
+    format_axes(axes, "predicted standard deviation [unit of the parameter]")
+    axes.grid(False, axis="y")
+    axes.set_yticks(range(count), accuracies.names)
+    _write_columns(axes, accuracies)
+
+    handles = [
+        Patch(color=INITIAL_COLOUR, label="initial"),
+        Patch(color=OPTIMIZED_COLOUR, label="optimized"),
+    ]
+    note = BEST_CASE
+    if not np.isfinite(stds).all():
+        note += " ∞: this trajectory does not determine the parameter by itself."
+    add_title(figure, "Predicted accuracy (Cramér–Rao)", handles, note)
+    return figure
+
+
+def _accuracies(design: Design, labels: Labels) -> _Accuracies:
+    """Collect the wanted parameters and the combinations of a design."""
+    wanted = list(design.wanted)
+    combined = design.combined
+    names = [shorten_label(labels.parameter(j)) for j in wanted]
+    names += [shorten(combination.expression) for combination in combined]
+
+    values = [*design.theta[wanted], *(combination.value for combination in combined)]
+    initial = [*design.initial.std[wanted], *(c.std_initial for c in combined)]
+    final = [*design.final.std[wanted], *(c.std_final for c in combined)]
+    return _Accuracies(
+        names=names,
+        values=np.array(values),
+        std_initial=np.array(initial),
+        std_final=np.array(final),
+    )
+
+
+def _bar_limits(stds: Array) -> tuple[float, float]:
+    """Return the limits of a logarithmic axis around all finite positive values. stds: (n,)."""
+    finite = stds[np.isfinite(stds) & (stds > 0.0)]
     if not finite.size:
         return 0.1, 10.0
-    low, high = float(finite.min()), float(finite.max())
-    return low / 3.0, high * (3.0 if np.isfinite(values).all() else 30.0)
+
+    # Infinite bars reach beyond all others.
+    headroom = 3.0 if np.isfinite(stds).all() else 30.0
+    return float(finite.min()) / 3.0, float(finite.max()) * headroom
 
 
-def draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
-    """One trajectory's bars; an infinite std becomes a hatched bar across the whole axis."""
-    high = axes.get_xlim()[1]
+def _draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
+    """Draw the bars of one trajectory; that of an infinite value is hatched and crosses the whole axis.
+
+    Args:
+        axes: Axes with their final limits.
+        std: (n,) standard deviations [theta-unit].
+        offset: Distance of the bars from the middle of their rows, as a share of the height of a row.
+        colour: Colour of the trajectory.
+    """
     places = np.arange(len(std)) + offset
     known = np.isfinite(std)
-    if len(std) <= ROOMY:
-        for x, y in zip(std[known], places[known], strict=True):
-            axes.text(
-                x, y, f" {format_number(float(x))}", va="center", fontsize=SMALL_FONT, color=colour
-            )
-    axes.barh(places[known], std[known], height=0.36, color=colour)
+
+    if len(std) <= MAX_HIGH_ROWS:
+        for value, place in zip(std[known], places[known], strict=True):
+            text = f" {format_number(float(value))}"
+            axes.text(value, place, text, va="center", fontsize=SMALL_FONT, color=colour)
+    axes.barh(places[known], std[known], height=BAR_HEIGHT, color=colour)
+
+    right = axes.get_xlim()[1]
     axes.barh(
         places[~known],
-        high,
-        height=0.36,
+        right,
+        height=BAR_HEIGHT,
         facecolor="white",
         edgecolor=colour,
         hatch="////",
         linewidth=0.8,
     )
-    for y in places[~known]:
+    for place in places[~known]:
         axes.text(
-            high,
-            y,
+            right,
+            place,
             "∞ ",
             ha="right",
             va="center",
@@ -77,39 +175,45 @@ def draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
         )
 
 
-def annotate_bars(axes: Axes, values: Array, before: Array, after: Array) -> None:
-    """Columns right of the bars: std as percent of the value for both trajectories, and the ratio of the stds."""
+def _write_columns(axes: Axes, accuracies: _Accuracies) -> None:
+    """Write three columns beside the bars: both standard deviations over the value, and their ratio."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        relative = [np.abs(std / values) for std in (before, after)]
-        ratio = before / after
-    cells = [
-        (62.0, INITIAL_COLOUR, "of value", [format_percent(v) for v in relative[0]]),
-        (122.0, OPTIMIZED_COLOUR, "of value", [format_percent(v) for v in relative[1]]),
-        (
-            178.0,
-            TEXT_COLOUR,
-            "ratio",
-            [f"{format_number(v)}×" if np.isfinite(v) else format_number(v) for v in ratio],
-        ),
+        relative_initial = np.abs(accuracies.std_initial / accuracies.values)
+        relative_final = np.abs(accuracies.std_final / accuracies.values)
+        ratio = accuracies.std_initial / accuracies.std_final
+
+    initial_texts = [format_percent(value) for value in relative_initial]
+    final_texts = [format_percent(value) for value in relative_final]
+    ratio_texts = [
+        f"{format_number(value)}×" if np.isfinite(value) else format_number(value)
+        for value in ratio
     ]
-    for x, colour, title, texts in cells:
-        place_text(axes, (1.0, 1.0), "axes fraction", (x, 6.0), title, colour)
-        for y, text in enumerate(texts):
-            place_text(axes, (1.0, y), axes.get_yaxis_transform(), (x, 0.0), text, colour)
+
+    # Right edge of each column [points], behind the right end of the axis.
+    _write_column(axes, 62.0, "of value", initial_texts, INITIAL_COLOUR)
+    _write_column(axes, 122.0, "of value", final_texts, OPTIMIZED_COLOUR)
+    _write_column(axes, 178.0, "ratio", ratio_texts, TEXT_COLOUR)
 
 
-def place_text(
+def _write_column(axes: Axes, right: float, heading: str, texts: list[str], colour: str) -> None:
+    """Write a heading and a text per row, aligned at `right` points behind the end of the axis."""
+    _write_at_offset(axes, 1.0, "axes fraction", (right, 6.0), heading, colour)
+    for row, text in enumerate(texts):
+        _write_at_offset(axes, row, axes.get_yaxis_transform(), (right, 0.0), text, colour)
+
+
+def _write_at_offset(
     axes: Axes,
-    anchor: tuple[float, float],
+    height: float,
     system: str | Transform,
     offset: tuple[float, float],
     text: str,
     colour: str,
 ) -> None:
-    """Right-aligned text at an offset [point] from an anchor."""
+    """Write right-aligned text at an offset [points] from the right end of the axes at a height of a coordinate system."""
     axes.annotate(
         text,
-        anchor,
+        (1.0, height),
         xycoords=system,
         xytext=offset,
         textcoords="offset points",
@@ -121,141 +225,174 @@ def place_text(
     )
 
 
-def std_bars(design: Design, labels: Labels) -> Figure:
-    """Predicted standard deviation of every wanted parameter and combination along both trajectories, with the gain."""
-    labels.check(parameters=len(design.theta))
-    shown = list(design.wanted)
-    names = [
-        *(shorten_label(labels.parameter(j)) for j in shown),
-        *(shorten(c.expression) for c in design.combined),
-    ]
-    values = np.array([*design.theta[shown], *(c.value for c in design.combined)])
-    before = np.array([*design.initial.std[shown], *(c.std_initial for c in design.combined)])
-    after = np.array([*design.final.std[shown], *(c.std_final for c in design.combined)])
-    count = len(names)
-    figure = new_figure(9.0, 1.7 + (0.5 if count <= ROOMY else 0.3) * count)
-    axes = figure.subplots()
-    axes.set_xscale("log")
-    axes.set_xlim(*bar_limits(before, after))
-    axes.set_ylim(count - 0.45, -0.55)
-    draw_bars(axes, before, -0.19, INITIAL_COLOUR)
-    draw_bars(axes, after, 0.19, OPTIMIZED_COLOUR)
-    format_axes(axes, "predicted standard deviation [unit of the parameter]")
-    axes.grid(False, axis="y")
-    axes.set_yticks(range(count), names)
-    annotate_bars(axes, values, before, after)
-    note = BEST_CASE
-    handles = [
-        Patch(color=INITIAL_COLOUR, label="initial"),
-        Patch(color=OPTIMIZED_COLOUR, label="optimized"),
-    ]
-    if not np.isfinite(np.concatenate([before, after])).all():
-        note += " ∞: this trajectory does not determine the parameter by itself."
-    add_title(figure, "Predicted accuracy (Cramér–Rao)", handles, note)
-    return figure
+# ---- estimates with their intervals
 
 
-def relative_axis(offset: Array, ends: Array) -> tuple[float, float]:
-    """Axis limits [%]: the guess, all estimates, and all intervals (p, 2) unless a few dwarf the rest."""
-    known = np.isfinite(offset)
-    centres, reach = offset[known], np.abs(ends - offset[:, None])[known]
-    finite = reach[np.isfinite(reach)]
-    widest = 5.0 * float(np.median(finite)) + float(np.abs(centres).max()) if finite.size else 1.0
-    shown = np.minimum(reach, widest)
-    low = min(0.0, float(np.min(centres - shown[:, 0], initial=0.0)))
-    high = max(0.0, float(np.max(centres + shown[:, 1], initial=0.0)))
-    margin = 0.08 * max(high - low, 1e-6)
-    return low - margin, high + margin
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _RelativeEstimate:
+    """Estimates relative to their guesses [% of the guess]; NaN where the guess is 0.
 
+    Attributes:
+        centre: (p,) difference of the estimates from the guesses.
+        formal_half_width: (p,) half widths of the formal 95 % intervals.
+        interval: (p, 2) ends of the 95 % intervals that allow for autocorrelated residuals.
+    """
 
-def draw_interval(
-    axes: Axes, y: int, centre: float, half: float, wide: tuple[float, float], bound: bool
-) -> None:
-    """One estimate with its formal interval, thick, in the honest one, thin; arrows where that leaves the axis."""
-    low, high = axes.get_xlim()
-    if np.isfinite(half):
-        inner = (max(centre - half, low), min(centre + half, high))
-        axes.plot(
-            inner, (y, y), color=OPTIMIZED_COLOUR, linewidth=5.0, solid_capstyle="butt", alpha=0.3
-        )
-    ends = (max(wide[0], low), min(wide[1], high))
-    axes.plot(ends, (y, y), color=OPTIMIZED_COLOUR, linewidth=1.4, solid_capstyle="butt")
-    for end, marker, cut in ((ends[0], "<", wide[0] < low), (ends[1], ">", wide[1] > high)):
-        axes.plot(
-            end, y, marker if cut else "|", color=OPTIMIZED_COLOUR, markersize=7, clip_on=False
-        )
-    face = "white" if bound else OPTIMIZED_COLOUR
-    axes.plot(
-        centre,
-        y,
-        "s" if bound else "o",
-        color=OPTIMIZED_COLOUR,
-        markerfacecolor=face,
-        markersize=6.5,
-        zorder=3,
-    )
-
-
-def interval_text(estimate: Estimate, j: int, unit: str) -> str:
-    """Guess, estimate and half width of the honest interval in the parameter's unit."""
-    low, high = estimate.interval[j]
-    half = 0.5 * float(high - low) if np.isfinite(estimate.std[j]) else np.inf
-    guess = format_number(float(estimate.initial_theta[j]), 4)
-    text = f"{guess} → {format_with_uncertainty(float(estimate.theta[j]), half)} {unit}"
-    return text.rstrip() + (
-        "   at its bound" if estimate.parameters[j] in estimate.at_bound else ""
-    )
+    centre: Array
+    formal_half_width: Array
+    interval: Array
 
 
 def parameter_intervals(estimate: Estimate, labels: Labels) -> Figure:
-    """Estimates with 95 % intervals relative to the guess; a bound that holds an estimate is flagged."""
+    """Draw estimates with 95 % intervals relative to the guess; an estimate at its bound is marked.
+
+    Args:
+        estimate: The estimate.
+        labels: Labels of the parameters.
+
+    Raises:
+        MjfimError: The labels do not fit the estimate.
+    """
     count = len(estimate.theta)
     labels.check(parameters=count)
-    scale = np.where(estimate.initial_theta == 0.0, np.nan, np.abs(estimate.initial_theta)) / 100.0
-    offset = (estimate.theta - estimate.initial_theta) / scale
-    half = QUANTILE_95 * estimate.std / scale
-    wide = (estimate.interval - estimate.initial_theta[:, None]) / scale[:, None]
-    figure = new_figure(9.5, 1.9 + (0.42 if count <= 12 else 0.27) * count)
+    relative = _relative_to_guess(estimate)
+    row_height = 0.42 if count <= MAX_HIGH_ROWS else 0.27
+
+    figure = new_figure(9.5, 1.9 + row_height * count)
     axes = figure.subplots()
-    axes.set(xlim=relative_axis(offset, wide), ylim=(count - 0.4, -0.6))
+    axes.set(xlim=_interval_limits(relative), ylim=(count - 0.4, -0.6))
     axes.axvline(0.0, color=INITIAL_COLOUR, linewidth=1.6)
-    for j in range(count):
-        if np.isfinite(offset[j]):
-            ends = (float(wide[j, 0]), float(wide[j, 1]))
-            bound = estimate.parameters[j] in estimate.at_bound
-            draw_interval(axes, j, float(offset[j]), float(half[j]), ends, bound)
-        text = interval_text(estimate, j, labels.parameter_units[j])
+    for j, name in enumerate(estimate.parameters):
+        if np.isfinite(relative.centre[j]):
+            _draw_interval(axes, relative, j, at_bound=name in estimate.at_bound)
         axes.text(
             1.02,
             j,
-            text,
+            _interval_text(estimate, j, labels.parameter_units[j]),
             transform=axes.get_yaxis_transform(),
             va="center",
             fontsize=SMALL_FONT,
             color=TEXT_COLOUR,
         )
+
     format_axes(axes, "difference from the guess [% of the guess]")
     axes.set_yticks(range(count), [shorten_label(labels.parameter(j)) for j in range(count)])
-    handles = [
-        Line2D([], [], color=INITIAL_COLOUR, label="guess", linewidth=1.6),
-        Line2D(
-            [], [], color=OPTIMIZED_COLOUR, marker="o", alpha=0.9, label="estimate, 95 % interval"
-        ),
-        Line2D([], [], color=OPTIMIZED_COLOUR, linewidth=5.0, alpha=0.3, label="formal 95 %"),
-        Line2D(
-            [],
-            [],
-            color=OPTIMIZED_COLOUR,
-            marker="s",
-            markerfacecolor="white",
-            linestyle="",
-            label="at its bound",
-        ),
-    ]
-    note = "Formal: a best case that holds if the model and the noise are right. The thin line allows for residuals that are not."
-    if estimate.misfit:
-        note += " Here the residuals are not noise: no interval covers what a wrong model does to the parameters."
-    if np.isnan(scale).any():
-        note += " A guess of 0 has no relative scale and is given as text only."
-    add_title(figure, "Estimated parameters", handles, note)
+    note = _interval_note(estimate, guess_of_zero=bool(np.isnan(relative.centre).any()))
+    add_title(figure, "Estimated parameters", _interval_handles(), note)
     return figure
+
+
+def _relative_to_guess(estimate: Estimate) -> _RelativeEstimate:
+    """Express estimates and intervals as percent of the guess."""
+    guess = estimate.initial_theta
+    percent = np.where(guess == 0.0, np.nan, np.abs(guess)) / 100.0
+    return _RelativeEstimate(
+        centre=(estimate.theta - guess) / percent,
+        formal_half_width=QUANTILE_95 * estimate.std / percent,
+        interval=(estimate.interval - guess[:, None]) / percent[:, None],
+    )
+
+
+def _interval_limits(relative: _RelativeEstimate) -> tuple[float, float]:
+    """Return the limits of the axis [%]: it holds the guess, all estimates and all intervals of usual width."""
+    known = np.isfinite(relative.centre)
+    centre = relative.centre[known]
+    reach = np.abs(relative.interval - relative.centre[:, None])[known]
+
+    # Few intervals that are much wider than the others are cut off.
+    finite = reach[np.isfinite(reach)]
+    largest_reach = 1.0
+    if finite.size:
+        largest_reach = MAX_RELATIVE_WIDTH * float(np.median(finite))
+        largest_reach += float(np.abs(centre).max())
+    shown = np.minimum(reach, largest_reach)
+
+    low = min(0.0, float(np.min(centre - shown[:, 0], initial=0.0)))
+    high = max(0.0, float(np.max(centre + shown[:, 1], initial=0.0)))
+    margin = 0.08 * max(high - low, 1e-6)
+    return low - margin, high + margin
+
+
+def _draw_interval(axes: Axes, relative: _RelativeEstimate, j: int, *, at_bound: bool) -> None:
+    """Draw one estimate with its formal interval (thick) and its other one (thin); arrows where the axis cuts it off."""
+    low, high = axes.get_xlim()
+    centre = float(relative.centre[j])
+    half = float(relative.formal_half_width[j])
+    if np.isfinite(half):
+        formal = (max(centre - half, low), min(centre + half, high))
+        axes.plot(
+            formal, (j, j), color=OPTIMIZED_COLOUR, linewidth=5.0, solid_capstyle="butt", alpha=0.3
+        )
+
+    left, right = (float(end) for end in relative.interval[j])
+    shown_left, shown_right = max(left, low), min(right, high)
+    axes.plot(
+        (shown_left, shown_right),
+        (j, j),
+        color=OPTIMIZED_COLOUR,
+        linewidth=1.4,
+        solid_capstyle="butt",
+    )
+    _draw_end(axes, shown_left, j, "<" if left < low else "|")
+    _draw_end(axes, shown_right, j, ">" if right > high else "|")
+
+    axes.plot(
+        centre,
+        j,
+        "s" if at_bound else "o",
+        color=OPTIMIZED_COLOUR,
+        markerfacecolor="white" if at_bound else OPTIMIZED_COLOUR,
+        markersize=6.5,
+        zorder=3,
+    )
+
+
+def _draw_end(axes: Axes, x: float, row: int, marker: str) -> None:
+    """Draw the marker at one end of an interval."""
+    axes.plot(x, row, marker, color=OPTIMIZED_COLOUR, markersize=7, clip_on=False)
+
+
+def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
+    """Write guess, estimate and half the width of the thin interval of parameter j in its unit."""
+    low, high = estimate.interval[j]
+    half = 0.5 * float(high - low) if np.isfinite(estimate.std[j]) else np.inf
+    guess = format_number(float(estimate.initial_theta[j]), 4)
+    value = format_with_uncertainty(float(estimate.theta[j]), half)
+    text = f"{guess} → {value} {unit}".rstrip()
+    return f"{text}   at its bound" if estimate.parameters[j] in estimate.at_bound else text
+
+
+def _interval_handles() -> list[Line2D]:
+    """Return the entries of the legend."""
+    at_bound = Line2D(
+        [],
+        [],
+        color=OPTIMIZED_COLOUR,
+        marker="s",
+        markerfacecolor="white",
+        linestyle="",
+        label="at its bound",
+    )
+    colour = OPTIMIZED_COLOUR
+    return [
+        Line2D([], [], color=INITIAL_COLOUR, label="guess", linewidth=1.6),
+        Line2D([], [], color=colour, marker="o", alpha=0.9, label="estimate, 95 % interval"),
+        Line2D([], [], color=colour, linewidth=5.0, alpha=0.3, label="formal 95 %"),
+        at_bound,
+    ]
+
+
+def _interval_note(estimate: Estimate, *, guess_of_zero: bool) -> str:
+    """Say what the two intervals mean."""
+    note = (
+        "Formal: a best case that holds if the model and the noise are right. "
+        "The thin line allows for residuals that are autocorrelated."
+    )
+    if estimate.misfit:
+        note += (
+            " Here the residuals are not noise: "
+            "no interval covers what a wrong model does to the parameters."
+        )
+    if guess_of_zero:
+        note += " A guess of 0 has no relative scale and is given as text only."
+    return note

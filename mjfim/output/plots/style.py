@@ -1,6 +1,6 @@
-"""House style of the figures: colours, number formats, blank figures, atomic saving.
+"""Style of the figures: colours, fonts, number formats, labels, blank figures, atomic saving.
 
-Only Figure and Agg objects are used: pyplot and its global state stay untouched, so threads may draw at once.
+Only Figure and Agg objects are used: pyplot and its global state stay untouched, so several threads may draw at once.
 """
 
 from __future__ import annotations
@@ -22,92 +22,198 @@ from mjfim.atomic_io import replacing
 from mjfim.errors import MjfimError
 from mjfim.model.coordinates import split_unit
 
+# Colour of the initial trajectory, of guesses and of nominal models.
 INITIAL_COLOUR = "#0077bb"
+
+# Colour of the optimized trajectory, of estimates and of identified models.
 OPTIMIZED_COLOUR = "#cc3311"
+
+# Colour of text, of true values and of reference lines.
 TEXT_COLOUR = "#222222"
+
+# Colour of notes, frames and curves that stay in the background.
 MUTED_COLOUR = "#6b7076"
+
+# Colour of grid lines and of shaded bands.
 GRID_COLOUR = "#d9dcdf"
+
+# Colour of trajectories and methods that are neither initial nor optimized.
 OTHER_COLOUR = "#8a6d3b"
+
+# Colour of measurements and of residuals.
 MEASURED_COLOUR = "#009988"
 
-
+# Font sizes of tick labels and notes, of axis labels, and of titles [points].
 SMALL_FONT, NORMAL_FONT, LARGE_FONT = 8.0, 9.0, 11.0
 
+# Font size of the footnote below a figure [points].
+NOTE_FONT = 7.5
 
-# How the two trajectories of a design or study are named and coloured.
+# Characters of a footnote that fit in one inch.
+NOTE_CHARACTERS_PER_INCH = 17
+
+# Name and colour in figures of the two trajectories of a design or study, by their name in the records.
 TRAJECTORY_STYLES: dict[str, tuple[str, str]] = {
     "initial": ("initial", INITIAL_COLOUR),
     "final": ("optimized", OPTIMIZED_COLOUR),
 }
-BEST_CASE = "Predicted standard deviations are a best case: they hold if the model and the stated noise are right."
+
+# Digits of a power of ten, raised.
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+# ---- units
 
 
 def quotient_unit(unit: str, divisor: str) -> str:
-    """Unit of a quotient: quotient_unit("m", "kg") is "m/kg"; compound units are bracketed."""
-    top = unit or "1"
+    """Return the unit of a quotient: `quotient_unit("m", "kg")` is "m/kg"; compound units are put in brackets.
+
+    Args:
+        unit: Unit of the numerator; may be empty.
+        divisor: Unit of the denominator; may be empty.
+    """
+    numerator = unit or "1"
     if not divisor:
-        return top
-    return f"{bracketed_unit(top)}/{bracketed_unit(divisor)}"
+        return numerator
+    return f"{bracketed_unit(numerator)}/{bracketed_unit(divisor)}"
 
 
 def bracketed_unit(unit: str) -> str:
-    """A unit that may be divided or raised as a whole."""
-    return f"({unit})" if any(c in unit for c in " /·*^²³") else unit
+    """Return a unit that may be divided or raised as a whole.
+
+    Args:
+        unit: The unit.
+    """
+    compound = any(character in unit for character in " /·*^²³")
+    return f"({unit})" if compound else unit
 
 
 def squared_unit(unit: str) -> str:
-    """Unit of a variance: "kg" becomes "kg²"."""
+    """Return the unit of a variance: "kg" becomes "kg²".
+
+    Args:
+        unit: Unit of the quantity; may be empty.
+    """
     return f"{bracketed_unit(unit)}²" if unit else ""
 
 
+# ---- numbers
+
+
 def format_number(value: float, digits: int = 3) -> str:
-    """Significant digits without trailing exponent code: 0.874, 1.65×10⁴, ∞; a dash for NaN."""
+    """Write a number with raised powers of ten: 0.874, 1.65×10⁴, ∞; a dash stands for NaN.
+
+    Args:
+        value: The number.
+        digits: Significant digits.
+    """
     if np.isnan(value):
         return "–"
     if np.isinf(value):
         return "∞" if value > 0 else "−∞"
+
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     power = int(exponent)
+
+    # Numbers of moderate size are written without a power of ten.
     if value == 0.0 or -4 < power < max(4, digits):
-        decimals = max(digits - 1 - (power if value else 0), 0)
+        shown_power = power if value else 0
+        decimals = max(digits - 1 - shown_power, 0)
         return f"{value:.{decimals}f}".replace("-", "−")
-    raised = str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+    raised = str(power).translate(SUPERSCRIPTS)
     return f"{mantissa}×10{raised}".replace("-", "−")
 
 
-def format_with_uncertainty(value: float, half: float) -> str:
-    """`0.994 ± 0.012`: the value to the digits that its half width leaves."""
-    if not np.isfinite(half) or half <= 0.0 or not 1e-3 <= max(abs(value), half) < 1e5:
-        return f"{format_number(value, 4)} ± {format_number(half, 2)}"
-    decimals = int(np.clip(1 - np.floor(np.log10(half)), 0, 8))
-    return f"{value:.{decimals}f} ± {half:.{decimals}f}".replace("-", "−")
+def format_with_uncertainty(value: float, half_width: float) -> str:
+    """Write a value with as many digits as its uncertainty leaves: `0.994 ± 0.012`.
+
+    Args:
+        value: The value.
+        half_width: Half the width of its interval, in the unit of the value.
+    """
+    usable = bool(np.isfinite(half_width)) and half_width > 0.0
+    largest = max(abs(value), half_width)
+    if not usable or not 1e-3 <= largest < 1e5:
+        return f"{format_number(value, 4)} ± {format_number(half_width, 2)}"
+
+    # The uncertainty has two significant digits.
+    decimals = int(np.clip(1 - np.floor(np.log10(half_width)), 0, 8))
+    text = f"{value:.{decimals}f} ± {half_width:.{decimals}f}"
+    return text.replace("-", "−")
 
 
 def format_percent(value: float) -> str:
-    """A fraction as percent with two significant digits."""
-    return f"{format_number(100.0 * value, 2)} %" if np.isfinite(value) else format_number(value)
+    """Write a fraction as percent with two significant digits.
+
+    Args:
+        value: The fraction, 1 for 100 %.
+    """
+    if not np.isfinite(value):
+        return format_number(value)
+    return f"{format_number(100.0 * value, 2)} %"
+
+
+# ---- labels
 
 
 def shorten(text: str, width: int = 28) -> str:
-    """Long names keep both ends around an ellipsis."""
-    keep = (width - 1) // 2
-    return text if len(text) <= width else f"{text[:keep]}…{text[-keep:]}"
+    """Shorten a long name; both of its ends stay, with an ellipsis between them.
 
-
-def break_before_unit(label: str, width: int = 18) -> str:
-    """`name [unit]` for the side of a low panel: a long label breaks before its unit."""
-    name, unit = split_unit(label)
-    return label if len(label) <= width or not unit else f"{shorten(name, width)}\n[{unit}]"
+    Args:
+        text: The name.
+        width: Largest number of characters.
+    """
+    if len(text) <= width:
+        return text
+    kept = (width - 1) // 2
+    return f"{text[:kept]}…{text[-kept:]}"
 
 
 def shorten_label(label: str, width: int = 28) -> str:
-    """`name [unit]` with a shortened name and the whole unit."""
+    """Shorten the name in a label `name [unit]`; the unit stays.
+
+    Args:
+        label: The label.
+        width: Largest number of characters of the name.
+    """
     name, unit = split_unit(label)
-    return f"{shorten(name, width)} [{unit}]" if unit else shorten(name, width)
+    short = shorten(name, width)
+    return f"{short} [{unit}]" if unit else short
+
+
+def break_before_unit(label: str, width: int = 18) -> str:
+    """Break a long label `name [unit]` before its unit, for the side of a low panel.
+
+    Args:
+        label: The label.
+        width: Largest number of characters of a line.
+    """
+    name, unit = split_unit(label)
+    if len(label) <= width or not unit:
+        return label
+    return f"{shorten(name, width)}\n[{unit}]"
+
+
+def trajectory_style(trajectory: str) -> tuple[str, str]:
+    """Return the name of a trajectory in figures, and its colour.
+
+    Args:
+        trajectory: Its name in the records.
+    """
+    return TRAJECTORY_STYLES.get(trajectory, (trajectory, OTHER_COLOUR))
+
+
+# ---- figures and axes
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Blank figure of width x height [inch] with its own Agg canvas and constrained layout."""
+    """Return a blank figure with an Agg canvas and constrained layout.
+
+    Args:
+        width: Width [inch].
+        height: Height [inch].
+    """
     layout = ConstrainedLayoutEngine(w_pad=0.09, h_pad=0.07)
     figure = Figure(figsize=(width, height), layout=layout, facecolor="white")
     FigureCanvasAgg(figure)
@@ -115,7 +221,16 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def format_axes(axes: Axes, xlabel: str = "", ylabel: str = "") -> Axes:
-    """Open frame, faint grid, small ticks, labels."""
+    """Give axes an open frame, a pale grid, small ticks and labels.
+
+    Args:
+        axes: The axes.
+        xlabel: Label of the horizontal axis.
+        ylabel: Label of the vertical axis.
+
+    Returns:
+        The axes.
+    """
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(MUTED_COLOUR)
     axes.grid(True, color=GRID_COLOUR, linewidth=0.6)
@@ -127,7 +242,12 @@ def format_axes(axes: Axes, xlabel: str = "", ylabel: str = "") -> Axes:
 
 
 def write_message(axes: Axes, sentence: str) -> None:
-    """A sentence in the middle of a panel that has nothing to draw."""
+    """Write a sentence in the middle of a panel that has nothing to draw.
+
+    Args:
+        axes: Axes of the panel.
+        sentence: The sentence.
+    """
     axes.text(
         0.5,
         0.5,
@@ -141,9 +261,17 @@ def write_message(axes: Axes, sentence: str) -> None:
 
 
 def add_title(figure: Figure, title: str, handles: Sequence[Artist] = (), note: str = "") -> None:
-    """Title at the top left, legend under it, wrapped footnote at the bottom left."""
+    """Write a title at the top left, a legend under it, and a wrapped footnote at the bottom left.
+
+    Args:
+        figure: The figure.
+        title: The title.
+        handles: Entries of the legend.
+        note: The footnote.
+    """
     left = 0.12 / figure.get_figwidth()
-    # The title's second, empty line keeps room for the legend.
+
+    # The second, empty line of the title keeps room for the legend.
     figure.suptitle(
         f"{title}\n ", x=left, ha="left", fontsize=LARGE_FONT, color=TEXT_COLOUR, linespacing=1.3
     )
@@ -159,12 +287,13 @@ def add_title(figure: Figure, title: str, handles: Sequence[Artist] = (), note: 
             borderpad=0.2,
         )
     if note:
-        wrapped = textwrap.fill(note, int(figure.get_figwidth() * 17))
-        figure.supxlabel(wrapped, x=left, ha="left", fontsize=SMALL_FONT - 0.5, color=MUTED_COLOUR)
+        width = int(figure.get_figwidth() * NOTE_CHARACTERS_PER_INCH)
+        wrapped = textwrap.fill(note, width)
+        figure.supxlabel(wrapped, x=left, ha="left", fontsize=NOTE_FONT, color=MUTED_COLOUR)
 
 
 def trajectory_handles() -> list[Line2D]:
-    """Legend entries of the two trajectories."""
+    """Return the legend entries of the initial and the optimized trajectory."""
     return [
         Line2D([], [], color=colour, label=name, linewidth=2.0)
         for name, colour in TRAJECTORY_STYLES.values()
@@ -172,10 +301,23 @@ def trajectory_handles() -> list[Line2D]:
 
 
 def save(figure: Figure, path: str | os.PathLike[str], dpi: float = 200.0) -> Path:
-    """Write the figure as PNG in one step: readers see the old file or the new one, never half of it."""
+    """Write a figure as PNG in one step, so that readers find either the old file or the complete new one.
+
+    Args:
+        figure: The figure.
+        path: The file; its name ends in .png.
+        dpi: Resolution [pixels/inch].
+
+    Returns:
+        The file.
+
+    Raises:
+        MjfimError: The name does not end in .png.
+    """
     target = Path(path)
     if target.suffix.lower() != ".png":
         raise MjfimError(f"figures are saved as PNG: {target.name!r} should end in .png")
+
     with replacing(target) as temporary:
         figure.savefig(temporary, format="png", dpi=dpi)
     return target

@@ -11,20 +11,18 @@ from matplotlib.font_manager import FontProperties, findfont, get_font
 
 from mjfim.output.labels import Labels
 from mjfim.output.plots.style import (
-    BEST_CASE,
     LARGE_FONT,
     MUTED_COLOUR,
     NORMAL_FONT,
-    OTHER_COLOUR,
-    SMALL_FONT,
+    NOTE_FONT,
     TEXT_COLOUR,
-    TRAJECTORY_STYLES,
     format_number,
     new_figure,
     shorten,
     shorten_label,
+    trajectory_style,
 )
-from mjfim.output.summaries import MAX_MATRIX, describe_design, describe_study
+from mjfim.output.summaries import BEST_CASE, MAX_MATRIX, describe_design, describe_study
 from mjfim.output.summary_parts import Cell, Name, Quantity, SummaryTable
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
@@ -102,7 +100,7 @@ def draw_tables(title: str, tables: Sequence[SummaryTable], notes: Sequence[str]
         notes: Lines below the tables.
     """
     widths = [text_width(title, LARGE_FONT)]
-    widths += [text_width(note, SMALL_FONT - 0.5) for note in notes]
+    widths += [text_width(note, NOTE_FONT) for note in notes]
     widths += [column_edges(table)[-1] for table in tables]
     table_width = max(widths)
 
@@ -123,7 +121,7 @@ def draw_tables(title: str, tables: Sequence[SummaryTable], notes: Sequence[str]
         top += table_height(table)
     for k, note in enumerate(notes):
         y = top + 0.1 + NOTE_HEIGHT * k
-        axes.text(MARGIN, y, note, fontsize=SMALL_FONT - 0.5, color=MUTED_COLOUR, va="center")
+        axes.text(MARGIN, y, note, fontsize=NOTE_FONT, color=MUTED_COLOUR, va="center")
     return figure
 
 
@@ -271,9 +269,9 @@ def _drawn(cell: Cell) -> str:
 
 def _trajectory_name(trajectory: str) -> str:
     """Return the name of a trajectory in figures."""
-    return TRAJECTORY_STYLES.get(trajectory, (trajectory, OTHER_COLOUR))[0]
+    return trajectory_style(trajectory)[0]
 
 
 def _trajectory_colour(trajectory: str) -> str:
     """Return the colour of a trajectory in figures."""
-    return TRAJECTORY_STYLES.get(trajectory, (trajectory, OTHER_COLOUR))[1]
+    return trajectory_style(trajectory)[1]

@@ -1,0 +1,232 @@
+"""Figure of a Monte Carlo study: histograms of the estimates of one parameter along each trajectory."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from mjfim.arrays import Array
+from mjfim.errors import MjfimError
+from mjfim.output.labels import Labels
+from mjfim.output.plots.style import (
+    MUTED_COLOUR,
+    NORMAL_FONT,
+    SMALL_FONT,
+    TEXT_COLOUR,
+    add_title,
+    format_axes,
+    format_number,
+    new_figure,
+    quotient_unit,
+    squared_unit,
+    trajectory_style,
+    write_message,
+)
+from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+
+# Distance from the quartiles beyond which estimates are outliers, as a multiple of the distance between the quartiles.
+OUTLIER_DISTANCE = 4.0
+
+# Standard deviations of the Cramér-Rao bound on each side of the true value that a histogram shows.
+SHOWN_STDS = 4.0
+
+# Ratio of the bound's standard deviation to half the range of the estimates above which the range ignores the bound.
+HUGE_BOUND = 20.0
+
+# Smallest relative width of a histogram's range.
+MIN_RELATIVE_RANGE = 1e-9
+
+# Number of points of the normal curve.
+CURVE_POINTS = 400
+
+
+def histogram(study: MonteCarloStudy, index: int, labels: Labels) -> Figure:
+    """Draw the estimates of one parameter along each trajectory (the paper's figures 4 to 6).
+
+    Args:
+        study: The study.
+        index: Number of the parameter.
+        labels: Labels of the parameters.
+
+    Raises:
+        MjfimError: There is no such parameter, or the labels do not fit the study.
+    """
+    count = len(study.theta)
+    labels.check(parameters=count)
+    if not 0 <= index < count:
+        raise MjfimError(f"the study has no parameter {index}; valid: 0 to {count - 1}")
+
+    label = labels.parameter(index)
+    density_unit = quotient_unit("", labels.parameter_units[index])
+    figure = new_figure(max(4.1 * len(study.sets), 5.0), 5.3)
+    grid = figure.add_gridspec(2, len(study.sets), height_ratios=(2.6, 1.0))
+    for k, trajectory in enumerate(study.sets):
+        axes = figure.add_subplot(grid[0, k])
+        format_axes(axes, label, f"density [{density_unit}]")
+        _draw_histogram(axes, study, trajectory, index, labels.parameter_units[index])
+
+    overlay = figure.add_subplot(grid[1, :])
+    format_axes(overlay, label, "density / peak [–]")
+    _draw_overlay(overlay, study, index)
+    overlay.set_title("common axis", loc="left", fontsize=SMALL_FONT, color=MUTED_COLOUR)
+
+    title = f"Monte Carlo estimates of {labels.parameters[index]}"
+    note = (
+        "Simulated noise of the stated sigma on the model itself; "
+        "the panels above have different ranges."
+    )
+    add_title(figure, title, _handles(study, index, labels), note)
+    return figure
+
+
+def _handles(study: MonteCarloStudy, index: int, labels: Labels) -> list[Artist]:
+    """Return the entries of the legend."""
+    handles: list[Artist] = []
+    for trajectory in study.sets:
+        name, colour = trajectory_style(trajectory)
+        handles.append(Patch(facecolor=colour, alpha=0.5, label=name))
+
+    theta = format_number(float(study.theta[index]))
+    true_value = f"true value {theta} {labels.parameter_units[index]}".rstrip()
+    handles.append(Line2D([], [], color=TEXT_COLOUR, linestyle="--", label=true_value))
+    curve = "normal curve of the Cramér–Rao bound"
+    handles.append(Line2D([], [], color=TEXT_COLOUR, label=curve))
+    return handles
+
+
+def _successful_estimates(trials: TrialStatistics, index: int) -> Array:
+    """Return the (n,) estimates of one parameter without those of failed trials [theta-unit]."""
+    estimates = trials.estimates[:, index]
+    return estimates[np.isfinite(estimates)]
+
+
+def _bound_std(trials: TrialStatistics, index: int) -> float:
+    """Return the Cramér-Rao bound of one parameter as a standard deviation [theta-unit]."""
+    return float(np.sqrt(trials.crlb[index, index]))
+
+
+def _central_range(values: Array, theta: float, std: float) -> tuple[float, float]:
+    """Return a range that shows most estimates, the true value and four standard deviations of the bound.
+
+    Args:
+        values: (n,) estimates [theta-unit].
+        theta: The true value.
+        std: Standard deviation of the Cramér-Rao bound; infinite where the range ignores it.
+
+    Returns:
+        Ends of the range; it is never empty.
+    """
+    # Outliers do not widen the range.
+    first, median, third = (float(value) for value in np.quantile(values, (0.25, 0.5, 0.75)))
+    reach = OUTLIER_DISTANCE * (third - first)
+    low = max(float(values.min()), first - reach)
+    high = min(float(values.max()), third + reach)
+
+    # A bound that is far wider than the estimates would hide them.
+    half = 0.5 * (high - low)
+    bound_fits = np.isfinite(std) and (std < HUGE_BOUND * half or half == 0.0)
+    bound_reach = SHOWN_STDS * std if bound_fits else 0.0
+    low = min(low - 0.1 * half, theta - bound_reach)
+    high = max(high + 0.1 * half, theta + bound_reach)
+
+    # Estimates that are all equal need some width around them.
+    smallest = MIN_RELATIVE_RANGE * max(abs(median), abs(theta), MIN_RELATIVE_RANGE)
+    if high - low > smallest:
+        return low, high
+    return median - 1e3 * smallest, median + 1e3 * smallest
+
+
+def _densities(values: Array, limits: tuple[float, float]) -> tuple[Array, Array]:
+    """Return heights (bins,) and edges (bins+1,) of a histogram; values outside the limits count in the normalisation."""
+    bins = int(np.clip(2.0 * len(values) ** 0.5, 8, 60))
+    counts, edges = np.histogram(values, bins=bins, range=limits)
+    heights = counts / (len(values) * np.diff(edges))
+    return heights, edges
+
+
+def _normal_density(x: Array, mean: float, std: float) -> Array:
+    """Return the density of a normal distribution at x (n,)."""
+    exponent = -0.5 * ((x - mean) / std) ** 2
+    return np.asarray(np.exp(exponent) / (std * np.sqrt(2.0 * np.pi)), dtype=np.float64)
+
+
+def _draw_histogram(
+    axes: Axes, study: MonteCarloStudy, trajectory: str, index: int, unit: str
+) -> None:
+    """Draw the estimates along one trajectory, with the true value and the normal curve of the bound."""
+    trials = study.sets[trajectory]
+    name, colour = trajectory_style(trajectory)
+    axes.set_title(name, loc="left", fontsize=NORMAL_FONT + 1, color=colour, weight="bold", pad=49)
+    values = _successful_estimates(trials, index)
+    if not values.size:
+        write_message(axes, "no successful trials")
+        return
+
+    theta = float(study.theta[index])
+    std = _bound_std(trials, index)
+    low, high = _central_range(values, theta, std)
+    heights, edges = _densities(values, (low, high))
+    axes.stairs(heights, edges, fill=True, color=colour, alpha=0.45, linewidth=0)
+    axes.stairs(heights, edges, color=colour, linewidth=0.8)
+    if np.isfinite(std) and std > 0.0:
+        x = np.linspace(low, high, CURVE_POINTS)
+        axes.plot(x, _normal_density(x, theta, std), color=TEXT_COLOUR, linewidth=1.4)
+    axes.axvline(theta, color=TEXT_COLOUR, linewidth=1.2, linestyle="--")
+    axes.set_xlim(low, high)
+    axes.locator_params(axis="x", nbins=6)
+
+    hidden = int(np.sum((values < low) | (values > high)))
+    axes.text(
+        0.0,
+        1.02,
+        _statistics_in_words(trials, index, unit, hidden),
+        transform=axes.transAxes,
+        va="bottom",
+        fontsize=SMALL_FONT,
+        color=MUTED_COLOUR,
+    )
+
+
+def _statistics_in_words(trials: TrialStatistics, index: int, unit: str, hidden: int) -> str:
+    """Write variance, bound, efficiency and counts of one panel; `hidden` estimates lie outside its range."""
+    variance = format_number(float(trials.covariance[index, index]))
+    bound = format_number(float(trials.crlb[index, index]))
+    efficiency = format_number(float(trials.efficiency[index]))
+    low, high = (format_number(float(end)) for end in trials.efficiency_interval[index])
+
+    counts = f"{trials.trials} trials, {trials.failed} failed"
+    if hidden:
+        counts += f", {hidden} outside this range"
+    lines = (
+        f"variance {variance} {squared_unit(unit)}".rstrip(),
+        f"bound {bound} {squared_unit(unit)}".rstrip(),
+        f"efficiency {efficiency}, 95 % interval [{low}, {high}]",
+        counts,
+    )
+    return "\n".join(lines)
+
+
+def _draw_overlay(axes: Axes, study: MonteCarloStudy, index: int) -> None:
+    """Draw the estimates along all trajectories on one axis, each scaled to its highest bar."""
+    theta = float(study.theta[index])
+    ranges = []
+    for trajectory, trials in study.sets.items():
+        values = _successful_estimates(trials, index)
+        if not values.size:
+            continue
+        ranges.append(_central_range(values, theta, _bound_std(trials, index)))
+        heights, edges = _densities(values, _central_range(values, theta, np.inf))
+        relative_heights = heights / max(heights.max(), 1e-300)
+        _, colour = trajectory_style(trajectory)
+        axes.stairs(relative_heights, edges, fill=True, color=colour, alpha=0.5)
+
+    if not ranges:
+        write_message(axes, "no successful trials")
+        return
+    axes.axvline(theta, color=TEXT_COLOUR, linewidth=1.2, linestyle="--")
+    axes.set_xlim(min(low for low, _ in ranges), max(high for _, high in ranges))
+    axes.set_ylim(0.0, 1.08)
