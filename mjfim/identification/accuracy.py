@@ -1,4 +1,4 @@
-"""How accurate an estimate is: formal covariance, honest intervals, what the data hardly tell."""
+"""Accuracy of an estimate: formal covariance, robust intervals, and parameters that are poorly known."""
 
 from __future__ import annotations
 
@@ -10,26 +10,46 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.experiment.system import System
 from mjfim.identification.residuals import FitProblem
-from mjfim.identification.robust_covariance import together, uncertainty
+from mjfim.identification.robust_covariance import block_length, robust_uncertainty
 from mjfim.information.marginal import marginal, standard_deviations
 from mjfim.information.null_space import NullSpace, parameter_groups
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.combinations import ParameterGroup
-from mjfim.records.estimate import Uncertainty
+from mjfim.records.estimate import NORMAL_95, Uncertainty
 
-SLOPPY = 0.25  # half of an interval over the value, from which a parameter is hardly known
-TRADED = 0.5  # correlation from which another parameter can stand in for one
+# Half width of an interval over the value, above which a parameter is poorly known.
+POORLY_KNOWN_SHARE = 0.25
+
+# Half width of an interval over the value, from which the interval says nearly nothing.
+UNKNOWN_SHARE = 10.0
+
+# Correlation above which another parameter is named as confounded.
+CONFOUNDED_CORRELATION = 0.5
+
+# Smallest size of a value, relative to the magnitude of its parameter, to which an interval is compared.
+SMALLEST_RELATIVE_SIZE = 1e-3
+
+# Smallest variance whose square root is divided by.
+SMALLEST_VARIANCE = 1e-300
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Accuracy:
-    """Of theta: (p,). std: (p,), covariance: (p, p) formal;  sandwich, between: (p,);  interval: (p, 2) (see `Estimate`)
+    """Accuracy of the p parameters, with the values of the first recording.
 
-    groups: of parameters that are known in combination only;  singular: others are not determined either
-    lost: a parameter that was declared alone is among the groups
-    sloppy: names of wanted parameters that are hardly known, and how that is said
-    data: (p, p) information of the recordings alone;  detail: of the common unknowns, None where one is not determined
+    Attributes:
+        std: (p,) formal standard deviations [theta-unit].
+        covariance: (p, p) formal covariance.
+        sandwich: (p,) standard deviations that allow for autocorrelated residuals [theta-unit].
+        interval: (p, 2) 95 % intervals [theta-unit].
+        between: (p,) standard deviations from recording to recording [theta-unit].
+        groups: Parameters that are known in combination only.
+        singular: True where parameters outside these groups are not determined either.
+        single_unidentifiable: True where a parameter that was declared by itself is in one of the groups.
+        poorly_known: Names of parameters of interest that are poorly known, and a remark on each.
+        data_information: (p, p) information of the recordings alone, without priors.
+        robust: Robust uncertainty of the common unknowns; None where one of them is not determined.
     """
 
     std: Array
@@ -39,129 +59,193 @@ class Accuracy:
     between: Array
     groups: tuple[ParameterGroup, ...]
     singular: bool
-    lost: bool
-    sloppy: tuple[tuple[str, str], ...]
-    data: Array
-    detail: Uncertainty | None
+    single_unidentifiable: bool
+    poorly_known: tuple[tuple[str, str], ...]
+    data_information: Array
+    robust: Uncertainty | None
 
 
-def accuracy(
-    fit: FitProblem, solution: Solution, null: NullSpace, times: Sequence[float]
+def accuracy_of(
+    problem: FitProblem,
+    solution: Solution,
+    null_space: NullSpace,
+    correlation_rows: Sequence[float],
 ) -> Accuracy:
-    """Of a solution. null: what no recording shows;  times: rows over which the residuals of each output hang together"""
-    p, theta = fit.system.parameters, fit.theta(solution.unknowns)
-    covariance, std = _formal(fit, solution)
-    groups = parameter_groups(null, p.names, p.magnitude, [q.unit for q in p.parameters])
-    lumped = np.isin(p.names, [name for group in groups for name in group.members])
-    std = np.where(lumped, np.inf, std)
-    covariance = np.where(np.logical_or.outer(lumped, lumped), np.inf, covariance)
-    lost = lumped & np.array([not q.group for q in p.parameters])
-    detail = _honest(fit, solution, times)
-    sandwich, interval, between = _spread(fit, theta, std, detail)
+    """Assess the accuracy of a solution.
+
+    Args:
+        problem: The least-squares problem.
+        solution: Its solution.
+        null_space: Directions of theta about which neither recordings nor priors contain information.
+        correlation_rows: Autocorrelation time of the residuals of every output [rows].
+
+    Returns:
+        The accuracy.
+    """
+    parameters = problem.system.parameters
+    theta = problem.theta(solution.unknowns)
+    covariance, std = _formal_covariance(problem, solution)
+
+    # Members of a group are not known by themselves, though pins make their information regular.
+    units = [parameter.unit for parameter in parameters.parameters]
+    groups = parameter_groups(null_space, parameters.names, parameters.magnitude, units)
+    members = [name for group in groups for name in group.members]
+    in_group = np.isin(parameters.names, members)
+    std = np.where(in_group, np.inf, std)
+    covariance = np.where(np.logical_or.outer(in_group, in_group), np.inf, covariance)
+    declared_alone = np.array([not parameter.group for parameter in parameters.parameters])
+
+    robust = _robust(problem, solution, correlation_rows)
+    sandwich, interval, between = _intervals(problem, theta, std, robust)
     return Accuracy(
-        std,
-        covariance,
-        sandwich,
-        interval,
-        between,
-        groups,
-        not np.isfinite(std[~lumped]).all(),
-        bool(lost.any()),
-        tuple(_sloppy(fit.system, theta, interval, covariance)),
-        _data(fit, solution.condensed),
-        detail,
+        std=std,
+        covariance=covariance,
+        sandwich=sandwich,
+        interval=interval,
+        between=between,
+        groups=groups,
+        singular=not np.isfinite(std[~in_group]).all(),
+        single_unidentifiable=bool((in_group & declared_alone).any()),
+        poorly_known=tuple(_poorly_known(problem.system, theta, interval, covariance)),
+        data_information=_data_information(problem, solution.condensed),
+        robust=robust,
     )
 
 
-def _formal(fit: FitProblem, solution: Solution) -> tuple[Array, Array]:
-    """(p, p) covariance and (p,) standard deviations; of what recordings have of their own, the first one's."""
-    layout, condensed = fit.layout, solution.condensed
+def _formal_covariance(problem: FitProblem, solution: Solution) -> tuple[Array, Array]:
+    """(p, p) covariance and (p,) standard deviations; for unknowns of each recording, those of the first one."""
+    layout = problem.layout
+    condensed = solution.condensed
     H = condensed.information()
-    std = standard_deviations(H)
-    singular = not np.isfinite(std).all()
-    whole = np.full_like(H, np.inf) if singular else np.linalg.inv(H)
-    p, first = len(fit.system.parameters), layout.first
-    places = layout.places[first]
-    covariance, spread = np.zeros((p, p)), np.zeros(p)
-    covariance[np.ix_(places, places)], spread[places] = whole[np.ix_(first, first)], std[first]
+    common_std = standard_deviations(H)
+    is_singular = not np.isfinite(common_std).all()
+    common = np.full_like(H, np.inf) if is_singular else np.linalg.inv(H)
+
+    # Common unknowns of the first recording.
+    p = len(problem.system.parameters)
+    columns = layout.first_columns
+    index = layout.parameter_of_column[columns]
+    covariance = np.zeros((p, p))
+    std = np.zeros(p)
+    covariance[np.ix_(index, index)] = common[np.ix_(columns, columns)]
+    std[index] = common_std[columns]
+
+    # Deviations of the first initial state, which follow the common unknowns.
     private = layout.private
     n = len(private)
-    if n and not fit.measured:
-        R = condensed.triangles[0, :n, :n]
-        free = np.linalg.matrix_rank(R) == n and not singular
-        C = condensed.private_response[0]
-        alone = np.linalg.inv(R.T @ R) + C @ whole @ C.T if free else np.full((n, n), np.inf)
-        cross = (C @ whole)[:, first] if free else np.full((n, len(first)), np.inf)
-        covariance[np.ix_(private, private)] = alone
-        covariance[np.ix_(private, places)] = cross
-        covariance[np.ix_(places, private)] = cross.T
-        spread[private] = np.sqrt(np.diag(alone))
-    return covariance, spread
+    if not n or layout.free_starts:
+        return covariance, std
+
+    R = condensed.triangles[0, :n, :n]
+    own = np.full((n, n), np.inf)
+    cross = np.full((n, len(columns)), np.inf)
+    if np.linalg.matrix_rank(R) == n and not is_singular:
+        response = condensed.private_response[0]
+        own = np.linalg.inv(R.T @ R) + response @ common @ response.T
+        cross = (response @ common)[:, columns]
+
+    covariance[np.ix_(private, private)] = own
+    covariance[np.ix_(private, index)] = cross
+    covariance[np.ix_(index, private)] = cross.T
+    std[private] = np.sqrt(np.diag(own))
+    return covariance, std
 
 
-def _honest(fit: FitProblem, solution: Solution, times: Sequence[float]) -> Uncertainty | None:
-    """What the blocks of the last linearisation say; None where a common unknown is not determined."""
-    spec = fit.system.experiment.fit
-    if not np.isfinite(standard_deviations(solution.condensed.information())).all():
+def _robust(
+    problem: FitProblem, solution: Solution, correlation_rows: Sequence[float]
+) -> Uncertainty | None:
+    """Robust uncertainty from the blocks of the last linearisation; None where a common unknown is not determined."""
+    settings = problem.system.experiment.fit
+    information = solution.condensed.information()
+    if not np.isfinite(standard_deviations(information)).all():
         return None
-    recording, rows = fit.blocks
-    total = sum(len(t.t) for t in fit.aligned)
-    length = together(times, total)
-    if spec.blocks is not None:
-        length = spec.blocks * total / sum(float(t.t[-1]) for t in fit.aligned)
-    rng = np.random.default_rng(spec.seed)
-    place = fit.common_values(solution.unknowns)
-    return uncertainty(solution.condensed, place, recording, rows, length, spec.bootstrap, rng)
+
+    # Length of a block of the bootstrap, stated in seconds or from the autocorrelation of the residuals.
+    rows = problem.row_count
+    length = block_length(correlation_rows, rows)
+    if settings.blocks is not None:
+        duration = sum(float(recording.t[-1]) for recording in problem.recordings)
+        length = settings.blocks * rows / duration
+
+    recording_of_block, rows_of_block = problem.blocks
+    return robust_uncertainty(
+        solution.condensed,
+        problem.common_values(solution.unknowns),
+        recording_of_block,
+        rows_of_block,
+        min_rows=length,
+        draws=settings.bootstrap,
+        rng=np.random.default_rng(settings.seed),
+    )
 
 
-def _spread(
-    fit: FitProblem, theta: Array, std: Array, honest: Uncertainty | None
+def _intervals(
+    problem: FitProblem, theta: Array, std: Array, robust: Uncertainty | None
 ) -> tuple[Array, Array, Array]:
-    """(p,) sandwich deviations, (p, 2) intervals, (p,) deviations between recordings; formal ones where there are none."""
-    sandwich, between = np.array(std), np.zeros(len(std))
-    interval = np.column_stack([theta - 1.96 * std, theta + 1.96 * std])
-    layout, p = fit.layout, fit.system.parameters
-    if honest is not None:
-        columns = layout.first
-        places = layout.places[columns]
-        known = np.isfinite(std[places])
-        places, columns = places[known], columns[known]
-        sandwich[places], between[places] = honest.sandwich[columns], honest.between[columns]
-        interval[places] = honest.interval[columns]
-    low = np.maximum(interval[:, 0], np.minimum(p.lower, theta))
-    high = np.minimum(interval[:, 1], np.maximum(p.upper, theta))
+    """(p,) sandwich deviations, (p, 2) intervals, (p,) deviations between recordings; formal values stand in."""
+    parameters = problem.system.parameters
+    sandwich = np.array(std)
+    between = np.zeros(len(std))
+    interval = np.column_stack([theta - NORMAL_95 * std, theta + NORMAL_95 * std])
+
+    if robust is not None:
+        columns = problem.layout.first_columns
+        index = problem.layout.parameter_of_column[columns]
+        is_known = np.isfinite(std[index])
+        index, columns = index[is_known], columns[is_known]
+
+        sandwich[index] = robust.sandwich[columns]
+        between[index] = robust.between[columns]
+        interval[index] = robust.interval[columns]
+
+    # Intervals end at the bounds; an estimate beyond its bounds (newton) stays inside its interval.
+    low = np.maximum(interval[:, 0], np.minimum(parameters.lower, theta))
+    high = np.minimum(interval[:, 1], np.maximum(parameters.upper, theta))
     return sandwich, np.column_stack([low, high]), between
 
 
-def _data(fit: FitProblem, condensed: Condensed) -> Array:
-    """(p, p) information of the recordings alone about what they share, everything else marginalised."""
-    p, layout = fit.system.parameters, fit.layout
-    H, places = condensed.information(with_common_rows=False), layout.places
-    kept, out = np.arange(len(layout.shared)), np.zeros((len(p), len(p)))
-    prior = p.prior_information[np.ix_(places, places)] * np.eye(len(places))
-    out[np.ix_(layout.shared, layout.shared)] = marginal(H, prior, kept)
-    return out
+def _data_information(problem: FitProblem, condensed: Condensed) -> Array:
+    """(p, p) information of the recordings alone about the parameters that they share, all others marginalised."""
+    parameters = problem.system.parameters
+    layout = problem.layout
+    index = layout.parameter_of_column
+
+    # Priors count for the unknowns that are marginalised only.
+    H = condensed.information(with_common_rows=False)
+    prior = parameters.prior_information[np.ix_(index, index)] * np.eye(len(index))
+    kept = np.arange(len(layout.shared))
+
+    information = np.zeros((len(parameters), len(parameters)))
+    information[np.ix_(layout.shared, layout.shared)] = marginal(H, prior, kept)
+    return information
 
 
-def _sloppy(
+def _poorly_known(
     system: System, theta: Array, interval: Array, covariance: Array
 ) -> Iterator[tuple[str, str]]:
-    """Wanted parameters that the data hardly tell, and in words what they may be traded for."""
-    p = system.parameters
-    told = np.isfinite(np.diag(covariance))
-    spread = np.sqrt(np.maximum(np.where(told, np.diag(covariance), 1.0), 1e-300))
-    for j in p.interest:
-        half = 0.5 * float(interval[j, 1] - interval[j, 0])
-        size = max(abs(float(theta[j])), 1e-3 * float(p.magnitude[j]))
-        if not np.isfinite(half) or half <= SLOPPY * size:
+    """Names of the parameters of interest that are poorly known, with a remark on how well and why."""
+    parameters = system.parameters
+    variance = np.diag(covariance)
+    is_known = np.isfinite(variance)
+    std = np.sqrt(np.maximum(np.where(is_known, variance, 1.0), SMALLEST_VARIANCE))
+
+    for j in parameters.interest:
+        half_width = 0.5 * float(interval[j, 1] - interval[j, 0])
+        smallest = SMALLEST_RELATIVE_SIZE * float(parameters.magnitude[j])
+        size = max(abs(float(theta[j])), smallest)
+        if not np.isfinite(half_width) or half_width <= POORLY_KNOWN_SHARE * size:
             continue
-        together = np.where(told, covariance[j], 0.0) / (spread * spread[j])
-        together[j] = 0.0
-        other = int(np.argmax(np.abs(together)))
-        traded = f"; it is traded for {p.names[other]} (correlation {together[other]:+.2f})"
-        known = (
-            f"is known to ±{100 * half / size:.0f} % only"
-            if half < 10 * size
-            else "may be anything in its interval"
-        )
-        yield p.names[j], known + (traded if abs(together[other]) > TRADED else "")
+
+        remark = "may have any value in its interval"
+        if half_width < UNKNOWN_SHARE * size:
+            remark = f"is known to ±{100 * half_width / size:.0f} % only"
+
+        # The most correlated parameter says which experiment would help.
+        correlation = np.where(is_known, covariance[j], 0.0) / (std * std[j])
+        correlation[j] = 0.0
+        other = int(np.argmax(np.abs(correlation)))
+        if abs(correlation[other]) > CONFOUNDED_CORRELATION:
+            name = parameters.names[other]
+            remark += f"; it is confounded with {name} (correlation {correlation[other]:+.2f})"
+
+        yield parameters.names[j], remark

@@ -1,6 +1,6 @@
-"""Recordings against the experiment's sample grid: the control on it, the measured values at their own times.
+"""Recordings aligned with the sample grid of an experiment: the control on the grid, the measured values at their times.
 
-Nothing measured is interpolated, which would colour its noise; it is the prediction that is read between samples.
+Measured values are not interpolated, because that would colour their noise; predictions are interpolated instead.
 """
 
 from __future__ import annotations
@@ -18,16 +18,33 @@ from mjfim.plant.outputs import outputs_by_state
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
-ON_GRID = 0.01  # of a sample period: stamps that close to the grid are meant to be on it
+# Largest distance from the grid [sample periods] at which a time stamp counts as lying on it.
+GRID_TOLERANCE = 0.01
+
+# Time [sample periods] by which edges of samples are moved before they are compared with time stamps, against round-off.
+EDGE_TOLERANCE = 1e-9
+
+# Smallest number of rows of a recording.
+MIN_ROWS = 3
+
+# Samples that are simulated to find the sign of a quaternion at the start.
+SAMPLES_FOR_SIGN = 4
+
+# Smallest norm by which an interpolated quaternion is divided.
+SMALLEST_NORM = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AlignedRecording:
-    """A recording as the fit sees it.
+    """A recording on the sample grid of an experiment.
 
-    t: (M,) [s] from its first row;  y: (M, ny) in the order of the experiment's outputs, NaN where not measured
-    ctrl: (N, nu) held over each sample of the grid, which covers all rows;  dt: of the grid [s]
-    even: every stamp lies on the grid
+    Attributes:
+        name: Name of the recording.
+        t: (M,) times of the rows since the first one [s].
+        y: (M, ny) measured values in the order of the experiment's outputs [y-unit]; NaN where not measured.
+        ctrl: (N, nu) control held over each sample of the grid, which covers all rows [u-unit].
+        dt: Sample period of the grid [s].
+        on_grid: True where every time stamp lies on the grid.
     """
 
     name: str
@@ -35,134 +52,228 @@ class AlignedRecording:
     y: Array
     ctrl: Array
     dt: float
-    even: bool
+    on_grid: bool
 
     def __post_init__(self) -> None:
         freeze(self, "t", "y", "ctrl")
 
     @cached_property
     def measured(self) -> np.ndarray:
-        """(M, ny) True where there is a value."""
+        """(M, ny) True where there is a measured value."""
         return np.isfinite(self.y)
 
     @cached_property
-    def seen(self) -> tuple[np.ndarray, ...]:
-        """Rows with a value, of every output."""
+    def measured_rows(self) -> tuple[np.ndarray, ...]:
+        """Indices of the rows with a measured value, for every output."""
         return tuple(np.flatnonzero(column) for column in self.measured.T)
 
 
 def align(system: System, recording: Recording) -> AlignedRecording:
-    """A recording on the experiment's grid. Raises RecordingError where time, control or columns do not fit."""
-    names, where, dt = system.outputs.names, recording.name, system.dt
-    if len(recording.t) < 3:
-        raise RecordingError(
-            f"{where}: too few rows ({len(recording.t)}); an identification needs at least 3"
-        )
-    t = recording.t - recording.t[0]
-    if not (np.diff(t) > 0.0).all():  # also where one is NaN
-        row = int(np.argmin(np.diff(t) > 0.0)) + 2
-        raise RecordingError(f"{where}: column 't' does not increase in data row {row}")
-    ctrl = recording.ctrl[: len(t) - 1]
-    if ctrl.shape != (len(t) - 1, len(system.controls)):
-        raise RecordingError(
-            f"{where}: the control has shape {recording.ctrl.shape}, wanted {len(t) - 1} rows of {len(system.controls)}"
-        )
-    if not np.isfinite(ctrl).all():
-        row = int(np.argmax(~np.isfinite(ctrl).all(axis=1)))
-        raise RecordingError(
-            f"{where}: the control in data row {row + 1} is NaN; only the last row may leave it out"
-        )
-    shared = [name for name in names if name in recording.outputs]
-    if not shared:
-        raise RecordingError(
-            f"{where}: no measured column; {unknown('column', ', '.join(recording.outputs), names)}"
-        )
-    y = np.full((len(t), len(names)), np.nan)
-    for name in shared:
-        y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
-    place = np.rint(t / dt)
-    even = bool(np.abs(t - place * dt).max() <= ON_GRID * dt)
-    t = place * dt if even else t
-    if not even or not np.array_equal(place, np.arange(len(t))):
-        ctrl = held(t, ctrl, dt)
-    return AlignedRecording(where, t, _continuous(system, ctrl, y), ctrl, dt, even)
+    """Align a recording with the sample grid of a system.
 
+    Args:
+        system: System whose grid, controls and outputs the recording has.
+        recording: Recording in SI units.
 
-def held(t: Array, ctrl: Array, dt: float) -> Array:
-    """(N, nu) means over each sample period of a control: (M-1, nu) that is held from t_i to t_i+1; N dt >= t_M-1.
+    Returns:
+        The recording on the grid.
 
-    Its integral, and so the impulse on the robot, is that of the log.
+    Raises:
+        RecordingError: Time, control or columns of the recording do not fit the experiment.
     """
-    N = max(int(np.ceil(t[-1] / dt - ON_GRID)), 1)
-    edges = np.arange(N + 1) * dt
-    total = np.concatenate(
-        [np.zeros((1, ctrl.shape[1])), np.cumsum(ctrl * np.diff(t)[:, None], axis=0)]
+    dt = system.dt
+    t = _times(recording)
+    ctrl = _control(system, recording)
+    y = _outputs(system, recording)
+
+    # Time stamps that nearly lie on the grid are moved onto it.
+    sample = np.rint(t / dt)
+    on_grid = bool(np.abs(t - sample * dt).max() <= GRID_TOLERANCE * dt)
+    if on_grid:
+        t = sample * dt
+
+    # The control needs no resampling where there is one row per sample.
+    if not on_grid or not np.array_equal(sample, np.arange(len(t))):
+        ctrl = resample_control(t, ctrl, dt)
+
+    return AlignedRecording(
+        name=recording.name,
+        t=t,
+        y=_with_continuous_quaternions(system, ctrl, y),
+        ctrl=ctrl,
+        dt=dt,
+        on_grid=on_grid,
     )
-    reach = np.append(t, max(edges[-1], t[-1]) + dt)
-    total = np.concatenate([total, total[-1:] + ctrl[-1:] * (reach[-1] - t[-1])])
-    at = np.column_stack([np.interp(edges, reach, column) for column in total.T])
-    mean = np.diff(at, axis=0) / dt
-    # where nothing changes within a sample, the value itself, free of the round-off of a long sum
-    first = np.clip(np.searchsorted(t, edges[:-1] + 1e-9 * dt, side="right") - 1, 0, len(ctrl) - 1)
-    last = np.clip(np.searchsorted(t, edges[1:] - 1e-9 * dt, side="left") - 1, 0, len(ctrl) - 1)
-    return np.asarray(np.where((first == last)[:, None], ctrl[first], mean))
 
 
-def _continuous(system: System, ctrl: Array, y: Array) -> Array:
-    """Measured quaternions with the sign that follows from the model's start: q and -q are one orientation."""
-    quaternions = _quaternions(system)
-    if not quaternions:
-        return y
-    predicted, _ = system.plant.measure(system.parameters.guess[None], ctrl[:4])
-    for at in quaternions:
-        last = predicted[0, 0, at]
-        for row in y:
-            if np.isfinite(row[at]).all():
-                row[at] *= 1.0 if last @ row[at] >= 0.0 else -1.0
-                last = np.array(row[at])
+def _times(recording: Recording) -> Array:
+    """(M,) times since the first row [s]. Raises RecordingError for too few rows or times that do not increase."""
+    count = len(recording.t)
+    if count < MIN_ROWS:
+        raise RecordingError(
+            f"{recording.name}: too few rows ({count}); an identification needs at least {MIN_ROWS}"
+        )
+
+    # A comparison with NaN is False, so that missing times are found as well.
+    t = recording.t - recording.t[0]
+    increases = np.diff(t) > 0.0
+    if not increases.all():
+        row = int(np.argmin(increases)) + 2
+        raise RecordingError(f"{recording.name}: column 't' does not increase in data row {row}")
+
+    return np.asarray(t)
+
+
+def _control(system: System, recording: Recording) -> Array:
+    """(M-1, nu) control from each row to the next one. Raises RecordingError where values are missing."""
+    rows = len(recording.t) - 1
+    ctrl = recording.ctrl[:rows]
+    if ctrl.shape != (rows, len(system.controls)):
+        raise RecordingError(
+            f"{recording.name}: the control has shape {recording.ctrl.shape}; "
+            f"expected {rows} rows of {len(system.controls)} values"
+        )
+
+    finite = np.isfinite(ctrl).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite)) + 1
+        raise RecordingError(
+            f"{recording.name}: the control in data row {row} is NaN; only the last row may omit it"
+        )
+    return np.asarray(ctrl)
+
+
+def _outputs(system: System, recording: Recording) -> Array:
+    """(M, ny) measured values in the order of the outputs. Raises RecordingError where the recording has none of them."""
+    names = system.outputs.names
+    recorded = [name for name in names if name in recording.outputs]
+    if not recorded:
+        raise RecordingError(
+            f"{recording.name}: no measured column; "
+            f"{unknown('column', ', '.join(recording.outputs), names)}"
+        )
+
+    y = np.full((len(recording.t), len(names)), np.nan)
+    for name in recorded:
+        y[:, names.index(name)] = recording.y[:, recording.outputs.index(name)]
     return y
 
 
-def _quaternions(system: System) -> list[list[int]]:
-    """Outputs that are the components of one quaternion, of a joint or of a sensor."""
-    outputs, model = system.outputs.outputs, system.model
+def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
+    """Mean of a held control over each sample period.
+
+    The integral of the control, and so the impulse on the robot, is that of the log.
+
+    Args:
+        t: (M,) times of the rows, from 0 [s].
+        ctrl: (M-1, nu) control that is held from each row to the next one [u-unit].
+        dt: Sample period [s].
+
+    Returns:
+        (N, nu) means [u-unit], with `N dt >= t[-1]`.
+    """
+    N = max(int(np.ceil(t[-1] / dt - GRID_TOLERANCE)), 1)
+    edges = np.arange(N + 1) * dt
+
+    # Integral of the control at every row; the last control is held beyond the last edge.
+    integral = np.concatenate(
+        [np.zeros((1, ctrl.shape[1])), np.cumsum(ctrl * np.diff(t)[:, None], axis=0)]
+    )
+    extended_t = np.append(t, max(edges[-1], t[-1]) + dt)
+    last_interval = extended_t[-1] - t[-1]
+    integral = np.concatenate([integral, integral[-1:] + ctrl[-1:] * last_interval])
+
+    # Means over the samples are differences of the integral at their edges.
+    at_edges = np.column_stack([np.interp(edges, extended_t, column) for column in integral.T])
+    mean = np.diff(at_edges, axis=0) / dt
+
+    # Where the control does not change within a sample, its value itself is free of the round-off of a long sum.
+    margin = EDGE_TOLERANCE * dt
+    first = np.searchsorted(t, edges[:-1] + margin, side="right") - 1
+    last = np.searchsorted(t, edges[1:] - margin, side="left") - 1
+    first = np.clip(first, 0, len(ctrl) - 1)
+    last = np.clip(last, 0, len(ctrl) - 1)
+    constant = first == last
+    return np.asarray(np.where(constant[:, None], ctrl[first], mean))
+
+
+def _with_continuous_quaternions(system: System, ctrl: Array, y: Array) -> Array:
+    """(M, ny) outputs in which measured quaternions never flip their sign; q and -q are one orientation.
+
+    The sign at the start is that of the model at the guess. The array y: (M, ny) is changed in place.
+    """
+    quaternions = _quaternion_outputs(system)
+    if not quaternions:
+        return y
+
+    guess = system.parameters.guess[None]
+    predicted, _ = system.plant.measure(guess, ctrl[:SAMPLES_FOR_SIGN])
+
+    for columns in quaternions:
+        previous = predicted[0, 0, columns]
+        for row in y:
+            if not np.isfinite(row[columns]).all():
+                continue
+            if not previous @ row[columns] >= 0.0:
+                row[columns] *= -1.0
+            previous = np.array(row[columns])
+    return y
+
+
+def _quaternion_outputs(system: System) -> list[list[int]]:
+    """Indices of the four outputs of every quaternion, of a joint or of a sensor, that is measured completely."""
+    outputs = system.outputs.outputs
+    model = system.model
     kinds = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
-    first = [
-        int(model.sensor_adr[i]) for i in range(model.nsensor) if int(model.sensor_type[i]) in kinds
-    ]
-    joints = [
-        [i for i, o in enumerate(outputs) if o.state in range(q, q + 4)]
-        for q, _ in system.space.quaternions
-    ]
-    sensors = [[i for i, o in enumerate(outputs) if o.sensor in range(a, a + 4)] for a in first]
-    return [found for found in (*joints, *sensors) if len(found) == 4]
+
+    found = []
+    for q, _ in system.space.quaternions:
+        found.append([i for i, output in enumerate(outputs) if output.state in range(q, q + 4)])
+    for sensor in range(model.nsensor):
+        if int(model.sensor_type[sensor]) not in kinds:
+            continue
+        first = int(model.sensor_adr[sensor])
+        values = range(first, first + 4)
+        found.append([i for i, output in enumerate(outputs) if output.sensor in values])
+
+    return [columns for columns in found if len(columns) == 4]
 
 
 def measured_trajectory(system: System, recording: Recording) -> Trajectory | None:
-    """The recorded motion as a trajectory, where every position was measured at most samples; else None.
+    """The recorded motion as a trajectory, for figures; gaps are bridged linearly and velocities are zero.
 
-    Gaps are bridged linearly; velocities are zero. For pictures, not for estimation.
+    Args:
+        system: System that was recorded.
+        recording: Recording in SI units.
+
+    Returns:
+        The trajectory; None where not every position was measured.
     """
-    shown, nq = outputs_by_state(system.model, system.outputs), system.model.nq
-    names = [system.outputs.names[shown[q]] if q in shown else "" for q in range(nq)]
-    if any(name not in recording.outputs for name in names):
-        return None
-    qpos = np.empty((len(recording.t), nq))
-    for q, name in enumerate(names):
-        column = recording.y[:, recording.outputs.index(name)]
-        seen = np.isfinite(column)
-        if not seen.any():
+    model = system.model
+    measured = outputs_by_state(model, system.outputs)
+
+    qpos = np.empty((len(recording.t), model.nq))
+    for q in range(model.nq):
+        name = system.outputs.names[measured[q]] if q in measured else ""
+        if name not in recording.outputs:
             return None
-        qpos[:, q] = np.interp(recording.t, recording.t[seen], column[seen])
+
+        column = recording.y[:, recording.outputs.index(name)]
+        finite = np.isfinite(column)
+        if not finite.any():
+            return None
+        qpos[:, q] = np.interp(recording.t, recording.t[finite], column[finite])
+
+    # Interpolated quaternions are scaled to unit length.
     for q, _ in system.space.quaternions:
-        qpos[:, q : q + 4] /= np.maximum(
-            np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True), 1e-12
-        )
+        norms = np.linalg.norm(qpos[:, q : q + 4], axis=1, keepdims=True)
+        qpos[:, q : q + 4] /= np.maximum(norms, SMALLEST_NORM)
+
     n = len(qpos)
     return Trajectory(
         t=recording.t,
         qpos=qpos,
-        qvel=np.zeros((n, system.model.nv)),
-        act=np.zeros((n, system.model.na)),
+        qvel=np.zeros((n, model.nv)),
+        act=np.zeros((n, model.na)),
         ctrl=recording.ctrl,
     )

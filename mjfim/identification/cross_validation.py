@@ -1,13 +1,13 @@
-"""Predictions of what was not fitted: held-out recordings, or parts of the fitted ones in turn, against the nominal model.
+"""Predictions of data that were not fitted, by the identified and by the nominal model.
 
-The parameters stay as they were fitted to the rest; what belongs to the held-out piece alone, its start, is found from it, for
-the identified and for the nominal model alike.
+Without held-out recordings, parts of the fitted ones are left out in turn. Theta stays as it was fitted to the other parts; the
+initial state of a predicted part is estimated from it, for both models alike.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,10 +20,17 @@ from mjfim.optimize.levenberg_marquardt import SearchSettings, UnknownValues, mi
 from mjfim.records.estimate import Prediction, PredictionErrors
 from mjfim.records.recording import Recording
 
-FOLDS = 5  # at most
-REST = 0.25  # of a single recording that is predicted from what comes before
-MANY = 400_000  # samples of a fit to a part at most
-STEPS = 8  # Levenberg-Marquardt steps of a fit without a part, and of a start
+# Largest number of groups of recordings that are left out in turn.
+MAX_FOLDS = 5
+
+# Share of a single recording, at its end, that is predicted from the part before.
+PREDICTED_SHARE = 0.25
+
+# Largest number of samples that are fitted to predict the others.
+MAX_SAMPLES = 400_000
+
+# Searches for theta without a part of the data, and for initial states, which begin close to their result.
+SEARCH = SearchSettings(max_iterations=8, tolerance=1e-2, relinearise_at_end=False)
 
 
 def predict(
@@ -33,129 +40,176 @@ def predict(
     *,
     threads: int | None = None,
 ) -> tuple[PredictionErrors, ...]:
-    """Errors of a model at theta: (p,) on recordings; only what belongs to a recording alone is found from it.
+    """Prediction errors of a model on recordings; only unknowns of each recording, as its initial state, are estimated.
 
-    Raises RecordingError for unusable recordings.
+    Args:
+        experiment: Model, parameters and noise.
+        theta: (p,) parameter values [theta-unit].
+        recordings: Recordings to predict.
+        threads: Threads for the engine; default: one per core.
+
+    Returns:
+        The errors for each recording.
+
+    Raises:
+        ExperimentError: Something is wrong in the experiment.
+        RecordingError: A recording cannot be used.
     """
     system = System.resolve(experiment, threads=threads)
-    fit = FitProblem.of(system, recordings)
+    problem = FitProblem.of(system, recordings)
+    values = np.asarray(theta)
     return tuple(
-        _errors(fit, np.asarray(theta), _alone(fit.masks, i), fit.aligned[i].name)
-        for i in range(len(fit.aligned))
+        _prediction_errors(problem, values, _masks_of(problem.masks, [i]), recording.name, Budget())
+        for i, recording in enumerate(problem.recordings)
     )
 
 
-def predicted(
-    fit: FitProblem, at: UnknownValues, held_out: FitProblem | None, budget: Budget | None = None
+def predict_unfitted(
+    problem: FitProblem, at: UnknownValues, held_out: FitProblem | None, budget: Budget
 ) -> tuple[Prediction, ...]:
-    """Of held-out recordings; without any, of recordings in turn, or of the last quarter of a single one.
+    """Predict data that were not fitted: held-out recordings, else every part of the data from the others.
 
-    Where the budget is exhausted, parts that were not predicted by then are missing.
+    Args:
+        problem: Problem of the fitted recordings.
+        at: Its solution.
+        held_out: Problem of held-out recordings; None without any.
+        budget: Where it is exhausted, parts that were not predicted by then are missing.
+
+    Returns:
+        The predictions.
     """
-    budget = Budget() if budget is None else budget
-    nominal = fit.system.parameters.guess
-    if held_out is not None:
-        masks = held_out.masks
-        return tuple(
-            _judged(held_out, at.theta, nominal, _alone(masks, i), (i,), True, budget)
-            for i in range(len(masks))
-            if budget.exhausted is None
-        )
-    return tuple(_folds(fit, at, nominal, budget))
+    if held_out is None:
+        return tuple(_cross_validate(problem, at, budget))
+
+    predictions = []
+    for i in range(len(held_out.recordings)):
+        if budget.exhausted is not None:
+            break
+        part = _Part(recordings=(i,), masks=_masks_of(held_out.masks, [i]))
+        predictions.append(_prediction(held_out, at.theta, part, True, budget))
+    return tuple(predictions)
 
 
-def _folds(
-    fit: FitProblem, at: UnknownValues, nominal: Array, budget: Budget
-) -> Iterator[Prediction]:
-    """What the rest says of each part; of much data, pieces all over it."""
-    if fit.samples > MANY and len(fit.pieces) > 1:
-        places = evenly_spread_indices(
-            len(fit.pieces), max(MANY * len(fit.pieces) // fit.samples, 2)
-        )
-        fit, at = fit.part(places), replace(at, private=at.private[places])
-    for names, masks in _parts(fit):
-        rest = fit.masked([~mask for mask in masks])
-        some = rest.occupied
-        if not len(some):
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Part:
+    """A part of the data that is predicted.
+
+    Attributes:
+        recordings: Indices of the recordings to which it belongs.
+        masks: (M, ny) for every recording, True for the values of the part.
+    """
+
+    recordings: tuple[int, ...]
+    masks: list[np.ndarray]
+
+
+def _cross_validate(problem: FitProblem, at: UnknownValues, budget: Budget) -> Iterator[Prediction]:
+    """Prediction of every part of the data by a fit to the others."""
+    # Of much data, segments that are evenly spread over them are enough.
+    count = len(problem.segments)
+    if problem.sample_count > MAX_SAMPLES and count > 1:
+        wanted = max(MAX_SAMPLES * count // problem.sample_count, 2)
+        subset = evenly_spread_indices(count, wanted)
+        problem = problem.of_segments(subset)
+        at = replace(at, private=at.private[subset])
+
+    for part in _parts(problem):
+        others = problem.masked([~mask for mask in part.masks])
+        segments = others.segments_with_values
+        if not len(segments):
             continue
-        begin = replace(at, private=at.private[some])
-        settings = SearchSettings(max_iterations=STEPS, tolerance=1e-2, relinearise_at_end=False)
-        found = minimise(rest.part(some), begin, settings, budget)
+
+        begin = replace(at, private=at.private[segments])
+        found = minimise(others.of_segments(segments), begin, SEARCH, budget)
         if budget.exhausted is not None:
             return
         if found is not None:
-            yield _judged(fit, found.unknowns.theta, nominal, masks, names, False, budget)
+            yield _prediction(problem, found.unknowns.theta, part, False, budget)
 
 
-def _parts(fit: FitProblem) -> Iterator[tuple[tuple[int, ...], list[np.ndarray]]]:
-    """Recordings in at most so many groups, and their masks; of a single one its end."""
-    count = len(fit.aligned)
+def _parts(problem: FitProblem) -> Iterator[_Part]:
+    """Parts of the data that are left out in turn: groups of recordings, or the end of a single one."""
+    count = len(problem.recordings)
     if count == 1:
-        track = fit.aligned[0]
-        late = track.t >= (1.0 - REST) * track.t[-1]
-        yield (0,), [np.broadcast_to(late[:, None], track.y.shape)]
+        recording = problem.recordings[0]
+        late = recording.t >= (1.0 - PREDICTED_SHARE) * recording.t[-1]
+        mask = np.broadcast_to(late[:, None], recording.y.shape)
+        yield _Part(recordings=(0,), masks=[mask])
         return
-    for group in np.array_split(np.arange(count), min(count, FOLDS)):
-        yield tuple(int(i) for i in group), _alone(fit.masks, *group)
+
+    for group in np.array_split(np.arange(count), min(count, MAX_FOLDS)):
+        indices = tuple(group.tolist())
+        yield _Part(recordings=indices, masks=_masks_of(problem.masks, indices))
 
 
-def _alone(masks: Sequence[np.ndarray], *kept: int) -> list[np.ndarray]:
-    """The masks of some recordings, nothing of the others."""
-    return [mask if i in kept else np.zeros_like(mask) for i, mask in enumerate(masks)]
+def _masks_of(masks: Sequence[np.ndarray], recordings: Sequence[int]) -> list[np.ndarray]:
+    """The masks of some recordings; False for all values of the others."""
+    return [mask if i in recordings else np.zeros_like(mask) for i, mask in enumerate(masks)]
 
 
-def _judged(
-    fit: FitProblem,
-    theta: Array,
-    nominal: Array,
-    masks: Sequence[np.ndarray],
-    tracks: Sequence[int],
-    held_out: bool,
-    budget: Budget,
+def _prediction(
+    problem: FitProblem, theta: Array, part: _Part, held_out: bool, budget: Budget
 ) -> Prediction:
-    name = ", ".join(fit.aligned[i].name for i in tracks)
-    if len(fit.aligned) == 1 and not held_out:
-        name = f"last {100 * REST:.0f} % of {name}"
-    own, plain = (_errors(fit, value, masks, name, budget) for value in (theta, nominal))
-    return Prediction(name=name, identified=own, nominal=plain, held_out=held_out)
+    """Errors of the model at theta: (p,), and of the nominal one, on a part of the data."""
+    name = ", ".join(problem.recordings[i].name for i in part.recordings)
+    if len(problem.recordings) == 1 and not held_out:
+        name = f"last {100 * PREDICTED_SHARE:.0f} % of {name}"
+
+    nominal = problem.system.parameters.guess
+    return Prediction(
+        name=name,
+        identified=_prediction_errors(problem, theta, part.masks, name, budget),
+        nominal=_prediction_errors(problem, nominal, part.masks, name, budget),
+        held_out=held_out,
+    )
 
 
-def _errors(
-    fit: FitProblem,
+def _prediction_errors(
+    problem: FitProblem,
     theta: Array,
     masks: Sequence[np.ndarray],
     name: str,
-    budget: Budget | None = None,
+    budget: Budget,
 ) -> PredictionErrors:
-    """Errors at theta: (p,) of the values that the masks: (M, ny) of each track hold.
+    """Errors at theta: (p,) of the values in some masks: (M, ny) for every recording.
 
-    Unknown starts are found from what else a piece measures, or from those values where they are all it has.
+    Unknown initial states are estimated from the other values of a segment, or from the predicted ones where it has no others.
     """
-    fit = fit.part(fit.masked(masks).occupied)
-    now, nominal = fit.begin(theta), fit.system.parameters.guess[fit.layout.private]
-    if fit.size > len(fit.layout.shared):
-        # a nuisance start of the fitted recordings says nothing of this one's
-        starts = (
-            np.zeros_like(now.private) if fit.measured else np.tile(nominal, (len(fit.pieces), 1))
-        )
-        search = SearchSettings(max_iterations=STEPS, tolerance=1e-2, relinearise_at_end=False)
-        found = minimise(
-            fit.masked(_learned(fit, masks)).frozen(), replace(now, private=starts), search, budget
-        )
-        now = now if found is None else found.unknowns
-    values, outputs = fit.predicted(now), fit.system.outputs.names
-    rms, mae = np.full(len(outputs), np.nan), np.full(len(outputs), np.nan)
-    for j, error in enumerate([] if values is None else fit.masked(masks).errors(values)):
-        if len(error):
-            rms[j], mae[j] = np.sqrt(np.mean(error**2)), np.mean(np.abs(error))
+    problem = problem.of_segments(problem.masked(masks).segments_with_values)
+    at = problem.begin(theta)
+
+    if problem.unknown_count > len(problem.layout.shared):
+        # Deviations of the initial state that were fitted belong to other recordings.
+        private = np.zeros_like(at.private)
+        if not problem.layout.free_starts:
+            guess = problem.system.parameters.guess[problem.layout.private]
+            private = np.tile(guess, (len(problem.segments), 1))
+
+        known = problem.masked(_masks_for_initial_states(problem, masks))
+        begin = replace(at, private=private)
+        found = minimise(known.with_shared_held(), begin, SEARCH, budget)
+        at = at if found is None else found.unknowns
+
+    outputs = problem.system.outputs.names
+    rms = np.full(len(outputs), np.nan)
+    mae = np.full(len(outputs), np.nan)
+    predicted = problem.predict(at)
+    if predicted is not None:
+        for j, errors in enumerate(problem.masked(masks).errors(predicted)):
+            if len(errors):
+                rms[j] = np.sqrt(np.mean(errors**2))
+                mae[j] = np.mean(np.abs(errors))
+
     return PredictionErrors(name=name, outputs=outputs, rms=rms, mae=mae)
 
 
-def _learned(fit: FitProblem, masks: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """What starts are found from."""
-    found = [np.zeros_like(mask) for mask in fit.masks]
-    for piece in fit.pieces:
-        own = fit.masks[piece.track][piece.rows]
-        rest = own & ~masks[piece.track][piece.rows]
-        found[piece.track][piece.rows] = rest if rest.any() else own
-    return found
+def _masks_for_initial_states(
+    problem: FitProblem, predicted: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """(M, ny) for every recording, True for the values from which initial states are estimated."""
+    masks = [np.zeros_like(mask) for mask in problem.masks]
+    for segment in problem.segments:
+        counted = problem.masks[segment.recording][segment.rows]
+        others = counted & ~predicted[segment.recording][segment.rows]
+        masks[segment.recording][segment.rows] = others if others.any() else counted
+    return masks

@@ -1,4 +1,4 @@
-"""What a fit leaves: predictions, whitened residuals, their size, whether they are white, where they are worst."""
+"""Quality of a fit: predictions, size and whiteness of the residuals, and where they are largest."""
 
 from __future__ import annotations
 
@@ -10,80 +10,130 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.identification.residual_tests import whiteness, worst_place
+from mjfim.identification.residual_tests import find_worst_residual, whiteness_of
 from mjfim.identification.residuals import FitProblem
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Whiteness, WorstResidual
 
-# root mean square of residuals over the deviation of what was measured, from which a motion is not explained
-HARDLY = 0.5
+# Root mean square of residuals over the standard deviation of the measured values, above which a motion is not explained.
+UNEXPLAINED_SHARE = 0.5
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FitQuality:
-    """predicted: (M, ny) of every recording;  chi2: whitened squares;  dof: degrees of freedom;  rms: by output
+    """Residuals of a fit.
 
-    white: of every output;  worst: place;  unexplained: outputs whose motion the fit hardly explains
+    Attributes:
+        predicted: (M, ny) outputs of the fitted model for every recording [y-unit].
+        chi2: Sum of squared whitened residuals; with a robust loss, of those that are not outliers.
+        dof: Degrees of freedom of `chi2`.
+        rms: Root mean square residual of every measured output [y-unit].
+        whiteness: Test of the residuals of every output.
+        worst_residual: Interval in which residuals are largest; None without residuals.
+        unexplained: Names of the outputs of whose motion the fit explains little.
     """
 
     predicted: tuple[Array, ...]
     chi2: float
     dof: int
     rms: dict[str, float]
-    white: tuple[Whiteness, ...]
-    worst: WorstResidual | None
+    whiteness: tuple[Whiteness, ...]
+    worst_residual: WorstResidual | None
     unexplained: tuple[str, ...]
 
-    def times(self, rows: int) -> list[float]:
-        """Rows of the recordings, of all together so many, over which the residuals of each output hang together."""
-        return [w.time * rows / max(w.count, 1) for w in self.white]
+    def correlation_rows(self, rows: int) -> list[float]:
+        """Autocorrelation times of the residuals.
+
+        Args:
+            rows: Number of rows of all recordings.
+
+        Returns:
+            One time for every output, in rows of the recordings.
+        """
+        return [test.time * rows / max(test.count, 1) for test in self.whiteness]
 
 
-def fit_quality(fit: FitProblem, solution: Solution) -> FitQuality:
-    """Of a solution. Raises SimulationDivergedError."""
-    values, names = fit.predicted(solution.unknowns), fit.system.outputs.names
-    if values is None:
+def fit_quality(problem: FitProblem, solution: Solution) -> FitQuality:
+    """Assess the residuals of a solution.
+
+    Args:
+        problem: The least-squares problem.
+        solution: Its solution.
+
+    Returns:
+        The quality of the fit.
+
+    Raises:
+        SimulationDivergedError: The simulation diverges at the solution.
+    """
+    predicted = problem.predict(solution.unknowns)
+    if predicted is None:
         raise SimulationDivergedError("the simulation diverges near the estimate")
-    whitened = _whitened(fit, values)
-    inside = _inside(fit, whitened)
-    columns = [np.concatenate([z[:, j] for z in whitened]) for j in range(len(names))]
-    rms, unexplained = {}, []
-    for j, (name, r) in enumerate(zip(names, fit.errors(values), strict=True)):
-        if not len(r):
+
+    names = problem.system.outputs.names
+    recordings = problem.recordings
+    whitened = _whitened_residuals(problem, predicted)
+    by_output = [[z[:, j] for z in whitened] for j in range(len(names))]
+
+    # Outliers say nothing about the noise.
+    inliers = _without_outliers(problem, whitened)
+    chi2 = float(np.nansum(inliers**2)) / problem.loss.inlier_mean_square
+    dof = max(int(np.isfinite(inliers).sum()) - solution.condensed.rank, 1)
+
+    rms = {}
+    unexplained = []
+    for j, (name, errors) in enumerate(zip(names, problem.errors(predicted), strict=True)):
+        if not len(errors):
             continue
-        rms[name] = float(np.sqrt(np.mean(r**2)))
-        moved = float(
-            np.std(
-                np.concatenate(
-                    [t.y[m[:, j], j] for t, m in zip(fit.aligned, fit.masks, strict=True)]
-                )
-            )
-        )
-        if rms[name] > HARDLY * moved and float(np.nanmean(columns[j] ** 2)) > 1.0 / HARDLY**2:
+
+        rms[name] = float(np.sqrt(np.mean(errors**2)))
+        mean_square = float(np.nanmean(np.concatenate(by_output[j]) ** 2))
+
+        # Residuals as large as the motion itself, and larger than noise.
+        large = rms[name] > UNEXPLAINED_SHARE * _measured_deviation(problem, j)
+        if large and mean_square > 1.0 / UNEXPLAINED_SHARE**2:
             unexplained.append(name)
-    tracks = fit.aligned
+
     return FitQuality(
-        tuple(values),
-        float(np.nansum(inside**2)) / fit.loss.inlier_mean_square,
-        max(int(np.isfinite(inside).sum()) - solution.condensed.rank, 1),
-        rms,
-        tuple(whiteness(name, [z[:, j] for z in whitened]) for j, name in enumerate(names)),
-        worst_place(names, [Path(t.name).name for t in tracks], [t.t for t in tracks], whitened),
-        tuple(unexplained),
+        predicted=tuple(predicted),
+        chi2=chi2,
+        dof=dof,
+        rms=rms,
+        whiteness=tuple(
+            whiteness_of(name, series) for name, series in zip(names, by_output, strict=True)
+        ),
+        worst_residual=find_worst_residual(
+            names,
+            [Path(recording.name).name for recording in recordings],
+            [recording.t for recording in recordings],
+            whitened,
+        ),
+        unexplained=tuple(unexplained),
     )
 
 
-def _whitened(fit: FitProblem, values: Sequence[Array]) -> list[Array]:
-    """(M, ny) whitened measured - predicted of every recording, NaN where nothing counts."""
-    out = []
-    for y, track, mask in zip(values, fit.aligned, fit.masks, strict=True):
+def _measured_deviation(problem: FitProblem, output: int) -> float:
+    """Standard deviation of the measured values of an output over all recordings [y-unit]."""
+    values = [
+        recording.y[mask[:, output], output]
+        for recording, mask in zip(problem.recordings, problem.masks, strict=True)
+    ]
+    return float(np.std(np.concatenate(values)))
+
+
+def _whitened_residuals(problem: FitProblem, predicted: Sequence[Array]) -> list[Array]:
+    """(M, ny) whitened measured minus predicted values of every recording, NaN where none count."""
+    whitened = []
+    for y, recording, mask in zip(predicted, problem.recordings, problem.masks, strict=True):
         z = np.full(y.shape, np.nan)
-        z[mask] = fit.noise.whiten_present(np.where(mask, track.y - y, 0.0), mask)
-        out.append(z)
-    return out
+        difference = np.where(mask, recording.y - y, 0.0)
+        z[mask] = problem.noise.whiten_present(difference, mask)
+        whitened.append(z)
+    return whitened
 
 
-def _inside(fit: FitProblem, whitened: Sequence[Array]) -> Array:
-    """All whitened residuals; with a robust loss without outliers."""
-    every = np.concatenate([z.ravel() for z in whitened])
-    return np.where(np.abs(every) <= fit.loss.outlier_threshold, every, np.nan)
+def _without_outliers(problem: FitProblem, whitened: Sequence[Array]) -> Array:
+    """(n,) all whitened residuals; NaN for the outliers of a robust loss."""
+    residuals = np.concatenate([z.ravel() for z in whitened])
+    is_inlier = np.abs(residuals) <= problem.loss.outlier_threshold
+    return np.where(is_inlier, residuals, np.nan)

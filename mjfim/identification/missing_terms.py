@@ -1,8 +1,8 @@
-"""What a model that does not fit may be missing: score tests of terms that are not among the parameters.
+"""Score tests of physical terms that a model which does not fit may lack.
 
-Each candidate (dry friction, damping, a spring, rotor inertia of a joint; bias and lag of what is measured) gets a column of
-sensitivities at the estimate. With g its score and I its information once all parameters have followed, `g^2 / I` is the squared
-residual that it would explain, and `-g / I` how much of it there would be. One linearisation tests all of them.
+Each candidate (dry friction, damping, stiffness or rotor inertia of a joint; bias or delay of outputs) gets a column of
+sensitivities at the estimate. With g its score and I its information once all parameters follow, `g^2 / I` is the squared
+residual that it would explain and `-g / I` its size. One linearisation tests all candidates.
 """
 
 from __future__ import annotations
@@ -14,123 +14,271 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
+from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.identification.residuals import FitProblem
 from mjfim.model.coordinates import scalar_joints
 from mjfim.model.units import JOINT_FIELD_UNITS
+from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.records.estimate import MissingTerm
 from mjfim.records.recording import Recording
 
-LEVEL = 1e-3  # probability, over all candidates, from which one is named
-WORTH = 2e-3  # of all squared residuals that it has to explain
-FAINT = 1e-4  # size of a term at which its sensitivity is taken, where it is zero in the model
-MOST = 60  # candidates
-LISTED = 4
+# Probability, over all candidates, that one is named though the model lacks nothing.
+SIGNIFICANCE = 1e-3
+
+# Smallest share of all squared residuals that a term must explain to be named.
+MIN_EXPLAINED_SHARE = 2e-3
+
+# Size at which the sensitivity of a term is taken where it is zero in the model [unit of the term].
+LINEARISATION_SIZE = 1e-4
+
+# Largest number of candidates.
+MAX_CANDIDATES = 60
+
+# Largest number of terms that are named.
+MAX_NAMED_TERMS = 4
+
+# Share of a term's information that must remain once all parameters follow; below, it cannot be told from them.
+MIN_REMAINING_SHARE = 1e-8
+
+# Eigenvalues of the scaled information of the parameters below this share of the largest one count as zero.
+INVERSE_TOLERANCE = 1e-12
+
+# Smallest column norm by which a column is divided.
+SMALLEST_NORM = 1e-300
+
+# Fields of a joint that are candidates, with their names in words.
+JOINT_TERMS = {
+    "frictionloss": "dry friction",
+    "damping": "viscous damping",
+    "armature": "rotor inertia",
+    "stiffness": "a spring",
+}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """A term to test. positive: only positive values make sense;  now: in the model;  at: where its sensitivity is taken"""
+    """A term to test.
 
-    words: str
+    Attributes:
+        description: The term in words.
+        path: Parameter path of the term.
+        unit: Unit of the term; may be empty.
+        positive: True where only positive values make sense.
+        value: Value in the model [unit].
+        linearised_at: Value at which its sensitivity is taken [unit].
+    """
+
+    description: str
     path: str
     unit: str
     positive: bool
-    now: float
-    at: float
+    value: float
+    linearised_at: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Linearisation:
+    """Normal equations of parameters and candidates, columns scaled to length 1.
+
+    Attributes:
+        H: (m, m) information.
+        g: (m,) gradient of half of the squared residuals, with all candidates at their values in the model.
+        norms: (m,) lengths of the columns.
+        columns: Column of every candidate.
+        others: Columns of the parameters.
+        inverse: Pseudo-inverse of the information about the parameters.
+    """
+
+    H: Array
+    g: Array
+    norms: Array
+    columns: list[int]
+    others: np.ndarray
+    inverse: Array
 
 
 def find_missing_terms(
-    fit: FitProblem, recordings: Sequence[Recording], pieces: np.ndarray, at: UnknownValues
+    problem: FitProblem, recordings: Sequence[Recording], segments: np.ndarray, at: UnknownValues
 ) -> tuple[MissingTerm, ...]:
-    """Terms that would explain significant residuals, the strongest first; none where nothing does.
+    """Terms that would explain significant residuals.
 
-    fit: of some of the pieces that the recordings are cut into
+    Args:
+        problem: The least-squares problem of some segments.
+        recordings: All recordings.
+        segments: Indices of these segments among those of all recordings.
+        at: Solution of the problem.
+
+    Returns:
+        The terms, most significant first; none where the model lacks nothing.
     """
-    system = fit.system
-    tested = list(_candidates(system, fit.measured))[:MOST]
-    if not tested:
+    system = problem.system
+    candidates = list(_candidates(system, problem.layout.free_starts))[:MAX_CANDIDATES]
+    if not candidates:
         return ()
-    stated = {
-        f"?{i}": {"target": c.path, "guess": c.at, "scale": FAINT} for i, c in enumerate(tested)
+
+    linearisation = _linearise(problem, recordings, segments, at, candidates)
+    if linearisation is None:
+        return ()
+
+    squares = 2.0 * problem.cost(at)
+    found = []
+    for candidate, column in zip(candidates, linearisation.columns, strict=True):
+        term = _tested(candidate, column, linearisation, squares, len(candidates))
+        if term is not None:
+            found.append(term)
+
+    found.sort(key=lambda term: -term.sigmas)
+    return tuple(found[:MAX_NAMED_TERMS])
+
+
+def _linearise(
+    problem: FitProblem,
+    recordings: Sequence[Recording],
+    segments: np.ndarray,
+    at: UnknownValues,
+    candidates: Sequence[Candidate],
+) -> _Linearisation | None:
+    """Linearise the residuals by parameters and candidates; None where that is impossible."""
+    system = problem.system
+
+    # Candidates become further parameters of the experiment.
+    names = [f"?{i}" for i in range(len(candidates))]
+    tables = {
+        name: {
+            "target": candidate.path,
+            "guess": candidate.linearised_at,
+            "scale": LINEARISATION_SIZE,
+        }
+        for name, candidate in zip(names, candidates, strict=True)
     }
     try:
-        wider = System.resolve(
-            system.experiment.replace(parameters=stated),
+        extended = System.resolve(
+            system.experiment.replace(parameters=tables),
             threads=system.threads,
             source=system.source,
         )
     except ExperimentError:
-        return ()
-    own = [wider.parameters.names.index(name) for name in system.parameters.names]
-    theta = np.array(wider.parameters.guess)
-    theta[own] = at.theta
-    other = FitProblem.of(wider, recordings).part(pieces).reweighted(fit.noise)
-    found = other.condense(replace(at, theta=theta))
-    if found is None:
-        return ()
-    J = np.concatenate([found.reduced_rows(), found.common_rows])
-    unit = np.maximum(np.linalg.norm(J[:, :-1], axis=0), 1e-300)
-    J[:, :-1] /= unit
-    H, g = J[:, :-1].T @ J[:, :-1], J[:, :-1].T @ J[:, -1]
-    moved = np.zeros(
-        len(H)
-    )  # to where sensitivities are taken; the residuals that count are those without it
-    names = np.array(wider.parameters.names)[other.layout.places]
-    columns = [int(np.flatnonzero(names == name)[0]) for name in stated]
-    moved[columns] = [c.at - c.now for c in tested]
-    g = g - H @ (moved * unit)
-    rest = np.setdiff1d(np.arange(len(H)), columns)
-    inverse = np.linalg.pinv(H[np.ix_(rest, rest)], rcond=1e-12, hermitian=True)
-    total, named = 2.0 * fit.cost(at), []
-    for candidate, i in zip(tested, columns, strict=True):
-        cross = inverse @ H[rest, i]
-        left, score = H[i, i] - H[i, rest] @ cross, g[i] - g[rest] @ cross
-        if left <= 1e-8 * H[i, i]:  # hardly told from the parameters that there are
-            continue
-        value, sigmas, share = (
-            -score / left / unit[i],
-            abs(score) / np.sqrt(left),
-            score**2 / left / total,
-        )
-        wrong = candidate.positive and candidate.now + value < 0.0
-        # more than all squares: the fit is too far from its minimum for a linear answer
-        if not wrong and sigmas > norm.isf(0.5 * LEVEL / len(tested)) and WORTH < share < 1.0:
-            named.append(
-                MissingTerm(
-                    description=candidate.words,
-                    path=candidate.path,
-                    value=float(value),
-                    unit=candidate.unit,
-                    sigmas=float(sigmas),
-                    share=float(share),
-                )
-            )
-    return tuple(sorted(named, key=lambda s: -s.sigmas)[:LISTED])
+        return None
+
+    theta = np.array(extended.parameters.guess)
+    theta[[extended.parameters.names.index(name) for name in system.parameters.names]] = at.theta
+
+    wider = FitProblem.of(extended, recordings).of_segments(segments).with_noise(problem.noise)
+    condensed = wider.condense(replace(at, theta=theta))
+    if condensed is None:
+        return None
+
+    column_names = np.array(extended.parameters.names)[wider.layout.parameter_of_column]
+    columns = [int(np.flatnonzero(column_names == name)[0]) for name in names]
+    return _normal_equations(condensed, candidates, columns)
 
 
-def _candidates(system: System, measured: bool) -> Iterator[Candidate]:
-    """Everything that the experiment does not already seek."""
-    sought = {t.path.removesuffix("[0]") for p in system.parameters.parameters for t in p.targets}
+def _normal_equations(
+    condensed: Condensed, candidates: Sequence[Candidate], columns: list[int]
+) -> _Linearisation:
+    """Information and gradient with scaled columns, the candidates at their values in the model."""
+    rows = np.concatenate([condensed.reduced_rows(), condensed.common_rows])
+    norms = np.maximum(np.linalg.norm(rows[:, :-1], axis=0), SMALLEST_NORM)
+    J = rows[:, :-1] / norms
+    H = J.T @ J
+    g = J.T @ rows[:, -1]
+
+    # Sensitivities were taken at a small value of each term; the residuals that count are those without it.
+    offset = np.zeros(len(H))
+    offset[columns] = [candidate.linearised_at - candidate.value for candidate in candidates]
+    g = g - H @ (offset * norms)
+
+    # The parameters follow each candidate.
+    others = np.setdiff1d(np.arange(len(H)), columns)
+    about_others = H[np.ix_(others, others)]
+    inverse = np.linalg.pinv(about_others, rcond=INVERSE_TOLERANCE, hermitian=True)
+    return _Linearisation(H=H, g=g, norms=norms, columns=columns, others=others, inverse=inverse)
+
+
+def _tested(
+    candidate: Candidate, column: int, linearisation: _Linearisation, squares: float, count: int
+) -> MissingTerm | None:
+    """Score test of one of `count` candidates; None where it is not significant. squares: sum of squared residuals."""
+    H, g = linearisation.H, linearisation.g
+
+    # Information and score once all parameters follow.
+    others = linearisation.others
+    response = linearisation.inverse @ H[others, column]
+    information = H[column, column] - H[column, others] @ response
+    score = g[column] - g[others] @ response
+
+    # The term cannot be told from the parameters of the experiment.
+    if information <= MIN_REMAINING_SHARE * H[column, column]:
+        return None
+
+    value = -score / information / linearisation.norms[column]
+    sigmas = abs(score) / np.sqrt(information)
+    share = score**2 / information / squares
+
+    # A share above 1: the fit is too far from its minimum for a linear answer.
+    impossible = candidate.positive and candidate.value + value < 0.0
+    significant = sigmas > norm.isf(0.5 * SIGNIFICANCE / count)
+    if impossible or not significant or not MIN_EXPLAINED_SHARE < share < 1.0:
+        return None
+
+    return MissingTerm(
+        description=candidate.description,
+        path=candidate.path,
+        value=float(value),
+        unit=candidate.unit,
+        sigmas=float(sigmas),
+        share=float(share),
+    )
+
+
+def _candidates(system: System, free_starts: bool) -> Iterator[Candidate]:
+    """All terms that are not among the parameters of the experiment."""
+    parameters = system.parameters
+    targets = {
+        target.path.removesuffix("[0]")
+        for parameter in parameters.parameters
+        for target in parameter.targets
+    }
+
     model: Any = system.model
-    for c in scalar_joints(model):
-        dof = c.v
-        for field, words, now in (
-            ("frictionloss", "dry friction", model.dof_frictionloss[dof]),
-            ("damping", "viscous damping", model.dof_damping[dof]),
-            ("armature", "rotor inertia", model.dof_armature[dof]),
-            ("stiffness", "a spring", model.jnt_stiffness[c.joint]),
-        ):
-            path, unit = f"joint/{c.name}:{field}", JOINT_FIELD_UNITS[field][c.unit]
-            if path not in sought:
-                yield Candidate(
-                    f"{words} of {c.name}", path, unit, True, float(now), float(now) or FAINT
-                )
+    for joint in scalar_joints(model):
+        for field, words in JOINT_TERMS.items():
+            path = f"joint/{joint.name}:{field}"
+            if path in targets:
+                continue
+            values = getattr(model, f"{'jnt' if field == 'stiffness' else 'dof'}_{field}")
+            value = float(values[joint.joint if field == "stiffness" else joint.v])
+            yield Candidate(
+                description=f"{words} of {joint.name}",
+                path=path,
+                unit=JOINT_FIELD_UNITS[field][joint.unit],
+                positive=True,
+                value=value,
+                linearised_at=value or LINEARISATION_SIZE,
+            )
+
     for output in system.outputs.outputs:
         path = f"output/{output.name}:bias"
-        if path not in sought:
-            yield Candidate(f"bias of {output.name}", path, output.unit, False, 0.0, 0.0)
-    if not measured and not system.parameters.delay_derivative.any():  # a lag would move the pieces
-        yield Candidate("a lag of everything that is measured", "output:delay", "s", True, 0.0, 0.0)
+        if path not in targets:
+            yield Candidate(
+                description=f"bias of {output.name}",
+                path=path,
+                unit=output.unit,
+                positive=False,
+                value=0.0,
+                linearised_at=0.0,
+            )
+
+    # A delay would move the segments of free initial states.
+    if not free_starts and not parameters.delay_derivative.any():
+        yield Candidate(
+            description="a delay of all outputs",
+            path="output:delay",
+            unit="s",
+            positive=True,
+            value=0.0,
+            linearised_at=0.0,
+        )

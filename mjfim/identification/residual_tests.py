@@ -1,200 +1,310 @@
-"""The verdict on a fit: are the residuals noise of the stated size, and if not, which output and when."""
+"""Tests of residuals: whether they are white noise of the stated size, and where they are largest."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import correlate
-from scipy.stats import chi2
 from scipy.stats import chi2 as chi2_distribution
 
 from mjfim.arrays import Array
 from mjfim.records.estimate import Whiteness, WorstResidual
 
-MISFIT = 1e-3  # probability below which residuals are not noise
-LARGER = 1.03  # residuals over the stated noise from which that matters
-INFLATED = 1.25  # variance of means over that of white noise from which it matters
-SHOWS = 0.05  # correlation of one residual with the next that is worth telling
-WINDOWS = 25  # of a recording, looked at one by one
-VALUES_PER_WINDOW = 8  # values of a window, about
-STICKS_OUT = 1.5  # root mean square of a window over that of all
+# Probability below which residuals are not noise.
+SIGNIFICANCE = 1e-3
+
+# Residuals over the stated noise above which the difference matters.
+RELEVANT_SIZE_RATIO = 1.03
+
+# Variance of means over that of white noise above which autocorrelation matters.
+RELEVANT_INFLATION = 1.25
+
+# Lag-1 correlation that is large enough to describe an autocorrelation.
+RELEVANT_CORRELATION = 0.05
+
+# Largest number of outputs that a message lists.
+MAX_LISTED_OUTPUTS = 4
+
+# Largest number of windows into which a recording is divided to find its largest residuals.
+MAX_WINDOWS = 25
+
+# Number of values of a window, about; windows with fewer values count as if the others were zero.
+VALUES_PER_WINDOW = 8
+
+# Root mean square of a window over that of the recording, above which the window is named rather than the whole recording.
+PEAK_RATIO = 1.5
+
+# Share of the peak down to which neighbouring windows belong to it.
+PEAK_SHARE = 0.5
+
+# Number of lags of the Ljung-Box test.
+LAGS = 20
+
+# Smallest number of values, or of means of runs, of which a variance is taken.
+MIN_VALUES = 8
+
+# Ratio of the lengths of successive runs whose means are tested.
+RUN_RATIO = 4
+
+# Autocorrelation below which it counts as zero.
+NO_AUTOCORRELATION = 0.05
+
+# Smallest sum of squares by which is divided.
+SMALLEST_SQUARES = 1e-300
 
 
-def larger(chi2: float, dof: int) -> bool:
-    """Residuals are larger than the stated noise."""
-    return bool(chi2_distribution.sf(chi2, dof) < MISFIT and np.sqrt(chi2 / dof) > LARGER)
+def is_larger_than_noise(chi2: float, dof: int) -> bool:
+    """True where residuals are significantly larger than the stated noise.
 
-
-def smaller(chi2: float, dof: int) -> bool:
-    """Residuals are smaller than the stated noise."""
-    return bool(chi2_distribution.cdf(chi2, dof) < MISFIT and np.sqrt(chi2 / dof) < 1.0 / LARGER)
-
-
-def coloured(found: Sequence[Whiteness]) -> tuple[Whiteness, ...]:
-    """Outputs whose residuals follow one another, by more than the noise would hide, the worst first."""
-    level = MISFIT / max(len(found), 1)
-    hit = [w for w in found if w.p < level and max(w.inflation, w.time) * w.variance > INFLATED]
-    return tuple(sorted(hit, key=lambda w: -w.inflation))
-
-
-def reasons(
-    chi2: float, dof: int, stated: bool, found: Sequence[Whiteness], missing: Sequence[object]
-) -> tuple[str, ...]:
-    """Why residuals are not the noise that they should be, in sentences; none where they are.
-
-    stated: the sigmas were;  missing: terms that would explain the residuals
+    Args:
+        chi2: Sum of squared whitened residuals.
+        dof: Degrees of freedom.
     """
-    said = []
-    if stated and larger(chi2, dof):
-        said.append(f"residuals are {np.sqrt(chi2 / dof):.2f} x the stated noise")
-    hit = coloured(found)
-    if hit:
-        names = ", ".join(f"{w.output} ({_how(w)})" for w in hit[:4])
-        more = f" and {len(hit) - 4} more" if len(hit) > 4 else ""
-        said.append(f"residuals follow one another in {names}{more}")
+    significant = chi2_distribution.sf(chi2, dof) < SIGNIFICANCE
+    return bool(significant and np.sqrt(chi2 / dof) > RELEVANT_SIZE_RATIO)
+
+
+def is_smaller_than_noise(chi2: float, dof: int) -> bool:
+    """True where residuals are significantly smaller than the stated noise.
+
+    Args:
+        chi2: Sum of squared whitened residuals.
+        dof: Degrees of freedom.
+    """
+    significant = chi2_distribution.cdf(chi2, dof) < SIGNIFICANCE
+    return bool(significant and np.sqrt(chi2 / dof) < 1.0 / RELEVANT_SIZE_RATIO)
+
+
+def autocorrelated(tests: Sequence[Whiteness]) -> tuple[Whiteness, ...]:
+    """Tests that find autocorrelation which is significant and large enough to matter.
+
+    Args:
+        tests: Test of every output.
+
+    Returns:
+        These tests, strongest autocorrelation first.
+    """
+    level = SIGNIFICANCE / max(len(tests), 1)
+    found = [
+        test
+        for test in tests
+        if test.p < level and max(test.inflation, test.time) * test.variance > RELEVANT_INFLATION
+    ]
+    return tuple(sorted(found, key=lambda test: -test.inflation))
+
+
+def misfit_reasons(
+    chi2: float,
+    dof: int,
+    noise_is_stated: bool,
+    tests: Sequence[Whiteness],
+    missing: Sequence[object],
+) -> tuple[str, ...]:
+    """Reasons why residuals are not the expected noise.
+
+    Args:
+        chi2: Sum of squared whitened residuals.
+        dof: Degrees of freedom.
+        noise_is_stated: Whether the noise was stated rather than estimated from the residuals.
+        tests: Test of every output.
+        missing: Terms that would explain residuals.
+
+    Returns:
+        Sentences; none where the residuals are the expected noise.
+    """
+    reasons = []
+    if noise_is_stated and is_larger_than_noise(chi2, dof):
+        reasons.append(f"residuals are {np.sqrt(chi2 / dof):.2f} x the stated noise")
+
+    found = autocorrelated(tests)
+    if found:
+        listed = [f"{test.output} ({_describe(test)})" for test in found[:MAX_LISTED_OUTPUTS]]
+        more = len(found) - len(listed)
+        suffix = f" and {more} more" if more else ""
+        reasons.append(f"residuals are autocorrelated: {', '.join(listed)}{suffix}")
     elif missing:
-        said.append("a term that the model lacks explains some of the residuals")
-    return tuple(said)
+        reasons.append("a term that the model lacks explains part of the residuals")
+    return tuple(reasons)
 
 
-def _how(found: Whiteness) -> str:
-    """In which way residuals follow one another: from each to the next, or only over longer runs."""
-    if abs(found.correlation) > SHOWS:
-        return f"{found.correlation:+.2f} from one to the next"
-    return f"means of many scatter {np.sqrt(max(found.inflation, 1.0)):.1f} x as much as those of noise"
+def _describe(test: Whiteness) -> str:
+    """An autocorrelation in words: by the correlation of neighbours, or by the variance of means over long runs."""
+    if abs(test.correlation) > RELEVANT_CORRELATION:
+        return f"lag-1 correlation {test.correlation:+.2f}"
+    return f"long-run variance is {max(test.inflation, 1.0):.1f} times that of white noise"
 
 
-def worst_place(
-    outputs: Sequence[str], names: Sequence[str], times: Sequence[Array], whitened: Sequence[Array]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Windows:
+    """Whitened residuals of one output of a recording, window by window.
+
+    Attributes:
+        edges: (w+1,) times between the windows [s].
+        counts: (w,) numbers of values.
+        squares: (w,) sums of squares.
+    """
+
+    edges: Array
+    counts: np.ndarray
+    squares: Array
+
+
+def find_worst_residual(
+    outputs: Sequence[str],
+    recordings: Sequence[str],
+    times: Sequence[Array],
+    whitened: Sequence[Array],
 ) -> WorstResidual | None:
-    """The window, or run of neighbouring ones, where whitened residuals: (M, ny) per recording are largest.
+    """The output and the interval in which residuals are largest.
 
-    None where there are none. A run that does not stand out is widened to the whole recording.
+    An interval is a window or several neighbouring ones; where none stands out, it is the whole recording.
+
+    Args:
+        outputs: Names of the ny outputs.
+        recordings: Names of the recordings.
+        times: (M,) times of the rows of every recording [s].
+        whitened: (M, ny) whitened residuals of every recording, NaN where not measured.
+
+    Returns:
+        The interval; None without residuals.
     """
     total = sum(float(np.nansum(z**2)) for z in whitened)
-    best: WorstResidual | None = None
-    for name, t, z in zip(names, times, whitened, strict=True):
+    worst: WorstResidual | None = None
+    for name, t, z in zip(recordings, times, whitened, strict=True):
         for j, output in enumerate(outputs):
-            seen = np.isfinite(z[:, j])
-            if not seen.any():
+            windows = _windows(t, z[:, j])
+            if windows is None:
                 continue
-            edges = np.linspace(
-                t[0],
-                t[-1] * (1 + 1e-12),
-                min(WINDOWS, max(int(seen.sum()) // VALUES_PER_WINDOW, 1)) + 1,
-            )
-            window = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(edges) - 2)
-            counts = np.bincount(window[seen], minlength=len(edges) - 1)
-            squares = np.bincount(window[seen], weights=z[seen, j] ** 2, minlength=len(edges) - 1)
-            rms = np.sqrt(
-                squares / np.maximum(counts, VALUES_PER_WINDOW)
-            )  # a single value is no place
-            peak, floor = (
-                int(np.argmax(rms)),
-                STICKS_OUT * float(np.sqrt(squares.sum() / counts.sum())),
-            )
-            first, last = (
-                _run(rms, peak, 0.5 * rms[peak]) if rms[peak] > floor else (0, len(rms) - 1)
-            )
-            inside = slice(first, last + 1)
-            size = float(np.sqrt(squares[inside].sum() / max(counts[inside].sum(), 1)))
-            place = WorstResidual(
+
+            inside = _largest_windows(windows)
+            squares = float(windows.squares[inside].sum())
+            count = max(windows.counts[inside].sum(), 1)
+            found = WorstResidual(
                 output=output,
                 recording=name,
-                begin=edges[first],
-                end=edges[last + 1],
-                size=size,
-                share=float(squares[inside].sum() / max(total, 1e-300)),
+                begin=windows.edges[inside.start],
+                end=windows.edges[inside.stop],
+                size=float(np.sqrt(squares / count)),
+                share=squares / max(total, SMALLEST_SQUARES),
             )
-            if best is None or place.size > best.size:
-                best = place
-    return best
+            if worst is None or found.size > worst.size:
+                worst = found
+    return worst
 
 
-def _run(values: Array, peak: int, least: float) -> tuple[int, int]:
-    """First and last of the neighbours of a peak that are at least so large."""
+def _windows(t: Array, z: Array) -> _Windows | None:
+    """Divide the residuals z: (M,) of an output at times t: (M,) into windows; None without a residual."""
+    measured = np.isfinite(z)
+    if not measured.any():
+        return None
+
+    count = min(MAX_WINDOWS, max(int(measured.sum()) // VALUES_PER_WINDOW, 1))
+    edges = np.linspace(t[0], t[-1] * (1 + 1e-12), count + 1)
+    window = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, count - 1)[measured]
+    squares = np.bincount(window, weights=z[measured] ** 2, minlength=count)
+    return _Windows(
+        edges=edges,
+        counts=np.bincount(window, minlength=count),
+        squares=squares.astype(np.float64),
+    )
+
+
+def _largest_windows(windows: _Windows) -> slice:
+    """Neighbouring windows in which residuals are largest; all of them where none stands out."""
+    # A single large value is not an interval: windows with few values count as if they had more.
+    rms = np.sqrt(windows.squares / np.maximum(windows.counts, VALUES_PER_WINDOW))
+    peak = int(np.argmax(rms))
+    overall = float(np.sqrt(windows.squares.sum() / windows.counts.sum()))
+    if not rms[peak] > PEAK_RATIO * overall:
+        return slice(0, len(rms))
+
+    least = PEAK_SHARE * rms[peak]
     first = last = peak
-    while first > 0 and values[first - 1] >= least:
+    while first > 0 and rms[first - 1] >= least:
         first -= 1
-    while last < len(values) - 1 and values[last + 1] >= least:
+    while last < len(rms) - 1 and rms[last + 1] >= least:
         last += 1
-    return first, last
+    return slice(first, last + 1)
 
 
-LAGS = 20
-FEWEST = 8  # means that a variance is taken of
-RUN = 4  # factor between the lengths of runs
-CUT = 0.05  # autocorrelation that counts as none
+def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
+    """Test whether residuals are white noise: Ljung-Box at short lags, and variances of means over longer and longer runs.
 
+    Args:
+        output: Name of the output.
+        parts: (M,) whitened residuals of every recording, NaN where not measured.
 
-def whiteness(output: str, parts: Sequence[Array]) -> Whiteness:
-    """parts: whitened residuals of one output, one array for each recording, NaN where not measured."""
+    Returns:
+        The result; p is 1 where there are too few residuals.
+    """
     series = [part[np.isfinite(part)] for part in parts]
     series = [part for part in series if len(part) > 1]
     count = sum(len(part) for part in series)
-    square = sum(float(part @ part) for part in series)
-    if count < 2 * FEWEST or not square > 0.0:
+    squares = sum(float(part @ part) for part in series)
+    if count < 2 * MIN_VALUES or not squares > 0.0:
         return Whiteness(
             output=output,
             count=count,
-            variance=square / max(count, 1),
+            variance=squares / max(count, 1),
             correlation=0.0,
             p=1.0,
             inflation=1.0,
             time=1.0,
         )
+
+    # Ljung & Box (1978).
     lags = min(LAGS, count // 5)
-    rho = _autocorrelation(series, max(lags, _reach(series)))
-    statistic = (
-        count
-        * (count + 2)
-        * float(np.sum(rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))))
-    )
-    ratios = list(_ratios(series, square / count))
-    chances = [float(chi2.sf(statistic, lags)), *(p for _, p in ratios)]
-    inflation = max((ratio for ratio, _ in ratios), default=1.0)
-    p = min(min(chances) * len(chances), 1.0)
+    longest_lag = max(max(len(part) for part in series) // 4, 1)
+    rho = _autocorrelation(series, max(lags, longest_lag))
+    terms = rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))
+    statistic = count * (count + 2) * float(np.sum(terms))
+
+    # Means over runs show slow drifts that short lags miss. The number of tests corrects the probability.
+    variance = squares / count
+    runs = list(_run_tests(series, variance))
+    probabilities = [float(chi2_distribution.sf(statistic, lags)), *(p for _, p in runs)]
+    inflation = max((ratio for ratio, _ in runs), default=1.0)
     return Whiteness(
         output=output,
         count=count,
-        variance=square / count,
+        variance=variance,
         correlation=float(rho[1]),
-        p=p,
+        p=min(min(probabilities) * len(probabilities), 1.0),
         inflation=max(inflation, 1.0),
-        time=_integrated(rho),
+        time=_autocorrelation_time(rho),
     )
 
 
-def _autocorrelation(series: Sequence[Array], reach: int) -> Array:
-    """(reach+1,) of all series together, each about zero: a constant offset of residuals is no noise either."""
-    total = np.zeros(reach + 1)
+def _autocorrelation(series: Sequence[Array], longest_lag: int) -> Array:
+    """(longest_lag+1,) autocorrelation of all series together, about zero: a constant offset is not noise either."""
+    total = np.zeros(longest_lag + 1)
     for part in series:
-        full = correlate(part, part, method="fft")[len(part) - 1 :][: reach + 1]
-        total[: len(full)] += full
+        products = correlate(part, part, method="fft")
+        at_lags = products[len(part) - 1 :][: longest_lag + 1]
+        total[: len(at_lags)] += at_lags
     return np.asarray(total / total[0])
 
 
-def _reach(series: Sequence[Array]) -> int:
-    """Longest lag at which the autocorrelation is worth a look."""
-    return max(max(len(part) for part in series) // 4, 1)
-
-
-def _integrated(rho: Array) -> float:
-    """`1 + 2 sum rho`, up to where it first vanishes (the initial positive sequence)."""
-    below = np.flatnonzero(rho < CUT)
-    end = int(below[0]) if len(below) else len(rho)
+def _autocorrelation_time(rho: Array) -> float:
+    """Integrated autocorrelation time `1 + 2 sum rho` [rows], up to where rho first vanishes (initial positive sequence)."""
+    vanishing = np.flatnonzero(rho < NO_AUTOCORRELATION)
+    end = int(vanishing[0]) if len(vanishing) else len(rho)
     return float(1.0 + 2.0 * rho[1:end].sum())
 
 
-def _ratios(series: Sequence[Array], variance: float) -> Iterator[tuple[float, float]]:
-    """Variance of the mean of a run over that of white noise, and its probability, for ever longer runs."""
-    run = RUN
+def _run_tests(series: Sequence[Array], variance: float) -> Iterator[tuple[float, float]]:
+    """Variance of the mean of a run over that of white noise, and its probability, for longer and longer runs."""
+    length = RUN_RATIO
     while True:
-        means = [part[: len(part) // run * run].reshape(-1, run).mean(axis=1) for part in series]
+        means = [
+            part[: len(part) // length * length].reshape(-1, length).mean(axis=1) for part in series
+        ]
         joined = np.concatenate(means)
-        if len(joined) < FEWEST:
+        if len(joined) < MIN_VALUES:
             return
-        total = run * float(joined @ joined) / variance
-        yield total / len(joined), float(chi2.sf(total, len(joined)))
-        run *= RUN
+
+        statistic = length * float(joined @ joined) / variance
+        yield statistic / len(joined), float(chi2_distribution.sf(statistic, len(joined)))
+        length *= RUN_RATIO

@@ -1,14 +1,13 @@
-"""Recordings against the model: whitened residuals, their Jacobian, and both condensed for the solver.
+"""The least-squares problem of an identification: whitened residuals of recordings and their linearisation.
 
-Every recording is one piece or several (`pieces`). What a piece measures is compared at its own times: the prediction is
-read between the samples, as late as the outputs lag (`lag`).
+Residuals are compared at the times of the logs. The problem is condensed for the solver, block of rows by block of rows.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise, zip_longest
 
 import numpy as np
@@ -16,525 +15,581 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, RecordingError, SimulationDivergedError
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import align
-from mjfim.identification.segments import cut, groups, whole
+from mjfim.identification.aligned_recording import AlignedRecording, align
+from mjfim.identification.segment_simulation import SegmentRows, SegmentSimulation
+from mjfim.identification.segments import Segment, cut_into_segments, whole_recordings
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.information.null_space import COARSER_STEP_FACTOR, NullSpace
+from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
-from mjfim.plant.delay import OutputDelay
-from mjfim.plant.derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
+from mjfim.plant.derivatives import SENSITIVITY_STEP
 from mjfim.plant.noise import Noise
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
-FINE = 8  # rows of a block at least
-BLOCKS = 1024  # about as many
-LARGE = 400_000  # samples times sides of differences from which these are one-sided
-WIDE = 1e3  # [m, rad, ...] standard deviation of a free start, so that what nothing shows stays where it is
-DELAYED = 5.0  # sizes or prior standard deviations by which a delay may grow while it is sought
+# Smallest number of rows of a block.
+MIN_BLOCK_ROWS = 8
 
+# Number of blocks into which all rows are divided at most, about.
+MAX_BLOCKS = 1024
 
-@dataclass(frozen=True, eq=False)
-class Residuals:
-    """Whitened residuals of all recordings, then prior rows, then pins, and their Jacobian. r: (n,), J: (n, c + private)."""
+# Standard deviation of the prior on a free initial state [m, rad, m/s, ...]; it holds components that no output shows.
+FREE_START_SIGMA = 1e3
 
-    r: Array
-    J: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Some rows of one piece. piece: its place;  rows: (k,) of its track
-
-    y: (k, ny) predicted;  common: (k, ny, p), private: (k, ny, n) derivatives, or None
-    """
-
-    piece: int
-    rows: np.ndarray
-    y: Array
-    common: Array | None
-    private: Array | None
-
+# Prior standard deviations, or scales, by which a delay may grow during the search.
+MAX_DELAY_GROWTH = 5.0
 
 # Samples of the longest recording along which difference steps are calibrated.
 CALIBRATION_SAMPLES = 1000
 
 
-class FitProblem:
-    """Residuals of an experiment against recordings, as functions of the unknowns (`levenberg_marquardt.Problem`).
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Residuals:
+    """All rows of a linearised problem: whitened residuals of the recordings, then priors, then pins.
 
-    The common unknowns are theta without the private deviations of a start; every piece has its own of those. Pieces that
-    start where the data say have all of the state as private unknowns.
-    data_only: leave priors and bounds out
+    Attributes:
+        r: (n,) residuals [standard deviations].
+        J: (n, c + P n_private) derivatives by the common unknowns, then by the private ones of each segment.
     """
+
+    r: Array
+    J: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pins:
+    """Rows that hold combinations of parameters which no recording shows.
+
+    Attributes:
+        rows: (k, p) combinations, each in units of the magnitudes of the parameters.
+        theta: (p,) parameters at which they are held.
+    """
+
+    rows: Array
+    theta: Array
+
+    def residual(self, theta: Array) -> Array:
+        """(k,) distances of theta: (p,) from the place where it is held."""
+        return np.asarray(self.rows @ (theta - self.theta))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitProblem:
+    """Residuals of a system against recordings as functions of the unknowns (`levenberg_marquardt.Problem`).
+
+    The common unknowns are theta without private deviations of the initial state; every segment has deviations of its own. Where
+    initial states are measured, the whole state is private.
+
+    Attributes:
+        simulation: Simulation of the segments.
+        masks: (M, ny) for every recording, True for the measured values that count.
+        noise: Noise of the outputs.
+        loss: Loss of a whitened residual.
+        pins: Combinations that no recording shows, and where they are held.
+        with_priors: Whether priors of the parameters count.
+    """
+
+    simulation: SegmentSimulation
+    masks: tuple[np.ndarray, ...]
+    noise: Noise
+    loss: RobustLoss
+    pins: Pins
+    with_priors: bool
 
     @classmethod
     def of(
         cls, system: System, recordings: Sequence[Recording], *, data_only: bool = False
     ) -> FitProblem:
-        """The problem of a system and recordings; data_only leaves priors and bounds out."""
-        return cls(system, recordings, data_only)
+        """The problem that the `[fit]` table of a system's experiment states.
 
-    def __init__(
-        self, system: System, recordings: Sequence[Recording], data_only: bool = False
-    ) -> None:
+        Args:
+            system: The system.
+            recordings: Recordings in SI units.
+            data_only: Whether to leave priors and bounds out.
+
+        Returns:
+            The problem.
+
+        Raises:
+            RecordingError: There is no recording, or one cannot be used.
+            ExperimentError: The initial state is measured, and deviations of the stated one are asked for.
+        """
         if not recordings:
             raise RecordingError("identify needs at least one recording")
-        self.system, self.data_only = system, data_only
-        p, fit = system.parameters, system.experiment.fit
-        self.loss = RobustLoss(kind=fit.loss, scale=fit.loss_scale)
-        self.noise: Noise = system.noise
-        self.recordings = list(recordings)
-        self.aligned = [align(system, r) for r in recordings]
+
+        settings = system.experiment.fit
+        parameters = system.parameters
+        aligned = tuple(align(system, recording) for recording in recordings)
 
         # Difference steps suit the motion that was recorded; a part of it shows how strongly each parameter acts.
-        longest = max(self.aligned, key=lambda track: len(track.ctrl))
-        self.system = system = system.calibrated(p.guess, longest.ctrl[:CALIBRATION_SAMPLES])
-        self.measured = fit.start == "measured" or fit.segments is not None
-        if self.measured:
-            self._require_free()
-            self.free = np.eye(system.space.nx)
-            self.pieces = cut(system, self.aligned, fit.segments, self._lead())
+        longest = max(aligned, key=lambda recording: len(recording.ctrl))
+        system = system.calibrated(parameters.guess, longest.ctrl[:CALIBRATION_SAMPLES])
+
+        # Segments need initial states of their own, which only the measured values show.
+        free_starts = settings.start == "measured" or settings.segments is not None
+        if free_starts:
+            _require_measured_starts(system)
+            directions = np.eye(system.space.nx)
+            lead = _max_delay(parameters)
+            segments = cut_into_segments(system, aligned, settings.segments, lead)
         else:
-            self.free = p.initial_state_derivative(system.space.nx)[:, p.initial_deviations]
-            self.pieces = whole(self.aligned, system.plant.nominal_initial_state)
-        self.masks = [self._used(i) for i in range(len(self.aligned))]
-        if not any(mask.any() for mask in self.masks):
+            by_theta = parameters.initial_state_derivative(system.space.nx)
+            directions = by_theta[:, parameters.initial_deviations]
+            segments = whole_recordings(aligned, system.plant.nominal_initial_state)
+
+        masks = tuple(_counted_values(recording, free_starts) for recording in aligned)
+        if not any(mask.any() for mask in masks):
             raise RecordingError("the recordings hold no measured value after t = 0")
-        self.layout = UnknownLayout.of(p, len(self.aligned), self.measured, not data_only)
-        self.pins, self.pinned_at = np.zeros((0, len(p))), np.array(p.guess)
-        self._offsets = self._partition()
 
-    def _require_free(self) -> None:
-        """Raises ExperimentError where deviations of the stated start are asked for though it is measured."""
-        starts = self.system.parameters.initial_state_derivative(self.system.space.nx).any(axis=0)
-        if starts.any():
-            name = self.system.parameters.names[int(np.argmax(starts))]
-            raise ExperimentError(
-                f"{self.system.experiment.source}: {name}: a start is free where fit.segments or fit.start = \"measured\" is "
-                "stated; take nuisance.initial and parameters of the start out, or the other"
-            )  # fmt: skip
+        layout = UnknownLayout.of(
+            parameters, len(aligned), free_starts=free_starts, bounded=not data_only
+        )
+        simulation = SegmentSimulation(
+            system=system,
+            recordings=aligned,
+            segments=segments,
+            layout=layout,
+            start_directions=directions,
+        )
+        return cls(
+            simulation=simulation,
+            masks=masks,
+            noise=system.noise,
+            loss=RobustLoss(kind=settings.loss, scale=settings.loss_scale),
+            pins=Pins(rows=np.zeros((0, len(parameters))), theta=np.array(parameters.guess)),
+            with_priors=not data_only,
+        )
 
-    def _lead(self) -> float:
-        """[s] that outputs may lag at most while the delay is sought."""
-        p = self.system.parameters
-        reach = np.array([DELAYED * (q.prior or q.scale) for q in p.parameters])
-        latest = np.minimum(p.guess + reach, np.where(np.isfinite(p.upper), p.upper, np.inf))
-        return max(float(p.delay_derivative @ latest), 0.0) if p.delay_derivative.any() else 0.0
+    # ---- variants
 
-    def _used(self, i: int) -> np.ndarray:
-        """(M, ny) measured values of a track; what is measured at a stated start tells nothing."""
-        mask = np.array(self.aligned[i].measured)
-        if not self.measured:
-            mask[0] = False
-        return mask
+    def unbounded(self) -> FitProblem:
+        """This problem without bounds."""
+        return replace(self, simulation=self.simulation.with_layout(self.layout.unbounded()))
 
-    def _partition(self) -> np.ndarray:
-        """First block of every piece, and the number of all blocks."""
-        total = sum(len(t.t) for t in self.aligned)
-        fine = max(FINE, -(-total // BLOCKS))
-        counts = [max(round((p.rows.stop - p.rows.start) / fine), 1) for p in self.pieces]
-        return np.concatenate([[0], np.cumsum(counts)])
+    def with_shared_held(self) -> FitProblem:
+        """This problem with the shared parameters held at any theta; pins do not matter then."""
+        simulation = self.simulation.with_layout(self.layout.without_shared())
+        return replace(
+            self, simulation=simulation, pins=replace(self.pins, rows=self.pins.rows[:0])
+        )
 
-    # what is sought
+    def with_noise(self, noise: Noise) -> FitProblem:
+        """This problem with other noise."""
+        return replace(self, noise=noise)
+
+    def of_segments(self, indices: np.ndarray) -> FitProblem:
+        """The problem of some segments only; only their rows count."""
+        simulation = self.simulation.of_segments(indices)
+        masks = tuple(np.zeros_like(mask) for mask in self.masks)
+        for segment in simulation.segments:
+            counted = self.masks[segment.recording][segment.rows]
+            masks[segment.recording][segment.rows] = counted
+        return replace(self, simulation=simulation, masks=masks)
+
+    def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
+        """This problem with some measured values only.
+
+        Args:
+            masks: (M, ny) for every recording, True for values that may count.
+
+        Returns:
+            The problem of the values that count in both.
+        """
+        both = tuple(mask & counted for mask, counted in zip(masks, self.masks, strict=True))
+        return replace(self, masks=both)
+
+    def pinned(self, theta: Array, null_space: NullSpace) -> FitProblem:
+        """This problem with the combinations of parameters that no recording shows held, to one magnitude of each parameter.
+
+        Args:
+            theta: (p,) parameters at which they are held.
+            null_space: Invisible directions of all p parameters.
+
+        Returns:
+            The problem.
+        """
+        magnitude = self.system.parameters.magnitude
+        orthonormal = np.linalg.qr(null_space.directions / magnitude[:, None])[0]
+        pins = Pins(rows=orthonormal.T / magnitude, theta=np.array(theta))
+        return replace(self, pins=pins)
+
+    # ---- sizes
 
     @property
-    def samples(self) -> int:
-        """Of all pieces together."""
-        return sum(p.samples for p in self.pieces)
+    def system(self) -> System:
+        """The system, its difference steps calibrated along the longest recording."""
+        return self.simulation.system
 
     @property
-    def count(self) -> int:
-        """Number of measured values."""
+    def recordings(self) -> tuple[AlignedRecording, ...]:
+        """The recordings on the sample grid."""
+        return self.simulation.recordings
+
+    @property
+    def segments(self) -> tuple[Segment, ...]:
+        """The segments."""
+        return self.simulation.segments
+
+    @property
+    def layout(self) -> UnknownLayout:
+        """Layout of the unknowns."""
+        return self.simulation.layout
+
+    @property
+    def sample_count(self) -> int:
+        """Number of samples of all segments together."""
+        return self.simulation.sample_count
+
+    @property
+    def row_count(self) -> int:
+        """Number of rows of all recordings."""
+        return sum(len(recording.t) for recording in self.recordings)
+
+    @property
+    def value_count(self) -> int:
+        """Number of measured values that count."""
         return int(sum(mask.sum() for mask in self.masks))
 
     @property
-    def occupied(self) -> np.ndarray:
-        """Places of the pieces that hold a measured value."""
-        hold = [
-            i for i, piece in enumerate(self.pieces) if self.masks[piece.track][piece.rows].any()
-        ]
-        return np.array(hold, dtype=np.intp)
+    def unknown_count(self) -> int:
+        """Number of all unknowns."""
+        return self.layout.column_count + len(self.segments) * self.simulation.private_count
 
     @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.layout.columns + len(self.pieces) * self.free.shape[1]
+    def segments_with_values(self) -> np.ndarray:
+        """Indices of the segments that hold a measured value that counts."""
+        indices = [
+            i
+            for i, segment in enumerate(self.segments)
+            if self.masks[segment.recording][segment.rows].any()
+        ]
+        return np.array(indices, dtype=np.intp)
+
+    @cached_property
+    def _block_offsets(self) -> np.ndarray:
+        """(P+1,) first block of every segment, and the number of all blocks."""
+        block_rows = max(MIN_BLOCK_ROWS, -(-self.row_count // MAX_BLOCKS))
+        counts = [
+            max(round((segment.rows.stop - segment.rows.start) / block_rows), 1)
+            for segment in self.segments
+        ]
+        return np.concatenate([[0], np.cumsum(counts)])
+
+    @property
+    def blocks(self) -> tuple[np.ndarray, np.ndarray]:
+        """(B,) index of the recording, and (B,) mean number of rows, of every block."""
+        counts = np.diff(self._block_offsets)
+        recordings = np.repeat([segment.recording for segment in self.segments], counts)
+        rows = [
+            (segment.rows.stop - segment.rows.start) / count
+            for segment, count in zip(self.segments, counts, strict=True)
+        ]
+        return recordings, np.repeat(rows, counts)
+
+    # ---- unknowns
 
     @property
     def lower(self) -> Array:
-        """(c,) bounds of the common unknowns."""
+        """(c,) lower bounds of the common unknowns."""
         return self.layout.lower
 
     @property
     def upper(self) -> Array:
-        """(c,) bounds of the common unknowns."""
+        """(c,) upper bounds of the common unknowns."""
         return self.layout.upper
 
     def begin(self, theta: Array) -> UnknownValues:
-        """Unknowns at theta: (p,), every piece starting as stated or measured."""
-        return self.layout.begin(theta, len(self.pieces), self.free.shape[1])
+        """Unknowns at theta: (p,), with every initial state as stated or measured."""
+        return self.layout.begin(theta, len(self.segments), self.simulation.private_count)
 
     def common_values(self, at: UnknownValues) -> Array:
         """(c,) values of the common unknowns."""
         return self.layout.common_values(at)
 
-    def moved(self, at: UnknownValues, step: Step, length: float) -> UnknownValues:
-        """The unknowns after a part of a step, inside the bounds to the last digit."""
-        return self.layout.moved(at, step, length)
+    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
+        """The unknowns after a fraction of a step; rounding does not take them out of the bounds."""
+        return self.layout.moved(at, step, fraction)
 
     def theta(self, at: UnknownValues) -> Array:
-        """(p,) with what is the first recording's."""
+        """(p,) parameters, with the values of the first recording."""
         return self.layout.theta(at)
 
-    @property
-    def blocks(self) -> tuple[np.ndarray, np.ndarray]:
-        """Recording and number of rows of every block."""
-        counts = np.diff(self._offsets)
-        tracks = np.repeat([piece.track for piece in self.pieces], counts)
-        rows = [
-            (piece.rows.stop - piece.rows.start) / n
-            for piece, n in zip(self.pieces, counts, strict=True)
+    # ---- residuals
+
+    def predict(self, at: UnknownValues) -> list[Array] | None:
+        """(M, ny) predicted outputs of every recording at its times; None where a simulation diverges."""
+        return self.simulation.predict(at)
+
+    def motion(self, at: UnknownValues, recording: int) -> Trajectory | None:
+        """The fitted motion of one recording; None where it diverges."""
+        return self.simulation.motion(at, recording)
+
+    def errors(self, predicted: Sequence[Array]) -> list[Array]:
+        """Predicted minus measured values of every output, for all recordings one after the other.
+
+        Args:
+            predicted: (M, ny) predicted outputs of every recording [y-unit].
+
+        Returns:
+            One array for each output [y-unit].
+        """
+        differences = [
+            y - recording.y for y, recording in zip(predicted, self.recordings, strict=True)
         ]
-        return tracks, np.repeat(rows, counts)
-
-    def unbounded(self) -> FitProblem:
-        """The same without bounds."""
-        other = copy.copy(self)
-        other.layout = self.layout.unbounded()
-        return other
-
-    def frozen(self) -> FitProblem:
-        """The same at any theta, whose shared part stays as it is."""
-        other = copy.copy(self)
-        other.layout, other.pins = self.layout.frozen(), self.pins[:0]
-        return other
-
-    def reweighted(self, noise: Noise) -> FitProblem:
-        """The same with other noise."""
-        other = copy.copy(self)
-        other.noise = noise
-        return other
-
-    def part(self, pieces: np.ndarray) -> FitProblem:
-        """Of some pieces alone."""
-        other = copy.copy(self)
-        other.pieces = tuple(self.pieces[i] for i in pieces)
-        other.masks = [np.zeros_like(mask) for mask in self.masks]
-        for piece in other.pieces:
-            other.masks[piece.track][piece.rows] = self.masks[piece.track][piece.rows]
-        other._offsets = other._partition()
-        return other
-
-    def masked(self, masks: Sequence[np.ndarray]) -> FitProblem:
-        """Of some measured values alone. masks: (M, ny) for every track"""
-        other = copy.copy(self)
-        other.masks = [mask & own for mask, own in zip(masks, self.masks, strict=True)]
-        return other
-
-    def pin(self, theta0: Array, null: NullSpace) -> None:
-        """Hold what no recording shows at its start, to one size of each parameter. null: of all p parameters"""
-        size = self.system.parameters.magnitude
-        self.pins = np.linalg.qr(null.directions / size[:, None])[0].T / size
-        self.pinned_at = np.array(theta0)
-
-    # what is computed
-
-    def predicted(self, at: UnknownValues) -> list[Array] | None:
-        """(M, ny) of every track at its measured times, NaN outside of all pieces; None where a simulation diverges."""
-        found = [np.full(track.y.shape, np.nan) for track in self.aligned]
-        for rows in self._rows(at, derivatives=False):
-            if rows is None:
-                return None
-            found[self.pieces[rows.piece].track][rows.rows] = rows.y
-        return found
-
-    def errors(self, values: Sequence[Array]) -> list[Array]:
-        """Predicted - measured of every output, those of all tracks in one row. values: (M, ny) of every track"""
-        parts = list(zip(values, self.aligned, self.masks, strict=True))
         return [
-            np.concatenate([(y - track.y)[mask[:, j], j] for y, track, mask in parts])
+            np.concatenate(
+                [
+                    difference[mask[:, j], j]
+                    for difference, mask in zip(differences, self.masks, strict=True)
+                ]
+            )
             for j in range(len(self.system.outputs))
         ]
 
-    def motion(self, at: UnknownValues, track: int) -> Trajectory | None:
-        """The fitted motion of one track on its grid, jumps between pieces and all; None where it diverges."""
-        plant, whole, theta = (
-            self.system.plant,
-            self.aligned[track],
-            self.layout.of_recording(at, track),
-        )
-        states = np.full((len(whole.ctrl) + 1, plant.nominal_initial_state.size), np.nan)
-        mine = [i for i, piece in enumerate(self.pieces) if piece.track == track]
-        for i in mine:
-            own = self.pieces[i]
-            out = plant.simulator.rollout(
-                [plant.model(theta)], self._start(at, i)[None], self._control(i, own.samples)[None]
-            )
-            if not out.finite[0]:
-                return None
-            seen = np.isnan(states[own.begin : own.begin + own.samples + 1, 0])
-            states[own.begin : own.begin + own.samples + 1][seen] = out.states[0][seen]
-        gap = np.isnan(states[:, 0])
-        if gap.any():  # rows without a piece
-            states[gap] = (
-                states[np.flatnonzero(~gap)[0]] if not gap.all() else plant.nominal_initial_state
-            )
-        return plant.trajectory(states, whole.ctrl)
-
     def cost(self, at: UnknownValues) -> float:
-        """Half of the loss and the priors; infinite where a simulation diverges."""
+        """Half of the loss of the residuals and of the squared priors; infinite where a simulation diverges."""
         total = 0.0
-        for rows in self._rows(at, derivatives=False):
+        for rows in self.simulation.rows(at, derivatives=False):
             if rows is None:
                 return np.inf
-            total += self.loss.value(self._whitened(rows)[1])
-        further = self._outer(at)[:, -1]
-        inner = self._inner(at)[:, :, -1]
-        return 0.5 * (total + float(further @ further) + float(np.sum(inner**2)))
+            _, residual = self._whitened(rows)
+            total += self.loss.value(residual)
+
+        common = self._common_rows(at)[:, -1]
+        private = self._private_rows(at)[:, :, -1]
+        return 0.5 * (total + float(common @ common) + float(np.sum(private**2)))
 
     def condense(self, at: UnknownValues) -> Condensed | None:
-        """Linearised about the unknowns; None where a perturbed simulation diverges."""
-        m = self.free.shape[1] + self.layout.columns + 1
-        blocks = np.zeros((int(self._offsets[-1]), m, m))
-        owners = np.repeat(np.arange(len(self.pieces)), np.diff(self._offsets))
-        for rows in self._rows(at, derivatives=True):
+        """Linearisation about the unknowns, condensed block by block; None where a perturbed simulation diverges."""
+        m = self.simulation.private_count + self.layout.column_count + 1
+        blocks = np.zeros((int(self._block_offsets[-1]), m, m))
+        segment_of_block = np.repeat(np.arange(len(self.segments)), np.diff(self._block_offsets))
+
+        for rows in self.simulation.rows(at, derivatives=True):
             if rows is None:
                 return None
-            index, r, J = self._linear(rows)
-            stacked = np.concatenate([J, r[:, None]], axis=1) * self.loss.weight(r)[:, None]
-            edges = np.flatnonzero(np.diff(index, prepend=-1, append=-1))
+
+            # A robust loss is linearised by weights (iteratively reweighted least squares).
+            block, r, J = self._linearised(rows)
+            weighted = np.concatenate([J, r[:, None]], axis=1) * self.loss.weight(r)[:, None]
+
+            # Rows of a block join its triangle.
+            edges = np.flatnonzero(np.diff(block, prepend=-1, append=-1))
             for first, last in pairwise(edges):
-                own = np.concatenate([blocks[index[first]], stacked[first:last]])
-                blocks[index[first]] = triangle(own)
+                index = block[first]
+                joined = np.concatenate([blocks[index], weighted[first:last]])
+                blocks[index] = triangle(joined)
+
         return Condensed(
             blocks=blocks,
-            segment_of_block=owners,
-            private_rows=self._inner(at),
-            common_rows=self._outer(at),
+            segment_of_block=segment_of_block,
+            private_rows=self._private_rows(at),
+            common_rows=self._common_rows(at),
         )
 
     def dense(self, at: UnknownValues) -> Residuals | None:
-        """All rows, data first, and the derivative by the common unknowns, then by each piece's own. For small problems."""
-        n, c = self.free.shape[1], self.layout.columns
-        r, J = [], []
-        for rows in self._rows(at, derivatives=True):
+        """All rows without a loss: recordings first, then priors and pins. For small problems and tests.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            Residuals with their derivatives; None where a perturbed simulation diverges.
+        """
+        n = self.simulation.private_count
+        c = self.layout.column_count
+        residuals, jacobians = [], []
+
+        def append(residual: Array, common: Array, private: Array, segment: int) -> None:
+            """Append rows of one segment with derivatives by the common and by its private unknowns."""
+            wide = np.zeros((len(residual), self.unknown_count))
+            wide[:, :c] = common
+            wide[:, c + segment * n : c + (segment + 1) * n] = private
+            residuals.append(residual)
+            jacobians.append(wide)
+
+        for rows in self.simulation.rows(at, derivatives=True):
             if rows is None:
                 return None
-            _, residual, slope = self._linear(rows)
-            wide = np.zeros((len(residual), self.size))
-            wide[:, :c] = slope[:, n:]
-            wide[:, c + rows.piece * n : c + (rows.piece + 1) * n] = slope[:, :n]
-            r.append(residual)
-            J.append(wide)
-        outer, inner = self._outer(at), self._inner(at)
-        r.append(outer[:, -1])
-        J.append(np.pad(outer[:, :-1], ((0, 0), (0, self.size - c))))
-        for i, own in enumerate(inner):
-            wide = np.zeros((len(own), self.size))
-            wide[:, :c], wide[:, c + i * n : c + (i + 1) * n] = own[:, n:-1], own[:, :n]
-            r.append(own[:, -1])
-            J.append(wide)
-        return Residuals(np.concatenate(r), np.concatenate(J))
+            _, residual, J = self._linearised(rows)
+            append(residual, J[:, n:], J[:, :n], rows.segment)
 
-    def sensed(self, at: UnknownValues) -> list[tuple[Array, Array]]:
-        """Whitened rows of G: (n, p) along each piece, and their change with a longer difference step; condensed, (2p, p).
+        common_rows = self._common_rows(at)
+        none = np.zeros((len(common_rows), n))
+        append(common_rows[:, -1], common_rows[:, :-1], none, 0)
 
-        Of pieces whose whole start is free, what that leaves of them. Raises SimulationDivergedError.
+        for i, own in enumerate(self._private_rows(at)):
+            append(own[:, -1], own[:, n:-1], own[:, :n], i)
+
+        return Residuals(r=np.concatenate(residuals), J=np.concatenate(jacobians))
+
+    def sensitivity_rows(self, at: UnknownValues) -> list[tuple[Array, Array]]:
+        """Condensed rows of the whitened sensitivity G for every segment, and their change with a longer difference step.
+
+        Where the whole initial state is free, only what it cannot explain remains of them.
+
+        Args:
+            at: The unknowns.
+
+        Returns:
+            (k, p) rows and (k, p) changes of every segment [standard deviations / theta-unit], k at most 2p + 2n.
+
+        Raises:
+            SimulationDivergedError: A perturbed simulation diverges.
         """
         fine, coarse = (
-            self._rows(at, derivatives=True, central=True, step=step, every=True)
+            self.simulation.rows(
+                at, derivatives=True, central=True, step=step, by_all_parameters=True
+            )
             for step in (SENSITIVITY_STEP, COARSER_STEP_FACTOR * SENSITIVITY_STEP)
         )
-        found: dict[int, Array] = {}
-        n = self.free.shape[1] if self.measured else 0
-        for rows, other in zip_longest(fine, coarse):
-            if rows is None:
-                raise SimulationDivergedError(
-                    f"{self.aligned[0].name}: the simulation diverges under its control"
-                )
-            J = self._columns(rows)
-            error = np.zeros_like(J) if other is None else self._columns(other) - J
-            both = np.concatenate([J, error], axis=1)
-            found[rows.piece] = triangle(np.concatenate([found.get(rows.piece, both[:0]), both]))
-        out = []
-        for key in sorted(found):
-            J, error = np.split(found[key], 2, axis=1)
-            Q = np.linalg.qr(J[:, :n])[0]
-            kept, doubt = J[:, n:], error[:, n:]
-            out.append((kept - Q @ (Q.T @ kept), doubt - Q @ (Q.T @ doubt)))
-        return out
 
-    def _columns(self, rows: Rows) -> Array:
-        """(k, n + p) whitened derivatives, by the start where that is all free, then by theta."""
-        mask = self.masks[self.pieces[rows.piece].track][rows.rows]
-        if rows.common is None or rows.private is None:
-            raise ValueError("no derivatives were asked for")
-        G = np.concatenate([rows.private, rows.common], axis=2) if self.measured else rows.common
+        # Rows of G and of their change stand side by side while they are condensed, so that they stay together.
+        condensed: dict[int, Array] = {}
+        for rows, coarse_rows in zip_longest(fine, coarse):
+            if rows is None:
+                name = self.recordings[0].name
+                raise SimulationDivergedError(
+                    f"{name}: the simulation diverges under the recorded control"
+                )
+            J = self._whitened_sensitivity(rows)
+            change = np.zeros_like(J)
+            if coarse_rows is not None:
+                change = self._whitened_sensitivity(coarse_rows) - J
+
+            both = np.concatenate([J, change], axis=1)
+            earlier = condensed.get(rows.segment, both[:0])
+            condensed[rows.segment] = triangle(np.concatenate([earlier, both]))
+
+        # Project onto the complement of what a free initial state can explain.
+        n = self.simulation.private_count if self.layout.free_starts else 0
+        found = []
+        for segment in sorted(condensed):
+            J, change = np.split(condensed[segment], 2, axis=1)
+            Q = np.linalg.qr(J[:, :n])[0]
+            by_theta, change_by_theta = J[:, n:], change[:, n:]
+            found.append(
+                (
+                    by_theta - Q @ (Q.T @ by_theta),
+                    change_by_theta - Q @ (Q.T @ change_by_theta),
+                )
+            )
+        return found
+
+    # ---- rows
+
+    def _whitened_sensitivity(self, rows: SegmentRows) -> Array:
+        """(k, n+p) whitened derivatives, by the initial state where that is free, then by theta."""
+        mask = self.masks[self.segments[rows.segment].recording][rows.rows]
+        common, private = rows.jacobians
+        G = common
+        if self.layout.free_starts:
+            G = np.concatenate([private, common], axis=2)
         return self.noise.whiten_present(G, mask)
 
-    def _whitened(self, rows: Rows) -> tuple[np.ndarray, Array]:
-        """Which values are there, (k, ny), and their whitened residuals, one after the other."""
-        track = self.pieces[rows.piece].track
-        mask = self.masks[track][rows.rows]
-        residual = np.where(mask, rows.y - self.aligned[track].y[rows.rows], 0.0)
+    def _whitened(self, rows: SegmentRows) -> tuple[np.ndarray, Array]:
+        """(k, ny) mask of the values that count, and their whitened residuals one after the other."""
+        recording = self.segments[rows.segment].recording
+        mask = self.masks[recording][rows.rows]
+        measured = self.recordings[recording].y[rows.rows]
+        residual = np.where(mask, rows.y - measured, 0.0)
         return mask, self.noise.whiten_present(residual, mask)
 
-    def _linear(self, rows: Rows) -> tuple[np.ndarray, Array, Array]:
-        """Block of every value, its whitened residual and its derivative by private and common unknowns."""
+    def _linearised(self, rows: SegmentRows) -> tuple[np.ndarray, Array, Array]:
+        """Block, whitened residual and derivative by private, then common unknowns of every value."""
         mask, r = self._whitened(rows)
-        if rows.common is None or rows.private is None:
-            raise ValueError("no derivatives were asked for")
-        common = self.layout.spread(rows.common, self.pieces[rows.piece].track)
-        G = np.concatenate([rows.private, common], axis=2)
-        piece, first = self.pieces[rows.piece], int(self._offsets[rows.piece])
-        count = int(self._offsets[rows.piece + 1]) - first
-        share = (rows.rows - piece.rows.start) * count // (piece.rows.stop - piece.rows.start)
-        index = np.broadcast_to((first + share)[:, None], mask.shape)[mask]
-        return index, r, self.noise.whiten_present(G, mask)
+        common, private = rows.jacobians
+        segment = self.segments[rows.segment]
+        columns = self.layout.to_columns(common, segment.recording)
+        G = np.concatenate([private, columns], axis=2)
 
-    def _outer(self, at: UnknownValues) -> Array:
-        """(l, c+1) rows of priors and pins on the common unknowns."""
-        rows = self.layout.priors(at)
-        pins = np.column_stack(
-            [self.layout.spread(self.pins, 0), self.pins @ (self.theta(at) - self.pinned_at)]
-        )
-        return np.concatenate(
-            [rows[: 0 if self.data_only else None], pins if self._apart else pins[:0]]
-        )
+        # The rows of a segment are divided evenly among its blocks.
+        first = int(self._block_offsets[rows.segment])
+        count = int(self._block_offsets[rows.segment + 1]) - first
+        length = segment.rows.stop - segment.rows.start
+        block_of_row = first + (rows.rows - segment.rows.start) * count // length
+        block = np.broadcast_to(block_of_row[:, None], mask.shape)[mask]
 
-    @property
-    def _apart(self) -> bool:
-        """True where pins do not touch private unknowns."""
-        return not self.pins[:, self.layout.private].any()
+        return block, r, self.noise.whiten_present(G, mask)
 
-    def _inner(self, at: UnknownValues) -> Array:
-        """(P, k, m) rows of priors on the private unknowns; pins that touch them belong to the first piece."""
-        n, c, p = self.free.shape[1], self.layout.columns, self.system.parameters
-        private = self.layout.private
-        if self.measured:
-            rows = np.zeros((len(self.pieces), n, n + c + 1))
-            rows[:, np.arange(n), np.arange(n)] = 1.0 / WIDE
-            rows[:, :, -1] = at.private / WIDE
+    def _common_rows(self, at: UnknownValues) -> Array:
+        """(l, c+1) rows `[J, r]` of priors and pins on the common unknowns."""
+        rows = np.zeros((0, self.layout.column_count + 1))
+        if self.with_priors:
+            rows = self.layout.prior_rows(at)
+        if self._pins_touch_private:
+            return rows
+
+        residual = self.pins.residual(self.theta(at))
+        columns = self.layout.to_columns(self.pins.rows, 0)
+        return np.concatenate([rows, np.column_stack([columns, residual])])
+
+    @cached_property
+    def _pins_touch_private(self) -> bool:
+        """True where pins involve private unknowns."""
+        return bool(self.pins.rows[:, self.layout.private].any())
+
+    def _private_rows(self, at: UnknownValues) -> Array:
+        """(P, k, m) rows `[J_private, J_common, r]` of priors on private unknowns, and of pins that involve them."""
+        n = self.simulation.private_count
+        m = n + self.layout.column_count + 1
+        count = len(self.segments)
+        diagonal = np.arange(n)
+
+        # A weak prior holds components of a free initial state that no output shows.
+        if self.layout.free_starts:
+            rows = np.zeros((count, n, m))
+            rows[:, diagonal, diagonal] = 1.0 / FREE_START_SIGMA
+            rows[:, :, -1] = at.private / FREE_START_SIGMA
             return rows
         if not n:
-            return np.zeros((len(self.pieces), 0, n + c + 1))
-        weight = np.sqrt(np.diag(p.prior_information))[private] * (not self.data_only)
-        rows = np.zeros((len(self.pieces), n + len(self.pins) * (not self._apart), n + c + 1))
-        rows[:, np.arange(n), np.arange(n)] = weight
-        rows[:, :n, -1] = weight * (at.private - p.guess[private])
-        if not self._apart:
-            rows[0, n:, :n], rows[0, n:, n:-1] = (
-                self.pins[:, private],
-                self.layout.spread(self.pins, 0),
-            )
-            rows[0, n:, -1] = self.pins @ (self.theta(at) - self.pinned_at)
+            return np.zeros((count, 0, m))
+
+        # Stated priors on the deviations of the initial state.
+        parameters = self.system.parameters
+        private = self.layout.private
+        weight = np.sqrt(np.diag(parameters.prior_information))[private] * self.with_priors
+        pin_count = len(self.pins.rows) if self._pins_touch_private else 0
+        rows = np.zeros((count, n + pin_count, m))
+        rows[:, diagonal, diagonal] = weight
+        rows[:, :n, -1] = weight * (at.private - parameters.guess[private])
+
+        # Pins that involve private unknowns belong to the first segment.
+        if pin_count:
+            rows[0, n:, :n] = self.pins.rows[:, private]
+            rows[0, n:, n:-1] = self.layout.to_columns(self.pins.rows, 0)
+            rows[0, n:, -1] = self.pins.residual(self.theta(at))
         return rows
 
-    def _rows(
-        self,
-        at: UnknownValues,
-        derivatives: bool,
-        central: bool | None = None,
-        step: float = SENSITIVITY_STEP,
-        every: bool = False,
-    ) -> Iterator[Rows | None]:
-        """All rows that belong to pieces, stretch by stretch; None where a simulation diverges.
 
-        every: differentiate by all of theta, what the layout does not seek too
-        """
-        plant = self.system.plant
-        sought = np.ones(len(self.system.parameters), dtype=bool) if every else self.layout.sought
-        q = int(sought.sum()) + self.free.shape[1]
-        central = self.samples * 2 * q < LARGE if central is None else central
-        sides = 1 + (q * (2 if central else 1) if derivatives else 0)
-        most = max(
-            MAX_NUMBERS_AT_ONCE
-            // (sides * self.system.grid.substeps * (1 + plant.nominal_initial_state.size)),
-            1,
+def _require_measured_starts(system: System) -> None:
+    """Raise ExperimentError where deviations of the stated initial state are asked for though the state is measured."""
+    parameters = system.parameters
+    moves_start = parameters.initial_state_derivative(system.space.nx).any(axis=0)
+    if moves_start.any():
+        name = parameters.names[int(np.argmax(moves_start))]
+        raise ExperimentError(
+            f"{system.experiment.source}: {name}: the initial state is free where fit.segments or "
+            'fit.start = "measured" is stated; remove nuisance.initial and parameters of the initial state, '
+            "or remove the settings of the fit"
         )
-        step = step if central else 0.1 * step
-        for track, batch in self._batches(most):
-            theta = self.layout.of_recording(at, track)
-            starts = np.stack([self._start(at, i) for i in batch])
-            longest = max(self.pieces[i].samples for i in batch)
-            ctrl = np.stack([self._control(i, longest) for i in batch])
-            free = self.free if derivatives else None
-            for response in plant.derivatives.responses(
-                theta,
-                starts,
-                ctrl,
-                start_directions=free,
-                central=central,
-                step=step,
-                wanted=sought,
-            ):
-                if response is None:
-                    yield None
-                    return
-                for s, i in enumerate(batch):
-                    rows = self._read(theta, i, s, response)
-                    if rows is not None:
-                        yield rows
 
-    def _batches(self, most: int) -> Iterator[tuple[int, list[int]]]:
-        """Recording whose theta they have, and places, of pieces that are simulated together; at most so many samples."""
-        if not len(self.layout.own):
-            yield from ((0, batch) for batch in groups(self.pieces, most))
-            return
-        for track in range(len(self.aligned)):
-            mine = [i for i, piece in enumerate(self.pieces) if piece.track == track]
-            for batch in groups([self.pieces[i] for i in mine], most):
-                yield track, [mine[k] for k in batch]
 
-    def _start(self, at: UnknownValues, piece: int) -> Array:
-        """(ns,) where a piece starts."""
-        space, p = self.system.space, self.system.parameters
-        if self.measured:
-            return space.plus(self.pieces[piece].start, self.free @ at.private[piece])
-        theta = np.array(at.theta)
-        theta[self.layout.private] = at.private[piece]
-        return space.plus(self.pieces[piece].start, p.initial_state_derivative(space.nx) @ theta)
+def _max_delay(parameters: ParameterSet) -> float:
+    """Largest delay of the outputs that the search may try [s]."""
+    if not parameters.delay_derivative.any():
+        return 0.0
 
-    def _control(self, piece: int, longest: int) -> Array:
-        """(longest, nu) from the piece's begin; held where the track is over."""
-        own = self.pieces[piece]
-        ctrl = self.aligned[own.track].ctrl[own.begin : own.begin + longest]
-        return np.concatenate([ctrl, np.repeat(ctrl[-1:], longest - len(ctrl), axis=0)])
+    spread = np.array([p.prior or p.scale for p in parameters.parameters])
+    latest = np.minimum(parameters.guess + MAX_DELAY_GROWTH * spread, parameters.upper)
+    return max(float(parameters.delay_derivative @ latest), 0.0)
 
-    def _read(self, theta: Array, piece: int, place: int, response: Response) -> Rows | None:
-        """What a response says of the rows of one piece that fall into its stretch; None where none does."""
-        own, p = self.pieces[piece], self.system.parameters
-        track = self.aligned[own.track]
-        late = float(p.delay_derivative @ theta) / track.dt
-        wanted = track.t[own.rows] / track.dt - own.begin - late
-        n = response.y.shape[1] - 1
-        inside = np.clip(wanted, 0.0, own.samples)
-        last = response.first + n >= own.samples
-        hit = (inside >= response.first) & ((inside < response.first + n) | last)
-        if not hit.any():
-            return None
-        rows = np.flatnonzero(hit) + own.rows.start
-        values = (response.y[place], response.common, response.private)
-        if track.even and not p.delay_derivative.any():
-            at_samples = np.rint(wanted[hit]).astype(int) - response.first
-            y, common, private = (
-                None if v is None else (v if i == 0 else v[place])[at_samples]
-                for i, v in enumerate(values)
-            )
-        else:
-            output_delay = OutputDelay.at(wanted[hit] - response.first, n + 1, track.dt)
-            y, common, private = (
-                None if v is None else output_delay.apply(v if i == 0 else v[place])
-                for i, v in enumerate(values)
-            )
-            if common is not None and p.delay_derivative.any():
-                common = (
-                    common
-                    + output_delay.derivative(response.y[place])[..., None] * p.delay_derivative
-                )
-        if y is None:
-            raise ValueError("a response without outputs")
-        return Rows(piece, rows, y, common, private)
+
+def _counted_values(recording: AlignedRecording, free_starts: bool) -> np.ndarray:
+    """(M, ny) True for the measured values that count; at a stated initial state they contain no information."""
+    mask = np.array(recording.measured)
+    if not free_starts:
+        mask[0] = False
+    return mask

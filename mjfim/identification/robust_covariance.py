@@ -1,13 +1,14 @@
-"""How far an estimate may be off where residuals are no white noise: sandwich covariance, block bootstrap, recordings apart.
+"""Uncertainty of an estimate where residuals are not white noise: sandwich covariance, block bootstrap, recordings that differ.
 
-All from the condensed blocks of the last linearisation, without a further simulation. With g_b the score of block b, H its
-information and W that of the priors, `cov = H^-1 (sum g_b g_b' + W) H^-1`; the bootstrap draws blocks with replacement and
+Everything comes from the condensed blocks of the last linearisation, without another simulation. With g_b the score of block b, H
+the information and W that of the priors, `cov = H^-1 (sum g_b g_b' + W) H^-1`. The bootstrap draws blocks with replacement and
 takes a Gauss-Newton step for each draw.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import f as fisher
@@ -17,65 +18,131 @@ from mjfim.arrays import Array, scaled_pseudo_inverse, scaled_to_unit_diagonal
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 
+# Confidence level of the intervals.
 LEVEL = 0.95
 
 # Eigenvalues of an information scaled to unit diagonal below this share of the largest one count as zero.
 INVERSE_TOLERANCE = 1e-14
 
-APART = 1e-3  # probability below which recordings disagree
-TIMES = 4.0  # a block is that many times as long as residuals hang together
-MOST_SHARE = (
-    20  # of the data that a block may take at most, inverse, so that enough of them are left
-)
-CHUNK = 200  # replicates at once
-ALONE = 1e12  # condition of a recording's information, unknowns in units of their own, that still tells all of them
-DRAWN = 1e14  # and of that of a draw
+# Probability below which recordings disagree.
+SIGNIFICANCE = 1e-3
+
+# Length of a block over the autocorrelation time of the residuals.
+LENGTH_PER_CORRELATION_TIME = 4.0
+
+# Autocorrelation time [rows] up to which residuals count as white.
+WHITE_TIME = 1.5
+
+# Smallest number of blocks that must remain, whatever the autocorrelation time.
+MIN_BLOCKS = 20
+
+# Number of bootstrap replicates that are computed at once.
+REPLICATES_AT_ONCE = 200
+
+# Condition of the scaled information of one recording above which it does not determine all unknowns.
+MAX_CONDITION_OF_RECORDING = 1e12
+
+# Condition of the scaled information of a bootstrap draw above which it does not determine all unknowns.
+MAX_CONDITION_OF_DRAW = 1e14
+
+# Smallest variance by which is divided.
+SMALLEST_VARIANCE = 1e-300
 
 
-def uncertainty(
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Blocks:
+    """Scores and information of B blocks that count as independent.
+
+    Attributes:
+        scores: (B, c) gradient of half of each block's squared residuals.
+        information: (B, c, c) information of each block.
+        prior_rows: (l, c) Jacobian of the priors.
+        recording: (B,) index of the recording.
+    """
+
+    scores: Array
+    information: Array
+    prior_rows: Array
+    recording: np.ndarray
+
+    @property
+    def prior_information(self) -> Array:
+        """(c, c) information of the priors."""
+        return np.asarray(self.prior_rows.T @ self.prior_rows)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SingleEstimates:
+    """Estimates from each of K recordings by itself.
+
+    Attributes:
+        theta: (K, c) estimates, NaN where a recording does not determine all unknowns.
+        formal_variance: (K, c) formal variances.
+        variance: (K, c) variances from the scatter of the recording's own scores, infinite where there is no estimate.
+        information: (c, c) information of the recordings with an estimate.
+        scores: (b, c) their scores, each recording's about its own mean.
+        count: Number of recordings with an estimate.
+    """
+
+    theta: Array
+    formal_variance: Array
+    variance: Array
+    information: Array
+    scores: Array
+    count: int
+
+
+def robust_uncertainty(
     condensed: Condensed,
     theta: Array,
     recording: np.ndarray,
     rows: np.ndarray,
-    together: float,
+    *,
+    min_rows: float,
     draws: int,
     rng: np.random.Generator,
 ) -> Uncertainty:
-    """Of theta: (c,), where the gradient vanishes.
+    """Uncertainty of the common unknowns at a minimum.
 
-    recording, rows: of each block;  together: rows of a block at least;  draws: bootstrap replicates
+    Args:
+        condensed: Linearisation at the minimum, where the gradient vanishes.
+        theta: (c,) values of the common unknowns.
+        recording: (b,) index of the recording of every block of the linearisation, ascending.
+        rows: (b,) number of rows of every block.
+        min_rows: Smallest number of rows of the longer blocks that count as independent.
+        draws: Number of bootstrap replicates.
+        rng: Random generator of the bootstrap.
+
+    Returns:
+        The uncertainty.
     """
-    merged = merge(recording, rows, together)
-    count = int(merged.max(initial=-1)) + 1
-    c = condensed.common_count
-    scores, grams = np.zeros((count, c)), np.zeros((count, c, c))
-    np.add.at(scores, merged, condensed.block_scores)
-    np.add.at(grams, merged, condensed.block_information)
+    # Blocks long enough to be independent.
+    label = merge_blocks(recording, rows, min_rows)
     known = condensed.reduced_private_rows
-    prior = np.concatenate([condensed.common_rows, known.reshape(-1, c + 1)])[:, :-1]
-    H = grams.sum(axis=0) + prior.T @ prior
+    blocks = _merged(condensed, label, recording, known)
+    count = len(blocks.scores)
+
+    # Sandwich and formal covariance.
+    H = blocks.information.sum(axis=0) + blocks.prior_information
     inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
-    about = scores - scores.mean(axis=0)
-    S = about.T @ about * (count / max(count - 1, 1)) + prior.T @ prior
+    centred = blocks.scores - blocks.scores.mean(axis=0)
+    S = centred.T @ centred * (count / max(count - 1, 1)) + blocks.prior_information
     sandwich = np.sqrt(np.maximum(np.diag(inverse @ S @ inverse), 0.0))
     formal = np.sqrt(np.maximum(np.diag(inverse), 0.0))
-    replicates = _bootstrap(scores, grams, prior, draws, rng)
-    kept = merged_owner(recording, merged, count)
-    owners = np.zeros(condensed.segment_count, dtype=int)
-    owners[condensed.segment_of_block] = recording
-    each, between, apart = _recordings(
-        theta, scores, grams, kept, [known[owners == k] for k in range(kept.max() + 1)]
-    )
-    wide = float(student.ppf(0.5 + LEVEL / 2.0, max(count - 1, 1)))
-    normal = float(student.ppf(0.5 + LEVEL / 2.0, 1e9))
-    half = np.maximum(normal * np.hypot(formal, between), wide * np.hypot(sandwich, between))
-    low, high = theta - half, theta + half
-    if len(replicates):
-        tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, 0.5 + LEVEL / 2.0], axis=0)
-        low, high = np.minimum(low, theta + tails[0]), np.maximum(high, theta + tails[1])
+
+    replicates = _bootstrap(blocks, draws, rng)
+
+    # Each recording with the priors on its own private unknowns.
+    recording_of_segment = np.zeros(condensed.segment_count, dtype=int)
+    recording_of_segment[condensed.segment_of_block] = recording
+    recordings = range(int(blocks.recording.max()) + 1)
+    priors = [known[recording_of_segment == k] for k in recordings]
+    each, between, apart = _compare_recordings(theta, blocks, priors)
+
+    interval = _interval(theta, formal, sandwich, between, replicates, count)
     return Uncertainty(
         sandwich=sandwich,
-        interval=np.column_stack([low, high]),
+        interval=interval,
         between=between,
         apart=apart,
         each=each,
@@ -84,103 +151,227 @@ def uncertainty(
     )
 
 
-def together(times: Sequence[float], total: int) -> float:
-    """Rows of a block from those over which the residuals of each output hang together. total: of all rows"""
-    longest = max(times, default=1.0)
-    return min(TIMES * longest if longest > 1.5 else 1.0, max(total / MOST_SHARE, 1.0))
-
-
-def merge(recording: np.ndarray, rows: np.ndarray, together: float) -> np.ndarray:
-    """(B,) number of the longer block to which each block belongs: runs of one recording with at least so many rows.
-
-    The last of a recording has at least half as many, if the recording has.  recording: (B,) ascending
-    """
-    out, label, filled = np.zeros(len(rows), dtype=int), -1, np.inf
-    left = np.cumsum(rows[::-1])[::-1]  # from a block to the end of all
-    ends = np.append(left, 0.0)[np.searchsorted(recording, recording, side="right")]
-    for b in range(len(rows)):
-        new = b == 0 or recording[b] != recording[b - 1]
-        if new or (filled >= together and left[b] - ends[b] >= 0.5 * together):
-            label, filled = label + 1, 0.0
-        out[b] = label
-        filled += rows[b]
-    return out
-
-
-def merged_owner(recording: np.ndarray, merged: np.ndarray, count: int) -> np.ndarray:
-    """(count,) recording of every longer block."""
-    owner = np.zeros(count, dtype=int)
-    owner[merged] = recording
-    return owner
-
-
-def _bootstrap(
-    scores: Array, grams: Array, prior: Array, draws: int, rng: np.random.Generator
+def _interval(
+    theta: Array,
+    formal: Array,
+    sandwich: Array,
+    between: Array,
+    replicates: Array,
+    count: int,
 ) -> Array:
-    """(n, c) Gauss-Newton steps to the estimates of drawn blocks; draws that do not tell everything are left out."""
-    count, c = scores.shape
-    known = prior.T @ prior
-    found = []
-    for first in range(0, draws, CHUNK):
-        n = min(CHUNK, draws - first)
-        weights = rng.multinomial(count, np.full(count, 1.0 / count), size=n).astype(np.float64)
-        H = np.tensordot(weights, grams, axes=1) + known
-        g = weights @ scores - scores.sum(axis=0) + rng.standard_normal((n, len(prior))) @ prior
-        usable = _condition(H) < DRAWN
-        found.append(-np.linalg.solve(H[usable], g[usable][..., None])[..., 0])
-    return np.concatenate(found) if found else np.zeros((0, c))
+    """(c, 2) hull of the formal interval, of the sandwich interval from `count` blocks, and of the bootstrap interval."""
+    upper_tail = 0.5 + LEVEL / 2.0
+    student_quantile = float(student.ppf(upper_tail, max(count - 1, 1)))
+    normal_quantile = float(student.ppf(upper_tail, 1e9))
+
+    half_width = np.maximum(
+        normal_quantile * np.hypot(formal, between),
+        student_quantile * np.hypot(sandwich, between),
+    )
+    low = theta - half_width
+    high = theta + half_width
+
+    if len(replicates):
+        tails = np.quantile(replicates, [0.5 - LEVEL / 2.0, upper_tail], axis=0)
+        low = np.minimum(low, theta + tails[0])
+        high = np.maximum(high, theta + tails[1])
+    return np.column_stack([low, high])
 
 
-def _recordings(
-    theta: Array, scores: Array, grams: Array, owner: np.ndarray, known: Sequence[Array]
-) -> tuple[Array, Array, tuple[int, ...]]:
-    """What each recording alone says, and how much they differ beyond their own scatter (DerSimonian & Laird 1986).
+def block_length(correlation_rows: Sequence[float], rows: int) -> float:
+    """Number of rows of a block that counts as independent.
 
-    Its scatter is what its own blocks say, or those of all together if that is more: few blocks often scatter little by chance.
-    known: rows of what is known before of each recording's start
+    Args:
+        correlation_rows: Autocorrelation time of the residuals of every output [rows].
+        rows: Number of all rows.
+
+    Returns:
+        Four autocorrelation times, one row for white noise; at most a twentieth of the rows.
     """
-    c, count = len(theta), len(known)
-    each, variance = np.full((count, c), np.nan), np.full((count, c), np.inf)
-    formal, total, within = np.ones((count, c)), np.zeros((c, c)), [np.zeros((0, c))]
-    for k in range(count):
-        mine = owner == k
-        rows = known[k].reshape(-1, c + 1)
-        H = grams[mine].sum(axis=0) + rows[:, :-1].T @ rows[:, :-1]
-        g = scores[mine].sum(axis=0) + rows[:, :-1].T @ rows[:, -1]
-        if _condition(H) > ALONE:
+    longest = max(correlation_rows, default=1.0)
+    wanted = LENGTH_PER_CORRELATION_TIME * longest if longest > WHITE_TIME else 1.0
+    return min(wanted, max(rows / MIN_BLOCKS, 1.0))
+
+
+def merge_blocks(recording: np.ndarray, rows: np.ndarray, min_rows: float) -> np.ndarray:
+    """Merge blocks to longer ones: consecutive blocks of one recording with enough rows together.
+
+    The last one of a recording has at least half of the rows that are wanted, if the recording has them.
+
+    Args:
+        recording: (b,) index of the recording of every block, ascending.
+        rows: (b,) number of rows of every block.
+        min_rows: Smallest number of rows of a longer block.
+
+    Returns:
+        (b,) number of the longer block to which each block belongs.
+    """
+    # Rows from each block to the end of its recording.
+    to_end = np.cumsum(rows[::-1])[::-1]
+    after_recording = np.searchsorted(recording, recording, side="right")
+    left_in_recording = to_end - np.append(to_end, 0.0)[after_recording]
+
+    numbers = np.zeros(len(rows), dtype=int)
+    number = -1
+    filled = 0.0
+    for b in range(len(rows)):
+        is_new_recording = b == 0 or recording[b] != recording[b - 1]
+        is_full = filled >= min_rows and left_in_recording[b] >= 0.5 * min_rows
+        if is_new_recording or is_full:
+            number += 1
+            filled = 0.0
+        numbers[b] = number
+        filled += rows[b]
+    return numbers
+
+
+def _merged(
+    condensed: Condensed, label: np.ndarray, recording: np.ndarray, known: Array
+) -> _Blocks:
+    """Sum the blocks of a linearisation by the longer block to which they belong: label: (b,).
+
+    Args:
+        condensed: The linearisation.
+        label: (b,) number of the longer block.
+        recording: (b,) index of the recording.
+        known: (P, k, c+1) rows of the priors on private unknowns, as rows of the common ones.
+    """
+    count = int(label.max(initial=-1)) + 1
+    c = condensed.common_count
+
+    scores = np.zeros((count, c))
+    information = np.zeros((count, c, c))
+    np.add.at(scores, label, condensed.block_scores)
+    np.add.at(information, label, condensed.block_information)
+
+    recording_of_label = np.zeros(count, dtype=int)
+    recording_of_label[label] = recording
+    prior_rows = np.concatenate([condensed.common_rows, known.reshape(-1, c + 1)])[:, :-1]
+    return _Blocks(
+        scores=scores,
+        information=information,
+        prior_rows=prior_rows,
+        recording=recording_of_label,
+    )
+
+
+def _bootstrap(blocks: _Blocks, draws: int, rng: np.random.Generator) -> Array:
+    """(n, c) Gauss-Newton steps to the estimates from drawn blocks; draws that do not determine all unknowns are left out."""
+    count, c = blocks.scores.shape
+    total = blocks.scores.sum(axis=0)
+    prior_information = blocks.prior_information
+    probabilities = np.full(count, 1.0 / count)
+
+    steps = []
+    for first in range(0, draws, REPLICATES_AT_ONCE):
+        n = min(REPLICATES_AT_ONCE, draws - first)
+        weights = rng.multinomial(count, probabilities, size=n).astype(np.float64)
+        H = np.tensordot(weights, blocks.information, axes=1) + prior_information
+
+        # Priors are drawn as well, from their normal distribution.
+        prior_noise = rng.standard_normal((n, len(blocks.prior_rows)))
+        g = weights @ blocks.scores - total + prior_noise @ blocks.prior_rows
+
+        usable = _condition(H) < MAX_CONDITION_OF_DRAW
+        steps.append(-np.linalg.solve(H[usable], g[usable][..., None])[..., 0])
+    return np.concatenate(steps) if steps else np.zeros((0, c))
+
+
+def _compare_recordings(
+    theta: Array, blocks: _Blocks, priors: Sequence[Array]
+) -> tuple[Array, Array, tuple[int, ...]]:
+    """Estimates from each recording by itself, and how much they differ beyond their scatter (DerSimonian & Laird 1986).
+
+    Args:
+        theta: (c,) estimate from all recordings.
+        blocks: Blocks of all recordings.
+        priors: (P_k, k, c+1) rows of the priors on the private unknowns of every recording.
+
+    Returns:
+        (K, c) estimates, (c,) standard deviations between recordings, and the indices of unknowns on which they disagree.
+    """
+    single = _single_estimates(theta, blocks, priors)
+
+    # The scatter within a recording is at least that of all together: few blocks often scatter little by chance.
+    inflation, freedom = _inflation(single)
+    variance = np.maximum(single.variance, single.formal_variance * inflation)
+
+    between = np.zeros(len(theta))
+    apart = []
+    for j in range(len(theta)):
+        estimated = np.isfinite(single.theta[:, j])
+        if estimated.sum() < 2:
             continue
-        inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
-        # at its own estimate: what sets recordings apart is no scatter
-        own = scores[mine] - grams[mine] @ (inverse @ g)
-        own = own - own.mean(axis=0)
-        each[k], formal[k] = theta - inverse @ g, np.diag(inverse)
-        variance[k] = np.diag(inverse @ own.T @ own @ inverse) * len(own) / max(len(own) - 1, 1)
-        total += H
-        within.append(own)
-    inflation, free = _inflation(total, np.concatenate(within), len(within) - 1)
-    variance = np.maximum(variance, formal * inflation)
-    between, apart = np.zeros(c), []
-    for j in range(c):
-        some = np.isfinite(each[:, j])
-        if some.sum() < 2:
-            continue
-        y, w = each[some, j], 1.0 / variance[some, j]
-        spread, others = float(np.sum(w * (y - np.sum(w * y) / w.sum()) ** 2)), int(some.sum()) - 1
-        if fisher.sf(spread / others, others, free) < APART:
+
+        # Weighted scatter of the estimates against what their variances explain.
+        y = single.theta[estimated, j]
+        w = 1.0 / variance[estimated, j]
+        mean = np.sum(w * y) / w.sum()
+        scatter = float(np.sum(w * (y - mean) ** 2))
+        others = int(estimated.sum()) - 1
+        if fisher.sf(scatter / others, others, freedom) < SIGNIFICANCE:
             apart.append(j)
-            between[j] = np.sqrt(max(spread - others, 0.0) / (w.sum() - np.sum(w**2) / w.sum()))
-    return each, between, tuple(apart)
+            excess = max(scatter - others, 0.0)
+            between[j] = np.sqrt(excess / (w.sum() - np.sum(w**2) / w.sum()))
+    return single.theta, between, tuple(apart)
 
 
-def _inflation(H: Array, scores: Array, recordings: int) -> tuple[Array, int]:
-    """(c,) variances from the scatter of scores within recordings over formal ones, at least 1; its degrees of freedom."""
-    free = max(len(scores) - recordings, 1)
-    inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
-    S = scores.T @ scores * (len(scores) / free)
-    formal = np.maximum(np.diag(inverse), 1e-300)
-    return np.asarray(np.maximum(np.diag(inverse @ S @ inverse) / formal, 1.0)), free
+def _single_estimates(theta: Array, blocks: _Blocks, priors: Sequence[Array]) -> _SingleEstimates:
+    """Estimates from each recording by itself, one Gauss-Newton step away from theta: (c,)."""
+    c = len(theta)
+    count = len(priors)
+    each = np.full((count, c), np.nan)
+    variance = np.full((count, c), np.inf)
+    formal = np.ones((count, c))
+    total = np.zeros((c, c))
+    centred_scores = [np.zeros((0, c))]
+
+    for k in range(count):
+        mine = blocks.recording == k
+        scores = blocks.scores[mine]
+        information = blocks.information[mine]
+        rows = priors[k].reshape(-1, c + 1)
+        H = information.sum(axis=0) + rows[:, :-1].T @ rows[:, :-1]
+        g = scores.sum(axis=0) + rows[:, :-1].T @ rows[:, -1]
+        if _condition(H) > MAX_CONDITION_OF_RECORDING:
+            continue
+
+        inverse = scaled_pseudo_inverse(H, INVERSE_TOLERANCE)
+        step = -inverse @ g
+        each[k] = theta + step
+        formal[k] = np.diag(inverse)
+
+        # Scores at the recording's own estimate: differences between recordings are not scatter within one.
+        own = scores + information @ step
+        own = own - own.mean(axis=0)
+        scatter = own.T @ own * (len(own) / max(len(own) - 1, 1))
+        variance[k] = np.diag(inverse @ scatter @ inverse)
+        total += H
+        centred_scores.append(own)
+
+    return _SingleEstimates(
+        theta=each,
+        formal_variance=formal,
+        variance=variance,
+        information=total,
+        scores=np.concatenate(centred_scores),
+        count=len(centred_scores) - 1,
+    )
+
+
+def _inflation(single: _SingleEstimates) -> tuple[Array, int]:
+    """(c,) variances from the scatter within recordings over formal ones, at least 1, and their degrees of freedom."""
+    scores = single.scores
+    freedom = max(len(scores) - single.count, 1)
+    inverse = scaled_pseudo_inverse(single.information, INVERSE_TOLERANCE)
+    S = scores.T @ scores * (len(scores) / freedom)
+
+    formal = np.maximum(np.diag(inverse), SMALLEST_VARIANCE)
+    ratio = np.diag(inverse @ S @ inverse) / formal
+    return np.asarray(np.maximum(ratio, 1.0)), freedom
 
 
 def _condition(H: Array) -> Array:
-    """(...) condition of informations: (..., c, c), independent of the units of the unknowns."""
-    return np.asarray(np.linalg.cond(scaled_to_unit_diagonal(H)[0]))
+    """(...) condition numbers of information matrices: (..., c, c), independent of the units of the unknowns."""
+    scaled, _ = scaled_to_unit_diagonal(H)
+    return np.asarray(np.linalg.cond(scaled))

@@ -1,7 +1,7 @@
-"""Recordings cut into pieces that are simulated on their own, and where each of them starts.
+"""Segments of recordings for multiple shooting, and the initial state of each one.
 
-A rollout over a whole recording amplifies what the model cannot know (chaos, slip, a shove); pieces of a few time constants with
-starts of their own do not. What is between two pieces, a jump of the state, is left free.
+A simulation over a whole recording amplifies what the model cannot know: chaos, slip, a push. Segments of a few time constants
+with initial states of their own do not. The state may jump from one segment to the next.
 """
 
 from __future__ import annotations
@@ -14,150 +14,250 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
-from mjfim.identification.aligned_recording import AlignedRecording
+from mjfim.identification.aligned_recording import EDGE_TOLERANCE, AlignedRecording
 from mjfim.plant.outputs import outputs_by_state
 
-NEAR = 12  # rows to either side from which a start is read off
-FEWEST = 4  # samples of a piece
-ALIKE = 1.1  # ratio of lengths up to which pieces share a batch
+# Number of measured rows before and after a time through which a polynomial is fitted to find a state.
+ROWS_PER_SIDE = 12
+
+# Smallest number of samples of a segment.
+MIN_SAMPLES = 4
+
+# Largest ratio of the lengths of segments that are simulated in one batch.
+MAX_LENGTH_RATIO = 1.1
+
+# Smallest time [s] to which times around a segment's begin are scaled.
+SMALLEST_TIME = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Segment:
-    """A run of samples of one track. track: its place;  begin: first sample;  samples: of the grid
+    """Consecutive samples of one recording that are simulated from an initial state of their own.
 
-    rows: of the track that belong to it;  start: (ns,) state at its begin, where the search starts
+    Attributes:
+        recording: Index of the recording.
+        begin: Sample of the recording at which the simulation begins.
+        samples: Number of samples.
+        rows: Rows of the recording that are compared with this segment.
+        start: (ns,) state at the begin, from which the search starts.
     """
 
-    track: int
+    recording: int
     begin: int
     samples: int
     rows: slice
     start: Array
 
 
-def whole(tracks: Sequence[AlignedRecording], start: Array) -> tuple[Segment, ...]:
-    """Every track one piece from the stated start: (ns,)."""
+def whole_recordings(recordings: Sequence[AlignedRecording], start: Array) -> tuple[Segment, ...]:
+    """One segment for every recording, which begins at the stated initial state.
+
+    Args:
+        recordings: The recordings.
+        start: (ns,) initial state.
+
+    Returns:
+        The segments.
+    """
     return tuple(
-        Segment(i, 0, len(t.ctrl), slice(0, len(t.t)), start) for i, t in enumerate(tracks)
+        Segment(
+            recording=i,
+            begin=0,
+            samples=len(recording.ctrl),
+            rows=slice(0, len(recording.t)),
+            start=start,
+        )
+        for i, recording in enumerate(recordings)
     )
 
 
-def cut(
-    system: System, tracks: Sequence[AlignedRecording], length: float | None, lead: float
+def cut_into_segments(
+    system: System, recordings: Sequence[AlignedRecording], length: float | None, lead: float
 ) -> tuple[Segment, ...]:
-    """Pieces of a length [s], None: whole tracks, each with the start that the data show.
+    """Cut recordings into segments, each with the initial state that the measured values show.
 
-    lead: [s] by which a piece is simulated before its first row, the longest delay of the outputs
+    Args:
+        system: System that was recorded.
+        recordings: The recordings.
+        length: Length of a segment [s]; None: one segment per recording.
+        lead: Time by which a segment is simulated before its first row, the largest delay of the outputs [s].
+
+    Returns:
+        The segments; parts of a recording without any row have none.
+
+    Raises:
+        RecordingError: The length is too short.
     """
-    found = []
-    for i, track in enumerate(tracks):
-        bounds = _bounds(track, length)
-        ahead = int(np.ceil(lead / track.dt - 1e-9))
-        begins = [max(int(b) - ahead, 0) for b in bounds[:-1]]
-        starts = measured_starts(system, track, np.array(begins))
-        edges = np.searchsorted(track.t, bounds * track.dt - 1e-9 * track.dt)
-        edges[-1] = len(track.t)
-        for begin, end, first, last, start in zip(
-            begins, bounds[1:], edges[:-1], edges[1:], starts, strict=True
-        ):
-            if last > first:
-                found.append(
-                    Segment(i, begin, int(end) - begin, slice(int(first), int(last)), start)
+    segments = []
+    for i, recording in enumerate(recordings):
+        bounds = _segment_bounds(recording, length)
+
+        # The simulation of a segment begins earlier than its rows by the delay of the outputs.
+        lead_samples = int(np.ceil(lead / recording.dt - 1e-9))
+        begins = np.maximum(bounds[:-1] - lead_samples, 0)
+        starts = measured_initial_states(system, recording, begins)
+
+        # Rows on a bound belong to the segment that begins there.
+        times = bounds * recording.dt - EDGE_TOLERANCE * recording.dt
+        row_bounds = np.searchsorted(recording.t, times)
+        row_bounds[-1] = len(recording.t)
+
+        for k, begin in enumerate(begins.tolist()):
+            first, last = int(row_bounds[k]), int(row_bounds[k + 1])
+            if last <= first:
+                continue
+            segments.append(
+                Segment(
+                    recording=i,
+                    begin=begin,
+                    samples=int(bounds[k + 1]) - begin,
+                    rows=slice(first, last),
+                    start=starts[k],
                 )
-    return tuple(found)
+            )
+    return tuple(segments)
 
 
-def _bounds(track: AlignedRecording, length: float | None) -> np.ndarray:
-    """Samples at which pieces begin, and the end; all of nearly the same length."""
-    N = len(track.ctrl)
+def _segment_bounds(recording: AlignedRecording, length: float | None) -> np.ndarray:
+    """Samples at which segments of nearly equal length [s] begin, and the last sample."""
+    N = len(recording.ctrl)
     if length is None:
         return np.array([0, N])
-    count = max(round(N * track.dt / length), 1)
-    if N // count < FEWEST:
+
+    count = max(round(N * recording.dt / length), 1)
+    if N // count < MIN_SAMPLES:
         raise RecordingError(
-            f"{track.name}: fit.segments = {length:g} s is too short: pieces need at least {FEWEST} samples of {track.dt:g} s"
+            f"{recording.name}: fit.segments = {length:g} s is too short; "
+            f"a segment needs at least {MIN_SAMPLES} samples of {recording.dt:g} s"
         )
     return np.linspace(0, N, count + 1).astype(int)
 
 
-def measured_starts(system: System, track: AlignedRecording, begins: np.ndarray) -> Array:
-    """(n, ns) states at samples: what the log shows; what it does not show, as the model at the guess goes.
+def measured_initial_states(
+    system: System, recording: AlignedRecording, begins: np.ndarray
+) -> Array:
+    """States at some samples according to the measured values.
 
-    A line through position and velocity of the rows around, a parabola where velocities were not measured.
+    Positions and velocities come from a polynomial through the rows nearby: a line through measured velocities, a parabola
+    through positions. Components that were not measured follow the model at the guess.
+
+    Args:
+        system: System that was recorded.
+        recording: The recording.
+        begins: (n,) samples of the recording.
+
+    Returns:
+        (n, ns) states.
     """
-    states = _nominal(system, track, begins)
-    place = _shown(system, track)
     space = system.space
-    quaternion = {a for q, _ in space.quaternions for a in range(q, q + 4)}
-    velocity = dict(zip(space.scalar_q.tolist(), (space.nq + space.scalar_v).tolist(), strict=True))
+    states = _nominal_states(system, recording, begins)
+    output_of = _measured_states(system, recording)
+
+    quaternion_components = {a for q, _ in space.quaternions for a in range(q, q + 4)}
+    velocity_addresses = (space.nq + space.scalar_v).tolist()
+    velocity_of = dict(zip(space.scalar_q.tolist(), velocity_addresses, strict=True))
+
     for k, begin in enumerate(begins):
-        t0 = begin * track.dt
+        t0 = begin * recording.dt
+
+        # Positions, and velocities as their slopes.
         for q in range(space.nq):
-            if q in place and q not in quaternion:
-                states[k, q], states[k, velocity[q]] = _local(track, place[q], t0, 2)
+            if q in output_of and q not in quaternion_components:
+                value, slope = _local_fit(recording, output_of[q], t0, degree=2)
+                states[k, q] = value
+                states[k, velocity_of[q]] = slope
+
+        # Measured velocities replace the slopes of positions.
         for v in range(space.nq, space.nq + space.nv):
-            if v in place:
-                states[k, v] = _local(track, place[v], t0, 1)[0]
+            if v in output_of:
+                states[k, v], _ = _local_fit(recording, output_of[v], t0, degree=1)
+
+        # Quaternions cannot be averaged componentwise; the nearest one is taken.
         for q, _ in space.quaternions:
-            if all(a in place for a in range(q, q + 4)):
-                nearest = _nearest(track, [place[a] for a in range(q, q + 4)], t0)
+            components = range(q, q + 4)
+            if all(a in output_of for a in components):
+                nearest = _nearest_values(recording, [output_of[a] for a in components], t0)
                 states[k, q : q + 4] = nearest / np.linalg.norm(nearest)
     return states
 
 
-def _local(track: AlignedRecording, column: int, t0: float, degree: int) -> tuple[float, float]:
-    """Value and slope at t0 of a polynomial through the rows around that hold a value of a column."""
-    seen = track.seen[column]
-    middle = int(np.searchsorted(seen, np.searchsorted(track.t, t0)))
-    rows = seen[max(middle - NEAR, 0) : middle + NEAR]
-    s, y = track.t[rows] - t0, track.y[rows, column]
+def _local_fit(
+    recording: AlignedRecording, column: int, t0: float, degree: int
+) -> tuple[float, float]:
+    """Value and slope at time t0 [s] of a polynomial through the measured values of an output nearby."""
+    measured = recording.measured_rows[column]
+    middle = int(np.searchsorted(measured, np.searchsorted(recording.t, t0)))
+    rows = measured[max(middle - ROWS_PER_SIDE, 0) : middle + ROWS_PER_SIDE]
+
+    since = recording.t[rows] - t0
+    y = recording.y[rows, column]
     if len(rows) <= degree:
         return float(y.mean()), 0.0
-    unit = max(float(np.abs(s).max()), 1e-12)
-    fitted = np.polynomial.polynomial.polyfit(s / unit, y, degree)
-    return float(fitted[0]), float(fitted[1] / unit)
+
+    # Times are scaled to [-1, 1], so that the fit is well conditioned.
+    unit = max(float(np.abs(since).max()), SMALLEST_TIME)
+    coefficients = np.polynomial.polynomial.polyfit(since / unit, y, degree)
+    return float(coefficients[0]), float(coefficients[1] / unit)
 
 
-def _nearest(track: AlignedRecording, columns: Sequence[int], t0: float) -> Array:
-    """The measured values of some columns nearest to t0."""
-    seen = track.seen[columns[0]]  # components of one quaternion are measured together
-    after = int(np.clip(np.searchsorted(seen, np.searchsorted(track.t, t0)), 0, len(seen) - 1))
-    near = min((seen[max(after - 1, 0)], seen[after]), key=lambda row: abs(track.t[row] - t0))
-    return np.asarray(track.y[near][list(columns)])
+def _nearest_values(recording: AlignedRecording, columns: Sequence[int], t0: float) -> Array:
+    """Measured values of some outputs in the row nearest to time t0 [s]."""
+    # Components of one quaternion are measured together.
+    measured = recording.measured_rows[columns[0]]
+    after = int(np.searchsorted(measured, np.searchsorted(recording.t, t0)))
+    after = int(np.clip(after, 0, len(measured) - 1))
+
+    candidates = (measured[max(after - 1, 0)], measured[after])
+    nearest = min(candidates, key=lambda row: abs(recording.t[row] - t0))
+    return np.asarray(recording.y[nearest][list(columns)])
 
 
-def _nominal(system: System, track: AlignedRecording, begins: np.ndarray) -> Array:
-    """(n, ns) states of the model at the guess from the stated start; the start itself where that diverges."""
+def _nominal_states(system: System, recording: AlignedRecording, begins: np.ndarray) -> Array:
+    """(n, ns) states of the model at the guess from the stated start; that start itself where the model diverges."""
     start = system.plant.initial_state(system.parameters.guess)
-    out = np.tile(start, (len(begins), 1))
-    if set(_shown(system, track)).issuperset(range(len(start))) or not begins.any():
-        return out
+    states = np.tile(start, (len(begins), 1))
+
+    # Nothing needs to be simulated where the whole state is measured or only the start is asked for.
+    measured = set(_measured_states(system, recording))
+    if measured.issuperset(range(len(start))) or not begins.any():
+        return states
+
     model = system.plant.model(system.parameters.guess)
-    rolled = system.plant.simulator.rollout(
-        [model], start[None], track.ctrl[None, : int(begins.max())]
-    )
-    return np.array(rolled.states[0][begins]) if rolled.finite[0] else out
+    ctrl = recording.ctrl[None, : int(begins.max())]
+    simulated = system.plant.simulator.rollout([model], start[None], ctrl)
+    return np.array(simulated.states[0][begins]) if simulated.finite[0] else states
 
 
-def _shown(system: System, track: AlignedRecording) -> dict[int, int]:
-    """Output that shows a component of the state, by its address, where the track has values of it."""
+def _measured_states(system: System, recording: AlignedRecording) -> dict[int, int]:
+    """Output that measures a component of the state, by the component's address, where the recording has values of it."""
+    outputs = outputs_by_state(system.model, system.outputs)
     return {
-        state: i
-        for state, i in outputs_by_state(system.model, system.outputs).items()
-        if len(track.seen[i])
+        state: output for state, output in outputs.items() if len(recording.measured_rows[output])
     }
 
 
-def groups(pieces: Sequence[Segment], most: int) -> Iterator[list[int]]:
-    """Places of pieces that are simulated in one batch: of like length, together at most so many samples."""
-    order = sorted(range(len(pieces)), key=lambda i: pieces[i].samples)
+def batches(segments: Sequence[Segment], max_samples: int) -> Iterator[list[int]]:
+    """Group segments of similar length for simulation in one batch.
+
+    Args:
+        segments: The segments.
+        max_samples: Largest number of samples of a batch; a longer segment makes a batch by itself.
+
+    Yields:
+        Indices of the segments of a batch.
+    """
+    order = sorted(range(len(segments)), key=lambda i: segments[i].samples)
     batch: list[int] = []
     for i in order:
-        longer = batch and pieces[i].samples > ALIKE * pieces[batch[0]].samples
-        if batch and (longer or (len(batch) + 1) * pieces[i].samples > most):
-            yield batch
-            batch = []
+        samples = segments[i].samples
+        if batch:
+            # Shorter segments are simulated as long as the longest one of their batch.
+            too_long = samples > MAX_LENGTH_RATIO * segments[batch[0]].samples
+            too_many = (len(batch) + 1) * samples > max_samples
+            if too_long or too_many:
+                yield batch
+                batch = []
         batch.append(i)
+
     if batch:
         yield batch

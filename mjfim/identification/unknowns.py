@@ -1,7 +1,7 @@
-"""Which unknowns a fit has: what all recordings share, what each recording has of its own, what each start deviates by.
+"""Layout of the unknowns of a fit: shared by all recordings, of each recording, or private to each segment.
 
-The common columns of `condensed` are the shared parameters, then those of the first recording, of the second, and so on;
-deviations of starts are the private ones.
+The common columns of a linearisation are the shared parameters, then those of the first recording, of the second, and so on.
+Deviations of initial states are the private unknowns of segments.
 """
 
 from __future__ import annotations
@@ -16,119 +16,179 @@ from mjfim.optimize.condensed_least_squares import Step
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class UnknownLayout:
-    """shared: (s,), own: (e,), private: (n,) places in theta;  recordings: K;  c = s + K e common columns
+    """Positions of the p parameters among the c = s + K e common and the n private unknowns.
 
-    lower, upper: (c,);  free: the start is private as a whole, and theta holds none of it
+    Attributes:
+        parameters: The p parameters.
+        shared: (s,) indices in theta of the parameters that all recordings share.
+        per_recording: (e,) indices in theta of the parameters that each recording has for itself.
+        private: (n,) indices in theta of the nuisance deviations of the initial state.
+        recordings: Number of recordings K.
+        lower: (c,) lower bounds of the common unknowns [theta-unit].
+        upper: (c,) upper bounds of the common unknowns [theta-unit].
+        free_starts: True where the whole initial state of every segment is private, and theta holds none of it.
     """
 
     parameters: ParameterSet
     shared: np.ndarray
-    own: np.ndarray
+    per_recording: np.ndarray
     private: np.ndarray
     recordings: int
     lower: Array
     upper: Array
-    free: bool
+    free_starts: bool
 
     @staticmethod
-    def of(parameters: ParameterSet, recordings: int, free: bool, bounded: bool) -> UnknownLayout:
-        """free: starts are measured;  bounded: False: without bounds"""
-        p = parameters
-        own = p.recording_specific & ~p.initial_deviations
-        shared, each = np.flatnonzero(~p.recording_specific), np.flatnonzero(own)
-        places = np.concatenate([shared, np.tile(each, recordings)])
-        lower, upper = p.lower[places], p.upper[places]
-        found = UnknownLayout(
-            p, shared, each, np.flatnonzero(p.initial_deviations), recordings, lower, upper, free
+    def of(
+        parameters: ParameterSet, recordings: int, *, free_starts: bool, bounded: bool
+    ) -> UnknownLayout:
+        """The layout of the unknowns of a fit.
+
+        Args:
+            parameters: The parameters.
+            recordings: Number of recordings.
+            free_starts: Whether initial states are measured and then free.
+            bounded: Whether the parameters have bounds.
+
+        Returns:
+            The layout.
+        """
+        is_per_recording = parameters.recording_specific & ~parameters.initial_deviations
+        shared = np.flatnonzero(~parameters.recording_specific)
+        per_recording = np.flatnonzero(is_per_recording)
+
+        columns = np.concatenate([shared, np.tile(per_recording, recordings)])
+        layout = UnknownLayout(
+            parameters=parameters,
+            shared=shared,
+            per_recording=per_recording,
+            private=np.flatnonzero(parameters.initial_deviations),
+            recordings=recordings,
+            lower=parameters.lower[columns],
+            upper=parameters.upper[columns],
+            free_starts=free_starts,
         )
-        return found if bounded else found.unbounded()
+        return layout if bounded else layout.unbounded()
 
     def unbounded(self) -> UnknownLayout:
-        """The same without bounds."""
+        """This layout without bounds."""
+        infinite = np.full(self.column_count, np.inf)
+        return replace(self, lower=-infinite, upper=infinite)
+
+    def without_shared(self) -> UnknownLayout:
+        """This layout with the shared parameters held, so that they have no columns."""
+        count = len(self.shared)
         return replace(
-            self, lower=np.full(self.columns, -np.inf), upper=np.full(self.columns, np.inf)
+            self, shared=self.shared[:0], lower=self.lower[count:], upper=self.upper[count:]
         )
 
-    def frozen(self) -> UnknownLayout:
-        """The same with the shared parameters staying as they are."""
-        s = len(self.shared)
-        return replace(self, shared=self.shared[:0], lower=self.lower[s:], upper=self.upper[s:])
+    @property
+    def column_count(self) -> int:
+        """Number of common unknowns c."""
+        return len(self.shared) + self.recordings * len(self.per_recording)
 
     @property
-    def columns(self) -> int:
-        """c, the number of common unknowns."""
-        return len(self.shared) + self.recordings * len(self.own)
+    def parameter_of_column(self) -> np.ndarray:
+        """(c,) index in theta of every common column."""
+        return np.concatenate([self.shared, np.tile(self.per_recording, self.recordings)])
 
     @property
-    def places(self) -> np.ndarray:
-        """(c,) place in theta of every common column."""
-        return np.concatenate([self.shared, np.tile(self.own, self.recordings)])
+    def first_columns(self) -> np.ndarray:
+        """(s+e,) common columns of the shared parameters and of those of the first recording."""
+        return np.arange(len(self.shared) + len(self.per_recording))
 
     @property
-    def first(self) -> np.ndarray:
-        """Common columns of the shared parameters and of the first recording's own."""
-        return np.arange(len(self.shared) + len(self.own))
-
-    @property
-    def sought(self) -> np.ndarray:
+    def estimated(self) -> np.ndarray:
         """(p,) True for the parameters that have common columns."""
         mask = np.zeros(len(self.parameters), dtype=bool)
-        mask[self.places] = True
+        mask[self.parameter_of_column] = True
         return mask
 
-    def begin(self, theta: Array, pieces: int, width: int) -> UnknownValues:
-        """At theta: (p,), every one of some pieces with a start of some width as stated or measured."""
+    def begin(self, theta: Array, segments: int, width: int) -> UnknownValues:
+        """Unknowns at given parameters, with the initial state of every segment as stated or measured.
+
+        Args:
+            theta: (p,) parameter values.
+            segments: Number of segments.
+            width: Number of private unknowns of a segment.
+
+        Returns:
+            The unknowns.
+        """
         theta = np.array(theta, dtype=np.float64)
-        start = np.zeros(width) if self.free else theta[self.private]
+        start = np.zeros(width) if self.free_starts else theta[self.private]
         return UnknownValues(
             theta=theta,
-            private=np.tile(start, (pieces, 1)),
-            per_recording=np.tile(theta[self.own], (self.recordings, 1)),
+            private=np.tile(start, (segments, 1)),
+            per_recording=np.tile(theta[self.per_recording], (self.recordings, 1)),
         )
 
     def common_values(self, at: UnknownValues) -> Array:
         """(c,) values of the common unknowns."""
         return np.concatenate([at.theta[self.shared], at.per_recording.ravel()])
 
-    def moved(self, at: UnknownValues, step: Step, length: float) -> UnknownValues:
-        """The unknowns after a part of a step, inside the bounds to the last digit."""
-        values = np.clip(self.common_values(at) + length * step.common, self.lower, self.upper)
-        theta, s = np.array(at.theta), len(self.shared)
-        theta[self.shared] = values[:s]
+    def moved(self, at: UnknownValues, step: Step, fraction: float) -> UnknownValues:
+        """The unknowns after a fraction of a step; rounding does not take them out of the bounds.
+
+        Args:
+            at: The unknowns.
+            step: Step of all unknowns.
+            fraction: Fraction of the step.
+
+        Returns:
+            The moved unknowns.
+        """
+        values = self.common_values(at) + fraction * step.common
+        values = np.clip(values, self.lower, self.upper)
+
+        count = len(self.shared)
+        theta = np.array(at.theta)
+        theta[self.shared] = values[:count]
         return UnknownValues(
             theta=theta,
-            private=at.private + length * step.private,
-            per_recording=values[s:].reshape(at.per_recording.shape),
+            private=at.private + fraction * step.private,
+            per_recording=values[count:].reshape(at.per_recording.shape),
         )
 
-    def of_recording(self, at: UnknownValues, recording: int) -> Array:
-        """(p,) theta of one recording, its start deviations left as they stand in theta."""
+    def theta_of_recording(self, at: UnknownValues, recording: int) -> Array:
+        """(p,) parameters of one recording; deviations of the initial state are not filled in."""
         theta = np.array(at.theta)
-        theta[self.own] = at.per_recording[recording]
+        theta[self.per_recording] = at.per_recording[recording]
         return theta
 
     def theta(self, at: UnknownValues) -> Array:
-        """(p,) with what is the first recording's."""
-        theta = self.of_recording(at, 0)
-        if not self.free and len(self.private):
+        """(p,) parameters, with the values of the first recording and of its first segment."""
+        theta = self.theta_of_recording(at, 0)
+        if not self.free_starts and len(self.private):
             theta[self.private] = at.private[0]
         return theta
 
-    def spread(self, G: Array, recording: int) -> Array:
-        """(..., c) common columns from derivatives by theta: (..., p) of one recording."""
-        s, e = len(self.shared), len(self.own)
-        out = np.zeros((*G.shape[:-1], self.columns))
-        out[..., :s] = G[..., self.shared]
-        out[..., s + recording * e : s + (recording + 1) * e] = G[..., self.own]
-        return out
+    def to_columns(self, G: Array, recording: int) -> Array:
+        """Derivatives of one recording by the common unknowns.
 
-    def priors(self, at: UnknownValues) -> Array:
-        """(l, c+1) rows of the stated priors."""
-        places = self.places
-        weight = np.sqrt(np.diag(self.parameters.prior_information))[places]
-        rows = np.column_stack(
-            [np.diag(weight), weight * (self.common_values(at) - self.parameters.guess[places])]
-        )
+        Args:
+            G: (..., p) derivatives by theta.
+            recording: Index of the recording.
+
+        Returns:
+            (..., c) derivatives; zero by the unknowns of other recordings.
+        """
+        s = len(self.shared)
+        e = len(self.per_recording)
+        first = s + recording * e
+
+        columns = np.zeros((*G.shape[:-1], self.column_count))
+        columns[..., :s] = G[..., self.shared]
+        columns[..., first : first + e] = G[..., self.per_recording]
+        return columns
+
+    def prior_rows(self, at: UnknownValues) -> Array:
+        """(l, c+1) rows `[J, r]` of the stated priors on the common unknowns [standard deviations of the prior]."""
+        index = self.parameter_of_column
+        weight = np.sqrt(np.diag(self.parameters.prior_information))[index]
+        residual = weight * (self.common_values(at) - self.parameters.guess[index])
+
+        rows = np.column_stack([np.diag(weight), residual])
         return np.asarray(rows[weight > 0.0])

@@ -100,7 +100,7 @@ def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
 def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
     """Check which parameters recordings identify; derivatives are tested along the longest one. See `check`."""
     fit = FitProblem.of(system, recordings, data_only=True)
-    longest = max(fit.aligned, key=lambda recording: len(recording.ctrl))
+    longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
     task = DesignTask.along(system, longest.ctrl[:MAX_TESTED_SAMPLES])
 
     problem, point = _evaluate(task, task.initial)
@@ -108,7 +108,7 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
         raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
     # Rows of G at the times at which the recordings were measured, and the error of their differences.
-    recorded = fit.sensed(fit.begin(task.theta))
+    recorded = fit.sensitivity_rows(fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
     identifiability = task.observer.identifiability_of_rows(task.initial, J, error)
 
@@ -116,7 +116,7 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
     return _Assessment(
         task=task,
         source=f"{count} recording{'s' if count > 1 else ''}",
-        duration=float(sum(recording.t[-1] for recording in fit.aligned)),
+        duration=float(sum(recording.t[-1] for recording in fit.recordings)),
         identifiability=identifiability,
         data=_common_information(task, [rows.T @ rows for rows, _ in recorded]),
         tested=_test_derivatives(task, problem, point, identifiability),

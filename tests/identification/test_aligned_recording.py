@@ -13,8 +13,8 @@ from mjfim.excitation.task import DesignTask
 from mjfim.identification.aligned_recording import (
     AlignedRecording,
     align,
-    held,
     measured_trajectory,
+    resample_control,
 )
 from mjfim.plant.delay import OutputDelay
 from mjfim.records.recording import Recording
@@ -59,7 +59,7 @@ def test_every_sample_holds_the_mean_of_the_control(mean: float) -> None:
     for _ in range(60):
         t = stamps(rng, mean)
         ctrl = rng.uniform(-5.0, 5.0, (len(t) - 1, 2)) + 100.0
-        found = held(t, ctrl, DT)
+        found = resample_control(t, ctrl, DT)
         edges = np.arange(len(found) + 1) * DT
         assert edges[-1] >= t[-1] - 0.01 * DT
         assert len(found) == 1 or edges[-2] < t[-1]
@@ -74,12 +74,12 @@ def test_on_the_grid_the_control_is_itself() -> None:
     rng = np.random.default_rng(0)
     for count in (2, 7, 200_000):
         ctrl = rng.standard_normal((count, 3))
-        np.testing.assert_array_equal(held(np.arange(count + 1) * DT, ctrl, DT), ctrl)
+        np.testing.assert_array_equal(resample_control(np.arange(count + 1) * DT, ctrl, DT), ctrl)
     rows = rng.standard_normal((40, 1))
     np.testing.assert_array_equal(
-        held(np.arange(41) * 5 * DT, rows, DT), np.repeat(rows, 5, axis=0)
+        resample_control(np.arange(41) * 5 * DT, rows, DT), np.repeat(rows, 5, axis=0)
     )
-    fine = held(np.arange(41) * DT / 4, rows, DT)
+    fine = resample_control(np.arange(41) * DT / 4, rows, DT)
     np.testing.assert_allclose(fine, rows.reshape(10, 4, 1).mean(axis=1), rtol=0, atol=1e-14)
 
 
@@ -104,7 +104,7 @@ def test_a_recording_on_the_grid_is_taken_as_it_is(task: DesignTask) -> None:
     jitter = np.random.default_rng(1).uniform(-4e-5, 4e-5, len(plain.t))
     for t in (plain.t, plain.t + 1.7e9, plain.t + jitter):
         track = align(task.system, log(task, t=t))
-        assert track.even
+        assert track.on_grid
         np.testing.assert_allclose(track.t, plain.t, rtol=0, atol=1e-15)
         np.testing.assert_array_equal(track.ctrl, plain.ctrl)
         np.testing.assert_array_equal(track.y, plain.y)
@@ -122,15 +122,17 @@ def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> No
     plain = log(task)
     t = np.sort(np.random.default_rng(2).uniform(0.0, 0.3, len(plain.t)))
     track = align(task.system, log(task, t=t + 5.0))
-    assert not track.even
+    assert not track.on_grid
     np.testing.assert_allclose(track.t, t - t[0], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(track.y, plain.y)
-    np.testing.assert_allclose(track.ctrl, held(t - t[0], plain.ctrl, task.dt), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        track.ctrl, resample_control(t - t[0], plain.ctrl, task.dt), rtol=0, atol=1e-9
+    )
     kept = np.delete(np.arange(31), [4, 5, 20])
     sparse = align(
         task.system, log(task, t=plain.t[kept], ctrl=plain.ctrl[kept[:-1]], y=plain.y[kept])
     )
-    assert sparse.even
+    assert sparse.on_grid
     np.testing.assert_array_equal(sparse.ctrl[3:6], np.repeat(plain.ctrl[3:4], 3, axis=0))
     np.testing.assert_array_equal(sparse.ctrl[6:20], plain.ctrl[6:20])
     assert len(sparse.ctrl) == 30
@@ -158,8 +160,8 @@ def test_two_rows_of_one_sample_do_not_shift_the_control(task: DesignTask) -> No
             {"t": np.where(np.arange(31) == 12, np.nan, np.arange(31)) * DT},
             "'t' does not increase in data row 13",
         ),
-        ({"ctrl": np.zeros((20, 1))}, r"control has shape \(20, 1\), wanted 30 rows of 1"),
-        ({"ctrl": np.zeros((30, 2))}, "wanted 30 rows of 1"),
+        ({"ctrl": np.zeros((20, 1))}, r"control has shape \(20, 1\); expected 30 rows of 1"),
+        ({"ctrl": np.zeros((30, 2))}, "expected 30 rows of 1"),
         (
             {"ctrl": np.where(np.arange(30) == 4, np.nan, 0.0)[:, None]},
             "control in data row 5 is NaN",

@@ -111,7 +111,7 @@ def test_chi_square_and_misfit(task: DesignTask, recording: Recording) -> None:
         [Recording(t=recording.t, ctrl=recording.ctrl, y=drag, outputs=recording.outputs)],
     )
     assert wrong.misfit
-    assert any("not accuracy" in sentence for sentence in wrong.warnings)
+    assert any("not the accuracy" in sentence for sentence in wrong.warnings)
 
 
 def test_overstated_noise_is_said(task: DesignTask, recording: Recording) -> None:
@@ -222,7 +222,11 @@ def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
 
 @pytest.mark.parametrize(
     "place",
-    ["identify.find_missing_terms", "cross_validation.minimise", "cross_validation._errors"],
+    [
+        "report.find_missing_terms",
+        "cross_validation.minimise",
+        "cross_validation._prediction_errors",
+    ],
 )
 def test_interrupted_after_the_search_the_estimate_stays(
     task: DesignTask, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
@@ -297,12 +301,12 @@ def test_interrupted_before_the_last_search_nothing_more_is_searched(
 
     def show(event: FitEvent) -> None:
         seen.append(event.phase)
-        if event.phase == "where pieces start":
+        if event.phase == "initial states":
             signal.raise_signal(signal.SIGINT)
 
     found = identify_system(pieces.system, [recording], callback=show)
     assert found.interrupted and not found.success
-    assert set(seen) == {"where pieces start"}
+    assert set(seen) == {"initial states"}
     np.testing.assert_array_equal(found.theta, task.parameters.guess)
 
 

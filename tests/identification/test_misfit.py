@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mjfim.identification.residual_tests import coloured, larger, reasons, smaller, worst_place
+from mjfim.identification.residual_tests import (
+    autocorrelated,
+    find_worst_residual,
+    is_larger_than_noise,
+    is_smaller_than_noise,
+    misfit_reasons,
+)
 from mjfim.records.estimate import Whiteness, WorstResidual
 from tests.support.numerics import Array
 
@@ -22,7 +28,7 @@ def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
 
 def place(times: list[Array], z: list[Array]) -> WorstResidual:
     """The worst of the three recordings a, b, c."""
-    found = worst_place(NAMES, "abc", times, z)
+    found = find_worst_residual(NAMES, "abc", times, z)
     assert found is not None
     return found
 
@@ -67,8 +73,11 @@ def test_gaps_and_outputs_that_are_not_measured() -> None:
     assert (worst.output, worst.recording) == ("angle", "a")
     assert worst.begin <= 7.2 + 0.4
     assert worst.end >= 7.8 - 0.4
-    assert worst_place(NAMES, "abc", times, [np.full(part.shape, np.nan) for part in z]) is None
-    assert worst_place(NAMES, "", [], []) is None
+    assert (
+        find_worst_residual(NAMES, "abc", times, [np.full(part.shape, np.nan) for part in z])
+        is None
+    )
+    assert find_worst_residual(NAMES, "", [], []) is None
 
 
 def test_one_value_is_no_place() -> None:
@@ -88,7 +97,7 @@ def test_one_value_is_no_place() -> None:
 def test_short_recordings(count: int) -> None:
     """All of it is the place."""
     times, z = [np.arange(count) * 0.1 + 0.5], [np.tile([0.1, 2.0, 0.1], (count, 1))]
-    worst = worst_place(NAMES, ["x"], times, z)
+    worst = find_worst_residual(NAMES, ["x"], times, z)
     assert worst is not None
     assert (worst.output, worst.begin) == ("speed", 0.5)
     assert worst.size == pytest.approx(2.0)
@@ -127,47 +136,53 @@ def test_larger_and_smaller_need_probability_and_size() -> None:
     """Chi-square beyond its 0.1 % tail, and a ratio that matters; with much data the tail alone is not enough."""
     for dof in (10, 300, 10_000):
         top, bottom = chi2.isf(1e-3, dof), chi2.ppf(1e-3, dof)
-        assert larger(1.01 * top, dof) == (np.sqrt(1.01 * top / dof) > 1.03)
-        assert not larger(0.99 * top, dof)
-        assert smaller(0.99 * bottom, dof) == (np.sqrt(0.99 * bottom / dof) < 1 / 1.03)
-        assert not smaller(1.01 * bottom, dof)
-        assert not (larger(dof, dof) or smaller(dof, dof))
-    assert larger(1.07 * 1e5, 100_000)
-    assert not larger(1.02 * 1e5, 100_000)
-    assert smaller(0.9 * 1e5, 100_000)
-    assert not smaller(0.98 * 1e5, 100_000)
+        assert is_larger_than_noise(1.01 * top, dof) == (np.sqrt(1.01 * top / dof) > 1.03)
+        assert not is_larger_than_noise(0.99 * top, dof)
+        assert is_smaller_than_noise(0.99 * bottom, dof) == (
+            np.sqrt(0.99 * bottom / dof) < 1 / 1.03
+        )
+        assert not is_smaller_than_noise(1.01 * bottom, dof)
+        assert not (is_larger_than_noise(dof, dof) or is_smaller_than_noise(dof, dof))
+    assert is_larger_than_noise(1.07 * 1e5, 100_000)
+    assert not is_larger_than_noise(1.02 * 1e5, 100_000)
+    assert is_smaller_than_noise(0.9 * 1e5, 100_000)
+    assert not is_smaller_than_noise(0.98 * 1e5, 100_000)
 
 
 def test_noise_that_follows_itself_matters_where_it_is_large_enough() -> None:
     """Improbable, corrected for the number of outputs, and more than the noise hides; the worst first."""
     assert [
         w.output
-        for w in coloured([seen("a", 1e-9, 2.0), seen("b", 1e-9, 5.0), seen("c", 0.1, 9.0)])
+        for w in autocorrelated([seen("a", 1e-9, 2.0), seen("b", 1e-9, 5.0), seen("c", 0.1, 9.0)])
     ] == ["b", "a"]
-    assert not coloured([seen(p=1e-9, inflation=1.1)])
-    assert not coloured([seen(p=1e-9, inflation=5.0, variance=0.01)]), "far below the stated noise"
-    assert coloured([seen(p=1e-9, inflation=1.0, time=3.0)])
-    assert coloured([seen(p=5e-4, inflation=2.0)])
-    assert not coloured([seen(p=5e-4, inflation=2.0), seen("z")])
+    assert not autocorrelated([seen(p=1e-9, inflation=1.1)])
+    assert not autocorrelated([seen(p=1e-9, inflation=5.0, variance=0.01)]), (
+        "far below the stated noise"
+    )
+    assert autocorrelated([seen(p=1e-9, inflation=1.0, time=3.0)])
+    assert autocorrelated([seen(p=5e-4, inflation=2.0)])
+    assert not autocorrelated([seen(p=5e-4, inflation=2.0), seen("z")])
 
 
 def test_reasons_in_sentences() -> None:
     """Each cause one sentence; of noise that is as stated there is nothing to say."""
-    assert reasons(1000.0, 1000, True, [seen()], ()) == ()
-    assert reasons(4000.0, 1000, True, [seen()], ()) == ("residuals are 2.00 x the stated noise",)
-    assert reasons(4000.0, 1000, False, [seen()], ()) == (), (
+    assert misfit_reasons(1000.0, 1000, True, [seen()], ()) == ()
+    assert misfit_reasons(4000.0, 1000, True, [seen()], ()) == (
+        "residuals are 2.00 x the stated noise",
+    )
+    assert misfit_reasons(4000.0, 1000, False, [seen()], ()) == (), (
         "where sigmas are estimated, size tells nothing"
     )
-    said = reasons(1000.0, 1000, False, [seen("speed", 1e-9, 4.0)], ())
-    assert said == ("residuals follow one another in speed (+0.30 from one to the next)",)
-    slow = reasons(1000.0, 1000, True, [seen("speed", 1e-9, 16.0, correlation=0.001)], ())
+    said = misfit_reasons(1000.0, 1000, False, [seen("speed", 1e-9, 4.0)], ())
+    assert said == ("residuals are autocorrelated: speed (lag-1 correlation +0.30)",)
+    slow = misfit_reasons(1000.0, 1000, True, [seen("speed", 1e-9, 16.0, correlation=0.001)], ())
     assert slow == (
-        "residuals follow one another in speed (means of many scatter 4.0 x as much as those of noise)",
+        "residuals are autocorrelated: speed (long-run variance is 16.0 times that of white noise)",
     )
-    assert len(reasons(4000.0, 1000, True, [seen("speed", 1e-9, 4.0)], ())) == 2
-    many = reasons(1000.0, 1000, True, [seen(f"y{i}", 1e-9, 9.0 - i) for i in range(6)], ())
+    assert len(misfit_reasons(4000.0, 1000, True, [seen("speed", 1e-9, 4.0)], ())) == 2
+    many = misfit_reasons(1000.0, 1000, True, [seen(f"y{i}", 1e-9, 9.0 - i) for i in range(6)], ())
     assert (
         "y0 (" in many[0] and "y3 (" in many[0] and "y4" not in many[0] and "and 2 more" in many[0]
     )
-    lacking = reasons(1000.0, 1000, True, [seen()], ["dry friction"])
+    lacking = misfit_reasons(1000.0, 1000, True, [seen()], ["dry friction"])
     assert len(lacking) == 1 and "model lacks" in lacking[0]

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom, chi2
 
-from mjfim.identification.residual_tests import LAGS, whiteness
+from mjfim.identification.residual_tests import LAGS, whiteness_of
 from mjfim.records.estimate import Whiteness
 from tests.support.numerics import Array
 
@@ -24,7 +24,7 @@ def autoregressive(phi: float, count: int, rng: np.random.Generator) -> Array:
 def seen(seed: int, extra: Array | float = 0.0, phi: float = 0.0, count: int = N) -> Whiteness:
     """Verdict on one series of noise with something added."""
     rng = np.random.default_rng(seed)
-    return whiteness("y", [autoregressive(phi, count, rng) + extra])
+    return whiteness_of("y", [autoregressive(phi, count, rng) + extra])
 
 
 @pytest.mark.parametrize("lengths", [(40,), (400,), (3000,), (700, 90, 1300), tuple([60] * 30)])
@@ -33,7 +33,7 @@ def test_white_noise_is_rarely_accused(lengths: tuple[int, ...]) -> None:
     rng = np.random.default_rng(len(lengths))
     draws = 400
     p = np.array(
-        [whiteness("y", [3.0 * rng.standard_normal(n) for n in lengths]).p for _ in range(draws)]
+        [whiteness_of("y", [3.0 * rng.standard_normal(n) for n in lengths]).p for _ in range(draws)]
     )
     for level in (0.2, 0.05, 0.01):
         assert (p < level).sum() <= binom.ppf(0.999, draws, level), f"at {level}"
@@ -49,9 +49,9 @@ def test_gaps_do_not_make_white_noise_coloured() -> None:
         y = rng.standard_normal(2000)
         y[rng.random(2000) < 0.3] = np.nan
         y[600:1000] = np.nan
-        p.append(whiteness("y", [y, np.full(50, np.nan), rng.standard_normal(300)]).p)
+        p.append(whiteness_of("y", [y, np.full(50, np.nan), rng.standard_normal(300)]).p)
     assert (np.array(p) < 0.05).sum() <= binom.ppf(0.999, 200, 0.05)
-    assert whiteness("y", [y]).count == np.isfinite(y).sum()
+    assert whiteness_of("y", [y]).count == np.isfinite(y).sum()
 
 
 @pytest.mark.parametrize("phi", [0.15, -0.15, 0.5, 0.95])
@@ -92,17 +92,17 @@ def test_several_recordings_are_seen_together() -> None:
     """Each too short to tell by itself, all with the same correlation, or each with an offset of its own."""
     rng = np.random.default_rng(7)
     parts = [autoregressive(0.3, 60, rng) for _ in range(40)]
-    assert whiteness("y", parts).p < 1e-4
-    assert sum(whiteness("y", [part]).p < 1e-4 for part in parts) <= 4
+    assert whiteness_of("y", parts).p < 1e-4
+    assert sum(whiteness_of("y", [part]).p < 1e-4 for part in parts) <= 4
     moved = [rng.standard_normal(70) + 0.35 * rng.standard_normal() for _ in range(40)]
-    assert whiteness("y", moved).p < 1e-4
+    assert whiteness_of("y", moved).p < 1e-4
 
 
 def test_borders_of_recordings_are_not_crossed() -> None:
     """Products reach from one value to another of the same recording only."""
     a, b = np.array([1.0, 2.0, -1.0, 0.5] * 5), np.array([3.0, -2.0, 1.0, 4.0] * 5)
     rho = (np.sum(a[1:] * a[:-1]) + np.sum(b[1:] * b[:-1])) / (a @ a + b @ b)
-    assert whiteness("y", [a, b]).correlation == pytest.approx(rho, rel=1e-10)
+    assert whiteness_of("y", [a, b]).correlation == pytest.approx(rho, rel=1e-10)
 
 
 def test_the_statistic_is_that_of_ljung_and_box() -> None:
@@ -122,7 +122,7 @@ def test_the_statistic_is_that_of_ljung_and_box() -> None:
             means = y[: n // w * w].reshape(-1, w).mean(axis=1)
             if len(means) >= 8:
                 tails.append(chi2.sf(w * np.sum(means**2) / np.mean(y**2), len(means)))
-        found = whiteness("y", [y])
+        found = whiteness_of("y", [y])
         assert found.p == pytest.approx(min(looks * min(tails), 1.0), rel=1e-8)
         assert found.correlation == pytest.approx(rho[1], rel=1e-10)
 
@@ -143,11 +143,11 @@ def test_white_and_alternating_noise_has_no_memory() -> None:
 def test_variance_and_inflation() -> None:
     """In squares of the sigmas; the inflation of white noise is not far from one."""
     rng = np.random.default_rng(0)
-    found = whiteness("speed", [2.0 * rng.standard_normal(20_000)])
+    found = whiteness_of("speed", [2.0 * rng.standard_normal(20_000)])
     assert found.output == "speed"
     assert found.variance == pytest.approx(4.0, rel=0.05)
     assert 1.0 <= found.inflation < 2.5
-    slow = whiteness("y", [autoregressive(0.9, 50_000, rng)])
+    slow = whiteness_of("y", [autoregressive(0.9, 50_000, rng)])
     assert slow.inflation > 10.0  # 19 in the limit of long runs
 
 
@@ -157,5 +157,5 @@ def test_variance_and_inflation() -> None:
 )
 def test_too_little_to_tell_accuses_nobody(parts: list[Array]) -> None:
     """No values, few, or none but zeros."""
-    found = whiteness("y", parts)
+    found = whiteness_of("y", parts)
     assert (found.p, found.inflation, found.time) == (1.0, 1.0, 1.0)

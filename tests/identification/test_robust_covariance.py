@@ -1,6 +1,6 @@
-"""How far an estimate is off, against what many repetitions of a simulated experiment show.
+"""Robust uncertainty of an estimate against the spread of many repetitions of a simulated experiment.
 
-Linear models: the truth is known, and everything that `uncertainty` says of one repetition can be held against the spread of all.
+The models are linear and the truth is known, so that every part of `robust_uncertainty` can be compared with that spread.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from mjfim.identification.robust_covariance import merge, together, uncertainty
+from mjfim.identification.robust_covariance import block_length, merge_blocks, robust_uncertainty
 from mjfim.optimize.condensed_least_squares import Condensed
 from mjfim.records.estimate import Uncertainty
 from tests.support.numerics import Array
@@ -59,14 +59,14 @@ class Linear:
         theta, condensed = self.fitted(y)
         rows = np.full(len(condensed.segment_of_block), float(FINE))
         formal = np.sqrt(np.diag(np.linalg.inv(condensed.information())))
-        said = uncertainty(
+        said = robust_uncertainty(
             condensed,
             theta,
             condensed.segment_of_block,
             rows,
-            length,
-            draws,
-            np.random.default_rng(0),
+            min_rows=length,
+            draws=draws,
+            rng=np.random.default_rng(0),
         )
         return theta, formal, said
 
@@ -103,7 +103,7 @@ def study(phi: float, own: bool = False, prior: float = np.inf, repetitions: int
     """One recording or, with offsets of their own, four."""
     K, N = (4, 480) if own else (1, 1600)
     model, rng = Linear(waves(K, N, 2), own, prior), np.random.default_rng(11)
-    length = together([(1 + phi) / (1 - phi)], K * N)
+    length = block_length([(1 + phi) / (1 - phi)], K * N)
     found = []
     for _ in range(repetitions):
         truth = prior * rng.standard_normal(2) if np.isfinite(prior) else np.zeros(2)
@@ -181,7 +181,7 @@ def test_recordings_that_differ_are_told_apart() -> None:
         y = np.einsum("knc,kc->kn", model.X, truth)
         for other, found in ((0.0, equal), (1.0, apart)):
             theta, _, said = model.judged(
-                other * y + noise(0.5, (K, N), rng), together([3.0], K * N)
+                other * y + noise(0.5, (K, N), rng), block_length([3.0], K * N)
             )
             found.append(said.apart)
             if other:
@@ -200,7 +200,9 @@ def test_a_few_blocks_of_each_recording_accuse_nobody() -> None:
     """Strongly coloured noise leaves five or so blocks a recording, whose own scatter is often small by chance."""
     rng, K, N = np.random.default_rng(6), 10, 480
     model = Linear(waves(K, N, 3, slow=1.0))
-    said = [model.judged(noise(0.92, (K, N), rng), together([24.0], K * N))[2] for _ in range(150)]
+    said = [
+        model.judged(noise(0.92, (K, N), rng), block_length([24.0], K * N))[2] for _ in range(150)
+    ]
     assert max(s.blocks for s in said) <= 50
     assert sum(bool(s.apart) for s in said) <= 7
 
@@ -213,7 +215,7 @@ def test_what_sets_recordings_apart_does_not_hide_itself() -> None:
     for _ in range(40):
         truth = 0.5 * rng.standard_normal((K, 3))
         y = np.einsum("knc,kc->kn", model.X, truth) + noise(0.0, (K, N), rng)
-        apart += bool(model.judged(y, together([60.0], K * N))[2].apart)
+        apart += bool(model.judged(y, block_length([60.0], K * N))[2].apart)
     assert apart >= 39
 
 
@@ -243,8 +245,14 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
         common_rows=condensed.common_rows * wide,
     )
     rows = np.full(len(condensed.segment_of_block), float(FINE))
-    two = uncertainty(
-        other, theta / unit, other.segment_of_block, rows, 36.0, 50, np.random.default_rng(0)
+    two = robust_uncertainty(
+        other,
+        theta / unit,
+        other.segment_of_block,
+        rows,
+        min_rows=36.0,
+        draws=50,
+        rng=np.random.default_rng(0),
     )
     np.testing.assert_allclose(two.sandwich * unit, one.sandwich, rtol=1e-6)
     np.testing.assert_allclose(two.interval * unit[:, None], one.interval, rtol=1e-6)
@@ -275,11 +283,11 @@ def test_the_interval_is_the_hull() -> None:
 
 def test_blocks_are_as_long_as_residuals_hang_together() -> None:
     """Four times that, one row where they are white, and never more than a twentieth of the data."""
-    assert together([1.0, 1.2], 10_000) == 1.0
-    assert together([2.0, 9.0], 10_000) == 36.0
-    assert together([1000.0], 10_000) == 500.0
-    assert together([], 10_000) == 1.0
-    assert together([5.0], 3) == 1.0
+    assert block_length([1.0, 1.2], 10_000) == 1.0
+    assert block_length([2.0, 9.0], 10_000) == 36.0
+    assert block_length([1000.0], 10_000) == 500.0
+    assert block_length([], 10_000) == 1.0
+    assert block_length([5.0], 3) == 1.0
 
 
 def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
@@ -291,7 +299,7 @@ def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
             np.flatnonzero(rng.random(2 * len(counts)) < 2.0)[: len(counts)], counts
         )
         rows, length = rng.integers(1, 20, counts.sum()).astype(float), float(rng.integers(1, 60))
-        merged = merge(recording, rows, length)
+        merged = merge_blocks(recording, rows, length)
         assert merged[0] == 0
         assert set(np.diff(merged).tolist()) <= {0, 1}, "runs, numbered in order"
         for label in range(merged[-1] + 1):
@@ -305,5 +313,7 @@ def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
                 assert total - rows[mine][-1] < length, "longer than needed"
             else:
                 assert total < 1.5 * length + 20.0
-    assert merge(np.zeros(0, int), np.zeros(0), 5.0).shape == (0,)
-    np.testing.assert_array_equal(merge(np.array([0, 0, 1, 1]), np.ones(4), 1.0), [0, 1, 2, 3])
+    assert merge_blocks(np.zeros(0, int), np.zeros(0), 5.0).shape == (0,)
+    np.testing.assert_array_equal(
+        merge_blocks(np.array([0, 0, 1, 1]), np.ones(4), 1.0), [0, 1, 2, 3]
+    )

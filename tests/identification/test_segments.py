@@ -11,7 +11,14 @@ from mjfim.errors import RecordingError
 from mjfim.excitation.task import DesignTask
 from mjfim.identification.aligned_recording import AlignedRecording, align
 from mjfim.identification.identify import identify_system
-from mjfim.identification.segments import FEWEST, Segment, cut, groups, measured_starts, whole
+from mjfim.identification.segments import (
+    MIN_SAMPLES,
+    Segment,
+    batches,
+    cut_into_segments,
+    measured_initial_states,
+    whole_recordings,
+)
 from mjfim.records.recording import Recording
 from tests.support.numerics import Array, body_task, cart_task
 
@@ -64,10 +71,10 @@ def track(
 def covered(pieces: tuple[Segment, ...], tracks: list[AlignedRecording]) -> None:
     """Every row of every track belongs to exactly one piece, which simulates it."""
     for i, one in enumerate(tracks):
-        rows = np.concatenate([np.arange(len(one.t))[p.rows] for p in pieces if p.track == i])
+        rows = np.concatenate([np.arange(len(one.t))[p.rows] for p in pieces if p.recording == i])
         np.testing.assert_array_equal(rows, np.arange(len(one.t)))
     for p in pieces:
-        t = tracks[p.track].t[p.rows] / tracks[p.track].dt
+        t = tracks[p.recording].t[p.rows] / tracks[p.recording].dt
         assert t[0] >= p.begin - 1e-9
         assert t[-1] <= p.begin + p.samples + 0.011
 
@@ -88,12 +95,12 @@ def test_every_row_is_in_one_piece(task: DesignTask, length: float | None, lead:
         name="off.csv",
     )
     tracks = [track(task), track(task, rows=some), align(task.system, off)]
-    assert [t.even for t in tracks] == [True, True, False]
-    pieces = cut(task.system, tracks, length, lead)
+    assert [t.on_grid for t in tracks] == [True, True, False]
+    pieces = cut_into_segments(task.system, tracks, length, lead)
     covered(pieces, tracks)
     ahead = int(np.ceil(lead / task.dt))
     for i, one in enumerate(tracks):
-        mine = [p for p in pieces if p.track == i]
+        mine = [p for p in pieces if p.recording == i]
         sizes = np.array([p.samples - min(ahead, p.begin + ahead) * (p.begin > 0) for p in mine])
         if length is None or length >= one.t[-1]:
             assert len(mine) == 1
@@ -102,7 +109,7 @@ def test_every_row_is_in_one_piece(task: DesignTask, length: float | None, lead:
             assert len(mine) == round(len(one.ctrl) * one.dt / length)
             inner = np.diff([p.rows.start for p in mine])
             assert inner.max(initial=0) - inner.min(initial=9999) <= 1 or not len(inner)
-            assert min(sizes) >= FEWEST
+            assert min(sizes) >= MIN_SAMPLES
         for p in mine[1:]:
             first = round(one.t[p.rows.start] / one.dt - 0.5)
             assert p.begin == 0 or first - p.begin >= ahead - 1
@@ -111,7 +118,7 @@ def test_every_row_is_in_one_piece(task: DesignTask, length: float | None, lead:
 
 def test_a_piece_begins_as_much_earlier_as_outputs_lag(task: DesignTask) -> None:
     """So that what its first row shows is simulated; the first piece cannot."""
-    pieces = cut(task.system, [track(task)], 0.5, 0.025)
+    pieces = cut_into_segments(task.system, [track(task)], 0.5, 0.025)
     assert [p.begin for p in pieces] == [0, 47, 97, 147]
     assert [p.rows.start for p in pieces] == [0, 50, 100, 150]
     assert [p.begin + p.samples for p in pieces] == [50, 100, 150, 200]
@@ -122,7 +129,7 @@ def test_stretches_without_rows_are_no_pieces(task: DesignTask) -> None:
     """A hole longer than a piece."""
     rows = np.concatenate([np.arange(60), np.arange(140, 201)])
     tracks = [track(task, rows=rows)]
-    pieces = cut(task.system, tracks, 0.2, 0.0)
+    pieces = cut_into_segments(task.system, tracks, 0.2, 0.0)
     covered(pieces, tracks)
     assert [p.begin for p in pieces] == [0, 20, 40, 140, 160, 180]
 
@@ -132,15 +139,15 @@ def test_pieces_that_are_too_short_are_refused(task: DesignTask) -> None:
     with pytest.raises(
         RecordingError, match=r"x\.csv: fit\.segments = 0\.03 s is too short.*4 samples of 0\.01 s"
     ):
-        cut(task.system, [track(task)], 0.03, 0.0)
+        cut_into_segments(task.system, [track(task)], 0.03, 0.0)
 
 
 def test_whole_tracks_start_as_stated(task: DesignTask) -> None:
     tracks = [track(task), track(task, rows=np.arange(80))]
     start = np.array([0.1, 3.0, 0.0, 0.4])
-    pieces = whole(tracks, start)
+    pieces = whole_recordings(tracks, start)
     covered(pieces, tracks)
-    assert [(p.track, p.begin, p.samples) for p in pieces] == [(0, 0, 200), (1, 0, 79)]
+    assert [(p.recording, p.begin, p.samples) for p in pieces] == [(0, 0, 200), (1, 0, 79)]
     for p in pieces:
         np.testing.assert_array_equal(p.start, start)
 
@@ -156,7 +163,7 @@ def test_measured_starts_are_where_the_motion_was(
     shown = np.array(y)
     if gaps:
         shown[np.random.default_rng(0).random(shown.shape) < 0.3] = np.nan
-    states = measured_starts(task.system, track(task, shown, hidden=hidden), begins)
+    states = measured_initial_states(task.system, track(task, shown, hidden=hidden), begins)
     position, speed = np.ptp(y[:, :2], axis=0), np.ptp(y[:, 2:], axis=0)
     assert (np.abs(states[:, :2] - y[begins, :2]) < 0.02 * position).all()
     assert (np.abs(states[:, 2:] - y[begins, 2:]) < (0.15 if hidden else 0.1) * speed).all()
@@ -169,7 +176,7 @@ def test_noise_is_averaged_over_the_rows_around(task: DesignTask) -> None:
     """Starts are several times better than the rows that they are read off."""
     y, begins = truth(task), np.arange(15, 185, 2)
     noisy = y + 0.02 * np.random.default_rng(0).standard_normal(y.shape)
-    states = measured_starts(task.system, track(task, noisy), begins)
+    states = measured_initial_states(task.system, track(task, noisy), begins)
     assert np.std((states - y[begins])[:, :2]) < 0.5 * 0.02
 
 
@@ -179,7 +186,7 @@ def test_a_free_body_starts_with_its_orientation(body: DesignTask) -> None:
     begins = np.array([0, 50, 133])
     noisy = np.array(y)
     noisy[:, 3:11] *= 1.01
-    states = measured_starts(body.system, track(body, noisy), begins)
+    states = measured_initial_states(body.system, track(body, noisy), begins)
     for first in (3, 7):
         np.testing.assert_allclose(
             np.linalg.norm(states[:, first : first + 4], axis=1), 1.0, rtol=1e-12
@@ -195,12 +202,14 @@ def test_what_is_not_measured_goes_as_the_model_at_the_guess(body: DesignTask) -
     """Velocities of rotations that the log does not hold; all of it where orientations are missing too."""
     y, guess = truth(body), truth(body, 1.0)
     begins = np.array([0, 40, 120])
-    slow = measured_starts(body.system, track(body, y, hidden=("qvel",)), begins)
+    slow = measured_initial_states(body.system, track(body, y, hidden=("qvel",)), begins)
     np.testing.assert_allclose(slow[:, 14:], guess[begins, 14:], rtol=0, atol=1e-9)
     np.testing.assert_allclose(
         slow[:, 11:14], y[begins, 11:14], rtol=0, atol=0.1 * np.ptp(y[:, 11:14])
     )
-    ball = measured_starts(body.system, track(body, y, hidden=("qpos:ball", "qvel")), begins)
+    ball = measured_initial_states(
+        body.system, track(body, y, hidden=("qpos:ball", "qvel")), begins
+    )
     np.testing.assert_allclose(ball[:, 7:11], guess[begins, 7:11], rtol=0, atol=1e-9)
     np.testing.assert_allclose(ball[:, 3:7], y[begins, 3:7], rtol=0, atol=1e-9)
 
@@ -211,7 +220,7 @@ def test_an_output_that_a_recording_lacks_does_not_spoil_its_starts(
 ) -> None:
     """One of several recordings without that column: the model stands in."""
     y, guess, begins = truth(task), truth(task, 1.0), np.array([0, 70, 150])
-    states = measured_starts(task.system, track(task, y, hidden=hidden), begins)
+    states = measured_initial_states(task.system, track(task, y, hidden=hidden), begins)
     assert np.isfinite(states).all()
     names = task.system.outputs.names
     if "qpos:slide" in hidden:
@@ -245,7 +254,7 @@ def test_a_start_that_nothing_shows_does_no_harm(
 
 
 def piece(samples: int) -> Segment:
-    return Segment(0, 0, samples, slice(0, 1), np.zeros(1))
+    return Segment(recording=0, begin=0, samples=samples, rows=slice(0, 1), start=np.zeros(1))
 
 
 def test_batches_hold_all_pieces_once_and_not_too_much() -> None:
@@ -253,14 +262,14 @@ def test_batches_hold_all_pieces_once_and_not_too_much() -> None:
     rng = np.random.default_rng(0)
     for most in (10, 200, 5000):
         pieces = [piece(int(n)) for n in rng.integers(4, 120, 60)]
-        batches = list(groups(pieces, most))
-        assert sorted(i for batch in batches for i in batch) == list(range(60))
-        for batch in batches:
+        found = list(batches(pieces, most))
+        assert sorted(i for batch in found for i in batch) == list(range(60))
+        for batch in found:
             longest, shortest = (
                 max(pieces[i].samples for i in batch),
                 min(pieces[i].samples for i in batch),
             )
             assert len(batch) == 1 or len(batch) * longest <= most
             assert longest <= 1.1 * shortest
-    assert len(list(groups([piece(50)] * 40, 1000))) == 2
-    assert list(groups([], 100)) == []
+    assert len(list(batches([piece(50)] * 40, 1000))) == 2
+    assert list(batches([], 100)) == []

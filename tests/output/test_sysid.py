@@ -169,7 +169,7 @@ def test_sysid_gets_the_same_model_data_and_weights(
     assert wanted is not None
     mine = residual(exported, theta, weighted=True)
     np.testing.assert_allclose(np.sum(mine**2), np.sum(wanted.r**2), rtol=1e-6)
-    data = fit.count  # priors follow the data
+    data = fit.value_count  # priors follow the data
     np.testing.assert_allclose(np.sum(mine[:data] ** 2), script.chi2(exported, theta), rtol=1e-12)
     np.testing.assert_allclose(
         np.sort(np.abs(mine[:data])), np.sort(np.abs(wanted.r[:data])), rtol=1e-6, atol=1e-6

@@ -23,7 +23,7 @@ from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.identify import identify_system
-from mjfim.identification.residual_tests import larger
+from mjfim.identification.residual_tests import is_larger_than_noise
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
 from mjfim.records.recording import Recording
@@ -191,9 +191,9 @@ def test_friction_too_weak_for_chi_squared_shows_in_successive_residuals(tmp_pat
         easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=1
     )
     assert found.estimate is not None and found.estimate.misfit
-    assert not larger(found.estimate.chi2, found.estimate.dof)
+    assert not is_larger_than_noise(found.estimate.chi2, found.estimate.dof)
     assert found.status is CampaignStatus.DOUBTFUL
-    assert any("follow one another" in sentence for sentence in found.warnings)
+    assert any("autocorrelated" in sentence for sentence in found.warnings)
 
 
 def test_a_round_that_tells_nothing_is_named(campaign: Campaign) -> None:

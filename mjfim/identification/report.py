@@ -1,0 +1,324 @@
+"""From the solution of the least-squares problem to the estimate that a user reads: accuracy, predictions, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.budget import Budget
+from mjfim.identification.accuracy import Accuracy, accuracy_of
+from mjfim.identification.cross_validation import predict_unfitted
+from mjfim.identification.fit_quality import FitQuality, fit_quality
+from mjfim.identification.missing_terms import find_missing_terms
+from mjfim.identification.residual_tests import is_smaller_than_noise, misfit_reasons
+from mjfim.identification.residuals import FitProblem
+from mjfim.identification.task import FitTask
+from mjfim.information.null_space import NullSpace
+from mjfim.model.parameters import ParameterSet
+from mjfim.optimize.levenberg_marquardt import Solution
+from mjfim.recordings.plausibility import plausibility_remarks
+from mjfim.records.estimate import Estimate, MissingTerm, Prediction
+from mjfim.records.recording import Recording
+
+# Distance from the guess [prior standard deviations] above which an estimate contradicts its prior.
+IMPLAUSIBLE_PRIOR_DISTANCE = 4.0
+
+# Distance from a bound, relative to the magnitude of the parameter, at which an estimate counts as at the bound.
+BOUND_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitResult:
+    """Result of the searches of one identification.
+
+    Attributes:
+        task: System, recordings and settings.
+        problem: The least-squares problem, with the noise that was used at last.
+        solution: Its solution.
+        null_space: Directions of theta about which neither recordings nor priors contain information.
+        held_out: Problem of the held-out recordings; None without any.
+        subset: Indices of segments that are quick to simulate, evenly spread over the data.
+    """
+
+    task: FitTask
+    problem: FitProblem
+    solution: Solution
+    null_space: NullSpace
+    held_out: FitProblem | None
+    subset: np.ndarray
+
+    @property
+    def theta(self) -> Array:
+        """(p,) estimate, with the values of the first recording."""
+        return self.problem.theta(self.solution.unknowns)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Findings:
+    """Everything about a fit that its warnings depend on.
+
+    Attributes:
+        result: The fit.
+        quality: Size and whiteness of the residuals.
+        accuracy: Accuracy of theta.
+        missing: Terms that the model may lack.
+        reasons: Reasons for a misfit, in sentences; empty where there is none.
+        at_bound: Names of the parameters at a bound or beyond it.
+        outside: True where a parameter is beyond a bound.
+        interrupted: True where somebody asked to stop.
+    """
+
+    result: FitResult
+    quality: FitQuality
+    accuracy: Accuracy
+    missing: tuple[MissingTerm, ...]
+    reasons: tuple[str, ...]
+    at_bound: tuple[str, ...]
+    outside: bool
+    interrupted: bool
+
+
+def estimate_from(result: FitResult, budget: Budget) -> Estimate:
+    """Assess a fit and put the estimate together.
+
+    Once somebody asks to stop, missing terms and predictions are left out; the estimate itself is complete.
+
+    Args:
+        result: The fit.
+        budget: Budget with the stop token.
+
+    Returns:
+        The estimate, without its time and engine steps.
+
+    Raises:
+        SimulationDivergedError: The simulation diverges at the estimate.
+    """
+    task, problem = result.task, result.problem
+    quality = fit_quality(problem, result.solution)
+
+    # Optional parts, each of which takes about as long as a search.
+    missing = _missing_terms(result, quality, budget)
+    predictions = _predictions(result, budget)
+
+    reasons = misfit_reasons(
+        quality.chi2, quality.dof, task.noise_is_stated, quality.whiteness, missing
+    )
+    accuracy = accuracy_of(
+        problem,
+        result.solution,
+        result.null_space,
+        quality.correlation_rows(problem.row_count),
+    )
+    at_bound, outside = _at_bounds(task.system.parameters, result.theta)
+
+    findings = _Findings(
+        result=result,
+        quality=quality,
+        accuracy=accuracy,
+        missing=missing,
+        reasons=reasons,
+        at_bound=at_bound,
+        outside=outside,
+        interrupted=budget.stop.requested,
+    )
+    return _estimate(findings, predictions)
+
+
+def _missing_terms(
+    result: FitResult, quality: FitQuality, budget: Budget
+) -> tuple[MissingTerm, ...]:
+    """Terms that the model may lack; none where the fit is too poor for an answer, or where somebody asked to stop."""
+    if budget.stop.requested or quality.unexplained:
+        return ()
+
+    # A subset of much data is enough for the test.
+    unknowns = result.solution.unknowns
+    at = replace(unknowns, private=unknowns.private[result.subset])
+    problem = result.problem.of_segments(result.subset)
+    missing = find_missing_terms(problem, result.task.recordings, result.subset, at)
+    return () if budget.stop.requested else missing
+
+
+def _predictions(result: FitResult, budget: Budget) -> tuple[Prediction, ...]:
+    """Predictions of data that were not fitted; none where somebody asked to stop."""
+    if budget.stop.requested:
+        return ()
+
+    found = predict_unfitted(result.problem, result.solution.unknowns, result.held_out, budget)
+    return () if budget.stop.requested else found
+
+
+def _at_bounds(parameters: ParameterSet, theta: Array) -> tuple[tuple[str, ...], bool]:
+    """Names of the parameters at a bound or beyond it, and whether any is beyond."""
+    near = BOUND_TOLERANCE * parameters.magnitude
+    outside = (theta < parameters.lower - near) | (theta > parameters.upper + near)
+
+    distance = np.minimum(theta - parameters.lower, parameters.upper - theta)
+    touching = distance < near
+    names = tuple(name for name, touches in zip(parameters.names, touching, strict=True) if touches)
+    return names, bool(outside.any())
+
+
+def _estimate(findings: _Findings, predictions: tuple[Prediction, ...]) -> Estimate:
+    """The record that a user gets."""
+    result, quality, accuracy = findings.result, findings.quality, findings.accuracy
+    system, problem = result.task.system, result.problem
+    solution, parameters = result.solution, result.task.system.parameters
+
+    undetermined = accuracy.singular or accuracy.single_unidentifiable
+    sigma = problem.noise.sigma.tolist()
+    per_recording = {
+        parameters.names[j]: tuple(solution.unknowns.per_recording[:, column].tolist())
+        for column, j in enumerate(problem.layout.per_recording)
+    }
+
+    return Estimate(
+        parameters=parameters.names,
+        units=system.units,
+        prior=parameters.prior_information,
+        theta=result.theta,
+        std=accuracy.std,
+        covariance=accuracy.covariance,
+        initial_theta=result.task.start,
+        chi2=quality.chi2,
+        dof=quality.dof,
+        status=solution.status,
+        success=solution.success and not (undetermined or findings.outside),
+        misfit=bool(findings.reasons),
+        iterations=solution.iterations,
+        residual_rms=quality.rms,
+        at_bound=findings.at_bound,
+        predicted=quality.predicted,
+        recordings=_fitted_recordings(result),
+        warnings=tuple(_warnings(findings)),
+        combinations=tuple(str(group) for group in accuracy.groups),
+        data=accuracy.data_information,
+        std_sandwich=accuracy.sandwich,
+        interval=accuracy.interval,
+        between_recordings=accuracy.between,
+        sigma=dict(zip(system.outputs.names, sigma, strict=True)),
+        reasons=findings.reasons,
+        whiteness=quality.whiteness,
+        sloppy=tuple(name for name, _ in accuracy.poorly_known),
+        missing_terms=findings.missing,
+        per_recording=per_recording,
+        worst_residual=quality.worst_residual if findings.reasons else None,
+        predictions=predictions,
+        robust_uncertainty=accuracy.robust,
+        motion=problem.motion(solution.unknowns, 0),
+        interrupted=findings.interrupted,
+    )
+
+
+def _fitted_recordings(result: FitResult) -> tuple[Recording, ...]:
+    """The recordings with their outputs in the order of the experiment, as they were fitted."""
+    names = result.task.system.outputs.names
+    return tuple(
+        Recording(
+            t=aligned.t,
+            ctrl=recording.ctrl[: len(aligned.t) - 1],
+            y=aligned.y,
+            outputs=names,
+            name=aligned.name,
+        )
+        for aligned, recording in zip(
+            result.problem.recordings, result.task.recordings, strict=True
+        )
+    )
+
+
+def _warnings(findings: _Findings) -> Iterator[str]:
+    """Sentences that a user should read besides the numbers, the most serious ones first."""
+    result = findings.result
+    yield from _warnings_of_search(findings)
+    yield from _warnings_of_misfit(findings)
+    yield from _warnings_of_recordings(findings)
+    yield from _warnings_of_bounds(findings)
+
+    # Where the misfit is, and where it may come from.
+    if findings.reasons and findings.quality.worst_residual is not None:
+        yield f"residuals are {findings.quality.worst_residual}"
+    for term in findings.missing:
+        yield f"the residuals look like {term}"
+
+    yield from _implausible_estimates(result.task.system.parameters, result.theta)
+    for name, remark in findings.accuracy.poorly_known:
+        yield f"sloppy: {name} {remark}"
+
+    channels = result.task.system.channels
+    for recording in result.task.recordings:
+        for remark in plausibility_remarks(channels, recording):
+            yield f"poor data in {Path(recording.name).name}: {remark}"
+
+
+def _warnings_of_search(findings: _Findings) -> Iterator[str]:
+    """Warnings about a search that was interrupted, found a poor minimum or could not find all parameters."""
+    quality, accuracy = findings.quality, findings.accuracy
+    if findings.interrupted and not findings.result.solution.interrupted:
+        yield "interrupted after the search: there are no predictions of data that were not fitted"
+    if quality.unexplained:
+        yield (
+            f"the fit explains little of the motion of {', '.join(quality.unexplained)}: probably a local minimum. "
+            "Shorter segments (fit.segments), more starts (fit.starts) or a better guess may find a better one"
+        )
+    for group in accuracy.groups:
+        yield f"not identifiable separately: {group}; what the recordings do not determine was held at the start"
+    if accuracy.singular:
+        yield "the recordings do not determine all parameters: the information is singular"
+
+
+def _warnings_of_misfit(findings: _Findings) -> Iterator[str]:
+    """Warnings about residuals that are not the noise that was stated."""
+    quality = findings.quality
+    noise_is_stated = findings.result.task.noise_is_stated
+    if findings.reasons:
+        wrong = "The model or the noise is" if noise_is_stated else "The model is"
+        yield (
+            f"misfit: {'; '.join(findings.reasons)}. {wrong} wrong, "
+            "and the formal standard deviations are not the accuracy"
+        )
+    elif noise_is_stated and is_smaller_than_noise(quality.chi2, quality.dof):
+        ratio = np.sqrt(quality.chi2 / quality.dof)
+        yield f"residuals are only {ratio:.2f} x the stated noise: sigma is overstated"
+
+
+def _warnings_of_recordings(findings: _Findings) -> Iterator[str]:
+    """Warnings about recordings that contradict each other."""
+    robust = findings.accuracy.robust
+    if robust is None or not robust.apart:
+        return
+
+    names = findings.result.task.system.parameters.names
+    index = findings.result.problem.layout.parameter_of_column
+    listed = ", ".join(names[index[column]] for column in robust.apart)
+    yield (
+        f"recordings disagree on {listed} by more than the scatter within each recording: something differs between them "
+        "that is not in the model; the intervals allow for it"
+    )
+
+
+def _warnings_of_bounds(findings: _Findings) -> Iterator[str]:
+    """Warnings about parameters at their bounds."""
+    names = ", ".join(findings.at_bound)
+    if findings.outside:
+        yield f"outside its bounds, which the method newton ignores: {names}; use least_squares"
+    elif findings.at_bound:
+        yield f"at a bound: {names}; formal standard deviations are not valid there"
+
+
+def _implausible_estimates(parameters: ParameterSet, theta: Array) -> Iterator[str]:
+    """Warnings about estimates that contradict their stated priors."""
+    for parameter, value in zip(parameters.parameters, theta, strict=True):
+        if parameter.prior is None:
+            continue
+
+        distance = abs(value - parameter.guess) / parameter.prior
+        if distance > IMPLAUSIBLE_PRIOR_DISTANCE:
+            yield (
+                f"{parameter.name} is {distance:.0f} prior standard deviations from its guess: "
+                "the prior or the estimate is wrong"
+            )

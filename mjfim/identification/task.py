@@ -1,0 +1,137 @@
+"""The task of an identification: a system, recordings of it, and how its parameters are fitted to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, unknown
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.experiment.task_tables import FitSpec
+from mjfim.identification.residuals import FitProblem
+from mjfim.records.recording import Recording
+
+# least_squares: Levenberg-Marquardt inside the bounds; newton: the paper's Newton-Raphson without bounds.
+Method = Literal["least_squares", "newton"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitTask:
+    """Everything that an identification needs: no horizon, no cost and no initial control.
+
+    Attributes:
+        system: Model, parameters, outputs, noise and plant.
+        recordings: Recordings to which the parameters are fitted.
+        held_out: Recordings that are predicted, not fitted.
+        method: Method of the search.
+        start: (p,) parameters at which the search starts, inside the bounds if the method has any [theta-unit].
+        settings: The table `[fit]` of the experiment.
+    """
+
+    system: System
+    recordings: tuple[Recording, ...]
+    held_out: tuple[Recording, ...]
+    method: Method
+    start: Array
+    settings: FitSpec
+
+    @classmethod
+    def resolve(
+        cls,
+        experiment: Experiment,
+        recordings: Sequence[Recording],
+        *,
+        method: Method = "least_squares",
+        start: Array | None = None,
+        held_out: Sequence[Recording] = (),
+        threads: int | None = None,
+    ) -> FitTask:
+        """Resolve an experiment into the task of fitting its parameters.
+
+        Args:
+            experiment: Model, parameters and noise; nothing else needs to be stated.
+            recordings: Recordings to which the parameters are fitted.
+            method: Method of the search.
+            start: (p,) parameters at which the search starts; default: the guess.
+            held_out: Recordings that are predicted, not fitted.
+            threads: Threads for the engine; default: one per core.
+
+        Returns:
+            The task.
+
+        Raises:
+            ExperimentError: Something is wrong in the experiment or in the arguments; the message names it.
+            ModelError: The model cannot be used.
+        """
+        system = System.resolve(experiment, threads=threads)
+        return cls.of(system, recordings, method=method, start=start, held_out=held_out)
+
+    @classmethod
+    def of(
+        cls,
+        system: System,
+        recordings: Sequence[Recording],
+        *,
+        method: Method = "least_squares",
+        start: Array | None = None,
+        held_out: Sequence[Recording] = (),
+    ) -> FitTask:
+        """The task of a resolved system. See `resolve`."""
+        if method not in get_args(Method):
+            raise ExperimentError(unknown("method", method, get_args(Method)))
+
+        settings = system.experiment.fit
+        if settings.noise == "estimated" and system.noise.correlated:
+            raise ExperimentError(
+                f'{system.experiment.source}: fit.noise = "estimated" assumes uncorrelated outputs; '
+                "remove `noise.correlated`"
+            )
+
+        return cls(
+            system=system,
+            recordings=tuple(recordings),
+            held_out=tuple(held_out),
+            method=method,
+            start=_start(system, method, start),
+            settings=settings,
+        )
+
+    @property
+    def noise_is_stated(self) -> bool:
+        """True where the noise is that of the experiment; False where it is estimated from the residuals."""
+        return self.settings.noise == "stated"
+
+    def problem(self) -> FitProblem:
+        """The least-squares problem of the recordings.
+
+        Raises:
+            RecordingError: There is no recording, or one cannot be used.
+        """
+        problem = FitProblem.of(self.system, self.recordings)
+        return problem.unbounded() if self.method == "newton" else problem
+
+    def held_out_problem(self) -> FitProblem | None:
+        """The least-squares problem of the held-out recordings; None without any.
+
+        Raises:
+            RecordingError: A recording cannot be used.
+        """
+        return FitProblem.of(self.system, self.held_out) if self.held_out else None
+
+
+def _start(system: System, method: Method, start: Array | None) -> Array:
+    """(p,) parameters at which the search starts; the guess where none are given."""
+    parameters = system.parameters
+    theta = parameters.guess if start is None else np.asarray(start, dtype=np.float64)
+    if theta.shape != parameters.guess.shape:
+        names = ", ".join(parameters.names)
+        raise ExperimentError(f"start: {theta.shape} numbers; expected one per parameter: {names}")
+
+    if method == "least_squares":
+        theta = np.clip(theta, parameters.lower, parameters.upper)
+    return theta
