@@ -28,6 +28,10 @@ DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 DEFAULT_EXPERIMENT = MODELS / "cart_pendulum.toml"
 
 
+# Code that a document names: one or two names in backquotes, then `in`, then a file of the package in backquotes.
+NAMED_CODE = re.compile(r"`([\w.]+)`(?: and `([\w.]+)`)? in `(mjfim/[\w/]+\.py)`")
+
+
 def runnable(path: Path, language: str) -> list[CodeBlock]:
     """Blocks of one language of a file that are not marked as `not run`."""
     blocks = [block for block in code_blocks(path) if block.language == language]
@@ -144,6 +148,25 @@ def test_toml_blocks_are_experiments(tables: dict[str, Any]) -> None:
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
 def test_links_point_to_files(path: Path) -> None:
     assert [target for target in linked_files(path) if not target.exists()] == []
+
+
+@pytest.mark.parametrize("path", [*DOCUMENTS, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
+def test_named_code_exists(path: Path) -> None:
+    """Files of the package that a document names exist, and so do the functions and classes that it names with a file."""
+    text = path.read_text(encoding="utf-8")
+    named_files = set(re.findall(r"mjfim/[\w/]+\.py", text))
+    assert [name for name in sorted(named_files) if not (ROOT / name).exists()] == []
+
+    missing = []
+    for *names, file in NAMED_CODE.findall(text):
+        source = (ROOT / file).read_text(encoding="utf-8")
+        parts = [part for name in names if name for part in name.split(".")]
+        missing += [
+            f"{part} in {file}"
+            for part in parts
+            if not re.search(rf"\b(?:def|class) {part}\b|^\s*{part}\b", source, re.MULTILINE)
+        ]
+    assert missing == []
 
 
 # ---- the checks themselves, on small documents
