@@ -56,7 +56,7 @@ KINDS = {"position", "velocity", "acceleration", "control", "control_rate", "for
 
 
 def arm_task(folder: Path, **tables: Any) -> DesignTask:
-    """The arm from a standstill, swung by sines of 1.5 Hz for 0.4 s, on its lifted plant."""
+    """The arm from a standstill, swung by sines of 1.5 Hz for 0.4 s, on its relaxed plant."""
     swing = {"shoulder": 0.25, "elbow": 0.35}
     defaults: dict[str, Any] = {
         "horizon": 0.4,
@@ -103,7 +103,7 @@ def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
 
 
 def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -> None:
-    """Half a turn away the difference of rotations bends; a floating hull comes nowhere near its start."""
+    """Half a turn away the difference of rotations is not linear; a floating hull does not return to its initial state."""
     wild = {
         "initial": {
             "qvel": (0.1, 0.0, 0.2, 3.5, -2.4, 4.3, 1.0, -2.0),
@@ -119,8 +119,10 @@ def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", TOGETHER)
-def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: Path) -> None:
-    """Along any tangent curve it is the sum of squares of all that is looked at, weighted by the barriers' curvatures."""
+def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
+    name: str, tmp_path: Path
+) -> None:
+    """Its squares are the changes of all constrained quantities along a tangent curve; its weights are the barrier's curvature."""
     task = arm_task(tmp_path, **TOGETHER[name])
     constraints, delta = constraint_set_of(task), 0.05
     problem = InteriorProblem(task.problem, constraints, 1.0, delta, costs=False)
@@ -140,7 +142,7 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     free = rate.control_before is None, rate.control_after is None and not rate.periodic
     assert ((w.W[0] == 0.0).all(), (w.W[-1] == 0.0).all()) == free
     assert (w.W[1:-1] > 0.0).all()
-    # its own: the squares of what every limited number moves by, times the curvature of its barrier
+    # the squares of the change of every limited quantity, times the curvature of its barrier
     values, N = (
         constraints.evaluate(values_of(point).trajectory, values_of(point).observed, slopes=True),
         task.samples,
@@ -163,7 +165,7 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         near.barrier(values.distances, delta, 1.0 / N).curvature,
     ]
     for way in rng.normal(size=(3, *ctrl.shape)):
-        way[0] = 0.0  # with a seam the metric leaves the move of the first control out
+        way[0] = 0.0  # of a periodic control the Hessian leaves out the change of the first sample
         zeta = expansion.lift(np.zeros((N, 2, task.space.nx)), way)
         moves = [
             np.einsum("kswi,ki->ksw", rise, np.concatenate([zeta.z[:-1], zeta.v], axis=1)),
@@ -187,7 +189,7 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
         assert float(np.sum(a * zeta.z) + np.sum(b * zeta.v)) == pytest.approx(
             sum(wanted), rel=1e-9
         )
-    # and of what is linear in the control it is the curvature of the barrier itself
+    # for quantities that are linear in the control it is the curvature of the barrier
     substeps = constraints.substeps
     endless = np.full(len(substeps.kinds), np.inf)
     narrow = replace(
@@ -206,8 +208,8 @@ def test_the_metric_of_the_barrier_is_positive_and_its_own(name: str, tmp_path: 
     assert float(np.sum(b * 1e-5 * way)) == pytest.approx(up + down - 2 * here, rel=1e-3)
 
 
-def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> None:
-    """Over half of each range; the largest at any looked-at engine step."""
+def test_relative_moves_of_an_expansion_are_those_of_the_simulation(tmp_path: Path) -> None:
+    """They are relative to half of each range; the largest at any engine step with derivatives counts."""
     task = arm_task(tmp_path, limits=EVERY)
     constraints = constraint_set_of(task)
     problem = InteriorProblem(task.problem, constraints, 1.0, 0.1, costs=False)
@@ -223,8 +225,8 @@ def test_the_moves_of_a_hedge_are_those_of_the_simulation(tmp_path: Path) -> Non
         assert expansion.barrier.largest_relative_move(zeta) == pytest.approx(wanted, rel=1e-3)
 
 
-def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> None:
-    """Every kind at once, in its own unit, at every engine step; shares are the same over half of the range."""
+def test_margins_along_a_trajectory_are_those_of_single_engine_steps(tmp_path: Path) -> None:
+    """Every kind at once, at every engine step; relative margins are divided by half of the range."""
     task = arm_task(
         tmp_path,
         limits=EVERY,
@@ -288,7 +290,7 @@ def test_margins_of_a_simulation_are_those_of_plain_steps(tmp_path: Path) -> Non
     assert constraints.relative_margins(values) == pytest.approx(shares, rel=1e-5, abs=1e-7)
 
 
-def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> None:
+def test_a_tightened_constraint_set_has_smaller_relative_margins(tmp_path: Path) -> None:
     task = arm_task(
         tmp_path, limits=EVERY, boundary={"end": "periodic", "position": 0.2, "velocity": 3.0}
     )
@@ -303,7 +305,7 @@ def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> 
     found = constraints.tightened(shares).relative_margins(values)
     least = 0.03 * (
         1.0 + shares["clearance"]
-    )  # its share is of the least distance, which is raised
+    )  # the fraction of a clearance is relative to the least distance, which is raised
     raised = constraints.tightened(shares).clearance
     assert raised is not None
     assert raised.least == pytest.approx(least)
@@ -319,7 +321,7 @@ def test_a_tightened_fence_has_smaller_margins_by_its_shares(tmp_path: Path) -> 
     assert far.value(values, 0.1) > constraints.value(values, 0.1)
 
 
-def test_rates_begin_and_end_where_the_boundary_says(tmp_path: Path) -> None:
+def test_rates_at_both_ends_follow_the_boundary(tmp_path: Path) -> None:
     task = arm_task(tmp_path, limits={"control_rate": 9.0})
     rate, ctrl = constraint_set_of(task).rate, task.control
     assert rate is not None
@@ -335,8 +337,8 @@ def test_rates_begin_and_end_where_the_boundary_says(tmp_path: Path) -> None:
     )
 
 
-def test_without_enforcement_only_the_boundary_is_left(tmp_path: Path) -> None:
-    """What is checked and reported is all of them."""
+def test_without_enforcement_only_the_boundary_constrains(tmp_path: Path) -> None:
+    """All limits are checked and reported all the same."""
     task = arm_task(tmp_path, limits={**EVERY, "enforce": False}, boundary={"end": "periodic"})
     for every, kinds in ((False, set()), (True, KINDS)):
         constraints = constraint_set_of(task, every=every)

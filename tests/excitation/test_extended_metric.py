@@ -1,4 +1,4 @@
-"""Problem (8) with psi among the states: the same direction where psi has no weight, the right linearisation where it has."""
+"""Problem (8) with psi among the states: without weight on psi the ordinary direction, with it the right linearisation."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def both_directions(
 
 
 def extended_direction(e: Expansion, K: Array, Q: Array, R: Array, terminal: Array) -> TangentCurve:
-    """zeta of the extended problem."""
+    """The direction zeta of the extended problem."""
     return ExtendedMetricDescent(Q, R, terminal)(e, K)
 
 
@@ -86,7 +86,7 @@ def test_with_weight_on_psi_the_extended_direction_is_another_descent_direction(
 
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])
-def test_eliminating_psi_by_the_adjoint_is_exact_algebra(criterion: str) -> None:
+def test_the_slope_with_psi_eliminated_is_that_of_the_extended_system(criterion: str) -> None:
     rng, (N, nx, nu, ny, p) = np.random.default_rng(2), (9, 3, 2, 2, 3)
     A, B = 0.5 * rng.normal(size=(N, nx, nx)), rng.normal(size=(N, nx, nu))
     C, D = rng.normal(size=(N + 1, ny, nx)), rng.normal(size=(N + 1, ny, nu))

@@ -1,4 +1,4 @@
-"""Where designs begin: names, sizes and ranges of starts, how they swell and fade, earlier designs that are repeated."""
+"""Initial controls of a design: names, sizes and ranges, windows at both ends, and earlier designs that are repeated."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_given_control_takes_the_place_of_the_initial_one(tmp_path: Path) ->
     assert not np.array_equal(other[1].control, starts[2].control)
 
 
-def test_random_starts_swing_about_the_middle_up_to_six_times_as_far_within_their_range(
+def test_random_controls_have_up_to_six_times_the_amplitude_within_their_range(
     tmp_path: Path,
 ) -> None:
     task = arm(tmp_path, descent={"starts": 40})
@@ -68,7 +68,9 @@ def test_random_starts_swing_about_the_middle_up_to_six_times_as_far_within_thei
 
 @pytest.mark.parametrize("begins", [False, True])
 @pytest.mark.parametrize("ends", [False, True])
-def test_they_swell_from_what_holds_and_fade(begins: bool, ends: bool, tmp_path: Path) -> None:
+def test_random_controls_rise_from_the_holding_control_and_fade(
+    begins: bool, ends: bool, tmp_path: Path
+) -> None:
     boundary = {"start": "rest" if begins else "given", "end": "rest" if ends else "free"}
     task = arm(tmp_path, boundary=boundary, descent={"starts": 6})
     middle = task.initial_hold if begins else task.control.mean(axis=0)
@@ -82,8 +84,8 @@ def test_they_swell_from_what_holds_and_fade(begins: bool, ends: bool, tmp_path:
 
 
 @pytest.mark.parametrize(("begins", "ends"), [(False, False), (True, True)])
-def test_a_fourier_start_brings_its_series(begins: bool, ends: bool, tmp_path: Path) -> None:
-    """Fifteen harmonics, or as many as there are below the bandwidth."""
+def test_a_fourier_series_comes_with_its_basis(begins: bool, ends: bool, tmp_path: Path) -> None:
+    """It has fifteen harmonics, or those below the bandwidth."""
     boundary = {"start": "rest" if begins else "given", "end": "rest" if ends else "free"}
     for bandwidth, harmonics in ((None, 15), (7.0, 4)):
         limits = {"control": RANGE, **({"bandwidth": bandwidth} if bandwidth else {})}
@@ -96,7 +98,7 @@ def test_a_fourier_start_brings_its_series(begins: bool, ends: bool, tmp_path: P
 
 
 @pytest.mark.parametrize(("limits", "most"), [({}, 50), ({"bandwidth": 5.0}, 5)])
-def test_a_series_without_a_single_harmonic_is_refused(
+def test_a_series_without_any_harmonic_is_refused(
     limits: dict[str, float], most: int, tmp_path: Path
 ) -> None:
     task = arm(tmp_path, limits=limits, descent={"fourier": (60.0,)})
@@ -107,7 +109,7 @@ def test_a_series_without_a_single_harmonic_is_refused(
 
 
 def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) -> None:
-    """Its rows at the rate of its own; the last one, where nothing is commanded any more, is none."""
+    """Its rows have the rate of the earlier design; the last row commands nothing and is left out."""
     rows = np.arange(20)
     lines = [f"{k * 0.02},{0.01 * k},{-0.02 * k},0.0" for k in rows] + ["0.4,nan,nan,0.0"]
     for name, count in (("old.csv", 21), ("short.csv", 5)):
@@ -131,7 +133,7 @@ def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) ->
         list(initial_controls_of(missing, None))
 
 
-def test_a_repeated_start_is_the_first_part_of_the_initial_control_faded_to_rest(
+def test_a_repeated_control_is_the_first_part_of_the_initial_one_faded_to_rest(
     tmp_path: Path,
 ) -> None:
     boundary, limits = {"start": "rest", "end": "rest"}, {"control": RANGE, "control_rate": 5.0}

@@ -1,4 +1,4 @@
-"""Limits: the model's ranges and the file's, both hold where there are both; and the worst margin of a trajectory."""
+"""Limits from the ranges of the MJCF and of the experiment file, and the smallest margins of a trajectory."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def limits(model: mujoco.MjModel, **tables: object) -> tuple[Limit, ...]:
 
 
 def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajectory:
-    """Three samples at rest but for the named columns."""
+    """Three samples at rest, apart from the named columns."""
     arrays = {
         "qpos": np.zeros((3, model.nq)),
         "qvel": np.zeros((3, model.nv)),
@@ -75,8 +75,8 @@ def test_model_ranges_are_the_default(model: mujoco.MjModel) -> None:
     )
 
 
-def test_file_narrows_and_adds(model: mujoco.MjModel) -> None:
-    """A single velocity is a symmetric range. On purpose the file no longer replaces the MJCF's range: both hold."""
+def test_the_file_narrows_ranges_and_adds_others(model: mujoco.MjModel) -> None:
+    """One number is a symmetric range. The file does not replace the range of the MJCF: both hold."""
     found = limits(
         model,
         position={"lift": (-0.1, 0.1), "turn": (-1, 2)},
@@ -94,7 +94,7 @@ def test_file_narrows_and_adds(model: mujoco.MjModel) -> None:
 
 
 def test_one_number_stands_for_all_names(model: mujoco.MjModel) -> None:
-    """Of joints with one degree of freedom, of actuators, of actuators with one force."""
+    """It holds for joints with one degree of freedom, for controls, and for actuators with a single force."""
     found = limits(model, velocity=2.0, acceleration=9.0, control_rate=7.0, force=1.5)
     joints, places = (("lift", 3), ("turn", 4)), (("push", 0), ("twist", 1))
     assert set(found) - set(limits(model)) == {
@@ -115,7 +115,7 @@ def test_one_number_stands_for_all_names(model: mujoco.MjModel) -> None:
 
 
 def test_every_range_of_the_model_is_a_limit() -> None:
-    """Of positions, controls, forces of actuators and forces of actuators on joints, at their own places."""
+    """Positions, controls, actuator forces and actuator forces on joints have their addresses."""
     text = XML.replace(
         'name="turn" type="hinge"', 'name="turn" type="hinge" actuatorfrcrange="-6 7"'
     )
@@ -164,14 +164,16 @@ def test_every_range_of_the_model_is_a_limit() -> None:
         ({"force": {"turn": 1.0}}, r"limits\.force: unknown actuator 'turn'.*; valid: push, twist"),
     ],
 )
-def test_misuse(model: mujoco.MjModel, tables: dict[str, object], message: str) -> None:
-    """Key, fault and what would be right."""
+def test_wrong_limits_are_refused(
+    model: mujoco.MjModel, tables: dict[str, object], message: str
+) -> None:
+    """The message names the key, the fault and the valid alternatives."""
     with pytest.raises(ExperimentError, match=message):
         limits(model, **tables)
 
 
 def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -> dict[str, float]:
-    """Worst margins of a curve, looked at once per sample, by the constraints of an experiment on a model."""
+    """Smallest margins of a trajectory with one engine step per sample, for an experiment on a model."""
     task = make_task(
         text,
         folder,
@@ -188,8 +190,8 @@ def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -
     return constraints.margins(ConstraintValues(trajectory=trajectory, observed=shown[:, None]))
 
 
-def test_no_limits_no_margins(model: mujoco.MjModel, tmp_path: Path) -> None:
-    """Nothing stated, nothing reported."""
+def test_without_limits_there_are_no_margins(model: mujoco.MjModel, tmp_path: Path) -> None:
+    """No limit is stated."""
     free = XML.replace('range="-0.5 0.25"', "").replace('ctrlrange="-2 3"', "")
     assert margins(free, tmp_path, curve(model)) == {}
 
@@ -216,8 +218,10 @@ def test_margins(
     assert margins(XML, tmp_path, curve(model, **columns)) == pytest.approx(expected)
 
 
-def test_margin_is_the_worst_of_its_kind(model: mujoco.MjModel, tmp_path: Path) -> None:
-    """Two joints, the tighter one counts whichever comes first."""
+def test_the_margin_of_a_kind_is_the_smallest_of_its_joints(
+    model: mujoco.MjModel, tmp_path: Path
+) -> None:
+    """The tighter of two joints counts, in any order."""
     for tight, loose in (("lift", "turn"), ("turn", "lift")):
         moving = curve(model, qvel=({"lift": 3, "turn": 4}[tight], [0.0, 1.5, 0.0]))
         found = margins(XML, tmp_path, moving, velocity={tight: 1.0, loose: 10.0})
@@ -227,7 +231,7 @@ def test_margin_is_the_worst_of_its_kind(model: mujoco.MjModel, tmp_path: Path) 
 def test_accelerations_and_rates_of_the_control_are_changes_over_their_time(
     model: mujoco.MjModel, tmp_path
 ) -> None:
-    """Of the velocity over an engine step (2 ms), of the control over a sample (10 ms); the first control may be any."""
+    """The velocity changes over an engine step (2 ms), the control over a sample (10 ms); the first control is free."""
     moving = curve(model, qvel=(4, [0.0, 0.01, -0.02]), ctrl=(1, [0.5, 0.2]))
     found = margins(
         XML,
@@ -260,7 +264,7 @@ SERVOED = """
 
 
 def test_every_control_of_an_actuator_has_its_range() -> None:
-    """MuJoCo keeps ranges of controls per control. The range of a single force is a limit too, that of a norm is none."""
+    """MuJoCo has one range per control. The range of a single force is a limit too, that of a norm is not."""
     found = limits(mujoco.MjModel.from_xml_string(SERVOED))
     aims = [
         Limit(kind="control", name=f"aim[{i}]", index=i, lower=-1.0, upper=1.0) for i in range(3)

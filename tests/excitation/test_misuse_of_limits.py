@@ -1,4 +1,4 @@
-"""Hard limits and boundaries that cannot be: one message with file and key, exit code 2, before any work."""
+"""Hard limits and boundaries that cannot be kept: one message with file and key and exit code 2, before any optimisation."""
 
 from __future__ import annotations
 
@@ -176,7 +176,9 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_said_with_file_and_key_before_any_work(name: str, tmp_path: Path) -> None:
+def test_a_fault_is_reported_with_file_and_key_before_any_optimisation(
+    name: str, tmp_path: Path
+) -> None:
     lines, fragments, edits = FAULTS[name]
     path = write_experiment(tmp_path)
     path.write_text(f"{path.read_text(encoding='utf-8')}\n{lines}\n", encoding="utf-8")
@@ -193,7 +195,7 @@ def test_a_fault_is_said_with_file_and_key_before_any_work(name: str, tmp_path: 
 
 
 def with_control_weight(folder: Path, lines: str) -> Path:
-    """The study without weight on its control."""
+    """An experiment file without weight on its control."""
     path = write_experiment(folder)
     text = path.read_text(encoding="utf-8").replace("control = 1e-3", "control = 0.0")
     path.write_text(f"{text}\n{lines}\n", encoding="utf-8")
@@ -216,8 +218,8 @@ def test_a_control_with_neither_weight_nor_hard_range_is_refused(
     )
 
 
-def test_a_hard_range_stands_for_the_weight(tmp_path: Path) -> None:
-    """The file's, or the model's own."""
+def test_a_hard_range_replaces_the_weight(tmp_path: Path) -> None:
+    """It may be stated in the file or in the MJCF."""
     path = with_control_weight(tmp_path, "[limits]\ncontrol = { force = [-5.0, 5.0] }")
     assert DesignTask.resolve(Experiment.from_file(path)).control_weight.tolist() == [0.0]
     model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
@@ -229,7 +231,7 @@ def test_a_hard_range_stands_for_the_weight(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rate", [100.0, 2000.0])
 def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) -> None:
-    """However little it falls within a sample."""
+    """It falls very little within a sample of a high rate."""
     task = make_task(
         CART_PENDULUM.format(integrator="RK4").replace('timestep="0.01"', 'timestep="0.0005"'),
         tmp_path,
@@ -246,10 +248,10 @@ def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) 
         design_task(task)
 
 
-def test_limits_that_no_control_can_keep_are_no_misuse(
+def test_limits_that_no_control_can_keep_end_with_exit_code_one(
     tmp_path: Path,
 ) -> None:
-    """The pendulum falls faster than it may: exit code 1 after the work, and said which limit is missed."""
+    """The pendulum falls faster than its limit allows; the message names the violated limit."""
     hard = "[limits]\nvelocity = { hinge = 0.5 }\ncontrol = { force = [-0.01, 0.01] }"
     path = write_experiment(tmp_path, max_iterations=f"4\n{hard}")
     model = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
@@ -266,7 +268,7 @@ def test_limits_that_no_control_can_keep_are_no_misuse(
     assert "velocity limits are exceeded by" in result.stderr
 
 
-def test_a_fourier_start_above_the_bandwidth_is_refused(tmp_path: Path) -> None:
+def test_a_fourier_series_above_the_bandwidth_is_refused(tmp_path: Path) -> None:
     path = write_experiment(
         tmp_path, max_iterations="3\nfourier = [7.0]\n[limits]\nbandwidth = 5.0"
     )
@@ -276,8 +278,8 @@ def test_a_fourier_start_above_the_bandwidth_is_refused(tmp_path: Path) -> None:
     )
 
 
-def test_a_coarse_level_that_divides_nothing_is_refused(tmp_path: Path) -> None:
-    """Its timestep may be a share of a sample, or its samples a share of all."""
+def test_a_coarse_level_that_does_not_divide_the_samples_is_refused(tmp_path: Path) -> None:
+    """A level may have a longer timestep or longer samples."""
     hard = "[limits]\ncontrol = { force = [-5.0, 5.0] }\ncontrol_rate = 100.0"
     path = write_experiment(tmp_path, max_iterations=f"3\ncoarse = 7\n{hard}")
     said = "descent.coarse: 7 divides neither the 1 engine steps of a sample nor the 100 samples"
@@ -297,7 +299,7 @@ LOOSE = """
 """
 
 
-def test_ranges_that_are_no_limits_are_named() -> None:
+def test_ranges_of_the_mjcf_that_are_no_limits_are_named() -> None:
     model = mujoco.MjModel.from_xml_string(LOOSE)
     assert unsupported_ranges(model) == (
         "ball joint wrist",

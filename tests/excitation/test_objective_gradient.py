@@ -1,7 +1,7 @@
 """The adjoint gradient of J against central differences of J through the projection, on models of every kind.
 
-In every experiment here limits, clamps and contacts stay out of play: the models have none, or the control is too weak to
-reach them (said where it applies).
+In every experiment here limits, clamps and contacts do not act: the models have none, or the control is too weak to
+reach them (a docstring says so).
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def servo(folder: Path) -> DesignTask:
 
 
 def staged(task: DesignTask, basis: Array | None = None, power: float = np.inf) -> DesignTask:
-    """The same task, its cost as a stage of the descent sees it."""
+    """A task with the cost of a stage of the descent."""
     vars(task)["problem"] = Stage(task, basis, power).problem
     return task
 
@@ -269,7 +269,7 @@ def test_a_gradient_off_by_a_thousandth_would_be_rejected(case: str, tmp_path) -
         assert gradient_error(task, K, CENTRAL_DIFFERENCES, 5e-3, factor) > 5e-4
 
 
-def test_leaving_out_what_psi_does_to_the_information_would_be_rejected(tmp_path) -> None:
+def test_a_gradient_without_the_part_of_psi_would_be_rejected(tmp_path) -> None:
     task = cart_task(tmp_path)
     point, expansion = expansion_of(task, CENTRAL_DIFFERENCES)
     K = np.zeros((task.samples, 1, 4))
@@ -293,7 +293,7 @@ def test_leaving_out_what_psi_does_to_the_information_would_be_rejected(tmp_path
         ("quaternions measured", "h_mixed"),
     ],
 )
-def test_leaving_out_a_term_of_the_measurement_would_be_rejected(
+def test_a_gradient_without_a_term_of_the_outputs_would_be_rejected(
     case: str, term: str, tmp_path, monkeypatch
 ) -> None:
     task = SETUPS[case](tmp_path)
@@ -308,7 +308,9 @@ def test_leaving_out_a_term_of_the_measurement_would_be_rejected(
 
 
 @pytest.mark.parametrize("case", ["robust mean", "robust worst", "robust worst D"])
-def test_leaving_out_a_sample_of_a_robust_design_would_be_rejected(case: str, tmp_path) -> None:
+def test_a_gradient_without_a_sample_of_a_robust_design_would_be_rejected(
+    case: str, tmp_path
+) -> None:
     task = SETUPS[case](tmp_path)
     point, K = (
         task.problem.point(task.initial, CENTRAL_DIFFERENCES),
@@ -365,7 +367,7 @@ def test_running_cost_and_its_gradient_are_the_stated_sum(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])
-def test_slopes_are_compared_with_J_or_where_J_may_vanish_with_what_cannot(
+def test_the_size_of_J_is_J_or_of_D_optimality_one_nat_per_parameter(
     criterion: str, tmp_path
 ) -> None:
     task = cart_task(tmp_path, cost={**TRACKING, "criterion": criterion, "information": 0.3})
@@ -379,7 +381,7 @@ def test_slopes_are_compared_with_J_or_where_J_may_vanish_with_what_cannot(
         assert task.problem.size(point) == point.cost > 0.0
 
 
-def test_a_diverged_trial_costs_infinity_and_cannot_be_expanded(tmp_path) -> None:
+def test_a_diverged_trial_has_infinite_cost_and_no_expansion(tmp_path) -> None:
     task = cart_task(tmp_path)
     point, expansion = expansion_of(task, FORWARD_DIFFERENCES)
     K = np.zeros((task.samples, 1, 4))
@@ -389,7 +391,7 @@ def test_a_diverged_trial_costs_infinity_and_cannot_be_expanded(tmp_path) -> Non
         task.problem.expand(lost)
 
 
-def test_refining_keeps_the_trajectory_and_its_cost_and_happens_once(tmp_path) -> None:
+def test_refining_keeps_the_trajectory_and_its_cost_and_is_possible_once(tmp_path) -> None:
     task = cart_task(tmp_path)
     point = task.problem.point(task.initial, FORWARD_DIFFERENCES)
     better = task.problem.refine(point)

@@ -27,7 +27,7 @@ KINDS = {
 
 
 def pool(kind: str, count: int = 4) -> ParameterSamples:
-    """Over any parameter values."""
+    """Samples with any parameter values."""
     over, logarithmic = KINDS[kind]
     return ParameterSamples(thetas=np.zeros((count, 1)), over=over, logarithmic=logarithmic)
 
@@ -68,7 +68,7 @@ def test_the_mean_is_the_mean_and_the_worst_lies_just_below_the_largest() -> Non
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_samples_that_agree_pool_to_what_they_are_and_one_that_is_blind_makes_all_blind(
+def test_equal_samples_pool_to_their_value_and_one_infinite_sample_to_infinity(
     kind: str,
 ) -> None:
     assert pool(kind).value(np.full(4, 3.0)) == pytest.approx(3.0)
@@ -103,7 +103,7 @@ def test_samples_fill_bounds_evenly_and_begin_with_the_guess() -> None:
     assert abs(np.corrcoef(drawn[1:, 0], drawn[1:, 1])[0, 1]) < 0.7
 
 
-def test_samples_of_a_prior_are_normal_and_keep_within_bounds_and_reason() -> None:
+def test_samples_of_a_prior_are_normal_and_within_bounds() -> None:
     parameters = unknowns(
         {"prior": 0.5, "guess": 2.0}, {"prior": 1.0, "bounds": (-0.2, np.inf)}, {"prior": 1e3}
     )
@@ -158,7 +158,7 @@ def vague_task(folder: Path, **tables: object) -> DesignTask:
 
 
 def phis(task: DesignTask, control: Array, thetas: Array) -> Array:
-    """The criterion of the guess's experiment at other parameter values, each with its own trajectory."""
+    """The criterion at several parameter values, each along its trajectory."""
     found = []
     for theta in thetas:
         sensitivity = task.plant.derivatives.sensitivity(theta, task.plant.simulate(theta, control))
@@ -188,7 +188,7 @@ def test_the_cost_is_the_pooled_criterion_of_separate_experiments_at_the_samples
 @pytest.mark.parametrize(
     ("over", "pooled"), [("worst", np.max), pytest.param("mean", np.mean, marks=pytest.mark.slow)]
 )
-def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
+def test_a_robust_design_is_better_at_its_samples_than_the_nominal_design(
     over: str, pooled: Callable[[Array], float], tmp_path
 ) -> None:
     robust, nominal = (
@@ -209,7 +209,7 @@ def test_a_robust_design_serves_its_samples_better_than_the_nominal_design(
     ]
     assert made.final.cost < 0.9 * crossed[0].cost
     assert plain.final.cost < 0.9 * crossed[1].cost
-    # samples that neither has seen profit as well
+    # it is better at samples that neither design was made for, too
     fresh = sample_parameters(robust.parameters, robust.theta, 9, seed=7)[1:]
     ours, theirs = (phis(nominal, d.trajectory.ctrl, fresh) for d in (made, plain))
     assert pooled(ours) < 0.9 * pooled(theirs)

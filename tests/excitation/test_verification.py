@@ -1,4 +1,4 @@
-"""The verify of a design on the model as the user wrote it: between the samples, with clamps and stops, or lost."""
+"""Verification of a design on the model as the user wrote it: between samples, at clamps and stops, and where it diverges."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SPEED = SWING * 2 * np.pi * 10.0
 
 
 def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -> DesignTask:
-    """A second of it, at 10 Hz, from the middle at full speed, hardly pushed."""
+    """One second of a mass on a spring at 10 Hz, from the middle at full speed, with a small force."""
     defaults: dict[str, Any] = {
         "rate": 10.0,
         "horizon": 1.0,
@@ -47,8 +47,8 @@ def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -
     return make_task(text, folder, **{**defaults, **tables})
 
 
-def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
-    """At every sample the ball is in the middle, at full speed and without acceleration; in between it is anywhere."""
+def test_limits_hold_between_the_samples_too(tmp_path: Path) -> None:
+    """At every sample the ball is in the middle, at full speed and without acceleration; between samples it swings."""
     limits = {
         "position": {"slide": (-0.1, 0.12)},
         "velocity": {"slide": (0.9 * SPEED, 2 * SPEED)},
@@ -82,7 +82,7 @@ def test_what_happens_between_the_samples_counts(tmp_path: Path) -> None:
     ) == pytest.approx(found.margins)
 
 
-def test_clearance_between_the_samples_counts(tmp_path: Path) -> None:
+def test_a_clearance_holds_between_the_samples_too(tmp_path: Path) -> None:
     """The wall is 0.19 m from the ball in the middle, and 0.15 m nearer where it turns."""
     task = spring_task(tmp_path, limits={"clearance": 0.1})
     constraints = constraint_set_of(task)
@@ -95,8 +95,8 @@ def test_clearance_between_the_samples_counts(tmp_path: Path) -> None:
     assert verify(spring_task(tmp_path, limits={"clearance": 0.035}), task.initial).is_feasible
 
 
-def test_what_keeps_all_limits_is_kept_to_the_last_digit(tmp_path: Path) -> None:
-    """Just above the swing, just below it."""
+def test_a_limit_just_above_the_amplitude_holds_and_one_just_below_does_not(tmp_path: Path) -> None:
+    """The limit is just above the amplitude, or just below it."""
     for edge, kept in ((1.001, True), (0.999, False)):
         limits = {"position": {"slide": (-edge * SWING, 1.0)}}
         task = spring_task(tmp_path, limits=limits)
@@ -105,7 +105,7 @@ def test_what_keeps_all_limits_is_kept_to_the_last_digit(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("clamp", ["stop", "force", "joint force", "control"])
 def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path: Path) -> None:
-    """A design on the plant without them: played on the model with them it goes elsewhere."""
+    """A design on the plant without them deviates when it is played on the model with them."""
     words = {
         "stop": {"joint": 'range="-0.1 0.1" limited="true" solreflimit="0.004 1"'},
         "force": {"motor": 'forcerange="-0.05 0.05"'},
@@ -131,7 +131,7 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
 def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
     enforce: bool, tmp_path: Path
 ) -> None:
-    """A boundary alone keeps no force within its clamp: the design's plant must have it."""
+    """A boundary alone does not keep a force within its range: the plant of the design must clamp it."""
     motor = 'ctrlrange="-0.05 0.05" forcerange="-0.04 0.04"'
     control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
     tables = {
@@ -148,8 +148,8 @@ def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
     assert (verify(task, designed).deviation < SAME_STATE_TOLERANCE) is not enforce
 
 
-def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
-    """What is asked of the end does."""
+def test_violated_limits_that_are_only_checked_leave_a_design_feasible(tmp_path: Path) -> None:
+    """A boundary at the end is enforced in any case."""
     limits = {"position": {"slide": (-0.1, 0.12)}, "clearance": 0.1, "enforce": False}
     for boundary, kept in (
         ({}, True),
@@ -163,7 +163,7 @@ def test_limits_that_are_checked_only_do_not_decide(tmp_path: Path) -> None:
         assert found.is_feasible is kept
 
 
-def test_a_control_that_the_model_does_not_survive_keeps_nothing(tmp_path: Path) -> None:
+def test_a_control_that_makes_the_model_diverge_violates_every_limit(tmp_path: Path) -> None:
     limits = {"position": {"slide": (-3.0, 3.0)}, "control": {"force": (-1e13, 1e13)}}
     task = make_task(
         CART_PENDULUM.format(integrator="RK4"),

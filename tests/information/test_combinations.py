@@ -1,4 +1,4 @@
-"""Parameters that show in combination only, all the way: design, several experiments, earlier ones, estimates, criteria."""
+"""Parameters that are identifiable only in combination: in designs, joint designs, prior information, estimates and criteria."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ SINE = {"kind": "multisine", "amplitude": 1.0, "frequency": 0.5}
 
 
 def pendulum(folder: Path, **tables) -> DesignTask:
-    """One second of it, all states measured."""
+    """One second of a double pendulum, all states measured."""
     defaults = {
         "parameters": PARAMETERS,
         "noise": {"state": 0.01},
@@ -65,7 +65,7 @@ def lost(names: tuple[str, ...], std: np.ndarray) -> set[str]:
 
 
 @pytest.mark.slow
-def test_experiments_together_do_not_take_round_off_for_information(tmp_path) -> None:
+def test_joint_experiments_do_not_take_round_off_for_information(tmp_path) -> None:
     first = pendulum(tmp_path).experiment
     second = pendulum(tmp_path, initial={"qpos": (0.5, -0.4), "control": SINE}).experiment
     for design in mjfim.design_jointly([first, second], rounds=1):
@@ -90,7 +90,7 @@ def test_earlier_information_of_a_design_leaves_every_sigma_known(tmp_path) -> N
     assert {row.name for row in told.rows if not np.isfinite(row.std)} == {"m1r1", "I1", "m2"}
 
 
-def test_an_estimate_holds_what_no_recording_shows_and_knows_the_rest(tmp_path) -> None:
+def test_an_estimate_keeps_what_no_recording_shows_and_determines_the_rest(tmp_path) -> None:
     parameters = {
         **PARAMETERS,
         "d": {"target": "joint/shoulder:damping", "guess": 0.15, "true": 0.1},
@@ -133,7 +133,7 @@ def test_criterion_c_refuses_what_cannot_be_identified(tmp_path) -> None:
     )  # per second, 100 Hz
 
 
-def test_nothing_visible_is_a_verdict_not_a_crash(tmp_path) -> None:
+def test_parameters_that_are_all_invisible_are_reported(tmp_path) -> None:
     found = check_task(
         pendulum(tmp_path, parameters={"wind": {"target": "option:wind[0]", "guess": 1.0}})
     )
@@ -141,7 +141,7 @@ def test_nothing_visible_is_a_verdict_not_a_crash(tmp_path) -> None:
     assert any("no parameter can be identified" in sentence for sentence in found.verdict)
 
 
-def test_a_prior_on_one_member_tells_the_group_apart(tmp_path) -> None:
+def test_a_prior_on_one_member_makes_the_others_identifiable(tmp_path) -> None:
     parameters = {**PARAMETERS, "m2": {"target": "body/lower:mass", "prior": 0.01}}
     found = check_task(pendulum(tmp_path, parameters=parameters))
     assert all(np.isfinite(row.std) for row in found.rows)
@@ -150,7 +150,7 @@ def test_a_prior_on_one_member_tells_the_group_apart(tmp_path) -> None:
     assert any("by priors only" in sentence for sentence in found.verdict)
 
 
-def test_starts_are_each_recordings_own_for_check_as_for_identify(tmp_path) -> None:
+def test_check_and_identify_estimate_an_initial_state_per_recording(tmp_path) -> None:
     task = pendulum(tmp_path, parameters={"d": PARAMETERS["d"]}, nuisance={"initial": 0.05})
     recordings = [simulate_system(task.system, task.initial, seed=s) for s in range(3)]
     told, estimate = (

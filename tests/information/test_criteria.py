@@ -71,7 +71,7 @@ def test_the_derivative_is_that_of_differences(name: str, spectrum: str) -> None
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_information_only_ever_lowers_the_cost(name: str) -> None:
+def test_more_information_never_raises_the_criterion(name: str) -> None:
     rng, info = np.random.default_rng(2), matrix(SPECTRA["spread"])
     found = ALL[name](info)
     assert (found.weights < 0.0).all()
@@ -82,7 +82,9 @@ def test_information_only_ever_lowers_the_cost(name: str) -> None:
 
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize("least", [0.0, 1e-16, -1e-9, -1.0])
-def test_singular_information_costs_infinity_without_a_warning(name: str, least: float) -> None:
+def test_singular_information_has_an_infinite_criterion_without_a_warning(
+    name: str, least: float
+) -> None:
     found = ALL[name](matrix(np.array([least, 1.0, 2.0, 3.0])))
     assert found.value == np.inf
     assert np.isfinite(found.directions).all()
@@ -95,7 +97,7 @@ def test_the_criterion_of_one_parameter_is_its_variance_or_the_logarithm(name: s
     assert found.value == pytest.approx(-np.log(4.0) if name == "D" else 0.25, rel=1e-12)
 
 
-def test_the_smooth_criterion_lies_above_the_exact_one_and_comes_down_to_it() -> None:
+def test_the_smooth_criterion_is_above_the_exact_one_and_converges_to_it() -> None:
     for values in (SPECTRA["spread"], SPECTRA["close"], np.ones(4)):
         info = matrix(values)
         exact = e_optimality(info).value

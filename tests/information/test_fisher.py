@@ -23,7 +23,7 @@ SIGMA = np.array([0.1, 0.5, 2.0])
 
 
 def random_sensitivity(seed: int, N: int = 12, p: int = 4, nx: int = 5) -> Sensitivity:
-    """Any psi and G."""
+    """Random psi and G."""
     rng = np.random.default_rng(seed)
     return Sensitivity(psi=rng.normal(size=(N + 1, nx, p)), G=rng.normal(size=(N + 1, 3, p)))
 
@@ -126,7 +126,7 @@ PHI = {
 
 
 def seeing(phi: str, seen: str) -> FisherInformation:
-    """A criterion that sees less than all."""
+    """A criterion of the wanted parameters or of some combinations only."""
     wanted = 4 if seen == "combinations" else 2
     contrast = {"contrast": np.arange(1.0, 2 * wanted + 1).reshape(wanted, 2)} if phi == "c" else {}
     return information(weight=2.0, **PHI[phi], **SEEN[seen], **contrast)
@@ -152,7 +152,7 @@ def test_derivative_through_nuisance_and_combinations_is_that_of_differences(
         assert np.sum(1.001 * M * d) != pytest.approx(measured, rel=1e-4)
 
 
-def test_nuisance_leaves_the_block_of_the_full_inverse() -> None:
+def test_the_information_without_nuisance_is_the_inverse_of_the_block_of_the_full_inverse() -> None:
     matrix, t = spread_matrix(np.random.default_rng(13)), NUISANCE["interest"]
     made = information(**NUISANCE)
     scaled = made.scaled(matrix)
@@ -168,7 +168,7 @@ def test_nuisance_leaves_the_block_of_the_full_inverse() -> None:
     )  # forgetting the nuisance would be seen
 
 
-def test_a_nuisance_known_exactly_is_none_and_an_unknown_one_always_costs() -> None:
+def test_a_nuisance_known_exactly_costs_nothing_and_an_unknown_one_always_costs() -> None:
     matrix, t = spread_matrix(np.random.default_rng(14)), NUISANCE["interest"]
     without = information(scale=np.array([1.0, 0.1])).evaluate(matrix[np.ix_(t, t)])
     known, made = np.diag([0.0, 1.0, 0.0, 1.0]), information(**NUISANCE)
@@ -177,7 +177,7 @@ def test_a_nuisance_known_exactly_is_none_and_an_unknown_one_always_costs() -> N
     assert (np.diff(values) > 0.0).all()
 
 
-def test_nuisances_that_cannot_be_told_from_each_other_do_not_matter() -> None:
+def test_nuisances_that_are_confounded_with_each_other_do_not_matter() -> None:
     rng = np.random.default_rng(15)
     J = rng.normal(size=(20, 3))
     same = np.column_stack(
@@ -192,7 +192,7 @@ def test_nuisances_that_cannot_be_told_from_each_other_do_not_matter() -> None:
     assert np.isfinite(found.directions).all()
 
 
-def test_a_wanted_parameter_that_a_nuisance_imitates_costs_infinity() -> None:
+def test_a_wanted_parameter_confounded_with_a_nuisance_has_an_infinite_criterion() -> None:
     J = np.random.default_rng(16).normal(size=(20, 3))
     J[:, 1] = 2.0 * J[:, 2]
     made = information(prior=np.zeros((3, 3)), scale=np.ones(3), interest=np.array([0, 1]))
@@ -200,7 +200,9 @@ def test_a_wanted_parameter_that_a_nuisance_imitates_costs_infinity() -> None:
     assert np.isnan(made.covariance(J.T @ J)).all()
 
 
-def test_combinations_project_the_information_and_tell_who_stands_alone() -> None:
+def test_combinations_project_the_information_and_show_which_parameters_are_identifiable_alone() -> (
+    None
+):
     rng = np.random.default_rng(17)
     J = rng.normal(size=(30, 3)) @ np.array(
         [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -225,7 +227,7 @@ def test_combinations_project_the_information_and_tell_who_stands_alone() -> Non
     )
 
 
-def test_correlated_noise_at_several_rates_weighs_every_sample_with_its_own_covariance() -> None:
+def test_correlated_noise_at_several_rates_weighs_every_sample_with_its_covariance() -> None:
     S, strides = random_sensitivity(18), np.array([2, 2, 3])
     covariance = np.array([[0.01, 0.03, 0.0], [0.03, 0.25, 0.0], [0.0, 0.0, 4.0]])
     total = np.zeros((4, 4))
@@ -284,7 +286,7 @@ def test_criterion_says_how_many_directions_its_gradient_needs(criterion: str, r
 
 
 @pytest.mark.parametrize("criterion", ["E", "A", "D"])
-def test_singular_information_costs_infinity_without_a_warning(criterion: str) -> None:
+def test_singular_information_has_an_infinite_criterion_without_a_warning(criterion: str) -> None:
     for matrix in (
         np.zeros((4, 4)),
         np.diag([0.0, 1.0, 2.0, 3.0]),
@@ -379,7 +381,7 @@ def test_a_product_is_designed_on_what_can_be_identified_of_it(tmp_path) -> None
     np.testing.assert_allclose(result.final.eigenvalues, seen, rtol=1e-6)
 
 
-def test_coefficients_of_a_combination_are_in_the_parameters_own_units(tmp_path) -> None:
+def test_coefficients_of_a_combination_are_in_the_units_of_the_parameters(tmp_path) -> None:
     changed = {**PRODUCT, "gear": {"target": "actuator/force:gear[0]", "guess": 4.0}}
     result = design_task(cart_task(tmp_path, parameters=changed, descent={"max_iterations": 0}))
     assert result.combinations == (
@@ -400,7 +402,7 @@ def test_a_prior_on_one_factor_of_the_product_gives_both_a_deviation(tmp_path) -
 @pytest.mark.parametrize(
     "others", [{}, {"m": CART_PARAMETERS["m"]}], ids=["alone", "beside a mass"]
 )
-def test_a_parameter_that_changes_nothing_is_an_error_that_names_it(others: dict, tmp_path) -> None:
+def test_a_parameter_without_effect_is_an_error_that_names_it(others: dict, tmp_path) -> None:
     blind = {"depth": {"target": "body/bob:pos[1]", "guess": 0.1}, **others}
     with pytest.raises(UnidentifiableError, match=r"parameters\.depth changes nothing") as caught:
         design_task(cart_task(tmp_path, parameters=blind))

@@ -1,4 +1,4 @@
-"""What an experiment can see: along its own start, along any control, and what is refused because nothing shows."""
+"""Identifiable parameters along the initial control and along random ones, and experiments that are refused."""
 
 from __future__ import annotations
 
@@ -79,7 +79,9 @@ def test_an_experiment_that_shows_everything_needs_no_random_controls(
         look_without_simulations(cart_task(tmp_path, parameters=PRODUCT))
 
 
-def test_a_start_that_moves_half_of_the_model_is_told_from_what_never_shows(tmp_path) -> None:
+def test_parameters_hidden_by_the_initial_control_are_told_from_those_that_no_control_shows(
+    tmp_path,
+) -> None:
     task = two_task(tmp_path)
     seen = look(task)
     assert (seen.along_trajectory.silent, seen.along_all.count) == ((1,), 0)
@@ -90,13 +92,13 @@ def test_a_start_that_moves_half_of_the_model_is_told_from_what_never_shows(tmp_
     assert "left" not in str(caught.value)
 
 
-def test_at_rest_nothing_shows_here_and_everything_elsewhere(tmp_path) -> None:
+def test_at_rest_nothing_is_identifiable_and_along_random_controls_everything(tmp_path) -> None:
     seen = look(cart_task(tmp_path, initial=REST))
     assert seen.along_trajectory.basis.shape == (3, 0)
     assert seen.along_all.count == 0
 
 
-def test_what_no_control_shows_is_the_same_here_and_always(tmp_path) -> None:
+def test_the_null_space_of_all_controls_is_that_of_the_initial_one(tmp_path) -> None:
     task = cart_task(tmp_path, parameters=PRODUCT)
     seen = look(task)
     assert (seen.along_trajectory.count, seen.along_all.count) == (1, 1)
@@ -110,7 +112,7 @@ def test_what_no_control_shows_is_the_same_here_and_always(tmp_path) -> None:
     assert np.linalg.norm(J @ hidden) < 1e-6 * np.linalg.norm(J)
 
 
-def test_a_combination_hidden_at_the_start_alone_is_refused_with_a_way_out(tmp_path) -> None:
+def test_a_combination_that_only_the_initial_control_hides_is_refused_with_advice(tmp_path) -> None:
     """A slider that coasts shows damping over mass alone; pushed, it shows both."""
     parameters = {"mass": {"target": "body/left:mass"}, "drag": {"target": "joint/left:damping"}}
     coasting = {"qvel": (1.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
@@ -135,8 +137,8 @@ def test_a_combination_hidden_at_the_start_alone_is_refused_with_a_way_out(tmp_p
 
 
 @pytest.mark.parametrize("sigma", [0.05, 1e-7], ids=["coarse", "fine sensor"])
-def test_a_wanted_parameter_that_a_nuisance_imitates_is_named(sigma: float, tmp_path) -> None:
-    """Where the cart starts and what its position sensor adds are the same to every measurement."""
+def test_a_wanted_parameter_confounded_with_a_nuisance_is_named(sigma: float, tmp_path) -> None:
+    """The initial position of the cart and the bias of its position sensor change every measurement alike."""
     wanted = {"offset": {"target": "output/qpos:slide:bias"}}
     noise = {"qpos:slide": sigma, "qvel:slide": sigma}
     task = cart_task(
@@ -161,7 +163,7 @@ def test_members_of_an_inertia_may_be_invisible_but_not_all_of_them(tmp_path) ->
         require_designable(welded, look(welded))
 
 
-def test_several_dead_parameters_are_all_named(tmp_path) -> None:
+def test_several_parameters_without_effect_are_all_named(tmp_path) -> None:
     dead = {
         "y": {"target": "body/bob:pos[1]", "guess": 0.1},
         "i": {"target": "body/cart:inertia[0]"},
@@ -215,7 +217,9 @@ def controls(task: DesignTask) -> list[Array]:
     return [probe.ctrl for probe in task.probes(PROBES)]
 
 
-def test_random_controls_keep_to_the_actuators_and_about_the_initial_one(tmp_path) -> None:
+def test_random_controls_stay_in_the_ranges_of_the_actuators_and_about_the_initial_one(
+    tmp_path,
+) -> None:
     control = {
         "kind": "sine",
         "amplitude": {"left": 0.8, "right": 3.0},
@@ -251,7 +255,7 @@ def test_random_controls_that_diverge_are_left_out(tmp_path, monkeypatch) -> Non
     assert (seen.along_trajectory.count, seen.along_all.count) == (1, 1)
 
 
-def test_data_must_show_every_parameter_nuisance_and_prior_or_not(tmp_path) -> None:
+def test_data_must_show_every_parameter_even_nuisances_and_those_with_a_prior(tmp_path) -> None:
     plain = cart_task(tmp_path)
     require_visible(
         plain.parameters,
@@ -266,7 +270,7 @@ def test_data_must_show_every_parameter_nuisance_and_prior_or_not(tmp_path) -> N
             require_visible(task.parameters, task.prior, J)
 
 
-def test_the_design_refuses_before_it_spends_anything(tmp_path) -> None:
+def test_a_design_is_refused_before_any_optimisation(tmp_path) -> None:
     task = two_task(tmp_path)
     told: list[object] = []
     with pytest.raises(UnidentifiableError, match="start excites nothing"):

@@ -1,4 +1,4 @@
-"""Invisible directions of synthetic sensitivities and of a double pendulum whose base parameters are known in closed form."""
+"""Null spaces of synthetic sensitivities and of a double pendulum whose base parameters are known in closed form."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def rows(null: Array, seed: int = 0, n: int = 60) -> Array:
 
 
 def look(J: Array, error: Array | None = None, size: Array = SIZES, **changes) -> NullSpace:
-    """Invisible directions of rows whose parameters have these sizes and nothing known before."""
+    """Null space of rows whose parameters have these sizes and no prior."""
     p = len(size)
     given = {"scale": size, "interest": np.arange(p), "prior": np.zeros((p, p)), **changes}
     return find_null_space(J, error, size, **given)
 
 
 def same_span(found: Array, expected: Array) -> bool:
-    """Two matrices span one space."""
+    """Tell whether two matrices span one space."""
     a, b = np.linalg.qr(found)[0], np.linalg.qr(expected)[0]
     return a.shape == b.shape and np.linalg.svd(a.T @ b)[1].min() > 1.0 - 1e-9
 
@@ -45,7 +45,7 @@ NULLS = {
 
 @pytest.mark.parametrize("noise", [0.0, 1e-11], ids=["exact", "round-off"])
 @pytest.mark.parametrize("case", NULLS)
-def test_a_known_null_space_is_found_whatever_the_parameters_sizes(case: str, noise: float) -> None:
+def test_a_known_null_space_is_found_for_parameters_of_any_size(case: str, noise: float) -> None:
     null = NULLS[case]
     J = rows(null) / SIZES
     rng = np.random.default_rng(2)
@@ -61,7 +61,7 @@ def test_a_known_null_space_is_found_whatever_the_parameters_sizes(case: str, no
     assert np.linalg.matrix_rank(J * SIZES @ found.basis, tol=1e-6) == 5 - found.count
 
 
-def test_the_basis_is_in_scaled_units_whatever_the_scale() -> None:
+def test_the_basis_is_in_scaled_units() -> None:
     null, scale = NULLS["one of all"], np.array([2.0, 1e-5, 3.0, 7.0, 1e3])
     found = look(rows(null) / SIZES, scale=scale)
     np.testing.assert_allclose(
@@ -91,7 +91,7 @@ def test_nearly_alike_columns_are_visible_down_to_the_error_of_the_differences()
 
 
 @pytest.mark.parametrize("alive", [0, 1, 4])
-def test_parameters_that_change_nothing_are_silent(alive: int) -> None:
+def test_parameters_without_effect_are_silent(alive: int) -> None:
     J = np.zeros((60, 5))
     J[:, :alive] = np.random.default_rng(6).normal(size=(60, alive)) / SIZES[:alive]
     found = look(J)
@@ -102,7 +102,7 @@ def test_parameters_that_change_nothing_are_silent(alive: int) -> None:
     assert (found.smallest > 0.5) == (alive > 0)
 
 
-def test_round_off_beside_strong_parameters_is_silent_and_a_clean_faint_effect_is_not() -> None:
+def test_round_off_beside_strong_parameters_is_silent_and_a_weak_exact_effect_is_not() -> None:
     rng = np.random.default_rng(7)
     J = np.column_stack([1e5 * rng.normal(size=60), 1e-4 * rng.normal(size=60)])
     assert look(J, np.column_stack([np.zeros(60), J[:, 1]]), np.ones(2)).silent == (
@@ -111,7 +111,7 @@ def test_round_off_beside_strong_parameters_is_silent_and_a_clean_faint_effect_i
     assert look(J, np.column_stack([np.zeros(60), 1e-3 * J[:, 1]]), np.ones(2)).silent == ()
 
 
-def test_a_nuisance_hides_what_it_imitates_unless_it_is_known() -> None:
+def test_a_nuisance_hides_a_parameter_with_an_equal_effect_unless_it_is_known() -> None:
     J = rows(NULLS["one pair"]) / SIZES
     kept = {"interest": np.array([0, 1, 2, 3])}
     hidden = look(J, **kept)
@@ -122,7 +122,7 @@ def test_a_nuisance_hides_what_it_imitates_unless_it_is_known() -> None:
 
 
 @pytest.mark.parametrize("strength", [1.0, 1e5], ids=["weak", "strong"])
-def test_a_lone_wanted_parameter_that_a_nuisance_imitates_to_round_off_is_hidden(
+def test_a_single_wanted_parameter_confounded_with_a_nuisance_is_hidden(
     strength: float,
 ) -> None:
     rng = np.random.default_rng(8)
@@ -137,7 +137,7 @@ def test_a_lone_wanted_parameter_that_a_nuisance_imitates_to_round_off_is_hidden
     assert seen.smallest < 1e-3  # little is left of it: a doubt that deserves a second look
 
 
-def test_a_direction_known_to_be_invisible_stays_so_however_large_the_round_off() -> None:
+def test_a_direction_known_to_be_invisible_stays_so_despite_large_round_off() -> None:
     rng = np.random.default_rng(10)
     chaotic = rng.normal(size=(60, 5)) / SIZES  # everything seems to show
     direction = NULLS["one of all"] * SIZES[:, None]
@@ -161,7 +161,7 @@ def words(null: Array, units: tuple[str, ...] = ("",) * 5, size: Array = SIZES) 
     ]
 
 
-def test_groups_name_their_members_and_what_remains_of_them() -> None:
+def test_groups_name_their_members_and_identifiable_combinations() -> None:
     said = words(NULLS["two"], size=np.ones(5))
     assert len(said) == 2
     assert said[0] == "a and b only as a + b"
@@ -169,7 +169,7 @@ def test_groups_name_their_members_and_what_remains_of_them() -> None:
 
 
 @pytest.mark.parametrize("case", NULLS)
-def test_what_remains_in_words_is_blind_to_every_invisible_direction(case: str) -> None:
+def test_combinations_of_groups_do_not_change_along_the_null_space(case: str) -> None:
     found = look(rows(NULLS[case]) / SIZES)
     groups = parameter_groups(found, "abcde", SIZES, [""] * 5)
     assert sum(len(g.members) - len(g.combinations) for g in groups) == found.count
@@ -182,7 +182,7 @@ def test_what_remains_in_words_is_blind_to_every_invisible_direction(case: str) 
             np.testing.assert_allclose(terms.sum(axis=0), 0.0, atol=1e-7 * np.abs(terms).max())
 
 
-def test_nothing_invisible_gives_no_groups_and_silent_ones_are_said_once() -> None:
+def test_an_empty_null_space_gives_no_groups_and_silent_parameters_make_one() -> None:
     assert (
         parameter_groups(
             look(np.random.default_rng(9).normal(size=(60, 5)) / SIZES), "abcde", SIZES, [""] * 5

@@ -1,4 +1,4 @@
-"""Where two difference steps disagree: dry friction and contacts are flagged with sample and cause, smooth models are not."""
+"""Disagreement of two difference steps: dry friction and contacts are flagged with sample and cause, smooth models are not."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ BALL = """
 
 
 def slider(folder: Path, joint: str = "", motor: str = "", amplitude: float = 3.0) -> DesignTask:
-    """A block that is pushed to and fro."""
+    """A block that is pushed back and forth."""
     parameters = {"mass": {"target": "body/block:mass"}, "drag": {"target": "joint/rail:damping"}}
     control = {"kind": "sine", "amplitude": amplitude, "frequency": 1.0}
     xml = SLIDER.format(joint=joint, motor=motor)
@@ -179,11 +179,11 @@ def test_the_design_warns_of_roughness(tmp_path) -> None:
 
 
 def sensed(seed: int = 0) -> Array:
-    """Any G: (21, 3, 2)."""
+    """Random G: (21, 3, 2)."""
     return np.random.default_rng(seed).normal(size=(21, 3, 2))
 
 
-def test_disagreement_is_relative_to_each_outputs_own_largest_value() -> None:
+def test_disagreement_is_relative_to_the_largest_value_of_each_output() -> None:
     fine = sensed() * np.array([1.0, 10.0, 0.1])[:, None]
     coarse = np.array(fine)
     coarse[7, 2, 1] += 0.1 * np.abs(fine[:, 2, 1]).max()
@@ -215,7 +215,7 @@ def test_a_parameter_without_effect_is_not_called_rough(tmp_path) -> None:
     assert along(alone) is None
 
 
-def test_a_model_that_diverges_under_the_longer_step_is_rough_without_bound(
+def test_a_model_that_diverges_under_the_longer_step_is_infinitely_rough(
     tmp_path, monkeypatch
 ) -> None:
     task = slider(tmp_path, 'frictionloss="1.5"')
