@@ -122,7 +122,7 @@ def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -
 def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
     name: str, tmp_path: Path
 ) -> None:
-    """Its squares are the changes of all constrained quantities along a tangent curve; its weights are the barrier's curvature."""
+    """Changes of all constrained quantities along a tangent curve are squared, and weighted by the barrier's curvature."""
     task = arm_task(tmp_path, **TOGETHER[name])
     constraints, delta = constraint_set_of(task), 0.05
     problem = InteriorProblem(task.problem, constraints, 1.0, delta, costs=False)
