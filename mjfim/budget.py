@@ -6,6 +6,7 @@ Ctrl-C becomes a token at the edge, in the verbs and the command line, by `stop_
 
 from __future__ import annotations
 
+import copy
 import signal
 import threading
 import time
@@ -88,6 +89,11 @@ class Budget:
         return max(self.deadline - time.monotonic(), 0.0)
 
     @property
+    def iterations_left(self) -> float:
+        """Iterations that are left, never negative; infinite without a limit."""
+        return max(self.max_iterations - self.iterations, 0)
+
+    @property
     def seconds_used(self) -> float:
         """Time since the budget was made [s]."""
         return time.monotonic() - self.begun
@@ -133,6 +139,19 @@ class Budget:
             iterations=iterations,
             stop=self.stop,
         )
+
+    def with_stop(self, stop: StopToken) -> Budget:
+        """Make a copy that asks another token.
+
+        Args:
+            stop: The other token.
+
+        Returns:
+            A budget with the same limits, of which as much is used.
+        """
+        other = copy.copy(self)
+        other.stop = stop
+        return other
 
     def __getstate__(self) -> dict[str, Any]:
         """State for another process, which has another stop token and whose monotonic clock may differ."""

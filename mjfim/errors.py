@@ -30,6 +30,10 @@ class SimulationDivergedError(MjfimError):
     """MuJoCo reported a numerical warning, or a state is not finite, along a rollout that must not fail."""
 
 
+class NoResultError(MjfimError):
+    """The work was asked to stop before there was a result."""
+
+
 def unknown(kind: str, name: str, valid: Iterable[str]) -> str:
     """Sentence for a name that does not exist.
 

@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from mjfim.excitation.design import design_task
+from mjfim.excitation.levels import Stage
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import Stage
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
 from mjfim.plant.derivatives import FORWARD_DIFFERENCES
@@ -76,7 +76,7 @@ def measured(model: Path, p: int, iterations: int) -> Cost:
     """Run the design for some iterations, then time its parts."""
     task = DesignTask.resolve(experiment(model, p, iterations))
     seconds: list[float] = []
-    design_task(task, monitor=lambda row: seconds.append(row.seconds))
+    design_task(task, callback=lambda event: seconds.append(event.row.seconds))
     curve = task.initial
     sensitivity = task.plant.derivatives.sensitivity(task.theta, curve)
     if sensitivity is None:

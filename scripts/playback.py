@@ -97,8 +97,8 @@ def made(experiment: Experiment, folder: Path, console: Console) -> Path:
     with console.status("designing") as status:
         design = design_task(
             task,
-            monitor=lambda row: status.update(
-                f"designing: iteration {row.iteration}, {row.seconds:.0f} s"
+            callback=lambda event: status.update(
+                f"designing: iteration {event.row.iteration}, {event.row.seconds:.0f} s"
             ),
         )
     write_design(folder, design, task.system)

@@ -1,4 +1,4 @@
-"""Searches side by side: stopped in the middle they return what they have, and one that breaks does not end the others."""
+"""Searches side by side: stopped early they return their best results, and one that fails does not end the others."""
 
 from __future__ import annotations
 
@@ -18,10 +18,12 @@ import pytest
 
 import mjfim
 from mjfim import parallel as workers
-from mjfim.excitation import constrained as enclosed
+from mjfim.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.excitation import constrained
 from mjfim.excitation.design import design_task
 from mjfim.excitation.interior_point import BarrierIterate, InteriorPointMethod
-from mjfim.records.design import HistoryRow, Status
+from mjfim.records.design import Status
+from mjfim.records.events import DesignEvent
 from tests.support.cli import names, read, write_experiment
 from tests.support.limits import HARD, cart_inside
 
@@ -30,35 +32,35 @@ def identity() -> int:
     return os.getpid()
 
 
-def until_told(longest: float) -> tuple[bool, int]:
-    """Wait for the pool's word."""
+def wait_for_stop(longest: float) -> tuple[bool, int]:
+    """Wait for the request of the pool to stop."""
     end = time.monotonic() + longest
-    while time.monotonic() < end and not workers.stopped():
+    while time.monotonic() < end and not workers.pool_stop_token().requested:
         time.sleep(0.02)
-    return workers.stopped(), os.getpid()
+    return workers.pool_stop_token().requested, os.getpid()
 
 
-def test_a_pool_s_processes_are_others_and_end_when_told() -> None:
+def test_processes_of_a_pool_are_others_and_see_the_request_to_stop() -> None:
     with mjfim.Pool(2) as pool:
         assert pool.submit(identity).result() != os.getpid()
-        running = pool.submit(until_told, 60.0)
+        running = pool.submit(wait_for_stop, 60.0)
         pool.stop()
         told, _ = running.result(timeout=30.0)
         assert told
-    assert not workers.stopped()
+    assert not workers.pool_stop_token().requested
 
 
 @pytest.mark.slow
 def test_a_pool_that_was_stopped_serves_again_once_nothing_runs() -> None:
     with mjfim.Pool(1) as pool:
-        waiting = [pool.submit(until_told, 60.0) for _ in range(3)]
+        waiting = [pool.submit(wait_for_stop, 60.0) for _ in range(3)]
         time.sleep(0.5)
         first = workers.collect_finished(pool, waiting)[0]
         assert first[0]
-        assert pool.submit(until_told, 0.1).result(timeout=30.0) == (False, first[1])
+        assert pool.submit(wait_for_stop, 0.1).result(timeout=30.0) == (False, first[1])
 
 
-def test_what_has_ended_is_salvaged_in_order_and_the_rest_is_left(
+def test_finished_tasks_are_collected_in_order_and_the_others_are_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     done: list[Future[int]] = [Future() for _ in range(4)]
@@ -85,7 +87,8 @@ def test_interrupted_among_workers_a_design_keeps_what_they_found(tmp_path: Path
         timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGINT))
         timer.start()
         try:
-            design = design_task(task, executor=pool)
+            with stop_on_interrupt() as stop:
+                design = design_task(task, executor=pool, budget=Budget(stop=stop))
         finally:
             timer.cancel()
     assert design.status is Status.INTERRUPTED
@@ -93,14 +96,16 @@ def test_interrupted_among_workers_a_design_keeps_what_they_found(tmp_path: Path
     assert design.final.cost < design.initial.cost
 
 
-def test_interrupted_by_what_watches_it_keeps_the_others_too(tmp_path: Path) -> None:
+def test_a_callback_that_asks_to_stop_keeps_the_results_of_all_workers(tmp_path: Path) -> None:
     task = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 30})
 
-    def stop(row: HistoryRow) -> None:
-        raise KeyboardInterrupt
+    stop = StopToken()
+
+    def callback(event: DesignEvent) -> None:
+        stop.request()
 
     with mjfim.Pool(2) as pool:
-        design = design_task(task, stop, executor=pool)
+        design = design_task(task, callback=callback, executor=pool, budget=Budget(stop=stop))
     assert design.status is Status.INTERRUPTED
     assert len(design.starts) >= 2
     assert design.final.cost < design.initial.cost
@@ -140,14 +145,14 @@ def test_a_start_that_breaks_does_not_end_the_others(
     run = InteriorPointMethod.run
 
     def broken(
-        self: InteriorPointMethod, control: np.ndarray, *rest: float
+        self: InteriorPointMethod, control: np.ndarray, budget: Budget
     ) -> Iterator[BarrierIterate]:
         if np.abs(control - task.control).max() > 1e-9:
             raise np.linalg.LinAlgError("singular")
-        yield from run(self, control, *rest)
+        yield from run(self, control, budget)
 
     task = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 20, "coarse": 1})
-    monkeypatch.setattr(enclosed.InteriorPointMethod, "run", broken)
+    monkeypatch.setattr(constrained.InteriorPointMethod, "run", broken)
     design = design_task(task)
     assert [start.status is Status.INFEASIBLE for start in design.starts] == [False, True, True]
     assert design.final.cost < design.initial.cost

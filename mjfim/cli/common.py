@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 import mjfim
-from mjfim.errors import MjfimError
+from mjfim.errors import MjfimError, NoResultError
 from mjfim.records.serialization import as_json as records_as_json
 
 app = typer.Typer(
@@ -90,6 +90,9 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
     def wrapped(*args: Any, **kwargs: Any) -> None:
         try:
             function(*args, **kwargs)
+        except NoResultError:
+            errors.print("mjfim: interrupted before there was a result; nothing was written")
+            raise typer.Exit(1) from None
         except MjfimError as error:
             errors.print(f"mjfim: {error}", markup=False)
             raise typer.Exit(2) from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from typing import Annotated
@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 import mjfim
+from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.cli.common import (
     AsJson,
     ExperimentFile,
@@ -21,14 +22,14 @@ from mjfim.cli.common import (
     verb,
     writing,
 )
-from mjfim.excitation.design import design_task
+from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, ShortestExperiment
 from mjfim.excitation.task import DesignTask
 from mjfim.output.folders import check_folder
 from mjfim.output.summaries import describe_design
 from mjfim.output.text import render
 from mjfim.parallel import Pool
-from mjfim.records.design import HistoryRow
+from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
 from mjfim.records.serialization import write_json
 
 
@@ -66,17 +67,26 @@ def design(
         stated = stated.replace(descent={"starts": starts})
     task = DesignTask.resolve(stated, threads=threads)
     check_folder(output)
-    with several(task) as executor, progress() as bar:
+    with several(task) as executor, progress() as bar, stop_on_interrupt() as stop:
         progress_task = bar.add_task("designing", total=None)
 
-        def monitor(row: HistoryRow) -> None:
+        def callback(event: Event) -> None:
+            if isinstance(event, StudyEvent):
+                errors.print(event.message, markup=False)
+            if not isinstance(event, DesignEvent):
+                return
+            row = event.row
             text = f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}  slope {row.slope:.1e}"
             bar.update(progress_task, description=text)
             if not errors.is_terminal and row.iteration % 10 == 0:
                 errors.print(text)
 
-        found = _shortest(task, monitor, executor) if shortest else None
-        result = design_task(task, monitor, executor=executor) if found is None else found.design
+        found = _shortest(task, callback, executor, stop) if shortest else None
+        if found is not None:
+            result = found.design
+        else:
+            budget = design_budget(task, stop)
+            result = design_task(task, callback=callback, executor=executor, budget=budget)
     if found is not None:
         task = DesignTask.resolve(found.experiment, threads=threads)
     with writing(output) as results:
@@ -101,16 +111,16 @@ def design(
 
 
 def _shortest(
-    task: DesignTask, monitor: Callable[[HistoryRow], None], executor: Executor | None
+    task: DesignTask, callback: Callback, executor: Executor | None, stop: StopToken
 ) -> ShortestExperiment:
-    """The shortest design, every duration told on the way; exit code 1 where none is long enough."""
+    """The shortest experiment; exit code 1 where even the longest one does not reach the targets."""
     try:
         return mjfim.shortest_experiment(
             task.experiment,
-            monitor=monitor,
+            callback=callback,
             threads=task.plant.simulator.threads,
-            report=lambda tried: errors.print(str(tried), markup=False),
             executor=executor,
+            stop=stop,
         )
     except OutOfReachError as error:
         errors.print(f"mjfim: {error}", markup=False)

@@ -1,15 +1,15 @@
-"""Descents under hard limits from one start, as tasks that may run anywhere."""
+"""One optimisation under hard limits from one initial control, as an order that any process can carry out."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget, StopToken
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
@@ -20,179 +20,285 @@ from mjfim.excitation.interior_point import (
     InteriorPointMethod,
     values_of,
 )
+from mjfim.excitation.levels import Stage
 from mjfim.excitation.objective import DesignPoint, DesignProblem
+from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import Stage, regulator_for
+from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.schema import Experiment
 from mjfim.model.variants import RELAXED, ModelVariant
-from mjfim.parallel import stopped
+from mjfim.parallel import pool_stop_token
 from mjfim.records.design import HistoryRow, Status
+from mjfim.records.events import DesignEvent
 from mjfim.signals import independent_curves
 
-POWER = (
-    40.0  # of the smooth E-criterion: several of the smallest eigenvalues meet under hard limits
-)
-CALM = 100.0  # growth of deviations from which on feedback is worth the time: steps are short under hard limits
-FAINT = (
-    3e-3  # weight of an eigenvector, over the largest, below which it is left out of the gradient
-)
+# Power of the smooth E-criterion. It is always smooth here: several of the smallest eigenvalues meet under hard limits.
+SMOOTH_POWER = 40.0
+
+# Growth of deviations from which on feedback is worth its time; steps are short under hard limits.
+FEEDBACK_THRESHOLD = 100.0
+
+# Weight of an eigenvector, over the largest weight, below which it is left out of the gradient.
+MIN_EIGENVECTOR_WEIGHT = 3e-3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ConstrainedSearch:
-    """A descent under hard limits. seconds: time it may take;  combinations: (t, s) identifiable ones, or None
+    """Order for one constrained optimisation from one initial control; picklable, so that a worker can run it.
 
-    added_information: (p, p) of other experiments, or None;  variant: of the plant;  held: shares held back
-    begun: when the design began, by `time.time`
+    Attributes:
+        experiment: The experiment.
+        start: Initial control; need not be feasible.
+        schedule: Weights mu of the barrier stages and when a stage ends.
+        max_iterations: Iterations, at most.
+        budget: Budget of the whole design; the time in the history counts from its beginning, and its token ends the search.
+        seconds: Time that this search may take from its own beginning [s].
+        combinations: (t, s) identifiable combinations of the parameters, or None where all are identifiable.
+        added_information: (p, p) information of other experiments [1/theta^2], or None.
+        variant: Plant on which the search runs; the result is evaluated on the stated plant later.
+        threads: Threads for simulations; None for one per core.
+        tightening: Share of half of each range that is held back, by kind of constraint.
     """
 
     experiment: Experiment
     start: InitialControl
     schedule: BarrierSchedule
-    budget: int
+    max_iterations: int
+    budget: Budget = field(default_factory=Budget)
     seconds: float = np.inf
     combinations: Array | None = None
     added_information: Array | None = None
     variant: ModelVariant = RELAXED
     threads: int | None = None
-    held: Mapping[str, float] = field(default_factory=dict)
-    begun: float = field(default_factory=time.time)
+    tightening: Mapping[str, float] = field(default_factory=dict)
 
+    def run(self, task: DesignTask | None = None) -> Generator[DesignEvent, None, RunResult]:
+        """Run the search.
 
-@dataclass
-class Chase:
-    """Where a search has come to. control: (N, nu) the best inside all limits, else the last;  cost: J there, infinite outside"""
+        Args:
+            task: The task on the search's plant, where it exists already.
 
-    name: str
-    control: Array | None = None
-    cost: float = np.inf
-    status: Status = Status.INTERRUPTED
-    slope: float = np.inf
-    history: tuple[HistoryRow, ...] = ()
-    steps: int = 0
+        Yields:
+            Every iterate.
 
+        Returns:
+            The best feasible control, or the last one where none is feasible.
+        """
+        task = self._task() if task is None else task
+        if self.start.repeats > 1:
+            task = task.with_horizon(task.horizon / self.start.repeats)
 
-def pursue(
-    search: ConstrainedSearch, chase: Chase, task: DesignTask | None = None
-) -> Iterator[HistoryRow]:
-    """Every iterate of a search, keeping `chase` up to date. task: of the experiment on its lifted plant, if there is one"""
-    clock = time.perf_counter()
-    repeats = search.start.repeats
-    if task is None:
-        task = DesignTask.resolve(
-            search.experiment,
-            threads=search.threads,
-            added_information=search.added_information,
-            variant=search.variant,
+        return (yield from _Search.begin(self, task).run())
+
+    def _task(self) -> DesignTask:
+        """The task on the plant of the search."""
+        return DesignTask.resolve(
+            self.experiment,
+            threads=self.threads,
+            added_information=self.added_information,
+            variant=self.variant,
         )
-    if repeats > 1:
-        task = task.with_horizon(task.horizon / repeats)
-    begun = task.plant.engine_steps
-    exact, smooth = Stage(task, search.combinations).problem, smoothed(task, search.combinations)
-    fine = (
-        search.start.basis
-        if search.start.basis is not None
-        else bandwidth_basis(task, task.stated_times)
-    )
-    basis = None if fine is None else independent_curves(task.averaged(fine))
-    regulate = replace(regulator_for(task), feedback_threshold=CALM if basis is None else np.inf)
-    constraints = constraint_set_of(task).tightened(search.held)
-    barrier_weights = InteriorPointMethod(
-        smooth, constraints, task.centre, basis, regulate, search.schedule
-    )
-    control = task.averaged(search.start.control)
-    for stage_iterate in _sound(
-        barrier_weights.run(control, search.budget, clock + search.seconds), chase
-    ):
-        own = stage_iterate.iterate.point
-        point = None if own.point is None else exact.reevaluated(_repeated(own.point, repeats))
-        chase.slope, chase.status = (
-            stage_iterate.iterate.slope,
-            stage_iterate.status or Status.INTERRUPTED,
+
+
+def run_in_worker(search: ConstrainedSearch) -> RunResult:
+    """Run a search to its end, for an executor.
+
+    Args:
+        search: The order. A request to stop by its own token or by that of the worker's pool ends it.
+
+    Returns:
+        The best result so far.
+    """
+    own_stop, pool_stop = search.budget.stop, pool_stop_token()
+    stop = StopToken(also=lambda: own_stop.requested or pool_stop.requested)
+
+    search = replace(search, budget=search.budget.with_stop(stop))
+
+    # Matrices are small: threads of the BLAS would only wait for each other.
+    with threadpool_limits(1, user_api="blas"):
+        return consume(search.run(), None)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Search:
+    """A search whose task is resolved.
+
+    Attributes:
+        order: What was asked for.
+        task: The task on the plant of the search, over one repetition.
+        exact: The cost by which iterates are judged.
+        curves: (N * coarsening, M) curves of which the control is made at the stated rate, or None where it is free.
+        constraints: The limits, as far as they are tightened.
+        method: Minimises the smooth cost within them.
+        budget: Time and iterations of the search.
+        steps_before: Engine steps when it began.
+    """
+
+    order: ConstrainedSearch
+    task: DesignTask
+    exact: DesignProblem
+    curves: Array | None
+    constraints: ConstraintSet
+    method: InteriorPointMethod
+    budget: Budget
+    steps_before: int
+
+    @classmethod
+    def begin(cls, order: ConstrainedSearch, task: DesignTask) -> _Search:
+        """Set up the interior-point method; the time counts from here."""
+        budget = Budget(
+            seconds=order.seconds,
+            iterations=order.max_iterations,
+            stop=order.budget.stop,
         )
-        chase.steps = task.plant.engine_steps - begun
-        cost = np.inf if point is None or not stage_iterate.feasible else point.cost
-        if cost <= chase.cost:
-            chase.control, chase.cost = np.tile(_stated(task, own.ctrl, fine), (repeats, 1)), cost
-        if stage_iterate.repaired:
-            continue
-        row = _row(stage_iterate, point, 1.0 / task.dt, constraints)
-        row = replace(row, seconds=time.time() - search.begun, steps=chase.steps)
-        chase.history += (row,)
-        yield row
-    if chase.status is Status.INTERRUPTED and chase.history:  # the schedule asked for are done
-        chase.status = Status.MAX_ITERATIONS
-    if not np.isfinite(chase.cost):
-        chase.status = Status.INFEASIBLE
+        steps_before = task.plant.engine_steps
 
+        # A start may have curves of its own, such as a Fourier series; else a limited bandwidth asks for splines.
+        curves = order.start.basis
+        if curves is None:
+            curves = bandwidth_basis(task, task.stated_times)
+        basis = None if curves is None else independent_curves(task.averaged(curves))
 
-def _sound(schedule: Iterator[BarrierIterate], chase: Chase) -> Iterator[BarrierIterate]:
-    """As far as numbers go: a start that leads beyond must not end the others."""
-    try:
-        yield from schedule
-    except (SimulationDivergedError, np.linalg.LinAlgError):
-        chase.status = Status.STALLED
+        # Feedback would leave the span of the curves.
+        threshold = FEEDBACK_THRESHOLD if basis is None else np.inf
+        constraints = constraint_set_of(task).tightened(order.tightening)
+        method = InteriorPointMethod(
+            base=smoothed(task, order.combinations),
+            constraints=constraints,
+            centre=task.centre,
+            basis=basis,
+            regulator=replace(regulator_for(task), feedback_threshold=threshold),
+            schedule=order.schedule,
+        )
+        return cls(
+            order=order,
+            task=task,
+            exact=Stage(task, order.combinations).problem,
+            curves=curves,
+            constraints=constraints,
+            method=method,
+            budget=budget,
+            steps_before=steps_before,
+        )
 
+    def run(self) -> Generator[DesignEvent, None, RunResult]:
+        """Yield every iterate and return the best result."""
+        result = RunResult(name=self.order.start.name)
+        status: Status | None = None
+        control = self.task.averaged(self.order.start.control)
 
-def _repeated(point: DesignPoint, count: int) -> DesignPoint:
-    """A point as if its trajectory were measured so many times."""
-    if count == 1 or point.information is None:
-        return point
-    others = tuple(_repeated(other, count) for other in point.others)
-    return replace(point, information=count * point.information, others=others)
+        # A simulation that diverges ends this run, not the others.
+        try:
+            for iterate in self.method.run(control, self.budget):
+                status = iterate.status
+                point = self._judge(iterate)
+                result = self._updated(result, iterate, point)
+                if iterate.repaired:
+                    continue
+
+                row = self._row(iterate, point, result.steps)
+                result = replace(result, history=(*result.history, row))
+                yield DesignEvent(start=result.name, row=row)
+
+                if self.budget.stop.requested:
+                    break
+        except (SimulationDivergedError, np.linalg.LinAlgError):
+            status = Status.STALLED
+
+        return replace(result, status=self._final_status(result, status))
+
+    def _judge(self, iterate: BarrierIterate) -> DesignPoint | None:
+        """The iterate's point by the exact cost over all repetitions; None without a cost."""
+        point = iterate.iterate.point.point
+        if point is None:
+            return None
+
+        return self.exact.reevaluated(_repeat_measurement(point, self.order.start.repeats))
+
+    def _updated(
+        self, result: RunResult, iterate: BarrierIterate, point: DesignPoint | None
+    ) -> RunResult:
+        """The result with this iterate: its control is kept where it is at least as good as the best feasible one."""
+        steps = self.task.plant.engine_steps - self.steps_before
+        result = replace(result, slope=iterate.iterate.slope, steps=steps)
+
+        cost = np.inf if point is None or not iterate.feasible else point.cost
+        if cost > result.cost:
+            return result
+
+        control = _at_stated_rate(self.task, iterate.iterate.point.ctrl, self.curves)
+        return replace(result, control=np.tile(control, (self.order.start.repeats, 1)), cost=cost)
+
+    def _final_status(self, result: RunResult, status: Status | None) -> Status:
+        """How the run ended. status: of the last iterate"""
+        if self.budget.stop.requested:
+            return status or Status.INTERRUPTED
+        if not np.isfinite(result.cost):
+            return Status.INFEASIBLE
+
+        # The last iterate has no status where the time ended the run, or the schedule had no further stage.
+        return status or Status.MAX_ITERATIONS
+
+    def _row(self, iterate: BarrierIterate, point: DesignPoint | None, steps: int) -> HistoryRow:
+        """An iterate as a row of the history."""
+        criterion = None if point is None else point.criterion
+        values = values_of(iterate.iterate.point)
+        margins = self.constraints.relative_margins(values)
+
+        return HistoryRow(
+            iteration=iterate.iterate.index,
+            cost=np.inf if point is None else point.cost,
+            criterion=np.inf if criterion is None else criterion.value,
+            min_eigenvalue=0.0 if criterion is None else float(criterion.eigenvalues[0]),
+            slope=iterate.iterate.slope,
+            gamma=iterate.iterate.gamma,
+            seconds=self.order.budget.seconds_used,
+            steps=steps,
+            rate=1.0 / self.task.dt,
+            mu=iterate.mu,
+            margin=min(margins.values(), default=np.nan),
+        )
 
 
 def smoothed(task: DesignTask, combinations: Array | None) -> DesignProblem:
-    """The cost as it is descended under hard limits: smooth where it is E's, without faint directions."""
-    power = POWER if task.experiment.cost.criterion == "E" else np.inf
+    """Make the cost that is minimised under hard limits.
+
+    Args:
+        task: The task.
+        combinations: (t, s) identifiable combinations of the parameters, or None.
+
+    Returns:
+        The cost, smooth where it is that of E-optimality, without eigenvectors that hardly count.
+    """
+    power = SMOOTH_POWER if task.experiment.cost.criterion == "E" else np.inf
     smooth = Stage(task, combinations, power).problem
-    return replace(smooth, information=replace(smooth.information, negligible_weight=FAINT))
+    information = replace(smooth.information, negligible_weight=MIN_EIGENVECTOR_WEIGHT)
+    return replace(smooth, information=information)
 
 
-def _stated(task: DesignTask, ctrl: Array, fine: Array | None) -> Array:
-    """A level's control on the stated grid of samples, made of the curves fine: (N * coarsen, M) there, or of anything."""
-    if task.system.variant.sample_factor == 1 or fine is None:
-        return np.repeat(ctrl, task.system.variant.sample_factor, axis=0)
-    return np.asarray(
-        task.centre + fine @ np.linalg.lstsq(task.averaged(fine), ctrl - task.centre)[0]
-    )
+def _repeat_measurement(point: DesignPoint, count: int) -> DesignPoint:
+    """A point whose trajectory is measured several times."""
+    if count == 1 or point.information is None:
+        return point
+
+    others = tuple(_repeat_measurement(other, count) for other in point.others)
+    return replace(point, information=count * point.information, others=others)
 
 
-def _row(
-    stage_iterate: BarrierIterate,
-    point: DesignPoint | None,
-    rate: float,
-    constraints: ConstraintSet,
-) -> HistoryRow:
-    criterion = None if point is None else point.criterion
-    value, smallest = (
-        (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
-    )
-    cost, i = (np.inf if point is None else point.cost), stage_iterate.iterate
-    margin = min(constraints.relative_margins(values_of(i.point)).values(), default=np.nan)
-    return HistoryRow(
-        iteration=i.index,
-        cost=cost,
-        criterion=value,
-        min_eigenvalue=smallest,
-        slope=i.slope,
-        gamma=i.gamma,
-        seconds=0.0,
-        steps=0,
-        rate=rate,
-        mu=stage_iterate.mu,
-        margin=margin,
-    )
+def _at_stated_rate(task: DesignTask, ctrl: Array, curves: Array | None) -> Array:
+    """The control of a level at the stated sample rate.
 
+    Args:
+        task: The task on the level.
+        ctrl: (N, nu) control on the level [u-unit].
+        curves: (N * coarsening, M) curves of which the control is made at the stated rate, or None.
 
-def perform(search: ConstrainedSearch) -> Chase:
-    """A search from beginning to end, for an executor; Ctrl-C, or its pool's word, ends it with the best so far."""
-    chase = Chase(search.start.name)
-    try:
-        with threadpool_limits(1, user_api="blas"):
-            for _ in pursue(search, chase):
-                if stopped():
-                    raise KeyboardInterrupt
-    except KeyboardInterrupt:
-        chase.status = Status.INTERRUPTED
-    return chase
+    Returns:
+        (N * coarsening, nu) control [u-unit].
+    """
+    factor = task.system.variant.sample_factor
+    if factor == 1 or curves is None:
+        return np.repeat(ctrl, factor, axis=0)
+
+    coefficients = np.linalg.lstsq(task.averaged(curves), ctrl - task.centre)[0]
+    return np.asarray(task.centre + curves @ coefficients)

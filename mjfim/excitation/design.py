@@ -1,26 +1,27 @@
-"""`mjfim.design`: find the control that reveals most, from one start or several, and say what came of it."""
+"""`mjfim.design`: find the control that reveals most about the parameters, from one initial control or several."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
-from mjfim.excitation.constrained import Chase
-from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.evaluation import design_warnings, evaluate, point_at_stated_rate
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
+from mjfim.excitation.levels import Stage, coarse_level, easier_level
 from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.objective import DesignPoint
+from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import COARSEST, Run, Stage, borne, coarse_level, descend
-from mjfim.excitation.verification import require_feasible_start, verify
+from mjfim.excitation.unconstrained import UnconstrainedSearch
+from mjfim.excitation.verification import Verification, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
 from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.information.marginal import shared
@@ -28,358 +29,441 @@ from mjfim.information.smoothness import roughness
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import ParameterGroup, join_names
-from mjfim.records.design import Design, HistoryRow, StartResult, Status
+from mjfim.records.design import Design, Evaluation, Status
+from mjfim.records.events import DesignCallback, DesignEvent
 
-Monitor = Callable[[HistoryRow], None]
-LONGER = (
-    5,
-    4,
-    3,
-    2,
-)  # times that the timestep is longer on a coarse level under hard limits; the first that is borne
-HALF = 2  # the same where samples become longer too
-TOLERATED = 0.5  # relative change of the initial cost that it may make: all is optimised anew on the stated one
+# What a search of several runs yields and returns.
+Runs = Generator[DesignEvent, None, list[RunResult]]
 
 
 def design(
     experiment: Experiment,
-    monitor: Monitor | None = None,
-    start: Array | None = None,
+    *,
+    callback: DesignCallback | None = None,
+    initial_control: Array | None = None,
     threads: int | None = None,
     executor: Executor | None = None,
+    stop: StopToken | None = None,
 ) -> Design:
-    """Design the control that minimises eq. 3 of the paper, within the experiment's limits.
+    """Design the control that minimises the cost of the experiment, equation (3) of the paper, within its limits.
 
-    monitor: called with every iterate;  start: (N, nu) control to start from instead of the experiment's initial one
-    executor: of `concurrent.futures`, runs several starts under hard limits at once
-    The initial control stays the reference x_d of the tracking term. Ctrl-C returns the best trajectory so far.
-    Raises UnidentifiableError where the initial control excites nothing, ExperimentError for a faulty experiment.
+    Ctrl-C, or a request by the token, ends the search with the best trajectory so far.
+
+    Args:
+        experiment: The experiment.
+        callback: Called with a `DesignEvent` for every iterate.
+        initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's. The experiment's initial control
+            remains the reference x_d of the tracking term.
+        threads: Threads for simulations; default: one per core.
+        executor: Executor of `concurrent.futures` that runs several starts under hard limits side by side.
+        stop: Token that ends the search early.
+
+    Returns:
+        The design.
+
+    Raises:
+        ExperimentError: The experiment or the initial control is faulty.
+        UnidentifiableError: A parameter has no effect, or the initial control does not excite it.
+        SimulationDivergedError: The simulation diverges along the initial control.
     """
-    task = DesignTask.resolve(experiment, threads=threads)
-    return design_task(task, monitor, start, executor)
+    with stop_on_interrupt(stop) as token:
+        task = DesignTask.resolve(experiment, threads=threads)
+        return design_task(
+            task,
+            callback=callback,
+            initial_control=initial_control,
+            executor=executor,
+            budget=design_budget(task, token),
+        )
+
+
+def design_budget(task: DesignTask, stop: StopToken | None = None) -> Budget:
+    """Make the budget of a design.
+
+    Args:
+        task: The task, whose `[descent] seconds` limit the time.
+        stop: Token that ends the design early.
+
+    Returns:
+        A budget that begins to count now.
+    """
+    seconds = task.experiment.descent.seconds
+    return Budget(seconds=np.inf if seconds is None else seconds, stop=stop)
 
 
 def design_task(
     task: DesignTask,
-    monitor: Monitor | None = None,
-    start: Array | None = None,
+    *,
+    callback: DesignCallback | None = None,
+    initial_control: Array | None = None,
     executor: Executor | None = None,
+    budget: Budget | None = None,
 ) -> Design:
-    """Design the control of a resolved task. See `design`."""
+    """Design the control of a task that is resolved already. See `design`.
+
+    Args:
+        task: The task.
+        callback: Called with a `DesignEvent` for every iterate.
+        initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's.
+        executor: Runs several starts under hard limits side by side.
+        budget: Time of the design and the token that stops it; default: `[descent] seconds`.
+
+    Returns:
+        The design.
+    """
+    budget = design_budget(task) if budget is None else budget
     require_feasible_start(task)
-    clock, begun = time.perf_counter(), task.plant.engine_steps
+    steps_before = task.plant.engine_steps
+
+    # Evaluate the initial control and find out what can be identified.
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
-    if start is not None:
-        start = np.asarray(start, dtype=np.float64)
-        if start.shape != task.control.shape:
-            raise ExperimentError(
-                f"start: shape {start.shape}, wanted (samples, actuators) = {task.control.shape}"
-            )
-    starts = initial_controls_of(task, start)
-    begin = (
-        first
-        if start is None
-        else task.problem.point(task.plant.simulate(task.theta, start), CENTRAL_DIFFERENCES)
-    )
-    if first.information is None or begin.trajectory is None or begin.sensitivity is None:
-        why = "when the parameters move a little along the initial control"
-        if task.samples_of_parameters is not None:
-            why += ", or at a parameter sample of [robust]; bounds keep samples where the model makes sense"
-        raise SimulationDivergedError(f"the simulation diverges {why}")
-    seen = task.observer.identifiability(begin.trajectory, begin.sensitivity)
-    require_designable(task, seen)
-    stage = Stage(task, seen.basis)
+    if initial_control is not None:
+        initial_control = _checked_control(task, initial_control)
+    starts = initial_controls_of(task, initial_control)
+    identifiability = _identifiability(task, first, initial_control)
+    require_designable(task, identifiability)
+
+    stage = Stage(task, identifiability.basis)
     first = stage.problem.reevaluated(first)
-    runs: list[Run] = []
-    with threadpool_limits(
-        1, user_api="blas"
-    ):  # small matrices: threads of BLAS only wait for each other
-        rows = (
-            _enclosed(stage, first, starts, executor, runs, clock)
-            if task.is_limited
-            else _free(stage, first, starts, runs, clock)
+
+    # Search. Matrices are small: threads of the BLAS would only wait for each other.
+    search = _Search(stage=stage, first=first, executor=executor, budget=budget)
+    with threadpool_limits(1, user_api="blas"):
+        results = consume(search.run(starts), callback)
+    interrupted = budget.stop.requested
+
+    # Steps on other plants, also those of workers, are counted by the runs.
+    steps = task.plant.engine_steps - steps_before + sum(result.steps for result in results)
+    best, chosen = _choose(stage, first, results, interrupted)
+    report = _Report(stage=stage, identifiability=identifiability, initial=first, final=chosen)
+    return report.design(best, results, budget.seconds_used, steps, interrupted)
+
+
+def _checked_control(task: DesignTask, control: Array) -> Array:
+    """A given initial control as an array of numbers; raises ExperimentError for a wrong shape."""
+    control = np.asarray(control, dtype=np.float64)
+    if control.shape != task.control.shape:
+        raise ExperimentError(
+            f"initial_control: shape {control.shape}; it must be (samples, actuators) = {task.control.shape}"
         )
-        try:
-            for row in rows:
-                if monitor is not None:
-                    monitor(row)
-        except KeyboardInterrupt:
-            rows.close()  # what a monitor interrupts is not yet told
-            for run in runs[-1:]:
-                run.status = Status.INTERRUPTED
-    spent = task.plant.engine_steps - begun + sum(run.steps for run in runs)
-    return _conclude(stage, seen, first, runs, time.perf_counter() - clock, spent)
+
+    return control
 
 
-def _free(
-    stage: Stage,
-    first: DesignPoint,
-    starts: Iterable[InitialControl],
-    runs: list[Run],
-    clock: float,
-    constraints: ConstraintSet | None = None,
-) -> Generator[HistoryRow, None, None]:
-    """Descents without a barrier, from every start while there is time; with a constraints, until one leaves it."""
-    task = stage.task
-    until = clock + (task.experiment.descent.seconds or np.inf)
-    coarse = coarse_level(task, first, stage.basis)
-    levels = (task,) if coarse is None else (coarse, task)
-    begun = sum(level.plant.engine_steps for level in levels)
-    for begin in starts:
-        runs.append(Run(begin.name))
-        elsewhere = sum(run.steps for run in runs)
-        for row in descend(
-            [Stage(level, stage.basis) for level in levels],
-            begin.over_horizon,
-            runs[-1],
-            constraints,
-        ):
-            spent = sum(level.plant.engine_steps for level in levels) - begun
-            told = replace(row, seconds=time.perf_counter() - clock, steps=spent)
-            runs[-1].history += (told,)
-            runs[-1].steps = 0 if coarse is None else coarse.plant.engine_steps - elsewhere
-            yield told
-            if time.perf_counter() > until:
-                if runs[-1].status is Status.INTERRUPTED:
-                    runs[-1].status = Status.MAX_ITERATIONS
-                return
-        if runs[-1].outside:
-            return
+def _identifiability(
+    task: DesignTask, first: DesignPoint, initial_control: Array | None
+) -> Identifiability:
+    """What can be identified, along the control with which the search begins and along random ones."""
+    begin = first
+    if initial_control is not None:
+        trajectory = task.plant.simulate(task.theta, initial_control)
+        begin = task.problem.point(trajectory, CENTRAL_DIFFERENCES)
+
+    if first.information is None or begin.trajectory is None or begin.sensitivity is None:
+        reason = "when the parameters move a little along the initial control"
+        if task.samples_of_parameters is not None:
+            reason += ", or at a parameter sample of [robust]; bounds keep samples where the model makes sense"
+        raise SimulationDivergedError(f"the simulation diverges {reason}")
+
+    return task.observer.identifiability(begin.trajectory, begin.sensitivity)
 
 
-def _enclosed(
-    stage: Stage,
-    first: DesignPoint,
-    starts: Iterable[InitialControl],
-    executor: Executor | None,
-    runs: list[Run],
-    clock: float,
-) -> Generator[HistoryRow, None, None]:
-    """Descents inside the limits. Where soft weights alone keep them, there is no barrier to begin with."""
-    task, starts, elsewhere = stage.task, list(starts), 0
-    if _weighted(task):
-        yield from _free(stage, first, starts, runs, clock, constraint_set_of(task))
-        if not runs[-1].outside:
-            return
-        left = runs.pop()
-        starts, elsewhere = starts[len(runs) :], left.steps
-        if left.control is not None:  # as far as it came without a barrier
-            starts[0] = InitialControl(name=starts[0].name, control=left.control)
-    free = task.relaxed()
-    chases: list[Chase] = []
-    multistart = Multistart(
-        Stage(free, stage.basis), _easier(Stage(free, stage.basis)), executor, clock
-    )
-    try:
-        yield from multistart.run(starts, chases)
-        yield from multistart.prove(chases)
-    finally:
-        cut = any(chase.status is Status.INTERRUPTED for chase in chases)
-        runs += [_settled(stage, chase, cut) for chase in chases]
-        if runs:
-            runs[0].steps += elsewhere
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Search:
+    """Search for the best control from several initial controls.
+
+    Attributes:
+        stage: The stated level.
+        first: The experiment's initial control, evaluated.
+        executor: Runs several starts under hard limits side by side, or None.
+        budget: Time of the search and the token that stops it.
+    """
+
+    stage: Stage
+    first: DesignPoint
+    executor: Executor | None
+    budget: Budget
+
+    def run(self, starts: Iterable[InitialControl]) -> Runs:
+        """Yield every iterate of all runs; return their results on the stated plant."""
+        if not self.stage.task.is_limited:
+            return (yield from self._run_without_barrier(starts))
+
+        return (yield from self._run_within_limits(list(starts)))
+
+    def _run_without_barrier(self, starts: Iterable[InitialControl]) -> Runs:
+        """Descend from every start; under hard limits until one descent leaves them."""
+        task, basis = self.stage.task, self.stage.basis
+        coarse = coarse_level(task, self.first, basis)
+        tasks = [task] if coarse is None else [coarse, task]
+
+        search = UnconstrainedSearch(
+            levels=[Stage(level, basis) for level in tasks],
+            budget=self.budget,
+            constraints=constraint_set_of(task) if task.is_limited else None,
+            steps_before=sum(level.plant.engine_steps for level in tasks),
+        )
+        return (yield from search.run_all(starts))
+
+    def _run_within_limits(self, starts: list[InitialControl]) -> Runs:
+        """Optimise under hard limits; without a barrier at first, where soft weights alone may keep them."""
+        results: list[RunResult] = []
+        steps_without_barrier = 0
+
+        if _is_bounded_by_weights(self.stage.task):
+            results = yield from self._run_without_barrier(starts)
+            if not results[-1].left_limits:
+                return results
+
+            # The start that left the limits continues from its last feasible control.
+            left = results.pop()
+            steps_without_barrier = left.steps
+            starts = starts[len(results) :]
+            if left.control is not None:
+                starts[0] = InitialControl(name=starts[0].name, control=left.control)
+
+        free = Stage(self.stage.task.relaxed(), self.stage.basis)
+        multistart = Multistart(
+            fine=free, coarse=easier_level(free), executor=self.executor, budget=self.budget
+        )
+        constrained = yield from multistart.run(starts)
+        constrained = yield from multistart.tighten_winner(constrained)
+
+        results += [self._on_stated_plant(result) for result in constrained]
+        if results:
+            steps = results[0].steps + steps_without_barrier
+            results[0] = replace(results[0], steps=steps)
+        return results
+
+    def _on_stated_plant(self, result: RunResult) -> RunResult:
+        """Result of one start, evaluated again on the unmodified plant."""
+        point = None
+        if result.control is not None:
+            point = point_at_stated_rate(self.stage, result.control)
+
+        # A search that was stopped has not verified its controls on the unmodified model.
+        is_feasible = bool(np.isfinite(result.cost))
+        if self.budget.stop.requested:
+            trajectory = None if point is None else point.trajectory
+            is_feasible = trajectory is not None and verify(self.stage.task, trajectory).is_feasible
+
+        return replace(
+            result,
+            point=point,
+            cost=np.inf if point is None else point.cost,
+            is_feasible=is_feasible,
+        )
 
 
-def _weighted(task: DesignTask) -> bool:
-    """The weights alone bound the design, and nothing but ranges is asked for."""
-    e = task.experiment
-    hard = task.is_shaped or bool(e.limits.control_rate) or e.limits.clearance is not None
-    return not hard and bool((task.control_weight > 0.0).all())
+def _is_bounded_by_weights(task: DesignTask) -> bool:
+    """Whether the weights of the control alone bound the design, and nothing but ranges is asked for."""
+    limits = task.experiment.limits
+    needs_barrier = task.is_shaped or bool(limits.control_rate) or limits.clearance is not None
+    return not needs_barrier and bool((task.control_weight > 0.0).all())
 
 
-def _easier(fine: Stage) -> Stage | None:
-    """A level with softened friction, with a longer timestep, or with longer samples where they are one timestep."""
-    smooth = (
-        replace(fine, task=fine.task.smoothed())
-        if fine.task.system.variant.smoothing_speeds
-        else fine
-    )
-    try:
-        begin = smooth.problem.point(smooth.task.initial)
-    except SimulationDivergedError:
-        return None
-    for factor in _factors(smooth.task):
-        coarse = _coarser(smooth, begin, factor)
-        if coarse is not None:
-            return coarse
-    return None if smooth is fine else smooth
+def _choose(
+    stage: Stage, first: DesignPoint, results: list[RunResult], interrupted: bool
+) -> tuple[RunResult, DesignPoint]:
+    """The best run and the point of the design, which is the initial control where nothing better was found."""
+    if not results:
+        results.append(RunResult(name="initial control", status=Status.INTERRUPTED))
 
+    # A search that was stopped on the coarse level has no point at the stated rate yet.
+    last = results[-1]
+    if last.point is None and last.control is not None:
+        point = point_at_stated_rate(stage, last.control)
+        cost = np.inf if point is None else point.cost
+        results[-1] = replace(last, point=point, cost=cost)
 
-def _factors(task: DesignTask) -> tuple[int, ...]:
-    """Candidates for the timestep of a coarse level, the longest first."""
-    stated = task.experiment.descent.coarse
-    if stated != "auto":
-        substeps = task.system.grid.substeps
-        if substeps % stated and task.samples % stated:
-            raise ExperimentError(
-                f"{task.experiment.source}: descent.coarse: {stated} divides neither the {substeps} engine steps of a "
-                f"sample nor the {task.samples} samples"
-            )
-        return () if stated == 1 else (stated,)
-    return tuple(k for k in LONGER if task.system.grid.substeps % k == 0) or (HALF,)
-
-
-def _coarser(stage: Stage, begin: DesignPoint, factor: int) -> Stage | None:
-    """A level so many times coarser, if the model bears it. begin: the stage's initial point"""
-    task = stage.task
-    stretch = task.system.grid.substeps % factor == 0
-    parts = [task.samples // count for count in (1, *task.experiment.descent.repeats)]
-    if not (stretch or (all(N % factor == 0 for N in parts) and task.samples >= COARSEST * factor)):
-        return None
-    try:
-        coarse = Stage(task.stretched(factor) if stretch else task.coarser(factor), stage.basis)
-    except ExperimentError:
-        return None
-    return coarse if borne(coarse, begin, task.problem.size(begin), TOLERATED) else None
-
-
-def _settled(stage: Stage, chase: Chase, cut: bool) -> Run:
-    """What came of a start, on the plant as it is. cut: the multistart was, before anybody looked at it there"""
-    run = Run(
-        chase.name, None, chase.control, chase.status, chase.slope, chase.history, steps=chase.steps
-    )
-    if chase.control is not None:
-        run.point = point_at_stated_rate(stage, chase.control)
-    run.inside = np.isfinite(chase.cost)
-    if cut:
-        found = None if run.point is None else run.point.trajectory
-        run.inside = found is not None and verify(stage.task, found).is_feasible
-    return run
-
-
-def _conclude(
-    stage: Stage,
-    seen: Identifiability,
-    first: DesignPoint,
-    runs: list[Run],
-    seconds: float,
-    steps: int,
-) -> Design:
-    task = stage.task
-    if not runs:
-        runs = [Run("initial control", status=Status.INTERRUPTED)]
-    if runs[-1].point is None and runs[-1].control is not None:  # interrupted on the coarse level
-        runs[-1].point = point_at_stated_rate(stage, runs[-1].control)
-    best = min(runs, key=lambda run: (not run.inside, run.cost))
-    interrupted = any(run.status is Status.INTERRUPTED for run in runs)
+    best = min(results, key=lambda result: (not result.is_feasible, result.cost))
     if best.point is None and not interrupted:
         raise SimulationDivergedError("the simulation diverges from every start")
-    chosen = (
-        first
-        if best.point is None or (best.cost > first.cost and not task.is_limited)
-        else best.point
-    )
-    initial, final, information = (
-        evaluate(stage, first),
-        evaluate(stage, chosen),
-        stage.problem.information,
-    )
-    found = verify(task, final.trajectory)
-    clamped = saturated_actuators(task.system.model_at(task.theta), final.trajectory)
-    rough = (
-        None
-        if interrupted
-        else roughness(
-            task.plant,
-            task.system.noise,
-            task.system.model_at(task.theta),
-            task.theta,
-            final.trajectory,
-            chosen.sensitivity,
-        )
-    )
-    status = Status.INTERRUPTED if interrupted else best.status
-    if status.success and (rough is not None or clamped):
-        status = Status.ROUGH
-    if task.is_limited and not found.is_feasible and not interrupted:
-        status = Status.INFEASIBLE
-    return Design(
-        status=status,
-        parameters=task.parameters.names,
-        theta=task.theta,
-        initial=initial,
-        final=final,
-        history=best.history,
-        slope=best.slope,
-        steps=steps,
-        seconds=seconds,
-        limits=found.margins,
-        usage=found.usage,
-        warnings=tuple(design_warnings(final, found, task, clamped, rough)),
-        found_by=best.name,
-        starts=tuple(
-            StartResult(
-                name=r.name,
-                cost=r.cost,
-                status=r.status,
-                iterations=r.history[-1].iteration if r.history else 0,
+
+    # Without hard limits a design is never worse than the initial control.
+    is_worse = best.cost > first.cost and not stage.task.is_limited
+    chosen = first if best.point is None or is_worse else best.point
+    return best, chosen
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Report:
+    """What is said about a design.
+
+    Attributes:
+        stage: The stated level.
+        identifiability: What can be identified.
+        initial: The initial control, evaluated.
+        final: The designed control, evaluated.
+    """
+
+    stage: Stage
+    identifiability: Identifiability
+    initial: DesignPoint
+    final: DesignPoint
+
+    def design(
+        self,
+        best: RunResult,
+        results: Sequence[RunResult],
+        seconds: float,
+        steps: int,
+        interrupted: bool,
+    ) -> Design:
+        """The design of the best run, with its warnings."""
+        task = self.stage.task
+        initial = evaluate(self.stage, self.initial)
+        final = evaluate(self.stage, self.final)
+
+        # The limits, on the model as the user wrote it.
+        found = verify(task, final.trajectory)
+        model = task.system.model_at(task.theta)
+        clamped = saturated_actuators(model, final.trajectory)
+
+        # Whether derivatives hold along the design. Nobody waits for that after Ctrl-C.
+        rough = None
+        if not interrupted:
+            rough = roughness(
+                task.plant,
+                task.system.noise,
+                model,
+                task.theta,
+                final.trajectory,
+                self.final.sensitivity,
             )
-            for r in runs
-        ),
-        nuisance=tuple(p.name for p in task.parameters.parameters if p.nuisance),
-        combinations=tuple(str(group) for group in seen.groups_along_all),
-        combined=seen.combinations(
-            information,
-            task.theta[task.parameters.interest],
-            initial.information,
-            final.information,
-        ),
-        prior=task.prior,
-        data=shared(
+
+        status = Status.INTERRUPTED if interrupted else best.status
+        if status.success and (rough is not None or clamped):
+            status = Status.ROUGH
+        if task.is_limited and not found.is_feasible and not interrupted:
+            status = Status.INFEASIBLE
+
+        warnings = tuple(design_warnings(final, found, task, clamped, rough))
+        return self._record(best, results, seconds, steps, status, initial, final, found, warnings)
+
+    def _record(
+        self,
+        best: RunResult,
+        results: Sequence[RunResult],
+        seconds: float,
+        steps: int,
+        status: Status,
+        initial: Evaluation,
+        final: Evaluation,
+        found: Verification,
+        warnings: tuple[str, ...],
+    ) -> Design:
+        """The record of the design."""
+        task = self.stage.task
+        information = self.stage.problem.information
+        parameters = task.parameters
+        combined = self.identifiability.combinations(
+            information, task.theta[parameters.interest], initial.information, final.information
+        )
+        data = shared(
             information.without_round_off(final.information - task.prior),
-            task.parameters.prior_information,
-            task.parameters.recording_specific,
-        ),
-    )
+            parameters.prior_information,
+            parameters.recording_specific,
+        )
+        return Design(
+            status=status,
+            parameters=parameters.names,
+            theta=task.theta,
+            initial=initial,
+            final=final,
+            history=best.history,
+            slope=best.slope,
+            steps=steps,
+            seconds=seconds,
+            limits=found.margins,
+            usage=found.usage,
+            warnings=warnings,
+            found_by=best.name,
+            starts=tuple(result.start_result for result in results),
+            nuisance=tuple(p.name for p in parameters.parameters if p.nuisance),
+            combinations=tuple(str(group) for group in self.identifiability.groups_along_all),
+            combined=combined,
+            prior=task.prior,
+            data=data,
+        )
 
 
 def designable(task: DesignTask) -> Identifiability:
-    """Look along the initial control. Raises UnidentifiableError or SimulationDivergedError where no design can begin there."""
+    """Find out what can be identified, and require that a design can begin at the initial control.
+
+    Args:
+        task: The task.
+
+    Returns:
+        What can be identified along the initial control and along random ones.
+
+    Raises:
+        UnidentifiableError: A parameter has no effect, or the initial control does not excite it.
+        SimulationDivergedError: The simulation diverges along the initial control.
+    """
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if first.trajectory is None or first.sensitivity is None:
         raise SimulationDivergedError(
             "the simulation diverges when the parameters move a little along the initial control"
         )
-    seen = task.observer.identifiability(first.trajectory, first.sensitivity)
-    require_designable(task, seen)
-    return seen
+
+    identifiability = task.observer.identifiability(first.trajectory, first.sensitivity)
+    require_designable(task, identifiability)
+    return identifiability
 
 
-def require_designable(task: DesignTask, seen: Identifiability) -> None:
-    """Raise UnidentifiableError where a parameter changes nothing at all, or the start does not excite what others would.
+def require_designable(task: DesignTask, identifiability: Identifiability) -> None:
+    """Require that every parameter has an effect, and that the start excites whatever another control would.
 
-    Members of a declared inertia may be invisible: the design then works on what is visible of them.
+    Members of a declared inertia may have no effect; the design then works on the combinations that have one.
+
+    Args:
+        task: The task.
+        identifiability: What can be identified.
+
+    Raises:
+        UnidentifiableError: A parameter has no effect on the outputs, or the start does not excite it.
     """
-    p = task.parameters
-    wanted = [p.parameters[j] for j in p.interest]
-    dead = [wanted[i].name for i in seen.along_all.silent if not wanted[i].group]
-    if dead:
+    along_all = identifiability.along_all
+    parameters = task.parameters
+    estimated = [parameters.parameters[j] for j in parameters.interest]
+
+    # Parameters without any effect.
+    silent = [estimated[i].name for i in along_all.silent if not estimated[i].group]
+    if silent:
         raise UnidentifiableError(
-            f"{_parameters(dead)} nothing in the measured outputs, neither along the initial control nor along "
-            f"{PROBES} random ones; take {'it' if len(dead) == 1 else 'them'} out, or measure what shows the effect"
+            f"{_subject(silent)} nothing in the measured outputs, neither along the initial control nor along "
+            f"{PROBES} random ones; take {'it' if len(silent) == 1 else 'them'} out, or measure what shows the effect"
         )
+
+    # A criterion for combinations that cannot be identified.
     if task.contrast is not None:
-        information = replace(task.information, basis=seen.basis)
+        information = replace(task.information, basis=identifiability.basis)
         if not information.is_estimable(task.contrast).all():
             raise UnidentifiableError(
                 "cost.combination or cost.subset asks for what cannot be identified; what can is: "
-                + "; ".join(str(group) for group in seen.groups_along_all)
+                + "; ".join(str(group) for group in identifiability.groups_along_all)
             )
-    if not seen.along_all.basis.shape[1]:
+
+    if not along_all.basis.shape[1]:
         raise UnidentifiableError("none of the parameters shows in the measured outputs")
-    if seen.along_trajectory.count > seen.along_all.count:
-        unexcited = "; ".join(_plainly(group) for group in seen.groups_along_trajectory)
+
+    # Combinations that other controls excite, but not this one.
+    if identifiability.along_trajectory.count > along_all.count:
+        groups = identifiability.groups_along_trajectory
+        unexcited = "; ".join(_unexcited_group(group) for group in groups)
         raise UnidentifiableError(
             f"the start excites nothing along: {unexcited}. Another control would: "
             "start from one that moves those parameters' joints, a multisine for example"
         )
 
 
-def _plainly(group: ParameterGroup) -> str:
-    """A group that is not excited here, though it has an effect elsewhere."""
+def _unexcited_group(group: ParameterGroup) -> str:
+    """Name of a group that has an effect, but not along the start."""
     return str(group) if group.combinations else join_names(group.members)
 
 
-def _parameters(names: Sequence[str]) -> str:
+def _subject(names: Sequence[str]) -> str:
+    """Beginning of a sentence about some parameters."""
     quoted = ", ".join(f"parameters.{name}" for name in names)
     return f"{quoted} {'changes' if len(names) == 1 else 'change'}"

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
+from mjfim.excitation.levels import Stage
 from mjfim.excitation.limits import unsupported_ranges
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import Stage, regulator_for
+from mjfim.excitation.unconstrained import regulator_for
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, Verification
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification, regulator

@@ -1,20 +1,22 @@
-"""Designs under hard limits: `log J + mu * barrier`, mu falling in stages (Hauser & Saccon 2006).
+"""Interior-point method for designs under hard limits: minimise `log J + mu * barrier` while mu falls (Hauser & Saccon 2006).
 
-The logarithm makes the cost free of scale, so that one barrier_weights of mu fits every experiment; its minima are those of J.
-The barrier is relaxed: it stays defined outside, and an infeasible start is first driven inside without any cost.
+The logarithm makes the cost free of scale, so that one schedule of mu fits every experiment; its minima are those of J.
+The barrier is relaxed: it is defined outside the limits as well, and a control that is far outside is first steered inside
+without any cost.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget, StopReason
 from mjfim.excitation.constraint_kinds import ConstraintValues
 from mjfim.excitation.constraints import ConstraintSet
+from mjfim.excitation.feasibility import shrink_until_feasible
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.optimize.barrier import BarrierExpansion
 from mjfim.optimize.lq import TangentCurve
@@ -22,13 +24,55 @@ from mjfim.optimize.projection_operator import Armijo, Expansion, Iterate, Regul
 from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.records.design import Status
 
+# Factor between the barrier weights mu of two successive stages.
+MU_FACTOR = 3.0
 
-@dataclass(frozen=True, eq=False)
+# Relaxation delta of the barrier, over mu.
+RELAXATION_PER_MU = 0.3
+
+# Largest relaxation delta of the barrier.
+MAX_RELAXATION = 0.1
+
+# Weight mu of the barrier from which on violated limits are answered by tighter limits in the next stage.
+TIGHTENING_MU = 4e-3
+
+# A violation at the end of a stage tightens the limit by this many times the violation.
+TIGHTENING_GAIN = 1.2
+
+# A limit that is well kept is released again by this share of its margin.
+RELEASE_GAIN = 0.5
+
+# A stage may take this many times its equal share of the time that is left.
+TIME_SHARE_FACTOR = 1.5
+
+# Number of times that the last stage is repeated, at most, because its result violates a limit.
+MAX_REPEATED_STAGES = 3
+
+# Violation of a limit, over half of its range, up to which the barrier can bring a control back inside by itself.
+MAX_START_VIOLATION = 1.0
+
+# Iterations that steer a control inside the limits, at most.
+MAX_STEERING_ITERATIONS = 60
+
+# The same where shrinking the control leads inside as well, so that steering only has to be tried.
+MAX_STEERING_TRIAL = 20
+
+# Slope of the barrier, over its size, at which steering has converged.
+STEERING_TOLERANCE = 1e-6
+
+# Weight of the control in the metric, times the number of samples, over the square of half of the control's range.
+RIDGE = 0.03
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class InteriorPoint:
-    """A trajectory with its cost and its limits. A diverged trial has no values and infinite value.
+    """A trajectory with its cost and the values of its constraints.
 
-    point: with the cost J, or None where only the limits are looked at;  merit: log J, 0 without
-    barrier: its value, mu left out
+    Attributes:
+        values: Constrained quantities; None for a trial that diverged.
+        point: The trajectory with its cost J; None where only the constraints are evaluated.
+        merit: log J; 0 without a cost, infinite for a trial that diverged.
+        barrier: Value of the barrier, not multiplied by mu.
     """
 
     values: ConstraintValues | None
@@ -38,159 +82,217 @@ class InteriorPoint:
 
     @property
     def ctrl(self) -> Array:
-        """(N, nu)"""
+        """(N, nu) control [u-unit]."""
         return values_of(self).trajectory.ctrl
 
 
-DIVERGED_POINT = InteriorPoint(None, None, np.inf, np.inf)
+# The point of every trial that diverged.
+DIVERGED_POINT = InteriorPoint(values=None, point=None, merit=np.inf, barrier=np.inf)
 
 
 def values_of(point: InteriorPoint) -> ConstraintValues:
-    """What its limits look at. Raises ValueError for a diverged trial."""
+    """Return the constrained quantities of a point.
+
+    Args:
+        point: A point.
+
+    Returns:
+        Its constrained quantities.
+
+    Raises:
+        ValueError: The point is a trial that diverged.
+    """
     if point.values is None:
         raise ValueError("a diverged trial has no trajectory")
+
     return point.values
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class InteriorProblem:
-    """`log J + mu B` as Algorithm 1 wants it; D-optimality has its logarithm in it already and is counted per parameter.
+    """Minimise `log J + mu B` over controls, in the form that Algorithm 1 asks for.
 
-    costs: False where only the limits are to be met;  delta: relaxation of the barrier
+    The cost of D-optimality is a logarithm already; in its place stands the cost per parameter.
+
+    Attributes:
+        base: The cost J on the plant without clamps.
+        constraints: The limits.
+        mu: Weight of the barrier B.
+        delta: Relaxation of the barrier, over half of each range.
+        with_cost: False where only the limits have to be reached, without any cost.
     """
 
     base: DesignProblem
     constraints: ConstraintSet
     mu: float
     delta: float
-    costs: bool = True
+    with_cost: bool = True
 
     def point(self, ctrl: Array) -> InteriorPoint:
-        """Evaluate along the open-loop trajectory of a control."""
-        watched = self.base.plant.observe(self.base.theta, ctrl, self.constraints.observations)
-        if watched is None:
-            return DIVERGED_POINT
-        values = self.constraints.evaluate(*watched, slopes=False)
-        barrier = self.constraints.value(values, self.delta)
-        if not self.costs:
-            return InteriorPoint(values, None, 0.0, barrier)
-        point = self.base.point(values.trajectory, self.base.plant.derivatives.quickest_accuracy)
-        return (
-            DIVERGED_POINT
-            if point is DIVERGED
-            else InteriorPoint(values, point, self._merit(point), barrier)
-        )
+        """Evaluate a control along its open-loop trajectory.
 
-    def again(self, point: InteriorPoint) -> InteriorPoint:
-        """A point of a problem that differs from this one in criterion, mu, delta or the constraints's bounds."""
+        Args:
+            ctrl: (N, nu) control [u-unit].
+
+        Returns:
+            The point; `DIVERGED_POINT` where the simulation diverges.
+        """
+        observed = self.base.plant.observe(self.base.theta, ctrl, self.constraints.observations)
+        if observed is None:
+            return DIVERGED_POINT
+
+        values = self.constraints.evaluate(*observed, slopes=False)
+        barrier = self.constraints.value(values, self.delta)
+        if not self.with_cost:
+            return InteriorPoint(values=values, point=None, merit=0.0, barrier=barrier)
+
+        accuracy = self.base.plant.derivatives.quickest_accuracy
+        point = self.base.point(values.trajectory, accuracy)
+        if point is DIVERGED:
+            return DIVERGED_POINT
+
+        return InteriorPoint(values=values, point=point, merit=self._merit(point), barrier=barrier)
+
+    def reevaluate(self, point: InteriorPoint) -> InteriorPoint:
+        """Evaluate a point of another problem, which differs in its criterion, mu, delta or bounds, without a simulation.
+
+        Args:
+            point: Point of the other problem.
+
+        Returns:
+            The point of this problem.
+        """
         if point.values is None or point.point is None:
             return point
-        judged = self.base.reevaluated(point.point)
+
+        evaluated = self.base.reevaluated(point.point)
         return InteriorPoint(
-            point.values,
-            judged,
-            self._merit(judged),
-            self.constraints.value(point.values, self.delta),
+            values=point.values,
+            point=evaluated,
+            merit=self._merit(evaluated),
+            barrier=self.constraints.value(point.values, self.delta),
         )
 
     def _merit(self, point: DesignPoint) -> float:
+        """Logarithm of the cost, or the cost per parameter of D-optimality; infinite where J is not positive."""
         if self.base.information.criterion == "D":
-            return point.cost / self._nats(point)
-        return float(np.log(point.cost)) if point.cost > 0.0 and np.isfinite(point.cost) else np.inf
+            return point.cost / self._cost_per_nat(point)
 
-    def _share(self, point: InteriorPoint) -> float:
-        """dJ over the change of the merit."""
+        if point.cost > 0.0 and np.isfinite(point.cost):
+            return float(np.log(point.cost))
+        return np.inf
+
+    def _merit_scale(self, point: InteriorPoint) -> float:
+        """Derivative dJ / d(merit)."""
         if point.point is None:
             return 1.0
-        return (
-            self._nats(point.point) if self.base.information.criterion == "D" else point.point.cost
-        )
+        if self.base.information.criterion == "D":
+            return self._cost_per_nat(point.point)
 
-    def _nats(self, point: DesignPoint) -> float:
+        return point.point.cost
+
+    def _cost_per_nat(self, point: DesignPoint) -> float:
+        """Cost of D-optimality that corresponds to one e-fold of every eigenvalue."""
         count = 1 if point.criterion is None else len(point.criterion.eigenvalues)
         return self.base.information.weight * count
 
     def value(self, point: InteriorPoint) -> float:
-        """`log J + mu B`."""
+        """`log J + mu B` at a point."""
         return point.merit + self.mu * point.barrier
 
     def size(self, point: InteriorPoint) -> float:
-        """One e-fold of J, or the barrier where that is more; without a cost, the barrier in full."""
-        return max(1.0, abs(point.barrier) * (self.mu if self.costs else 1.0))
+        """Scale of the slope in the test of convergence: one e-fold of J, or the barrier where that is more."""
+        weight = self.mu if self.with_cost else 1.0
+        return max(1.0, abs(point.barrier) * weight)
 
     def expand(self, point: InteriorPoint) -> Expansion:
-        """Expansion of the sum; the barrier's share stands apart as well."""
+        """Expand the sum about a point; the barrier's part is also given separately.
+
+        Args:
+            point: Point that did not diverge.
+
+        Returns:
+            The linearised dynamics, the gradient of the sum and the expansion of the barrier.
+        """
         values = values_of(point)
         values = self.constraints.evaluate(values.trajectory, values.observed, slopes=True)
-        if point.point is None:
-            A, B, rise = self.base.plant.derivatives.observation_jacobians(
-                self.base.theta, values.trajectory, self.constraints.observations
-            )
-            e = Expansion(
-                A=A, B=B, a=np.zeros((len(A) + 1, A.shape[1])), b=np.zeros((len(A), B.shape[2]))
-            )
-        else:
-            e, found = self.base.expand_observed(point.point, self.constraints.observations)
-            if found is None:
-                raise ValueError("an expansion along a criterion without directions")
-            rise = found
-        share = self._share(point)
-        barrier: BarrierExpansion = self.constraints.expand(values, rise, self.delta).scaled(
-            self.mu
-        )
+        expansion, jacobian = self._expand_cost(point, values)
+
+        scale = self._merit_scale(point)
+        barrier: BarrierExpansion = self.constraints.expand(values, jacobian, self.delta)
+        barrier = barrier.scaled(self.mu)
+
         return Expansion(
-            A=e.A,
-            B=e.B,
-            a=e.a / share + barrier.a,
-            b=e.b / share + barrier.b,
+            A=expansion.A,
+            B=expansion.B,
+            a=expansion.a / scale + barrier.a,
+            b=expansion.b / scale + barrier.b,
             extended=None,
             barrier=barrier,
-            eigenvalue_model=e.eigenvalue_model,
+            eigenvalue_model=expansion.eigenvalue_model,
         )
+
+    def _expand_cost(
+        self, point: InteriorPoint, values: ConstraintValues
+    ) -> tuple[Expansion, Array]:
+        """Expansion of J, and the derivative of the observations: (N, substeps, w, nx+nu)."""
+        observations = self.constraints.observations
+
+        if point.point is not None:
+            expansion, jacobian = self.base.expand_observed(point.point, observations)
+            if jacobian is None:
+                raise ValueError("an expansion along a criterion without directions")
+            return expansion, jacobian
+
+        # Without a cost only the dynamics and the observations are linearised.
+        A, B, jacobian = self.base.plant.derivatives.observation_jacobians(
+            self.base.theta, values.trajectory, observations
+        )
+        a = np.zeros((len(A) + 1, A.shape[1]))
+        b = np.zeros((len(A), B.shape[2]))
+        return Expansion(A=A, B=B, a=a, b=b), jacobian
 
     def project(
         self, point: InteriorPoint, zeta: TangentCurve, gamma: float, K: Array
     ) -> InteriorPoint:
-        """P(xi + gamma zeta), evaluated."""
+        """Evaluate P(xi + gamma zeta).
+
+        Args:
+            point: Point at xi.
+            zeta: Direction.
+            gamma: Length of the step.
+            K: (N, nu, nx) gain of the projection operator [u-unit / x-unit].
+
+        Returns:
+            The new point.
+        """
         trajectory = values_of(point).trajectory
         if not K.any():
             return self.point(trajectory.ctrl + gamma * zeta.v)
+
         moved = self.base.plant.project(self.base.theta, trajectory, zeta, gamma, K)
         return DIVERGED_POINT if moved is None else self.point(moved.ctrl)
 
     def difference(self, new: InteriorPoint, old: InteriorPoint) -> TangentCurve:
-        """(x_new - x_old, u_new - u_old)."""
+        """(x_new - x_old, u_new - u_old) of two points."""
         return self.base.plant.difference(values_of(new).trajectory, values_of(old).trajectory)
 
     def refine(self, point: InteriorPoint) -> InteriorPoint | None:
-        """Never: the barrier_weights of mu ends before the differences matter."""
+        """Return None: the schedule ends before the accuracy of the derivatives matters."""
         return None
 
 
-FACTOR = 3.0  # between schedule
-RELAXED = 0.3  # delta over mu
-MAX_RELAXATION = 0.1  # delta at most
-SHRINK_FACTORS = np.concatenate(
-    [[1.0, 0.997, 0.99, 0.97, 0.94, 0.9], 0.8 ** np.arange(1, 24)]
-)  # of a start, tried in turn
-TIGHTENING_MU = 4e-3  # mu from which on leaks are answered
-SPARE = 1.2  # what was outside at the end of a stage_iterate is held back on the next by that much of it
-SLACK = 1.5  # of the time that is left per stage_iterate, what one may take
-AGAIN = 3  # times that the last stage_iterate is repeated because of leaks, at most
-MAX_START_VIOLATION = (
-    1.0  # of a start beyond its limits, over half of their ranges, that is begun with as it is
-)
-
-
-ROUNDS, FEW = 60, 20  # iterations towards the inside, the latter where shrinking leads there too
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BarrierSchedule:
-    """first, last: mu;  patience: iterations per stage at most, twice as many on the last
+    """Weights mu of the barrier, one per stage, and when a stage ends.
 
-    settled: progress over `window` iterations, over mu, below which a stage is done
-    tolerance: slope at which the last stage is done
+    Attributes:
+        first: Largest weight.
+        last: Smallest weight.
+        patience: Iterations of a stage, at most; the last stage may take twice as many.
+        settled: A stage ends when the merit falls by less than this times mu over `window` iterations.
+        window: Number of iterations over which progress is measured.
+        tolerance: Slope, over the size of the merit, at which the last stage has converged.
     """
 
     first: float = 0.1
@@ -201,16 +303,21 @@ class BarrierSchedule:
     tolerance: float = 1e-5
 
     def barrier_weights(self) -> list[float]:
-        """Every mu, from the first to the last."""
-        count = max(round(np.log(self.first / self.last) / np.log(FACTOR)), 1)
+        """All weights mu, from the first to the last, in equal ratios of about `MU_FACTOR`."""
+        count = max(round(np.log(self.first / self.last) / np.log(MU_FACTOR)), 1)
         return [float(mu) for mu in np.geomspace(self.first, self.last, count + 1)]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class BarrierIterate:
-    """An iterate on the barrier_weights. margins: worst of each kind;  status: set on the very last one
+    """One iterate of the interior-point method.
 
-    repaired: no iterate, but the one before shrunk until it kept all limits
+    Attributes:
+        iterate: The iterate, numbered over all stages.
+        mu: Weight of the barrier; infinite while the control is steered inside the limits.
+        margins: Worst margin of each kind of constraint [unit of the kind], negative where violated.
+        status: How the run ended; None except in the last iterate.
+        repaired: True where this is not a new iterate, but the one before, shrunk until it keeps all limits.
     """
 
     iterate: Iterate[InteriorPoint]
@@ -221,204 +328,375 @@ class BarrierIterate:
 
     @property
     def feasible(self) -> bool:
-        """Inside all limits."""
+        """True where all limits hold."""
         return all(margin >= 0.0 for margin in self.margins.values())
 
 
-@dataclass(frozen=True, eq=False)
-class Entry:
-    """Where a descent begins. control: (N, nu), or None where all diverge;  iterations: that it took to get there"""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _FirstControl:
+    """Control with which the first stage begins.
+
+    Attributes:
+        control: (N, nu) control [u-unit]; None where every candidate diverges.
+        iterations: Number of iterates that were needed to find it.
+    """
 
     control: Array | None
     iterations: int
 
 
-@dataclass
-class InteriorPointMethod:
-    """One descent. base: the cost on the lifted plant;  basis: (N, M) what the control minus centre is made of, or None
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Stage:
+    """Settings of one barrier stage.
 
-    centre: (nu,) control about which a start is shrunk until it is inside
+    Attributes:
+        problem: What is minimised, with the limits as they are tightened in this stage.
+        budget: Time of the stage.
+        max_iterations: Iterations of the stage, at most.
+        is_last: True for the stage with the smallest mu and its repetitions.
+        first_index: Number of its first iterate.
+    """
+
+    problem: InteriorProblem
+    budget: Budget
+    max_iterations: int
+    is_last: bool
+    first_index: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _StageResult:
+    """Result of one barrier stage.
+
+    Attributes:
+        iterate: Last iterate of the stage, numbered within the stage.
+        is_feasible: True where it keeps all limits.
+        converged: True where it is the final result of the run.
+    """
+
+    iterate: Iterate[InteriorPoint]
+    is_feasible: bool
+    converged: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InteriorPointMethod:
+    """Minimise a cost under hard limits.
+
+    Attributes:
+        base: The cost on the plant without clamps.
+        constraints: The limits.
+        centre: (nu,) control about which an infeasible control is shrunk [u-unit].
+        basis: (N, M) curves of which the control minus its centre is made; None where the control is free.
+        regulator: Gain of the projection operator.
+        schedule: Weights of the barrier and when a stage ends.
     """
 
     base: DesignProblem
     constraints: ConstraintSet
     centre: Array
     basis: Array | None
-    regulate: Regulator
+    regulator: Regulator
     schedule: BarrierSchedule = BarrierSchedule()
 
-    def run(self, control: Array, budget: int, until: float = np.inf) -> Iterator[BarrierIterate]:
-        """Every iterate from a control: (N, nu), at most `budget`, until a time of `time.perf_counter`."""
-        entry = yield from self._entered(control, min(budget, ROUNDS), until)
-        if entry.control is not None:
-            yield from self._down(entry.control, self._direction(), budget, until, entry.iterations)
+    def run(self, control: Array, budget: Budget) -> Iterator[BarrierIterate]:
+        """Run the method from a control.
 
-    def _entered(
-        self, control: Array, budget: int, until: float
-    ) -> Generator[BarrierIterate, None, Entry]:
-        """A control inside all limits or near them; of those far outside, shrunk about the centre or steered, what costs less."""
-        fitted = self._fitted(control)
-        if self._near(fitted):
-            return Entry(fitted, 0)
-        shrunk = self.inside(fitted)
-        stage_iterate: BarrierIterate | None = None
-        for stage_iterate in self._steered(
-            fitted, budget if shrunk is None else min(budget, FEW), until
-        ):
-            yield stage_iterate
-        if stage_iterate is None:
-            return Entry(shrunk, 0)
-        steered, taken = stage_iterate.iterate.point.ctrl, stage_iterate.iterate.index + 1
+        Args:
+            control: (N, nu) control [u-unit]; need not be feasible.
+            budget: Time and iterations of the run. Iterations that steer the control inside the limits are not counted.
+
+        Yields:
+            Every iterate.
+        """
+        first = yield from self._find_first_control(control, budget)
+
+        if first.control is not None and not budget.stop.requested:
+            yield from self._minimize(first.control, budget, first.iterations)
+
+    def shrink_inside(self, control: Array) -> Array | None:
+        """Shrink a control about the centre until all limits hold strictly.
+
+        Args:
+            control: (N, nu) control [u-unit].
+
+        Returns:
+            (N, nu) the shrunk control, or None where no shrinking helps.
+        """
+        problem = self._problem_without_cost
+
+        def keep_feasible(candidate: Array) -> Array | None:
+            """Return the candidate where it is strictly feasible."""
+            values = problem.point(candidate).values
+            if values is None or not self.constraints.is_feasible(values, strictly=True):
+                return None
+            return np.asarray(candidate)
+
+        return shrink_until_feasible(control, self.centre, keep_feasible)
+
+    # ---- the first control
+
+    def _find_first_control(
+        self, control: Array, budget: Budget
+    ) -> Generator[BarrierIterate, None, _FirstControl]:
+        """Find a control near the feasible set: the given one, or the better of the shrunk and the steered one."""
+        fitted = self._fit_to_basis(control)
+
+        # The barrier itself brings a control back that is only a little outside.
+        if self._is_near_feasible(fitted):
+            return _FirstControl(control=fitted, iterations=0)
+
+        shrunk = self.shrink_inside(fitted)
+
+        # Steer the control inside; only a few iterations where shrinking has worked.
+        longest = MAX_STEERING_ITERATIONS if shrunk is None else MAX_STEERING_TRIAL
+        steered: BarrierIterate | None = None
+        for steered in self._steer_inside(fitted, int(min(budget.max_iterations, longest)), budget):
+            yield steered
+
+        if steered is None:
+            return _FirstControl(control=shrunk, iterations=0)
+
+        steered_control = steered.iterate.point.ctrl
+        iterations = steered.iterate.index + 1
         if shrunk is None:
-            return Entry(steered, taken)
-        problem = InteriorProblem(self.base, self.constraints, self.schedule.first, MAX_RELAXATION)
-        entries = [shrunk, steered] if stage_iterate.feasible else [shrunk]
-        values = [problem.value(problem.point(ctrl)) for ctrl in entries]
-        return Entry(entries[int(np.argmin(values))], taken)
+            return _FirstControl(control=steered_control, iterations=iterations)
 
-    def _near(self, control: Array) -> bool:
-        """What a relaxed barrier brings back inside on its way down: an end that is missed can be any number of its bands off."""
-        point = InteriorProblem(
-            self.base, self.constraints, 1.0, MAX_RELAXATION, costs=False
-        ).point(control)
-        if point.values is None:
+        # Both are available: begin with the one of lower merit.
+        problem = InteriorProblem(
+            base=self.base,
+            constraints=self.constraints,
+            mu=self.schedule.first,
+            delta=MAX_RELAXATION,
+        )
+        candidates = [shrunk, steered_control] if steered.feasible else [shrunk]
+        values = [problem.value(problem.point(candidate)) for candidate in candidates]
+        best = candidates[int(np.argmin(values))]
+        return _FirstControl(control=best, iterations=iterations)
+
+    def _fit_to_basis(self, control: Array) -> Array:
+        """The nearest control, (N, nu), that the basis can represent."""
+        if self.basis is None:
+            return control
+
+        coefficients = np.linalg.lstsq(self.basis, control - self.centre)[0]
+        return np.asarray(self.centre + self.basis @ coefficients)
+
+    def _is_near_feasible(self, control: Array) -> bool:
+        """Whether the relaxed barrier can restore feasibility from here; terminal constraints are ignored.
+
+        The end may be missed by any number of its tolerances, because the tolerances are narrow.
+        """
+        values = self._problem_without_cost.point(control).values
+        if values is None:
             return False
+
+        margins = self.constraints.relative_margins(values)
         return all(
-            s > -MAX_START_VIOLATION
-            for kind, s in self.constraints.relative_margins(point.values).items()
+            margin > -MAX_START_VIOLATION
+            for kind, margin in margins.items()
             if not kind.startswith("end_")
         )
 
-    def _direction(self) -> StructuredBFGS:
-        N = len(self.base.running.desired_state) - 1
-        ridge = 0.03 / N / self.constraints.control.bounds.scale**2
-        return StructuredBFGS(ridge, self.basis)
+    def _steer_inside(
+        self, control: Array, max_iterations: int, budget: Budget
+    ) -> Iterator[BarrierIterate]:
+        """Minimise the barrier alone until all limits hold strictly."""
+        problem = self._problem_without_cost
+        start = problem.point(control)
+        if start.values is None:
+            return
 
-    def _fitted(self, control: Array) -> Array:
-        """The nearest control that the basis can make."""
-        if self.basis is None:
-            return control
-        return np.asarray(
-            self.centre + self.basis @ np.linalg.lstsq(self.basis, control - self.centre)[0]
+        iterates = optimize(
+            problem,
+            start,
+            self._direction(),
+            self.regulator,
+            Armijo(),
+            tolerance=STEERING_TOLERANCE,
+            max_iterations=max_iterations,
+        )
+        for iterate in iterates:
+            values = values_of(iterate.point)
+            margins = self.constraints.margins(values)
+            yield BarrierIterate(iterate=iterate, mu=np.inf, margins=margins)
+
+            inside = self.constraints.is_feasible(values, strictly=True)
+            if inside or budget.exhausted is not None:
+                return
+
+    # ---- the barrier stages
+
+    def _minimize(
+        self, control: Array, budget: Budget, first_index: int
+    ) -> Iterator[BarrierIterate]:
+        """Run the stages with falling mu; the last one is repeated while its result violates a limit."""
+        weights = self.schedule.barrier_weights()
+        stages = [*weights, *weights[-1:] * MAX_REPEATED_STAGES]
+
+        # One direction for all stages: its curvature pairs do not depend on mu.
+        direction = self._direction()
+        tightening = dict[str, float]()
+
+        point = self._problem(weights[0], self.constraints).point(control)
+        if point.values is None:
+            # The simulation diverges when the parameters move a little.
+            return
+
+        for number, mu in enumerate(stages):
+            problem = self._problem(mu, self.constraints.tightened(tightening))
+            stage = self._stage(problem, len(weights) - number, budget, first_index)
+            ended = yield from self._run_stage(stage, problem.reevaluate(point), direction)
+            if ended.converged:
+                return
+
+            point = ended.iterate.point
+            first_index += ended.iterate.index
+            budget.spend(iterations=ended.iterate.index)
+            reason = budget.exhausted
+
+            # Repair an infeasible end, since nothing better may follow; but nobody waits for that after Ctrl-C.
+            if not ended.is_feasible and reason is not StopReason.REQUESTED:
+                yield from self._repair(problem, ended.iterate, first_index)
+
+            if reason is not None or (stage.is_last and ended.is_feasible):
+                return
+
+            # Move the limits inwards by what is violated, so that the next stage ends inside.
+            if mu <= TIGHTENING_MU:
+                margins = self.constraints.relative_margins(values_of(point))
+                tightening = updated_tightening(tightening, margins)
+
+    def _stage(
+        self, problem: InteriorProblem, stages_left: int, budget: Budget, first_index: int
+    ) -> _Stage:
+        """Settings of the next stage: its share of the time and of the iterations that are left."""
+        stages_left = max(stages_left, 1)
+        is_last = stages_left == 1
+
+        # A stage may take somewhat more than its equal share of the time; the last one may take all of it.
+        share = 1.0 if is_last else min(TIME_SHARE_FACTOR / stages_left, 1.0)
+
+        patience = self.schedule.patience * (2 if is_last else 1)
+        max_iterations = min(patience, np.ceil(budget.iterations_left / stages_left))
+
+        return _Stage(
+            problem=problem,
+            budget=budget.share(share),
+            max_iterations=int(max_iterations),
+            is_last=is_last,
+            first_index=first_index,
         )
 
-    def inside(self, control: Array) -> Array | None:
-        """A control shrunk about the centre until all limits hold; None where even the least one leaves them."""
-        problem = InteriorProblem(self.base, self.constraints, 1.0, MAX_RELAXATION, costs=False)
-        for share in SHRINK_FACTORS:
-            candidate = control if share == 1.0 else self.centre + share * (control - self.centre)
-            point = problem.point(candidate)
-            if point.values is not None and self.constraints.is_feasible(
-                point.values, strictly=True
-            ):
-                return np.asarray(candidate)
-        return None
+    def _run_stage(
+        self, stage: _Stage, start: InteriorPoint, direction: StructuredBFGS
+    ) -> Generator[BarrierIterate, None, _StageResult]:
+        """Minimise with one mu until convergence, stagnation, or the end of the stage's budget."""
+        schedule = self.schedule
+        problem = stage.problem
+        values: list[float] = []
 
-    def _steered(self, control: Array, budget: int, until: float) -> Iterator[BarrierIterate]:
-        """Iterates towards the inside, without any cost."""
-        problem = InteriorProblem(self.base, self.constraints, 1.0, MAX_RELAXATION, costs=False)
-        begin = problem.point(control)
-        if begin.values is None:  # it diverges
-            return
-        for iterate in optimize(
+        # A tighter tolerance than many a stated one: a smaller slope also makes a violation smaller.
+        tolerance = min(schedule.tolerance, BarrierSchedule.tolerance)
+
+        iterates = optimize(
             problem,
-            begin,
-            self._direction(),
-            self.regulate,
+            start,
+            direction,
+            self.regulator,
             Armijo(),
-            tolerance=1e-6,
-            max_iterations=budget,
-        ):
+            tolerance=tolerance,
+            max_iterations=stage.max_iterations,
+        )
+        for iterate in iterates:
             margins = self.constraints.margins(values_of(iterate.point))
-            stage_iterate = BarrierIterate(iterate, np.inf, margins)
-            yield stage_iterate
-            if (
-                self.constraints.is_feasible(values_of(iterate.point), strictly=True)
-                or time.perf_counter() > until
-            ):
-                return
+            is_feasible = self.constraints.is_feasible(values_of(iterate.point))
 
-    def _down(
-        self, control: Array, direction: StructuredBFGS, budget: int, until: float, done: int
+            # Convergence counts on the last stage only, and only inside the stated limits.
+            status = Status.CONVERGED if iterate.slope <= schedule.tolerance else iterate.status
+            if not (stage.is_last and is_feasible):
+                status = None
+
+            numbered = replace(iterate, index=stage.first_index + iterate.index)
+            yield BarrierIterate(iterate=numbered, mu=problem.mu, margins=margins, status=status)
+
+            if status is Status.CONVERGED:
+                break
+
+            # Stagnation: a sharper barrier promises more than further iterations.
+            values.append(iterate.value)
+            stagnates = (
+                len(values) > schedule.window
+                and values[-1 - schedule.window] - values[-1] < schedule.settled * problem.mu
+            )
+            if stage.budget.exhausted is not None or (stagnates and not stage.is_last):
+                break
+
+        return _StageResult(
+            iterate=iterate,
+            is_feasible=is_feasible,
+            converged=status is Status.CONVERGED,
+        )
+
+    def _repair(
+        self, problem: InteriorProblem, iterate: Iterate[InteriorPoint], index: int
     ) -> Iterator[BarrierIterate]:
-        r, held, budget = self.schedule, dict[str, float](), budget + done
-        barrier_weights = r.barrier_weights()
-        point = InteriorProblem(self.base, self.constraints, r.first, MAX_RELAXATION).point(control)
-        if point.values is None:  # it diverges where the parameters move a little
+        """Yield an infeasible iterate again, shrunk until it keeps all limits, if that is possible."""
+        control = self.shrink_inside(iterate.point.ctrl)
+        if control is None:
             return
-        for i, mu in enumerate([*barrier_weights, *barrier_weights[-1:] * AGAIN]):
-            left, last, now = (
-                max(len(barrier_weights) - i, 1),
-                i >= len(barrier_weights) - 1,
-                time.perf_counter(),
-            )
-            deadline = until if last else min(until, now + SLACK * (until - now) / left)
-            patience = min(
-                r.patience * (2 if last else 1),
-                -(-(budget - done) // left) if left > 1 else budget - done,
-            )
-            constraints = self.constraints.tightened(held)
-            problem = InteriorProblem(self.base, constraints, mu, min(MAX_RELAXATION, RELAXED * mu))
-            point = problem.again(point)
-            values: list[float] = []
-            tight = min(
-                r.tolerance, BarrierSchedule.tolerance
-            )  # what leaks is repaired by less slope than many a stated tolerance
-            for iterate in optimize(
-                problem,
-                point,
-                direction,
-                self.regulate,
-                Armijo(),
-                tolerance=tight,
-                max_iterations=patience,
-            ):
-                point, margins = iterate.point, self.constraints.margins(values_of(iterate.point))
-                kept = self.constraints.is_feasible(values_of(iterate.point))
-                status = Status.CONVERGED if iterate.slope <= r.tolerance else iterate.status
-                status = status if last and kept else None
-                yield BarrierIterate(
-                    replace(iterate, index=done + iterate.index), mu, margins, status
-                )
-                if status is Status.CONVERGED:
-                    return
-                values.append(iterate.value)
-                settled = (
-                    len(values) > r.window and values[-1 - r.window] - values[-1] < r.settled * mu
-                )
-                if time.perf_counter() > deadline or (settled and not last):
-                    break
-            done += iterate.index
-            over = done >= budget or time.perf_counter() > until
-            if not kept:
-                yield from self._mended(problem, iterate, mu, done)
-            if over or (last and kept):
-                return
-            if mu <= TIGHTENING_MU:
-                held = updated_tightening(held, self.constraints.relative_margins(values_of(point)))
 
-    def _mended(
-        self, problem: InteriorProblem, iterate: Iterate[InteriorPoint], mu: float, done: int
-    ) -> Iterator[BarrierIterate]:
-        """An iterate that leaks, shrunk until it does not: the best so far in case that nothing follows."""
-        control = self.inside(iterate.point.ctrl)
-        if control is not None:
-            point = replace(problem, constraints=self.constraints).point(control)
-            if point.values is not None:
-                own = replace(
-                    iterate,
-                    index=done,
-                    point=point,
-                    value=problem.value(point),
-                    gamma=0.0,
-                    status=None,
-                )
-                yield BarrierIterate(own, mu, self.constraints.margins(point.values), repaired=True)
+        stated = replace(problem, constraints=self.constraints)
+        point = stated.point(control)
+        if point.values is None:
+            return
+
+        repaired = replace(
+            iterate, index=index, point=point, value=stated.value(point), gamma=0.0, status=None
+        )
+        margins = self.constraints.margins(point.values)
+        yield BarrierIterate(iterate=repaired, mu=problem.mu, margins=margins, repaired=True)
+
+    # ---- what the stages are made of
+
+    def _problem(self, mu: float, constraints: ConstraintSet) -> InteriorProblem:
+        """The problem with a weight of the barrier; the relaxation falls with it."""
+        delta = min(MAX_RELAXATION, RELAXATION_PER_MU * mu)
+        return InteriorProblem(base=self.base, constraints=constraints, mu=mu, delta=delta)
+
+    @property
+    def _problem_without_cost(self) -> InteriorProblem:
+        """The barrier alone."""
+        return InteriorProblem(
+            base=self.base,
+            constraints=self.constraints,
+            mu=1.0,
+            delta=MAX_RELAXATION,
+            with_cost=False,
+        )
+
+    def _direction(self) -> StructuredBFGS:
+        """A quasi-Newton direction without any curvature pairs yet."""
+        N = len(self.base.running.desired_state) - 1
+        ridge = RIDGE / N / self.constraints.control.bounds.scale**2
+        return StructuredBFGS(ridge, self.basis)
 
 
-def updated_tightening(held: Mapping[str, float], shares: Mapping[str, float]) -> dict[str, float]:
-    """How far each kind is held back from its bounds next: more where it was outside, less where it was well inside."""
-    return {
-        kind: max(0.0, held.get(kind, 0.0) - share * (SPARE if share < 0.0 else 0.5))
-        for kind, share in shares.items()
-    }
+def updated_tightening(
+    tightening: Mapping[str, float], relative_margins: Mapping[str, float]
+) -> dict[str, float]:
+    """Choose how far each kind of limit is moved inwards in the next stage.
+
+    Args:
+        tightening: Share of half of the range that was held back so far, by kind.
+        relative_margins: Worst margin over half of the range at the end of the stage, by kind; negative where violated.
+
+    Returns:
+        The new shares: larger where the limit was violated, smaller where it was well kept.
+    """
+    updated = {}
+    for kind, margin in relative_margins.items():
+        gain = TIGHTENING_GAIN if margin < 0.0 else RELEASE_GAIN
+        updated[kind] = max(0.0, tightening.get(kind, 0.0) - gain * margin)
+
+    return updated

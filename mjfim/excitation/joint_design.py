@@ -3,78 +3,115 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.excitation.design import Monitor, design_task
+from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.information.marginal import shared
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
+from mjfim.records.events import DesignCallback
 
 
 def design_jointly(
     experiments: Sequence[Experiment],
-    monitor: Monitor | None = None,
+    *,
+    callback: DesignCallback | None = None,
     rounds: int = 5,
     tolerance: float = 1e-3,
     threads: int | None = None,
+    executor: Executor | None = None,
+    stop: StopToken | None = None,
 ) -> tuple[Design, ...]:
-    """Design each experiment in turn, given what the others tell, until none improves the criterion by more than tolerance.
+    """Design several experiments in turn, each given the information of the others.
 
-    The designs depend on each other through the sum of their information alone, so where no single one can improve, none
-    of them together can to first order. `final.information` of each design holds all of it; deviations of the start are
-    each experiment's own, all other nuisance is common. The experiments state the same parameters in the same order;
-    raises ExperimentError where they do not. See also `design`.
+    The designs depend on each other through the sum of their information alone. So where no single design can be improved,
+    all of them together cannot be improved to first order either.
+
+    Args:
+        experiments: Two or more experiments that state the same parameters in the same order.
+        callback: Called with a `DesignEvent` for every iterate of every design.
+        rounds: Number of times that every experiment is designed, at most.
+        tolerance: Relative improvement of the criterion in one round below which the search ends.
+        threads: Threads for simulations; default: one per core.
+        executor: Executor of `concurrent.futures` that runs several starts under hard limits side by side.
+        stop: Token that ends the search with the best designs so far, as Ctrl-C does.
+
+    Returns:
+        One design per experiment. `final.information` of each holds the information of all; deviations of the initial state
+        belong to each experiment alone, all other nuisance parameters are common.
+
+    Raises:
+        ExperimentError: There are fewer than two experiments, or their parameters differ. See also `design`.
     """
-    tasks = [DesignTask.resolve(experiment, threads=threads) for experiment in experiments]
+    with stop_on_interrupt(stop) as token:
+        tasks = [DesignTask.resolve(experiment, threads=threads) for experiment in experiments]
+        _require_common_parameters(tasks)
+
+        information = [_initial_information(task) for task in tasks]
+        designs: list[Design | None] = [None] * len(tasks)
+        last = np.inf
+
+        for _ in range(rounds):
+            for i, task in enumerate(tasks):
+                # After a request to stop, only experiments without any design are still designed, and that ends at once.
+                earlier = designs[i]
+                if token.requested and earlier is not None:
+                    continue
+
+                others = information[:i] + information[i + 1 :]
+                added = sum(others, start=np.zeros_like(information[i]))
+                design = design_task(
+                    task.restated(task.experiment, added_information=added),
+                    callback=callback,
+                    initial_control=None if earlier is None else earlier.trajectory.ctrl,
+                    executor=executor,
+                    budget=design_budget(task, token),
+                )
+                information[i] = design.data
+                designs[i] = design
+
+            # The last design knows the information of all others.
+            reached = [design.final.criterion for design in designs if design is not None][-1]
+            if token.requested or last - reached <= tolerance * abs(reached):
+                break
+            last = reached
+
+        return tuple(design for design in designs if design is not None)
+
+
+def _require_common_parameters(tasks: Sequence[DesignTask]) -> None:
+    """Raise ExperimentError where there are fewer than two tasks, or their parameters differ."""
     names = [task.parameters.names for task in tasks]
-    if len(tasks) < 2 or any(own != names[0] for own in names):
-        told = "; ".join(", ".join(own) for own in names)
+    if len(tasks) < 2 or any(other != names[0] for other in names):
+        stated = "; ".join(", ".join(each) for each in names)
         raise ExperimentError(
-            f"design_jointly takes two or more experiments with the same parameters in one order: {told}"
+            f"design_jointly takes two or more experiments with the same parameters in one order: {stated}"
         )
-    tells = [_data(task) for task in tasks]
-    controls: list[Array | None] = [None] * len(tasks)
-    designs: list[Design] = []
-    last = np.inf
-    for _ in range(rounds):
-        designs = []
-        for i, task in enumerate(tasks):
-            others = sum(
-                (tells[j] for j in range(len(tasks)) if j != i), start=np.zeros_like(tells[0])
-            )
-            found = design_task(
-                task.restated(task.experiment, added_information=others), monitor, controls[i]
-            )
-            controls[i] = found.trajectory.ctrl
-            tells[i] = found.data
-            designs.append(found)
-        reached = designs[-1].final.criterion
-        if last - reached <= tolerance * abs(reached):
-            break
-        last = reached
-    return tuple(designs)
 
 
-def _data(task: DesignTask) -> Array:
-    """What the initial control tells about the parameters that all experiments share."""
+def _initial_information(task: DesignTask) -> Array:
+    """(p, p) information of the initial control about the parameters that all experiments share [1/theta^2]."""
     point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError(
             "the simulation diverges when the parameters move a little along the initial control"
         )
-    seen = task.observer.identifiability(task.initial, point.sensitivity)
-    information = replace(
-        task.information, basis=seen.along_trajectory.basis if seen.along_trajectory.count else None
-    )
-    p = task.parameters
+
+    # Where the initial control excites some combinations only, the others carry no information.
+    excited = task.observer.identifiability(task.initial, point.sensitivity).along_trajectory
+    basis = excited.basis if excited.count else None
+    information = replace(task.information, basis=basis)
+
     return shared(
         information.without_round_off(point.information - task.information.prior),
-        p.prior_information,
-        p.recording_specific,
+        task.parameters.prior_information,
+        task.parameters.recording_specific,
     )

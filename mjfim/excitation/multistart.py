@@ -1,71 +1,189 @@
-"""Several starts under hard limits: all compete on blunt barriers, the best go on to sharp ones."""
+"""Optimisation under hard limits from several initial controls, with successive halving.
+
+All starts compete with a blunt barrier, on a plant that is quicker to simulate where there is one. The best of them continue
+on the stated plant with a sharp barrier. A winner that violates a limit on the unmodified model between the points that the
+barrier evaluates is optimised again within tighter limits.
+"""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future
-from dataclasses import dataclass, field, replace
+from collections.abc import Generator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform, pursue
+from mjfim.budget import Budget
+from mjfim.excitation.constrained import ConstrainedSearch, run_in_worker
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
+from mjfim.excitation.feasibility import shrink_until_feasible
 from mjfim.excitation.initial_controls import InitialControl
-from mjfim.excitation.interior_point import SHRINK_FACTORS, BarrierSchedule, updated_tightening
-from mjfim.excitation.unconstrained import Stage
+from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
+from mjfim.excitation.levels import Stage
+from mjfim.excitation.run_result import RunResult
 from mjfim.excitation.verification import verify
-from mjfim.parallel import collect_finished, workers_of
+from mjfim.parallel import results_in_order, workers_of
 from mjfim.records.design import HistoryRow, Status
+from mjfim.records.events import DesignEvent
 
-KEPT = 4  # one in so many goes on
+# One in this many starts survives the first round.
+HALVING_RATE = 4
+
+# Barrier weight mu down to which many starts compete.
+FIRST_ROUND_MU = 0.01
+
+# The same for few starts on samples as stated, where the first round may go further.
+FEW_STARTS_MU = 1e-3
+
+# The second round begins with this many times the last mu of the first round.
+MU_RESTART_FACTOR = 3.0
+
+# Share of the iterations and of the time for the first round.
+FIRST_ROUND_SHARE = 0.5
+
+# Share of the time that is kept for runs within tighter limits.
+RESERVED_SHARE = 0.05
+
+# Number of times that a winner which violates a limit on the unmodified model is optimised again.
+MAX_TIGHTENED_RUNS = 3
+
+# First barrier weight mu of such a run.
+TIGHTENED_RUN_MU = 1e-3
+
+# Iterations of such a run, at most.
+TIGHTENED_RUN_ITERATIONS = 60
+
+# What a search of several runs yields and returns.
+Runs = Generator[DesignEvent, None, list[RunResult]]
 
 
-HALFWAY, SHARP = (
-    0.01,
-    1e-3,
-)  # mu down to which starts compete, and where they are few, on samples as stated
-
-
-SPAN = 3.0  # times mu there with which the second round begins
-
-
-PROOFS, LATE, PATIENCE = (
-    3,
-    1e-3,
-    60,
-)  # repetitions of a winner that leaks, their first mu, their iterations
-
-
-EARLY, SPARE = (
-    0.5,
-    0.05,
-)  # share of the iterations and of the time for the first round, and of the time for repetitions
-
-
-@dataclass(frozen=True, eq=False)
-class Lead:
-    """What a start goes on with. control: (N, nu) or None;  cost: J, on the stated model where it keeps its limits there"""
-
-    control: Array | None
-    cost: float
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Multistart:
-    """What all starts have in common.
+    """Successive halving of several starts under hard limits.
 
-    fine: the experiment on its lifted plant;  coarse: on a plant that is quicker to step, or smoother, or None
-    executor: that runs the starts, None: one after the other here
-    begun: when the time began to count, by `time.perf_counter`
+    Attributes:
+        fine: The experiment on the plant without clamps.
+        coarse: The same on a plant that is quicker to simulate, or smoother; None without one.
+        executor: Runs the starts side by side; None: one after the other in this process.
+        budget: Time of the whole design, and the token that stops it.
     """
 
     fine: Stage
     coarse: Stage | None
     executor: Executor | None = None
-    begun: float = field(default_factory=time.perf_counter)
+    budget: Budget
+
+    def run(self, starts: Sequence[InitialControl]) -> Runs:
+        """Optimise from all starts in two rounds.
+
+        Args:
+            starts: The initial controls.
+
+        Yields:
+            Every iterate.
+
+        Returns:
+            One result per start that was begun; those of the survivors include the second round.
+        """
+        max_iterations = self.fine.task.experiment.descent.max_iterations
+
+        # A single start without a coarse level or a basis of its own needs no competition.
+        if self._needs_one_round(starts):
+            return (
+                yield from self._round(
+                    self.fine,
+                    starts,
+                    BarrierSchedule(),
+                    max_iterations,
+                    self.budget.seconds_left - self._reserved_seconds,
+                )
+            )
+
+        # First round: all starts, down to a blunt barrier.
+        is_short = len(starts) < HALVING_RATE and self._differs_by_timestep_only
+        last_mu = FEW_STARTS_MU if is_short else FIRST_ROUND_MU
+        results = yield from self._round(
+            self.coarse or self.fine,
+            starts,
+            BarrierSchedule(last=last_mu),
+            round(FIRST_ROUND_SHARE * max_iterations),
+            FIRST_ROUND_SHARE * self.budget.seconds_left / self._turns(len(starts)),
+        )
+        if self.budget.stop.requested:
+            return results
+
+        # The survivors are chosen by their cost on the stated plant.
+        results, candidates = self._judge_all(results, starts)
+        survivors = self._choose_survivors(candidates)
+        if not survivors:
+            return results
+        results = _discard_others(results, candidates, survivors)
+
+        # Second round: the survivors on the stated plant, down to a sharp barrier.
+        done = max((row.iteration for i in survivors for row in results[i].history), default=0)
+        seconds_left = max(self.budget.seconds_left - self._reserved_seconds, 0.0)
+        second = yield from _renumber(
+            self._round(
+                self.fine,
+                [_continued(candidates[i]) for i in survivors],
+                BarrierSchedule(first=min(MU_RESTART_FACTOR * last_mu, FIRST_ROUND_MU)),
+                max_iterations - done,
+                seconds_left / self._turns(len(survivors)),
+            ),
+            done + 1,
+        )
+        return _merge_rounds(results, second)
+
+    def tighten_winner(self, results: Sequence[RunResult]) -> Runs:
+        """Optimise a winner again within tighter limits while it violates a limit on the unmodified model.
+
+        The barrier evaluates distances at the samples and other quantities at some engine steps; between them a limit may be
+        violated. Where tighter limits do not help, the control is shrunk.
+
+        Args:
+            results: Result of every start.
+
+        Yields:
+            Every iterate.
+
+        Returns:
+            The results, the winner's replaced.
+        """
+        results = list(results)
+        tightening = dict[str, float]()
+
+        for _ in range(MAX_TIGHTENED_RUNS):
+            violated = self._violated_by_winner(results)
+            if violated is None:
+                return results
+            if self.budget.exhausted is not None:
+                break
+
+            winner, margins = violated
+            tightening = updated_tightening(tightening, margins)
+            repeated = yield from self._round(
+                self.fine,
+                [_continued(results[winner])],
+                BarrierSchedule(first=TIGHTENED_RUN_MU),
+                TIGHTENED_RUN_ITERATIONS,
+                self.budget.seconds_left,
+                tightening,
+            )
+            for result in repeated:
+                if np.isfinite(result.cost):
+                    results[winner] = _append_run(results[winner], result)
+
+        # As a last resort the control is shrunk.
+        violated = self._violated_by_winner(results)
+        if violated is not None:
+            winner, _ = violated
+            results[winner] = self._shrink(results[winner])
+
+        return results
+
+    # ---- properties of the task
 
     @cached_property
     def _constraints(self) -> ConstraintSet:
@@ -73,251 +191,271 @@ class Multistart:
         return constraint_set_of(self.fine.task)
 
     @property
-    def _seconds(self) -> float:
-        """That are left."""
-        stated = self.fine.task.experiment.descent.seconds
-        return np.inf if stated is None else max(self.begun + stated - time.perf_counter(), 0.0)
+    def _reserved_seconds(self) -> float:
+        """Time that is kept for runs within tighter limits [s]; 0 without a limit of the time."""
+        return RESERVED_SHARE * (self.fine.task.experiment.descent.seconds or 0.0)
 
     @property
-    def _faithful(self) -> bool:
-        """The coarse level differs by its timestep alone: its minima are nearly those of the stated one."""
+    def _differs_by_timestep_only(self) -> bool:
+        """Whether the minima on the coarse level are nearly those of the stated one."""
         if self.coarse is None:
             return True
-        level = self.coarse.task.system.variant
-        return replace(level, timestep_factor=1) == self.fine.task.system.variant
 
-    def run(self, starts: Sequence[InitialControl], chases: list[Chase]) -> Iterator[HistoryRow]:
-        """Every iterate; `chases` gets one entry per start, the winners' ones after the second round."""
-        d = self.fine.task.experiment.descent
-        reserve = SPARE * (d.seconds or 0.0)
-        first = self.coarse or self.fine
-        if (
-            len(starts) == 1
-            and self.coarse is None
-            and starts[0].basis is None
-            and starts[0].repeats == 1
-        ):
-            yield from self._round(
-                self.fine,
-                starts,
-                BarrierSchedule(),
-                d.max_iterations,
-                self._seconds - reserve,
-                chases,
-            )
-            return
-        share = EARLY * self._seconds / self._turns(len(starts))
-        last = SHARP if len(starts) < KEPT and self._faithful else HALFWAY
-        yield from self._round(
-            first,
-            starts,
-            BarrierSchedule(last=last),
-            round(EARLY * d.max_iterations),
-            share,
-            chases,
-        )
-        if any(chase.status is Status.INTERRUPTED for chase in chases):
-            return
-        leads = [Lead(chase.control, chase.cost) for chase in chases]
-        if self.coarse is not None or any(start.repeats > 1 for start in starts):
-            leads = [
-                self._judge(chase, start) for start, chase in zip(starts, chases, strict=False)
-            ]
-        order = sorted(
-            (i for i, lead in enumerate(leads) if lead.control is not None),
-            key=lambda i: leads[i].cost,
-        )
-        kept = order[: max(1, len(chases) // KEPT)]
-        if not kept:
-            return
-        again = [
-            InitialControl(name=chases[i].name, control=np.asarray(leads[i].control)) for i in kept
-        ]
-        for i in order[len(kept) :]:
-            if np.isfinite(leads[i].cost):
-                chases[i].status = Status.LEFT
-        left = max(self._seconds - reserve, 0.0) / self._turns(len(again))
-        done = max((row.iteration for i in kept for row in chases[i].history), default=0)
-        second: list[Chase] = []
-        try:
-            for row in self._round(
-                self.fine,
-                again,
-                BarrierSchedule(first=min(SPAN * last, HALFWAY)),
-                d.max_iterations - done,
-                left,
-                second,
-            ):
-                yield replace(row, iteration=row.iteration + done + 1)
-        finally:  # also where the user interrupts
-            found = {chase.name: chase for chase in second}
-            for i in kept:
-                if chases[i].name in found:
-                    _continue(chases[i], found[chases[i].name])
-            best = min(chases, key=lambda chase: chase.cost)
-            if np.isfinite(best.cost) and best.status in (
-                Status.LEFT,
-                Status.INFEASIBLE,
-            ):  # better after all
-                best.status = Status.MAX_ITERATIONS
+        variant = self.coarse.task.system.variant
+        return replace(variant, timestep_factor=1) == self.fine.task.system.variant
 
-    def prove(self, chases: list[Chase]) -> Iterator[HistoryRow]:
-        """Hold back a winner that leaves a limit on the untouched model, between what the barrier looked at; a few times."""
-        held = dict[str, float]()
-        for _ in range(PROOFS):
-            leaking = self._leaking(chases)
-            if leaking is None:
-                return
-            if self._seconds == 0.0:
-                break
-            i, shares = leaking
-            held = updated_tightening(held, shares)
-            best, again = chases[i], list[Chase]()
-            start = InitialControl(name=best.name, control=np.asarray(best.control))
-            try:
-                yield from self._round(
-                    self.fine,
-                    [start],
-                    BarrierSchedule(first=LATE),
-                    PATIENCE,
-                    self._seconds,
-                    again,
-                    held,
-                )
-            finally:  # also where the user interrupts
-                for chase in again:
-                    if np.isfinite(chase.cost):
-                        chase.history = _joined(best.history, chase.history)
-                        chase.steps += best.steps
-                        chases[i] = chase
-        leaking = self._leaking(chases)
-        if leaking is not None:
-            self._shrink(chases[leaking[0]])
+    def _needs_one_round(self, starts: Sequence[InitialControl]) -> bool:
+        """Whether there is a single start that is free to take any shape on the stated level."""
+        if len(starts) > 1 or self.coarse is not None:
+            return False
 
-    def _leaking(self, chases: list[Chase]) -> tuple[int, dict[str, float]] | None:
-        """Which one wins and leaves a limit on the untouched model, and its shares; None where there is none."""
-        if not chases or any(chase.status is Status.INTERRUPTED for chase in chases):
-            return None
-        i = min(range(len(chases)), key=lambda i: chases[i].cost)
-        if chases[i].control is None or not np.isfinite(chases[i].cost):
-            return None
-        task = self.fine.task
-        found = verify(task, task.plant.simulate(task.theta, np.asarray(chases[i].control)))
-        return (
-            None
-            if found.is_feasible or not np.isfinite(found.deviation)
-            else (i, found.relative_margins)
-        )
-
-    def _judge(self, chase: Chase, start: InitialControl) -> Lead:
-        """Replace a coarse level's cost by that on the stated model, of what was found or of the start if that is better.
-
-        Returns what to go on with: that, or what leaks here as the coarse level saw it, since the second round brings it back.
-        """
-        lead = Lead(chase.control, chase.cost)
-        found = [control for control in (chase.control, start.over_horizon) if control is not None]
-        costs = [self._worth(control) for control in found]
-        best = int(np.argmin(costs))
-        chase.cost = costs[best]
-        if np.isfinite(chase.cost):
-            chase.control = found[best]
-        leaks = lead.control is not None and np.isinf(costs[0])
-        return lead if leaks else Lead(chase.control, chase.cost)
-
-    def _worth(self, control: Array) -> float:
-        """J on the stated model, infinite outside the limits, also where a clamp alone keeps a force inside."""
-        task, constraints = self.fine.task, self._constraints
-        watched = task.plant.observe(task.theta, control, constraints.observations)
-        if watched is None:
-            return np.inf
-        values = constraints.evaluate(*watched, slopes=False)
-        if not constraints.is_feasible(values) or not verify(task, values.trajectory).is_feasible:
-            return np.inf
-        return self.fine.problem.point(values.trajectory).cost
-
-    def _shrink(self, chase: Chase) -> None:
-        """Shrink a control about the centre until no limit is left, if it ever is."""
-        task = self.fine.task
-        for share in SHRINK_FACTORS:
-            control = task.centre + share * (np.asarray(chase.control) - task.centre)
-            cost = self._worth(control)
-            if np.isfinite(cost):
-                chase.control, chase.cost = control, cost
-                return
+        return all(start.basis is None and start.repeats == 1 for start in starts)
 
     def _turns(self, count: int) -> int:
-        """How many of the tasks run after one another."""
+        """How many tasks each worker runs one after the other."""
         return -(-max(count, 1) // workers_of(self.executor))
+
+    # ---- choice of the survivors
+
+    def _judge_all(
+        self, results: Sequence[RunResult], starts: Sequence[InitialControl]
+    ) -> tuple[list[RunResult], list[RunResult]]:
+        """Results with their cost on the stated plant, and the candidates of the second round."""
+        repeats = any(start.repeats > 1 for start in starts)
+        if self.coarse is None and not repeats:
+            return list(results), list(results)
+
+        by_name = {start.name: start for start in starts}
+        judged = [self.judge(result, by_name[result.name]) for result in results]
+        return [result for result, _ in judged], [candidate for _, candidate in judged]
+
+    def judge(self, result: RunResult, start: InitialControl) -> tuple[RunResult, RunResult]:
+        """Replace the cost on a coarse level by that on the stated plant.
+
+        Args:
+            result: Result of the first round.
+            start: Its initial control.
+
+        Returns:
+            The result with the better of the found and the initial control, by their costs on the stated plant, and the
+            candidate with which the second round would continue: the same, or a found control that violates a limit here,
+            with its cost on the coarse level, because the second round makes it feasible again.
+        """
+        found = [control for control in (result.control, start.over_horizon) if control is not None]
+        costs = [self._cost_on_stated_plant(control) for control in found]
+
+        best = int(np.argmin(costs))
+        judged = replace(result, cost=costs[best])
+        if np.isfinite(judged.cost):
+            judged = replace(judged, control=found[best])
+
+        violates = result.control is not None and np.isinf(costs[0])
+        return judged, result if violates else judged
+
+    def _cost_on_stated_plant(self, control: Array) -> float:
+        """J of a control: (N, nu); infinite where it violates a limit, also where only a clamp keeps a force within one."""
+        task = self.fine.task
+        observed = task.plant.observe(task.theta, control, self._constraints.observations)
+        if observed is None:
+            return np.inf
+
+        values = self._constraints.evaluate(*observed, slopes=False)
+        if not self._constraints.is_feasible(values):
+            return np.inf
+        if not verify(task, values.trajectory).is_feasible:
+            return np.inf
+
+        return self.fine.problem.point(values.trajectory).cost
+
+    def _choose_survivors(self, candidates: Sequence[RunResult]) -> list[int]:
+        """Indices of the best candidates, at least one where there is any; the best one comes first."""
+        usable = [i for i, candidate in enumerate(candidates) if candidate.control is not None]
+        order = sorted(usable, key=lambda i: candidates[i].cost)
+        return order[: max(1, len(candidates) // HALVING_RATE)]
+
+    # ---- the winner on the unmodified model
+
+    def _violated_by_winner(
+        self, results: Sequence[RunResult]
+    ) -> tuple[int, dict[str, float]] | None:
+        """Index of the winner and its relative margins, where it violates a limit on the unmodified model; else None."""
+        if not results or self.budget.stop.requested:
+            return None
+
+        winner = min(range(len(results)), key=lambda i: results[i].cost)
+        control = results[winner].control
+        if control is None or not np.isfinite(results[winner].cost):
+            return None
+
+        task = self.fine.task
+        found = verify(task, task.plant.simulate(task.theta, control))
+        if found.is_feasible or not np.isfinite(found.deviation):
+            return None
+
+        return winner, found.relative_margins
+
+    def _shrink(self, result: RunResult) -> RunResult:
+        """Shrink the control of a result until no limit is violated, if that is possible."""
+
+        def repair(control: Array) -> RunResult | None:
+            """The result with this control, where it is feasible."""
+            cost = self._cost_on_stated_plant(control)
+            return replace(result, control=control, cost=cost) if np.isfinite(cost) else None
+
+        control = np.asarray(result.control)
+        return shrink_until_feasible(control, self.fine.task.centre, repair) or result
+
+    # ---- one round
 
     def _round(
         self,
         stage: Stage,
         starts: Sequence[InitialControl],
         schedule: BarrierSchedule,
-        budget: int,
+        max_iterations: int,
         seconds: float,
-        chases: list[Chase],
-        held: Mapping[str, float] | None = None,
-    ) -> Iterator[HistoryRow]:
-        """Every iterate of one descent per start, at most `budget` each."""
-        level, combinations = stage.task, stage.basis
-        stated = level.experiment.descent.tolerance
-        common = ConstrainedSearch(
-            level.experiment,
-            starts[0],
-            replace(schedule, tolerance=max(schedule.tolerance, stated)),
-            max(budget, 1),
-            seconds,
-            combinations,
-            level.added_information,
-            level.system.variant,
-            max(workers_of(self.executor) // len(starts), 1)
-            if self.executor is not None
-            else level.system.threads,
-            held or {},
-            time.time() - (time.perf_counter() - self.begun),
-        )
-        searches = [replace(common, start=start) for start in starts]
+        tightening: Mapping[str, float] | None = None,
+    ) -> Runs:
+        """Run one search per start, each with the given iterations and seconds."""
+        task = stage.task
+        tolerance = max(schedule.tolerance, task.experiment.descent.tolerance)
+
+        # Workers share the threads; without an executor a search may use all of them.
+        threads = task.system.threads
+        if self.executor is not None:
+            threads = max(workers_of(self.executor) // len(starts), 1)
+
+        searches = [
+            ConstrainedSearch(
+                experiment=task.experiment,
+                start=start,
+                schedule=replace(schedule, tolerance=tolerance),
+                max_iterations=max(max_iterations, 1),
+                budget=self.budget,
+                seconds=seconds,
+                combinations=stage.basis,
+                added_information=task.added_information,
+                variant=task.system.variant,
+                threads=threads,
+                tightening=tightening or {},
+            )
+            for start in starts
+        ]
         if self.executor is None:
-            for search in searches:
-                if chases and self._seconds == 0.0:
-                    return
-                chases.append(Chase(search.start.name))
-                yield from pursue(search, chases[-1], level)
-            return
-        futures: list[Future[Chase]] = []
+            return (yield from self._run_here(searches, stage))
+        return (yield from self._run_in_workers(searches, self.executor))
+
+    def _run_here(self, searches: Sequence[ConstrainedSearch], stage: Stage) -> Runs:
+        """Run searches one after the other while the budget lasts; the first one always begins."""
+        results: list[RunResult] = []
+        for search in searches:
+            if results and self.budget.exhausted is not None:
+                break
+
+            result = yield from search.run(stage.task)
+            results.append(result)
+
+        return results
+
+    def _run_in_workers(self, searches: Sequence[ConstrainedSearch], executor: Executor) -> Runs:
+        """Run searches side by side; the iterates of each are reported when it has ended."""
+        futures = [executor.submit(run_in_worker, search) for search in searches]
+        results: list[RunResult] = []
+
+        for result in results_in_order(executor, futures, self.budget):
+            results.append(result)
+
+            for row in result.history:
+                if self.budget.stop.requested:
+                    break
+                yield DesignEvent(start=result.name, row=row)
+
+        return results
+
+
+def _continued(result: RunResult) -> InitialControl:
+    """The control of a result as an initial control."""
+    return InitialControl(name=result.name, control=np.asarray(result.control))
+
+
+def _renumber(events: Runs, offset: int) -> Runs:
+    """Add an offset to the numbers of the iterates."""
+    while True:
         try:
-            futures += [self.executor.submit(perform, search) for search in searches]
-            for future in futures:
-                if chases and self._seconds == 0.0 and future.cancel():
-                    continue
-                chases.append(future.result())
-                yield from chases[-1].history
-        except (
-            BaseException
-        ):  # the user's Ctrl-C, that of what watches the iterates, or a fault: nothing may run on
-            chases += collect_finished(self.executor, futures[len(chases) :])
-            raise
+            event = next(events)
+        except StopIteration as end:
+            results: list[RunResult] = end.value
+            return results
+
+        row = replace(event.row, iteration=event.row.iteration + offset)
+        yield replace(event, row=row)
 
 
-def _continue(chase: Chase, later: Chase) -> None:
-    """Bring a start of the first round to where it came in the second, but for what it had found better before."""
-    if later.control is not None and not later.cost > chase.cost:
-        chase.control, chase.cost = later.control, later.cost
-    chase.history = _joined(chase.history, later.history)
-    chase.steps += later.steps
-    chase.status, chase.slope = later.status, later.slope
-    if np.isfinite(chase.cost) and later.status is Status.INFEASIBLE:
-        chase.status = Status.MAX_ITERATIONS
+def _discard_others(
+    results: Sequence[RunResult], candidates: Sequence[RunResult], survivors: Sequence[int]
+) -> list[RunResult]:
+    """Mark feasible results that do not survive the first round."""
+    marked = list(results)
+    for i, candidate in enumerate(candidates):
+        is_usable = candidate.control is not None and np.isfinite(candidate.cost)
+        if i not in survivors and is_usable:
+            marked[i] = replace(marked[i], status=Status.LEFT)
+
+    return marked
 
 
-def _joined(early: tuple[HistoryRow, ...], late: tuple[HistoryRow, ...]) -> tuple[HistoryRow, ...]:
-    """One history of two rounds."""
-    if not early:
-        return late
-    end = early[-1]
-    moved = (
-        replace(r, iteration=r.iteration + end.iteration + 1, steps=r.steps + end.steps)
-        for r in late
+def _merge_rounds(first: Sequence[RunResult], second: Sequence[RunResult]) -> list[RunResult]:
+    """Results of both rounds; the second one replaces a control only where it is at least as good."""
+    by_name = {result.name: result for result in second}
+    merged = [
+        _merge(result, by_name[result.name]) if result.name in by_name else result
+        for result in first
+    ]
+
+    # A discarded start may be the best after all, and so may one whose second run found nothing feasible.
+    best = min(range(len(merged)), key=lambda i: merged[i].cost)
+    if np.isfinite(merged[best].cost) and merged[best].status in (Status.LEFT, Status.INFEASIBLE):
+        merged[best] = replace(merged[best], status=Status.MAX_ITERATIONS)
+
+    return merged
+
+
+def _merge(first: RunResult, second: RunResult) -> RunResult:
+    """Result of a start after both rounds."""
+    merged = replace(
+        first,
+        history=_join(first.history, second.history),
+        steps=first.steps + second.steps,
+        status=second.status,
+        slope=second.slope,
     )
-    return (*early, *moved)
+    if second.control is not None and second.cost <= first.cost:
+        merged = replace(merged, control=second.control, cost=second.cost)
+
+    # The control of the first round still counts where the second one found nothing feasible.
+    if np.isfinite(merged.cost) and second.status is Status.INFEASIBLE:
+        merged = replace(merged, status=Status.MAX_ITERATIONS)
+
+    return merged
+
+
+def _append_run(first: RunResult, second: RunResult) -> RunResult:
+    """The second result, with the history and the steps of both."""
+    return replace(
+        second,
+        history=_join(first.history, second.history),
+        steps=first.steps + second.steps,
+    )
+
+
+def _join(first: tuple[HistoryRow, ...], second: tuple[HistoryRow, ...]) -> tuple[HistoryRow, ...]:
+    """One history of two runs; iterates and engine steps are counted on."""
+    if not first:
+        return second
+
+    end = first[-1]
+    continued = [
+        replace(row, iteration=row.iteration + end.iteration + 1, steps=row.steps + end.steps)
+        for row in second
+    ]
+    return (*first, *continued)

@@ -1,13 +1,12 @@
-"""`mjfim.shortest_experiment`: the shortest experiment whose design tells every parameter as well as wanted.
+"""`mjfim.shortest_experiment`: the shortest experiment whose design reaches every target standard deviation.
 
-Standard deviations fall like T^-1/2 or faster with the duration T, so a secant on their logarithms finds the place where
-the worst of them, over the wanted one, is 1. Both ends of the bracket are designs: the one that is returned reaches what
-is wanted, and one that is shorter by the tolerance does not.
+Standard deviations fall like T^-1/2 or faster with the duration T. So a secant on their logarithms finds the duration at
+which the worst ratio of a predicted to a target standard deviation is 1. Both ends of the bracket are designs: the returned
+one reaches the targets, and one that is shorter by the tolerance does not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -15,35 +14,47 @@ from typing import Any, NoReturn
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, MjfimError
-from mjfim.excitation.design import Monitor, design_task
+from mjfim.budget import StopToken, stop_on_interrupt
+from mjfim.errors import ExperimentError, MjfimError, NoResultError
+from mjfim.excitation.design import design_budget, design_task
+from mjfim.excitation.levels import AUTO_COARSE_FACTOR, MIN_COARSE_SAMPLES
 from mjfim.excitation.target_accuracy import (
     largest_ratio_to_target,
     require_reachable,
     target_accuracies,
 )
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import AUTO, COARSEST
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system_tables import Signal
 from mjfim.optimize.bracketing import SampleGrid, smallest_feasible
 from mjfim.recordings.formats.read import read_table
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
+from mjfim.records.events import Callback, StudyEvent
 
-LONGER = 4.0  # times the stated horizon: how long an experiment may become
-TOLERANCE = 0.02  # of the horizon
+# Longest horizon that is tried by default, over the stated one.
+MAX_HORIZON_FACTOR = 4.0
+
+# Default tolerance of the horizon, relative.
+DEFAULT_TOLERANCE = 0.02
+
+# Rounding error of a number of samples [samples].
+ROUNDING = 1e-9
 
 
 class OutOfReachError(ExperimentError):
-    """Even the longest experiment does not reach what is wanted."""
+    """Even the longest experiment does not reach the target standard deviations."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Tried:
-    """A duration that was tried. horizon: [s];  ratio: of the worst predicted σ to the wanted one, infinite without a design
+    """A duration that was tried.
 
-    parameter: whose σ that is;  why: there is no design, or empty
+    Attributes:
+        horizon: The duration [s].
+        ratio: Largest ratio of a predicted to a target standard deviation; infinite without a design.
+        parameter: Name of the parameter with this ratio.
+        why: Why there is no design; empty where there is one.
     """
 
     horizon: float
@@ -53,22 +64,27 @@ class Tried:
 
     @property
     def reached(self) -> bool:
-        """Every parameter as well as wanted."""
+        """True where every target is reached."""
         return self.ratio <= 1.0
 
     def __str__(self) -> str:
         if self.why:
             return f"{self.horizon:g} s: {self.why}"
+
         return f"{self.horizon:g} s: σ of {self.parameter} is {self.ratio:.3f} × the wanted one"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ShortestExperiment:
-    """The shortest design. experiment: as stated, with its horizon and the repeats that divide it
+    """The shortest experiment and its design.
 
-    design: reaches every wanted σ
-    tried: all durations, in their order;  tolerance: [s]
-    closed: one that is shorter by no more than the tolerance was tried and does not reach it, or there is none
+    Attributes:
+        experiment: The experiment as stated, with its new horizon and those repeats that divide it.
+        design: Its design, which reaches every target.
+        tried: All durations in the order in which they were tried.
+        tolerance: The horizon is too long by this at most, where the search is closed [s].
+        closed: True where a duration that is shorter by no more than the tolerance does not reach the targets, or where there
+            is no shorter one.
     """
 
     experiment: Experiment
@@ -79,11 +95,17 @@ class ShortestExperiment:
 
     @property
     def horizon(self) -> float:
-        """[s]"""
+        """Duration of the experiment [s]."""
         return float(self.experiment.horizon or 0.0)
 
+    @property
+    def missed(self) -> Tried | None:
+        """The longest of the shorter durations that do not reach the targets."""
+        shorter = [t for t in self.tried if not t.reached and t.horizon < self.horizon]
+        return max(shorter, key=lambda t: t.horizon, default=None)
+
     def summary(self) -> dict[str, Any]:
-        """Contents of shortest.json."""
+        """Return the contents of shortest.json."""
         tried = [
             {"horizon": t.horizon, "ratio": t.ratio, "parameter": t.parameter, "why": t.why}
             for t in self.tried
@@ -96,170 +118,240 @@ class ShortestExperiment:
         }
 
     def __str__(self) -> str:
-        below = (
-            "nothing shorter was tried" if self.missed is None else f"too short is {self.missed}"
-        )
-        ended = "" if self.closed else "; the search was interrupted, so it may be shorter still"
-        return f"shortest horizon: {self.horizon:g} s ({below}){ended}"
-
-    @property
-    def missed(self) -> Tried | None:
-        """The longest of the shorter ones that do not reach what is wanted."""
-        shorter = [t for t in self.tried if not t.reached and t.horizon < self.horizon]
-        return max(shorter, key=lambda t: t.horizon, default=None)
+        below = "nothing shorter was tried"
+        if self.missed is not None:
+            below = f"too short is {self.missed}"
+        ending = "" if self.closed else "; the search was interrupted, so it may be shorter still"
+        return f"shortest horizon: {self.horizon:g} s ({below}){ending}"
 
 
 def shortest_experiment(
     experiment: Experiment,
+    *,
     longest: float | None = None,
     tolerance: float | None = None,
-    monitor: Monitor | None = None,
+    callback: Callback | None = None,
     threads: int | None = None,
-    report: Callable[[Tried], None] | None = None,
     executor: Executor | None = None,
+    stop: StopToken | None = None,
 ) -> ShortestExperiment:
-    """Find the shortest horizon whose design is predicted to reach every parameter's `wanted` σ, and that design.
+    """Find the shortest horizon whose design is predicted to reach every target standard deviation, and that design.
 
-    longest: [s], default four times the experiment's horizon, or as long as its table of the initial control lasts
-    tolerance: [s] by how much it may be too long, default 2 % of it, a sample at least
-    monitor: called with every iterate of every design;  report: with every duration that was tried
-    executor: of `concurrent.futures`, runs several starts under hard limits at once
-    Every design starts from that of the nearest duration so far instead of the initial control, and where that does not
-    reach, from the initial control as well. Ctrl-C returns the shortest one so far.
-    Raises OutOfReachError where even the longest does not reach it, ExperimentError where nothing is wanted.
+    Every design begins with that of the nearest duration so far instead of the initial control, and where that does not
+    reach the targets, with the initial control as well.
+
+    Args:
+        experiment: The experiment; at least one parameter states `wanted`.
+        longest: Longest horizon [s]; default: four times that of the experiment, or as long as its table of the initial
+            control lasts.
+        tolerance: The horizon may be too long by this [s]; default: 2 % of it; at least one sample.
+        callback: Called with a `DesignEvent` for every iterate, and a `StudyEvent` for every duration that was tried.
+        threads: Threads for simulations; default: one per core.
+        executor: Executor of `concurrent.futures` that runs several starts under hard limits side by side.
+        stop: Token that ends the search with the shortest one so far, as Ctrl-C does.
+
+    Returns:
+        The shortest experiment.
+
+    Raises:
+        OutOfReachError: Even the longest horizon does not reach the targets.
+        ExperimentError: No parameter states a target, or an argument is faulty.
+        NoResultError: The search was stopped before any duration reached the targets.
     """
-    return _Hunt(experiment, longest, tolerance, monitor, threads, report, executor).run()
+    if tolerance is not None and not tolerance > 0.0:
+        raise ExperimentError(f"shortest: tolerance {tolerance:g} s; it must be > 0")
+
+    with stop_on_interrupt(stop) as token:
+        task = DesignTask.resolve(experiment, threads=threads)
+        search = _HorizonSearch(task, tolerance, callback, executor, token)
+        return search.run(_default_longest(task) if longest is None else longest)
 
 
-class _Hunt:
-    """Designs by number of samples, and the bracket around the shortest one that is good enough."""
+class _HorizonSearch:
+    """Designs by their number of samples, and the bracket around the shortest one that reaches the targets.
+
+    Args:
+        base: The experiment as stated.
+        tolerance: Tolerance of the horizon [s], or None for the default.
+        callback: Called with every event.
+        executor: Runs several starts side by side, or None.
+        stop: Token that ends the search.
+
+    Attributes:
+        tried: Result of every number of samples.
+        designs: Best design of every number of samples that has one.
+    """
 
     def __init__(
         self,
-        experiment: Experiment,
-        longest: float | None,
+        base: DesignTask,
         tolerance: float | None,
-        monitor: Monitor | None,
-        threads: int | None,
-        report: Callable[[Tried], None] | None,
+        callback: Callback | None,
         executor: Executor | None,
+        stop: StopToken,
     ) -> None:
-        if tolerance is not None and not tolerance > 0.0:
-            raise ExperimentError(f"shortest: tolerance {tolerance:g} s; it must be > 0")
-        self.experiment, self.tolerance = experiment, tolerance
-        self.monitor, self.threads, self.report, self.executor = monitor, threads, report, executor
-        self.base = DesignTask.resolve(experiment, threads=threads)
-        self.wanted = target_accuracies(self.base)
-        self.grid = _grid(self.base)
-        self.longest = _longest(self.base) if longest is None else longest
-        if self.longest * experiment.rate < self.grid.minimum:
-            raise ExperimentError(
-                f"shortest: longest {self.longest:g} s is less than {self.grid.minimum} samples"
-            )
+        self.base = base
+        self.experiment = base.experiment
+        self.tolerance = tolerance
+        self.callback = callback
+        self.executor = executor
+        self.stop = stop
+
+        self.targets = target_accuracies(base)
+        self.grid = _sample_grid(base)
         self.tried: dict[int, Tried] = {}
         self.designs: dict[int, Design] = {}
-        self.stopped = False
 
-    def run(self) -> ShortestExperiment:
-        """Bracket, then narrow."""
-        most = self.grid.round_down(self.longest * self.experiment.rate)
-        first = min(self.grid.round_up(self.base.samples), most)
-        found, below = smallest_feasible(self.ratio, first, most, self.grid, self.slack)
-        if found is None and self.stopped:
-            raise KeyboardInterrupt
+    def run(self, longest: float) -> ShortestExperiment:
+        """Search up to a longest horizon [s]."""
+        rate = self.experiment.rate
+        if longest * rate < self.grid.minimum:
+            raise ExperimentError(
+                f"shortest: longest {longest:g} s is less than {self.grid.minimum} samples"
+            )
+
+        largest = self.grid.round_down(longest * rate)
+        first = min(self.grid.round_up(self.base.samples), largest)
+        found, below = smallest_feasible(self.ratio, first, largest, self.grid, self.slack)
+        if found is None and self.stop.requested:
+            raise NoResultError("stopped before any duration reached the wanted accuracy")
         if found is None:
-            self._fail(most)
-        least = found <= self.grid.minimum
-        closed = least or (below is not None and found - below <= self.slack(found))
-        own, tolerance = self.at(found), self.slack(found) / self.experiment.rate
+            self._raise_out_of_reach(largest)
+
+        # The bracket is closed where its lower end was tried as well, or where nothing shorter exists.
+        is_shortest = found <= self.grid.minimum
+        is_narrow = below is not None and found - below <= self.slack(found)
         return ShortestExperiment(
-            own, self.designs[found], tuple(self.tried.values()), tolerance, closed
+            experiment=self.at(found),
+            design=self.designs[found],
+            tried=tuple(self.tried.values()),
+            tolerance=self.slack(found) / rate,
+            closed=is_shortest or is_narrow,
         )
 
     def slack(self, samples: int) -> int:
-        """Tolerance in samples: no less than the grid resolves."""
-        wide = (
-            TOLERANCE * samples if self.tolerance is None else self.tolerance * self.experiment.rate
-        )
-        return max(int(wide + 1e-9), samples - self.grid.round_down(samples - 1))
+        """Tolerance at a number of samples [samples]; at least the distance to the next smaller number."""
+        width = DEFAULT_TOLERANCE * samples
+        if self.tolerance is not None:
+            width = self.tolerance * self.experiment.rate
+
+        resolution = samples - self.grid.round_down(samples - 1)
+        return max(int(width + ROUNDING), resolution)
 
     def at(self, samples: int) -> Experiment:
-        """The experiment with so many samples."""
-        dividing = tuple(count for count in self.experiment.descent.repeats if samples % count == 0)
-        return self.experiment.replace(
-            horizon=samples / self.experiment.rate, descent={"repeats": dividing}
-        )
+        """The experiment with a number of samples."""
+        repeats = self.experiment.descent.repeats
+        dividing = tuple(count for count in repeats if samples % count == 0)
+        horizon = samples / self.experiment.rate
+        return self.experiment.replace(horizon=horizon, descent={"repeats": dividing})
 
     def ratio(self, samples: int) -> float | None:
-        """Largest ratio of a predicted σ to the wanted one with a number of samples; None where its design was interrupted."""
+        """Largest ratio of a predicted to a target standard deviation; None where the design was stopped."""
         tried = self._try(samples)
         if tried is None:
-            self.stopped = True
             return None
+
         self.tried[samples] = tried
-        if self.report is not None:
-            self.report(tried)
+        if self.callback is not None:
+            event = StudyEvent(
+                study="shortest_experiment",
+                part=f"{tried.horizon:g} s",
+                index=len(self.tried) - 1,
+                count=None,
+                share=1.0,
+                message=str(tried),
+            )
+            self.callback(event)
         return tried.ratio
 
     def _try(self, samples: int) -> Tried | None:
-        """The better of a design from the nearest one so far and, where that is not good enough, from the initial control."""
+        """The better of a design from the nearest one so far and, where that fails, from the initial control."""
         near = min(self.designs, key=lambda n: abs(np.log(n / samples)), default=None)
         tried = self._design(samples, near)
-        if near is not None and tried is not None and not tried.reached:
-            again = self._design(samples, None)
-            if again is None:
-                return None
-            tried = again if again.ratio <= tried.ratio else tried
-        return tried
+        if near is None or tried is None or tried.reached:
+            return tried
+
+        again = self._design(samples, None)
+        if again is None:
+            return None
+        return again if again.ratio <= tried.ratio else tried
 
     def _design(self, samples: int, near: int | None) -> Tried | None:
-        """One design of so many samples, its control begun from another one's; kept where it is the best of them."""
+        """Design the experiment with a number of samples and keep the design where it is the best one of that length.
+
+        Args:
+            samples: Number of samples.
+            near: Number of samples of the design with whose control to begin; None for the initial control.
+
+        Returns:
+            The outcome, or None where the design was stopped.
+        """
         horizon = samples / self.experiment.rate
         try:
             task = self.base.restated(self.at(samples))
-            begin = None if near is None else fitted(task, self.designs[near].trajectory.ctrl)
-            found = design_task(task, self.monitor, begin, self.executor)
-            if found.status is Status.INTERRUPTED:
+            initial = None if near is None else fitted(task, self.designs[near].trajectory.ctrl)
+            design = design_task(
+                task,
+                callback=self.callback,
+                initial_control=initial,
+                executor=self.executor,
+                budget=design_budget(task, self.stop),
+            )
+            if design.status is Status.INTERRUPTED:
                 return None
-            require_reachable(task, found, self.wanted)
+            require_reachable(task, design, self.targets)
         except MjfimError as error:
+            # A fault at the stated horizon is the user's to see; at another one it only rules that horizon out.
             if not self.tried:
-                raise  # as stated, there is no design
-            return Tried(horizon, np.inf, why=str(error))
-        if found.status is Status.INFEASIBLE:
-            return Tried(horizon, np.inf, why=f"{found.status.value} ({_outside(found)})")
-        ratio, j = largest_ratio_to_target(found.final.std, self.wanted)
-        if (
-            samples not in self.designs
-            or ratio < largest_ratio_to_target(self.designs[samples].final.std, self.wanted)[0]
-        ):
-            self.designs[samples] = found
-        return Tried(horizon, ratio, task.parameters.names[j])
+                raise
+            return Tried(horizon=horizon, ratio=np.inf, why=str(error))
 
-    def _fail(self, samples: int) -> NoReturn:
-        last, found = self.tried[samples], self.designs.get(samples)
-        names = self.base.parameters.names
-        far = (
-            last.why
-            if found is None
-            else f"it does not tell {missed_targets(names, found.final.std, self.wanted)}"
-        )
+        if design.status is Status.INFEASIBLE:
+            why = f"{design.status.value} ({_violated_limits(design)})"
+            return Tried(horizon=horizon, ratio=np.inf, why=why)
+
+        ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
+        known = self.designs.get(samples)
+        if known is None or ratio < largest_ratio_to_target(known.final.std, self.targets)[0]:
+            self.designs[samples] = design
+
+        name = task.parameters.names[parameter]
+        return Tried(horizon=horizon, ratio=ratio, parameter=name)
+
+    def _raise_out_of_reach(self, samples: int) -> NoReturn:
+        """Say how far even the longest experiment is from the targets."""
+        longest = self.tried[samples]
+        design = self.designs.get(samples)
+
+        reason = longest.why
+        if design is not None:
+            names = self.base.parameters.names
+            missed = missed_targets(names, design.final.std, self.targets)
+            reason = f"the target is missed by {missed}"
         raise OutOfReachError(
-            f"{self.experiment.source}: even {last.horizon:g} s is not enough: {far}. Allow a longer experiment (`longest`, "
+            f"{self.experiment.source}: even {longest.horizon:g} s is too short: {reason}. Allow a longer experiment (`longest`, "
             "or a longer table of the initial control) or a stronger control, or ask for less; `mjfim check` says how many "
             "repetitions reach it"
         )
 
 
-def _outside(design: Design) -> str:
-    """The limits that a design misses."""
+def _violated_limits(design: Design) -> str:
+    """The limits that a design violates, in words."""
     return ", ".join(
         f"{kind} by {-margin:.3g}" for kind, margin in design.limits.items() if margin < 0.0
     )
 
 
 def fitted(task: DesignTask, control: Array) -> Array:
-    """(N, nu) from the control of another duration: cut or repeated, stretched where it has to keep its end or limits."""
+    """Fit a control of another duration to a task.
+
+    Args:
+        task: The task.
+        control: (n, nu) control [u-unit].
+
+    Returns:
+        (N, nu) control: cut or repeated, or stretched where the end or limits have to be kept.
+    """
     N, n = task.samples, len(control)
     if n == N:
         return control
@@ -267,27 +359,36 @@ def fitted(task: DesignTask, control: Array) -> Array:
         return control[:N]
     if n < N and not task.is_limited:
         return np.asarray(np.resize(control, (N, control.shape[1])))
-    middle, wanted = (np.arange(n) + 0.5) / n, (np.arange(N) + 0.5) / N
-    return np.stack([np.interp(wanted, middle, column) for column in control.T], axis=1)
+
+    # Stretch: interpolate between the middles of the samples, over the relative time.
+    given = (np.arange(n) + 0.5) / n
+    wanted = (np.arange(N) + 0.5) / N
+    return np.stack([np.interp(wanted, given, column) for column in control.T], axis=1)
 
 
-def _grid(task: DesignTask) -> SampleGrid:
-    """What coarse levels need: samples that they divide, where they are used."""
-    d = task.experiment.descent
-    if d.method != "lbfgs":
+def _sample_grid(task: DesignTask) -> SampleGrid:
+    """Numbers of samples that a coarse level can divide, where one is used."""
+    descent = task.experiment.descent
+    if descent.method != "lbfgs":
         return SampleGrid(unit=1, first_multiple=0)
-    if d.coarse == "auto":
-        return SampleGrid(unit=AUTO, first_multiple=COARSEST * AUTO)
-    return SampleGrid(unit=d.coarse, first_multiple=0, minimum=max(d.coarse, 2))
+
+    if descent.coarse == "auto":
+        first_multiple = MIN_COARSE_SAMPLES * AUTO_COARSE_FACTOR
+        return SampleGrid(unit=AUTO_COARSE_FACTOR, first_multiple=first_multiple)
+
+    return SampleGrid(unit=descent.coarse, first_multiple=0, minimum=max(descent.coarse, 2))
 
 
-def _longest(task: DesignTask) -> float:
-    """[s] that an experiment may last where nobody says it: no longer than its table of the initial control."""
-    e, horizon = task.experiment, task.horizon
-    wanted = LONGER * horizon
-    if isinstance(e.initial.control, Signal):
-        return wanted
-    columns = read_table(e.directory / str(e.initial.control))
+def _default_longest(task: DesignTask) -> float:
+    """Longest horizon by default [s]; no longer than the table of the initial control lasts."""
+    experiment = task.experiment
+    longest = MAX_HORIZON_FACTOR * task.horizon
+    if isinstance(experiment.initial.control, Signal):
+        return longest
+
+    columns = read_table(experiment.directory / str(experiment.initial.control))
     name = task.controls[0]
-    t = columns["t"][np.isfinite(columns[name if name in columns else f"ctrl:{name}"])]
-    return max(horizon, min(wanted, float(t[-1] + np.median(np.diff(t)))))
+    values = columns[name if name in columns else f"ctrl:{name}"]
+    t = columns["t"][np.isfinite(values)]
+    end = float(t[-1] + np.median(np.diff(t)))
+    return max(task.horizon, min(longest, end))

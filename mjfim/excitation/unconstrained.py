@@ -1,300 +1,428 @@
-"""Algorithm 1 on an experiment without hard limits: levels of sample rate, and a smooth criterion where eigenvalues meet."""
+"""Algorithm 1 without a barrier: from a coarse to the stated sample rate, with a smooth criterion where eigenvalues meet."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.budget import Budget, StopReason
+from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.constraints import ConstraintSet
 from mjfim.excitation.extended_system import ExtendedDesignProblem
+from mjfim.excitation.initial_controls import InitialControl
+from mjfim.excitation.levels import Stage
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
+from mjfim.excitation.run_result import RunResult
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.directions import LBFGS, ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regulator, optimize
 from mjfim.records.design import HistoryRow, Status
+from mjfim.records.events import DesignEvent
 
+# Growth of a small deviation along the open-loop trajectory up to which the projection needs no feedback.
+FEEDBACK_THRESHOLD = 10.0
 
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """A level of the descent: the experiment at one sample rate and the criterion as it is minimised there.
+# Smallest tolerance on a coarse level, whose minimum is refined anyway.
+COARSE_TOLERANCE = 1e-5
 
-    basis: identifiable combinations, or None;  power: of the smooth E-criterion, infinite for 1/lambda_min itself
-    """
+# Ratio of the second to the smallest eigenvalue below which E-optimality becomes smooth.
+MEETING_RATIO = 1.02
 
-    task: DesignTask
-    basis: Array | None
-    power: float = np.inf
+# The same ratio for a descent that has stalled.
+STALLED_MEETING_RATIO = 1.2
 
-    @cached_property
-    def problem(self) -> DesignProblem:
-        """The cost."""
-        problem = self.task.problem
-        information = replace(problem.information, basis=self.basis, power=self.power)
-        return replace(
-            problem,
-            information=information,
-            forward_differences_only=self.task.system.variant.sample_factor > 1,
-        )
+# Powers of the smooth E-criterion: the first one, and the sharper one that may follow on the stated level.
+SMOOTH_POWERS = (40.0, 160.0)
 
+# Ratio of the smooth to the exact criterion below which the first power is accurate enough.
+MAX_SMOOTHING_ERROR = 1.01
 
-@dataclass
-class Run:
-    """One start on its way. point: the last iterate at the stated sample rate;  control: (N, nu) the last of any level.
-
-    rate: sample rate of the level that it is on [Hz];  steps: MuJoCo steps taken on other plants than the experiment's
-    outside: it was left because an iterate left the limits;  inside: no limit is known to be missed
-    """
-
-    name: str
-    point: DesignPoint | None = None
-    control: Array | None = None
-    status: Status = Status.STALLED
-    slope: float = np.inf
-    history: tuple[HistoryRow, ...] = ()
-    rate: float = 0.0
-    steps: int = 0
-    outside: bool = False
-    inside: bool = True
-
-    @property
-    def cost(self) -> float:
-        """J reached."""
-        return np.inf if self.point is None else self.point.cost
+# Number of successive iterates that may use a clamp of the model before a barrier has to keep them off it.
+MAX_CLAMPED_ITERATES = 10
 
 
 def direction_for(stage: Stage) -> tuple[Direction, DesignProblem]:
-    """The descent direction that the experiment asks for, and the problem that feeds it."""
+    """Make the descent direction that the experiment asks for.
+
+    Args:
+        stage: Level of the descent.
+
+    Returns:
+        The direction, and the problem whose expansions it needs.
+    """
     task = stage.task
-    d, dt = task.experiment.descent, task.dt
-    R, Q = np.diag(task.control_weight) * dt, np.diag(task.tracking) * dt
-    if d.method == "lbfgs":
+    descent = task.experiment.descent
+    R = np.diag(task.control_weight) * task.dt
+    Q = np.diag(task.tracking) * task.dt
+
+    if descent.method == "lbfgs":
         return LBFGS(R), stage.problem
-    if d.psi_weight == 0.0:
+    if descent.psi_weight == 0.0:
         return MetricDescent(Q, R, Q), stage.problem
-    nx, p = len(Q), len(task.parameters)
-    wide = np.diag(np.concatenate([np.diag(Q), np.full(nx * p, d.psi_weight * dt)]))
-    return ExtendedMetricDescent(wide, R, wide), ExtendedDesignProblem.of(stage.problem)
 
-
-CALM = 10.0
+    # The metric of the paper also weighs the sensitivities psi, as states of the extended system.
+    psi_count = len(Q) * len(task.parameters)
+    psi_weights = np.full(psi_count, descent.psi_weight * task.dt)
+    extended_Q = np.diag(np.concatenate([np.diag(Q), psi_weights]))
+    return ExtendedMetricDescent(extended_Q, R, extended_Q), ExtendedDesignProblem.of(stage.problem)
 
 
 def regulator_for(task: DesignTask) -> Regulator:
-    """Unit weights on state and control along the trajectory; no feedback where the plant is calm without."""
-    Q, R = np.eye(task.space.nx) * task.dt, np.eye(len(task.controls)) * task.dt
-    return Regulator(Q=Q, R=R, terminal=Q / task.dt, feedback_threshold=CALM)
+    """Make the regulator of the projection operator.
 
+    Args:
+        task: The task.
 
-AUTO = 4  # how many times longer the samples of a coarse level are, where the experiment leaves it open
-COARSEST = 50  # samples of a coarse level, at least
-BORNE = 0.05  # relative change of the initial cost that it may make
-
-
-def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> DesignTask | None:
-    """The coarse level, where the experiment wants it and the model bears it (the initial cost agrees within 5 %).
-
-    Raises ExperimentError where a stated factor does not divide the samples.
+    Returns:
+        A regulator with unit weights on state and control, without feedback where deviations do not grow much.
     """
-    d = task.experiment.descent
-    factor = AUTO if d.coarse == "auto" else d.coarse
-    if factor == 1 or d.method != "lbfgs":
-        return None
-    if d.coarse != "auto" and task.samples % factor:
-        valid = ", ".join(str(k) for k in range(1, 17) if task.samples % k == 0)
-        raise ExperimentError(
-            f"{task.experiment.source}: descent.coarse: {factor} does not divide the {task.samples} samples; "
-            f"valid for example: {valid}"
-        )
-    if task.samples % factor or task.samples < COARSEST * factor:
-        return None
-    coarse = task.coarser(factor)
-    return coarse if borne(Stage(coarse, basis), first, task.problem.size(first), BORNE) else None
+    Q = np.eye(task.space.nx) * task.dt
+    R = np.eye(len(task.controls)) * task.dt
+    return Regulator(Q=Q, R=R, terminal=Q / task.dt, feedback_threshold=FEEDBACK_THRESHOLD)
 
 
-def borne(coarse: Stage, first: DesignPoint, size: float, share: float) -> bool:
-    """Whether the initial cost of a coarse level is that of the first point, up to a share of its size."""
-    try:
-        there = coarse.problem.point(coarse.task.initial)
-    except SimulationDivergedError:
-        return False
-    return abs(there.cost - first.cost) <= share * size
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Progress:
+    """State of a run.
 
-
-COARSE_TOLERANCE = 1e-5
-MEETING = 1.02  # second over smallest eigenvalue at which E-optimality turns smooth
-NEAR = 1.2  # the same for a descent that stalled
-POWERS = (40.0, 160.0)
-CLOSE = 1.01  # smooth over exact criterion that is good enough
-CLAMPED = (
-    10  # iterates in a row that may rest on a clamp of the model before a barrier keeps them off it
-)
-
-
-def descend(
-    stages: Sequence[Stage], control: Array, run: Run, constraints: ConstraintSet | None = None
-) -> Iterator[HistoryRow]:
-    """Follow Algorithm 1 from one control through the levels, coarse to fine, keeping `run` up to date.
-
-    With a constraint set it ends where an iterate leaves the limits, or several in a row rest on a clamp; its control is
-    the last feasible one.
-    Where the smallest eigenvalues meet, E-optimality goes on with the smooth criterion, on this level and all finer ones.
+    Attributes:
+        result: The best result so far.
+        rate: Sample rate of the level that was worked on last [Hz]; 0 before the first.
+        clamped_iterates: Number of successive iterates that used a clamp of the model.
     """
-    power, memory, given, clamped = np.inf, None, control, 0
-    for level in stages:
-        while True:
-            stage = replace(level, power=power)
-            pass_ = _Pass(stage, (control, given), run, memory)
-            for row in pass_.rows():
-                margin = (
-                    np.inf
-                    if constraints is None
-                    else _margin(level.task, constraints, pass_.control)
-                )
-                clamped = clamped + 1 if margin == 0.0 else 0
-                if margin < 0.0 or clamped > CLAMPED:
-                    run.outside = True
-                    return
-                if not clamped:
-                    run.control = pass_.control
-                yield row
-            if pass_.failed:
-                return
-            control = pass_.control
-            power, again = _sharper(stage, pass_)
-            memory = None if again else pass_.direction
-            if not again:
+
+    result: RunResult
+    rate: float = 0.0
+    clamped_iterates: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Pass:
+    """Result of one run of Algorithm 1 on one level.
+
+    Attributes:
+        progress: State of the run.
+        control: (N, nu) last control, at the stated sample rate.
+        eigenvalues: (s,) of the information at the last iterate, ascending.
+        direction: Holds the curvature that was learnt.
+        eigenvalues_meet: True where it ended because the smallest eigenvalues meet.
+        ends_run: True where no further level may follow.
+    """
+
+    progress: _Progress
+    control: Array
+    eigenvalues: Array
+    direction: Direction
+    eigenvalues_meet: bool = False
+    ends_run: bool = False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class UnconstrainedSearch:
+    """Descents without a barrier from several initial controls.
+
+    Attributes:
+        levels: Levels from the coarsest to the stated one.
+        budget: Time of all descents.
+        constraints: Limits that a descent must not leave, or None; it ends where it does.
+        steps_before: Engine steps of all levels' plants when the search began.
+    """
+
+    levels: Sequence[Stage]
+    budget: Budget
+    constraints: ConstraintSet | None
+    steps_before: int
+
+    def run_all(
+        self, starts: Iterable[InitialControl]
+    ) -> Generator[DesignEvent, None, list[RunResult]]:
+        """Descend from every initial control while there is time, until one descent leaves the limits.
+
+        Args:
+            starts: The initial controls.
+
+        Yields:
+            Every iterate.
+
+        Returns:
+            One result for every descent that was begun.
+        """
+        results: list[RunResult] = []
+        for start in starts:
+            result = yield from self.run(start)
+
+            # Steps on the coarse plant are not among those of the stated one.
+            counted = sum(earlier.steps for earlier in results)
+            coarse = self.levels[0].task.plant.engine_steps if len(self.levels) > 1 else counted
+            results.append(replace(result, steps=coarse - counted))
+
+            if result.left_limits or self.budget.exhausted is not None:
                 break
-    run.outside = clamped > 0
+
+        return results
+
+    def run(self, start: InitialControl) -> Generator[DesignEvent, None, RunResult]:
+        """Descend from one initial control through all levels.
+
+        Where the smallest eigenvalues meet, the E-criterion is replaced by the smooth one, on this and all finer levels.
+
+        Args:
+            start: The initial control.
+
+        Yields:
+            Every iterate.
+
+        Returns:
+            The result; with constraints its control is the last one that kept all limits.
+        """
+        progress = _Progress(result=RunResult(name=start.name))
+        given = start.over_horizon
+        control = given
+        power = np.inf
+        memory: Direction | None = None
+
+        for level in self.levels:
+            repeat = True
+            while repeat:
+                stage = replace(level, power=power)
+                ended = yield from self._run_pass(stage, [control, given], progress, memory)
+                progress = ended.progress
+                if ended.ends_run:
+                    return progress.result
+
+                control = ended.control
+                power, repeat = _next_power(stage, ended)
+                memory = None if repeat else ended.direction
+
+        # A result that uses a clamp needs the barrier: its derivatives do not hold there.
+        return replace(progress.result, left_limits=progress.clamped_iterates > 0)
+
+    def _run_pass(
+        self,
+        stage: Stage,
+        controls: Sequence[Array],
+        progress: _Progress,
+        memory: Direction | None,
+    ) -> Generator[DesignEvent, None, _Pass]:
+        """Run Algorithm 1 on one level, from the cheapest of some controls, since a coarse level may mislead."""
+        task = stage.task
+        rate = 1.0 / task.dt
+        direction, problem = _direction_with_memory(stage, memory, progress.rate)
+        ended = _Pass(
+            progress=progress,
+            control=controls[0],
+            eigenvalues=np.zeros(0),
+            direction=direction,
+        )
+
+        start = _cheapest_point(task, problem, controls)
+        if not np.isfinite(start.cost):
+            return replace(ended, ends_run=True)
+
+        # Iterations are counted over all levels; a coarse level may use half of them.
+        descent = task.experiment.descent
+        is_stated_rate = task.system.variant.sample_factor == 1
+        history = progress.result.history
+        done = history[-1].iteration + 1 if history else 0
+        allowed = descent.max_iterations if is_stated_rate else descent.max_iterations // 2
+
+        iterates = optimize(
+            problem,
+            start,
+            direction,
+            regulator_for(task),
+            Armijo(),
+            tolerance=descent.tolerance
+            if is_stated_rate
+            else max(descent.tolerance, COARSE_TOLERANCE),
+            max_iterations=max(allowed - done, 0),
+        )
+        for iterate in iterates:
+            ended = _advance(ended, stage, iterate, rate)
+            last = ended.progress.result.history[-1:]
+
+            # The last iterate of Algorithm 1 is reported twice, the second time with its status.
+            is_new = not last or last[0].iteration != done + iterate.index or last[0].rate != rate
+            if is_new:
+                ended = self._check_limits(ended, task)
+                if ended.ends_run:
+                    return ended
+
+                ended, row = self._record(ended, stage, iterate, done)
+                yield DesignEvent(start=ended.progress.result.name, row=row)
+
+                reason = self.budget.exhausted
+                if reason is not None:
+                    return _stop(ended, reason)
+
+            # Where the smallest eigenvalues cross, the exact criterion has a kink that no step crosses.
+            may_continue = iterate.status is None and iterate.index > 0
+            if may_continue and _eigenvalues_meet(stage, ended.eigenvalues):
+                return replace(ended, eigenvalues_meet=True)
+
+        return ended
+
+    def _check_limits(self, ended: _Pass, task: DesignTask) -> _Pass:
+        """End the run where the iterate leaves the limits, or where several in a row use a clamp of the model."""
+        progress = ended.progress
+        sign = np.inf
+        if self.constraints is not None:
+            sign = _worst_margin_sign(task, self.constraints, ended.control)
+
+        clamped = progress.clamped_iterates + 1 if sign == 0.0 else 0
+        if sign < 0.0 or clamped > MAX_CLAMPED_ITERATES:
+            left = replace(progress.result, left_limits=True)
+            return replace(ended, progress=replace(progress, result=left), ends_run=True)
+
+        # Only a control that is off all clamps may be continued with a barrier.
+        result = progress.result
+        if not clamped:
+            result = replace(result, control=ended.control)
+
+        return replace(ended, progress=replace(progress, result=result, clamped_iterates=clamped))
+
+    def _record(
+        self, ended: _Pass, stage: Stage, iterate: Iterate[DesignPoint], done: int
+    ) -> tuple[_Pass, HistoryRow]:
+        """Append an iterate to the history."""
+        steps = sum(level.task.plant.engine_steps for level in self.levels) - self.steps_before
+        point = _exact_point(stage, iterate.point)
+        criterion = point.criterion
+
+        row = HistoryRow(
+            iteration=done + iterate.index,
+            cost=point.cost,
+            criterion=np.inf if criterion is None else criterion.value,
+            min_eigenvalue=0.0 if criterion is None else float(criterion.eigenvalues[0]),
+            slope=iterate.slope,
+            gamma=iterate.gamma,
+            seconds=self.budget.seconds_used,
+            steps=steps,
+            rate=1.0 / stage.task.dt,
+        )
+        result = ended.progress.result
+        result = replace(result, history=(*result.history, row))
+        return replace(ended, progress=replace(ended.progress, result=result)), row
 
 
-def _margin(task: DesignTask, constraints: ConstraintSet, control: Array) -> float:
-    """Sign of the worst margin at any engine step of the level, for a control at the stated rate; 0 where a force is clamped."""
-    watched = task.plant.observe(task.theta, task.averaged(control), constraints.observations)
-    if watched is None:
+def _direction_with_memory(
+    stage: Stage, memory: Direction | None, rate: float
+) -> tuple[Direction, DesignProblem]:
+    """The direction of a level, with the curvature that a coarser level at a sample rate [Hz] has learnt."""
+    direction, problem = direction_for(stage)
+    if isinstance(memory, LBFGS) and rate:
+        task = stage.task
+        factor = round(1.0 / (task.dt * rate))
+        direction = memory.refined(np.diag(task.control_weight) * task.dt, factor)
+
+    return direction, problem
+
+
+def _cheapest_point(
+    task: DesignTask, problem: DesignProblem, controls: Sequence[Array]
+) -> DesignPoint:
+    """The point of lowest cost among some controls at the stated rate; `DIVERGED` where all diverge."""
+    points = []
+    distinct = {id(control): control for control in controls}
+    for control in distinct.values():
+        try:
+            trajectory = task.plant.simulate(task.theta, task.averaged(control))
+            points.append(problem.point(trajectory))
+        except SimulationDivergedError:
+            continue
+
+    return min(points, key=lambda point: point.cost, default=DIVERGED)
+
+
+def _exact_point(stage: Stage, point: DesignPoint) -> DesignPoint:
+    """The point judged by the exact criterion, where the smooth one is minimised."""
+    if np.isinf(stage.power):
+        return point
+
+    return Stage(stage.task, stage.basis).problem.reevaluated(point)
+
+
+def _advance(ended: _Pass, stage: Stage, iterate: Iterate[DesignPoint], rate: float) -> _Pass:
+    """Take an iterate into the state of the run."""
+    task = stage.task
+    trajectory, criterion = iterate.point.trajectory, iterate.point.criterion
+    if trajectory is None or criterion is None:
+        raise SimulationDivergedError("an iterate of Algorithm 1 diverged")
+
+    # Without a status the run has not ended; it says so where it is stopped here.
+    status = iterate.status or Status.INTERRUPTED
+    if status is Status.CONVERGED and np.isfinite(stage.power):
+        status = Status.SMOOTHED
+    result = replace(ended.progress.result, slope=iterate.slope, status=status)
+
+    # Only points at the stated rate count as results.
+    if task.system.variant.sample_factor == 1:
+        point = _exact_point(stage, iterate.point)
+        if result.point is None or point.cost <= result.cost:
+            result = replace(result, point=point, cost=point.cost)
+
+    return replace(
+        ended,
+        progress=replace(ended.progress, result=result, rate=rate),
+        control=np.repeat(trajectory.ctrl, task.system.variant.sample_factor, axis=0),
+        eigenvalues=criterion.eigenvalues,
+    )
+
+
+def _stop(ended: _Pass, reason: StopReason) -> _Pass:
+    """End a run whose budget is exhausted."""
+    result = ended.progress.result
+    if result.status is Status.INTERRUPTED and reason is not StopReason.REQUESTED:
+        result = replace(result, status=Status.MAX_ITERATIONS)
+
+    return replace(ended, progress=replace(ended.progress, result=result), ends_run=True)
+
+
+def _worst_margin_sign(task: DesignTask, constraints: ConstraintSet, control: Array) -> float:
+    """Sign of the worst margin at any engine step of a level; 0 where a force is clamped. control: (N, nu) as stated."""
+    observed = task.plant.observe(task.theta, task.averaged(control), constraints.observations)
+    if observed is None:
         return -1.0
-    values = constraints.evaluate(*watched, slopes=False)
+
+    values = constraints.evaluate(*observed, slopes=False)
     if not constraints.is_feasible(values):
         return -1.0
+
     margins = constraints.margins(values)
-    return float(all(margins.get(kind, 1.0) > 0.0 for kind in ("force", "joint_force")))
+    is_clamped = any(margins.get(kind, 1.0) <= 0.0 for kind in ("force", "joint_force"))
+    return 0.0 if is_clamped else 1.0
 
 
-def _sharper(stage: Stage, done: _Pass) -> tuple[float, bool]:
-    """Power of the E-criterion from here on, and whether this level has to be done again with it."""
-    values, power = done.eigenvalues, stage.power
+def _eigenvalues_meet(stage: Stage, eigenvalues: Array) -> bool:
+    """Whether the smallest eigenvalues are about to cross while the exact E-criterion is minimised."""
+    is_exact = stage.task.experiment.cost.criterion == "E" and np.isinf(stage.power)
+    if not is_exact or len(eigenvalues) < 2:
+        return False
+
+    return bool(eigenvalues[1] < MEETING_RATIO * eigenvalues[0])
+
+
+def _next_power(stage: Stage, ended: _Pass) -> tuple[float, bool]:
+    """Power of the E-criterion from here on, and whether this level has to be repeated with it."""
+    values = ended.eigenvalues
+    power = stage.power
     if stage.task.experiment.cost.criterion != "E" or len(values) < 2:
         return power, False
+
+    # The exact criterion becomes smooth where eigenvalues meet, or where it stalls close to that.
     if np.isinf(power):
-        meet = done.met or (done.run.status is Status.STALLED and values[1] < NEAR * values[0])
-        return (POWERS[0], True) if meet else (power, False)
-    gap = float(np.sum((values[0] / values) ** power) ** (1.0 / power))
-    if gap > CLOSE and power < POWERS[-1] and stage.task.system.variant.sample_factor == 1:
-        return POWERS[-1], True
+        stalled = ended.progress.result.status is Status.STALLED
+        close = bool(values[1] < STALLED_MEETING_RATIO * values[0])
+        meet = ended.eigenvalues_meet or (stalled and close)
+        return (SMOOTH_POWERS[0], True) if meet else (power, False)
+
+    # The smooth criterion becomes sharper, once, where it is too far from the exact one at the stated rate.
+    error = float(np.sum((values[0] / values) ** power) ** (1.0 / power))
+    is_stated_rate = stage.task.system.variant.sample_factor == 1
+    if error > MAX_SMOOTHING_ERROR and power < SMOOTH_POWERS[-1] and is_stated_rate:
+        return SMOOTH_POWERS[-1], True
+
     return power, False
-
-
-class _Pass:
-    """One run of Algorithm 1 on one stage, from the better of some controls: a coarse level may lead astray.
-
-    met: it was left because the smallest eigenvalues meet
-    """
-
-    def __init__(
-        self, stage: Stage, controls: Sequence[Array], run: Run, memory: Direction | None
-    ) -> None:
-        self.stage, self.controls, self.run = stage, controls, run
-        self.control = controls[0]
-        self.direction, self.problem = direction_for(stage)
-        if isinstance(memory, LBFGS) and run.rate:
-            task = stage.task
-            factor = round(1.0 / (task.dt * run.rate))
-            self.direction = memory.refined(np.diag(task.control_weight) * task.dt, factor)
-        self.met = self.failed = False
-        self.eigenvalues = np.zeros(0)
-
-    def rows(self) -> Iterator[HistoryRow]:
-        """Every iterate as a row of the history."""
-        level, run = self.stage.task, self.run
-        d, fine, rate = (
-            level.experiment.descent,
-            level.system.variant.sample_factor == 1,
-            1.0 / level.dt,
-        )
-        start = self._start()
-        if not np.isfinite(start.cost):
-            self.failed = True
-            return
-        exact = Stage(level, self.stage.basis).problem
-        tolerance = d.tolerance if fine else max(d.tolerance, COARSE_TOLERANCE)
-        done = run.history[-1].iteration + 1 if run.history else 0
-        budget = max((d.max_iterations if fine else d.max_iterations // 2) - done, 0)
-        run.rate = rate
-        for iterate in optimize(
-            self.problem,
-            start,
-            self.direction,
-            regulator_for(level),
-            Armijo(),
-            tolerance=tolerance,
-            max_iterations=budget,
-        ):
-            trajectory, criterion = iterate.point.trajectory, iterate.point.criterion
-            if trajectory is None or criterion is None:
-                raise SimulationDivergedError("an iterate of Algorithm 1 diverged")
-            self.control = np.repeat(trajectory.ctrl, level.system.variant.sample_factor, axis=0)
-            self.eigenvalues = criterion.eigenvalues
-            point = (
-                iterate.point if np.isinf(self.stage.power) else exact.reevaluated(iterate.point)
-            )
-            run.slope, run.status = iterate.slope, iterate.status or Status.INTERRUPTED
-            if run.status is Status.CONVERGED and np.isfinite(self.stage.power):
-                run.status = Status.SMOOTHED
-            if fine and (run.point is None or point.cost <= run.point.cost):
-                run.point = point
-            last = run.history[-1] if run.history else None
-            if last is None or last.iteration != done + iterate.index or last.rate != rate:
-                yield _row(replace(iterate, point=point, value=point.cost), done, rate)
-            if self._meets() and iterate.status is None and iterate.index > 0:
-                self.met = True
-                return
-
-    def _start(self) -> DesignPoint:
-        """The cheapest point of the controls; infinite where all diverge."""
-        level, points = self.stage.task, []
-        for control in {id(c): c for c in self.controls}.values():
-            try:
-                points.append(
-                    self.problem.point(level.plant.simulate(level.theta, level.averaged(control)))
-                )
-            except SimulationDivergedError:
-                continue
-        return min(points, key=lambda point: point.cost, default=DIVERGED)
-
-    def _meets(self) -> bool:
-        """The smallest eigenvalues are about to cross while the exact E-criterion is descended."""
-        values = self.eigenvalues
-        wanted = self.stage.task.experiment.cost.criterion == "E" and np.isinf(self.stage.power)
-        return bool(wanted and len(values) > 1 and values[1] < MEETING * values[0])
-
-
-def _row(iterate: Iterate[DesignPoint], done: int, rate: float) -> HistoryRow:
-    criterion = iterate.point.criterion
-    value, smallest = (
-        (np.inf, 0.0) if criterion is None else (criterion.value, float(criterion.eigenvalues[0]))
-    )
-    return HistoryRow(
-        iteration=done + iterate.index,
-        cost=iterate.value,
-        criterion=value,
-        min_eigenvalue=smallest,
-        slope=iterate.slope,
-        gamma=iterate.gamma,
-        seconds=0.0,
-        steps=0,
-        rate=rate,
-    )

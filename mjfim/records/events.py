@@ -61,3 +61,4 @@ class StudyEvent:
 
 Event = DesignEvent | FitEvent | StudyEvent
 Callback = Callable[[Event], None]
+DesignCallback = Callable[[DesignEvent], None]

@@ -12,8 +12,9 @@ from concurrent.futures import Executor
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.budget import stop_on_interrupt
 from mjfim.errors import ExperimentError, MjfimError, SimulationDivergedError
-from mjfim.excitation.design import Monitor, design_task
+from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.target_accuracy import (
     largest_ratio_to_target,
     require_reachable,
@@ -25,6 +26,7 @@ from mjfim.identification.identify import identify_system
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
+from mjfim.records.events import DesignCallback
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import Past, redesigned, restated
 
@@ -39,7 +41,7 @@ def sequential(
     experiment: Experiment,
     measure: Measure,
     rounds: int = 10,
-    monitor: Monitor | None = None,
+    callback: DesignCallback | None = None,
     threads: int | None = None,
     report: Callable[[Round], None] | None = None,
     done: Sequence[EarlierRound] = (),
@@ -50,7 +52,7 @@ def sequential(
     measure: plays a design and returns what was recorded, `(design, round)`, the first round being 1; None: not recorded yet,
     and the campaign ends with that design pending. Of a simulated robot:
     `lambda design, k: mjfim.simulate(robot, design.trajectory, seed=k)`
-    monitor: called with every iterate of every design;  report: with every round
+    callback: called with every iterate of every design;  report: with every round
     done: rounds that are recorded already, whose designs are not made anew
     executor: of `concurrent.futures`, runs several starts under hard limits at once
     Ctrl-C ends the campaign after the last complete round. Raises ExperimentError where nothing is wanted,
@@ -63,7 +65,7 @@ def sequential(
             f"{experiment.source}: earlier: a campaign's estimate comes from recordings alone; give those of earlier "
             "experiments (`done` in Python) instead of the information they left"
         )
-    return _Loop(DesignTask.resolve(experiment, threads=threads), monitor, report, executor).run(
+    return _Loop(DesignTask.resolve(experiment, threads=threads), callback, report, executor).run(
         measure, rounds, done
     )
 
@@ -74,12 +76,12 @@ class _Loop:
     def __init__(
         self,
         base: DesignTask,
-        monitor: Monitor | None,
+        callback: DesignCallback | None,
         report: Callable[[Round], None] | None,
         executor: Executor | None,
     ) -> None:
         self.base, self.wanted = base, target_accuracies(base)
-        self.monitor, self.report, self.executor = monitor, report, executor
+        self.callback, self.report, self.executor = callback, report, executor
         self.rounds: list[Round] = []
         self.pending: Design | None = None
 
@@ -136,15 +138,21 @@ class _Loop:
         """
         if not self.rounds:
             stated = self.base.restated(restated(self.base))
-            return design_task(stated, self.monitor, executor=self.executor), ()
+            with stop_on_interrupt() as stop:
+                budget = design_budget(stated, stop)
+                return design_task(
+                    stated, callback=self.callback, executor=self.executor, budget=budget
+                ), ()
         first, last = self.rounds[0], self.rounds[-1]
         count = sum(len(r.recordings) for r in self.rounds)
         past = Past(last.estimate, count, first.theta, first.control, last.control)
         try:
-            return redesigned(self.base, past, last.estimate.theta, self.monitor, self.executor), ()
+            return redesigned(
+                self.base, past, last.estimate.theta, self.callback, self.executor
+            ), ()
         except MjfimError as error:
             told = f"no design at the estimate, so it is made where the last was: {error}"
-            return redesigned(self.base, past, last.theta, self.monitor, self.executor), (told,)
+            return redesigned(self.base, past, last.theta, self.callback, self.executor), (told,)
 
     def _record(
         self, played: EarlierRound, found: Design | None = None, told: tuple[str, ...] = ()

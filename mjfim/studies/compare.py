@@ -10,18 +10,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
-from mjfim.excitation.design import design_task, designable
+from mjfim.excitation.design import design_budget, design_task, designable
 from mjfim.excitation.evaluation import point_at_stated_rate
-from mjfim.excitation.interior_point import SHRINK_FACTORS
+from mjfim.excitation.feasibility import SHRINK_FACTORS
+from mjfim.excitation.levels import Stage
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import Stage
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import collect_finished, workers_of
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
-from mjfim.records.design import HistoryRow, Status
+from mjfim.records.design import Status
+from mjfim.records.events import DesignEvent
 from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
 from mjfim.studies.baselines.methods import METHODS, run_baseline
 
@@ -186,13 +188,16 @@ def _designed(
     )
     meter = Meter(job, tell)
     try:
-        found = design_task(
-            DesignTask.resolve(
-                stated, threads=job.threads, added_information=job.added_information
-            ),
-            meter,
-            executor=executor,
+        task = DesignTask.resolve(
+            stated, threads=job.threads, added_information=job.added_information
         )
+        with stop_on_interrupt(meter.stop):
+            found = design_task(
+                task,
+                callback=meter,
+                executor=executor,
+                budget=design_budget(task, meter.stop),
+            )
     except SimulationDivergedError:
         return judge.row(
             DESIGN, OURS, SearchResult(seconds=meter.seconds, steps=meter.steps)
@@ -212,20 +217,22 @@ def _designed(
 
 
 class Meter:
-    """Watches a design's iterates and ends it, as Ctrl-C would, where its budget is used up."""
+    """Watches the iterates of a design and asks it to stop where its budget is used up."""
 
     def __init__(self, job: BaselineSearch, tell: Tell) -> None:
         self.job, self.tell = job, tell
         self.clock, self.steps, self.last, self.cost = time.perf_counter(), 0, 0, np.inf
         self.spent = False
+        self.stop = StopToken()
 
     @property
     def seconds(self) -> float:
         """Since the start."""
         return time.perf_counter() - self.clock
 
-    def __call__(self, row: HistoryRow) -> None:
-        """Count a row's steps, which begin anew with every task of a design."""
+    def __call__(self, event: DesignEvent) -> None:
+        """Count the steps of an iterate, which begin anew with every task of a design."""
+        row = event.row
         self.steps += row.steps - (self.last if row.steps >= self.last else 0)
         self.last = row.steps
         if not row.margin < 0.0:
@@ -236,7 +243,7 @@ class Meter:
             seconds > LATE or steps > 1.0
         ):  # a design keeps the time by itself, but for its last iterate
             self.spent = True
-            raise KeyboardInterrupt
+            self.stop.request()
 
 
 class Judge:

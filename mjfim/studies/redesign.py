@@ -11,20 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mjfim.arrays import Array
+from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import MjfimError, SimulationDivergedError
-from mjfim.excitation.design import Monitor, design_task
+from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
+from mjfim.records.events import DesignCallback
 
 INSIDE = 1e-3  # of a parameter's size, or a quarter of its range, that a design keeps from bounds
 KNOWN = 2.5  # standard deviations about the estimate from which a robust redesign draws its samples
@@ -48,7 +49,7 @@ def redesigned(
     base: DesignTask,
     past: Past,
     theta: Array,
-    monitor: Monitor | None = None,
+    callback: DesignCallback | None = None,
     executor: Executor | None = None,
 ) -> Design:
     """The better of the designs from the initial control and from the last one's, at theta: (p,).
@@ -59,18 +60,44 @@ def redesigned(
     told = past.estimate.data
     moved = moved.replace(cost={"information": _worth(base, moved, past)})
     task = base.restated(moved, added_information=told)
-    found = [design_task(task, monitor, executor=executor)]
-    if past.last.shape == task.control.shape and found[0].status is not Status.INTERRUPTED:
-        alone = moved.replace(descent={"starts": 1, "previous": (), "fourier": (), "repeats": ()})
-        with suppress(
-            SimulationDivergedError
-        ):  # the old control may be too much for the new values
-            found.append(
-                design_task(base.restated(alone, added_information=told), monitor, past.last)
+    with stop_on_interrupt() as stop:
+        found = [
+            design_task(
+                task, callback=callback, executor=executor, budget=design_budget(task, stop)
             )
+        ]
+        found += _from_last_control(base, moved, past, callback, stop, found[0])
     if found[-1].status is Status.INTERRUPTED:
         return found[-1]
     return min(found, key=lambda d: (d.status is Status.INFEASIBLE, d.final.cost))
+
+
+def _from_last_control(
+    base: DesignTask,
+    moved: Experiment,
+    past: Past,
+    callback: DesignCallback | None,
+    stop: StopToken,
+    first: Design,
+) -> list[Design]:
+    """The design that begins with the last control; empty where that does not fit or diverges."""
+    if past.last.shape != first.trajectory.ctrl.shape or first.status is Status.INTERRUPTED:
+        return []
+
+    alone = moved.replace(descent={"starts": 1, "previous": (), "fourier": (), "repeats": ()})
+    task = base.restated(alone, added_information=past.estimate.data)
+    try:
+        return [
+            design_task(
+                task,
+                callback=callback,
+                initial_control=past.last,
+                budget=design_budget(task, stop),
+            )
+        ]
+    except SimulationDivergedError:
+        # The old control may be too much for the new values.
+        return []
 
 
 def _worth(base: DesignTask, moved: Experiment, past: Past) -> float:

@@ -13,24 +13,26 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.excitation import interior_point as ladder_module
-from mjfim.excitation import multistart as multistart
+from mjfim.budget import Budget, StopToken
+from mjfim.excitation import feasibility, interior_point, multistart
 from mjfim.excitation.bandwidth import bandwidth_basis
-from mjfim.excitation.constrained import Chase, ConstrainedSearch, perform
+from mjfim.excitation.constrained import ConstrainedSearch, run_in_worker
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design_task
-from mjfim.excitation.initial_controls import InitialControl
+from mjfim.excitation.feasibility import SHRINK_FACTORS
+from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.interior_point import (
-    SHRINK_FACTORS,
     BarrierSchedule,
     InteriorPointMethod,
     updated_tightening,
 )
-from mjfim.excitation.multistart import Multistart
+from mjfim.excitation.levels import Stage
+from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import Stage, regulator_for
+from mjfim.excitation.unconstrained import regulator_for
 from mjfim.experiment.schema import Experiment
 from mjfim.records.design import Design, HistoryRow, Status
+from mjfim.records.events import DesignEvent
 from mjfim.signals import spline_basis
 from tests.support.limits import ARM, HARD, cart_inside
 from tests.support.numerics import (
@@ -61,6 +63,22 @@ def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -
             for key, value in zip(rows, now, strict=True):
                 rows[key].append(np.array(value))
     return {key: np.array(value) for key, value in rows.items()}
+
+
+def method_of(free: DesignTask) -> InteriorPointMethod:
+    """The interior-point method on a plant without clamps, free to choose any control."""
+    return InteriorPointMethod(
+        base=Stage(free, None).problem,
+        constraints=constraint_set_of(free),
+        centre=free.centre,
+        basis=None,
+        regulator=regulator_for(free),
+    )
+
+
+def multistart_of(free: DesignTask) -> multistart.Multistart:
+    """Several starts on a plant without clamps, without a coarse level."""
+    return multistart.Multistart(fine=Stage(free, None), coarse=None, budget=Budget())
 
 
 # ---- the requirement
@@ -161,10 +179,8 @@ def test_a_start_that_leaves_the_limits_is_driven_inside(tmp_path: Path) -> None
     assert_inside(task, design.trajectory.ctrl)
     # it begins with as much of the start as keeps them
     free = task.relaxed()
-    barrier_weights = InteriorPointMethod(
-        Stage(free, None).problem, constraint_set_of(free), free.centre, None, regulator_for(free)
-    )
-    begun = barrier_weights.inside(task.control)
+    method = method_of(free)
+    begun = method.shrink_inside(task.control)
     assert begun is not None
     share = float(begun[10, 0] / task.control[10, 0])
     np.testing.assert_allclose(begun, free.centre + share * (task.control - free.centre), rtol=1e-9)
@@ -224,10 +240,8 @@ def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> N
     """The relaxed barrier brings it there, and the cost has its say from the first iterate on."""
     task = swinging_task(tmp_path)
     free = task.relaxed()
-    barrier_weights = InteriorPointMethod(
-        Stage(free, None).problem, constraint_set_of(free), free.centre, None, regulator_for(free)
-    )
-    first = next(barrier_weights.run(task.control, 5))
+    method = method_of(free)
+    first = next(method.run(task.control, Budget(iterations=5)))
     assert first.mu == BarrierSchedule().first
     assert not first.feasible
     np.testing.assert_array_equal(first.iterate.point.ctrl, task.control)
@@ -239,14 +253,12 @@ def test_a_start_that_no_shrinking_brings_inside_is_steered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where it is too far outside to begin with: here by decree."""
-    monkeypatch.setattr(ladder_module, "MAX_START_VIOLATION", -np.inf)
+    monkeypatch.setattr(interior_point, "MAX_START_VIOLATION", -np.inf)
     task = swinging_task(tmp_path)
     free = task.relaxed()
-    barrier_weights = InteriorPointMethod(
-        Stage(free, None).problem, constraint_set_of(free), free.centre, None, regulator_for(free)
-    )
-    assert barrier_weights.inside(task.control) is None
-    first = next(barrier_weights.run(task.control, 5))
+    method = method_of(free)
+    assert method.shrink_inside(task.control) is None
+    first = next(method.run(task.control, Budget(iterations=5)))
     assert first.mu == np.inf
     assert not first.feasible
     design = design_task(task)
@@ -272,22 +284,22 @@ def test_what_no_control_can_keep_ends_as_infeasible(tmp_path: Path) -> None:
 def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path: Path) -> None:
     task = cart_inside(tmp_path, descent={"max_iterations": 4})
     search = ConstrainedSearch(
-        task.experiment,
-        InitialControl(
+        experiment=task.experiment,
+        start=InitialControl(
             name="wild", control=1e9 * np.ones((100, 1)) * np.sin(9.0 * task.t)[:, None]
         ),
-        BarrierSchedule(),
-        4,
+        schedule=BarrierSchedule(),
+        max_iterations=4,
     )
-    chase = perform(search)
-    assert chase.status is Status.INFEASIBLE
-    assert chase.cost == np.inf
-    # beside it another start goes on
-    chases: list[Chase] = []
+    result = run_in_worker(search)
+    assert result.status is Status.INFEASIBLE
+    assert result.cost == np.inf
+    # beside it another start continues
+    rows: list[DesignEvent] = []
     starts = [search.start, InitialControl(name="initial control", control=task.control)]
-    rows = list(Multistart(Stage(task.relaxed(), None), None).run(starts, chases))
+    results = consume(multistart_of(task.relaxed()).run(starts), rows.append)
     assert rows
-    assert np.isfinite(chases[1].cost)
+    assert np.isfinite(results[1].cost)
 
 
 def test_where_weights_keep_the_limits_there_is_no_barrier(tmp_path: Path) -> None:
@@ -415,45 +427,50 @@ def test_starts_in_parallel_find_what_they_find_one_after_the_other(
     assert_inside(task, alone.trajectory.ctrl)
 
 
-def test_an_interrupted_contest_keeps_the_best_so_far(tmp_path: Path) -> None:
-    """Also in its second round, also where the monitor interrupts: no worse than what was told before."""
+def test_an_interrupted_multistart_keeps_the_best_so_far(tmp_path: Path) -> None:
+    """Also in its second round, also where the callback asks to stop: no worse than what was reported before."""
     task = several(tmp_path)
-    told: list[HistoryRow] = []
+    reported: list[HistoryRow] = []
 
-    def stop(row: HistoryRow) -> None:
-        told.append(row)
-        if row.mu < 0.01 and row.margin > 0.0:
-            raise KeyboardInterrupt
+    def interrupted(mu: float | None = None) -> Design:
+        """Ask to stop at the first feasible iterate with a small mu, or with the given one."""
+        stop = StopToken()
 
-    design = design_task(task, stop)
+        def callback(event: DesignEvent) -> None:
+            row = event.row if mu is None else replace(event.row, mu=mu, margin=1.0)
+            reported.append(row)
+            if row.mu < 0.01 and row.margin > 0.0:
+                stop.request()
+
+        return design_task(task, callback=callback, budget=Budget(stop=stop))
+
+    design = interrupted()
     assert design.status is Status.INTERRUPTED
-    feasible = [row.cost for row in told if row.margin >= 0.0]
-    assert design.final.cost <= told[-1].cost * (1 + 1e-6)
+    feasible = [row.cost for row in reported if row.margin >= 0.0]
+    assert design.final.cost <= reported[-1].cost * (1 + 1e-6)
     assert design.final.cost < 1.2 * min(feasible)
     assert_inside(task, design.trajectory.ctrl)
-    early = design_task(task, lambda row: stop(replace(row, mu=0.0, margin=1.0)))
+    early = interrupted(mu=0.0)
     assert early.status is Status.INTERRUPTED
     assert len(early.starts) == 1
 
 
-def test_a_fourier_start_is_optimised_as_a_series_before_it_goes_on_freely(tmp_path: Path) -> None:
+def test_a_fourier_start_is_optimised_as_a_series_in_the_first_round(tmp_path: Path) -> None:
     task = several(tmp_path, descent={"max_iterations": 12, "fourier": (2.0,)})
-    chases: list[Chase] = []
-    first: dict[str, Array] = {}
-    from mjfim.excitation.initial_controls import initial_controls_of
-
-    for _ in Multistart(Stage(task.relaxed(), None), None).run(
-        list(initial_controls_of(task, None)), chases
-    ):
-        for chase in chases:
-            if chase.control is not None and chase.history[-1].mu >= 0.01:
-                first[chase.name] = chase.control
+    starts = list(initial_controls_of(task, None))
+    first_round = multistart_of(task.relaxed())._round(
+        Stage(task.relaxed(), None), starts, BarrierSchedule(last=0.01), 6, np.inf
+    )
+    first = {result.name: result.control for result in consume(first_round, None)}
     assert list(first) == ["initial control", "Fourier series of 2 Hz"]
     waves = [f(2 * np.pi * 2.0 * k * task.t) for k in range(1, 16) for f in (np.sin, np.cos)]
     series = np.column_stack(waves)
-    control = first["Fourier series of 2 Hz"] - task.centre
+    found = first["Fourier series of 2 Hz"]
+    assert found is not None
+    control = found - task.centre
     assert relative_error(series @ np.linalg.lstsq(series, control)[0], control) < 1e-6
-    assert np.isfinite(min(chase.cost for chase in chases))
+    results = consume(multistart_of(task.relaxed()).run(starts), None)
+    assert np.isfinite(min(result.cost for result in results))
 
 
 # ---- how a design begins, ends and moves
@@ -607,10 +624,10 @@ def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
     proofs: int, shrunk: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The barrier looks at distances at the samples, of 50 ms; the verify at every engine step."""
-    monkeypatch.setattr(multistart, "PROOFS", proofs)
+    monkeypatch.setattr(multistart, "MAX_TIGHTENED_RUNS", proofs)
     if not shrunk:
-        monkeypatch.setattr(multistart, "SHRINK_FACTORS", np.ones(1))
-    monkeypatch.setattr(multistart, "PATIENCE", 12)
+        monkeypatch.setattr(feasibility, "SHRINK_FACTORS", np.ones(1))
+    monkeypatch.setattr(multistart, "TIGHTENED_RUN_ITERATIONS", 12)
     task, design = arm_design(
         tmp_path,
         rate=20.0,
@@ -712,20 +729,20 @@ def test_every_criterion_gains_within_limits(tmp_path: Path, tables: dict[str, A
     assert min(design.limits.values()) >= 0.0
 
 
-def test_what_leaks_a_little_goes_on_and_the_start_is_kept_beside_it(tmp_path: Path) -> None:
+def test_a_control_that_violates_a_limit_a_little_continues_beside_its_start(
+    tmp_path: Path,
+) -> None:
     free = cart_inside(tmp_path).relaxed()
-    rivals = Multistart(Stage(free, None), None)
+    rivals = multistart_of(free)
     start, leaking, inside = (
         InitialControl(name="x", control=s * free.control) for s in (0.2, 3.0, 0.1)
     )  # here the smaller one tells more
-    chase = Chase("x", leaking.control, 1e-3)
-    lead = rivals._judge(chase, start)
-    assert (lead.control is leaking.control, lead.cost) == (True, 1e-3)
-    assert chase.control is not leaking.control
-    assert chase.cost == pytest.approx(
+    judged, candidate = rivals.judge(RunResult(name="x", control=leaking.control, cost=1e-3), start)
+    assert (candidate.control is leaking.control, candidate.cost) == (True, 1e-3)
+    assert judged.control is not leaking.control
+    assert judged.cost == pytest.approx(
         free.problem.point(free.plant.simulate(free.theta, start.control)).cost
     )
-    chase = Chase("x", inside.control, 1e-3)
-    lead = rivals._judge(chase, start)
-    assert lead.control is chase.control is inside.control
-    assert lead.cost == chase.cost > 1e-3
+    judged, candidate = rivals.judge(RunResult(name="x", control=inside.control, cost=1e-3), start)
+    assert candidate.control is judged.control is inside.control
+    assert candidate.cost == judged.cost > 1e-3

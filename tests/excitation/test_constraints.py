@@ -74,7 +74,9 @@ def arm_task(folder: Path, **tables: Any) -> DesignTask:
 
 def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
     """Largest relative error of the slope of the barrier along random controls, against differences of simulations."""
-    problem = InteriorProblem(task.problem, constraint_set_of(task), 1.0, delta, costs=False)
+    problem = InteriorProblem(
+        base=task.problem, constraints=constraint_set_of(task), mu=1.0, delta=delta, with_cost=False
+    )
     expansion = problem.expand(problem.point(task.control))
     open_loop = np.zeros((task.samples, len(task.controls), task.space.nx))
     gradient = expansion.gradient(open_loop)
@@ -125,7 +127,9 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
     """Changes of all constrained quantities along a tangent curve are squared, and weighted by the barrier's curvature."""
     task = arm_task(tmp_path, **TOGETHER[name])
     constraints, delta = constraint_set_of(task), 0.05
-    problem = InteriorProblem(task.problem, constraints, 1.0, delta, costs=False)
+    problem = InteriorProblem(
+        base=task.problem, constraints=constraints, mu=1.0, delta=delta, with_cost=False
+    )
     point = problem.point(task.control)
     expansion = problem.expand(point)
     assert expansion.barrier is not None
@@ -198,7 +202,9 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
         clearance=None,
         end=None,
     )
-    problem = InteriorProblem(task.problem, narrow, 1.0, delta, costs=False)
+    problem = InteriorProblem(
+        base=task.problem, constraints=narrow, mu=1.0, delta=delta, with_cost=False
+    )
     barrier = problem.expand(problem.point(ctrl)).barrier
     assert barrier is not None
     _, b = barrier.weights.half_gradient(
@@ -212,7 +218,9 @@ def test_relative_moves_of_an_expansion_are_those_of_the_simulation(tmp_path: Pa
     """They are relative to half of each range; the largest at any engine step with derivatives counts."""
     task = arm_task(tmp_path, limits=EVERY)
     constraints = constraint_set_of(task)
-    problem = InteriorProblem(task.problem, constraints, 1.0, 0.1, costs=False)
+    problem = InteriorProblem(
+        base=task.problem, constraints=constraints, mu=1.0, delta=0.1, with_cost=False
+    )
     expansion = problem.expand(problem.point(task.control))
     assert expansion.barrier is not None
     for way in 1e-4 * directions_of(task, 4, seed=2):

@@ -93,11 +93,11 @@ def test_limits_that_are_left_are_said_and_no_success(experiment: Experiment) ->
 
 def test_own_start_is_checked(experiment: Experiment) -> None:
     with pytest.raises(ExperimentError, match=r"\(400, 1\)"):
-        mjfim.design(experiment, start=np.zeros(400))
+        mjfim.design(experiment, initial_control=np.zeros(400))
     with pytest.raises(UnidentifiableError, match="excites nothing"):
-        mjfim.design(experiment, start=np.zeros((400, 1)))
+        mjfim.design(experiment, initial_control=np.zeros((400, 1)))
     t = np.arange(400) * 0.01
-    design = mjfim.design(experiment, start=np.sin(5 * t)[:, None])
+    design = mjfim.design(experiment, initial_control=np.sin(5 * t)[:, None])
     assert design.found_by == "given control"
     assert design.final.cost == pytest.approx(0.01741324, rel=1e-4)
 
@@ -107,9 +107,9 @@ def test_metric_weight_on_psi_needs_the_metric_descent(experiment: Experiment) -
         experiment.replace(descent={"psi_weight": 1.0})
 
 
-def test_monitor_sees_levels_and_growing_numbers(experiment: Experiment) -> None:
+def test_callback_sees_levels_and_growing_numbers(experiment: Experiment) -> None:
     rows: list[HistoryRow] = []
-    design = mjfim.design(experiment, monitor=rows.append)
+    design = mjfim.design(experiment, callback=lambda event: rows.append(event.row))
     assert [row.iteration for row in rows] == list(range(len(rows)))
     assert [row.rate for row in rows] == sorted(row.rate for row in rows)
     assert {row.rate for row in rows} == {25.0, 100.0}

@@ -9,8 +9,9 @@ import pytest
 
 from mjfim.excitation.design import design_task
 from mjfim.excitation.extended_system import ExtendedDesignProblem, extend
+from mjfim.excitation.levels import Stage
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import Stage, direction_for
+from mjfim.excitation.unconstrained import direction_for
 from mjfim.information.fisher import FisherInformation
 from mjfim.optimize.directions import ExtendedMetricDescent, MetricDescent
 from mjfim.optimize.lq import LinearRecursion, TangentCurve

@@ -46,7 +46,7 @@ def problem_of(name: str, folder: Path, **tables: Any) -> tuple[DesignTask, Inte
     base = task.problem
     if name == "smooth E":
         base = replace(base, information=replace(base.information, power=40.0))
-    return task, InteriorProblem(base, constraint_set_of(task), 0.2, 0.05)
+    return task, InteriorProblem(base=base, constraints=constraint_set_of(task), mu=0.2, delta=0.05)
 
 
 def check(
@@ -113,7 +113,7 @@ def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
         replace(problem, base=smooth, constraints=tight, mu=1e-3, delta=3e-4),
     ):
         begun = task.plant.simulator.steps
-        again = other.again(point)
+        again = other.reevaluate(point)
         assert task.plant.simulator.steps == begun
         fresh = other.point(task.control)
         assert task.plant.simulator.steps > begun
@@ -126,7 +126,7 @@ def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
 
 def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
     task, problem = problem_of("E", tmp_path)
-    inward = replace(problem, mu=1.0, costs=False)
+    inward = replace(problem, mu=1.0, with_cost=False)
     begun = task.plant.simulator.steps
     point = inward.point(task.control)
     assert (
@@ -139,12 +139,12 @@ def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
     assert expansion.barrier is not None
     np.testing.assert_array_equal(expansion.a, expansion.barrier.a)
     assert check(task, inward, expansion) < 2e-3
-    assert inward.again(point) is point
+    assert inward.reevaluate(point) is point
 
 
 def test_a_trial_that_diverges_is_outside_everything(tmp_path: Path) -> None:
     task, problem = problem_of("E", tmp_path)
-    for own in (problem, replace(problem, costs=False)):
+    for own in (problem, replace(problem, with_cost=False)):
         point = own.point(1e12 * task.control)
         assert point is DIVERGED_POINT
         assert own.value(point) == np.inf

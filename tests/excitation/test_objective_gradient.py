@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mjfim.excitation.levels import Stage
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import Stage
 from mjfim.optimize.lq import TangentCurve, regulator
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, DifferenceAccuracy

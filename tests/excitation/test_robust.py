@@ -196,7 +196,7 @@ def test_a_robust_design_is_better_at_its_samples_than_the_nominal_design(
         vague_task(tmp_path),
     )
     plain = design_task(nominal)
-    made = design_task(robust, start=plain.trajectory.ctrl)
+    made = design_task(robust, initial_control=plain.trajectory.ctrl)
     assert plain.status.success and made.status.success
     ours, theirs = (
         phis(nominal, d.trajectory.ctrl, robust.samples_of_parameters.thetas) for d in (made, plain)

@@ -11,14 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 import mjfim
+from mjfim.budget import StopToken
 from mjfim.cli import main as cli
-from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.errors import ExperimentError, NoResultError, SimulationDivergedError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
-from mjfim.excitation.shortest_horizon import OutOfReachError, Tried, fitted
+from mjfim.excitation.shortest_horizon import OutOfReachError, fitted
 from mjfim.excitation.target_accuracy import largest_ratio_to_target, target_accuracies
 from mjfim.excitation.task import DesignTask
-from mjfim.records.design import HistoryRow
+from mjfim.records.events import DesignEvent, StudyEvent
 from tests.support.paths import MODELS
 
 STUDY = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
@@ -73,19 +74,25 @@ def test_a_tolerance_shorter_does_not(shorter: mjfim.ShortestExperiment) -> None
 @pytest.mark.slow
 def test_longer_than_stated_where_it_takes_longer(shorter: mjfim.ShortestExperiment) -> None:
     """Begun from too short it ends at about the same."""
-    seen: list[Tried] = []
+    messages: list[str] = []
+
+    def callback(event: DesignEvent | StudyEvent) -> None:
+        if isinstance(event, StudyEvent):
+            messages.append(event.message)
+
     found = mjfim.shortest_experiment(
-        wanting(SIGMA, horizon=0.8), tolerance=0.05, report=seen.append
+        wanting(SIGMA, horizon=0.8), tolerance=0.05, callback=callback
     )
     assert found.horizon > 0.8 and abs(found.horizon - shorter.horizon) < 0.11
-    assert tuple(seen) == found.tried and not seen[0].reached and seen[0].horizon == 0.8
+    assert messages == [str(tried) for tried in found.tried]
+    assert not found.tried[0].reached and found.tried[0].horizon == 0.8
 
 
 def test_what_is_out_of_reach_is_said_with_numbers() -> None:
     hard = wanting({"m": 1e-3, "l": 0.02, "c": 0.0125}, horizon=0.6)
     with pytest.raises(
         OutOfReachError,
-        match=r"0\.8 s is not enough: it does not tell m \(σ 0\.\d+, wanted 0\.001\)",
+        match=r"0\.8 s is too short: the target is missed by m \(σ 0\.\d+, wanted 0\.001\)",
     ):
         mjfim.shortest_experiment(hard, longest=0.8)
 
@@ -117,39 +124,33 @@ def test_faulty_requests_say_what_is_right() -> None:
 
 
 def test_interrupted_it_returns_the_shortest_so_far() -> None:
-    horizons: list[float] = []
+    stop = StopToken()
+    horizons: list[str] = []
 
-    def monitor(row: HistoryRow) -> None:
-        if len(horizons) == 1:
-            raise KeyboardInterrupt
+    def callback(event: DesignEvent | StudyEvent) -> None:
+        if isinstance(event, StudyEvent):
+            horizons.append(event.part)
+        elif len(horizons) == 1:
+            stop.request()
 
-    found = mjfim.shortest_experiment(
-        wanting(SIGMA),
-        tolerance=0.05,
-        monitor=monitor,
-        report=lambda tried: horizons.append(tried.horizon),
-    )
+    found = mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.05, callback=callback, stop=stop)
     assert found.horizon == 1.5 and not found.closed and "interrupted" in str(found)
-    with pytest.raises(KeyboardInterrupt):
-        mjfim.shortest_experiment(wanting(SIGMA), report=_stop)
-
-
-def _stop(tried: Tried) -> None:
-    raise KeyboardInterrupt
+    with pytest.raises(NoResultError):
+        mjfim.shortest_experiment(wanting(SIGMA), stop=stop)
 
 
 def test_a_duration_that_cannot_be_simulated_does_not_reach(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Except the stated one: there the fault is the user's to see."""
-    real = mjfim.excitation.shortest_horizon.design  # type: ignore[attr-defined]
+    real = mjfim.excitation.shortest_horizon.design_task
 
     def faulty(task: DesignTask, *rest: object, **more: object) -> mjfim.Design:
         if task.samples < 140:
             raise SimulationDivergedError("too short")
         return real(task, *rest, **more)
 
-    monkeypatch.setattr(mjfim.excitation.shortest_horizon, "design", faulty)
+    monkeypatch.setattr(mjfim.excitation.shortest_horizon, "design_task", faulty)
     found = mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.05)
     assert (
         1.4 <= found.horizon <= 1.45

@@ -274,8 +274,8 @@ def test_a_design_is_refused_before_any_optimisation(tmp_path) -> None:
     task = two_task(tmp_path)
     told: list[object] = []
     with pytest.raises(UnidentifiableError, match="start excites nothing"):
-        design_task(task, monitor=told.append)
+        design_task(task, callback=told.append)
     assert told == []
     start = np.stack([np.sin(5.0 * task.t), np.cos(4.0 * task.t)], axis=1)
-    result = design_task(two_task(tmp_path, descent={"max_iterations": 1}), start=start)
+    result = design_task(two_task(tmp_path, descent={"max_iterations": 1}), initial_control=start)
     assert np.isfinite(result.final.std).all()

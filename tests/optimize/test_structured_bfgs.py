@@ -357,7 +357,9 @@ def test_the_direction_descends_on_a_simulated_design(based: bool, tmp_path: Pat
     task = cart_task(
         tmp_path, limits={"control": {"force": (-5.0, 5.0)}, "position": {"slide": (-0.3, 0.5)}}
     ).relaxed()
-    problem = InteriorProblem(task.problem, constraint_set_of(task), 0.1, 0.03)
+    problem = InteriorProblem(
+        base=task.problem, constraints=constraint_set_of(task), mu=0.1, delta=0.03
+    )
     point = problem.point(task.control)
     expansion = problem.expand(point)
     basis = spline_basis(task.t, 0.5, 8.0, False, False, False) if based else None

@@ -22,6 +22,7 @@ from mjfim.excitation.verification import verify
 from mjfim.output.plots.compare import compare_figure
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design, HistoryRow
+from mjfim.records.events import DesignEvent
 from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
 from mjfim.studies.compare import Glance, Judge, Meter, chosen_methods
 from tests.support.baselines import pendulum, played
@@ -203,8 +204,8 @@ def test_a_design_is_stopped_at_its_steps() -> None:
     job = BaselineSearch(experiment=pendulum(), method=DESIGN, seconds=60.0, steps=1000.0)
     meter = Meter(job, lambda used, cost: told.append(used))
 
-    def iterate(steps: int) -> HistoryRow:
-        return HistoryRow(
+    def iterate(steps: int) -> DesignEvent:
+        row = HistoryRow(
             iteration=0,
             cost=1.0,
             criterion=1.0,
@@ -214,12 +215,14 @@ def test_a_design_is_stopped_at_its_steps() -> None:
             seconds=0.0,
             steps=steps,
         )
+        return DesignEvent(start="initial control", row=row)
 
     meter(iterate(400))
     meter(iterate(300))  # another task
     meter(iterate(550))
-    with pytest.raises(KeyboardInterrupt):
-        meter(iterate(700))
+    assert not meter.stop.requested
+    meter(iterate(700))
+    assert meter.stop.requested
     assert meter.spent
     np.testing.assert_allclose(told, [0.4, 0.7, 0.95, 1.1], atol=0.05)
 

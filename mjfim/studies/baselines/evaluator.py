@@ -17,8 +17,8 @@ from mjfim.excitation.interior_point import (
     InteriorProblem,
     values_of,
 )
+from mjfim.excitation.levels import Stage
 from mjfim.excitation.task import DesignTask
-from mjfim.excitation.unconstrained import Stage
 from mjfim.experiment.schema import Experiment
 from mjfim.records.trajectory import Trajectory
 

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from mjfim.arrays import Array
 from mjfim.budget import StopToken
 from mjfim.excitation.bandwidth import bandwidth_basis
-from mjfim.parallel import stopped
+from mjfim.parallel import pool_stop_token
 from mjfim.signals import Chirp, Excitation, ExcitationSettings, Multisine, RandomSteps
 from mjfim.studies.baselines.evaluator import (
     BaselineSearch,
@@ -96,7 +96,7 @@ def run_baseline(
         The best control.
     """
     if stop is None:
-        stop = StopToken(also=stopped)
+        stop = pool_stop_token()
 
     # Small matrices: threads of the BLAS only wait for each other.
     with threadpool_limits(1, user_api="blas"):

@@ -15,13 +15,14 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from mjfim.arrays import Array
+from mjfim.budget import Budget, StopToken
 from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.bandwidth import boundary_splines
-from mjfim.excitation.constrained import Chase, ConstrainedSearch, pursue, smoothed
+from mjfim.excitation.constrained import ConstrainedSearch, smoothed
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import (
     MAX_RELAXATION,
-    RELAXED,
+    RELAXATION_PER_MU,
     TIGHTENING_MU,
     BarrierSchedule,
     InteriorPoint,
@@ -30,9 +31,11 @@ from mjfim.excitation.interior_point import (
     updated_tightening,
 )
 from mjfim.excitation.objective import DesignProblem
+from mjfim.excitation.run_result import consume
 from mjfim.excitation.unconstrained import regulator_for
 from mjfim.optimize.lq import Weights
 from mjfim.optimize.structured_bfgs import BasisMetric
+from mjfim.records.events import DesignEvent
 from mjfim.signals import fourier_basis, independent_curves
 from mjfim.studies.baselines.evaluator import ControlEvaluator
 
@@ -279,7 +282,8 @@ def optimise_with_mjfim(
     evaluator: ControlEvaluator, run: ParametricRun, last: float, limit: float
 ) -> None:
     """Optimise within the curves of a run as designs under hard limits are optimised. See `Optimiser`."""
-    order, chase = evaluator.search, Chase(run.name)
+    order = evaluator.search
+    stop = StopToken()
 
     # Only the last search gets a time limit: with one, the barrier of the others would fall too early.
     seconds = (1.0 - evaluator.used) * order.seconds if limit >= 1.0 else np.inf
@@ -287,19 +291,26 @@ def optimise_with_mjfim(
         experiment=order.experiment,
         start=InitialControl(name=run.name, control=run.control, basis=run.basis),
         schedule=BarrierSchedule(first=run.mu, last=last),
-        budget=UNLIMITED_ITERATIONS,
+        max_iterations=UNLIMITED_ITERATIONS,
+        budget=Budget(stop=stop),
         seconds=seconds,
         combinations=order.combinations,
         added_information=order.added_information,
         threads=order.threads,
     )
-    for row in pursue(search, chase, evaluator.task):
-        run.mu = min(row.mu, run.mu)
-        if chase.control is not None and chase.cost < run.cost:
-            run.control, run.cost = chase.control, chase.cost
-            evaluator.record(chase.control, chase.cost, 0.0, run.name)
+
+    def watch(event: DesignEvent) -> None:
+        """Ask the search to stop where the budget is exhausted."""
+        run.mu = min(event.row.mu, run.mu)
         if evaluator.exhausted(limit):
-            return
+            stop.request()
+
+    result = consume(search.run(evaluator.task), watch)
+    if result.control is not None and result.cost < run.cost:
+        run.control, run.cost = result.control, result.cost
+        evaluator.record(result.control, result.cost, 0.0, run.name)
+    if stop.requested:
+        return
 
     run.finish_schedule(last)
 
@@ -357,7 +368,7 @@ class ScipyDescent:
             constraints=evaluator.constraints,
             centre=evaluator.centre,
             basis=basis,
-            regulate=regulator_for(evaluator.task),
+            regulator=regulator_for(evaluator.task),
         )
         nu = len(evaluator.centre)
         self._no_feedback = np.zeros((len(basis), nu, evaluator.task.space.nx))
@@ -379,7 +390,7 @@ class ScipyDescent:
                 base=self.base,
                 constraints=evaluator.constraints.tightened(tightening),
                 mu=mu if evaluator.is_limited else 0.0,
-                delta=min(MAX_RELAXATION, RELAXED * mu),
+                delta=min(MAX_RELAXATION, RELAXATION_PER_MU * mu),
             )
             is_last = mu <= schedule.last or not evaluator.is_limited
             is_complete = self._run_stage(problem, schedule, mu, is_last)
@@ -401,7 +412,7 @@ class ScipyDescent:
         if not evaluator.is_limited:
             return control
 
-        inside = self.method.inside(control)
+        inside = self.method.shrink_inside(control)
         if inside is not None:
             return inside
 
@@ -411,12 +422,12 @@ class ScipyDescent:
             constraints=evaluator.constraints,
             mu=1.0,
             delta=MAX_RELAXATION,
-            costs=False,
+            with_cost=False,
         )
         self._run_stage(problem, BarrierSchedule(), 1.0, is_last=False)
 
         control = self.control(self.s)
-        inside = None if self.out_of_budget else self.method.inside(control)
+        inside = None if self.out_of_budget else self.method.shrink_inside(control)
         return control if inside is None else inside
 
     def _run_stage(
@@ -461,7 +472,7 @@ class ScipyDescent:
         evaluator = self.evaluator
         point = self._point(evaluator.problem)
         if evaluator.is_limited and (point.values is None or not evaluator.is_feasible(point)):
-            inside = self.method.inside(self.control(self.s))
+            inside = self.method.shrink_inside(self.control(self.s))
             if inside is not None:
                 point = evaluator.problem.point(inside)
 
@@ -476,7 +487,7 @@ class ScipyDescent:
 
         N = len(self.run.basis)
         ridge = RIDGE / N / evaluator.constraints.control.bounds.scale**2
-        if problem.costs and point.point is not None and point.point.cost > 0.0:
+        if problem.with_cost and point.point is not None and point.point.cost > 0.0:
             ridge = ridge + task.control_weight * task.dt / point.point.cost
 
         barrier = expansion.barrier.weights
@@ -561,7 +572,7 @@ class _ScipyStage:
         descent.run.update(descent.evaluator, point)
 
         # Without a cost, the first control inside all limits is the result.
-        if not self.problem.costs and descent.evaluator.is_feasible(point):
+        if not self.problem.with_cost and descent.evaluator.is_feasible(point):
             descent.s, self.ended = s, True
             return diverged
 

@@ -1,0 +1,190 @@
+"""Levels of a descent: the experiment at a longer timestep or sample period, or with smoothed friction, to begin with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.excitation.objective import DesignPoint, DesignProblem
+from mjfim.excitation.task import DesignTask
+
+# Factor by which the samples of a coarse level are longer, where the experiment leaves it open.
+AUTO_COARSE_FACTOR = 4
+
+# Smallest number of samples of a coarse level.
+MIN_COARSE_SAMPLES = 50
+
+# Largest relative change of the initial cost that a coarse level without hard limits may cause.
+MAX_COARSE_CHANGE = 0.05
+
+# Factors by which the timestep of a coarse level under hard limits may be longer; the first that suits the model is taken.
+TIMESTEP_FACTORS = (5, 4, 3, 2)
+
+# Factor by which the samples are longer where no timestep factor divides them.
+SAMPLE_FACTOR = 2
+
+# Largest relative change of the initial cost that a coarse level under hard limits may cause. Much is tolerated, because
+# everything is optimised again on the stated level.
+MAX_CONSTRAINED_COARSE_CHANGE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One level of the descent: the task at one sample rate, with the criterion that is minimised there.
+
+    Attributes:
+        task: The task at the sample rate of the level.
+        basis: (t, s) identifiable combinations of the parameters, or None where all are identifiable.
+        power: Power of the smooth E-criterion; infinite for 1/lambda_min itself.
+    """
+
+    task: DesignTask
+    basis: Array | None
+    power: float = np.inf
+
+    @cached_property
+    def problem(self) -> DesignProblem:
+        """The cost on this level."""
+        problem = self.task.problem
+        information = replace(problem.information, basis=self.basis, power=self.power)
+        is_coarse = self.task.system.variant.sample_factor > 1
+        return replace(problem, information=information, forward_differences_only=is_coarse)
+
+
+def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> DesignTask | None:
+    """Make the coarse level of a descent without hard limits.
+
+    Args:
+        task: The stated task.
+        first: Its initial control, evaluated.
+        basis: (t, s) identifiable combinations, or None.
+
+    Returns:
+        The task with longer samples; None where the experiment does not want it, or where its initial cost differs by
+        more than 5 % from the stated one.
+
+    Raises:
+        ExperimentError: The stated factor does not divide the samples.
+    """
+    descent = task.experiment.descent
+    is_auto = descent.coarse == "auto"
+    factor = AUTO_COARSE_FACTOR if descent.coarse == "auto" else descent.coarse
+    if factor == 1 or descent.method != "lbfgs":
+        return None
+
+    if not is_auto and task.samples % factor:
+        valid = ", ".join(str(k) for k in range(1, 17) if task.samples % k == 0)
+        raise ExperimentError(
+            f"{task.experiment.source}: descent.coarse: {factor} does not divide the {task.samples} samples; "
+            f"valid for example: {valid}"
+        )
+    if task.samples % factor or task.samples < MIN_COARSE_SAMPLES * factor:
+        return None
+
+    coarse = task.coarser(factor)
+    size = task.problem.size(first)
+    similar = has_similar_cost(Stage(coarse, basis), first, size, MAX_COARSE_CHANGE)
+    return coarse if similar else None
+
+
+def has_similar_cost(coarse: Stage, first: DesignPoint, size: float, share: float) -> bool:
+    """Whether the initial control costs nearly as much on a coarse level as on the stated one.
+
+    Args:
+        coarse: The coarse level.
+        first: The initial control, evaluated on the stated level.
+        size: Size of its cost.
+        share: Largest difference of the two costs, over the size.
+
+    Returns:
+        True where the difference is small enough.
+    """
+    try:
+        point = coarse.problem.point(coarse.task.initial)
+    except SimulationDivergedError:
+        return False
+
+    return abs(point.cost - first.cost) <= share * size
+
+
+def easier_level(fine: Stage) -> Stage | None:
+    """Make a level for the first round under hard limits, where one is worth it.
+
+    Args:
+        fine: The stated level, on the plant without clamps.
+
+    Returns:
+        A level with a longer timestep or longer samples, and with smoothed friction where the model has dry friction; one
+        with smoothed friction alone; or None.
+
+    Raises:
+        ExperimentError: A stated factor divides neither the engine steps of a sample nor the samples.
+    """
+    has_dry_friction = bool(fine.task.system.variant.smoothing_speeds)
+    smooth = replace(fine, task=fine.task.smoothed()) if has_dry_friction else fine
+
+    try:
+        first = smooth.problem.point(smooth.task.initial)
+    except SimulationDivergedError:
+        return None
+
+    # The longest timestep with which the initial control costs about as much.
+    for factor in _coarse_factors(smooth.task):
+        coarse = _coarser(smooth, first, factor)
+        if coarse is not None:
+            return coarse
+
+    return smooth if has_dry_friction else None
+
+
+def _coarse_factors(task: DesignTask) -> tuple[int, ...]:
+    """Candidates for the factor of a coarse level, the largest first."""
+    stated = task.experiment.descent.coarse
+    substeps = task.system.grid.substeps
+
+    if stated == "auto":
+        dividing = tuple(factor for factor in TIMESTEP_FACTORS if substeps % factor == 0)
+        return dividing or (SAMPLE_FACTOR,)
+
+    if substeps % stated and task.samples % stated:
+        raise ExperimentError(
+            f"{task.experiment.source}: descent.coarse: {stated} divides neither the {substeps} engine steps of a "
+            f"sample nor the {task.samples} samples"
+        )
+    return () if stated == 1 else (stated,)
+
+
+def _coarser(level: Stage, first: DesignPoint, factor: int) -> Stage | None:
+    """A level that is coarser by a factor, where the model allows it.
+
+    Args:
+        level: The level to begin with.
+        first: Its initial control, evaluated.
+        factor: Factor of the timestep, or of the samples where a sample is too few engine steps.
+
+    Returns:
+        The coarse level, or None where samples cannot be divided or the initial cost differs too much.
+    """
+    task = level.task
+    longer_timestep = task.system.grid.substeps % factor == 0
+
+    # Longer samples have to divide the horizon, and every part of it that is optimised alone.
+    parts = [task.samples // count for count in (1, *task.experiment.descent.repeats)]
+    enough_samples = task.samples >= MIN_COARSE_SAMPLES * factor
+    longer_samples = enough_samples and all(N % factor == 0 for N in parts)
+    if not (longer_timestep or longer_samples):
+        return None
+
+    try:
+        coarse_task = task.stretched(factor) if longer_timestep else task.coarser(factor)
+    except ExperimentError:
+        return None
+
+    coarse = Stage(coarse_task, level.basis)
+    size = task.problem.size(first)
+    similar = has_similar_cost(coarse, first, size, MAX_CONSTRAINED_COARSE_CHANGE)
+    return coarse if similar else None

@@ -1,0 +1,83 @@
+"""Result of one optimisation run, and the events that it yields on its way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.excitation.objective import DesignPoint
+from mjfim.records.design import HistoryRow, StartResult, Status
+from mjfim.records.events import DesignEvent
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunResult:
+    """Result of one optimisation run from one initial control.
+
+    Attributes:
+        name: Name of the initial control.
+        control: (N, nu) best control at the stated sample rate: of hard limits the best feasible one, else the last one; None
+            where no iterate could be simulated.
+        cost: J of the control; infinite where it is infeasible or unknown.
+        status: How the run ended.
+        slope: |DJ . zeta| at the last iterate.
+        history: Every iterate.
+        steps: Engine steps taken on other plants than the stated one.
+        point: The control evaluated on the stated plant; None where that was not done.
+        is_feasible: False where the control is known to violate a limit on the stated plant.
+        left_limits: True where a run without a barrier ended because it left the limits.
+    """
+
+    name: str
+    control: Array | None = None
+    cost: float = np.inf
+    status: Status = Status.STALLED
+    slope: float = np.inf
+    history: tuple[HistoryRow, ...] = ()
+    steps: int = 0
+    point: DesignPoint | None = None
+    is_feasible: bool = True
+    left_limits: bool = False
+
+    @property
+    def start_result(self) -> StartResult:
+        """The run as a row of the design's table of starts."""
+        return StartResult(
+            name=self.name,
+            cost=self.cost,
+            status=self.status,
+            iterations=self.history[-1].iteration if self.history else 0,
+        )
+
+
+def consume(
+    events: Generator[DesignEvent, None, T], callback: Callable[[DesignEvent], None] | None
+) -> T:
+    """Run an optimisation to its end.
+
+    Args:
+        events: Yields every iterate and returns the result.
+        callback: Called with every iterate; None where nobody watches.
+
+    Returns:
+        The result.
+    """
+    try:
+        while True:
+            try:
+                event = next(events)
+            except StopIteration as end:
+                result: T = end.value
+                return result
+
+            if callback is not None:
+                callback(event)
+    finally:
+        # A callback that raises ends the search, with all tasks that it runs elsewhere.
+        events.close()
