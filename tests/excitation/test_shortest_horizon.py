@@ -211,7 +211,7 @@ def test_the_command_line(tmp_path: Path) -> None:
     hard = text.replace("wanted = 0.03", "wanted = 1e-9").replace("horizon = 1.0", "horizon = 4.0")
     study.write_text(hard, encoding="utf-8")
     assert run("design", study, "-o", folder, "--shortest") == 1
-    assert "not enough" in run.output  # type: ignore[attr-defined]
+    assert "is too short" in run.output  # type: ignore[attr-defined]
     study.write_text(text.replace("wanted = 0.03", ""), encoding="utf-8")
     assert run("design", study, "-o", folder, "--shortest") == 2
     assert "wanted" in run.output  # type: ignore[attr-defined]
