@@ -4,6 +4,7 @@
 parameters from recordings, `monte_carlo` holds the estimator against the Cramer-Rao bound.
 """
 
+from mjfim.budget import Budget, StopToken
 from mjfim.errors import MjfimError
 from mjfim.excitation.design import design
 from mjfim.excitation.evaluation import evaluate_trajectory
@@ -22,12 +23,14 @@ from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
-from mjfim.studies.campaign import sequential
+from mjfim.studies.campaign import run_campaign
 from mjfim.studies.check import check
 from mjfim.studies.compare import compare
 from mjfim.studies.monte_carlo import monte_carlo
+from mjfim.studies.robustness import assess_robustness
 
 __all__ = [
+    "Budget",
     "Campaign",
     "Check",
     "Comparison",
@@ -39,7 +42,9 @@ __all__ = [
     "Pool",
     "Recording",
     "ShortestExperiment",
+    "StopToken",
     "Trajectory",
+    "assess_robustness",
     "check",
     "compare",
     "design",
@@ -48,7 +53,7 @@ __all__ = [
     "identify",
     "monte_carlo",
     "predict",
-    "sequential",
+    "run_campaign",
     "shortest_experiment",
     "simulate",
 ]

@@ -91,8 +91,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
         try:
             function(*args, **kwargs)
         except NoResultError:
-            errors.print("mjfim: interrupted before there was a result; nothing was written")
-            raise typer.Exit(1) from None
+            raise interrupted_without_result() from None
         except MjfimError as error:
             errors.print(f"mjfim: {error}", markup=False)
             raise typer.Exit(2) from None
@@ -111,7 +110,7 @@ def verb(function: Callable[..., None]) -> Callable[..., None]:
         except KeyboardInterrupt:
             raise interrupted_without_result() from None
 
-    app.command()(wrapped)
+    app.command(function.__name__.replace("_", "-"))(wrapped)
     return wrapped
 
 

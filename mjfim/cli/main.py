@@ -5,7 +5,17 @@ from __future__ import annotations
 import sys
 from typing import NoReturn
 
-from mjfim.cli import check, compare, design, identify, replay, simulate  # noqa: F401 - each registers its verbs
+from mjfim.cli import (  # noqa: F401 - each registers its verbs
+    campaign,
+    check,
+    compare,
+    design,
+    export_sysid,
+    identify,
+    replay,
+    robustness,
+    simulate,
+)
 from mjfim.cli.common import app
 
 

@@ -18,7 +18,8 @@ from mjfim.records.comparison import Comparison
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
-from mjfim.records.serialization import read_json
+from mjfim.records.robustness import Robustness
+from mjfim.records.serialization import read_json, write_json
 
 
 def recording_of(source: Path) -> Path:
@@ -136,6 +137,19 @@ def leave_check(folder: Path, check: Check) -> None:
     """
     check.save(folder)
     plots.save(plots.check_figure(check), folder / "check.png")
+
+
+def leave_robustness(folder: Path, result: Robustness, seconds: float) -> None:
+    """Write playback.json, playback.npz and a figure of limits, errors and coverage.
+
+    Args:
+        folder: Folder for the results.
+        result: The study.
+        seconds: Time that the study took [s].
+    """
+    result.save_archive(folder)
+    write_json(folder / "playback.json", {**result.summary(), "seconds": seconds})
+    plots.save(plots.robustness_figure(result), folder / "playback.png")
 
 
 def leave_comparison(folder: Path, comparison: Comparison, system: System) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from scipy.stats import binom
 
 from mjfim.arrays import Array
+from mjfim.model.parameters import ParameterSet
 from mjfim.output.summary_parts import (
     Cell,
     Column,
@@ -23,12 +25,14 @@ from mjfim.output.summary_parts import (
     columns,
 )
 from mjfim.recordings.summary import ColumnSummary, LogSummary
+from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check, ParameterCheck
 from mjfim.records.combinations import ParameterGroup
 from mjfim.records.comparison import DESIGN, Comparison, MethodResult
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate, Prediction
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
+from mjfim.records.robustness import CONFIDENCE, REQUIRED_COVERAGE, Robustness
 
 # Largest number of parameters or outputs that have a column each.
 MAX_COLUMNS = 7
@@ -818,3 +822,170 @@ def _method_emphasis(comparison: Comparison, row: MethodResult) -> Emphasis:
     if row.method == DESIGN:
         return Emphasis.STRONG
     return Emphasis.WARNING if row in comparison.beating else Emphasis.NORMAL
+
+
+# ---- robustness
+
+
+def describe_robustness(result: Robustness) -> Summary:
+    """Describe estimates and margins of a design on robots that differ from the model.
+
+    Args:
+        result: The study.
+    """
+    sentences = [Paragraph(text=f"• {sentence}") for sentence in robustness_sentences(result)]
+    return Summary(
+        title="The design on robots that differ from the model",
+        outcome="",
+        parts=(_unknown_table(result), _limit_table(result), *sentences),
+    )
+
+
+def _unknown_table(result: Robustness) -> SummaryTable:
+    """Tabulate how wrong the guess of every unknown was, and how accurate prediction and estimate are."""
+    rows = []
+    for j, name in enumerate(result.names):
+        errors = (result.wrong[j], result.predicted[j], result.formal[j], result.observed[j])
+        inside = int(result.inside[j])
+        alone = bool(np.isfinite(result.formal[j]))
+        covered = alone and inside >= REQUIRED_COVERAGE * result.runs
+        rows.append(
+            Row(
+                cells=(
+                    Name(name=name, unit=result.units[j]),
+                    *(f"{error:.3g}" if np.isfinite(error) else "-" for error in errors),
+                    str(inside) if alone else "in combination only",
+                ),
+                emphasis=Emphasis.NORMAL if covered or not alone else Emphasis.WARNING,
+            )
+        )
+
+    return SummaryTable(
+        key="unknowns",
+        title=f"Does information arrive? {result.runs} robots, each identified from the guess",
+        columns=columns(
+            "unknown",
+            "wrong by",
+            "sigma predicted",
+            "sigma stated",
+            "error, rms",
+            f"inside 95 % of {result.runs}",
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _limit_table(result: Robustness) -> SummaryTable:
+    """Tabulate the tightest limit of every kind."""
+    worst = result.margins.min(axis=0)
+    rows = []
+    for kind in dict.fromkeys(limit.kind for limit in result.limits):
+        members = [i for i, limit in enumerate(result.limits) if limit.kind == kind]
+        tightest = min(members, key=lambda i: float(worst[i]))
+        kept = int(result.kept[:, members].all(axis=1).sum())
+        shares = (result.planned[tightest], worst[tightest], result.lost[members].max())
+        rows.append(
+            Row(
+                cells=(
+                    kind,
+                    result.limits[tightest].name,
+                    *(f"{100 * share:.1f} %" for share in shares),
+                    f"{kept} of {result.runs}",
+                ),
+                emphasis=Emphasis.NORMAL if kept == result.runs else Emphasis.WARNING,
+            )
+        )
+
+    return SummaryTable(
+        key="limits",
+        title="Do limits hold? Margins in percent of half of each range; negative: outside",
+        columns=columns(
+            "limit",
+            "tightest of",
+            "planned",
+            "worst robot",
+            "taken at most",
+            "robots that keep it",
+            left=["tightest of"],
+        ),
+        rows=tuple(rows),
+    )
+
+
+def robustness_sentences(result: Robustness) -> Iterator[str]:
+    """Yield the conclusions of a robustness study.
+
+    Args:
+        result: The study.
+
+    Yields:
+        Sentences: on the intervals, on fits in doubt, on the limits, and on the reserve that a design needs.
+    """
+    n = result.runs
+    low, high = (int(k) for k in binom.interval(0.99, n, CONFIDENCE))
+    inside = result.inside[result.identified]
+    stated, every = result.joint
+    yield (
+        f"95 % intervals hold the true value in {inside.min(initial=n)} to {inside.max(initial=0)} of {n} runs "
+        f"(chance alone: {low} to {high}); joint region of the experiment's parameters in {stated}, of all unknowns in "
+        f"{every}; chi2 / dof {result.fit:.3f}, {result.misfits} misfits, {result.restarted} searches begun again"
+    )
+    for sentence, count in result.troubles.items():
+        yield f"{count} of {n} runs: {sentence}"
+
+    yield f"all limits hold at every engine step on {result.all_kept} of {n} robots"
+    worst = result.margins.min(axis=0)
+    missed = ~result.kept.all(axis=0)
+    for i in np.flatnonzero(missed).tolist():
+        limit = result.limits[i]
+        excess = -worst[i] * limit.scale
+        manner = f"exceeded by up to {excess:.3g}" if excess > 0.0 else "clamped"
+        yield f"{limit.kind} of {limit.name} is {manner}"
+
+    reserve = result.reserve()
+    if reserve:
+        needed = " ".join(f"{kind}={share:g}" for kind, share in reserve.items())
+        yield (
+            "reserve that a design needs so that such robots keep the limits, in shares of half ranges: "
+            f"{needed} (make such a design with --reserve {needed})"
+        )
+
+
+# ---- campaigns
+
+
+def describe_campaign(campaign: Campaign, parameters: ParameterSet, *, simulated: bool) -> Summary:
+    """Describe the estimate after the last round of a campaign.
+
+    Args:
+        campaign: The campaign.
+        parameters: The parameters of the experiment.
+        simulated: True where the recordings were simulated at the true values.
+    """
+    rows = []
+    estimate = campaign.estimate
+    indices = parameters.interest.tolist() if estimate is not None else []
+    for j in indices:
+        if estimate is None:
+            break
+        theta, std = float(estimate.theta[j]), float(estimate.std[j])
+        aim = float(campaign.wanted[j])
+        cells = [
+            estimate.parameters[j],
+            f"{parameters.guess[j]:.5g}",
+            f"{theta:.5g}",
+            f"{std:.2g}",
+            f"{aim:.2g}" if np.isfinite(aim) else "-",
+        ]
+        if simulated:
+            cells.append(f"{(theta - parameters.true[j]) / std:+.1f} σ")
+        emphasis = Emphasis.NORMAL if std <= aim else Emphasis.WARNING
+        rows.append(Row(cells=tuple(cells), emphasis=emphasis))
+
+    headings = ["parameter", "guess", "estimate", "formal σ", "wanted σ"]
+    if simulated:
+        headings.append("off by")
+    table = SummaryTable(
+        key="campaign", title=str(campaign), columns=columns(*headings), rows=tuple(rows)
+    )
+    return Summary(title="Campaign", outcome="", parts=(table,))

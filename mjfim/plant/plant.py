@@ -115,6 +115,18 @@ class Plant:
         other.derivatives = Derivatives(other, factors)
         return other
 
+    def with_initial_state(self, state: Array) -> Plant:
+        """A plant with another nominal initial state; simulator and models are shared.
+
+        Args:
+            state: (ns,) initial state where no parameter moves it.
+        """
+        other = copy.copy(self)
+        other.nominal_initial_state = np.array(state, dtype=np.float64)
+        other.derivatives = copy.copy(self.derivatives)
+        other.derivatives.plant = other
+        return other
+
     def initial_state(self, theta: Array) -> Array:
         """Initial states at parameter values.
 

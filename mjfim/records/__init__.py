@@ -7,6 +7,7 @@ from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.recording import Recording
+from mjfim.records.robustness import RobotConditions, Robustness
 from mjfim.records.trajectory import Trajectory
 
 __all__ = [
@@ -19,6 +20,8 @@ __all__ = [
     "MethodOutcome",
     "MonteCarloStudy",
     "Recording",
+    "RobotConditions",
+    "Robustness",
     "Status",
     "Trajectory",
 ]

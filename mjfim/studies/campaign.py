@@ -1,4 +1,4 @@
-"""`mjfim.sequential`: design, record, identify, design again with what is known by then, until it is known as well as wanted.
+"""`mjfim.run_campaign`: design, record, identify, design again with what is known by then, until it is known as well as wanted.
 
 Redesigns are made at the estimate of all recordings so far, whose information counts as known before (see `redesign`).
 Every estimate is of all recordings and starts from the last one; priors stay about the stated guess, where they belong.
@@ -37,7 +37,7 @@ JUMP = 4.0  # standard deviations that an estimate moves from one round to the n
 Measure = Callable[[Design, int], Recording | Sequence[Recording] | None]
 
 
-def sequential(
+def run_campaign(
     experiment: Experiment,
     measure: Measure,
     rounds: int = 10,
@@ -59,7 +59,7 @@ def sequential(
     UnidentifiableError where a wanted parameter cannot be told alone, and whatever `design` and `identify` raise.
     """
     if rounds < 1:
-        raise ExperimentError(f"sequential: {rounds} rounds; at least 1")
+        raise ExperimentError(f"run_campaign: {rounds} rounds; at least 1")
     if experiment.earlier:
         raise ExperimentError(
             f"{experiment.source}: earlier: a campaign's estimate comes from recordings alone; give those of earlier "

@@ -1,14 +1,11 @@
-"""scripts/export_sysid.py: sysid and mjfim simulate, compare and weigh alike, so they find the same values."""
+"""Export to mujoco.sysid: sysid and mjfim simulate, compare and weigh alike, so they find the same values."""
 
 from __future__ import annotations
 
 import json
 import re
-import sys
-from collections.abc import Callable, Iterator
-from importlib import import_module
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -22,7 +19,10 @@ from mjfim.experiment.simulate import simulate_system
 from mjfim.identification.residuals import FitProblem
 from mjfim.output.archive import write_recording
 from mjfim.output.mjcf.write import same_dynamics
+from mjfim.output.sysid.comparison import chi2, fit_with_sysid, report
+from mjfim.output.sysid.sequences import build, export
 from mjfim.records.recording import Recording
+from tests.support.cli import misused, run
 from tests.support.numerics import Array, body_task, filtered_task
 from tests.support.paths import ROOT
 
@@ -31,14 +31,6 @@ UNEQUAL = {"qpos:slide": 0.05, "qpos:hinge": 0.05, "qvel:slide": 0.005, "qvel:hi
 installed = pytest.mark.skipif(
     not hasattr(sysid, "ModelSequences"), reason="needs mujoco.sysid: pip install 'mjfim[sysid]'"
 )
-
-
-@pytest.fixture(scope="module")
-def script() -> Iterator[ModuleType]:
-    """scripts/export_sysid.py"""
-    sys.path.insert(0, str(ROOT / "scripts"))
-    yield import_module("export_sysid")
-    sys.path.remove(str(ROOT / "scripts"))
 
 
 def cart(**tables: Any) -> DesignTask:
@@ -71,20 +63,18 @@ def residual(exported: Any, theta: Array, weighted: bool) -> Array:
     [{"state": 0.05}, UNEQUAL, {"slide_position": 0.05, "hinge_velocity": 0.005}],
     ids=["state", "unequal", "sensors"],
 )
-def test_sysid_recovers_the_truth_without_lag(
-    script: ModuleType, noise: dict[str, float], weighted: bool
-) -> None:
+def test_sysid_recovers_the_truth_without_lag(noise: dict[str, float], weighted: bool) -> None:
     task = cart(noise=noise)
-    exported = script.export(task, [noiseless(task)])
-    fit = script.fitted(exported, weighted)
+    exported = export(task.system, [noiseless(task)])
+    fit = fit_with_sysid(exported, weighted)
     np.testing.assert_allclose(fit.theta, task.parameters.true, rtol=1e-6)
-    assert fit.ended.startswith("Terminated after") and fit.seconds > 0.0
+    assert fit.status.startswith("Terminated after") and fit.seconds > 0.0
 
 
 @installed
-def test_states_are_compared_as_sysid_does_and_sensors_without_its_lag(script: ModuleType) -> None:
+def test_states_are_compared_as_sysid_does_and_sensors_without_its_lag() -> None:
     task = cart()
-    exported = script.export(task, [simulate_system(task.system, task.initial, 0)])
+    exported = export(task.system, [simulate_system(task.system, task.initial, 0)])
     own = sysid.build_residual_fn(models_sequences=[exported.sequences])
     theirs = np.concatenate(own(task.parameters.guess, exported.parameters.copy())[0])
     np.testing.assert_allclose(
@@ -92,7 +82,7 @@ def test_states_are_compared_as_sysid_does_and_sensors_without_its_lag(script: M
     )
     names = ["slide_position", "hinge_angle", "slide_velocity", "hinge_velocity"]
     task = cart(noise=dict.fromkeys(names, 0.05))
-    exported = script.export(task, [noiseless(task)])
+    exported = export(task.system, [noiseless(task)])
     own = sysid.build_residual_fn(models_sequences=[exported.sequences])
     theirs = np.concatenate(own(task.parameters.true, exported.parameters.copy())[0])
     assert np.abs(residual(exported, task.parameters.true, weighted=False)).max() < 1e-10
@@ -151,17 +141,15 @@ CASES = {
 
 @installed
 @pytest.mark.parametrize("case", CASES)
-def test_sysid_gets_the_same_model_data_and_weights(
-    script: ModuleType, case: str, tmp_path: Path
-) -> None:
+def test_sysid_gets_the_same_model_data_and_weights(case: str, tmp_path: Path) -> None:
     """Whitened residuals away from the guess, and what the MjSpec compiles to there."""
     task, recording = CASES[case](tmp_path)
-    exported, p = script.export(task, [recording]), task.parameters
+    exported, p = export(task.system, [recording]), task.parameters
     theta = np.clip(p.guess + 0.02 * p.magnitude * np.cos(np.arange(len(p))), p.lower, p.upper)
     moved = exported.parameters.copy()
     moved.update_from_vector(theta)
     before = exported.sequences.spec.to_xml()
-    built = import_module("sysid_sequences").build(moved, exported.sequences.spec)
+    built = build(moved, exported.sequences.spec)
     assert same_dynamics(built, task.system.model_at(theta))
     assert exported.sequences.spec.to_xml() == before
     fit = FitProblem.of(task.system, [recording])
@@ -170,14 +158,14 @@ def test_sysid_gets_the_same_model_data_and_weights(
     mine = residual(exported, theta, weighted=True)
     np.testing.assert_allclose(np.sum(mine**2), np.sum(wanted.r**2), rtol=1e-6)
     data = fit.value_count  # priors follow the data
-    np.testing.assert_allclose(np.sum(mine[:data] ** 2), script.chi2(exported, theta), rtol=1e-12)
+    np.testing.assert_allclose(np.sum(mine[:data] ** 2), chi2(exported, theta), rtol=1e-12)
     np.testing.assert_allclose(
         np.sort(np.abs(mine[:data])), np.sort(np.abs(wanted.r[:data])), rtol=1e-6, atol=1e-6
     )
 
 
 @installed
-def test_times_off_the_grid_are_read_between_the_steps(script: ModuleType) -> None:
+def test_times_off_the_grid_are_read_between_the_steps() -> None:
     task = cart()
     fine, rng = noiseless(task), np.random.default_rng(4)
     rows = np.sort(rng.choice(np.arange(1, 400), 300, replace=False))
@@ -185,7 +173,7 @@ def test_times_off_the_grid_are_read_between_the_steps(script: ModuleType) -> No
     t[0] = 0.0
     y = np.column_stack([np.interp(t, fine.t, column) for column in fine.y.T])
     recording = Recording(t=t, ctrl=fine.ctrl[rows[:-1]], y=y, outputs=fine.outputs)
-    exported, fit = script.export(task, [recording]), FitProblem.of(task.system, [recording])
+    exported, fit = export(task.system, [recording]), FitProblem.of(task.system, [recording])
     wanted = fit.dense(fit.begin(task.parameters.true))
     assert wanted is not None
     mine = residual(exported, task.parameters.true, weighted=True)
@@ -193,16 +181,14 @@ def test_times_off_the_grid_are_read_between_the_steps(script: ModuleType) -> No
 
 
 @installed
-def test_the_report_draws_components_and_what_is_measured_now_and_then(
-    script: ModuleType, tmp_path: Path
-) -> None:
+def test_the_report_draws_components_and_what_is_measured_now_and_then(tmp_path: Path) -> None:
     """sysid's own report counts signals where it draws their components."""
     task, recording = whole(tmp_path)
-    exported = script.export(task, [recording])
-    assert "tip[2]" in script.report(exported, script.fitted(exported, weighted=True))
+    exported = export(task.system, [recording])
+    assert "tip[2]" in report(exported, fit_with_sysid(exported, weighted=True))
     assert set(exported.layout.mapping) == {"hull_qpos", "ball_qvel", "gyro", "tip"}
     task, recording = coarse(tmp_path)
-    exported = script.export(task, [recording])
+    exported = export(task.system, [recording])
     _, _, records = exported.residual(weighted=True)(
         task.parameters.guess, exported.parameters, return_pred_all=True
     )
@@ -219,7 +205,7 @@ def test_the_report_draws_components_and_what_is_measured_now_and_then(
 
 @installed
 def test_the_command_compares_both_and_leaves_the_report(
-    script: ModuleType, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Unequal sensors: weighted, sysid finds what mjfim finds; as is, it is several sigmas off."""
     task = cart(noise=UNEQUAL)
@@ -234,10 +220,10 @@ def test_the_command_compares_both_and_leaves_the_report(
     files = [tmp_path / f"recording_{seed}.csv" for seed in (0, 1)]
     for seed, path in enumerate(files):
         write_recording(path, simulate_system(task.system, task.initial, seed), task.system)
-    assert script.main([str(experiment), *map(str, files), "-o", str(tmp_path / "out")]) == 0
-    shown = capfd.readouterr()
-    assert not shown.err, "sysid is heard"
-    assert "The same data, two estimators" in shown.out and "iter:" not in shown.out
+    shown = run("export-sysid", experiment, *files, "-o", tmp_path / "out")
+    assert shown.exit_code == 0, shown.stderr
+    assert not shown.stderr and capfd.readouterr() == ("", ""), "messages of sysid"
+    assert "The same data, two estimators" in shown.stdout and "iter:" not in shown.stdout
     found = json.loads((tmp_path / "out" / "comparison.json").read_text(encoding="utf-8"))
     assert (
         found["parameters"] == ["m", "l", "c"]
@@ -267,32 +253,22 @@ def test_the_command_compares_both_and_leaves_the_report(
         ({"fit": {"segments": 1.0}}, "every start as stated"),
     ],
 )
-def test_what_sysid_cannot_fit_is_refused(
-    script: ModuleType, tables: dict[str, Any], said: str
-) -> None:
+def test_what_sysid_cannot_fit_is_refused(tables: dict[str, Any], said: str) -> None:
     task = DesignTask.resolve(Experiment.from_file(CART).replace(**tables))
     with pytest.raises(ExperimentError, match=said):
-        script.export(task, [noiseless(task)])
+        export(task.system, [noiseless(task)])
 
 
 @installed
-def test_misuse_ends_with_a_sentence(
-    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert script.main([str(CART), str(tmp_path / "none.csv"), "-o", str(tmp_path / "out")]) == 2
-    assert "none.csv" in capsys.readouterr().err
+def test_misuse_ends_with_a_sentence(tmp_path: Path) -> None:
+    misused(run("export-sysid", CART, tmp_path / "none.csv", "-o", tmp_path / "out"), "none.csv")
     assert not (tmp_path / "out").exists()
 
 
 def test_without_the_extra_it_says_how_to_get_it(
-    script: ModuleType,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(sysid, "ModelSequences", raising=False)
-    assert (
-        script.main([str(CART), str(tmp_path / "recording.csv"), "-o", str(tmp_path / "out")]) == 2
-    )
-    assert "pip install 'mjfim[sysid]'" in capsys.readouterr().err
+    words = (CART, tmp_path / "recording.csv", "-o", tmp_path / "out")
+    misused(run("export-sysid", *words), "pip install 'mjfim[sysid]'")
     assert not (tmp_path / "out").exists()

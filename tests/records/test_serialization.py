@@ -236,7 +236,7 @@ def test_a_campaign_is_loaded_as_it_was(task: DesignTask, tmp_path: Path) -> Non
     def measure(design: Design, number: int) -> Recording | None:
         return mjfim.simulate(wanted, design.trajectory, seed=0) if number == 1 else None
 
-    campaign = mjfim.sequential(wanted, measure, rounds=2)
+    campaign = mjfim.run_campaign(wanted, measure, rounds=2)
     assert len(campaign.rounds) == 1 and campaign.pending is not None
     round_trip(campaign, tmp_path)
 

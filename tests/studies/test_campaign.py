@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import json
 import shutil
-import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from typer.testing import Result
 
 import mjfim
 from mjfim.arrays import Array
@@ -28,11 +25,11 @@ from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import restated
+from tests.support.cli import read, run
 from tests.support.numerics import cart_task
 from tests.support.paths import MODELS
 
-SCRIPTS = MODELS.parent / "scripts"
-loop = importlib.import_module("mjfim.studies.campaign")  # `mjfim.sequential` is the function
+loop = importlib.import_module("mjfim.studies.campaign")  # `mjfim.run_campaign` is the function
 STUDY = mjfim.Experiment.from_file(
     MODELS / "cart_pendulum_guess.toml"
 ).replace(  # its guesses are 25 to 40 % off
@@ -64,7 +61,7 @@ def with_model(folder: Path, old: str, new: str) -> mjfim.Experiment:
 @pytest.fixture(scope="module")
 def campaign() -> Campaign:
     """From the wrong guess to what is wanted."""
-    return mjfim.sequential(STUDY, robot)
+    return mjfim.run_campaign(STUDY, robot)
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +173,7 @@ def test_friction_that_the_model_has_not_is_not_silent(tmp_path: Path) -> None:
     """Formally as good as wanted, and wrong by many sigma: not reached."""
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1.0"/>')
     easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
-    found = mjfim.sequential(
+    found = mjfim.run_campaign(
         easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=2
     )
     assert found.estimate is not None and found.estimate.misfit
@@ -187,7 +184,7 @@ def test_friction_that_the_model_has_not_is_not_silent(tmp_path: Path) -> None:
 def test_friction_too_weak_for_chi_squared_shows_in_successive_residuals(tmp_path: Path) -> None:
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" damping="0.5"/>')
     easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
-    found = mjfim.sequential(
+    found = mjfim.run_campaign(
         easy, lambda d, k: mjfim.simulate(rough, d.trajectory, seed=k), rounds=1
     )
     assert found.estimate is not None and found.estimate.misfit
@@ -214,7 +211,7 @@ def test_a_round_that_tells_nothing_is_named(campaign: Campaign) -> None:
         ),
         EarlierRound(recordings=(start,)),
     ]
-    found = mjfim.sequential(STUDY, never, rounds=2, done=done)
+    found = mjfim.run_campaign(STUDY, never, rounds=2, done=done)
     assert found.status is CampaignStatus.EXHAUSTED and not found.reached
     assert any("round 2: no progress" in sentence for sentence in found.warnings)
     assert "wanted 0.008" in found.short and "wanted 0.008" in str(found)
@@ -234,7 +231,7 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
         ),
         EarlierRound(recordings=(second,)),
     ]
-    found = mjfim.sequential(STUDY, never, rounds=2, done=done)
+    found = mjfim.run_campaign(STUDY, never, rounds=2, done=done)
     assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
 
 
@@ -249,7 +246,7 @@ def test_what_is_recorded_already_is_not_done_again(campaign: Campaign) -> None:
             control=first.control,
         )
     ]
-    found = mjfim.sequential(STUDY, lambda design, number: None, done=done)
+    found = mjfim.run_campaign(STUDY, lambda design, number: None, done=done)
     assert found.status is CampaignStatus.WAITING and found.pending is not None
     np.testing.assert_allclose(found.pending.trajectory.ctrl, campaign.rounds[1].control, atol=1e-6)
     np.testing.assert_allclose(found.pending.theta, campaign.rounds[1].theta, rtol=1e-9)
@@ -261,7 +258,7 @@ def test_interrupted_while_recording(campaign: Campaign) -> None:
             raise KeyboardInterrupt
         return robot(design, number)
 
-    found = mjfim.sequential(STUDY, stop)
+    found = mjfim.run_campaign(STUDY, stop)
     assert (
         found.status is CampaignStatus.INTERRUPTED
         and len(found.rounds) == 1
@@ -277,7 +274,7 @@ def test_nothing_is_played_that_leaves_the_limits(
 ) -> None:
     outside = replace(campaign.designs[0], status=Status.INFEASIBLE)
     monkeypatch.setattr(loop, "design_task", lambda *args, **kwargs: outside)
-    found = mjfim.sequential(STUDY, never)
+    found = mjfim.run_campaign(STUDY, never)
     assert (
         found.status is CampaignStatus.INFEASIBLE and found.pending is outside and not found.rounds
     )
@@ -303,7 +300,7 @@ def test_without_a_design_at_the_estimate_the_last_place_serves(
             control=first.control,
         )
     ]
-    found = mjfim.sequential(STUDY, robot, rounds=2, done=done)
+    found = mjfim.run_campaign(STUDY, robot, rounds=2, done=done)
     np.testing.assert_array_equal(asked, [first.estimate.theta, first.theta])
     assert any("no design at the estimate" in w and "too fast" in w for w in found.warnings)
 
@@ -326,7 +323,7 @@ def test_each_recording_has_its_own_start() -> None:
         )
         return mjfim.simulate(there, design.trajectory, seed=number)
 
-    found = mjfim.sequential(loose, displaced, rounds=2)
+    found = mjfim.run_campaign(loose, displaced, rounds=2)
     last = found.rounds[-1]
     j = last.estimate.parameters.index("initial qpos:slide")
     assert not last.estimate.data[j].any()
@@ -343,7 +340,7 @@ def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: DesignTask
         descent={"max_iterations": 15},
         parameters={name: {"wanted": 1e-4} for name in "mlc"},
     )
-    found = mjfim.sequential(limited, robot, rounds=2)
+    found = mjfim.run_campaign(limited, robot, rounds=2)
     assert len(found.rounds) == 2 and found.status is CampaignStatus.EXHAUSTED
     for design in found.designs:
         assert min(design.limits.values()) >= 0.0
@@ -353,11 +350,11 @@ def test_hard_limits_hold_in_every_round_and_the_redesign_pays(truth: DesignTask
 def test_faulty_requests_say_what_is_right(tmp_path: Path) -> None:
     plain = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     with pytest.raises(ExperimentError, match=r"parameters\.m\.wanted"):
-        mjfim.sequential(plain, never)
+        mjfim.run_campaign(plain, never)
     with pytest.raises(ExperimentError, match="recordings alone"):
-        mjfim.sequential(STUDY.replace(earlier=("design.json",)), never)
+        mjfim.run_campaign(STUDY.replace(earlier=("design.json",)), never)
     with pytest.raises(ExperimentError, match="0 rounds"):
-        mjfim.sequential(STUDY, never, rounds=0)
+        mjfim.run_campaign(STUDY, never, rounds=0)
 
 
 def test_what_no_round_can_tell_is_said_before_anything_moves() -> None:
@@ -371,20 +368,7 @@ def test_what_no_round_can_tell_is_said_before_anything_moves() -> None:
         descent={"max_iterations": 2},
     )
     with pytest.raises(UnidentifiableError, match=r"cart, rotor can be reached.*cart \+ rotor"):
-        mjfim.sequential(both, never)
-
-
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """scripts/sequential.py."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    spec = importlib.util.spec_from_file_location("sequential_script", SCRIPTS / "sequential.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    yield module
-    for name in ("sequential_folder", "sequential_picture"):
-        sys.modules.pop(name, None)
+        mjfim.run_campaign(both, never)
 
 
 def write_study(folder: Path) -> Path:
@@ -406,52 +390,42 @@ def write_study(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_round_by_round_is_the_simulated_campaign(
-    tmp_path: Path,
-    script: ModuleType,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    """Calls that know of each other by the folder alone design and estimate the same; then the misuses."""
+def test_round_by_round_is_the_simulated_campaign(tmp_path: Path) -> None:
+    """Calls that share nothing but the folder design and estimate as one call does; misuse is named."""
     study = write_study(tmp_path)
     together, apart = tmp_path / "together", tmp_path / "apart"
 
-    def call(*words: object) -> int:
-        monkeypatch.setattr(
-            sys, "argv", ["sequential.py", str(study), *(str(word) for word in words)]
-        )
-        return int(script.main())
+    def call(*words: object, code: int) -> Result:
+        """Run the verb on the study."""
+        result = run("campaign", study, *words)
+        assert result.exit_code == code, result.stderr
+        return result
 
     wanted = ("--wanted", 0.0055)
-    assert call("-o", together, *wanted, "--seed", 5) == 0
-    first = json.loads((together / "campaign.json").read_text(encoding="utf-8"))
+    call("-o", together, *wanted, "--seed", 5, code=0)
+    first = read(together / "campaign.json")
     assert first["reached"] and len(first["rounds"]) >= 2
-    assert (together / "campaign.png").stat().st_size > 10_000 and (
-        together / "identified.xml"
-    ).is_file()
-    assert call("-o", apart, *wanted, "--real") == 1
-    files: list[Path] = []
+    assert (together / "campaign.png").stat().st_size > 10_000
+    assert (together / "identified.xml").is_file()
+
+    shown = call("-o", apart, *wanted, "--real", code=1)
+    files: list[object] = []
     for k in range(1, len(first["rounds"]) + 1):
-        assert f"round_{k}/design.csv" in capsys.readouterr().out.replace("\n", "")
-        if k == 1:
-            assert call("-o", apart, *wanted, "--real") == 1, "asked again, it still waits"
-        files.append(together / f"round_{k}" / "recording.csv")
-        capsys.readouterr()
-        code = call(
-            "-o", apart, *wanted, "--recordings", *files
-        )  # what is known already does no harm
-        assert code == (0 if k == len(first["rounds"]) else 1)
-    second = json.loads((apart / "campaign.json").read_text(encoding="utf-8"))
-    assert (
-        second["reached"]
-        and not second["simulated"]
-        and len(second["rounds"]) == len(first["rounds"])
-    )
+        assert f"round_{k}/design.csv" in shown.stdout.replace("\n", "")
+        if k == 1:  # asked again, it still waits
+            call("-o", apart, *wanted, "--real", code=1)
+
+        # Recordings that are in the folder already do no harm.
+        files += ["--recordings", together / f"round_{k}" / "recording.csv"]
+        shown = call("-o", apart, *wanted, *files, code=0 if k == len(first["rounds"]) else 1)
+
+    second = read(apart / "campaign.json")
+    assert second["reached"]
+    assert not second["simulated"]
+    assert len(second["rounds"]) == len(first["rounds"])
     for one, other in zip(first["rounds"], second["rounds"], strict=True):
         for key in ("theta", "std", "predicted", "designed_at"):
             np.testing.assert_allclose(one[key], other[key], rtol=1e-6)
-    capsys.readouterr()
-    assert call("-o", together, *wanted) == 2
-    assert "--real" in capsys.readouterr().err
-    assert call("-o", tmp_path / "none", "--real") == 2
-    assert "wanted" in capsys.readouterr().err
+
+    assert "--real" in call("-o", together, *wanted, code=2).stderr
+    assert "wanted" in call("-o", tmp_path / "none", "--real", code=2).stderr

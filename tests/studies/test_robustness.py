@@ -1,14 +1,10 @@
-"""design.csv and reference.csv as a controller plays them, and the script that plays them on robots that are not the model."""
+"""design.csv and reference.csv as a controller plays them, and robots that differ from the model."""
 
 from __future__ import annotations
 
 import csv
 import json
-import sys
-from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import mujoco
@@ -17,7 +13,7 @@ import pytest
 from scipy.stats import binom
 
 import mjfim
-from mjfim.errors import ExperimentError, RecordingError
+from mjfim.errors import ExperimentError, NoResultError, RecordingError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.initial_controls import control_of_earlier_design
 from mjfim.excitation.task import DesignTask
@@ -25,11 +21,13 @@ from mjfim.model.coordinates import tangent_names
 from mjfim.optimize.lq import regulator
 from mjfim.output import archive
 from mjfim.output.playback import design_columns, reference_columns, simulate_playback
+from mjfim.output.summaries import robustness_sentences
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.playback import Playback
-from tests.support.cli import run_script
+from mjfim.records.robustness import RobotConditions, Robustness
+from mjfim.studies.robustness import RobotBench, summarize_runs
+from tests.support.cli import misused, run
 from tests.support.numerics import Array, body_task, cart_task, filtered_task
-from tests.support.paths import ROOT
 
 FILTERED_FINE = {"rate": 50.0, "playback_rate": 100.0}  # of an engine at 200 Hz
 COARSE = {"rate": 25.0, "horizon": 0.8}  # of engines at 100 Hz
@@ -178,7 +176,7 @@ def test_gain_columns_name_what_they_act_on(tmp_path: Path) -> None:
     body = BUILD["body"](tmp_path)
     parts = ["x", "y", "z", "rx", "ry", "rz"]
     wanted = [f"float.{p}" for p in parts] + [f"ball.{p}" for p in parts[3:]]
-    assert list(tangent_names(body.model)) == [
+    assert list(tangent_names(body.system.model)) == [
         f"{kind}:{name}" for kind in ("qpos", "qvel") for name in wanted
     ]
     rows = table(written(body, tmp_path)[0])
@@ -257,7 +255,7 @@ def test_a_table_is_read_as_it_was_written(tmp_path: Path) -> None:
     """All digits of states, controls and gains, whatever the rate."""
     task = BUILD["body"](tmp_path, playback_rate=50.0)
     path, played = written(task, tmp_path)
-    found = read_playback(path, BUILD["body"](tmp_path).channels)
+    found = read_playback(path, BUILD["body"](tmp_path).system.channels)
     for name in ("t", "state", "ctrl", "gain"):
         np.testing.assert_array_equal(getattr(found, name), getattr(played, name))
     assert found.period == pytest.approx(0.02, rel=1e-12)
@@ -302,20 +300,6 @@ def test_a_damaged_table_is_refused(column: str, wrong: Any, words: str, tmp_pat
     change(path, **{column: None if wrong is None else wrong(table(path)[column])})
     with pytest.raises(RecordingError, match=words):
         read_playback(path, task.system.channels)
-
-
-@pytest.fixture(scope="module")
-def robots() -> Iterator[ModuleType]:
-    """scripts/playback_robots.py"""
-    sys.path.insert(0, str(ROOT / "scripts"))
-    yield import_module("playback_robots")
-    sys.path.remove(str(ROOT / "scripts"))
-
-
-@pytest.fixture(scope="module")
-def verdict(robots: ModuleType) -> ModuleType:
-    """scripts/playback_verdict.py"""
-    return import_module("playback_verdict")
 
 
 CART = """
@@ -364,16 +348,16 @@ limits.velocity = {{ slide = 4.0, hinge = 9.0 }}
     return experiment, written(task, home)[0]
 
 
-def bench_of(robots: ModuleType, cart: tuple[mjfim.Experiment, Path], **conditions: Any) -> Any:
-    return robots.Bench(*cart, robots.Conditions(**{"latency": 0.015, **conditions}))
+def bench_of(cart: tuple[mjfim.Experiment, Path], **conditions: Any) -> Any:
+    return RobotBench(*cart, RobotConditions(**{"latency": 0.015, **conditions}))
 
 
 @pytest.mark.parametrize("feedback", [False, True])
 def test_a_robot_is_what_a_bare_loop_says(
-    robots: ModuleType, cart: tuple[mjfim.Experiment, Path], feedback: bool
+    cart: tuple[mjfim.Experiment, Path], feedback: bool
 ) -> None:
     """Wrong parameters written by hand, commands three steps late, limits at every engine step, noisy feedback."""
-    bench = bench_of(robots, cart, feedback=feedback)
+    bench = bench_of(cart, feedback=feedback)
     rng = np.random.default_rng(3)
     noise = bench.task.system.noise.sample(len(bench.plan.t), rng)
     stands = ("initial qpos:slide", "initial qpos:hinge") if feedback else ("initial qpos:hinge",)
@@ -420,10 +404,10 @@ def test_a_robot_is_what_a_bare_loop_says(
 @pytest.mark.parametrize("feedback", [False, True])
 @pytest.mark.parametrize("latency", [0.0, 0.005, pytest.param(0.02, marks=pytest.mark.slow)])
 def test_without_noise_the_truth_is_found(
-    robots: ModuleType, cart: tuple[mjfim.Experiment, Path], feedback: bool, latency: float
+    cart: tuple[mjfim.Experiment, Path], feedback: bool, latency: float
 ) -> None:
     """A late control is a late measurement, exactly; with feedback as well."""
-    bench = bench_of(robots, cart, feedback=feedback, latency=latency, loudness=0.0)
+    bench = bench_of(cart, feedback=feedback, latency=latency, loudness=0.0)
     for number in range(3):
         run = bench.run(number)
         off = run.theta[:3] / bench.task.parameters.guess[:3]
@@ -437,23 +421,19 @@ RUNS, FEW = 30, 12
 
 
 def judged(
-    robots: ModuleType,
-    verdict: ModuleType,
     cart: tuple[mjfim.Experiment, Path],
     runs: int = RUNS,
     **conditions: Any,
 ) -> Any:
-    bench = bench_of(robots, cart, **conditions)
-    return verdict.judge(bench, [bench.run(number) for number in range(runs)])
+    bench = bench_of(cart, **conditions)
+    return summarize_runs(bench, [bench.run(number) for number in range(runs)])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("feedback", [False, True])
-def test_intervals_hold_the_truth(
-    robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path], feedback: bool
-) -> None:
+def test_intervals_hold_the_truth(cart: tuple[mjfim.Experiment, Path], feedback: bool) -> None:
     """As often as 95 % intervals should, alone and jointly; errors are as large as was predicted."""
-    found = judged(robots, verdict, cart, feedback=feedback)
+    found = judged(cart, feedback=feedback)
     least = binom.ppf(1e-3, RUNS, 0.95)
     assert found.inside.min() >= least
     assert min(found.joint) >= least
@@ -466,80 +446,82 @@ def test_intervals_hold_the_truth(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["noise", "delay"])
-def test_the_check_can_fail(
-    robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path], fault: str
-) -> None:
+def test_the_check_can_fail(cart: tuple[mjfim.Experiment, Path], fault: str) -> None:
     """Noise three times as loud as stated, or a latency that is believed to be known: intervals no longer hold the truth."""
     experiment, path = cart
     if fault == "delay":
-        found = judged(robots, verdict, (experiment.replace(nuisance={"delay": 1e-5}), path), FEW)
+        found = judged((experiment.replace(nuisance={"delay": 1e-5}), path), FEW)
     else:
-        found = judged(robots, verdict, cart, FEW, loudness=3.0)
+        found = judged(cart, FEW, loudness=3.0)
     assert not found.covered and not found.ok
     assert found.inside.min() < binom.ppf(1e-3, FEW, 0.95)
     assert found.misfits > 0.9 * FEW
 
 
 @pytest.mark.slow
-def test_limits_that_the_plan_uses_up_are_missed(
-    robots: ModuleType, verdict: ModuleType, cart: tuple[mjfim.Experiment, Path]
-) -> None:
-    """The script says by how much, and what reserve would have held."""
+def test_limits_that_the_plan_uses_up_are_missed(cart: tuple[mjfim.Experiment, Path]) -> None:
+    """The conclusions say by how much, and which reserve would have been enough."""
     experiment, path = cart
-    plenty = bench_of(robots, cart)
+    plenty = bench_of(cart)
     planned = dict(zip([(i.kind, i.name) for i in plenty.limits], plenty.planned(), strict=True))
     fastest = 9.0 * (1.0 - planned["velocity", "hinge"])
     tight = (
         experiment.replace(limits={"velocity": {"slide": 4.0, "hinge": 1.0001 * fastest}}),
         path,
     )
-    found = judged(robots, verdict, tight)
+    found = judged(tight)
     assert found.inside.min() >= binom.ppf(1e-3, RUNS, 0.95) and not found.ok
     assert 0 < found.all_kept < RUNS
-    words = " ".join(verdict.conclusions(found))
+    words = " ".join(robustness_sentences(found))
     assert "velocity of hinge is exceeded by up to" in words
     share = found.reserve()["velocity"]
     roomy = (
         experiment.replace(limits={"velocity": {"slide": 4.0, "hinge": fastest / (1.0 - share)}}),
         path,
     )
-    assert judged(robots, verdict, roomy).all_kept == RUNS
+    assert judged(roomy).all_kept == RUNS
 
 
-def test_a_start_on_the_move_takes_no_latency(robots: ModuleType, tmp_path: Path) -> None:
+def test_a_start_on_the_move_takes_no_latency(tmp_path: Path) -> None:
     """What was before the start would matter; without a latency it can be played."""
     task = BUILD["cart"](tmp_path, playback_rate=50.0)
     path, _ = written(task, tmp_path)
     with pytest.raises(ExperimentError, match=r"no control holds the initial state.*--latency 0"):
-        robots.Bench(task.experiment, path, robots.Conditions(latency=0.01))
-    bench = robots.Bench(task.experiment, path, robots.Conditions(latency=0.0, loudness=0.0))
+        RobotBench(task.experiment, path, RobotConditions(latency=0.01))
+    bench = RobotBench(task.experiment, path, RobotConditions(latency=0.0, loudness=0.0))
     run = bench.run(0)
     np.testing.assert_allclose(run.estimate, run.theta, rtol=0, atol=float((1e-3 * run.std).max()))
     with pytest.raises(ExperimentError, match="whole number of timesteps"):
-        robots.Bench(task.experiment, path, robots.Conditions(latency=0.005))
+        RobotBench(task.experiment, path, RobotConditions(latency=0.005))
 
 
-def test_the_script_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: Path) -> None:
-    """Tables, sentences, JSON, a picture; in processes of its own."""
+def test_the_verb_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: Path) -> None:
+    """Tables and sentences on stdout, JSON and a figure in the folder; robots in processes."""
     experiment, path = cart
-    done = run_script(
-        "playback.py",
-        experiment.source,
-        path.parent,
-        "--runs",
-        6,
-        "--jobs",
-        2,
-        "-o",
-        tmp_path / "out",
-    )
+    words = ("--runs", 6, "--jobs", 2, "-o", tmp_path / "out")
+    done = run("robustness", experiment.source, path.parent, *words)
     found = json.loads((tmp_path / "out" / "playback.json").read_text(encoding="utf-8"))
-    assert done.returncode == (0 if found["ok"] else 1), done.stderr
+    assert done.exit_code == (0 if found["ok"] else 1), done.stderr
     assert (tmp_path / "out" / "playback.png").read_bytes()[:4] == b"\x89PNG"
     assert found["runs"] == 6 and len(found["parameters"]) == 5
     assert found["conditions"]["latency"] == 0.005
     assert {row["kind"] for row in found["limits"]} == {"velocity", "control"}
     assert "Does information arrive? 6 robots" in done.stdout
+
+    loaded = Robustness.load(tmp_path / "out")
+    assert loaded.summary()["limits"] == found["limits"]
+
+
+def test_a_stopped_study_keeps_the_robots_that_are_done(
+    cart: tuple[mjfim.Experiment, Path],
+) -> None:
+    """A token that is set before the first robot leaves no result; one that is set after it leaves that robot."""
+    stop = mjfim.StopToken()
+    options = {"runs": 3, "processes": 1}
+    result = mjfim.assess_robustness(*cart, callback=lambda _: stop.request(), stop=stop, **options)
+    assert result.runs == 1
+    with pytest.raises(NoResultError):
+        mjfim.assess_robustness(*cart, stop=stop, **options)
 
 
 @pytest.mark.parametrize(
@@ -554,7 +536,4 @@ def test_misuse_is_one_sentence(
 ) -> None:
     experiment, path = cart
     folder = [path.parent] if "--latency" in words else []
-    done = run_script("playback.py", experiment.source, *folder, *words, "-o", tmp_path)
-    assert done.returncode == 2
-    assert said in done.stdout.replace("\n", " ")
-    assert "Traceback" not in done.stderr
+    misused(run("robustness", experiment.source, *folder, *words, "-o", tmp_path), said)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
+import importlib
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -142,15 +141,7 @@ def test_half_the_sample_period_changes_neither_cost_nor_iteration_count(
 def peer() -> ModuleType:
     """The benchmark's CasADi solvers on the hand-derived model."""
     pytest.importorskip("casadi", reason="casadi is a development dependency")
-    spec = importlib.util.spec_from_file_location(
-        "casadi_peer", ROOT / "scripts" / "casadi_peer.py"
-    )
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["casadi_peer"] = module
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module("scripts.benchmarks.casadi_peer")
 
 
 @pytest.mark.parametrize("case", [pytest.param("b", marks=pytest.mark.slow), "c"])

@@ -5,6 +5,7 @@ Only the modules of this package import matplotlib.
 
 from __future__ import annotations
 
+from mjfim.output.plots.campaign import campaign_figure
 from mjfim.output.plots.check import check_figure
 from mjfim.output.plots.compare import compare_figure
 from mjfim.output.plots.design import convergence, sensitivity_phase, trajectories
@@ -13,10 +14,12 @@ from mjfim.output.plots.monte_carlo import histogram
 from mjfim.output.plots.parameters import parameter_intervals, std_bars
 from mjfim.output.plots.recording_fit import fit
 from mjfim.output.plots.residuals import predictions, residual_spectra
+from mjfim.output.plots.robustness import robustness_figure
 from mjfim.output.plots.style import save
 from mjfim.output.plots.tables import design_table, study_table
 
 __all__ = [
+    "campaign_figure",
     "check_figure",
     "compare_figure",
     "convergence",
@@ -27,6 +30,7 @@ __all__ = [
     "parameter_intervals",
     "predictions",
     "residual_spectra",
+    "robustness_figure",
     "save",
     "sensitivity_phase",
     "std_bars",

@@ -1,16 +1,16 @@
 """Where the time goes, as ratios inside one run: mjfim against the engine, against CasADi, against its own metric descent.
 
-    python scripts/benchmark.py                  # all tables, some minutes
-    python scripts/benchmark.py --quick          # case a only, few trials
-    python scripts/benchmark.py --markdown FILE  # the same tables for the README
+    python -m scripts.benchmarks benchmark                  # all tables, some minutes
+    python -m scripts.benchmarks benchmark --quick          # case a only, few trials
+    python -m scripts.benchmarks benchmark --markdown FILE  # the same tables for the README
 
 (a) wall time of a design over MuJoCo steps taken x time of one `mj_step` in C / threads
 (b) time until J is within 1e-6 (relative) of the best J of all solvers, beside CasADi on the hand-derived model
 (c) iterations and time beside the paper's metric descent, to the same J
 (d) 1500 Monte-Carlo trials at 100 Hz
-(e) seconds per iteration by number of parameters on a seven-joint arm, where its model is at hand (benchmark_arm.py)
-(f) the hard-limited design beside CasADi + IPOPT with many starts, the same seconds for both (benchmark_limits.py)
-(g) an hour of two joints at 1 kHz read and fitted, over bare engine time (benchmark_hour.py)
+(e) seconds per iteration by number of parameters on a seven-joint arm, where its model is at hand (benchmark_arm)
+(f) the hard-limited design beside CasADi + IPOPT with many starts, the same seconds for both (benchmark_limits)
+(g) an hour of two joints at 1 kHz read and fitted, over bare engine time (benchmark_hour)
 """
 
 from __future__ import annotations
@@ -23,12 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import benchmark_arm
-import benchmark_hour
-import benchmark_limits
 import mujoco
 import numpy as np
-from aside import aside
 from rich.console import Console
 from rich.table import Table
 
@@ -38,11 +34,13 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
 from mjfim.records.design import Design
+from scripts.benchmarks import benchmark_arm, benchmark_hour, benchmark_limits
+from scripts.benchmarks.run_in_subprocess import run_in_subprocess
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXPERIMENT = ROOT / "models" / "cart_pendulum.toml"
 PEERS = """
-import casadi_peer as p
+from scripts.benchmarks import casadi_peer as p
 found = []
 for use_c in (True, False):
     built = p.problem(use_c)
@@ -135,7 +133,7 @@ def mjfim_run(case: str, name: str, **descent: Any) -> tuple[Run, Design]:
 
 def peer_runs(cases: Iterable[str], repeats: int) -> list[Run]:
     """CasADi's; none where it is missing."""
-    rows = aside(PEERS, repeats, "".join(cases))
+    rows = run_in_subprocess(PEERS, repeats, "".join(cases))
     return [
         Run(**{**row, "history": tuple((t, J) for t, J in row["history"])}) for row in rows or ()
     ]
@@ -355,7 +353,3 @@ def main() -> None:
     console.print(tables[-1])
     if args.markdown:
         args.markdown.write_text(markdown(tables, verdicts, threads), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

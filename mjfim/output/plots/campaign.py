@@ -1,4 +1,4 @@
-"""The picture of a campaign: what every round told of each parameter, against what is wanted and what is true."""
+"""Figure of a campaign: estimates after every round beside target accuracies and true values."""
 
 from __future__ import annotations
 
@@ -8,17 +8,26 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from mjfim.excitation.task import DesignTask
+from mjfim.model.parameters import ParameterSet
 from mjfim.output.plots import style
 from mjfim.records.campaign import Campaign
 
-SHOWN = 8  # parameters, the wanted ones first
+# Largest number of parameters that are drawn; those with a target accuracy come first.
+MAX_PARAMETERS = 8
 
 
-def figure(campaign: Campaign, task: DesignTask, simulated: bool) -> Figure:
-    """Of each parameter: σ over the rounds against the wanted one, and the estimate, against the truth where it is known."""
-    p = task.parameters
-    order = sorted(p.interest.tolist(), key=lambda j: not np.isfinite(campaign.wanted[j]))[:SHOWN]
+def campaign_figure(campaign: Campaign, parameters: ParameterSet, *, simulated: bool) -> Figure:
+    """Draw standard deviation and estimate of each parameter over the rounds.
+
+    Args:
+        campaign: The campaign.
+        parameters: The parameters of the experiment.
+        simulated: True where the true values are known.
+    """
+    p = parameters
+    order = sorted(p.interest.tolist(), key=lambda j: not np.isfinite(campaign.wanted[j]))[
+        :MAX_PARAMETERS
+    ]
     new = style.new_figure(9.0, 1.2 + 1.75 * len(order))
     panels = new.subplots(len(order), 2, squeeze=False, sharex=True)
     for row, j in enumerate(order):
@@ -42,7 +51,7 @@ def figure(campaign: Campaign, task: DesignTask, simulated: bool) -> Figure:
             marker="o",
             mfc="white",
             linestyle="",
-            label="promised before the round",
+            label="predicted before the round",
         ),
         Line2D(
             [], [], color=style.OPTIMIZED_COLOUR, marker="o", label="after it, from all recordings"
@@ -58,13 +67,14 @@ def figure(campaign: Campaign, task: DesignTask, simulated: bool) -> Figure:
 
 
 def _draw_std(axes: Axes, campaign: Campaign, j: int) -> None:
+    """Draw predicted and formal standard deviations of parameter j over the rounds."""
     number = np.array([r.number for r in campaign.rounds])
-    promised = np.array([r.predicted[j] for r in campaign.rounds])
+    predicted = np.array([r.predicted[j] for r in campaign.rounds])
     after = np.array([r.attained[j] for r in campaign.rounds])
     axes.set_yscale("log")
     axes.plot(
         number,
-        promised,
+        predicted,
         color=style.INITIAL_COLOUR,
         marker="o",
         mfc="white",
@@ -74,7 +84,7 @@ def _draw_std(axes: Axes, campaign: Campaign, j: int) -> None:
     )
     axes.plot(number, after, color=style.OPTIMIZED_COLOUR, marker="o", markersize=4, zorder=3)
     aim = float(campaign.wanted[j])
-    values = np.concatenate([promised, after, [aim]])
+    values = np.concatenate([predicted, after, [aim]])
     values = values[np.isfinite(values) & (values > 0.0)]
     if len(values):
         axes.set_ylim(values.min() / 1.5, values.max() * 1.5)
@@ -92,13 +102,13 @@ def _draw_std(axes: Axes, campaign: Campaign, j: int) -> None:
             color=style.TEXT_COLOUR,
         )
     low, high = axes.get_ylim()
-    axes.set_yticks(_marks(low, high))
+    axes.set_yticks(_tick_values(low, high))
     axes.yaxis.set_major_formatter(lambda value, _: style.format_number(float(value), 1))
     axes.minorticks_off()
 
 
-def _marks(low: float, high: float) -> list[float]:
-    """Round numbers on a logarithmic axis: as many as it takes for two at least."""
+def _tick_values(low: float, high: float) -> list[float]:
+    """Round numbers on a logarithmic axis, so dense that at least two lie within its limits."""
     powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
     found: list[float] = []
     for digits in ((1,), (1, 3), (1, 2, 5), (1, 2, 3, 4, 6, 8)):
@@ -110,6 +120,7 @@ def _marks(low: float, high: float) -> list[float]:
 
 
 def _draw_estimate(axes: Axes, campaign: Campaign, j: int, true: float | None) -> None:
+    """Draw the estimates of parameter j over the rounds, with the true value where it is known."""
     number = np.array([r.number for r in campaign.rounds])
     theta = np.array([r.estimate.theta[j] for r in campaign.rounds])
     std = np.array([r.attained[j] for r in campaign.rounds])

@@ -1,6 +1,6 @@
 """Does identification keep its word? Many recordings of a simulated robot, fitted without knowing what was done to them.
 
-    python scripts/prove_identification.py [--runs 200] [--seed 0] [-o FILE.json]
+    python -m scripts.benchmarks prove_identification [--runs 200] [--seed 0] [-o FILE.json]
 
 The robot is the cart-pendulum on the designed control, stepped at 2 kHz. Its controller ticks with 2 ms of jitter and logs at its
 own ticks; what it logs is read 10 ms late, with noise and constant biases; it starts somewhere else than stated. Fitted are the
@@ -33,7 +33,7 @@ from mjfim.identification.identify import identify_system
 from mjfim.parallel import cores
 from mjfim.records.recording import Recording
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 STEP = 0.0005  # [s] of the robot
 JITTER, LATE, OFF = (
     0.002,
@@ -193,7 +193,3 @@ def main() -> int:
         with replacing(args.output) as temporary:
             temporary.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
     return 0 if min(shares.values()) >= 0.9 and caught >= 0.95 else 1
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

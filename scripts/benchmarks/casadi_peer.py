@@ -11,7 +11,7 @@ functions run in CasADi's virtual machine, slower but with equal results.  The p
 spend most of its time in threads that wait for each other if OpenBLAS may use several, so this file asks for one
 thread, which only works if it is imported before NumPy (or the variable is set outside).
 
-Usage:  python scripts/casadi_peer.py a c [--vm]
+Usage:  python -m scripts.benchmarks casadi_peer a c [--vm]
 """
 
 from __future__ import annotations
@@ -502,7 +502,3 @@ def main() -> None:
             counts = f"{run.iterations:4d}  {run.evaluations:4d}  {run.setup_seconds:7.3f}  {run.seconds:7.3f}"
             note = "" if run.converged else "  not converged"
             print(f"{name:4}  {run.name:15}  {run.J:15.9g}  {spectrum:>35}  {counts}{note}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """An hour of two joints at 1 kHz: 3.6 million samples are written as CSV, read and fitted by the command line.
 
-    python scripts/benchmark_hour.py [--hours 1.0] [--seed 0]
+    python -m scripts.benchmarks benchmark_hour [--hours 1.0] [--seed 0]
 
 Says how long reading and fitting took, beside the bare engine time of one rollout over all samples on as many threads, and how
 much memory the process had at most. The limits are 6 minutes and 3 GiB on two cores.
@@ -29,7 +29,7 @@ from mjfim.parallel import cores
 from mjfim.records.recording import Recording
 from mjfim.signals import multisine
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXPERIMENT = ROOT / "models" / "two_joint_arm.toml"
 READ = """
 import sys, time
@@ -195,7 +195,3 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     Console(width=160).print(hour_table(measured(args.hours, args.seed)), f"{cores()} cores")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,10 +1,10 @@
 """Two arms under hard limits: the design beside Fourier series with the same seconds on the same cores, as a table.
 
-    python scripts/arms_table.py FOLDER [--seconds 600] [--arms panda so_arm100] [--horizons 5 10] [--joints smooth dry]
-    python scripts/arms_table.py FOLDER --show        # the table of what was run so far
+    python -m scripts.benchmarks arms_table FOLDER [--seconds 600] [--arms panda so_arm100] [--horizons 5 10]
+    python -m scripts.benchmarks arms_table FOLDER --show        # the table of what was run so far
 
 Every case is run by `mjfim.compare` and kept in FOLDER as JSON; cases that are there already are left alone. The experiments
-are those of arms.py: from home, rest to rest, limits of position, velocity, force, control rate and distance. Among the
+are those of arms: from home, rest to rest, limits of position, velocity, force, control rate and distance. Among the
 design's own starts is a Fourier series of 15 harmonics; all methods use all cores, in as many processes.
 """
 
@@ -17,12 +17,13 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import arms
 from rich.console import Console
 
 import mjfim
+from mjfim.budget import stop_on_interrupt
 from mjfim.parallel import cores
 from mjfim.records.comparison import Comparison, MethodResult
+from scripts.benchmarks import arms
 
 FEW, MANY = ("fourier5", "fourier5-mjfim"), ("fourier15-mjfim",)
 PITCH = 0.2  # [Hz] of the series that is among the design's starts
@@ -62,8 +63,10 @@ class Case:
         return self.kept and self.gain >= WANTED and self.design <= self.many * (1.0 + 1e-3)
 
 
-def run(arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: Console) -> Case:
-    """Compare on one arm."""
+def run(
+    arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: Console
+) -> Case | None:
+    """Compare on one arm; None where the comparison was interrupted before the design."""
     stated = arms.experiment(arm, horizon, dry, args.folder / "models")
     experiment = stated.replace(descent={"fourier": [PITCH], "max_iterations": 100_000})
     with mjfim.Pool() as executor:
@@ -74,7 +77,7 @@ def run(arm: str, horizon: float, dry: bool, args: argparse.Namespace, console: 
         )
     ours = found.design
     if ours is None:
-        raise KeyboardInterrupt
+        return None
     kind, share = ours.tightest
     return Case(
         arm,
@@ -140,20 +143,22 @@ def main() -> None:
     parser.add_argument("--show", action="store_true", help="only print what was run so far")
     args = parser.parse_args()
     console, cases = Console(highlight=False, width=150), []
-    for arm, joints, horizon in itertools.product(args.arms, args.joints, args.horizons):
-        file = args.folder / f"{arm}_{joints}_{horizon:g}s.json"
-        if not file.is_file():
-            if args.show:
-                continue
-            console.print(f"{arm}, {joints}, {horizon:g} s")
-            args.folder.mkdir(parents=True, exist_ok=True)
-            case = run(arm, horizon, joints == "dry", args, console)
-            file.write_text(json.dumps(asdict(case)), encoding="utf-8")
-        cases.append(Case(**json.loads(file.read_text(encoding="utf-8"))))
+    with stop_on_interrupt() as stop:
+        for arm, joints, horizon in itertools.product(args.arms, args.joints, args.horizons):
+            file = args.folder / f"{arm}_{joints}_{horizon:g}s.json"
+            if not file.is_file():
+                if args.show or stop.requested:
+                    continue
+
+                console.print(f"{arm}, {joints}, {horizon:g} s")
+                args.folder.mkdir(parents=True, exist_ok=True)
+                case = run(arm, horizon, joints == "dry", args, console)
+                if case is None:
+                    continue
+                file.write_text(json.dumps(asdict(case)), encoding="utf-8")
+
+            cases.append(Case(**json.loads(file.read_text(encoding="utf-8"))))
+
     if cases:
         print(markdown(cases))
     sys.exit(0 if cases and all(case.met for case in cases) else 1)
-
-
-if __name__ == "__main__":
-    main()

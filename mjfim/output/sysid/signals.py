@@ -1,8 +1,9 @@
-"""Outputs of an experiment as signals of `mujoco.sysid`, and how measured and predicted ones are compared.
+"""Outputs of an experiment as signals of `mujoco.sysid`, and the comparison of measured and predicted signals.
 
-sysid stamps the sensor values of a step with the time after it, though they belong to the state before; states do not lag. So
-positions and velocities become state signals, and sensors are read one step earlier. sysid divides residuals by the norm of each
-measured signal, whatever its noise, and takes weights by name for sensors only; here they are whitened, or divided as sysid does.
+sysid stamps the sensor values of a step with the time after the step, though they belong to the state before it; states are not
+delayed. So positions and velocities become state signals, and sensors are read one step earlier. sysid divides residuals by the
+norm of each measured signal, whatever its noise, and takes weights by name for sensors only; here residuals are whitened, or
+divided in the manner of sysid.
 """
 
 from __future__ import annotations
@@ -16,20 +17,23 @@ from scipy.interpolate import CubicSpline
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
-from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
 from mjfim.plant.noise import Noise
 
-ON_STEP = 1e-6  # of an engine step: times that close to it are meant to be on it
+# Largest distance of a time from an engine step at which it counts as on that step [engine steps].
+ON_STEP_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class SignalLayout:
     """Columns of a sysid TimeSeries that holds the outputs of an experiment.
 
-    mapping: signal name -> (type, its columns), as sysid wants it
-    sensed: (c,) True for columns of sensors;  source: (c,) their place in sensordata or the state (qpos, qvel, act)
-    outputs: (ny,) column of each output of the experiment
-    shown: of the ny outputs alone, component by component; sysid's report cannot draw others
+    Attributes:
+        mapping: Type and columns of each signal by name, in the form that sysid takes.
+        sensed: (c,) True for columns of sensors.
+        source: (c,) place of each column in sensordata or in the state (qpos, qvel, act).
+        outputs: (ny,) column of each output of the experiment.
+        shown: Type and column of each of the ny outputs by name; sysid's report can draw single components only.
     """
 
     mapping: dict[str, tuple[Any, np.ndarray]]
@@ -39,20 +43,27 @@ class Layout:
     shown: dict[str, tuple[Any, np.ndarray]]
 
     @staticmethod
-    def of(task: DesignTask) -> Layout:
-        """Whole signals, also where some of their components are not measured. Raises ExperimentError."""
-        qpos, qvel, act, _ = sysid.TimeSeries.compute_all_state_mappings(task.system.model)
+    def of(system: System) -> SignalLayout:
+        """Lay out whole signals, also where some of their components are not measured.
+
+        Args:
+            system: The experiment.
+
+        Raises:
+            ExperimentError: An output belongs to a joint or body without a name.
+        """
+        qpos, qvel, act, _ = sysid.TimeSeries.compute_all_state_mappings(system.model)
         wholes = {
             False: qpos | qvel | act,
-            True: sysid.TimeSeries.compute_all_sensor_mapping(task.system.model),
+            True: sysid.TimeSeries.compute_all_sensor_mapping(system.model),
         }
         mapping: dict[str, tuple[Any, np.ndarray]] = {}
         columns: list[tuple[bool, int]] = []
         sought = [
             (o.sensor is not None, o.state if o.sensor is None else o.sensor)
-            for o in task.system.outputs.outputs
+            for o in system.outputs.outputs
         ]
-        for output, (sensed, place) in zip(task.system.outputs.outputs, sought, strict=True):
+        for output, (sensed, place) in zip(system.outputs.outputs, sought, strict=True):
             hits = [name for name, (_, indices) in wholes[sensed].items() if place in indices]
             if not hits or hits[0] in ("_qpos", "_qvel"):
                 raise ExperimentError(
@@ -68,7 +79,7 @@ class Layout:
             for name, (kind, indices) in mapping.items()
             for k, column in enumerate(indices)
         }
-        return Layout(
+        return SignalLayout(
             mapping,
             np.array([sensed for sensed, _ in columns], dtype=bool),
             np.array([place for _, place in columns], dtype=np.intp),
@@ -77,21 +88,29 @@ class Layout:
         )
 
     def series(self, t: Array, y: Array) -> Any:
-        """TimeSeries of outputs: (M, ny), NaN where not measured."""
+        """Return outputs as a TimeSeries of sysid.
+
+        Args:
+            t: (M,) times [s].
+            y: (M, ny) outputs [y-unit]; NaN where not measured.
+        """
         data = np.full((len(t), len(self.source)), np.nan)
         data[:, self.outputs] = y
         return sysid.TimeSeries(np.array(t), data, self.mapping)
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
-    """Measured against predicted, `modify_residual` of sysid. h: engine timestep [s]
+class WhitenedComparison:
+    """Residuals of measured and predicted outputs, in the form of `modify_residual` of sysid.
 
-    noise: whitens; None: each signal is divided by its measured norm, as sysid does
+    Attributes:
+        layout: Columns of the signals.
+        timestep: Timestep of the engine [s].
+        noise: Noise that whitens the residuals; None where each signal is divided by its measured norm.
     """
 
-    layout: Layout
-    h: float
+    layout: SignalLayout
+    timestep: float
     noise: Noise | None
 
     def __call__(
@@ -104,14 +123,25 @@ class Compared:
         state: Array,
         **_: Any,
     ) -> tuple[Array, Any, Any]:
-        """Residuals of what is measured, one after the other, and both TimeSeries after the start. everything: to be drawn"""
+        """Return the residuals of all measured values in one row, and both TimeSeries after the start.
+
+        Args:
+            params: Parameters, not used.
+            predicted: Predicted TimeSeries of the sensors.
+            measured: Measured TimeSeries.
+            model: The model, not used.
+            everything: True where the TimeSeries are to be drawn.
+            state: States of the rollout, with the time in the first column.
+        """
         layout, later = self.layout, measured.times > 0.0
         t, seen = measured.times[later], measured.data[later]
         y = np.empty(seen.shape)
         for sensed, values, first in ((False, state[:, 1:], 1), (True, predicted.data, 0)):
             chosen = layout.sensed == sensed
             if chosen.any():
-                y[:, chosen] = read(values[:, layout.source[chosen]], t / self.h - first)
+                y[:, chosen] = interpolated(
+                    values[:, layout.source[chosen]], t / self.timestep - first
+                )
         seen, y = seen[:, layout.outputs], y[:, layout.outputs]
         present = np.isfinite(seen)
         drawn = bridged(t, seen) if everything else seen
@@ -124,7 +154,12 @@ class Compared:
 
 
 def bridged(t: Array, y: Array) -> Array:
-    """(M, ny) with gaps filled linearly, for curves that could not be seen otherwise."""
+    """Fill gaps of measured outputs linearly; a curve through single samples could not be seen.
+
+    Args:
+        t: (M,) times [s].
+        y: (M, ny) outputs [y-unit]; NaN where not measured.
+    """
     filled = np.array(y)
     for column in filled.T:
         seen = np.isfinite(column)
@@ -133,9 +168,14 @@ def bridged(t: Array, y: Array) -> Array:
     return filled
 
 
-def read(values: Array, place: Array) -> Array:
-    """Rows of values: (n, c) at places (M,), in between by a cubic spline."""
+def interpolated(values: Array, place: Array) -> Array:
+    """Return rows of values between the engine steps by a cubic spline.
+
+    Args:
+        values: (n, c) values at the engine steps.
+        place: (M,) engine steps, which need not be whole numbers.
+    """
     near = np.rint(place)
-    if np.abs(place - near).max() <= ON_STEP:
+    if np.abs(place - near).max() <= ON_STEP_TOLERANCE:
         return np.asarray(values[near.astype(int)])
     return np.asarray(CubicSpline(np.arange(len(values)), values)(place))

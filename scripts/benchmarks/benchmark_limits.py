@@ -1,6 +1,6 @@
 """The hard-limited cart-pendulum beside CasADi + IPOPT with many starts on the hand-derived model: the same seconds for both.
 
-    python scripts/benchmark_limits.py [--seconds 60] [--seed 0]
+    python -m scripts.benchmarks benchmark_limits [--seconds 60] [--seed 0]
 
 |u| <= 5 N, |s| <= 1 m, E at the actual values, no weights (models/cart_pendulum_limits.toml). Both use all cores, in as many
 processes. mjfim's clock runs from before the experiment is built; the peer's starts once its derivatives are compiled. As long
@@ -16,21 +16,21 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from aside import aside
 from rich.console import Console
 from rich.table import Table
 
 import mjfim
+from mjfim.budget import stop_on_interrupt
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
-from mjfim.records.design import Status
+from scripts.benchmarks.run_in_subprocess import run_in_subprocess
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXPERIMENT = ROOT / "models" / "cart_pendulum_limits.toml"
 MARKS = (5.0, 10.0, 20.0, 40.0)  # [s] at which the race is looked at, and at its end
 BEST = 403.4  # lambda_min, the best known
 PEER = """
-import casadi_limits as p
+from scripts.benchmarks import casadi_limits as p
 r = p.limited_starts(float(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
 found = [r.history, len(r.searched), r.build_seconds]
 """
@@ -55,17 +55,19 @@ class Race:
 
 
 def own(seconds: float, seed: int) -> Race:
-    """mjfim: contests of starts, one after the other."""
-    clock, history, starts, margin = time.perf_counter(), list[tuple[float, float]](), 0, 0.0
-    with mjfim.Pool() as executor:
-        while (left := seconds - (time.perf_counter() - clock)) > 1.0:
+    """Run mjfim: multistarts one after the other, until the time is used up or Ctrl-C is pressed."""
+    clock = time.perf_counter()
+    history: list[tuple[float, float]] = []
+    starts, margin = 0, 0.0
+
+    with mjfim.Pool() as executor, stop_on_interrupt() as stop:
+        while not stop.requested and (left := seconds - (time.perf_counter() - clock)) > 1.0:
             descent = {"seed": seed, "seconds": left}
             design = mjfim.design(
                 Experiment.from_file(EXPERIMENT).replace(descent=descent), executor=executor
             )
-            value, seed = float(design.final.eigenvalues[0]), seed + 1
-            if design.status is Status.INTERRUPTED:
-                raise KeyboardInterrupt
+            value = float(design.final.eigenvalues[0])
+            seed += 1
             starts += len(design.starts)
             if min(design.limits.values()) >= 0.0 and value > max(
                 (v for _, v in history), default=0.0
@@ -77,7 +79,7 @@ def own(seconds: float, seed: int) -> Race:
 
 def peer(seconds: float, seed: int) -> Race | None:
     """CasADi + IPOPT; None where it is missing."""
-    found = aside(PEER, seconds, seed, cores())
+    found = run_in_subprocess(PEER, seconds, seed, cores())
     if found is None:
         return None
     history, starts, built = found
@@ -120,7 +122,3 @@ def main() -> None:
     Console(highlight=False, width=130).print(table(found, args.seconds))
     for race in found:
         print(json.dumps(dataclasses.asdict(race)))
-
-
-if __name__ == "__main__":
-    main()

@@ -10,7 +10,7 @@ Many local optima lie close together, so starts are searched on a grid with fewe
 time per start) and the promising ones refined on the full grid.  With `--search 400` every start is solved in full.
 Starts are small: from multisines of 0.01 N 75 % reach the best basin, from 1..5 N 28 %, from 5 N 19 % (150 starts each).
 
-Usage:  python scripts/casadi_limits.py --seconds 60 --seed 0 [--processes 2] [--search 400] [--peak 1 5]
+Usage:  python -m scripts.benchmarks casadi_limits --seconds 60 --seed 0 [--processes 2] [--search 400] [--peak 1 5]
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import casadi as ca
-import casadi_peer as peer
 import numpy as np
 from numpy.typing import NDArray
+
+from scripts.benchmarks import casadi_peer as peer
 
 Array = NDArray[np.float64]
 
@@ -469,7 +470,3 @@ def main() -> None:
     show(run, given.seconds)
     if given.save and run.best is not None:
         np.save(given.save, run.best.u)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Two arms under hard limits, rest to rest: their models, their experiments, and what these are like before any design.
 
-    python scripts/arms.py FOLDER [--arms panda so_arm100] [--horizons 5 10] [--skip-check]
+    python -m scripts.benchmarks arms FOLDER [--arms panda so_arm100] [--horizons 5 10] [--skip-check]
 
 The models are made at run time, into FOLDER, from ../shared/models beside the repository: the same kinematics, inertias,
 servos and ranges, and in addition
@@ -46,7 +46,7 @@ from mjfim.parallel import cores
 from mjfim.records.trajectory import Sensitivity
 from mjfim.signals import multisine
 
-MODELS = Path(__file__).resolve().parents[2] / "shared" / "models"
+MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
 RATE, MEASURED = 100.0, 50.0  # [Hz] control updates, measurements
 NOISE = {"qpos": 1e-3, "qvel": 1e-2}  # [rad, rad/s] encoders and their filtered derivative, 1 sigma
 CLEARANCE = 0.02  # [m]
@@ -602,7 +602,3 @@ def main() -> None:
         console.print(table)
         if args.timesteps:
             console.print(timesteps(name, friction, args.horizons[0], args.folder))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """How the cost of an E-optimal iteration grows with the number of parameters, on a seven-joint arm.
 
-    python scripts/benchmark_arm.py [--model panda_nohand_nomesh.xml] [--iterations 10]
+    python -m scripts.benchmarks benchmark_arm [--model panda_nohand_nomesh.xml] [--iterations 10]
 
 p = 3, 10, 30, 70 parameters of the last links' inertias (barycentric), 5 s at 100 Hz, position servos inside the model.
 The value of J needs psi, 2p rollouts; its gradient needs one direction, whatever p is.
@@ -25,7 +25,7 @@ from mjfim.parallel import cores
 from mjfim.plant.derivatives import FORWARD_DIFFERENCES
 
 ARM = (
-    Path(__file__).resolve().parents[2]
+    Path(__file__).resolve().parents[3]
     / "shared"
     / "models"
     / "menagerie_panda"
@@ -140,7 +140,3 @@ def main() -> None:
     console = Console(highlight=False, width=130)
     costs = [measured(args.model, p, args.iterations) for p in COUNTS]
     console.print(cost_table(costs), f"{cores()} cores")
-
-
-if __name__ == "__main__":
-    main()

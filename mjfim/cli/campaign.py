@@ -1,0 +1,218 @@
+"""`mjfim campaign`: design, record, identify and design again until every target accuracy is reached."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import mjfim
+from mjfim.cli.common import ExperimentFile, Folder, Threads, errors, out, verb
+from mjfim.errors import ExperimentError, RecordingError
+from mjfim.excitation.target_accuracy import target_accuracies
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.simulate import simulate_system
+from mjfim.experiment.system import System
+from mjfim.output.archive import write_recording
+from mjfim.output.campaign_folder import CampaignFolder, accuracy_sentence
+from mjfim.output.folders import check_folder
+from mjfim.output.summaries import describe_campaign
+from mjfim.output.text import render
+from mjfim.records.campaign import Campaign, CampaignStatus, Round
+from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate
+from mjfim.records.recording import Recording
+from mjfim.studies.redesign import restated
+
+
+@verb
+def campaign(
+    experiment: ExperimentFile,
+    output: Folder,
+    rounds: Annotated[int, typer.Option(help="Largest number of rounds.")] = 10,
+    wanted: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SHARE",
+            help="Target accuracy of parameters that state none, as a share of the guess.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated noise.")] = 0,
+    real: Annotated[
+        bool, typer.Option("--real", help="Record on a real robot, one round per call.")
+    ] = False,
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Recording of the round that waits; may be given several times; implies --real.",
+        ),
+    ] = None,
+    threads: Threads = None,
+) -> None:
+    """Repeat design, recording and estimate until every target accuracy is reached.
+
+    Without --real the robot is simulated at the `true` values. With --real each call identifies from all recordings so far,
+    designs the next round into DIR/round_K/ and ends: play its design.csv and repeat the call with --recordings.
+    """
+    stated = with_target_accuracies(mjfim.Experiment.from_file(experiment), wanted)
+    check_folder(output)
+    run = CampaignRun(output, DesignTask.resolve(stated, threads=threads))
+
+    simulated = not (real or recordings)
+    found = run.simulated(rounds, seed) if simulated else run.real(rounds, recordings or [])
+
+    warning = run.folder.write_campaign(found, simulated=simulated)
+    if warning:
+        errors.print(f"warning: {warning}", markup=False)
+    out.print(render(describe_campaign(found, run.task.parameters, simulated=simulated)))
+    if found.status is CampaignStatus.WAITING:
+        waiting = run.folder.round(run.folder.designed)
+        out.print(
+            f"play {waiting}/design.csv, record, then repeat this call with --recordings FILE.csv",
+            markup=False,
+            soft_wrap=True,
+        )
+    errors.print(f"wrote {output}/")
+    raise typer.Exit(0 if found.reached else 1)
+
+
+class CampaignRun:
+    """A campaign of the command line: its task, its folder, and the last estimate.
+
+    Attributes:
+        task: The task as stated.
+        folder: The folder of the campaign.
+    """
+
+    def __init__(self, path: Path, task: DesignTask) -> None:
+        """Prepare a campaign.
+
+        Args:
+            path: Folder of the campaign.
+            task: The task as stated.
+
+        Raises:
+            ExperimentError: No parameter states a target accuracy.
+        """
+        self.task = task
+        self.folder = CampaignFolder(path, task.system)
+        self._wanted = target_accuracies(task)
+        self._estimate: Estimate | None = None
+
+    def simulated(self, rounds: int, seed: int) -> Campaign:
+        """Run a campaign on a robot that is the model at its true values.
+
+        Args:
+            rounds: Largest number of rounds.
+            seed: Seed of the noise of the first round; each further round adds 1.
+
+        Raises:
+            ExperimentError: No parameter states a true value.
+            RecordingError: The folder holds a campaign already.
+        """
+        experiment = self.task.experiment
+        if all(spec.true is None for spec in experiment.parameters.values()):
+            raise ExperimentError(
+                f"{experiment.source}: no parameter states a `true` value, at which a robot could be simulated; "
+                "state some, or use --real"
+            )
+        if self.folder.has_rounds:
+            raise RecordingError(
+                f"{self.folder.path}: holds a campaign already; take another folder, or continue it with --real"
+            )
+
+        def measure(design: Design, number: int) -> Recording:
+            """Write the design of a round, and simulate its recording."""
+            self._write_design(design, number)
+            system = self.task.system
+            recording = simulate_system(system, design.trajectory, seed + number - 1)
+            write_recording(self.folder.round(number) / "recording.csv", recording, system)
+            return recording
+
+        return mjfim.run_campaign(
+            experiment,
+            measure,
+            rounds=rounds,
+            threads=self.task.system.threads,
+            report=self._finish_round,
+        )
+
+    def real(self, rounds: int, files: Sequence[Path]) -> Campaign:
+        """Identify from all recordings so far, and design the next round.
+
+        Args:
+            rounds: Largest number of rounds.
+            files: Recordings of the round that waits; those that are known already are left out.
+
+        Raises:
+            RecordingError: A file cannot be read, or no round waits for it.
+        """
+        self.folder.add_recordings(files)
+        done = list(self.folder.recorded_rounds())
+        is_waiting = self.folder.designed > self.folder.recorded
+
+        # The first design waits for its recording: there is nothing to identify.
+        if is_waiting and not done:
+            return Campaign(
+                parameters=self.task.parameters.names,
+                wanted=self._wanted,
+                rounds=(),
+                status=CampaignStatus.WAITING,
+            )
+
+        def measure(design: Design, number: int) -> None:
+            """Write the design of a round, which ends this call."""
+            self._write_design(design, number)
+
+        # While a design waits for its recording, no further one is made.
+        limit = len(done) if is_waiting else rounds
+        found = mjfim.run_campaign(
+            self.task.experiment,
+            measure,
+            rounds=limit,
+            threads=self.task.system.threads,
+            report=self._finish_round,
+            done=done,
+        )
+        if is_waiting and found.status is CampaignStatus.EXHAUSTED and len(done) < rounds:
+            return replace(found, status=CampaignStatus.WAITING)
+        return found
+
+    def _write_design(self, design: Design, number: int) -> None:
+        """Write the design of a round, beside the experiment by which it was made."""
+        experiment = restated(self.task, design.theta, self._estimate)
+        self.folder.write_design(design, number, self.task.restated(experiment).system)
+
+    def _finish_round(self, finished: Round) -> None:
+        """Write the estimate of a round, and say what it is."""
+        self._estimate = finished.estimate
+        self.folder.write_round(finished)
+        sentence = accuracy_sentence(finished.estimate, self._wanted)
+        errors.print(f"round {finished.number}: {sentence}", markup=False)
+        for warning in finished.warnings:
+            errors.print(f"  warning: {warning}", style="yellow", markup=False)
+
+
+def with_target_accuracies(experiment: mjfim.Experiment, share: float | None) -> mjfim.Experiment:
+    """Return the experiment with a target accuracy for every parameter that states none.
+
+    Args:
+        experiment: The experiment.
+        share: Target accuracy as a share of the guess; None leaves the experiment unchanged.
+    """
+    if share is None:
+        return experiment
+
+    parameters = System.resolve(experiment).parameters
+    tables = {}
+    for name, guess in zip(parameters.names, parameters.guess.tolist(), strict=True):
+        spec = experiment.parameters.get(name)
+        if spec is None or spec.wanted is not None or spec.inertial is not None:
+            continue
+        if guess and not spec.nuisance:
+            tables[name] = {"wanted": share * abs(guess)}
+    return experiment.replace(parameters=tables)

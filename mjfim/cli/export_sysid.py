@@ -1,0 +1,42 @@
+"""`mjfim export-sysid`: the same recordings for `mujoco.sysid`, and both estimators beside each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import mjfim
+from mjfim.cli.common import ExperimentFile, Folder, errors, out, verb
+from mjfim.experiment.system import System
+from mjfim.output.folders import check_folder
+from mjfim.output.text import render
+from mjfim.recordings.read import read_recording
+
+
+@verb
+def export_sysid(
+    experiment: ExperimentFile,
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING...", help="Logs of any format that is read.")
+    ],
+    output: Folder,
+) -> None:
+    """Give recordings and parameters to mujoco.sysid, and compare its fits with that of mjfim."""
+    # MuJoCo's sysid takes a while to import; no other verb needs it.
+    from mjfim.output.sysid import comparison as sysid_comparison
+    from mjfim.output.sysid.sequences import require_extra
+
+    require_extra()
+    check_folder(output)
+    system = System.resolve(mjfim.Experiment.from_file(experiment))
+    loaded = [read_recording(path, system.channels) for path in recordings]
+
+    result = sysid_comparison.compare_with_sysid(system, loaded)
+    out.print(render(sysid_comparison.describe_sysid_comparison(result)))
+    for sentence in result.warnings:
+        errors.print(f"warning: {sentence}", markup=False)
+
+    sysid_comparison.write_sysid_comparison(output, result)
+    out.print(f"wrote {output}: comparison.json, sysid_report.html", markup=False)

@@ -1,0 +1,194 @@
+"""`mjfim robustness`: a design on simulated robots that differ from the model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import mjfim
+from mjfim.cli.common import ExperimentFile, errors, out, progress, verb, writing
+from mjfim.errors import ExperimentError, unknown
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
+from mjfim.output.archive import write_design
+from mjfim.output.folders import check_folder
+from mjfim.output.summaries import describe_robustness
+from mjfim.output.text import render
+from mjfim.parallel import cores
+from mjfim.records.events import Event, StudyEvent
+from mjfim.records.robustness import RobotConditions
+from mjfim.studies.robustness import assess_robustness, default_latency
+
+# Kinds of limits from which a design can keep a reserve.
+KINDS = ("position", "velocity", "acceleration", "control", "control_rate", "force", "clearance")
+
+# Reserve of a design where none is stated, in shares of half ranges: what 20 % wrong parameters need on the servo arm.
+DEFAULT_RESERVE = ("position=0.05", "velocity=0.3", "force=0.25")
+
+
+@verb
+def robustness(
+    experiment: ExperimentFile,
+    design_folder: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DESIGN_FOLDER]", help="Folder of a design; default: a design is made."
+        ),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results.")
+    ] = Path("out/robustness"),
+    runs: Annotated[int, typer.Option(min=1, help="Number of robots.")] = 100,
+    wrong: Annotated[
+        float, typer.Option(min=0.0, help="Share by which every parameter is off.")
+    ] = 0.2,
+    latency: Annotated[
+        float | None,
+        typer.Option(help="Delay of the control [s], whole timesteps; default: 5 ms, rounded up."),
+    ] = None,
+    feedback: Annotated[
+        bool, typer.Option("--feedback", help="Use the gains on what is measured.")
+    ] = False,
+    noise: Annotated[
+        float, typer.Option(min=0.0, help="Noise of the robot over the stated noise.")
+    ] = 1.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes; default: one per core.")
+    ] = None,
+    reserve: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND=SHARE",
+            help="Share of half a range that a design made here stays away from limits of a kind; may be given several times.",
+        ),
+    ] = None,
+) -> None:
+    """Play a design on robots that differ from the model: do the limits hold, do the intervals hold the true values?"""
+    stated = mjfim.Experiment.from_file(experiment)
+    conditions = RobotConditions(
+        wrong=wrong,
+        latency=default_latency(stated) if latency is None else latency,
+        feedback=feedback,
+        loudness=noise,
+        seed=seed,
+    )
+    check_folder(output)
+    if design_folder is None:
+        shares = parse_reserve(reserve or DEFAULT_RESERVE)
+        design_folder = design_with_reserve(stated, shares, output / "design")
+
+    clock = time.perf_counter()
+    with progress() as bar:
+        task = bar.add_task("playing", total=runs)
+
+        def show(event: Event) -> None:
+            """Show how many robots are done."""
+            if isinstance(event, StudyEvent):
+                bar.update(task, completed=runs * event.share)
+
+        result = assess_robustness(
+            stated,
+            design_folder,
+            conditions=conditions,
+            runs=runs,
+            processes=jobs or cores(),
+            callback=show,
+        )
+
+    seconds = time.perf_counter() - clock
+    with writing(output) as results:
+        results.leave_robustness(output, result, seconds)
+    out.print(render(describe_robustness(result)))
+    errors.print(
+        f"{result.runs} runs in {seconds:.0f} s; wrote playback.json, playback.npz, playback.png to {output}/",
+        markup=False,
+    )
+    if result.runs < runs:
+        errors.print(f"mjfim: interrupted; only {result.runs} of {runs} robots are done")
+    raise typer.Exit(0 if result.ok and result.runs == runs else 1)
+
+
+def parse_reserve(words: Sequence[str]) -> dict[str, float]:
+    """Read the shares of half ranges by which a design stays away from its limits.
+
+    Args:
+        words: `KIND=SHARE` each.
+
+    Returns:
+        The shares by kind.
+
+    Raises:
+        ExperimentError: A kind is unknown, or a share is no number from 0 to 1.
+    """
+    shares = {}
+    for word in words:
+        kind, _, text = word.partition("=")
+        if kind not in KINDS:
+            raise ExperimentError(f"--reserve: {unknown('kind of limit', kind, KINDS)}")
+
+        try:
+            shares[kind] = float(text)
+        except ValueError:
+            raise ExperimentError(
+                f"--reserve: {word!r} is not {kind}=SHARE, as in {kind}=0.2"
+            ) from None
+
+        if not 0.0 <= shares[kind] < 1.0:
+            raise ExperimentError(
+                f"--reserve: {word!r}: a share of half of the range, at least 0 and below 1"
+            )
+    return shares
+
+
+def tightened(experiment: mjfim.Experiment, reserve: Mapping[str, float]) -> mjfim.Experiment:
+    """Return the experiment with tighter limits.
+
+    Args:
+        experiment: The experiment.
+        reserve: Shares of half ranges by which limits become tighter, by kind.
+    """
+    tables: dict[str, dict[str, tuple[float, float]]] = {}
+    for limit in DesignTask.resolve(experiment).limits:
+        if reserve.get(limit.kind):
+            inner = reserve[limit.kind] * limit.scale
+            table = tables.setdefault(limit.kind, {})
+            table[limit.name] = (limit.lower + inner, limit.upper - inner)
+
+    clearance = experiment.limits.clearance
+    if clearance is None:
+        return experiment.replace(limits=tables)
+
+    wider = clearance * (1.0 + reserve.get("clearance", 0.0))
+    return experiment.replace(limits={**tables, "clearance": wider})
+
+
+def design_with_reserve(
+    experiment: mjfim.Experiment, reserve: Mapping[str, float], folder: Path
+) -> Path:
+    """Design with a reserve to all limits, write the design, and say what it is like.
+
+    Args:
+        experiment: The experiment.
+        reserve: Shares of half ranges by which the design stays away from its limits, by kind.
+        folder: Folder for the design.
+
+    Returns:
+        The folder.
+    """
+    task = DesignTask.resolve(tightened(experiment, reserve))
+    with progress() as bar:
+        bar.add_task("designing", total=None)
+        design = design_task(task)
+
+    write_design(folder, design, task.system)
+    margins = ", ".join(f"{kind} {margin:.3g}" for kind, margin in design.limits.items())
+    errors.print(f"designed in {design.seconds:.0f} s: {design.status.value}", markup=False)
+    errors.print(f"margins, reserve taken off: {margins}", markup=False)
+    for warning in design.warnings:
+        errors.print(f"warning: {warning}", markup=False)
+    return folder

@@ -1,0 +1,213 @@
+"""The folder of a campaign: designs, recordings and estimates by round, from which a later call continues."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ModelError, RecordingError
+from mjfim.experiment.system import System
+from mjfim.output import plots
+from mjfim.output.archive import check_fits, write_design
+from mjfim.output.mjcf.write import write_identified
+from mjfim.output.plots.style import format_with_uncertainty
+from mjfim.recordings.read import read_recording
+from mjfim.records.campaign import Campaign, EarlierRound, Round
+from mjfim.records.design import Design
+from mjfim.records.estimate import Estimate
+from mjfim.records.serialization import write_json
+
+
+class CampaignFolder:
+    """The folder of a campaign; `round_<number>/` holds the files of a round.
+
+    Attributes:
+        path: The folder.
+        system: The experiment as stated.
+    """
+
+    def __init__(self, path: Path, system: System) -> None:
+        """Describe a folder, which need not exist yet.
+
+        Args:
+            path: The folder.
+            system: The experiment as stated.
+        """
+        self.path = path
+        self.system = system
+
+    # ---- what is there
+
+    def round(self, number: int) -> Path:
+        """Return the folder of a round.
+
+        Args:
+            number: Number of the round, from 1.
+        """
+        return self.path / f"round_{number}"
+
+    def recordings(self, number: int) -> list[Path]:
+        """Return the recordings of a round.
+
+        Args:
+            number: Number of the round, from 1.
+        """
+        return sorted(self.round(number).glob("recording*.csv"))
+
+    @property
+    def has_rounds(self) -> bool:
+        """True where the folder holds a campaign."""
+        return any(self.path.glob("round_*"))
+
+    @property
+    def designed(self) -> int:
+        """Number of rounds that have a design."""
+        number = 0
+        while self._has_design(number + 1):
+            number += 1
+        return number
+
+    @property
+    def recorded(self) -> int:
+        """Number of rounds that have a design and recordings."""
+        designed = self.designed
+        number = 0
+        while number < designed and self.recordings(number + 1):
+            number += 1
+        return number
+
+    def _has_design(self, number: int) -> bool:
+        """Whether both files of a round's design are there."""
+        return all((self.round(number) / name).is_file() for name in ("design.json", "design.npz"))
+
+    def recorded_rounds(self) -> Iterator[EarlierRound]:
+        """Yield the rounds that are recorded.
+
+        Yields:
+            The rounds, the first one first.
+
+        Raises:
+            RecordingError: A design or a recording cannot be read, or belongs to another experiment.
+        """
+        names = self.system.parameters.names
+        for number in range(1, self.recorded + 1):
+            folder = self.round(number)
+            design = Design.load(folder)
+            if design.parameters != names:
+                raise RecordingError(
+                    f"{folder / 'design.json'}: designed for {', '.join(design.parameters)}; "
+                    f"the experiment has {', '.join(names)}"
+                )
+
+            trajectory = design.trajectory
+            check_fits(folder / "design.npz", trajectory, self.system)
+            recordings = [
+                read_recording(path, self.system.channels) for path in self.recordings(number)
+            ]
+            std = design.final.std
+            yield EarlierRound(
+                recordings=tuple(recordings),
+                theta=design.theta,
+                predicted=np.where(np.isnan(std), np.inf, std),
+                control=trajectory.ctrl,
+            )
+
+    # ---- what is added
+
+    def add_recordings(self, files: Sequence[Path]) -> None:
+        """Copy recordings that are not in the folder yet to the round that waits for them.
+
+        Args:
+            files: The recordings; those that are in the folder already are left out.
+
+        Raises:
+            RecordingError: A recording cannot be read, or no round waits for it.
+        """
+        known: set[bytes] = set()
+        for number in range(1, self.designed + 1):
+            known.update(path.read_bytes() for path in self.recordings(number))
+
+        # Read all files first: none is copied where one is unusable.
+        for file in files:
+            read_recording(file, self.system.channels)
+
+        new = [file for file in dict.fromkeys(files) if file.read_bytes() not in known]
+        waiting = self.recorded + 1
+        if new and waiting > self.designed:
+            raise RecordingError(
+                f"{new[0]}: no design waits for a recording in {self.path}; repeat the call without it to design the next "
+                "round (is it a recording of an earlier one, changed?)"
+            )
+
+        for i, file in enumerate(new):
+            name = "recording.csv" if len(new) == 1 else f"recording_{i + 1}.csv"
+            shutil.copyfile(file, self.round(waiting) / name)
+
+    def write_design(self, design: Design, number: int, system: System) -> None:
+        """Write the files of a round's design, among them those that the robot plays.
+
+        Args:
+            design: The design.
+            number: Number of the round, from 1.
+            system: The experiment for which the design was made.
+        """
+        write_design(self.round(number), design, system)
+
+    def write_round(self, finished: Round) -> None:
+        """Write the estimate after a round.
+
+        Args:
+            finished: The round.
+        """
+        finished.estimate.save(self.round(finished.number))
+
+    def write_campaign(self, campaign: Campaign, *, simulated: bool) -> str:
+        """Write campaign.json, campaign.png and identified.xml.
+
+        Args:
+            campaign: The campaign.
+            simulated: True where the recordings were simulated at the true values.
+
+        Returns:
+            A warning where identified.xml could not be written; else empty.
+        """
+        write_json(self.path / "campaign.json", self._summary(campaign, simulated=simulated))
+        if campaign.estimate is None:
+            return ""
+
+        figure = plots.campaign_figure(campaign, self.system.parameters, simulated=simulated)
+        plots.save(figure, self.path / "campaign.png")
+        try:
+            write_identified(self.path / "identified.xml", self.system, campaign.estimate.theta)
+        except ModelError as error:
+            return str(error)
+        return ""
+
+    def _summary(self, campaign: Campaign, *, simulated: bool) -> dict[str, Any]:
+        """Return the contents of campaign.json."""
+        return {
+            **campaign.summary(),
+            "simulated": simulated,
+            "units": list(self.system.units),
+            "true": self.system.parameters.true if simulated else None,
+        }
+
+
+def accuracy_sentence(estimate: Estimate, wanted: Array) -> str:
+    """Return estimates of the parameters with a target accuracy: `m 2.001 ± 0.005 (wanted 0.006)`.
+
+    Args:
+        estimate: The estimate.
+        wanted: (p,) standard deviations aimed at [theta-unit]; infinite where none is.
+    """
+    parts = []
+    for j, name in enumerate(estimate.parameters):
+        if np.isfinite(wanted[j]):
+            value, std = float(estimate.theta[j]), float(estimate.std[j])
+            parts.append(f"{name} {format_with_uncertainty(value, std)} (wanted {wanted[j]:.3g})")
+    return ", ".join(parts)

@@ -1,0 +1,1 @@
+"""Recordings and parameters for `mujoco.sysid`, and both estimators on the same data."""

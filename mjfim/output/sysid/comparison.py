@@ -1,0 +1,245 @@
+"""Fits by `mujoco.sysid` beside the estimate of mjfim, on the same recordings.
+
+sysid fits twice: weighted by the noise that the experiment states, and unweighted, where each signal counts relative to the norm
+of its measured values.
+"""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mujoco import sysid
+
+from mjfim.arrays import Array
+from mjfim.atomic_io import replacing
+from mjfim.experiment.system import System
+from mjfim.identification.identify import identify_system
+from mjfim.output.summary_parts import Row, Summary, SummaryTable, columns
+from mjfim.output.sysid.sequences import Exported, build, export, silenced
+from mjfim.records.estimate import Estimate
+from mjfim.records.recording import Recording
+from mjfim.records.serialization import write_json
+
+# Largest number of iterations of a fit by sysid.
+MAX_ITERATIONS = 200
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SysidFit:
+    """A fit by sysid.
+
+    Attributes:
+        theta: (p,) parameters [theta-unit].
+        chi2: Sum of squared residuals there, whitened by the stated noise.
+        seconds: Time that it took [s].
+        status: Last message of sysid.
+        parameters: `ParameterDict` at the optimum, for the report.
+        result: `OptimizeResult`, for the report.
+    """
+
+    theta: Array
+    chi2: float
+    seconds: float
+    status: str
+    parameters: Any
+    result: Any
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SysidComparison:
+    """Both estimators on the same recordings.
+
+    Attributes:
+        exported: The experiment in the types of sysid.
+        estimate: Estimate of mjfim.
+        weighted: Fit by sysid, weighted by the stated noise.
+        unweighted: Fit by sysid with its default weights.
+    """
+
+    exported: Exported
+    estimate: Estimate
+    weighted: SysidFit
+    unweighted: SysidFit
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Settings that sysid does not take, and warnings of the estimate."""
+        return (*self.exported.notes, *self.estimate.warnings)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of comparison.json."""
+        estimate, parameters = self.estimate, self.exported.system.parameters
+        return {
+            "parameters": list(estimate.parameters),
+            "units": list(self.exported.system.units),
+            "true": [p.true for p in parameters.parameters],
+            "start": estimate.initial_theta,
+            "recordings": [r.name for r in estimate.recordings],
+            "dof": estimate.dof,
+            "mjfim": {
+                "theta": estimate.theta,
+                "std": estimate.std,
+                "interval": estimate.interval,
+                "chi2": estimate.chi2,
+                "seconds": estimate.seconds,
+                "status": estimate.status,
+                "misfit": estimate.misfit,
+            },
+            "sysid_weighted": _fit_summary(self.weighted),
+            "sysid_default": _fit_summary(self.unweighted),
+            "notes": list(self.exported.notes),
+        }
+
+
+def _fit_summary(fit: SysidFit) -> dict[str, Any]:
+    """Return the entry of one fit in comparison.json."""
+    return {"theta": fit.theta, "chi2": fit.chi2, "seconds": fit.seconds, "status": fit.status}
+
+
+def compare_with_sysid(system: System, recordings: Sequence[Recording]) -> SysidComparison:
+    """Fit recordings with mjfim, and twice with sysid.
+
+    Args:
+        system: The experiment.
+        recordings: Its recordings.
+
+    Raises:
+        MjfimError: sysid cannot express the problem, or is not installed.
+    """
+    exported = export(system, recordings)
+    return SysidComparison(
+        exported=exported,
+        estimate=identify_system(system, recordings),
+        weighted=fit_with_sysid(exported, weighted=True),
+        unweighted=fit_with_sysid(exported, weighted=False),
+    )
+
+
+def fit_with_sysid(exported: Exported, weighted: bool) -> SysidFit:
+    """Fit with the optimiser of sysid, from the guess.
+
+    Args:
+        exported: The experiment in the types of sysid.
+        weighted: True for residuals that are whitened by the stated noise.
+    """
+    messages, clock = io.StringIO(), time.perf_counter()
+    with silenced():
+        parameters, result = sysid.optimize(
+            exported.parameters,
+            exported.residual(weighted),
+            verbose=False,
+            max_iters=MAX_ITERATIONS,
+            output=messages,
+        )
+    seconds = time.perf_counter() - clock
+
+    theta = np.array(parameters.as_vector())
+    lines = [line for line in messages.getvalue().splitlines() if line.startswith("Terminated")]
+    return SysidFit(
+        theta=theta,
+        chi2=chi2(exported, theta),
+        seconds=seconds,
+        status=lines[-1] if lines else "",
+        parameters=parameters,
+        result=result,
+    )
+
+
+def chi2(exported: Exported, theta: Array) -> float:
+    """Return the sum of squared residuals of the recordings, whitened by the stated noise.
+
+    Args:
+        exported: The experiment in the types of sysid.
+        theta: (p,) parameters [theta-unit].
+    """
+    with silenced():
+        residuals, _, _ = exported.residual(weighted=True)(theta, exported.parameters.copy())
+
+    # The residuals of the priors come last and do not count.
+    count = len(exported.sequences.measured_rollout)
+    return float(sum(np.sum(r**2) for r in residuals[:count]))
+
+
+def report(exported: Exported, fit: SysidFit) -> str:
+    """Return the HTML report of sysid.
+
+    Args:
+        exported: The experiment in the types of sysid.
+        fit: The weighted fit.
+    """
+    return str(
+        sysid.default_report(
+            [exported.sequences],
+            exported.parameters,
+            fit.parameters,
+            exported.residual(weighted=True),
+            fit.result,
+            title=f"{exported.sequences.name}: mujoco.sysid, weighted by the stated noise",
+            build_model=build,
+            generate_videos=False,
+        ).build()
+    )
+
+
+def describe_sysid_comparison(comparison: SysidComparison) -> Summary:
+    """Describe both estimators, parameter by parameter.
+
+    Args:
+        comparison: The comparison.
+    """
+    estimate = comparison.estimate
+    fits = (comparison.weighted, comparison.unweighted)
+    rows = []
+    for j, p in enumerate(comparison.exported.system.parameters.parameters):
+        low, high = estimate.interval[j]
+        cells = (
+            p.name,
+            "-" if p.true is None else f"{p.true:.4g}",
+            f"{estimate.initial_theta[j]:.4g}",
+            f"{estimate.theta[j]:.5g}",
+            f"{estimate.std[j]:.2g}",
+            f"{low:.4g} to {high:.4g}",
+            *(f"{fit.theta[j]:.5g}" for fit in fits),
+        )
+        rows.append(Row(cells=cells))
+
+    squares = [f"{fit.chi2:.6g}" for fit in (estimate, *fits)]
+    seconds = [f"{fit.seconds:.2f}" for fit in (estimate, *fits)]
+    for heading, values in (("χ²", squares), ("seconds", seconds)):
+        rows.append(Row(cells=(heading, "", "", values[0], "", "", *values[1:])))
+
+    table = SummaryTable(
+        key="estimators",
+        title="The same data, two estimators",
+        columns=columns(
+            "parameter",
+            "true",
+            "start",
+            "mjfim",
+            "formal σ",
+            "95 % interval",
+            "sysid, weighted",
+            "sysid, default",
+        ),
+        rows=tuple(rows),
+    )
+    return Summary(title="mjfim and mujoco.sysid", outcome="", parts=(table,))
+
+
+def write_sysid_comparison(folder: Path, comparison: SysidComparison) -> None:
+    """Write comparison.json, and sysid_report.html of the weighted fit.
+
+    Args:
+        folder: Folder for the results.
+        comparison: The comparison.
+    """
+    page = report(comparison.exported, comparison.weighted)
+    write_json(folder / "comparison.json", comparison.summary())
+    with replacing(folder / "sysid_report.html") as temporary:
+        temporary.write_text(page, encoding="utf-8")

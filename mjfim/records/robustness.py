@@ -1,0 +1,259 @@
+"""Records of a robustness study: robots that differ from the model, and how a design fared on them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from mjfim.arrays import Array, freeze
+from mjfim.records.serialization import SavedRecord
+
+# Probability with which the intervals and joint regions should hold the true values.
+CONFIDENCE = 0.95
+
+# Half width of an interval of this probability [standard deviations].
+INTERVAL_HALF_WIDTH = 1.959964
+
+# Share of the robots whose interval has to hold the true value of every parameter.
+REQUIRED_COVERAGE = 0.90
+
+# Delay of the control of a simulated robot, where none is stated [s]; rounded up to whole timesteps.
+LATENCY = 5e-3
+
+# Smallest share of half a range that counts as needed reserve; less is round-off.
+MIN_RESERVE = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotConditions:
+    """How the simulated robots differ from the model.
+
+    Attributes:
+        wrong: Share by which every parameter differs from its guess, up or down at random.
+        latency: Delay of the control [s].
+        feedback: True where the controller adds the gains times the measured deviation.
+        loudness: Noise of the robot over the stated noise.
+        seed: Seed of everything random.
+    """
+
+    wrong: float = 0.2
+    latency: float = LATENCY
+    feedback: bool = False
+    loudness: float = 1.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RobotRun:
+    """One robot that has played the design, and the estimate from its recording.
+
+    Attributes:
+        theta: (p,) true parameters [theta-unit].
+        estimate: (p,) estimated parameters [theta-unit]; NaN where the robot could not be identified.
+        covariance: (p, p) covariance of the estimate [theta-unit²].
+        margins: (l,) smallest margin of each limit over half of its range; negative where it was exceeded.
+        fit: Sum of squared whitened residuals over the degrees of freedom.
+        misfit: True where the residuals contradict the model or the noise.
+        restarted: True where the first starting point of the fit ended in a misfit, so that others were tried.
+        trouble: Why there is no estimate, or why it is in doubt; else empty.
+    """
+
+    theta: Array
+    estimate: Array
+    covariance: Array
+    margins: Array
+    fit: float
+    misfit: bool
+    restarted: bool = False
+    trouble: str = ""
+
+    def __post_init__(self) -> None:
+        freeze(self, "theta", "estimate", "covariance", "margins")
+
+    @property
+    def std(self) -> Array:
+        """(p,) formal standard deviations of the estimate [theta-unit]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def squared_distance(self, chosen: np.ndarray) -> float:
+        """Squared Mahalanobis distance of the truth from the estimate of some parameters; chi-squared distributed.
+
+        Args:
+            chosen: Indices of the parameters.
+        """
+        error = (self.estimate - self.theta)[chosen]
+        covariance = self.covariance[np.ix_(chosen, chosen)]
+        return float(error @ np.linalg.solve(covariance, error))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssessedLimit:
+    """A limit that is looked at on every robot.
+
+    Attributes:
+        kind: Kind of the limit: position, velocity, acceleration, control, control_rate, force, joint_force or clearance.
+        name: Name of the joint or actuator; "nearest pair" for a clearance.
+        lower: Lower bound [unit of the quantity].
+        upper: Upper bound [unit of the quantity].
+        scale: Half of the range, by which margins are divided [unit of the quantity].
+    """
+
+    kind: str
+    name: str
+    lower: float
+    upper: float
+    scale: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Robustness(SavedRecord):
+    """How a design fared on n robots, g of which could be identified.
+
+    Attributes:
+        conditions: How the robots differ from the model.
+        names: Names of the p unknowns.
+        units: Unit of each unknown.
+        limits: The l limits.
+        wrong: (p,) root mean square of the errors of the guess [theta-unit].
+        z: (g, p) errors of the estimates in standard deviations.
+        error: (g, p) errors of the estimates [theta-unit].
+        std: (g, p) formal standard deviations [theta-unit]; NaN for what can only be found in combination with others.
+        predicted: (p,) standard deviations predicted before any run [theta-unit].
+        joint: Number of robots whose joint confidence region holds the truth: of the parameters that the experiment states, and
+            of all unknowns.
+        margins: (n, l) smallest margins over half of their ranges.
+        planned: (l,) margins of the design on the model over half of their ranges.
+        fit: Mean of the sums of squared whitened residuals over their degrees of freedom.
+        misfits: Number of misfits.
+        restarted: Number of fits that needed another starting point.
+        troubles: Number of robots by the sentence that says what went wrong.
+    """
+
+    conditions: RobotConditions
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    limits: tuple[AssessedLimit, ...]
+    wrong: Array
+    z: Array
+    error: Array
+    std: Array
+    predicted: Array
+    joint: tuple[int, int]
+    margins: Array
+    planned: Array
+    fit: float
+    misfits: int
+    restarted: int
+    troubles: dict[str, int]
+
+    file_stem: ClassVar[str] = "playback"
+    made_by: ClassVar[str] = "Robustness.save"
+
+    def __post_init__(self) -> None:
+        freeze(self, "wrong", "z", "error", "std", "predicted", "margins", "planned")
+
+    @property
+    def runs(self) -> int:
+        """Number n of robots."""
+        return len(self.margins)
+
+    @property
+    def identified(self) -> np.ndarray:
+        """(p,) True where a parameter is found by itself, not only in combination with others."""
+        return np.asarray(np.isfinite(self.std).all(axis=0)) & (len(self.std) > 0)
+
+    @property
+    def inside(self) -> np.ndarray:
+        """(p,) number of robots whose interval holds the true value."""
+        return np.asarray((np.abs(self.z) <= INTERVAL_HALF_WIDTH).sum(axis=0))
+
+    @property
+    def observed(self) -> Array:
+        """(p,) root mean square of the errors of the estimates [theta-unit]."""
+        return np.asarray(np.sqrt((self.error**2).mean(axis=0)))
+
+    @property
+    def formal(self) -> Array:
+        """(p,) root mean square of the formal standard deviations [theta-unit]."""
+        return np.asarray(np.sqrt((self.std**2).mean(axis=0)))
+
+    @property
+    def kept(self) -> np.ndarray:
+        """(n, l) True where a robot keeps a limit; a force at its limit is clamped, which does not count as kept."""
+        clamped = [limit.kind in ("force", "joint_force") for limit in self.limits]
+        return np.where(clamped, self.margins > 0.0, self.margins >= 0.0)
+
+    @property
+    def all_kept(self) -> int:
+        """Number of robots that keep every limit."""
+        return int(self.kept.all(axis=1).sum())
+
+    @property
+    def lost(self) -> Array:
+        """(l,) share of half of each range by which the worst robot comes closer to the limit than the design."""
+        worst = self.margins.min(axis=0)
+        return np.asarray(np.maximum(self.planned - worst, 0.0))
+
+    @property
+    def covered(self) -> bool:
+        """True where every parameter's interval holds the true value often enough."""
+        inside = self.inside[self.identified]
+        often = inside >= REQUIRED_COVERAGE * self.runs - 1e-9
+        return bool(often.all()) and bool(self.identified.any())
+
+    @property
+    def ok(self) -> bool:
+        """True where the intervals cover often enough and every robot keeps all limits."""
+        return self.covered and self.all_kept == self.runs
+
+    def reserve(self) -> dict[str, float]:
+        """Share of half of each range by which a design has to stay away from its limits, by kind, rounded up to 1 %."""
+        needed: dict[str, float] = {}
+        for limit, share in zip(self.limits, self.lost.tolist(), strict=True):
+            if share > MIN_RESERVE:
+                needed[limit.kind] = max(needed.get(limit.kind, 0.0), share)
+
+        return {kind: float(np.ceil(100.0 * share) / 100.0) for kind, share in needed.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of playback.json."""
+        return {
+            "ok": self.ok,
+            "conditions": asdict(self.conditions),
+            "runs": self.runs,
+            "parameters": [self._parameter_summary(j) for j in range(len(self.names))],
+            "joint": {"parameters": self.joint[0], "all": self.joint[1]},
+            "fit": self.fit,
+            "misfits": self.misfits,
+            "begun_again": self.restarted,
+            "troubles": self.troubles,
+            "all_limits_kept": self.all_kept,
+            "limits": [self._limit_summary(i) for i in range(len(self.limits))],
+            "reserve": self.reserve(),
+        }
+
+    def _parameter_summary(self, j: int) -> dict[str, Any]:
+        """Return the entry of one unknown in playback.json."""
+        return {
+            "name": self.names[j],
+            "unit": self.units[j],
+            "wrong": self.wrong[j],
+            "predicted": self.predicted[j],
+            "stated": self.formal[j],
+            "error": self.observed[j],
+            "inside": int(self.inside[j]),
+        }
+
+    def _limit_summary(self, i: int) -> dict[str, Any]:
+        """Return the entry of one limit in playback.json."""
+        limit = self.limits[i]
+        return {
+            "kind": limit.kind,
+            "name": limit.name,
+            "range": [limit.lower, limit.upper],
+            "planned": self.planned[i] * limit.scale,
+            "worst": self.margins[:, i].min() * limit.scale,
+            "kept": int(self.kept[:, i].sum()),
+        }

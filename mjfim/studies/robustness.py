@@ -1,0 +1,740 @@
+"""Robustness of a design: it is played on simulated robots that differ from the model, each of which is then identified.
+
+A delay of the control acts like a delay of the measurement: before the start all stands still, so the robot moves as it would
+without the delay, only later. That holds with feedback as well, as long as the recorded control is the one that was sent, not
+the one that has arrived.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.stats import chi2
+from threadpoolctl import threadpool_limits
+
+from mjfim.arrays import Array
+from mjfim.budget import StopToken, stop_on_interrupt
+from mjfim.errors import ExperimentError, NoResultError, SimulationDivergedError
+from mjfim.excitation.constraints import SUBSTEP_KINDS, constraint_set_of
+from mjfim.excitation.limits import Limit
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.schema import Experiment
+from mjfim.experiment.system import System
+from mjfim.identification.identify import identify_system
+from mjfim.information.marginal import standard_deviations
+from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.parallel import cores
+from mjfim.plant.batch import BatchSimulator
+from mjfim.recordings.design_table import read_playback
+from mjfim.records.estimate import Estimate
+from mjfim.records.events import Callback, StudyEvent
+from mjfim.records.recording import Recording
+from mjfim.records.robustness import (
+    CONFIDENCE,
+    LATENCY,
+    AssessedLimit,
+    RobotConditions,
+    RobotRun,
+    Robustness,
+)
+
+# Largest number of attempts at drawing a robot whose bodies can exist.
+MAX_DRAWS = 500
+
+# Largest acceleration of a robot that counts as standing still [1/s² times the unit of the coordinate].
+MAX_REST_ACCELERATION = 1e-5
+
+# Largest number of Newton steps towards standing still.
+MAX_REST_STEPS = 50
+
+# Length of the Newton step towards standing still that ends the search.
+REST_STEP_TOLERANCE = 1e-12
+
+# Perturbation of the state for the slope of the acceleration.
+REST_PERTURBATION = 1e-6
+
+# Delays from which a fit starts again where the first one ends in a misfit [s].
+FURTHER_DELAYS = (2e-3, 4e-3, 8e-3, 16e-3)
+
+# Smallest deviation of a start that makes it an unknown.
+MIN_START_DEVIATION = 1e-9
+
+# Factor on the errors of the parameters after each round of draws that made bodies that cannot exist.
+DRAW_SHRINKAGE = 0.9
+
+
+def assess_robustness(
+    experiment: Experiment,
+    design: str | Path,
+    *,
+    conditions: RobotConditions | None = None,
+    runs: int = 100,
+    processes: int | None = None,
+    callback: Callback | None = None,
+    stop: StopToken | None = None,
+) -> Robustness:
+    """Play a design on simulated robots that differ from the model, and identify each from its recording.
+
+    Every parameter of each robot is off by the stated share, up or down at random, and the robot stands still at its own
+    equilibrium before it begins. Limits are looked at at every engine step. The fit starts from the guess, with the delay and,
+    where the parameters move it, the start as further unknowns.
+
+    Args:
+        experiment: The experiment of the design.
+        design: Folder of the design, or its design.csv.
+        conditions: How the robots differ from the model; default: parameters 20 % off and 5 ms of latency.
+        runs: Number of robots.
+        processes: Number of processes; default: one per core.
+        callback: Called with a `StudyEvent` after every robot.
+        stop: Token that ends the study after the robots that are done.
+
+    Returns:
+        How the design fared on the robots that were done.
+
+    Raises:
+        ExperimentError: The design is of another duration, or the conditions cannot be simulated.
+        RecordingError: The design cannot be read.
+        NoResultError: The study was stopped before any robot was done.
+    """
+    table = design_table(design)
+    if conditions is None:
+        conditions = RobotConditions(latency=default_latency(experiment))
+    bench = RobotBench(experiment, table, conditions)
+
+    found: list[RobotRun] = []
+    with stop_on_interrupt(stop) as token:
+        for run in _play_all(experiment, table, conditions, runs, processes or cores(), token):
+            found.append(run)
+            if callback is not None:
+                callback(
+                    StudyEvent(
+                        study="robustness",
+                        part="robots",
+                        index=0,
+                        count=1,
+                        share=len(found) / runs,
+                        message=f"{len(found)} of {runs} robots",
+                    )
+                )
+
+    if not found:
+        raise NoResultError("the study was stopped before any robot was done")
+    return summarize_runs(bench, found)
+
+
+def design_table(design: str | Path) -> Path:
+    """Return the design.csv of a folder, or the file itself.
+
+    Args:
+        design: Folder of a design, or its design.csv.
+    """
+    path = Path(design)
+    return path if path.is_file() else path / "design.csv"
+
+
+def default_latency(experiment: Experiment) -> float:
+    """Delay of the control where none is stated [s]: 5 ms, rounded up to whole timesteps of the engine.
+
+    Args:
+        experiment: The experiment.
+    """
+    timestep = float(System.resolve(experiment, threads=1).model.opt.timestep)
+    return float(np.ceil(LATENCY / timestep - 1e-6) * timestep)
+
+
+class RobotBench:
+    """A design, and robots on which it is played.
+
+    Attributes:
+        conditions: How the robots differ from the model.
+        stated: The task as the experiment states it.
+        task: The task by which recordings are read: on the grid of the engine, where a delay is exact, with the delay and the
+            start as unknowns.
+        plan: Rows of design.csv.
+        timestep: Timestep of the engine [s].
+        steps_per_row: Engine steps per row of the plan.
+        late_steps: Engine steps by which the control is late.
+        constraints: Constraints of the stated task.
+        limits: All l limits that are looked at.
+        rest: (nu,) control before the start [unit of the actuator]; None where the experiment begins in motion.
+        sensed: (ns,) index of the output that measures each entry of the state; -1 where none does.
+    """
+
+    def __init__(self, experiment: Experiment, table: Path, conditions: RobotConditions) -> None:
+        """Read the design and resolve the experiment.
+
+        Args:
+            experiment: The experiment of the design.
+            table: The design.csv.
+            conditions: How the robots differ from the model.
+
+        Raises:
+            ExperimentError: The design is of another duration, or the conditions cannot be simulated.
+            RecordingError: The design cannot be read.
+        """
+        self.conditions = conditions
+        self.stated = DesignTask.resolve(experiment, threads=1)
+        self.plan = read_playback(table, self.stated.system.channels)
+        self.timestep = float(self.stated.system.model.opt.timestep)
+
+        duration = float(self.plan.t[-1])
+        if abs(duration - self.stated.horizon) > 0.5 * self.timestep:
+            raise ExperimentError(
+                f"{table}: it lasts {duration:g} s, the experiment {self.stated.horizon:g} s"
+            )
+
+        self.steps_per_row = round(self.plan.period / self.timestep)
+        self.late_steps = round(conditions.latency / self.timestep)
+        remainder = abs(conditions.latency - self.late_steps * self.timestep)
+        if self.late_steps < 0 or remainder > 1e-6 * self.timestep:
+            raise ExperimentError(
+                f"latency: {conditions.latency:g} s is no whole number of timesteps of {self.timestep:g} s"
+            )
+
+        self.constraints = constraint_set_of(self.stated)
+        self.limits = _assessed_limits(self.stated)
+        self.rest = self._rest_control()
+        self._simulator = BatchSimulator(
+            self.stated.system.model_at(self.stated.theta),
+            sensors=self.stated.system.outputs.needs_sensors,
+            threads=1,
+        )
+
+        self.sensed = _sensed(self.stated)
+        if conditions.feedback and (self.sensed < 0).all():
+            raise ExperimentError(
+                "--feedback: no position or velocity of a joint is measured, the gains have nothing to act on"
+            )
+
+        # Robots are drawn with the stated unknowns first, to see which starts they move.
+        self.task = self.stated
+        self.task = DesignTask.resolve(self._experiment_of_recordings(experiment), threads=1)
+
+    # ---- the experiment by which recordings are read
+
+    def _rest_control(self) -> Array | None:
+        """(nu,) control before the start; None where the experiment begins in motion, which allows no latency."""
+        try:
+            return self.stated.initial_hold
+        except ExperimentError as error:
+            if self.late_steps:
+                raise ExperimentError(
+                    f"{error}; without a latency (--latency 0) it can be played"
+                ) from None
+            return None
+
+    def _experiment_of_recordings(self, stated: Experiment) -> Experiment:
+        """The experiment on the grid of the engine, with the unknowns that the robots add."""
+        nuisance = stated.nuisance.model_dump(exclude_unset=True)
+        if self.late_steps:
+            nuisance["delay"] = nuisance.get("delay") or True
+
+        movable = self._movable_positions()
+        if nuisance.get("initial") is None and movable:
+            nuisance["initial"] = dict.fromkeys(movable, True)
+
+        return stated.replace(
+            nuisance=nuisance,
+            rate=1.0 / self.timestep,
+            measure_rate=stated.measure_rate or stated.rate,
+            playback_rate=None,
+        )
+
+    def _movable_positions(self) -> list[str]:
+        """Names of positions at which robots stand still elsewhere than the model, because their parameters differ."""
+        task = self.stated
+        moved = np.zeros(task.space.nv, dtype=bool)
+
+        for seed in range(2 * len(task.parameters)):
+            theta = self._drawn(np.random.default_rng(seed))
+            start = self._start(task.system.model_at(theta), theta, self.conditions.feedback)
+            deviation = task.space.minus(start, task.plant.nominal_initial_state)
+            moved |= np.abs(deviation[: task.space.nv]) > MIN_START_DEVIATION
+
+        names = _start_names(task.system.model)
+        return [name for name, has_moved in zip(names, moved, strict=True) if has_moved]
+
+    # ---- robots
+
+    def _drawn(self, rng: np.random.Generator) -> Array:
+        """(p,) parameters of a robot that can exist, its delay and biases included [theta-unit]; its start comes later.
+
+        No parameter is off by more than its prior, which says how well it is known, or than bodies allow.
+        """
+        p = self.task.parameters
+        wrong = self.conditions.wrong
+        size = np.where(p.guess == 0.0, p.scale, np.abs(p.guess))
+        prior = np.array([0.0 if q.prior is None else q.prior for q in p.parameters])
+        reach = np.where(prior > 0.0, np.minimum(wrong * size, prior), wrong * size)
+
+        for attempt in range(MAX_DRAWS):
+            shrinkage = DRAW_SHRINKAGE ** (attempt // len(p))
+            off = rng.choice([-1.0, 1.0], len(p)) * reach * shrinkage
+            theta = np.where(p.changes_model, p.guess + off, prior * rng.standard_normal(len(p)))
+            theta = self._with_delay(np.clip(theta, p.lower, p.upper))
+            if not p.writer.unphysical_bodies(self.task.plant.source, theta):
+                return theta
+
+        raise ExperimentError(
+            f"{wrong:.0%} wrong parameters make bodies that cannot exist; try less"
+        )
+
+    def _with_delay(self, theta: Array) -> Array:
+        """(p,) parameters with the true delay [theta-unit]."""
+        is_delay = self.task.parameters.delay_derivative != 0.0
+        return np.asarray(np.where(is_delay, self.late_steps * self.timestep, theta))
+
+    def _start(self, model: Any, theta: Array, feedback: bool) -> Array:
+        """(ns,) state at which a robot stands still before the start.
+
+        Raises:
+            SimulationDivergedError: It stands still nowhere near the start, and the control is late.
+        """
+        if self.rest is None:
+            return self.task.plant.initial_state(theta)
+
+        state, left = self._equilibrium(model, feedback)
+        if left <= MAX_REST_ACCELERATION:
+            return state
+        if self.late_steps == 0:
+            return np.array(self.stated.plant.nominal_initial_state)
+
+        advice = (
+            "play without a latency" if feedback else "play with --feedback, or without a latency"
+        )
+        raise SimulationDivergedError(
+            "a robot with other parameters does not stand still at the start "
+            f"(it accelerates by {left:.2g} per s²): {advice}"
+        )
+
+    def _equilibrium(self, model: Any, feedback: bool) -> tuple[Array, float]:
+        """(ns,) state at which the robot accelerates least, found by Newton's method, and its largest acceleration."""
+        space = self.stated.space
+        data = mujoco.MjData(model)
+        state = np.array(self.stated.plant.nominal_initial_state)
+
+        # Positions and activations may move; velocities stay.
+        directions = np.delete(np.eye(space.nx), np.arange(space.nv, 2 * space.nv), axis=0)
+
+        def acceleration(x: Array) -> Array:
+            """Accelerations and rates of the activations at a state."""
+            data.qpos[:], data.qvel[:], data.act[:] = space.split(x)
+            data.ctrl[:] = self._control_before(x, feedback)
+            mujoco.mj_forward(model, data)
+            return np.concatenate([data.qacc, data.act_dot])
+
+        for _ in range(MAX_REST_STEPS):
+            now = acceleration(state)
+            columns = []
+            for direction in directions:
+                ahead = acceleration(space.plus(state, REST_PERTURBATION * direction))
+                behind = acceleration(space.plus(state, -REST_PERTURBATION * direction))
+                columns.append(ahead - behind)
+
+            slope = np.stack(columns, 1) / (2.0 * REST_PERTURBATION)
+            step = np.linalg.lstsq(slope, -now, rcond=1e-9)[0]
+            state = space.plus(state, step @ directions)
+            if np.abs(step).max(initial=0.0) < REST_STEP_TOLERANCE:
+                break
+
+        return state, float(np.abs(acceleration(state)).max(initial=0.0))
+
+    # ---- the controller
+
+    def _command(self, state: Array, row: int, feedback: bool) -> Array:
+        """(nu,) control that the controller sends for a row of the plan when it reads a state [unit of the actuator]."""
+        control = self.plan.ctrl[row]
+        if feedback:
+            control = control + self.plan.gain[row] @ self._deviation(state, row)
+
+        bounds = self.constraints.control.bounds
+        return np.asarray(np.clip(control, bounds.lower, bounds.upper))
+
+    def _deviation(self, state: Array, row: int) -> Array:
+        """(nx,) planned minus measured state; what is not measured counts as planned."""
+        planned = self.plan.state[row]
+        space = self.stated.space
+        seen = np.where(self.sensed >= 0, state, planned)
+        for q, _ in space.quaternions:
+            seen[q : q + 4] /= np.linalg.norm(seen[q : q + 4])
+
+        return space.minus(planned, seen)
+
+    def _control_before(self, state: Array, feedback: bool) -> Array:
+        """(nu,) control before the start; with feedback, the first gain acts on where the robot stands."""
+        if self.rest is None:
+            return np.asarray(self.plan.ctrl[0])
+        if not feedback:
+            return self.rest
+        return np.asarray(self.rest + self.plan.gain[0] @ self._deviation(state, 0))
+
+    def _sent(self, model: Any, start: Array, before: Array, noise: Array, feedback: bool) -> Array:
+        """(M, nu) controls that are sent [unit of the actuator]; noise: (M+1, ny) of what the controller reads [y-unit]."""
+        rows = len(self.plan.ctrl)
+        if not feedback:
+            return np.stack([self._command(start, k, False) for k in range(rows)])
+
+        data, space = mujoco.MjData(model), self.stated.space
+        data.qpos[:], data.qvel[:], data.act[:] = space.split(start)
+        sent = np.zeros((rows, len(before)))
+        read = np.flatnonzero(self.sensed >= 0)
+
+        for step in range(rows * self.steps_per_row):
+            row, phase = divmod(step, self.steps_per_row)
+            if phase == 0:
+                state = np.concatenate([data.qpos, data.qvel, data.act])
+                state[read] += noise[row, self.sensed[read]]
+                sent[row] = self._command(state, row, True)
+
+            arrived = (step - self.late_steps) // self.steps_per_row
+            data.ctrl[:] = before if arrived < 0 else sent[arrived]
+            mujoco.mj_step(model, data)
+
+        return sent
+
+    # ---- one robot
+
+    def run(self, number: int) -> RobotRun:
+        """Play on one robot, look at its limits, and identify it.
+
+        Args:
+            number: Number of the robot; with the seed of the conditions it decides everything random.
+        """
+        rng = np.random.default_rng([self.conditions.seed, number])
+        theta = self._drawn(rng)
+        noise = self.conditions.loudness * self.task.system.noise.sample(len(self.plan.t), rng)
+
+        try:
+            recording, margins, start = self.play(theta, noise, self.conditions.feedback)
+            system = self._system_from(start)
+            self._put_start(theta, start, system)
+            estimate, restarted = self._identified(recording, system)
+        except SimulationDivergedError as error:
+            return RobotRun(
+                theta=theta,
+                estimate=np.full(len(theta), np.nan),
+                covariance=np.full((len(theta), len(theta)), np.nan),
+                margins=np.full(len(self.limits), -np.inf),
+                fit=np.nan,
+                misfit=True,
+                trouble=str(error),
+            )
+
+        return RobotRun(
+            theta=theta,
+            estimate=estimate.theta,
+            covariance=estimate.covariance,
+            margins=margins,
+            fit=estimate.chi2 / estimate.dof,
+            misfit=estimate.misfit,
+            restarted=restarted,
+            trouble="" if estimate.success else estimate.status,
+        )
+
+    def _system_from(self, start: Array) -> System:
+        """The system of the recordings with the activations of a robot's start: (ns,).
+
+        Activations are no unknowns: they follow from the control that was sent before the start.
+        """
+        system, na = self.task.system, self.task.space.na
+        if na == 0:
+            return system
+
+        state = np.array(system.plant.nominal_initial_state)
+        state[-na:] = start[-na:]
+        return replace(system, start=state, plant=system.plant.with_initial_state(state))
+
+    def _put_start(self, theta: Array, start: Array, system: System) -> None:
+        """Write the true deviation of the start: (ns,) into theta: (p,), as far as it is an unknown."""
+        matrix = system.parameters.initial_state_derivative(system.space.nx)
+        used = matrix.any(axis=0)
+        deviation = system.space.minus(start, system.plant.nominal_initial_state)
+        theta[used] = np.linalg.lstsq(matrix[:, used], deviation)[0]
+
+    def _identified(self, recording: Recording, system: System) -> tuple[Estimate, bool]:
+        """The estimate from the guess; where it is a misfit, the best from other delays, and True."""
+        best = identify_system(system, [recording])
+        if not best.misfit:
+            return best, False
+
+        p = system.parameters
+        starts = [p.guess]
+        if p.delay_derivative.any():
+            is_delay = p.delay_derivative != 0.0
+            starts += [np.where(is_delay, delay, p.guess) for delay in FURTHER_DELAYS]
+
+        for start in starts:
+            try:
+                other = identify_system(system, [recording], method="newton", start=start)
+            except SimulationDivergedError:
+                continue
+
+            if other.success and other.chi2 < best.chi2:
+                best = other
+            if not best.misfit:
+                break
+
+        return best, True
+
+    def play(self, theta: Array, noise: Array, feedback: bool) -> tuple[Recording, Array, Array]:
+        """Play the plan on one robot.
+
+        Args:
+            theta: (p,) parameters of the robot [theta-unit].
+            noise: (M+1, ny) noise of the outputs at the rows of the plan [y-unit].
+            feedback: True where the controller uses the gains.
+
+        Returns:
+            The recording, (l,) margins over half of their ranges, and (ns,) start of the robot.
+
+        Raises:
+            SimulationDivergedError: The simulation diverges, or the robot does not stand still at the start.
+        """
+        task, rows = self.task, len(self.plan.ctrl)
+        model = task.system.model_at(theta)
+        start = self._start(model, theta, feedback)
+        before = self._control_before(start, feedback)
+        noise = noise + task.parameters.bias_derivative(len(task.system.outputs)) @ theta
+        sent = self._sent(model, start, before, noise, feedback)
+
+        # The control arrives late; until then the robot gets the control before the start.
+        held = np.repeat(sent, self.steps_per_row, axis=0)
+        applied = np.concatenate([np.tile(before, (self.late_steps, 1)), held])
+        out = self._simulator.rollout(
+            [model], start[None], applied[None], self.constraints.observations
+        )
+        if not out.finite[0] or out.observed is None:
+            raise SimulationDivergedError("the robot's simulation diverges")
+
+        # Only the rows of the plan carry noise; samples that are not measured stay empty.
+        last = rows * self.steps_per_row + 1
+        sensors = None if out.sensors is None else out.sensors[0, :last]
+        y = task.system.outputs(out.states[0, :last], sensors)
+        y[:: self.steps_per_row] += noise
+        y[task.system.noise.measured(last - 1) == 0.0] = np.nan
+
+        recording = Recording(
+            t=np.arange(last, dtype=np.float64) * self.timestep,
+            ctrl=held,
+            y=y,
+            outputs=task.system.outputs.names,
+            name="robot",
+        )
+        qpos = out.states[0][:, : task.space.nq]
+        margins = self._margins(out.observed[0, :, 0], sent, before, qpos, feedback)
+        return recording, margins, start
+
+    def _margins(
+        self, observed: Array, sent: Array, before: Array, qpos: Array, feedback: bool
+    ) -> Array:
+        """(l,) smallest margins over half of their ranges.
+
+        Args:
+            observed: Quantities within samples at every engine step.
+            sent: (M, nu) controls that were sent.
+            before: (nu,) control before the start.
+            qpos: Positions at every engine step.
+            feedback: True where the controller uses the gains.
+        """
+        constraints = self.constraints
+        bounds = constraints.substeps.bounds
+        inside = bounds.margin(observed).min(axis=0, initial=np.inf) / bounds.scale
+        rates = self._control_rates(sent, before, feedback)
+
+        margins = []
+        for i, limit in enumerate(self.limits):
+            if limit.kind in SUBSTEP_KINDS:
+                margins.append(float(inside[i]))
+            elif limit.kind == "clearance" and constraints.clearance is not None:
+                nearest = constraints.clearance.distances.nearest(qpos)[0]
+                margins.append(nearest / constraints.clearance.least - 1.0)
+            else:
+                values = (sent if limit.kind == "control" else rates)[:, limit.index]
+                margin = np.minimum(values - limit.lower, limit.upper - values).min()
+                margins.append(float(margin) / limit.scale)
+
+        return np.array(margins)
+
+    def _control_rates(self, sent: Array, before: Array, feedback: bool) -> Array:
+        """Rates of the control over one sample [unit of the actuator / s], from before the start to after the end."""
+        rows_per_sample = round(self.stated.dt / self.plan.period)
+        rate = self.constraints.rate
+        after = sent[-1] if feedback or rate is None else rate.control_after
+        if after is None:
+            after = sent[-1]
+
+        controls = np.concatenate(
+            [np.tile(before, (rows_per_sample, 1)), sent, np.tile(after, (rows_per_sample, 1))]
+        )
+        changes = controls[rows_per_sample:] - controls[:-rows_per_sample]
+        return np.asarray(changes / self.stated.dt)
+
+    # ---- what was expected
+
+    def planned(self) -> Array:
+        """(l,) margins of the plan over half of their ranges: on the model, without noise and feedback."""
+        silence = np.zeros((len(self.plan.t), len(self.task.system.outputs)))
+        theta = self._with_delay(self.task.parameters.guess)
+        return self.play(theta, silence, False)[1]
+
+    def predicted(self) -> Array:
+        """(p,) standard deviations that the plan promises at the guess with the true delay [theta-unit]."""
+        task = self.task
+        theta = self._with_delay(task.parameters.guess)
+        control = np.repeat(self.plan.ctrl, self.steps_per_row, axis=0)
+        found = task.plant.derivatives.predict(theta, control)
+        if found is None:
+            raise SimulationDivergedError("the plan diverges at the guess")
+
+        J = task.system.noise.whitened_rows(found[1])
+        return standard_deviations(J.T @ J + task.parameters.prior_information)
+
+
+def _assessed_limits(task: DesignTask) -> tuple[Limit, ...]:
+    """All limits; those within samples come first, in the order of the observations."""
+    within = [limit for kind in SUBSTEP_KINDS for limit in task.limits if limit.kind == kind]
+    others = [limit for limit in task.limits if limit.kind not in SUBSTEP_KINDS]
+
+    clearance = task.experiment.limits.clearance
+    if clearance is not None:
+        others.append(
+            Limit(kind="clearance", name="nearest pair", index=0, lower=clearance, upper=np.inf)
+        )
+    return (*within, *others)
+
+
+def _start_names(model: Any) -> Iterator[str]:
+    """Names of the nv deviations of the initial positions."""
+    for j, name in enumerate(joint_names(model)):
+        width = joint_dofs(model, j)
+        for i in range(width):
+            yield f"qpos:{name}" if width == 1 else f"qpos:{name}[{i}]"
+
+
+def _sensed(task: DesignTask) -> np.ndarray:
+    """(ns,) index of the output that measures each entry of the state; -1 where none does."""
+    model, space = task.system.model, task.space
+    position = int(mujoco.mjtSensor.mjSENS_JOINTPOS)
+    velocity = int(mujoco.mjtSensor.mjSENS_JOINTVEL)
+
+    # Entry of the state that each sensor of a joint measures, by the address of the sensor.
+    encoders = {}
+    for i in range(model.nsensor):
+        kind, joint = int(model.sensor_type[i]), int(model.sensor_objid[i])
+        if kind == position:
+            encoders[int(model.sensor_adr[i])] = int(model.jnt_qposadr[joint])
+        elif kind == velocity:
+            encoders[int(model.sensor_adr[i])] = space.nq + int(model.jnt_dofadr[joint])
+
+    found = np.full(space.nq + space.nv + space.na, -1)
+    for i, output in enumerate(task.system.outputs.outputs):
+        entry = output.state if output.sensor is None else encoders.get(output.sensor)
+        if entry is not None:
+            found[entry] = i
+    return found
+
+
+def summarize_runs(bench: RobotBench, runs: Sequence[RobotRun]) -> Robustness:
+    """Compare the estimates and margins of all robots with the truth and with the plan.
+
+    Args:
+        bench: The bench on which the robots were played.
+        runs: The robots.
+    """
+    task = bench.task
+    stated = set(bench.stated.parameters.names)
+    names = task.parameters.names
+    shape = (-1, len(names))
+
+    # Only robots that could be identified count for the errors.
+    good = [run for run in runs if np.isfinite(run.estimate).all()]
+    error = np.array([run.estimate - run.theta for run in good]).reshape(shape)
+    std = np.array([run.std for run in good]).reshape(shape)
+    std = np.where(np.isfinite(std).all(axis=0), std, np.nan)
+
+    # Joint regions: of the parameters that the experiment states, and of all unknowns.
+    identified = np.isfinite(std).all(axis=0)
+    regions = [
+        np.flatnonzero(identified & [name in stated for name in names]),
+        np.flatnonzero(identified),
+    ]
+    joint = []
+    for region in regions:
+        threshold = chi2.ppf(CONFIDENCE, len(region))
+        joint.append(sum(run.squared_distance(region) <= threshold for run in good))
+
+    squared = [(run.theta - task.parameters.guess) ** 2 for run in runs]
+    return Robustness(
+        conditions=bench.conditions,
+        names=names,
+        units=task.system.units,
+        limits=tuple(
+            AssessedLimit(
+                kind=limit.kind,
+                name=limit.name,
+                lower=limit.lower,
+                upper=limit.upper,
+                scale=limit.scale,
+            )
+            for limit in bench.limits
+        ),
+        wrong=np.sqrt(np.mean(squared, axis=0)),
+        z=error / std,
+        error=error,
+        std=std,
+        predicted=bench.predicted(),
+        joint=(int(joint[0]), int(joint[1])),
+        margins=np.array([run.margins for run in runs]),
+        planned=bench.planned(),
+        fit=float(np.mean([run.fit for run in good])) if good else np.nan,
+        misfits=sum(run.misfit for run in runs),
+        restarted=sum(run.restarted for run in runs),
+        troubles=dict(Counter(run.trouble for run in runs if run.trouble)),
+    )
+
+
+# ---- robots in processes
+
+# The bench of a worker process, made once.
+_worker_bench: list[RobotBench] = []
+
+
+def _begin_worker(experiment: Experiment, table: Path, conditions: RobotConditions) -> None:
+    """Prepare a worker process: it ignores Ctrl-C, uses one thread and makes its bench."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threadpool_limits(1)
+    _worker_bench[:] = [RobotBench(experiment, table, conditions)]
+
+
+def _run_in_worker(number: int) -> RobotRun:
+    """Play one robot in a worker process."""
+    return _worker_bench[0].run(number)
+
+
+def _play_all(
+    experiment: Experiment,
+    table: Path,
+    conditions: RobotConditions,
+    count: int,
+    processes: int,
+    stop: StopToken,
+) -> Iterator[RobotRun]:
+    """Play all robots in processes, in their order, until a stop is requested."""
+    context = multiprocessing.get_context("spawn")
+    arguments = (experiment, table, conditions)
+    with ProcessPoolExecutor(min(processes, count), context, _begin_worker, arguments) as pool:
+        futures = [pool.submit(_run_in_worker, number) for number in range(count)]
+        for future in futures:
+            if stop.requested:
+                pool.shutdown(wait=True, cancel_futures=True)
+                return
+            yield future.result()

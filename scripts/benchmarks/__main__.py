@@ -1,0 +1,42 @@
+"""Run one benchmark by name, from the top folder of the repository.
+
+python -m scripts.benchmarks                        # the names
+python -m scripts.benchmarks benchmark --quick      # one benchmark with its options
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+# The benchmarks, each with the question that it answers.
+BENCHMARKS = {
+    "benchmark": "where does the time of a design go?",
+    "benchmark_arm": "how does the time of an iteration grow with the number of parameters?",
+    "benchmark_hour": "how long do reading and fitting an hour of data at 1 kHz take?",
+    "benchmark_limits": "is the design under hard limits better than CasADi + IPOPT in equal time?",
+    "casadi_peer": "what do CasADi's solvers find on the hand-derived cart-pendulum?",
+    "casadi_limits": "what do CasADi's solvers find under hard limits?",
+    "arms": "which experiments do the robot arms get, and do their designs keep the limits?",
+    "arms_table": "is the design of two arms better than Fourier series in equal time?",
+    "prove_identification": "do the 95 % intervals hold the true values?",
+}
+
+
+def main() -> int:
+    """Run the benchmark that the first argument names; return its exit code."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name not in BENCHMARKS:
+        print("usage: python -m scripts.benchmarks NAME [OPTIONS]\n", file=sys.stderr)
+        for each, question in BENCHMARKS.items():
+            print(f"  {each:20s} {question}", file=sys.stderr)
+        return 2
+
+    # The benchmark parses the remaining arguments itself.
+    sys.argv = [f"python -m scripts.benchmarks {name}", *sys.argv[2:]]
+    module = importlib.import_module(f"scripts.benchmarks.{name}")
+    return int(module.main() or 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
