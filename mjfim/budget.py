@@ -48,7 +48,7 @@ class StopToken:
 
     @property
     def requested(self) -> bool:
-        """True once somebody asked to stop."""
+        """True after a request to stop."""
         return self._event.is_set() or (self._also is not None and self._also())
 
 

@@ -58,7 +58,7 @@ def resolve_outputs(
 
     table = _NoiseTable(components, list(measurable_columns(model)), stride)
 
-    # A key that stands for fewer outputs overrules one that stands for more of them.
+    # A key for fewer outputs takes precedence over a key for more of them.
     for key in sorted(stated, key=lambda k: -len(columns_of_key[k])):
         table.set_key(key, stated[key], columns_of_key[key], experiment)
     for block in experiment.correlated:
@@ -111,7 +111,7 @@ class _NoiseTable:
     def set_key(
         self, key: str, value: float | NoiseSpec, names: list[str], experiment: Experiment
     ) -> None:
-        """Enter one key of the table `noise`, which stands for the columns `names`."""
+        """Enter one key of the table `noise`, which is valid for the columns `names`."""
         if not names:
             raise ExperimentError(
                 "noise.state: the model has no joint to measure; name sensors instead"
@@ -160,7 +160,7 @@ class _NoiseTable:
 def _columns_of_keys(
     components: Mapping[str, StateComponent], model: Any, sensors: list[str]
 ) -> dict[str, list[str]]:
-    """Columns that each valid key of the table `noise` stands for."""
+    """Columns for which each key of the table `noise` is valid."""
     found: dict[str, list[str]] = {"state": list(components)}
     for component in components.values():
         found[component.name] = [component.name]
@@ -214,7 +214,7 @@ def _outputs(
 
 
 def _key_covariance(key: str, spec: NoiseSpec, sigma_factors: Array) -> Array:
-    """(n, n) covariance of the n columns that one key stands for.
+    """(n, n) covariance of the n columns of one key.
 
     Args:
         key: The key, for messages.

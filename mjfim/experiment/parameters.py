@@ -96,7 +96,7 @@ def _single_parameter(
     bounds = spec.bounds or (-np.inf, np.inf)
     if not bounds[0] <= guess <= bounds[1]:
         raise ExperimentError(
-            f"parameters.{name}.guess: the model's own value {guess:g} is outside bounds {list(bounds)}"
+            f"parameters.{name}.guess: the value {guess:g} in the model is outside bounds {list(bounds)}"
         )
 
     magnitude = max(abs(guess), magnitude)
@@ -128,7 +128,7 @@ def _scale(name: str, spec: ParameterSpec, guess: float, magnitude: float) -> fl
 
     if scale == 0.0:
         raise ExperimentError(
-            f"parameters.{name}.scale: the model's own value or guess is 0: state a guess, or a scale in the "
+            f"parameters.{name}.scale: the value in the model or the guess is 0: state a guess, or a scale in the "
             "parameter's unit"
         )
     return scale

@@ -209,7 +209,7 @@ class ParameterSpec(Section):
 
         if single:
             raise ValueError(
-                f"inertial stands for ten parameters; {', '.join(single)} would fit only one"
+                f"inertial defines ten parameters; {', '.join(single)} would fit only one"
             )
 
     def _require_inside(self, low: float, high: float) -> None:

@@ -236,7 +236,7 @@ def _with_capsule_axes(model: Any) -> Any:
 
 
 def _farthest_points(kind: int, size: Array, direction: Array) -> Array:
-    """Points (n, 3) of a primitive that lie farthest along unit vectors (n, 3), in its own frame [m].
+    """Points (n, 3) of a primitive that lie farthest along unit vectors (n, 3), in the primitive's frame [m].
 
     Args:
         kind: Type of the geom.

@@ -78,7 +78,7 @@ class Parameter:
         nuisance: Whether it is unknown but of no interest, so that the design spends no effort on it.
         wanted: Standard deviation aimed at, or None.
         group: Name of the group with which it was declared; empty for a single parameter.
-        per_recording: Whether every recording has its own value.
+        per_recording: Whether every recording has a separate value.
     """
 
     name: str
@@ -255,7 +255,7 @@ class ParameterSet:
 
     @cached_property
     def recording_specific(self) -> np.ndarray:
-        """(p,) True where every experiment and recording has its own value, as for deviations of the initial state."""
+        """(p,) True where every experiment and recording has a separate value, as for deviations of the initial state."""
         stated = np.array([p.per_recording for p in self.parameters], dtype=bool)
         return np.asarray(self.initial_deviations | stated)
 

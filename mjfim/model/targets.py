@@ -71,7 +71,7 @@ class ModelField:
         return float(number) / self.factor
 
     def magnitude(self, model: Any) -> float:
-        """The radius of gyration for a centre of mass; 0 for other numbers, whose own value is their magnitude."""
+        """The radius of gyration for a centre of mass; 0 for other numbers, whose magnitude is their value."""
         if self.array == "body_ipos" and float(model.body_mass[self.rows[0]]) > 0.0:
             return body_inertia(model, self.rows[0]).gyration_radius
         return 0.0
@@ -198,7 +198,7 @@ class SpecField:
         )
 
     def magnitude(self, model: Any) -> float:
-        """The geom's bounding radius for positions; 0 for other numbers, whose own value is their magnitude."""
+        """The geom's bounding radius for positions; 0 for other numbers, whose magnitude is their value."""
         return float(model.geom_rbound[model.geom(self.name).id]) if self.field == "pos" else 0.0
 
 

@@ -139,7 +139,7 @@ class Relaxation:
 
 
 class PlantModel:
-    """The compiled model that a plant steps: a copy of the user's with its own settings.
+    """The compiled model that a plant steps: a copy of the user's model with other settings.
 
     Args:
         source: The user's model.

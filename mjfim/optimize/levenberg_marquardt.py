@@ -128,7 +128,7 @@ class Solution:
         iterations: Number of iterations that were begun.
         success: True where the search converged.
         status: Sentence that says why the search ended.
-        interrupted: True where somebody asked the search to stop.
+        interrupted: True where the stop token ended the search.
     """
 
     unknowns: UnknownValues

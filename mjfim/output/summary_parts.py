@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Emphasis(Enum):
-    """Degree to which a row or a sentence stands out."""
+    """Visual emphasis of a row or a sentence."""
 
     NORMAL = auto()
     STRONG = auto()
@@ -22,7 +22,7 @@ class Emphasis(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
-    """A number in a table; every renderer writes it in its own notation.
+    """A number in a table; every renderer chooses the notation.
 
     Attributes:
         value: The number.

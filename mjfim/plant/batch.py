@@ -176,7 +176,7 @@ class BatchSimulator:
         """Build the simulator.
 
         Args:
-            model: Model copy that nobody else changes.
+            model: Model copy that no other code changes.
             substeps: `mj_step` calls per sample.
             sensors: True if sensor data are requested.
             threads: Number of threads; None takes all cores.

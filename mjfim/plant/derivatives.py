@@ -792,7 +792,7 @@ class Derivatives:
             change = observed[:count, :-1] - observed[count:, :-1]
             jacobian = np.moveaxis(change / moved.widths[..., None], 0, 3)
 
-        # Mixed differences are taken on the smooth plant, from its own origin.
+        # Mixed differences are taken on the smooth plant, relative to its unmoved step.
         if smooth is not plant:
             smooth_step = smooth.simulator.step([smooth.model(theta)], moved.states, moved.ctrl)
             origin = moved.unflatten(smooth_step.states)[0]

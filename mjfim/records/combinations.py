@@ -69,7 +69,7 @@ def combination_matrix(groups: Sequence[ParameterGroup], names: Sequence[str]) -
 
     Args:
         groups: Groups of parameters.
-        names: Names of the t parameters that the columns stand for.
+        names: Names of the t parameters, one for each column.
 
     Returns:
         (c, t) coefficients, one row per combination.

@@ -105,7 +105,7 @@ class Estimate(SavedRecord):
     def __post_init__(self) -> None:
         count = len(self.parameters)
 
-        # Formal values stand in for what was not computed.
+        # Formal values replace robust ones that were not computed.
         if len(self.interval) != count:
             theta, half_width = np.asarray(self.theta), NORMAL_95 * np.asarray(self.std)
             interval = np.column_stack([theta - half_width, theta + half_width])

@@ -622,7 +622,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "model's value outside": (
         parameter('target = "body/bob:mass"\nbounds = [3, 5]'),
         E,
-        [HOME, "parameters.m.guess", "the model's own value 2", "[3.0, 5.0]"],
+        [HOME, "parameters.m.guess", "the value 2 in the model", "[3.0, 5.0]"],
     ),
     "true outside": (
         parameter('target = "body/bob:mass"\nbounds = [1, 5]\ntrue = 0.5'),

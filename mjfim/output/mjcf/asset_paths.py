@@ -9,7 +9,7 @@ from typing import Any
 
 from mjfim.output.mjcf.document import MjcfDocument
 
-# Folders that <compiler> may state for one type of asset; `assetdir` stands for both.
+# Folders that <compiler> may state for one type of asset; `assetdir` is used for both.
 TYPED_FOLDERS = ("meshdir", "texturedir")
 
 

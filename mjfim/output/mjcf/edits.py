@@ -172,7 +172,7 @@ class ParameterEdits:
         elif field == "springref" and self._is_in_degrees(name):
             old, new = np.rad2deg(old), np.rad2deg(new)
         elif field == "springlength":
-            # One rest length stands for both ends of the range.
+            # One rest length sets both ends of the range.
             is_single = new[0] == new[1] and len(self.document.written_numbers(tag, field)) < 2
             min_count = 1 if is_single else 2
             old, new = old[:min_count], new[:min_count]
