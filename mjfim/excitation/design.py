@@ -165,7 +165,7 @@ def _identifiability(
             reason += ", or at a parameter sample of [robust]; bounds keep samples where the model makes sense"
         raise SimulationDivergedError(f"the simulation diverges {reason}")
 
-    return task.observer.identifiability(begin.trajectory, begin.sensitivity)
+    return task.identifiability_test.along(begin.trajectory, begin.sensitivity)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -407,7 +407,7 @@ def designable(task: DesignTask) -> Identifiability:
             "the simulation diverges when the parameters move a little along the initial control"
         )
 
-    identifiability = task.observer.identifiability(first.trajectory, first.sensitivity)
+    identifiability = task.identifiability_test.along(first.trajectory, first.sensitivity)
     require_designable(task, identifiability)
     return identifiability
 

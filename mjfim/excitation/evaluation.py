@@ -98,7 +98,7 @@ def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
     if point.trajectory is None or point.sensitivity is None:
         raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
 
-    identifiability = task.observer.identifiability(point.trajectory, point.sensitivity)
+    identifiability = task.identifiability_test.along(point.trajectory, point.sensitivity)
     stage = Stage(task, identifiability.basis)
     return evaluate(stage, stage.problem.reevaluated(point))
 

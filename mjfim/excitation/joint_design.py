@@ -106,7 +106,7 @@ def _initial_information(task: DesignTask) -> Array:
         )
 
     # Where the initial control excites some combinations only, the others carry no information.
-    excited = task.observer.identifiability(task.initial, point.sensitivity).along_trajectory
+    excited = task.identifiability_test.along(task.initial, point.sensitivity).along_trajectory
     basis = excited.basis if excited.count else None
     information = replace(task.information, basis=basis)
 

@@ -20,7 +20,7 @@ from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System, keyframe
 from mjfim.experiment.system_tables import Signal
 from mjfim.information.fisher import FisherInformation
-from mjfim.information.identifiability import Observer
+from mjfim.information.identifiability import IdentifiabilityTest
 from mjfim.model.coordinates import joint_dofs, joint_names
 from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import ParameterSet
@@ -297,9 +297,9 @@ class DesignTask:
         )
 
     @property
-    def observer(self) -> Observer:
+    def identifiability_test(self) -> IdentifiabilityTest:
         """Finds the parameters that cannot be identified, along trajectories of this task."""
-        return Observer(
+        return IdentifiabilityTest(
             plant=self.plant,
             parameters=self.parameters,
             noise=self.system.noise,

@@ -1,6 +1,6 @@
-"""Which parameters an experiment can identify: along its own trajectory, and along random ones.
+"""Identifiability of the parameters of an experiment: along its trajectory, and along random ones.
 
-Random trajectories tell whether another control would help.
+Random trajectories show whether another control would help.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ROUND_OFF = 1e-7
 # An effect below this share of the strongest one in earlier experiments is round-off.
 NEGLIGIBLE_EFFECT = 1e-6
 
-# Samples of a trajectory whose single steps are looked at first, before all of them.
+# Number of samples of a trajectory whose single steps are tested first, before all of them.
 FEW_SAMPLES = 60
 
 # Difference steps of the parameters for single engine steps, relative to the size of each parameter.
@@ -98,8 +98,8 @@ class Identifiability:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Observer:
-    """Looks for parameters that the measurements of a plant cannot show.
+class IdentifiabilityTest:
+    """Test for parameters that the measurements of a plant cannot show.
 
     Attributes:
         plant: The plant.
@@ -126,35 +126,39 @@ class Observer:
         """(n, p) whitened rows of G at the measured samples."""
         return self.noise.whitened_rows(sensitivity.G)
 
-    def identifiability(self, trajectory: Trajectory, sensitivity: Sensitivity) -> Identifiability:
-        """Look along a trajectory whose sensitivity is known; along random ones only where that leaves a doubt."""
+    def along(self, trajectory: Trajectory, sensitivity: Sensitivity) -> Identifiability:
+        """Test identifiability along a trajectory; along random ones only where that leaves a doubt.
+
+        Args:
+            trajectory: The trajectory.
+            sensitivity: Its sensitivities to the parameters.
+        """
         J = self.rows(sensitivity)
         single_steps = _single_step_null_space(self, [trajectory])
 
         # One difference step is enough where every singular value stands far above its round-off.
         quick = _null_space(self, [J], None, single_steps)
         if quick.smallest > CLEAR_SINGULAR_VALUE and not quick.count:
-            return _in_words(self, quick, quick)
+            return _with_groups(self, quick, quick)
 
-        return _look(
-            self, trajectory, *_rows_and_error(self, trajectory, sensitivity), single_steps
-        )
+        J, error = _rows_and_error(self, trajectory, sensitivity)
+        return _identifiability(self, trajectory, J, error, single_steps)
 
-    def identifiability_of_rows(
-        self, trajectory: Trajectory, J: Array, error: Array
-    ) -> Identifiability:
-        """Look at given rows of G; along random trajectories only where that leaves a doubt.
+    def of_rows(self, trajectory: Trajectory, J: Array, error: Array) -> Identifiability:
+        """Test identifiability from rows of G; along random trajectories only where that leaves a doubt.
 
         Args:
             trajectory: One of the trajectories to which the rows belong.
             J: (n, p) whitened rows of G.
             error: (n, p) their change with a longer difference step.
         """
-        return _look(self, trajectory, J, error, _single_step_null_space(self, [trajectory]))
+        return _identifiability(
+            self, trajectory, J, error, _single_step_null_space(self, [trajectory])
+        )
 
 
 def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
-    """Raise where a parameter cannot be told from data with these rows of G.
+    """Raise where a parameter cannot be identified from data with these rows of G.
 
     Args:
         parameters: The p unknown parameters.
@@ -175,48 +179,54 @@ def require_visible(parameters: ParameterSet, prior: Array, J: Array) -> None:
     raise UnidentifiableError(f"this trajectory does not show every parameter: {listed}")
 
 
-def _look(
-    observer: Observer, trajectory: Trajectory, J: Array, error: Array, single_steps: Array | None
+def _identifiability(
+    test: IdentifiabilityTest,
+    trajectory: Trajectory,
+    J: Array,
+    error: Array,
+    single_steps: Array | None,
 ) -> Identifiability:
     """Null space of given rows, and what random trajectories leave of it."""
-    along_trajectory = _null_space(observer, [J], [error], single_steps)
+    along_trajectory = _null_space(test, [J], [error], single_steps)
     if not along_trajectory.count:
-        return _in_words(observer, along_trajectory, along_trajectory)
+        return _with_groups(test, along_trajectory, along_trajectory)
 
-    tried = list(observer.probes(PROBES))
-    known = _single_step_null_space(observer, [trajectory, *tried])
+    tried = list(test.probes(PROBES))
+    known = _single_step_null_space(test, [trajectory, *tried])
     stack, errors = [J], [error]
 
     # Whole motions are differentiated only where single steps do not explain the null space already.
     if known is None or along_trajectory.count > known.shape[1]:
         for probe in tried:
-            fine = observer.plant.derivatives.sensitivity(observer.theta, probe)
+            fine = test.plant.derivatives.sensitivity(test.theta, probe)
             if fine is None:
                 continue
-            rows, change = _rows_and_error(observer, probe, fine)
+            rows, change = _rows_and_error(test, probe, fine)
             stack.append(rows)
             errors.append(change)
 
-    along_all = _null_space(observer, stack, errors, known)
-    return _in_words(observer, along_trajectory, along_all)
+    along_all = _null_space(test, stack, errors, known)
+    return _with_groups(test, along_trajectory, along_all)
 
 
-def _single_step_null_space(observer: Observer, trajectories: Sequence[Trajectory]) -> Array | None:
+def _single_step_null_space(
+    test: IdentifiabilityTest, trajectories: Sequence[Trajectory]
+) -> Array | None:
     """Directions without effect on single steps and their outputs, (t, k); None without a parameter inside the model.
 
-    Such a direction moves nothing, whatever is measured. Single steps tell it exactly, even where motions are chaotic.
+    Such a direction moves nothing, whatever is measured. Single steps show it exactly, even where motions are chaotic.
     """
-    parameters = observer.parameters
+    parameters = test.parameters
     inside = parameters.interest[parameters.changes_model[parameters.interest]]
     if not len(inside):
         return None
 
-    no_prior = np.zeros_like(observer.prior)
+    no_prior = np.zeros_like(test.prior)
     longest = max(trajectory.samples for trajectory in trajectories)
 
     # A few samples first: where they leave a direction open, a contact between them may still show it.
     for most in (FEW_SAMPLES, longest):
-        found = _step_effects(observer, trajectories, most)
+        found = _step_effects(test, trajectories, most)
         if found is None:
             return None
         J, error = found[0][:, inside], found[1][:, inside]
@@ -227,16 +237,16 @@ def _single_step_null_space(observer: Observer, trajectories: Sequence[Trajector
 
     directions = np.zeros((len(parameters.interest), null.count))
     directions[np.searchsorted(parameters.interest, inside)] = null.directions
-    return _unseen_by_earlier(observer, directions)
+    return _hidden_from_earlier(test, directions)
 
 
 def _step_effects(
-    observer: Observer, trajectories: Sequence[Trajectory], most: int
+    test: IdentifiabilityTest, trajectories: Sequence[Trajectory], most: int
 ) -> tuple[Array, Array] | None:
     """Effects of the parameters on single steps, and their error; None where all trajectories diverge.
 
     Args:
-        observer: The plant and its parameters.
+        test: The plant and its parameters.
         trajectories: Trajectories whose samples are looked at.
         most: Largest number of samples of each.
 
@@ -249,7 +259,7 @@ def _step_effects(
         picked = np.unique(np.linspace(0, trajectory.samples - 1, count).astype(int))
         try:
             first, second = (
-                observer.plant.derivatives.one_step(observer.theta, trajectory, picked, step)
+                test.plant.derivatives.one_step(test.theta, trajectory, picked, step)
                 for step in SINGLE_STEP_DIFFERENCES
             )
         except SimulationDivergedError:
@@ -260,11 +270,11 @@ def _step_effects(
     return (np.concatenate(stack), np.concatenate(errors)) if stack else None
 
 
-def _in_words(
-    observer: Observer, along_trajectory: NullSpace, along_all: NullSpace
+def _with_groups(
+    test: IdentifiabilityTest, along_trajectory: NullSpace, along_all: NullSpace
 ) -> Identifiability:
     """Two null spaces in the names of the wanted parameters."""
-    parameters = observer.parameters
+    parameters = test.parameters
     interest = parameters.interest
     names = tuple(parameters.names[j] for j in interest)
     size = parameters.magnitude[interest]
@@ -280,14 +290,14 @@ def _in_words(
 
 
 def _null_space(
-    observer: Observer,
+    test: IdentifiabilityTest,
     stack: Sequence[Array],
     errors: Sequence[Array] | None,
     known: Array | None,
 ) -> NullSpace:
     """Null space of stacked rows together with those of earlier experiments. known: (t, k) directions found otherwise."""
-    parameters = observer.parameters
-    before = _rows_of_information(observer.earlier)
+    parameters = test.parameters
+    before = _rows_of_information(test.earlier)
     error = None
     if errors is not None:
         error = np.concatenate([*errors, ROUND_OFF * np.abs(before)])
@@ -298,7 +308,7 @@ def _null_space(
         parameters.magnitude,
         parameters.scale,
         parameters.interest,
-        observer.prior,
+        test.prior,
         known=known,
     )
 
@@ -310,17 +320,17 @@ def _rows_of_information(information: Array) -> Array:
     return np.asarray(np.sqrt(values[kept])[:, None] * vectors.T[kept])
 
 
-def _unseen_by_earlier(observer: Observer, directions: Array) -> Array:
+def _hidden_from_earlier(test: IdentifiabilityTest, directions: Array) -> Array:
     """Combinations of (t, k) directions that earlier experiments do not show either."""
-    if not observer.earlier.any() or not directions.shape[1]:
+    if not test.earlier.any() or not directions.shape[1]:
         return directions
 
-    parameters = observer.parameters
+    parameters = test.parameters
     interest = parameters.interest
     sizes = parameters.magnitude[interest][:, None]
     unit = directions / np.linalg.norm(directions / sizes, axis=0)
 
-    before = _rows_of_information(observer.earlier)
+    before = _rows_of_information(test.earlier)
     effect = before[:, interest] @ unit
     square = np.zeros((unit.shape[1], unit.shape[1]))
     _, values, V = np.linalg.svd(np.concatenate([effect, square]), full_matrices=False)
@@ -331,10 +341,10 @@ def _unseen_by_earlier(observer: Observer, directions: Array) -> Array:
 
 
 def _rows_and_error(
-    observer: Observer, trajectory: Trajectory, fine: Sensitivity
+    test: IdentifiabilityTest, trajectory: Trajectory, fine: Sensitivity
 ) -> tuple[Array, Array]:
     """Rows of G and their change with a longer step, which is all of them where the longer step diverges."""
-    J = observer.rows(fine)
+    J = test.rows(fine)
     step = COARSER_STEP_FACTOR * SENSITIVITY_STEP
-    coarse = observer.plant.derivatives.sensitivity(observer.theta, trajectory, step)
-    return J, np.zeros_like(J) if coarse is None else observer.rows(coarse) - J
+    coarse = test.plant.derivatives.sensitivity(test.theta, trajectory, step)
+    return J, np.zeros_like(J) if coarse is None else test.rows(coarse) - J

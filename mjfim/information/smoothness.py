@@ -76,25 +76,24 @@ def roughness(
     Returns:
         The worst disagreement and what causes it; None where it is below `DISAGREEMENT_TOLERANCE`.
     """
-    parameters, derivatives = plant.parameters, plant.derivatives
+    names, derivatives = plant.parameters.names, plant.derivatives
+    factors = _longer_step_factors(plant)
+    coarse = derivatives.sensitivity(theta, trajectory, factors * SENSITIVITY_STEP)
     if fine is None:
         fine = derivatives.sensitivity(theta, trajectory)
-    factors = LONGER_STEP_FACTOR * parameters.magnitude / derivatives.parameter_scale
-    factors = np.maximum(factors, LEAST_STEP_FACTOR)
-    coarse = derivatives.sensitivity(theta, trajectory, factors * SENSITIVITY_STEP)
 
     # A trajectory that diverges when the parameters move a little is as rough as can be.
     if fine is None or coarse is None:
         return Roughness(
             error=np.inf,
-            parameter=", ".join(parameters.names),
+            parameter=", ".join(names),
             sample=0,
             time=0.0,
             causes=active_constraints(model, trajectory, range(trajectory.samples)),
         )
 
     G = noise.whiten(fine.G)
-    visible = np.flatnonzero(visible_columns(parameters, G))
+    visible = np.flatnonzero(visible_columns(plant.parameters, G))
     if not len(visible):
         return None
 
@@ -116,11 +115,17 @@ def roughness(
     nearby = range(max(first - SAMPLES_BEFORE, 0), min(first + 1, trajectory.samples))
     return Roughness(
         error=float(error[:, worst].max()),
-        parameter=parameters.names[visible[worst]],
+        parameter=names[visible[worst]],
         sample=first,
         time=float(trajectory.t[first]),
         causes=active_constraints(model, trajectory, nearby),
     )
+
+
+def _longer_step_factors(plant: Plant) -> Array:
+    """(p,) the second difference step of each parameter over its first one."""
+    factors = LONGER_STEP_FACTOR * plant.parameters.magnitude / plant.derivatives.parameter_scale
+    return np.maximum(factors, LEAST_STEP_FACTOR)
 
 
 def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:

@@ -86,7 +86,7 @@ def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
-    identifiability = task.observer.identifiability(curve, point.sensitivity)
+    identifiability = task.identifiability_test.along(curve, point.sensitivity)
     return _Assessment(
         task=task,
         source=source,
@@ -110,7 +110,7 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
     # Rows of G at the times at which the recordings were measured, and the error of their differences.
     recorded = fit.sensitivity_rows(fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
-    identifiability = task.observer.identifiability_of_rows(task.initial, J, error)
+    identifiability = task.identifiability_test.of_rows(task.initial, J, error)
 
     count = len(recordings)
     return _Assessment(

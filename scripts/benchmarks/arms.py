@@ -527,7 +527,7 @@ def identifiable(e: Experiment) -> Iterator[tuple[str, str]]:
         ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[:3]),
     )
     yield "best", ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[-2:])
-    seen = task.observer.identifiability(task.initial, told)
+    seen = task.identifiability_test.along(task.initial, told)
     yield "never identifiable", "; ".join(str(group) for group in seen.groups_along_all) or "none"
     yield (
         "not along this motion",

@@ -81,7 +81,7 @@ def measured(model: Path, p: int, iterations: int) -> Cost:
     sensitivity = task.plant.derivatives.sensitivity(task.theta, curve)
     if sensitivity is None:
         raise SystemExit("the arm diverges")
-    problem = Stage(task, task.observer.identifiability(curve, sensitivity).basis).problem
+    problem = Stage(task, task.identifiability_test.along(curve, sensitivity).basis).problem
     clock = time.perf_counter()
     point = problem.point(curve, FORWARD_DIFFERENCES)
     value = time.perf_counter() - clock

@@ -53,7 +53,7 @@ def two_task(folder: Path, **tables: Any) -> DesignTask:
 
 def look(task: DesignTask) -> Identifiability:
     """Identifiability along the initial control."""
-    return task.observer.identifiability(
+    return task.identifiability_test.along(
         task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
     )
 
@@ -69,7 +69,7 @@ def test_an_experiment_that_shows_everything_needs_no_random_controls(
         curve = task.initial
         found = task.plant.derivatives.sensitivity(task.theta, curve)
         monkeypatch.setattr(task.plant, "simulate", refused)
-        return task.observer.identifiability(curve, found)
+        return task.identifiability_test.along(curve, found)
 
     seen = look_without_simulations(cart_task(tmp_path))
     assert seen.basis is None
@@ -105,7 +105,7 @@ def test_the_null_space_of_all_controls_is_that_of_the_initial_one(tmp_path) -> 
     assert seen.basis.shape == (3, 2)
     require_designable(task, seen)  # a combination can be designed for
     J = (
-        task.observer.rows(task.plant.derivatives.sensitivity(task.theta, task.initial))
+        task.identifiability_test.rows(task.plant.derivatives.sensitivity(task.theta, task.initial))
         * task.parameters.scale
     )
     hidden = np.linalg.qr(seen.basis, mode="complete")[0][:, 2]
@@ -251,7 +251,7 @@ def test_random_controls_that_diverge_are_left_out(tmp_path, monkeypatch) -> Non
         raise SimulationDivergedError("too fast")
 
     monkeypatch.setattr(task.plant, "simulate", diverges)
-    seen = task.observer.identifiability(curve, found)
+    seen = task.identifiability_test.along(curve, found)
     assert (seen.along_trajectory.count, seen.along_all.count) == (1, 1)
 
 
@@ -260,12 +260,16 @@ def test_data_must_show_every_parameter_even_nuisances_and_those_with_a_prior(tm
     require_visible(
         plain.parameters,
         plain.prior,
-        plain.observer.rows(plain.plant.derivatives.sensitivity(plain.theta, plain.initial)),
+        plain.identifiability_test.rows(
+            plain.plant.derivatives.sensitivity(plain.theta, plain.initial)
+        ),
     )
     sure = {**PRODUCT, "gear": {**PRODUCT["gear"], "nuisance": True, "prior": 1e-6}}
     for parameters in (PRODUCT, sure):
         task = cart_task(tmp_path, parameters=parameters)
-        J = task.observer.rows(task.plant.derivatives.sensitivity(task.theta, task.initial))
+        J = task.identifiability_test.rows(
+            task.plant.derivatives.sensitivity(task.theta, task.initial)
+        )
         with pytest.raises(UnidentifiableError, match="gear and gain only as gear"):
             require_visible(task.parameters, task.prior, J)
 

@@ -226,7 +226,7 @@ def double_pendulum(folder: Path, coordinates: str) -> DesignTask:
 
 def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
     task = double_pendulum(tmp_path, "barycentric")
-    seen = task.observer.identifiability(
+    seen = task.identifiability_test.along(
         task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
     )
     assert (seen.along_trajectory.count, seen.along_all.count) == (14, 14)
@@ -249,7 +249,7 @@ def test_base_parameters_are_as_many_in_any_coordinates_and_predict_the_same_mot
     tmp_path,
 ) -> None:
     task = double_pendulum(tmp_path, "logcholesky")
-    seen = task.observer.identifiability(
+    seen = task.identifiability_test.along(
         task.initial, task.plant.derivatives.sensitivity(task.theta, task.initial)
     )
     assert seen.basis.shape == (20, 6)
