@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 import mjfim
-from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.output.mjcf.write import write_identified
 from mjfim.recordings.read import read_recording
@@ -29,16 +29,14 @@ def main() -> int:
     args = parser.parse_args()
 
     # The experiment file says what is unknown, where to start, and how noisy each output is.
-    task = DesignTask.resolve(mjfim.Experiment.from_file(args.experiment))
-    recordings = [read_recording(path, task.system.channels) for path in args.recordings]
+    system = System.resolve(mjfim.Experiment.from_file(args.experiment))
+    recordings = [read_recording(path, system.channels) for path in args.recordings]
 
     # Weighted least squares in MuJoCo over all recordings at once.
-    estimate = identify_system(task.system, recordings)
+    estimate = identify_system(system, recordings)
 
     # 95 % intervals that allow for residuals which are no white noise
-    rows = zip(
-        estimate.parameters, estimate.theta, estimate.interval, task.system.units, strict=True
-    )
+    rows = zip(estimate.parameters, estimate.theta, estimate.interval, system.units, strict=True)
     for name, value, (low, high), unit in rows:
         print(f"{name:>12s} = {value:.5g} ({low:.5g} ... {high:.5g}) {unit}")
     print(f"chi2 / dof = {estimate.chi2 / estimate.dof:.3f}; {estimate.status}")
@@ -46,7 +44,7 @@ def main() -> int:
         print(f"warning: {warning}")
 
     target = args.recordings[0].with_name("identified.xml")
-    remark = write_identified(target, task.system, estimate.theta)
+    remark = write_identified(target, system, estimate.theta)
     print(f"wrote {target}{f' ({remark})' if remark else ''}")
     return 0 if estimate.success and not estimate.misfit else 1
 

@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 import mjfim
-from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
 from mjfim.output.archive import write_recording
 from mjfim.parallel import cores
 from mjfim.records.recording import Recording
@@ -37,10 +37,10 @@ clock = time.perf_counter()
 from pathlib import Path
 import mjfim
 from mjfim.recordings.read import read_recording
-from mjfim.excitation.task import DesignTask
-task = DesignTask.resolve(mjfim.Experiment.from_file(sys.argv[1]))
+from mjfim.experiment.system import System
+system = System.resolve(mjfim.Experiment.from_file(sys.argv[1]))
 clock = time.perf_counter()
-read_recording(Path(sys.argv[2]), task.system.channels)
+read_recording(Path(sys.argv[2]), system.channels)
 print(time.perf_counter() - clock)
 """
 
@@ -64,51 +64,54 @@ class Hour:
     parameters: int
 
 
-def played(task: DesignTask, seconds: float, seed: int) -> Recording:
+def played(system: System, seconds: float, seed: int) -> Recording:
     """A simulated log: random multisines of a minute each, noise on everything measured."""
     rng = np.random.default_rng(seed)
-    rate = task.experiment.rate
+    rate = system.experiment.rate
     minute = np.arange(round(60.0 * rate)) / rate
     amplitude = np.array([8.0, 3.0])
     parts = [
         amplitude * multisine(minute, 2, 0.1, 30, rng) for _ in range(int(np.ceil(seconds / 60.0)))
     ]
     ctrl = np.concatenate(parts)[: round(seconds * rate)]
-    theta, states = task.parameters.true, [task.plant.initial_state(task.parameters.true)[None]]
+    theta, states = (
+        system.parameters.true,
+        [system.plant.initial_state(system.parameters.true)[None]],
+    )
     for first in range(0, len(ctrl), 100_000):
-        model = [task.plant.model(theta)]
-        out = task.plant.simulator.rollout(
+        model = [system.plant.model(theta)]
+        out = system.plant.simulator.rollout(
             model, states[-1][-1:], ctrl[None, first : first + 100_000]
         )
         states.append(out.states[0, 1:])
-    y = task.plant.outputs(np.concatenate(states), None)
-    y += task.system.noise.sample(len(y), rng)
+    y = system.plant.outputs(np.concatenate(states), None)
+    y += system.noise.sample(len(y), rng)
     return Recording(
-        t=np.arange(len(y)) / rate, ctrl=ctrl, y=y, outputs=task.system.outputs.names, name="hour"
+        t=np.arange(len(y)) / rate, ctrl=ctrl, y=y, outputs=system.outputs.names, name="hour"
     )
 
 
-def bare(task: DesignTask, samples: int) -> float:
+def bare(system: System, samples: int) -> float:
     """Seconds that the engine takes for so many steps on all threads."""
-    count = task.plant.simulator.threads * 50
+    count = system.plant.simulator.threads * 50
     steps = 2000
-    starts = np.tile(task.plant.initial_state(task.theta), (count, 1))
-    ctrl = np.zeros((count, steps, len(task.controls)))
-    model = [task.plant.model(task.theta)]
-    task.plant.simulator.rollout(model, starts, ctrl)
+    starts = np.tile(system.plant.initial_state(system.theta), (count, 1))
+    ctrl = np.zeros((count, steps, len(system.controls)))
+    model = [system.plant.model(system.theta)]
+    system.plant.simulator.rollout(model, starts, ctrl)
     clock = time.perf_counter()
-    task.plant.simulator.rollout(model, starts, ctrl)
+    system.plant.simulator.rollout(model, starts, ctrl)
     return (time.perf_counter() - clock) / (count * steps) * samples
 
 
 def measured(hours: float, seed: int) -> Hour:
     """Write, read and fit."""
-    task = DesignTask.resolve(mjfim.Experiment.from_file(EXPERIMENT))
-    recording = played(task, 3600.0 * hours, seed)
+    system = System.resolve(mjfim.Experiment.from_file(EXPERIMENT))
+    recording = played(system, 3600.0 * hours, seed)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         log = folder / "hour.csv"
-        write_recording(log, recording, task.system)
+        write_recording(log, recording, system)
         size, samples = log.stat().st_size / 1e6, len(recording.ctrl)
         del recording
         read = float(
@@ -134,12 +137,12 @@ def measured(hours: float, seed: int) -> Hour:
         if not (folder / "out" / "estimate.json").is_file():
             raise SystemExit(done.stderr)
         found = json.loads((folder / "out" / "estimate.json").read_text(encoding="utf-8"))
-    theta, true = np.array(found["theta"]), task.parameters.true
+    theta, true = np.array(found["theta"]), system.parameters.true
     inside = np.array(
         [low <= value <= high for (low, high), value in zip(found["interval"], true, strict=True)]
     )
     wrong = float(np.abs((theta - true) / np.array(found["std"])).max())
-    engine = bare(task, samples)
+    engine = bare(system, samples)
     return Hour(
         samples,
         size,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mjfim
-from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.recordings.read import read_recording
 from mjfim.records.estimate import Estimate
@@ -67,12 +67,11 @@ def experiment(name: str, guess: dict[str, float] | None = None, **fit: object) 
 
 def identified(stated: mjfim.Experiment, files: list[Path], held_out: list[Path]) -> Estimate:
     """Read, fit, predict."""
-    task = DesignTask.resolve(stated)
+    system = System.resolve(stated)
     fitted, kept = (
-        [read_recording(path, task.system.channels) for path in paths]
-        for paths in (files, held_out)
+        [read_recording(path, system.channels) for path in paths] for paths in (files, held_out)
     )
-    return identify_system(task.system, fitted, held_out=kept)
+    return identify_system(system, fitted, held_out=kept)
 
 
 @pytest.mark.parametrize(
@@ -162,11 +161,11 @@ def test_servo_predicts_held_out_logs_as_well_as_published() -> None:
     found = identified(experiment("bam_xl330", bootstrap=300), fitted, others)
     mine = np.mean([p.identified.mae[0] for p in found.predictions])
     for published in (PUBLISHED_SERVO, HEAD_SERVO):
-        task = DesignTask.resolve(experiment("bam_xl330", published))
+        system = System.resolve(experiment("bam_xl330", published))
         errors = mjfim.predict(
-            task.experiment,
-            task.theta,
-            [read_recording(path, task.system.channels) for path in others],
+            system.experiment,
+            system.theta,
+            [read_recording(path, system.channels) for path in others],
         )
         assert mine < 1.05 * np.mean([e.mae[0] for e in errors])
     assert "coulomb" in found.sloppy

@@ -12,6 +12,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.output import folders as results
 from tests.support.cli import DESIGN, MODELS, names, read, run
+from tests.support.examples import design_file
 
 EXAMPLES = sorted(
     path.stem for path in MODELS.glob("*.toml") if not path.stem.startswith("cart_pendulum")
@@ -37,7 +38,7 @@ def test_every_model_has_an_experiment() -> None:
 
 @pytest.mark.parametrize("name", slow_except("four_bar", "sliding_block"))
 def test_check_says_what_the_example_is_about(name: str, tmp_path: Path) -> None:
-    result = run("check", MODELS / f"{name}.toml", "-o", tmp_path / "out")
+    result = run("check", design_file(name, tmp_path), "-o", tmp_path / "out")
     assert result.exit_code in (0, 1), result.output
     told = read(tmp_path / "out" / "check.json")
     assert told["self_test"]["passed"] == (name not in ROUGH)
@@ -54,13 +55,16 @@ def test_check_says_what_the_example_is_about(name: str, tmp_path: Path) -> None
 @pytest.mark.parametrize("name", slow_except("four_bar"))
 def test_a_short_design_improves_and_leaves_everything(name: str, tmp_path: Path) -> None:
     task = DesignTask.resolve(
-        mjfim.Experiment.from_file(MODELS / f"{name}.toml").replace(descent={"max_iterations": 3})
+        mjfim.Experiment.from_file(design_file(name, tmp_path)).replace(
+            descent={"max_iterations": 3}
+        )
     )
     design = design_task(task)
     assert design.final.cost < design.initial.cost
-    results.leave_design(tmp_path, design, task.system)
-    assert names(tmp_path) == DESIGN | ({"limits.png"} if design.usage else set())
-    told = read(tmp_path / "design.json")
+    folder = tmp_path / "out"
+    results.leave_design(folder, design, task.system)
+    assert names(folder) == DESIGN | ({"limits.png"} if design.usage else set())
+    told = read(folder / "design.json")
     assert len(told["final"]["std"]) == len(told["parameters"])
     assert [c["words"] for c in told["combined"]] == [c.expression for c in design.combined]
     assert bool(design.combined) == (name in TOGETHER)

@@ -20,6 +20,7 @@ from mjfim.output.mjcf.actuators import SHORTCUTS
 from mjfim.output.mjcf.document import MjcfDocument
 from mjfim.output.mjcf.write import COMPARED, NOT_DYNAMICS, write_identified
 from mjfim.output.mjcf.xml_edit import XmlText
+from tests.support.examples import design_file
 from tests.support.numerics import make_task, shared_model
 from tests.support.paths import MODELS, SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
@@ -600,7 +601,7 @@ def test_shortcuts_set_the_entries_that_mujoco_sets(element: str) -> None:
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in MODELS.glob("*.toml")))
 def test_the_models_of_this_repository(name: str, tmp_path: Path) -> None:
-    task = DesignTask.resolve(mjfim.Experiment.from_file(MODELS / f"{name}.toml"))
+    task = DesignTask.resolve(mjfim.Experiment.from_file(design_file(name, tmp_path)))
     theta = task.parameters.guess * (
         1.0 + 0.004 * np.random.default_rng(1).uniform(-1.0, 1.0, len(task.parameters))
     )

@@ -18,6 +18,7 @@ from mjfim.information.fisher import FisherInformation
 from mjfim.records.recording import Recording
 from mjfim.records.serialization import as_json
 from mjfim.studies.check import check, check_recordings, check_task
+from tests.support.examples import design_file
 from tests.support.numerics import CART_PARAMETERS, Array, cart_task, make_task, relative_error
 from tests.support.paths import MODELS, SHARED_DATA
 
@@ -264,9 +265,9 @@ def test_the_summary_is_strict_json(tmp_path) -> None:
         for file in sorted(MODELS.glob("*.toml"))
     ],
 )
-def test_every_example_can_be_checked_whatever_its_weights(file: Path) -> None:
+def test_every_example_can_be_checked_whatever_its_weights(file: Path, tmp_path: Path) -> None:
     """A cost without control weights has no metric of its own; the slope is tested along a unit-weight direction."""
-    found = check(mjfim.Experiment.from_file(file))
+    found = check(mjfim.Experiment.from_file(design_file(file.stem, tmp_path)))
     assert found.verdict
     assert np.isfinite(found.self_test.slope)
     if found.self_test.roughness is None:

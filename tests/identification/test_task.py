@@ -1,0 +1,127 @@
+"""Tasks of identifications: a model, parameters, noise and recordings are enough."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mjfim
+from mjfim.budget import StopToken
+from mjfim.errors import ExperimentError
+from mjfim.experiment.system import System
+from mjfim.identification.identify import identify_task
+from mjfim.identification.task import FitTask
+from mjfim.records.recording import Recording
+from tests.support.paths import MODELS
+
+MINIMAL = f"""
+model = "{(MODELS / "cart_pendulum.xml").as_posix()}"
+rate = 100.0
+
+[parameters.m]
+target = "body/bob:mass"
+guess = 2.5
+true = 2.0
+bounds = [0.1, 10.0]
+
+[parameters.c]
+target = "joint/hinge:damping"
+guess = 1.4
+true = 1.0
+bounds = [0.0, 10.0]
+
+[noise]
+state = 0.05
+"""
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> mjfim.Experiment:
+    """An experiment file without horizon, initial state, control, cost or settings of a design."""
+    file = tmp_path_factory.mktemp("minimal") / "minimal.toml"
+    file.write_text(MINIMAL, encoding="utf-8")
+    return mjfim.Experiment.from_file(file)
+
+
+@pytest.fixture(scope="module")
+def recording(experiment: mjfim.Experiment) -> Recording:
+    """A noisy recording at the true parameters."""
+    system = System.resolve(experiment)
+    t = np.arange(301) * system.dt
+    ctrl = 10.0 * np.sin(2.0 * np.pi * 0.7 * t[:-1])[:, None]
+    y, _ = system.plant.measure(system.parameters.true[None], ctrl)
+    noise = 0.05 * np.random.default_rng(0).standard_normal(y[0].shape)
+    return Recording(t=t, ctrl=ctrl, y=y[0] + noise, outputs=system.outputs.names, name="log")
+
+
+def test_a_minimal_experiment_identifies_its_parameters(
+    experiment: mjfim.Experiment, recording: Recording
+) -> None:
+    estimate = mjfim.identify(experiment, [recording], threads=1)
+    assert estimate.success and not estimate.misfit
+    assert (np.abs(estimate.theta - [2.0, 1.0]) < 4.0 * estimate.std).all()
+
+    (errors,) = mjfim.predict(experiment, estimate.theta, [recording], threads=1)
+    np.testing.assert_allclose(errors.rms, 0.05, rtol=0.2)
+
+
+def test_a_minimal_experiment_can_be_checked_on_recordings(
+    experiment: mjfim.Experiment, recording: Recording
+) -> None:
+    found = mjfim.check(experiment, recordings=[recording])
+    assert found.source == "1 recording"
+    assert found.self_test.passed
+    estimate = mjfim.identify(experiment, [recording])
+    np.testing.assert_allclose([row.std for row in found.rows], estimate.std, rtol=0.3)
+
+
+def test_a_design_of_a_minimal_experiment_says_what_is_missing(
+    experiment: mjfim.Experiment,
+) -> None:
+    with pytest.raises(ExperimentError, match="design needs `horizon`"):
+        mjfim.design(experiment)
+
+
+def test_the_start_is_moved_inside_the_bounds_of_a_bounded_method(
+    experiment: mjfim.Experiment, recording: Recording
+) -> None:
+    start = np.array([50.0, -1.0])
+    bounded = FitTask.resolve(experiment, [recording], start=start)
+    np.testing.assert_array_equal(bounded.start, [10.0, 0.0])
+    unbounded = FitTask.resolve(experiment, [recording], start=start, method="newton")
+    np.testing.assert_array_equal(unbounded.start, start)
+
+
+def test_a_stop_token_ends_the_search_with_the_best_result_so_far(
+    experiment: mjfim.Experiment, recording: Recording
+) -> None:
+    stop = StopToken()
+    stop.request()
+    task = FitTask.resolve(experiment, [recording])
+    estimate = identify_task(task, stop=stop)
+    assert estimate.interrupted and not estimate.success
+    assert estimate.predictions == ()
+    np.testing.assert_array_equal(estimate.theta, task.start)
+
+
+def test_variants_of_a_problem_leave_the_problem_unchanged(
+    experiment: mjfim.Experiment, recording: Recording
+) -> None:
+    """Variants share what they do not change, and nothing of them shows in the problem that they were made from."""
+    task = FitTask.resolve(experiment.replace(fit={"segments": 0.5}), [recording])
+    problem = task.problem()
+    begin = problem.begin(task.start)
+    cost, lower = problem.cost(begin), np.array(problem.lower)
+
+    first = problem.of_segments(np.array([0, 2]))
+    assert first.value_count < problem.value_count
+    assert first.recordings is problem.recordings
+    assert np.isneginf(problem.unbounded().lower).all()
+    assert len(problem.with_shared_held().lower) == 0
+    nothing = problem.masked([np.zeros_like(mask) for mask in problem.masks])
+    assert nothing.value_count == 0
+
+    assert problem.cost(begin) == cost
+    np.testing.assert_array_equal(problem.lower, lower)
