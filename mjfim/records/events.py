@@ -13,7 +13,7 @@ class DesignEvent:
     """One iterate of a design.
 
     Attributes:
-        start: Name of the start from which the iterate comes.
+        start: Name of the initial control from which the iterate comes.
         row: The iterate.
     """
 
@@ -26,7 +26,7 @@ class FitEvent:
     """One iterate of an estimation.
 
     Attributes:
-        phase: Data to which the model is fitted: "all data", or a part of the search for its starting point.
+        phase: Data to which the model is fitted: "all data", or a part of the search for an initial guess.
         iteration: Number of the iterate in this phase.
         cost: Half of the sum of squared whitened residuals.
         step: Length of the last step [standard deviations].
