@@ -24,8 +24,9 @@ from mjfim.output.text import render
 from mjfim.records.campaign import Campaign, CampaignStatus, Round
 from mjfim.records.design import Design
 from mjfim.records.estimate import Estimate
+from mjfim.records.events import Event, StudyEvent
 from mjfim.records.recording import Recording
-from mjfim.studies.redesign import restated
+from mjfim.studies.redesign import restate_experiment
 
 
 @verb
@@ -138,7 +139,7 @@ class CampaignRun:
             measure,
             rounds=rounds,
             threads=self.task.system.threads,
-            report=self._finish_round,
+            callback=self._finish_round,
         )
 
     def real(self, rounds: int, files: Sequence[Path]) -> Campaign:
@@ -175,7 +176,7 @@ class CampaignRun:
             measure,
             rounds=limit,
             threads=self.task.system.threads,
-            report=self._finish_round,
+            callback=self._finish_round,
             done=done,
         )
         if is_waiting and found.status is CampaignStatus.EXHAUSTED and len(done) < rounds:
@@ -184,11 +185,15 @@ class CampaignRun:
 
     def _write_design(self, design: Design, number: int) -> None:
         """Write the design of a round, beside the experiment by which it was made."""
-        experiment = restated(self.task, design.theta, self._estimate)
+        experiment = restate_experiment(self.task, design.theta, self._estimate)
         self.folder.write_design(design, number, self.task.restated(experiment).system)
 
-    def _finish_round(self, finished: Round) -> None:
-        """Write the estimate of a round, and say what it is."""
+    def _finish_round(self, event: Event) -> None:
+        """Write the estimate of a complete round, and print it."""
+        if not isinstance(event, StudyEvent) or not isinstance(event.result, Round):
+            return
+
+        finished = event.result
         self._estimate = finished.estimate
         self.folder.write_round(finished)
         sentence = accuracy_sentence(finished.estimate, self._wanted)

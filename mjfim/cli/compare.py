@@ -14,6 +14,7 @@ from mjfim.cli.common import (
     Threads,
     _say,
     errors,
+    interrupted_without_result,
     progress,
     verb,
     writing,
@@ -22,8 +23,9 @@ from mjfim.excitation.task import DesignTask
 from mjfim.output.folders import check_folder
 from mjfim.output.summaries import describe_comparison
 from mjfim.output.text import render
+from mjfim.records.events import Event, StudyEvent
 from mjfim.studies.baselines.methods import METHODS
-from mjfim.studies.compare import Glance, compare_task
+from mjfim.studies.compare import compare_task
 
 
 @verb
@@ -44,7 +46,7 @@ def compare(
     as_json: AsJson = False,
     threads: Threads = None,
 ) -> None:
-    """Hold the design against chirps, multisines, Fourier series, splines with the same budget; exit code 1 if one is better."""
+    """Compare the design with chirps, multisines, Fourier series and splines of the same budget; exit code 1 if one is better."""
     task = DesignTask.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     chosen = (
         None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
@@ -52,23 +54,29 @@ def compare(
     check_folder(output)
     with progress() as bar:
         progress_task = bar.add_task("comparing", total=None)
-        told = [-1]
+        announced = [-1]
 
-        def monitor(glance: Glance) -> None:
-            text = f"{glance.place + 1}/{glance.count} {glance.title}  best J {glance.cost:.5g}"
+        def show(event: Event) -> None:
+            """Show the method that runs and its best cost."""
+            if not isinstance(event, StudyEvent):
+                return
+            method = f"{event.index + 1}/{event.count} {event.part}"
             bar.update(
                 progress_task,
-                description=text,
-                total=glance.count,
-                completed=glance.place + min(glance.used, 1.0),
+                description=f"{method}  {event.message}",
+                total=event.count,
+                completed=event.index + event.share,
             )
-            if not errors.is_terminal and glance.place > told[0]:
-                told[0] = glance.place
-                errors.print(f"{glance.place + 1}/{glance.count} {glance.title}", markup=False)
+            if not errors.is_terminal and event.index > announced[0]:
+                announced[0] = event.index
+                errors.print(method, markup=False)
 
-        result = compare_task(task, seconds, steps, seed, chosen, monitor=monitor)
+        result = compare_task(
+            task, seconds=seconds, steps=steps, seed=seed, methods=chosen, callback=show
+        )
+
     if not result.rows:
-        raise KeyboardInterrupt
+        raise interrupted_without_result()
     with writing(output) as results:
         results.leave_comparison(output, result, task.system)
     _say(as_json, result.summary(), render(describe_comparison(result)))

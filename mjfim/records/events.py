@@ -49,6 +49,7 @@ class StudyEvent:
         count: Number of parts; None where it is not known beforehand.
         share: Share of this part that is done, 0 to 1.
         message: One line about what was found so far; may be empty.
+        result: Result of the part once it is complete, such as the `Round` of a campaign; None before.
     """
 
     study: str
@@ -57,6 +58,7 @@ class StudyEvent:
     count: int | None
     share: float
     message: str = ""
+    result: object = None
 
 
 Event = DesignEvent | FitEvent | StudyEvent

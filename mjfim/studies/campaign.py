@@ -1,7 +1,7 @@
-"""`mjfim.run_campaign`: design, record, identify, design again with what is known by then, until it is known as well as wanted.
+"""`mjfim.run_campaign`: design, record, identify, and design again with the estimate, until every target is reached.
 
-Redesigns are made at the estimate of all recordings so far, whose information counts as known before (see `redesign`).
-Every estimate is of all recordings and starts from the last one; priors stay about the stated guess, where they belong.
+A redesign is made at the estimate of all recordings so far, whose information it counts as known (see `redesign`). Every
+estimate uses all recordings and starts from the last one. Priors remain centred at the stated guess.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import stop_on_interrupt
+from mjfim.budget import StopToken, stop_on_interrupt
 from mjfim.errors import ExperimentError, MjfimError, SimulationDivergedError
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.target_accuracy import (
@@ -26,200 +26,273 @@ from mjfim.identification.identify import identify_system
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound, Round
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
-from mjfim.records.events import DesignCallback
+from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.recording import Recording
-from mjfim.studies.redesign import Past, redesigned, restated
+from mjfim.studies.redesign import CampaignHistory, redesign, restate_experiment
 
-PROGRESS = (
-    0.99  # of the last round's worst σ over the wanted one; a round that leaves more made none
-)
-JUMP = 4.0  # standard deviations that an estimate moves from one round to the next only where something is wrong
+# A round makes no progress where the worst ratio of sigma to target stays above this share of the last round's ratio.
+NO_PROGRESS_RATIO = 0.99
+
+# Change of an estimate from one round to the next, in standard deviations, above which something is wrong.
+SUSPICIOUS_CHANGE = 4.0
+
+# Records the experiment that was designed for a round: (design, number of the round from 1).
 Measure = Callable[[Design, int], Recording | Sequence[Recording] | None]
 
 
 def run_campaign(
     experiment: Experiment,
     measure: Measure,
+    *,
     rounds: int = 10,
-    callback: DesignCallback | None = None,
+    callback: Callback | None = None,
     threads: int | None = None,
-    report: Callable[[Round], None] | None = None,
     done: Sequence[EarlierRound] = (),
     executor: Executor | None = None,
+    stop: StopToken | None = None,
 ) -> Campaign:
-    """Design, record and identify in turn until every parameter's `wanted` σ is reached, or the rounds are used up.
+    """Design, record and identify in turn until every target standard deviation is reached, or all rounds are used up.
 
-    measure: plays a design and returns what was recorded, `(design, round)`, the first round being 1; None: not recorded yet,
-    and the campaign ends with that design pending. Of a simulated robot:
-    `lambda design, k: mjfim.simulate(robot, design.trajectory, seed=k)`
-    callback: called with every iterate of every design;  report: with every round
-    done: rounds that are recorded already, whose designs are not made anew
-    executor: of `concurrent.futures`, runs several starts under hard limits at once
-    Ctrl-C ends the campaign after the last complete round. Raises ExperimentError where nothing is wanted,
-    UnidentifiableError where a wanted parameter cannot be told alone, and whatever `design` and `identify` raise.
+    Args:
+        experiment: Experiment whose parameters state the `wanted` standard deviations.
+        measure: Plays a design and returns what was recorded: `measure(design, number)`, the first round being 1. It returns
+            None where nothing is recorded yet; the campaign then ends with that design pending. For a simulated robot:
+            `lambda design, number: mjfim.simulate(robot, design.trajectory, seed=number)`.
+        rounds: Rounds, at most.
+        callback: Called with the events of every design and estimation, and with a `StudyEvent` after every round, whose
+            `result` is the `Round`.
+        threads: Threads of MuJoCo; None for all cores.
+        done: Rounds that are recorded already; their designs are not made again.
+        executor: Executor of `concurrent.futures` that runs several starts under hard limits at once.
+        stop: Ends the campaign early, as Ctrl-C does, after the last complete round.
+
+    Raises:
+        ExperimentError: No parameter states a target, or the request is faulty.
+        UnidentifiableError: A parameter with a target cannot be identified alone.
+        MjfimError: As `mjfim.design` and `mjfim.identify` raise it.
     """
     if rounds < 1:
         raise ExperimentError(f"run_campaign: {rounds} rounds; at least 1")
     if experiment.earlier:
         raise ExperimentError(
-            f"{experiment.source}: earlier: a campaign's estimate comes from recordings alone; give those of earlier "
-            "experiments (`done` in Python) instead of the information they left"
+            f"{experiment.source}: earlier: a campaign's estimate comes from recordings alone; give the recordings of "
+            "earlier experiments (`done` in Python) instead of their information"
         )
-    return _Loop(DesignTask.resolve(experiment, threads=threads), callback, report, executor).run(
-        measure, rounds, done
-    )
+
+    task = DesignTask.resolve(experiment, threads=threads)
+    with stop_on_interrupt(stop) as token:
+        campaign = _CampaignRun(task, rounds, callback, executor, token)
+        status = campaign.run(measure, done)
+        return campaign.record(status)
 
 
-class _Loop:
-    """A campaign on its way. base: the experiment as stated, by which everything is identified"""
+class _CampaignRun:
+    """A campaign while it runs.
+
+    Attributes:
+        base: Task of the experiment as stated, with which all estimates are made.
+        wanted: (p,) target standard deviations [theta-unit], infinite where there is none.
+        count: Rounds, at most.
+        rounds: Complete rounds.
+        pending: Design that is not recorded yet.
+    """
 
     def __init__(
         self,
         base: DesignTask,
-        callback: DesignCallback | None,
-        report: Callable[[Round], None] | None,
+        count: int,
+        callback: Callback | None,
         executor: Executor | None,
+        stop: StopToken,
     ) -> None:
-        self.base, self.wanted = base, target_accuracies(base)
-        self.callback, self.report, self.executor = callback, report, executor
+        self.base = base
+        self.wanted = target_accuracies(base)
+        self.count = count
         self.rounds: list[Round] = []
         self.pending: Design | None = None
+        self._callback = callback
+        self._executor = executor
+        self._stop = stop
 
-    def run(self, measure: Measure, count: int, done: Sequence[EarlierRound]) -> Campaign:
-        """The whole loop."""
-        try:
-            for played in done:
-                if not self._record(played):
-                    return self._concluded(CampaignStatus.INTERRUPTED)
-            while not self._formally() and len(self.rounds) < count:
-                ended = self._play(measure)
-                if ended is not None:
-                    return self._concluded(ended)
-        except KeyboardInterrupt:
-            return self._concluded(CampaignStatus.INTERRUPTED)
-        if not self._formally():
-            return self._concluded(CampaignStatus.EXHAUSTED)
+    def run(self, measure: Measure, done: Sequence[EarlierRound]) -> CampaignStatus:
+        """Make all rounds; return how the campaign ended."""
+        for earlier in done:
+            if not self._add_round(earlier):
+                return CampaignStatus.INTERRUPTED
+
+        while not self._targets_reached() and len(self.rounds) < self.count:
+            status = self._make_round(measure)
+            if status is not None:
+                return status
+
+        if not self._targets_reached():
+            return CampaignStatus.EXHAUSTED
         last = self.rounds[-1].estimate
-        doubtful = last.misfit or any(_doubts(last, self.wanted))
-        return self._concluded(CampaignStatus.DOUBTFUL if doubtful else CampaignStatus.REACHED)
+        is_doubtful = last.misfit or any(_doubts(last, self.wanted))
+        return CampaignStatus.DOUBTFUL if is_doubtful else CampaignStatus.REACHED
 
-    def _play(self, measure: Measure) -> CampaignStatus | None:
-        """One round; says how the campaign ends where it does before the recording."""
-        found, told = self._design()
-        self.pending = found
-        if found.status is Status.INTERRUPTED:
+    def _make_round(self, measure: Measure) -> CampaignStatus | None:
+        """Design, record and identify once; return how the campaign ends where it ends before the round is complete."""
+        design, remarks = self._design()
+        self.pending = design
+        if design.status is Status.INTERRUPTED:
             return CampaignStatus.INTERRUPTED
-        if found.status is Status.INFEASIBLE:
+        if design.status is Status.INFEASIBLE:
             return CampaignStatus.INFEASIBLE
-        require_reachable(self.base, found, self.wanted)
-        answer = measure(found, len(self.rounds) + 1)
+        require_reachable(self.base, design, self.wanted)
+
+        answer = measure(design, len(self.rounds) + 1)
         recordings = (answer,) if isinstance(answer, Recording) else tuple(answer or ())
+
+        # A recording that the user interrupted is not used.
+        if self._stop.requested:
+            return CampaignStatus.INTERRUPTED
         if not recordings:
             return CampaignStatus.WAITING
-        recorded = self._record(
-            EarlierRound(
-                recordings=recordings,
-                theta=found.theta,
-                predicted=found.final.std,
-                control=found.trajectory.ctrl,
-            ),
-            found,
-            told,
+
+        recorded = EarlierRound(
+            recordings=recordings,
+            theta=design.theta,
+            predicted=design.final.std,
+            control=design.trajectory.ctrl,
         )
-        if not recorded:
+        if not self._add_round(recorded, design, remarks):
             return CampaignStatus.INTERRUPTED
         self.pending = None
         return None
 
     def _design(self) -> tuple[Design, tuple[str, ...]]:
-        """The better of the designs from the initial control and from the last round's, at the estimate.
-
-        Where there is none at the estimate, at the last place where there was one, and a warning.
-        """
+        """Design at the estimate, or at the parameters of the last design where that fails; with remarks about it."""
         if not self.rounds:
-            stated = self.base.restated(restated(self.base))
-            with stop_on_interrupt() as stop:
-                budget = design_budget(stated, stop)
-                return design_task(
-                    stated, callback=self.callback, executor=self.executor, budget=budget
-                ), ()
-        first, last = self.rounds[0], self.rounds[-1]
-        count = sum(len(r.recordings) for r in self.rounds)
-        past = Past(last.estimate, count, first.theta, first.control, last.control)
-        try:
-            return redesigned(
-                self.base, past, last.estimate.theta, self.callback, self.executor
-            ), ()
-        except MjfimError as error:
-            told = f"no design at the estimate, so it is made where the last was: {error}"
-            return redesigned(self.base, past, last.theta, self.callback, self.executor), (told,)
+            task = self.base.restated(restate_experiment(self.base))
+            budget = design_budget(task, self._stop)
+            design = design_task(
+                task, callback=self._callback, executor=self._executor, budget=budget
+            )
+            return design, ()
 
-    def _record(
-        self, played: EarlierRound, found: Design | None = None, told: tuple[str, ...] = ()
+        first, last = self.rounds[0], self.rounds[-1]
+        history = CampaignHistory(
+            estimate=last.estimate,
+            count=sum(len(r.recordings) for r in self.rounds),
+            first_theta=first.theta,
+            first_control=first.control,
+            last_control=last.control,
+        )
+        try:
+            return self._redesign(history, last.estimate.theta), ()
+        except MjfimError as error:
+            remark = f"no design at the estimate, so it is made at the parameters of the last one: {error}"
+            return self._redesign(history, last.theta), (remark,)
+
+    def _redesign(self, history: CampaignHistory, theta: Array) -> Design:
+        """Redesign at parameters: (p,)."""
+        return redesign(
+            self.base,
+            history,
+            theta,
+            callback=self._callback,
+            executor=self._executor,
+            stop=self._stop,
+        )
+
+    def _add_round(
+        self, recorded: EarlierRound, design: Design | None = None, remarks: Sequence[str] = ()
     ) -> bool:
-        """Identify from all recordings and keep the round; False where the identification was interrupted."""
-        p, last = self.base.parameters, self.rounds[-1] if self.rounds else None
-        theta = p.guess if played.theta is None else played.theta
-        blank = np.full(len(p), np.nan)
-        recordings = [*(r for each in self.rounds for r in each.recordings), *played.recordings]
-        estimate = identified(self.base, recordings, theta if last is None else last.estimate.theta)
+        """Identify from all recordings and keep the round; return False where the identification was interrupted."""
+        p = self.base.parameters
+        theta = p.guess if recorded.theta is None else recorded.theta
+        start = self.rounds[-1].estimate.theta if self.rounds else theta
+
+        earlier = [recording for r in self.rounds for recording in r.recordings]
+        estimate = identify_all(
+            self.base,
+            [*earlier, *recorded.recordings],
+            start,
+            callback=self._callback,
+            stop=self._stop,
+        )
         if estimate is None:
             return False
-        warnings = [
-            *told,
-            *(f"design: {sentence}" for sentence in (found.warnings if found is not None else ())),
-        ]
-        warnings += [*estimate.warnings, *self._suspicions(estimate)]
-        self.rounds.append(
-            Round(
-                number=len(self.rounds) + 1,
-                theta=theta,
-                predicted=blank if played.predicted is None else played.predicted,
-                control=played.recordings[0].ctrl if played.control is None else played.control,
-                recordings=played.recordings,
-                estimate=estimate,
-                design=found,
-                warnings=tuple(warnings),
-            )
+
+        warnings = list(remarks)
+        if design is not None:
+            warnings += [f"design: {sentence}" for sentence in design.warnings]
+        warnings += estimate.warnings
+        warnings += self._suspicions(estimate)
+
+        unknown = np.full(len(p), np.nan)
+        control = recorded.control
+        now = Round(
+            number=len(self.rounds) + 1,
+            theta=theta,
+            predicted=unknown if recorded.predicted is None else recorded.predicted,
+            control=recorded.recordings[0].ctrl if control is None else control,
+            recordings=recorded.recordings,
+            estimate=estimate,
+            design=design,
+            warnings=tuple(warnings),
         )
-        if self.report is not None:
-            self.report(self.rounds[-1])
+        self.rounds.append(now)
+        self._report(now)
         return True
 
+    def _report(self, now: Round) -> None:
+        """Report a complete round."""
+        if self._callback is None:
+            return
+
+        ratio, j = largest_ratio_to_target(now.attained, self.wanted)
+        event = StudyEvent(
+            study="campaign",
+            part=f"round {now.number}",
+            index=now.number - 1,
+            count=self.count,
+            share=1.0,
+            message=f"largest ratio of sigma to target: {ratio:.3g} ({self.base.parameters.names[j]})",
+            result=now,
+        )
+        self._callback(event)
+
     def _suspicions(self, now: Estimate) -> Iterator[str]:
-        """What the step from the last round to this one says against the model, or against going on."""
-        names = self.base.parameters.names
+        """Sentences about an estimate that speak against the model, or against further rounds."""
         yield from _doubts(now, self.wanted)
         if not self.rounds:
             return
+
+        names = self.base.parameters.names
         before = self.rounds[-1].estimate
         known = np.isfinite(before.std) & (before.std > 0.0)
-        moved = np.zeros(len(names))
-        moved[known] = np.abs(now.theta - before.theta)[known] / before.std[known]
-        for j in np.flatnonzero(moved > JUMP).tolist():
+        change = np.zeros(len(names))
+        change[known] = np.abs(now.theta - before.theta)[known] / before.std[known]
+        for j in np.flatnonzero(change > SUSPICIOUS_CHANGE).tolist():
             yield (
-                f"{names[j]} moved from {before.theta[j]:.4g} to {now.theta[j]:.4g}, {moved[j]:.1f} σ of the last round's "
-                "estimate: formal σ is not accuracy; the model or the noise is wrong, or the last fit was a false minimum"
+                f"{names[j]} moved from {before.theta[j]:.4g} to {now.theta[j]:.4g}, by {change[j]:.1f} σ of the last "
+                "round's estimate: the formal σ is not the accuracy; the model or the noise is wrong, or the last fit "
+                "ended in a false minimum"
             )
-        (was, _), (is_, j) = (
-            largest_ratio_to_target(before.std, self.wanted),
-            largest_ratio_to_target(now.std, self.wanted),
-        )
-        if is_ > PROGRESS * was:
-            yield f"no progress: the worst σ over the wanted one went from {was:.3g} to {is_:.3g} ({names[j]})"
 
-    def _formally(self) -> bool:
-        """Every wanted σ is reached."""
-        return (
-            bool(self.rounds)
-            and largest_ratio_to_target(self.rounds[-1].attained, self.wanted)[0] <= 1.0
-        )
+        ratio_before, _ = largest_ratio_to_target(before.std, self.wanted)
+        ratio, j = largest_ratio_to_target(now.std, self.wanted)
+        if ratio > NO_PROGRESS_RATIO * ratio_before:
+            yield (
+                f"no progress: the largest ratio of σ to its target went from {ratio_before:.3g} to {ratio:.3g} "
+                f"({names[j]})"
+            )
 
-    def _concluded(self, status: CampaignStatus) -> Campaign:
+    def _targets_reached(self) -> bool:
+        """True where every target is reached formally."""
+        if not self.rounds:
+            return False
+
+        ratio, _ = largest_ratio_to_target(self.rounds[-1].attained, self.wanted)
+        return ratio <= 1.0
+
+    def record(self, status: CampaignStatus) -> Campaign:
+        """The record for the user."""
         warnings = [f"round {r.number}: {sentence}" for r in self.rounds for sentence in r.warnings]
-        names = self.base.parameters.names
         return Campaign(
-            parameters=names,
+            parameters=self.base.parameters.names,
             wanted=self.wanted,
             rounds=tuple(self.rounds),
             status=status,
@@ -228,35 +301,60 @@ class _Loop:
         )
 
 
-def identified(base: DesignTask, recordings: Sequence[Recording], start: Array) -> Estimate | None:
-    """Estimate from all recordings; where that is a misfit or fails, from the stated guess too, and the better one.
+def identify_all(
+    base: DesignTask,
+    recordings: Sequence[Recording],
+    start: Array,
+    *,
+    callback: Callback | None = None,
+    stop: StopToken | None = None,
+) -> Estimate | None:
+    """Estimate from all recordings; where that is a misfit or fails, also from the stated guess.
 
-    None where it was interrupted: a round is complete or it is not kept.
+    Args:
+        base: Task of the experiment as stated.
+        recordings: All recordings.
+        start: (p,) parameters at which the fit begins [theta-unit].
+        callback: Called with a `FitEvent` for every iterate.
+        stop: Ends the fit early.
+
+    Returns:
+        The better of the two estimates; None where a fit was interrupted, because a round is complete or not kept.
+
+    Raises:
+        SimulationDivergedError: The model diverges at both starts.
     """
     found: list[Estimate] = []
-    fault: SimulationDivergedError | None = None
+    first_error: SimulationDivergedError | None = None
     for begin in (start, base.parameters.guess):
+        # The guess is needed only where the first fit is bad.
         if found and (not found[0].misfit or np.array_equal(begin, start)):
             break
+
         try:
-            found.append(identify_system(base.system, recordings, start=begin))
+            estimate = identify_system(
+                base.system, recordings, start=begin, callback=callback, stop=stop
+            )
         except SimulationDivergedError as error:
-            fault = fault or error
-        if found and found[-1].interrupted:
+            first_error = first_error or error
+            continue
+        if estimate.interrupted:
             return None
+        found.append(estimate)
+
     if not found:
-        raise fault or SimulationDivergedError("no start of the fit can be simulated")
-    return min(found, key=lambda e: e.chi2)
+        raise first_error or SimulationDivergedError("no start of the fit can be simulated")
+    return min(found, key=lambda estimate: estimate.chi2)
 
 
 def _doubts(estimate: Estimate, wanted: Array) -> Iterator[str]:
-    """Why the formal standard deviations of wanted parameters are not to be trusted, besides a misfit."""
-    at = [
-        n
-        for n, w in zip(estimate.parameters, wanted, strict=True)
-        if np.isfinite(w) and n in estimate.at_bound
+    """Reasons besides a misfit not to trust the formal standard deviations; wanted: (p,) targets, infinite without one."""
+    at_bound = [
+        name
+        for name, target in zip(estimate.parameters, wanted, strict=True)
+        if np.isfinite(target) and name in estimate.at_bound
     ]
-    if at:
-        yield f"wanted, but at a bound: {', '.join(at)}"
-    if not estimate.success and not estimate.combinations and not at:
+    if at_bound:
+        yield f"has a target, but its estimate is at a bound: {', '.join(at_bound)}"
+    elif not estimate.success and not estimate.combinations:
         yield f"the fit did not succeed: {estimate.status}"

@@ -1,126 +1,149 @@
-"""`mjfim.compare`: a design against what else the same budget could have found, all judged alike."""
+"""`mjfim.compare`: a design beside other methods with the same budget, all evaluated in the same way."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
+from mjfim.budget import Budget, StopToken, stop_on_interrupt
+from mjfim.errors import ExperimentError, NoResultError, SimulationDivergedError, unknown
 from mjfim.excitation.design import design_budget, design_task, designable
 from mjfim.excitation.evaluation import point_at_stated_rate
-from mjfim.excitation.feasibility import SHRINK_FACTORS
+from mjfim.excitation.feasibility import shrink_until_feasible
 from mjfim.excitation.levels import Stage
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
-from mjfim.parallel import collect_finished, workers_of
+from mjfim.parallel import results_in_order, workers_of
 from mjfim.plant.active_constraints import saturated_actuators
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
-from mjfim.records.design import Status
-from mjfim.records.events import DesignEvent
+from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
 from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
 from mjfim.studies.baselines.methods import METHODS, run_baseline
 
-OURS = "mjfim's design"
-LATE = 1.05  # share of the seconds after which a design is ended
-PLENTY = 100_000  # iterations of the design: only its budget ends it
+# Name of the design for the user.
+DESIGN_TITLE = "mjfim's design"
 
+# Share of the time after which a design is stopped; it watches the time itself, but for its last iterate.
+LATEST_END = 1.05
 
-@dataclass(frozen=True)
-class Glance:
-    """How far a comparison is. title: of the method;  place, count: its number among all;  used: share of its budget
+# Iterations of the design: unlimited for practical purposes, the budget ends it.
+UNLIMITED_ITERATIONS = 100_000
 
-    cost: the lowest J so far, infinite without any
-    """
-
-    title: str
-    place: int
-    count: int
-    used: float
-    cost: float
-
-
-Monitor = Callable[[Glance], None]
-Tell = Callable[[float, float], None]  # share of the budget, J
+# Reports the progress of one method: share of its budget, lowest J so far.
+Progress = Callable[[float, float], None]
 
 
 def compare(
     experiment: Experiment,
+    *,
     seconds: float = 60.0,
     steps: float | None = None,
     seed: int = 0,
     methods: Sequence[str] | None = None,
     executor: Executor | None = None,
-    monitor: Monitor | None = None,
+    callback: Callback | None = None,
     threads: int | None = None,
+    stop: StopToken | None = None,
 ) -> Comparison:
-    """Run baselines, then the design, on an experiment: each for so many seconds and MuJoCo steps, whichever end first.
+    """Run baselines and then the design, each until its time or its MuJoCo steps are used up.
 
-    methods: keys of `baselines.METHODS`, default: all that make sense;  seed: of the baselines
-    executor: of `concurrent.futures`, among whose workers each method is shared out;  monitor: called during the searches
-    All look for a control under the same limits, by the same J, and are judged on the untouched model at every engine step.
-    Ctrl-C returns the methods that are finished. Raises as `design` does.
+    All methods search for a control under the same limits with the same cost J, and are evaluated at every engine step of the
+    user's model.
+
+    Args:
+        experiment: Experiment for which controls are searched.
+        seconds: Time of each method [s].
+        steps: MuJoCo steps of each method; None for time alone.
+        seed: Seed of the baselines.
+        methods: Keys of the baselines (`mjfim.studies.baselines.methods.METHODS`); None for all that make sense.
+        executor: Executor of `concurrent.futures`, among whose workers each method is divided.
+        callback: Called with a `StudyEvent` while a method runs, and with every `DesignEvent` of the design.
+        threads: Threads of MuJoCo; None for all cores.
+        stop: Ends the comparison early, as Ctrl-C does; the methods that are finished are returned.
+
+    Raises:
+        ExperimentError: A budget or a method is faulty.
+        MjfimError: As `mjfim.design` raises it.
     """
     task = DesignTask.resolve(experiment, threads=threads)
-    return compare_task(task, seconds, steps, seed, methods, executor, monitor)
+    return compare_task(
+        task,
+        seconds=seconds,
+        steps=steps,
+        seed=seed,
+        methods=methods,
+        executor=executor,
+        callback=callback,
+        stop=stop,
+    )
 
 
 def compare_task(
     task: DesignTask,
+    *,
     seconds: float = 60.0,
     steps: float | None = None,
     seed: int = 0,
     methods: Sequence[str] | None = None,
     executor: Executor | None = None,
-    monitor: Monitor | None = None,
+    callback: Callback | None = None,
+    stop: StopToken | None = None,
 ) -> Comparison:
     """Compare the design of a resolved task with baselines. See `compare`."""
     if not (seconds > 0.0 and np.isfinite(seconds)) or not (steps is None or steps > 0.0):
         raise ExperimentError("compare: seconds and steps must be positive")
+
     chosen = (*chosen_methods(task, methods), DESIGN)
-    judge = Judge(task, _combinations(task))
-    most = np.inf if steps is None else float(steps)
-    job = BaselineSearch(
+    evaluation = MethodEvaluation(task, _identifiable_combinations(task))
+    search = BaselineSearch(
         experiment=task.experiment,
         method=DESIGN,
         seconds=seconds,
-        steps=most,
+        steps=np.inf if steps is None else float(steps),
         seed=seed,
-        combinations=judge.stage.basis,
+        combinations=evaluation.stage.basis,
         added_information=task.added_information,
         threads=task.system.threads,
     )
+
     rows: list[MethodResult] = []
-    interrupted = False
-    try:
+    with stop_on_interrupt(stop) as token:
         for i, method in enumerate(chosen):
-            title = OURS if method == DESIGN else METHODS[method].title
-            tell = _teller(monitor, title, i, len(chosen))
-            if method == DESIGN:
-                row, interrupted = _designed(judge, job, executor, tell)
-            else:
-                row = judge.row(method, title, _tried(replace(job, method=method), executor, tell))
-            rows.append(row)
-    except KeyboardInterrupt:
-        interrupted = True
+            run = _MethodRun(
+                search=replace(search, method=method),
+                index=i,
+                count=len(chosen),
+                callback=callback,
+                executor=executor,
+                stop=token,
+            )
+            row = run.design(evaluation) if method == DESIGN else run.baseline(evaluation)
+
+            # An interrupted baseline is left out; an interrupted design is as good as it is.
+            if row is not None:
+                rows.append(row)
+            if token.requested:
+                break
+
+        interrupted = token.requested
+
     p = task.parameters
     return Comparison(
         source=task.experiment.source,
         criterion=task.experiment.cost.criterion,
-        nats=judge.nats,
+        nats=evaluation.nats,
         parameters=p.names,
         units=task.system.units,
         scale=p.scale,
-        nuisance=tuple(q.name for q in p.parameters if q.nuisance),
+        nuisance=tuple(parameter.name for parameter in p.parameters if parameter.nuisance),
         rows=tuple(rows),
         seconds=seconds,
-        steps=most,
+        steps=search.steps,
         seed=seed,
         weighted=bool(task.control_weight.any() or task.tracking.any()),
         interrupted=interrupted,
@@ -128,213 +151,337 @@ def compare_task(
 
 
 def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str, ...]:
-    """Keys of the baselines that are to run. Raises ExperimentError for others."""
+    """Choose the baselines that run.
+
+    Args:
+        task: Task that is compared.
+        methods: Keys that the user asks for; None for all that make sense.
+
+    Raises:
+        ExperimentError: A key is unknown, or its method does not make sense here.
+    """
     if methods is None:
         return tuple(
             key for key, baseline in METHODS.items() if task.is_limited or not baseline.needs_limits
         )
+
     for key in methods:
         if key not in METHODS and key != DESIGN:
             raise ExperimentError(f"methods: {unknown('method', key, [*METHODS, DESIGN])}")
         if key in METHODS and METHODS[key].needs_limits and not task.is_limited:
             raise ExperimentError(
-                f"methods: {key} needs hard limits; {task.experiment.source} has none that hold"
+                f"methods: {key} needs hard limits; {task.experiment.source} enforces none"
             )
     return tuple(key for key in dict.fromkeys(methods) if key != DESIGN)
 
 
-def _combinations(task: DesignTask) -> Array | None:
-    """The identifiable combinations, as a design finds them. Raises where nothing can be designed."""
-    seen = designable(task)
+def _identifiable_combinations(task: DesignTask) -> Array | None:
+    """(t, s) identifiable combinations, or None where all parameters are; raises where nothing can be designed."""
+    identifiability = designable(task)
     if task.is_limited:
         require_feasible_start(task)
-    return seen.basis
+    return identifiability.basis
 
 
-def _teller(monitor: Monitor | None, title: str, place: int, count: int) -> Tell:
-    def tell(used: float, cost: float) -> None:
-        if monitor is not None:
-            monitor(Glance(title, place, count, used, cost))
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _MethodRun:
+    """One method of a comparison.
 
-    return tell
+    Attributes:
+        search: The order.
+        index: Number of the method, from 0.
+        count: Number of methods.
+        callback: Called with the progress, or None.
+        executor: Among whose workers the method is divided, or None.
+        stop: Ends the method early.
+    """
 
-
-def _tried(job: BaselineSearch, executor: Executor | None, tell: Tell) -> SearchResult:
-    """A baseline's attempt; with an executor the best of as many as it has workers, each with its share of the steps."""
-    if executor is None:
-        return run_baseline(job, lambda used, attempt: tell(used, attempt.cost))
-    count = workers_of(executor)
-    jobs = [replace(job, part=(i, count), steps=job.steps / count, threads=1) for i in range(count)]
-    futures: list[Future[SearchResult]] = []
-    try:
-        futures += [executor.submit(run_baseline, each) for each in jobs]
-        attempts = [future.result() for future in futures]
-    except BaseException:
-        collect_finished(executor, futures)
-        raise
-    best = min(attempts, key=lambda attempt: (attempt.cost, -attempt.margin))
-    return replace(
-        best, seconds=max(a.seconds for a in attempts), steps=sum(a.steps for a in attempts)
-    )
-
-
-def _designed(
-    judge: Judge, job: BaselineSearch, executor: Executor | None, tell: Tell
-) -> tuple[MethodResult, bool]:
-    """The design with the same budget, and whether the user interrupted it."""
-    d = job.experiment.descent
-    stated = job.experiment.replace(
-        descent={"seconds": job.seconds, "max_iterations": max(d.max_iterations, PLENTY)}
-    )
-    meter = Meter(job, tell)
-    try:
-        task = DesignTask.resolve(
-            stated, threads=job.threads, added_information=job.added_information
-        )
-        with stop_on_interrupt(meter.stop):
-            found = design_task(
-                task,
-                callback=meter,
-                executor=executor,
-                budget=design_budget(task, meter.stop),
-            )
-    except SimulationDivergedError:
-        return judge.row(
-            DESIGN, OURS, SearchResult(seconds=meter.seconds, steps=meter.steps)
-        ), False
-    attempt = SearchResult(
-        control=found.trajectory.ctrl,
-        cost=found.final.cost,
-        margin=0.0,
-        found_by=found.found_by,
-        seconds=found.seconds,
-        steps=found.steps,
-    )
-    row = judge.row(
-        DESIGN, OURS, attempt, "" if meter.spent else found.status.value.split(":")[0].split(";")[0]
-    )
-    return row, found.status is Status.INTERRUPTED and not meter.spent
-
-
-class Meter:
-    """Watches the iterates of a design and asks it to stop where its budget is used up."""
-
-    def __init__(self, job: BaselineSearch, tell: Tell) -> None:
-        self.job, self.tell = job, tell
-        self.clock, self.steps, self.last, self.cost = time.perf_counter(), 0, 0, np.inf
-        self.spent = False
-        self.stop = StopToken()
+    search: BaselineSearch
+    index: int
+    count: int
+    callback: Callback | None
+    executor: Executor | None
+    stop: StopToken
 
     @property
-    def seconds(self) -> float:
-        """Since the start."""
-        return time.perf_counter() - self.clock
+    def title(self) -> str:
+        """Name of the method for the user."""
+        method = self.search.method
+        return DESIGN_TITLE if method == DESIGN else METHODS[method].title
 
-    def __call__(self, event: DesignEvent) -> None:
+    def report(self, share: float, cost: float) -> None:
+        """Report the used share of the budget and the lowest J so far."""
+        if self.callback is None:
+            return
+
+        event = StudyEvent(
+            study="compare",
+            part=self.title,
+            index=self.index,
+            count=self.count,
+            share=min(share, 1.0),
+            message=f"best J {cost:.5g}",
+        )
+        self.callback(event)
+
+    def baseline(self, evaluation: MethodEvaluation) -> MethodResult | None:
+        """Run a baseline and evaluate its control; None where it was interrupted."""
+        if self.executor is None:
+            result: SearchResult | None = run_baseline(
+                self.search, lambda used, best: self.report(used, best.cost), self.stop
+            )
+        else:
+            result = self.divided_baseline(self.executor)
+
+        if result is None or self.stop.requested:
+            return None
+        return evaluation.result(self.search.method, self.title, result)
+
+    def divided_baseline(self, executor: Executor) -> SearchResult | None:
+        """Run a part of a baseline in every worker, with its share of the steps, and return the best result."""
+        count = workers_of(executor)
+        parts = [
+            replace(self.search, part=(i, count), steps=self.search.steps / count, threads=1)
+            for i in range(count)
+        ]
+        futures: list[Future[SearchResult]] = [
+            executor.submit(run_baseline, part) for part in parts
+        ]
+        results = list(results_in_order(executor, futures, Budget(stop=self.stop)))
+        if not results:
+            return None
+
+        best = min(results, key=lambda result: (result.cost, -result.margin))
+        return replace(
+            best,
+            seconds=max(result.seconds for result in results),
+            steps=sum(result.steps for result in results),
+        )
+
+    def design(self, evaluation: MethodEvaluation) -> MethodResult | None:
+        """Design with the budget of the method and evaluate the result; None where it ended before there was one."""
+        descent = self.search.experiment.descent
+        iterations = max(descent.max_iterations, UNLIMITED_ITERATIONS)
+        stated = self.search.experiment.replace(
+            descent={"seconds": self.search.seconds, "max_iterations": iterations}
+        )
+        watch = DesignWatch(
+            search=self.search, progress=self.report, callback=self.callback, stop=self.stop
+        )
+        try:
+            task = DesignTask.resolve(
+                stated,
+                threads=self.search.threads,
+                added_information=self.search.added_information,
+            )
+            design = design_task(
+                task,
+                callback=watch,
+                executor=self.executor,
+                budget=design_budget(task, watch.design_stop),
+            )
+        except SimulationDivergedError:
+            nothing = SearchResult(seconds=watch.budget.seconds_used, steps=watch.steps)
+            return evaluation.result(DESIGN, self.title, nothing)
+        except NoResultError:
+            return None
+
+        result = SearchResult(
+            control=design.trajectory.ctrl,
+            cost=design.final.cost,
+            margin=0.0,
+            found_by=design.found_by,
+            seconds=design.seconds,
+            steps=design.steps,
+        )
+
+        # A design that its budget ended needs no remark about its status.
+        status = design.status.value.split(":")[0].split(";")[0]
+        note = "" if watch.budget_ended else status
+        return evaluation.result(DESIGN, self.title, result, note)
+
+
+@dataclass(eq=False, kw_only=True)
+class DesignWatch:
+    """Watches the iterates of a design and stops it when the budget of a method is used up.
+
+    Attributes:
+        search: The order with the budget.
+        progress: Called with every iterate.
+        callback: Called with every event, or None.
+        stop: Ends the design early.
+        cost: Lowest J of a feasible iterate.
+        budget_ended: True once the budget has ended the design.
+        design_stop: Token of the design.
+    """
+
+    search: BaselineSearch
+    progress: Progress
+    callback: Callback | None = None
+    stop: StopToken = field(default_factory=StopToken)
+    cost: float = np.inf
+    budget_ended: bool = False
+
+    def __post_init__(self) -> None:
+        self.budget = Budget(
+            seconds=LATEST_END * self.search.seconds, steps=self.search.steps, stop=self.stop
+        )
+        self.design_stop = StopToken(also=lambda: self.stop.requested)
+        self._last_steps = 0
+
+    @property
+    def steps(self) -> int:
+        """MuJoCo steps that the design has taken so far."""
+        return int(self.budget.steps)
+
+    def __call__(self, event: Event) -> None:
         """Count the steps of an iterate, which begin anew with every task of a design."""
+        if self.callback is not None:
+            self.callback(event)
+        if not isinstance(event, DesignEvent):
+            return
+
         row = event.row
-        self.steps += row.steps - (self.last if row.steps >= self.last else 0)
-        self.last = row.steps
+        is_same_task = row.steps >= self._last_steps
+        self.budget.spend(steps=row.steps - (self._last_steps if is_same_task else 0))
+        self._last_steps = row.steps
+
         if not row.margin < 0.0:
             self.cost = min(self.cost, row.cost)
-        seconds, steps = self.seconds / self.job.seconds, self.steps / self.job.steps
-        self.tell(max(seconds, steps), self.cost)
-        if (
-            seconds > LATE or steps > 1.0
-        ):  # a design keeps the time by itself, but for its last iterate
-            self.spent = True
-            self.stop.request()
+        seconds = self.budget.seconds_used / self.search.seconds
+        self.progress(max(seconds, self.budget.steps / self.search.steps), self.cost)
+
+        if self.budget.exhausted and not self.stop.requested:
+            self.budget_ended = True
+            self.design_stop.request()
 
 
-class Judge:
-    """Looks at every method's control in the same way: at the stated rate, on the user's model.
+class MethodEvaluation:
+    """Evaluates the control of every method in the same way: at the stated rate, on the user's model.
 
-    nats: see `Comparison`
+    Attributes:
+        task: Task that is compared.
+        stage: Its cost, with the identifiable combinations.
+        nats: Cost of one e-fold of every eigenvalue with D-optimality, else 0; see `Comparison`.
     """
 
     def __init__(self, task: DesignTask, combinations: Array | None) -> None:
-        self.task, self.stage = task, Stage(task, combinations)
-        e, p = task.experiment, task.parameters
-        count = len(p.interest) if combinations is None else combinations.shape[1]
-        self.nats = e.cost.information * count if e.cost.criterion == "D" else 0.0
+        self.task = task
+        self.stage = Stage(task, combinations)
 
-    def row(self, method: str, title: str, attempt: SearchResult, note: str = "") -> MethodResult:
-        """What an attempt is worth. A baseline's control that leaves the limits after all is shrunk until it does not."""
-        if attempt.control is None:
-            return self._nothing(method, title, attempt, note)
-        first: MethodResult | None = None
-        for share in (
-            [1.0] if method == DESIGN or not np.isfinite(attempt.cost) else SHRINK_FACTORS.tolist()
-        ):
-            control = self.task.centre + share * (attempt.control - self.task.centre)
-            told = note if share == 1.0 else f"shrunk to {100.0 * share:.3g} %"
-            found = self._looked(method, title, replace(attempt, control=control), told)
-            if found is not None and found.outcome is not MethodOutcome.OUTSIDE:
-                return found
-            first = first or found
-        return first or self._nothing(method, title, attempt, note)
+        cost = task.experiment.cost
+        interest = len(task.parameters.interest)
+        count = interest if combinations is None else combinations.shape[1]
+        self.nats = cost.information * count if cost.criterion == "D" else 0.0
 
-    def _looked(
-        self, method: str, title: str, attempt: SearchResult, note: str
+    def result(self, method: str, title: str, found: SearchResult, note: str = "") -> MethodResult:
+        """Evaluate what a method has found.
+
+        The control of a baseline that violates a limit on the user's model is shrunk until it does not; that of a design is
+        evaluated as it is.
+
+        Args:
+            method: Key of the method.
+            title: Its name for the user.
+            found: The best control of its search.
+            note: Remark about the result.
+        """
+        nothing = replace(self._without_control(method, title, found), note=note)
+        if found.control is None:
+            return nothing
+
+        if method == DESIGN or not np.isfinite(found.cost):
+            return self._evaluate(method, title, found, note) or nothing
+
+        evaluated: list[MethodResult] = []
+        deviation = _largest_entry(found.control - self.task.centre)
+
+        def result_if_feasible(control: Array) -> MethodResult | None:
+            """Result of a control, or None where it violates a limit."""
+            factor = 1.0
+            if control is not found.control:
+                factor = _largest_entry(control - self.task.centre) / deviation
+
+            remark = note if factor == 1.0 else f"shrunk to {100.0 * factor:.3g} %"
+            result = self._evaluate(method, title, replace(found, control=control), remark)
+            if result is None:
+                return None
+            evaluated.append(result)
+            return None if result.outcome is MethodOutcome.OUTSIDE else result
+
+        repaired = shrink_until_feasible(found.control, self.task.centre, result_if_feasible)
+        if repaired is not None:
+            return repaired
+        return evaluated[0] if evaluated else nothing
+
+    def _evaluate(
+        self, method: str, title: str, found: SearchResult, note: str
     ) -> MethodResult | None:
-        """None where the simulation diverges."""
+        """Evaluate a control as it is; None where the simulation diverges."""
         task = self.task
-        point = (
-            None if attempt.control is None else point_at_stated_rate(self.stage, attempt.control)
-        )
-        if (
-            point is None
-            or point.trajectory is None
-            or point.criterion is None
-            or point.information is None
-        ):
+        point = None
+        if found.control is not None:
+            point = point_at_stated_rate(self.stage, found.control)
+        if point is None or point.trajectory is None:
             return None
-        found = verify(task, point.trajectory)
-        outcome = MethodOutcome.INSIDE if found.is_feasible else MethodOutcome.OUTSIDE
-        if outcome is MethodOutcome.OUTSIDE and not np.isfinite(attempt.cost):
+        if point.criterion is None or point.information is None:
+            return None
+
+        # How the method ended, and what the user should know about it.
+        verification = verify(task, point.trajectory)
+        saturated = saturated_actuators(task.system.model_at(task.theta), point.trajectory)
+        outcome = MethodOutcome.INSIDE if verification.is_feasible else MethodOutcome.OUTSIDE
+        if outcome is MethodOutcome.OUTSIDE and not np.isfinite(found.cost):
             outcome = MethodOutcome.NOTHING
-        clamped = saturated_actuators(task.system.model_at(task.theta), point.trajectory)
-        if outcome is MethodOutcome.INSIDE and clamped:
-            outcome, note = MethodOutcome.CLAMPED, f"forcerange clamps {', '.join(clamped)}"
-        elif found.deviation > SAME_STATE_TOLERANCE:
-            note = f"a clamp, stop or contact acts: deviates by {found.deviation:.2g}"
+
+        if outcome is MethodOutcome.INSIDE and saturated:
+            outcome = MethodOutcome.CLAMPED
+            note = f"forcerange clamps {', '.join(saturated)}"
+        elif verification.deviation > SAME_STATE_TOLERANCE:
+            note = (
+                f"a clamp, stop or contact acts: the states deviate by {verification.deviation:.2g}"
+            )
+
         smallest = float(point.criterion.eigenvalues[0])
+        worst = (smallest * task.system.measure_rate) ** -0.5 if smallest > 0.0 else np.inf
         return MethodResult(
             method=method,
             title=title,
             outcome=outcome,
-            control=attempt.control,
+            control=found.control,
             cost=point.cost,
             criterion=point.criterion.value,
             std=self.stage.problem.information.std(point.information),
             min_eigenvalue=smallest,
-            worst_relative_std=(smallest * task.system.measure_rate) ** -0.5
-            if smallest > 0.0
-            else np.inf,
-            seconds=attempt.seconds,
-            steps=attempt.steps,
-            margins=found.margins,
-            relative_margins=found.relative_margins,
-            found_by=attempt.found_by,
+            worst_relative_std=worst,
+            seconds=found.seconds,
+            steps=found.steps,
+            margins=verification.margins,
+            relative_margins=verification.relative_margins,
+            found_by=found.found_by,
             note=note,
         )
 
-    def _nothing(self, method: str, title: str, attempt: SearchResult, note: str) -> MethodResult:
-        outcome = MethodOutcome.NONE if attempt.control is None else MethodOutcome.NOTHING
-        blank = np.full(len(self.task.parameters), np.nan)
+    def _without_control(self, method: str, title: str, found: SearchResult) -> MethodResult:
+        """Result of a method without a control that can be evaluated."""
+        has_control = found.control is not None
         return MethodResult(
             method=method,
             title=title,
-            outcome=outcome,
+            outcome=MethodOutcome.NOTHING if has_control else MethodOutcome.NONE,
             control=None,
             cost=np.nan,
             criterion=np.nan,
-            std=blank,
+            std=np.full(len(self.task.parameters), np.nan),
             min_eigenvalue=np.nan,
             worst_relative_std=np.nan,
-            seconds=attempt.seconds,
-            steps=attempt.steps,
+            seconds=found.seconds,
+            steps=found.steps,
             margins={},
             relative_margins={},
-            note=note,
         )
+
+
+def _largest_entry(deviation: Array) -> float:
+    """Largest entry of a deviation from the centre: (N, nu) [unit of the actuator]."""
+    return float(np.abs(deviation).max())

@@ -1,10 +1,10 @@
-"""A design at an estimate, with the information of recordings so far as known before.
+"""Design at an estimate, with the information of the recordings so far as prior information.
 
-What the criterion compares does not move with the estimate: each parameter keeps the scale that it has in the experiment as
-stated. Nor does the price of effort. The first design pays what a relative gain of information is worth to it, phi_1 = J's
-share of information there: d(log phi) * phi_1 = d(effort). The n-th of equal experiments changes log phi by 1/n only, so
-there phi weighs n phi_1 / phi_n times as much as stated (n times with D, whose phi is a logarithm). Otherwise every round
-would be gentler than the last, and a round at smaller values than guessed gentler than the first.
+The scales of the parameters remain those of the stated experiment, so that criteria of different rounds can be compared.
+The price of effort must remain the same as well. The first design pays what a relative gain of information is worth to it:
+phi_1 is the information's share of J there, and `d(log phi) * phi_1 = d(effort)`. The n-th of equal experiments changes log phi
+by 1/n only, so phi is weighted by n phi_1 / phi_n there (by n with D-optimality, whose phi is a logarithm). Otherwise every
+round would be gentler than the one before, and a round at values below the guess gentler than the first.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.budget import StopToken, stop_on_interrupt
+from mjfim.budget import StopToken
 from mjfim.errors import MjfimError, SimulationDivergedError
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.evaluation import evaluate_task
@@ -25,159 +25,203 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
-from mjfim.records.events import DesignCallback
+from mjfim.records.events import Callback
 
-INSIDE = 1e-3  # of a parameter's size, or a quarter of its range, that a design keeps from bounds
-KNOWN = 2.5  # standard deviations about the estimate from which a robust redesign draws its samples
+# Distance that guesses keep from bounds, relative to the size of a parameter, and the largest share of its range.
+BOUND_GAP = 1e-3
+MAX_BOUND_GAP = 0.25
+
+# Standard deviations about the estimate within which a robust redesign draws its samples.
+SAMPLING_RANGE = 2.5
+
+# Smallest such range, relative to the size of a parameter; bounds must not coincide.
+MIN_SAMPLING_RANGE = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class Past:
-    """What a redesign knows. estimate: from all recordings so far;  count: of them
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CampaignHistory:
+    """Earlier rounds of a campaign, as far as a redesign needs them.
 
-    begun, first: (p,) and (N, nu), where the first design was made and its control;  last: (N, nu) the last one's
+    Attributes:
+        estimate: Estimate from all recordings so far.
+        count: Number of these recordings.
+        first_theta: (p,) parameters at which the first design was made [theta-unit].
+        first_control: (N, nu) control of the first design [unit of the actuator].
+        last_control: (N, nu) control of the last design [unit of the actuator].
     """
 
     estimate: Estimate
     count: int
-    begun: Array
-    first: Array
-    last: Array
+    first_theta: Array
+    first_control: Array
+    last_control: Array
 
 
-def redesigned(
+def redesign(
     base: DesignTask,
-    past: Past,
+    history: CampaignHistory,
     theta: Array,
-    callback: DesignCallback | None = None,
+    *,
+    callback: Callback | None = None,
     executor: Executor | None = None,
+    stop: StopToken | None = None,
 ) -> Design:
-    """The better of the designs from the initial control and from the last one's, at theta: (p,).
+    """Design from the initial control and from the last design's control, and return the better design.
 
-    base: of the experiment as stated. Raises as `design` does.
+    Args:
+        base: Task of the experiment as stated.
+        history: Earlier rounds.
+        theta: (p,) parameters at which the design is made [theta-unit].
+        callback: Called with a `DesignEvent` for every iterate.
+        executor: Runs several starts under hard limits at once.
+        stop: Ends the design early.
+
+    Raises:
+        MjfimError: As `mjfim.design` raises it.
     """
-    moved = restated(base, theta, past.estimate)
-    told = past.estimate.data
-    moved = moved.replace(cost={"information": _worth(base, moved, past)})
-    task = base.restated(moved, added_information=told)
-    with stop_on_interrupt() as stop:
-        found = [
-            design_task(
-                task, callback=callback, executor=executor, budget=design_budget(task, stop)
-            )
-        ]
-        found += _from_last_control(base, moved, past, callback, stop, found[0])
-    if found[-1].status is Status.INTERRUPTED:
-        return found[-1]
-    return min(found, key=lambda d: (d.status is Status.INFEASIBLE, d.final.cost))
+    known = history.estimate.data
+    moved = restate_experiment(base, theta, history.estimate)
+    weight = _information_weight(base, moved, history)
+    moved = moved.replace(cost={"information": weight})
 
+    task = base.restated(moved, added_information=known)
+    first = design_task(
+        task, callback=callback, executor=executor, budget=design_budget(task, stop)
+    )
+    fits = history.last_control.shape == task.control.shape
+    if not fits or first.status is Status.INTERRUPTED:
+        return first
 
-def _from_last_control(
-    base: DesignTask,
-    moved: Experiment,
-    past: Past,
-    callback: DesignCallback | None,
-    stop: StopToken,
-    first: Design,
-) -> list[Design]:
-    """The design that begins with the last control; empty where that does not fit or diverges."""
-    if past.last.shape != first.trajectory.ctrl.shape or first.status is Status.INTERRUPTED:
-        return []
-
-    alone = moved.replace(descent={"starts": 1, "previous": (), "fourier": (), "repeats": ()})
-    task = base.restated(alone, added_information=past.estimate.data)
+    # One further start: the control of the last design, without any of the other starts.
+    only_start = {"starts": 1, "previous": (), "fourier": (), "repeats": ()}
+    task = base.restated(moved.replace(descent=only_start), added_information=known)
     try:
-        return [
-            design_task(
-                task,
-                callback=callback,
-                initial_control=past.last,
-                budget=design_budget(task, stop),
-            )
-        ]
+        second = design_task(
+            task,
+            callback=callback,
+            initial_control=history.last_control,
+            budget=design_budget(task, stop),
+        )
     except SimulationDivergedError:
-        # The old control may be too much for the new values.
-        return []
+        # The old control may be too strong for the new parameters.
+        return first
+
+    if second.status is Status.INTERRUPTED:
+        return second
+    return min(
+        (first, second),
+        key=lambda design: (design.status is Status.INFEASIBLE, design.final.cost),
+    )
 
 
-def _worth(base: DesignTask, moved: Experiment, past: Past) -> float:
+def _information_weight(base: DesignTask, moved: Experiment, history: CampaignHistory) -> float:
     """Weight of the criterion at which a relative gain of information costs as much effort as in the first design."""
-    stated, count = moved.cost.information, past.count + 1
+    stated = moved.cost.information
+    rounds = history.count + 1
     if moved.cost.criterion == "D":
-        return stated * count
+        return stated * rounds
+
+    first_task = base.restated(restate_experiment(base, history.first_theta))
+    task = base.restated(moved, added_information=history.estimate.data)
     try:
-        begun = _phi(base.restated(restated(base, past.begun)), past.first)
-        now = _phi(base.restated(moved, added_information=past.estimate.data), past.last)
+        first = _criterion_value(first_task, history.first_control)
+        now = _criterion_value(task, history.last_control)
     except (MjfimError, ValueError):
-        return stated * count**2  # as of equal experiments
-    return float(stated * count * begun / now)
+        # Without both values: the weight that equal experiments would get.
+        return stated * rounds**2
+
+    return float(stated * rounds * first / now)
 
 
-def _phi(task: DesignTask, control: Array) -> float:
-    """Criterion along a control: (N, nu). Raises where there is none."""
+def _criterion_value(task: DesignTask, control: Array) -> float:
+    """Criterion phi along a control: (N, nu); raises where there is none."""
     if control.shape != task.control.shape:
-        raise ValueError(f"a control of {control.shape} instead of {task.control.shape}")
+        raise ValueError(f"a control of shape {control.shape} instead of {task.control.shape}")
+
     value = evaluate_task(task, task.plant.simulate(task.theta, control)).criterion
     if not (np.isfinite(value) and value > 0.0):
-        raise SimulationDivergedError(f"criterion {value}")
+        raise SimulationDivergedError(f"the criterion is {value}")
     return value
 
 
-def restated(
+def restate_experiment(
     base: DesignTask, theta: Array | None = None, estimate: Estimate | None = None
 ) -> Experiment:
-    """The experiment as a redesign states it: guesses at theta, (p,), scales as they are, no true values.
+    """State the experiment of a redesign: guesses at the given parameters, unchanged scales, no true values.
 
-    Guesses keep a little inside bounds. A whole inertia moves only where the recordings show all of its coordinates. With
-    [robust], the bounds are drawn to what is known by now, from which its samples come.
+    Guesses keep a small distance from bounds. The parameters of a declared inertia move only where the recordings determine
+    all of them. With `[robust]`, bounds shrink to the region that the estimate leaves, from which the samples are drawn.
+
+    Args:
+        base: Task of the experiment as stated.
+        theta: (p,) new guesses [theta-unit]; None keeps the stated ones.
+        estimate: Estimate from the recordings so far, or None.
     """
-    e, p = base.experiment, base.parameters
+    experiment, p = base.experiment, base.parameters
+    index_of = {name: j for j, name in enumerate(p.names)}
     tables: dict[str, dict[str, Any]] = {}
-    place = {name: j for j, name in enumerate(p.names)}
-    for name, spec in e.parameters.items():
+
+    for name, spec in experiment.parameters.items():
         table = spec.model_dump(exclude_unset=True)
         table.pop("true", None)
         if spec.inertial is None:
-            tables[name] = {**table, **_moved(base, place[name], theta, estimate)}
+            tables[name] = {**table, **_restated_keys(base, index_of[name], theta, estimate)}
             continue
-        members = [j for j, q in enumerate(p.parameters) if q.group == name]
-        if theta is None or estimate is None or not _shown(base, members, estimate):
+
+        # A declared inertia is either left as it is, or replaced by its single parameters.
+        members = [j for j, parameter in enumerate(p.parameters) if parameter.group == name]
+        if theta is None or estimate is None or not _are_determined(base, members, estimate):
             tables[name] = table
             continue
         for j in members:
-            own = p.parameters[j]
-            alone = {"target": own.targets[0].path, "unit": own.unit, "nuisance": own.nuisance}
-            if own.prior is not None:
-                alone["prior"] = own.prior
-            tables[own.name] = {**alone, **_moved(base, j, theta, estimate)}
-    values = e.model_dump(exclude_unset=True)
-    cost = {**values.get("cost", {}), "linearize_at": "guess"}
-    return Experiment(
-        **{**values, "parameters": tables, "cost": cost}, directory=e.directory, source=e.source
-    )
+            member = _member_table(base, j)
+            tables[p.names[j]] = {**member, **_restated_keys(base, j, theta, estimate)}
+
+    values = experiment.model_dump(exclude_unset=True)
+    values["parameters"] = tables
+    values["cost"] = {**values.get("cost", {}), "linearize_at": "guess"}
+    return Experiment(**values, directory=experiment.directory, source=experiment.source)
 
 
-def _moved(
-    base: DesignTask, j: int, theta: Array | None, estimate: Estimate | None
+def _member_table(base: DesignTask, index: int) -> dict[str, Any]:
+    """Table of a parameter that belongs to a declared inertia, as if it were declared alone."""
+    parameter = base.parameters.parameters[index]
+    table: dict[str, Any] = {
+        "target": parameter.targets[0].path,
+        "unit": parameter.unit,
+        "nuisance": parameter.nuisance,
+    }
+    if parameter.prior is not None:
+        table["prior"] = parameter.prior
+    return table
+
+
+def _restated_keys(
+    base: DesignTask, index: int, theta: Array | None, estimate: Estimate | None
 ) -> dict[str, Any]:
-    """Keys of a parameter that a redesign states anew."""
-    own, size = base.parameters.parameters[j], float(base.parameters.magnitude[j])
-    low, high = own.bounds
+    """Keys of a parameter's table that a redesign states anew: guess, scale and, with `[robust]`, bounds."""
+    parameter = base.parameters.parameters[index]
+    size = float(base.parameters.magnitude[index])
     if theta is None:
-        return {"guess": own.guess, "scale": own.scale}
-    gap = min(INSIDE * size, 0.25 * (high - low))
-    guess = float(np.clip(theta[j], low + gap, high - gap))
-    keys = {"guess": guess, "scale": own.scale}
-    drawn = base.experiment.robust is not None and (
-        own.prior is not None or np.isfinite(own.bounds).all()
-    )
-    if drawn and estimate is not None and np.isfinite(estimate.std[j]):
-        reach = max(KNOWN * float(estimate.std[j]), 1e-9 * size)
-        return {**keys, "bounds": (max(low, guess - reach), min(high, guess + reach))}
+        return {"guess": parameter.guess, "scale": parameter.scale}
+
+    low, high = parameter.bounds
+    gap = min(BOUND_GAP * size, MAX_BOUND_GAP * (high - low))
+    guess = float(np.clip(theta[index], low + gap, high - gap))
+    keys: dict[str, Any] = {"guess": guess, "scale": parameter.scale}
+
+    # Robust designs sample parameters that have a prior or bounds.
+    is_bounded = bool(np.isfinite(parameter.bounds).all())
+    is_sampled = base.experiment.robust is not None and (parameter.prior is not None or is_bounded)
+    if is_sampled and estimate is not None and np.isfinite(estimate.std[index]):
+        reach = max(SAMPLING_RANGE * float(estimate.std[index]), MIN_SAMPLING_RANGE * size)
+        keys["bounds"] = (max(low, guess - reach), min(high, guess + reach))
     return keys
 
 
-def _shown(base: DesignTask, members: Sequence[int], estimate: Estimate) -> bool:
-    """Whether the recordings show every one of some parameters: to move one by its size moves them by more than the noise."""
-    at = np.asarray(members)
-    return bool((np.diag(estimate.data)[at] * base.parameters.magnitude[at] ** 2 > 1.0).all())
+def _are_determined(base: DesignTask, members: Sequence[int], estimate: Estimate) -> bool:
+    """True where the recordings determine every one of some parameters to better than its size."""
+    indices = np.asarray(members)
+    information = np.diag(estimate.data)[indices]
+    size = base.parameters.magnitude[indices]
+    return bool((information * size**2 > 1.0).all())

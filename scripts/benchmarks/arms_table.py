@@ -70,7 +70,9 @@ def run(
     stated = arms.experiment(arm, horizon, dry, args.folder / "models")
     experiment = stated.replace(descent={"fourier": [PITCH], "max_iterations": 100_000})
     with mjfim.Pool() as executor:
-        found = mjfim.compare(experiment, args.seconds, methods=args.methods, executor=executor)
+        found = mjfim.compare(
+            experiment, seconds=args.seconds, methods=args.methods, executor=executor
+        )
     for row in found.rows:
         console.print(
             f"  {row.title}: {row.worst_relative_std:.4g}, {row.outcome.value}, {row.seconds:.0f} s, {row.found_by}"

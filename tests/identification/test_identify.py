@@ -20,7 +20,7 @@ from mjfim.identification.identify import identify, identify_system, least_squar
 from mjfim.identification.residuals import FitProblem
 from mjfim.records.events import FitEvent
 from mjfim.records.recording import Recording
-from mjfim.studies.campaign import identified
+from mjfim.studies.campaign import identify_all
 from tests.support.paths import ROOT
 
 
@@ -271,7 +271,7 @@ def test_an_interrupted_search_gives_no_partial_result(
         with pytest.raises(KeyboardInterrupt):
             work()
     count[0] = 0
-    assert identified(task, [recording], task.parameters.guess) is None
+    assert identify_all(task, [recording], task.parameters.guess) is None
     count[0] = 0
     assert identify_system(task.system, [recording]).interrupted
 

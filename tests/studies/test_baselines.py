@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mjfim.arrays import Array
+from mjfim.budget import StopToken
 from mjfim.excitation.interior_point import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -38,7 +39,7 @@ from mjfim.studies.baselines.parametric import (
     optimise_with_scipy,
     spline_runs,
 )
-from mjfim.studies.compare import _tried
+from mjfim.studies.compare import _MethodRun
 from tests.support.baselines import pendulum, played
 from tests.support.paths import MODELS
 
@@ -202,7 +203,16 @@ def test_a_budget_of_steps_makes_it_repeatable() -> None:
 
 def test_workers_share_the_steps() -> None:
     with ThreadPoolExecutor(2) as executor:
-        result = _tried(order(pendulum(), "steps", steps=40_000), executor, lambda used, cost: None)
+        run = _MethodRun(
+            search=order(pendulum(), "steps", steps=40_000),
+            index=0,
+            count=1,
+            callback=None,
+            executor=executor,
+            stop=StopToken(),
+        )
+        result = run.divided_baseline(executor)
+    assert result is not None
     assert result.control is not None
     assert result.steps < 1.2 * 40_000 + 2 * 8_000
 

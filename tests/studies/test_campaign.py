@@ -1,8 +1,7 @@
-"""Campaigns: they end at what is wanted and at the truth, gain by the redesign, say what is wrong, go on where they stopped."""
+"""Campaigns: they reach the targets and the truth, gain by redesigns, name suspicious results, and can be continued."""
 
 from __future__ import annotations
 
-import importlib
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,6 +14,7 @@ from typer.testing import Result
 
 import mjfim
 from mjfim.arrays import Array
+from mjfim.budget import StopToken
 from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
@@ -24,12 +24,12 @@ from mjfim.identification.residual_tests import is_larger_than_noise
 from mjfim.records.campaign import Campaign, CampaignStatus, EarlierRound
 from mjfim.records.design import Design, Status
 from mjfim.records.recording import Recording
-from mjfim.studies.redesign import restated
+from mjfim.studies import campaign as campaign_module
+from mjfim.studies.redesign import restate_experiment
 from tests.support.cli import read, run
 from tests.support.numerics import cart_task
 from tests.support.paths import MODELS
 
-loop = importlib.import_module("mjfim.studies.campaign")  # `mjfim.run_campaign` is the function
 STUDY = mjfim.Experiment.from_file(
     MODELS / "cart_pendulum_guess.toml"
 ).replace(  # its guesses are 25 to 40 % off
@@ -70,7 +70,9 @@ def truth() -> DesignTask:
     return DesignTask.resolve(STUDY.replace(cost={"linearize_at": "true"}))
 
 
-def test_it_ends_at_what_is_wanted_and_at_the_truth(campaign: Campaign, truth: DesignTask) -> None:
+def test_a_campaign_ends_at_the_targets_and_at_the_truth(
+    campaign: Campaign, truth: DesignTask
+) -> None:
     assert campaign.reached and campaign.status is CampaignStatus.REACHED
     assert 2 <= len(campaign.rounds) <= 5, "one round would not test a redesign"
     last = campaign.estimate
@@ -81,7 +83,7 @@ def test_it_ends_at_what_is_wanted_and_at_the_truth(campaign: Campaign, truth: D
     assert not campaign.warnings and not campaign.short
 
 
-def test_a_round_is_what_its_parts_say(campaign: Campaign) -> None:
+def test_a_round_holds_its_design_recording_and_estimate(campaign: Campaign) -> None:
     """All recordings so far count, once; the first design is at the guess, the next at the estimate; promises are kept."""
     task = DesignTask.resolve(STUDY)
     recordings = [r for each in campaign.rounds for r in each.recordings]
@@ -108,7 +110,7 @@ def gained(controls: Sequence[Array], truth: DesignTask) -> float:
     )
 
 
-def test_a_redesign_tells_more_than_the_first_design_again(
+def test_a_redesign_gains_more_information_than_repeating_the_first_design(
     campaign: Campaign, truth: DesignTask
 ) -> None:
     """For about the same effort: information that is there already makes later rounds neither gentler nor wilder."""
@@ -124,11 +126,13 @@ def test_a_redesign_is_at_the_estimate_on_the_same_scales(tmp_path: Path) -> Non
         "c": {"target": "joint/hinge:damping"},
     }
     base = cart_task(tmp_path, parameters=tables, cost={"linearize_at": "true"})
-    moved = DesignTask.resolve(restated(base, np.array([2.0, 0.1])))
+    moved = DesignTask.resolve(restate_experiment(base, np.array([2.0, 0.1])))
     np.testing.assert_array_equal(moved.parameters.scale, base.parameters.scale)
     assert moved.theta[0] == pytest.approx(2.0 - 1e-3 * 1.5) and moved.theta[1] == 0.1
     assert moved.experiment.parameters["m"].true is None
-    np.testing.assert_array_equal(DesignTask.resolve(restated(base)).theta, base.parameters.guess)
+    np.testing.assert_array_equal(
+        DesignTask.resolve(restate_experiment(base)).theta, base.parameters.guess
+    )
 
 
 def test_a_whole_inertia_moves_where_the_recordings_show_it(tmp_path: Path) -> None:
@@ -146,22 +150,22 @@ def test_a_whole_inertia_moves_where_the_recordings_show_it(tmp_path: Path) -> N
         [simulate_system(cart_task(tmp_path).system, cart_task(tmp_path).initial)],
     )
     shown = replace(estimate, data=np.diag(1e4 / p.magnitude**2), std=0.01 * p.magnitude)
-    moved = DesignTask.resolve(restated(base, theta, shown))
+    moved = DesignTask.resolve(restate_experiment(base, theta, shown))
     assert moved.parameters.names == p.names
     np.testing.assert_allclose(moved.theta, theta)
     np.testing.assert_allclose(moved.parameters.scale, p.scale)
     hidden = np.array(shown.data)
     hidden[3, 3] = 0.0
-    kept = DesignTask.resolve(restated(base, theta, replace(shown, data=hidden)))
+    kept = DesignTask.resolve(restate_experiment(base, theta, replace(shown, data=hidden)))
     np.testing.assert_allclose(kept.theta[1:11], p.guess[1:11])
     np.testing.assert_allclose(kept.theta[[0, 11]], theta[[0, 11]])
 
 
-def test_robust_redesigns_sample_what_is_known_by_now(campaign: Campaign) -> None:
+def test_robust_redesigns_sample_around_the_estimate(campaign: Campaign) -> None:
     wide = STUDY.replace(robust={"samples": 6})
     last = campaign.rounds[0].estimate
     pool = DesignTask.resolve(
-        restated(DesignTask.resolve(wide), last.theta, last)
+        restate_experiment(DesignTask.resolve(wide), last.theta, last)
     ).samples_of_parameters
     before = DesignTask.resolve(wide).samples_of_parameters
     assert pool is not None and before is not None
@@ -169,7 +173,7 @@ def test_robust_redesigns_sample_what_is_known_by_now(campaign: Campaign) -> Non
     assert np.ptp(before.thetas, axis=0).min() > 10 * np.ptp(pool.thetas, axis=0).max()
 
 
-def test_friction_that_the_model_has_not_is_not_silent(tmp_path: Path) -> None:
+def test_friction_that_the_model_lacks_makes_the_result_doubtful(tmp_path: Path) -> None:
     """Formally as good as wanted, and wrong by many sigma: not reached."""
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1.0"/>')
     easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
@@ -193,7 +197,7 @@ def test_friction_too_weak_for_chi_squared_shows_in_successive_residuals(tmp_pat
     assert any("autocorrelated" in sentence for sentence in found.warnings)
 
 
-def test_a_round_that_tells_nothing_is_named(campaign: Campaign) -> None:
+def test_a_round_without_progress_is_named(campaign: Campaign) -> None:
     """Three rows of a recording are no progress; the rounds are used up, and it says what is missing."""
     first = campaign.rounds[0]
     start = replace(
@@ -235,7 +239,7 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
     assert any(sentence.startswith("round 2: m moved") for sentence in found.warnings)
 
 
-def test_what_is_recorded_already_is_not_done_again(campaign: Campaign) -> None:
+def test_recorded_rounds_are_not_repeated(campaign: Campaign) -> None:
     """The next design of a campaign that is taken up again is the one that it would have had."""
     first = campaign.rounds[0]
     done = [
@@ -253,12 +257,14 @@ def test_what_is_recorded_already_is_not_done_again(campaign: Campaign) -> None:
 
 
 def test_interrupted_while_recording(campaign: Campaign) -> None:
-    def stop(design: Design, number: int) -> Recording:
+    token = StopToken()
+
+    def stop_in_the_second_round(design: Design, number: int) -> Recording:
         if number == 2:
-            raise KeyboardInterrupt
+            token.request()
         return robot(design, number)
 
-    found = mjfim.run_campaign(STUDY, stop)
+    found = mjfim.run_campaign(STUDY, stop_in_the_second_round, stop=token)
     assert (
         found.status is CampaignStatus.INTERRUPTED
         and len(found.rounds) == 1
@@ -269,29 +275,29 @@ def test_interrupted_while_recording(campaign: Campaign) -> None:
     )
 
 
-def test_nothing_is_played_that_leaves_the_limits(
+def test_a_design_that_violates_limits_is_not_played(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     outside = replace(campaign.designs[0], status=Status.INFEASIBLE)
-    monkeypatch.setattr(loop, "design_task", lambda *args, **kwargs: outside)
+    monkeypatch.setattr(campaign_module, "design_task", lambda *args, **kwargs: outside)
     found = mjfim.run_campaign(STUDY, never)
     assert (
         found.status is CampaignStatus.INFEASIBLE and found.pending is outside and not found.rounds
     )
 
 
-def test_without_a_design_at_the_estimate_the_last_place_serves(
+def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_serve(
     campaign: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, asked = campaign.rounds[0], []
 
-    def fails_once(base: DesignTask, past: object, theta: Array, *rest: object) -> Design:
+    def fails_once(base: DesignTask, past: object, theta: Array, **options: object) -> Design:
         asked.append(theta)
         if len(asked) == 1:
             raise SimulationDivergedError("too fast")
         return campaign.designs[1]
 
-    monkeypatch.setattr(loop, "redesigned", fails_once)
+    monkeypatch.setattr(campaign_module, "redesign", fails_once)
     done = [
         EarlierRound(
             recordings=first.recordings,
@@ -357,7 +363,7 @@ def test_faulty_requests_say_what_is_right(tmp_path: Path) -> None:
         mjfim.run_campaign(STUDY, never, rounds=0)
 
 
-def test_what_no_round_can_tell_is_said_before_anything_moves() -> None:
+def test_unidentifiable_targets_are_reported_before_the_robot_moves() -> None:
     """The cart's mass and what the drive adds to it: only their sum shows."""
     tables = {
         "cart": {"target": "body/cart:mass"},

@@ -1,8 +1,8 @@
-"""`mjfim compare`: equal budgets, one way of judging, honest about who wins; records, files, exit codes, misuse."""
+"""`mjfim compare`: equal budgets, the same evaluation of every method, honest verdicts; files, exit codes, misuse."""
 
 from __future__ import annotations
 
-import importlib
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -14,7 +14,8 @@ import pytest
 from matplotlib.image import imread
 
 import mjfim
-from mjfim.errors import ExperimentError
+from mjfim.budget import StopToken
+from mjfim.errors import ExperimentError, NoResultError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.task import DesignTask
@@ -22,22 +23,20 @@ from mjfim.excitation.verification import verify
 from mjfim.output.plots.compare import compare_figure
 from mjfim.records.comparison import DESIGN, Comparison, MethodOutcome, MethodResult
 from mjfim.records.design import Design, HistoryRow
-from mjfim.records.events import DesignEvent
+from mjfim.records.events import DesignEvent, Event, StudyEvent
+from mjfim.studies import compare as compare_module
 from mjfim.studies.baselines.evaluator import BaselineSearch, SearchResult
-from mjfim.studies.compare import Glance, Judge, Meter, chosen_methods
+from mjfim.studies.compare import DesignWatch, MethodEvaluation, chosen_methods
 from tests.support.baselines import pendulum, played
 from tests.support.cli import loads, names, read, run, write_experiment
 
-compare = importlib.import_module(
-    "mjfim.studies.compare"
-)  # the name in the package is the function's
 LIMITS = "\n[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] }\n"
 
 
 @cache
 def small() -> Comparison:
     """A chirp and a Fourier series against the design of the cart-pendulum."""
-    return mjfim.compare(pendulum(), 60.0, 100_000, 1, ["chirp", "fourier5"])
+    return mjfim.compare(pendulum(), steps=100_000, seed=1, methods=["chirp", "fourier5"])
 
 
 def row(method: str, cost: float, outcome: MethodOutcome = MethodOutcome.INSIDE) -> MethodResult:
@@ -105,7 +104,7 @@ def test_each_method_has_its_budget_and_the_design_comes_last() -> None:
     assert not c.interrupted
 
 
-def test_rows_say_what_their_controls_do() -> None:
+def test_rows_hold_the_numbers_of_their_controls() -> None:
     task = DesignTask.resolve(pendulum())
     for r in small().rows:
         assert r.control is not None
@@ -123,32 +122,34 @@ def test_rows_say_what_their_controls_do() -> None:
         assert np.abs(ctrl).max() <= 5.0
 
 
-def test_a_control_that_leaks_is_shrunk_until_it_does_not() -> None:
+def test_a_control_that_violates_limits_is_shrunk_until_it_does_not() -> None:
     task, found = DesignTask.resolve(pendulum()), small().rows[0]
     assert found.control is not None
     leaking = task.centre + 1.15 * (found.control - task.centre)
-    r = Judge(task, None).row("chirp", "chirp", SearchResult(control=leaking, cost=1.0))
+    r = MethodEvaluation(task, None).result(
+        "chirp", "chirp", SearchResult(control=leaking, cost=1.0)
+    )
     assert r.outcome is MethodOutcome.INSIDE
     assert "shrunk to" in r.note
     assert min(r.margins.values()) >= 0.0
-    far = Judge(task, None).row("chirp", "chirp", SearchResult(control=leaking))
+    far = MethodEvaluation(task, None).result("chirp", "chirp", SearchResult(control=leaking))
     assert far.outcome is MethodOutcome.NOTHING
     assert min(far.margins.values()) < 0.0
     assert not far.sound
-    nothing = Judge(task, None).row("chirp", "chirp", SearchResult())
+    nothing = MethodEvaluation(task, None).result("chirp", "chirp", SearchResult())
     assert (nothing.outcome, nothing.control) == (MethodOutcome.NONE, None)
 
 
 def test_the_designs_control_is_never_shrunk() -> None:
     task, found = DesignTask.resolve(pendulum()), small().rows[2]
     assert found.control is not None
-    r = Judge(task, None).row(
+    r = MethodEvaluation(task, None).result(
         DESIGN, "design", SearchResult(control=1.05 * found.control, cost=1.0)
     )
     assert r.outcome is MethodOutcome.OUTSIDE
 
 
-def test_who_beats_whom() -> None:
+def test_the_verdict_names_the_methods_that_beat_the_design() -> None:
     c = made(
         row("a", 2.0),
         row("b", 0.5),
@@ -170,7 +171,7 @@ def test_who_beats_whom() -> None:
     assert made(row("a", 1.0), row(DESIGN, 1.0)).ok
 
 
-def test_a_design_that_may_not_be_played_has_lost() -> None:
+def test_a_design_that_violates_limits_has_lost() -> None:
     c = made(row("a", 2.0), row(DESIGN, 1.0, MethodOutcome.OUTSIDE))
     assert not c.ok
     assert [r.method for r in c.beating] == ["a"]
@@ -200,9 +201,9 @@ def test_only_methods_that_make_sense() -> None:
 
 
 def test_a_design_is_stopped_at_its_steps() -> None:
-    told: list[float] = []
-    job = BaselineSearch(experiment=pendulum(), method=DESIGN, seconds=60.0, steps=1000.0)
-    meter = Meter(job, lambda used, cost: told.append(used))
+    shares: list[float] = []
+    search = BaselineSearch(experiment=pendulum(), method=DESIGN, seconds=60.0, steps=1000.0)
+    watch = DesignWatch(search=search, progress=lambda share, cost: shares.append(share))
 
     def iterate(steps: int) -> DesignEvent:
         row = HistoryRow(
@@ -215,24 +216,32 @@ def test_a_design_is_stopped_at_its_steps() -> None:
             seconds=0.0,
             steps=steps,
         )
-        return DesignEvent(start="initial control", row=row)
+        return DesignEvent(start="initial", row=row)
 
-    meter(iterate(400))
-    meter(iterate(300))  # another task
-    meter(iterate(550))
-    assert not meter.stop.requested
-    meter(iterate(700))
-    assert meter.stop.requested
-    assert meter.spent
-    np.testing.assert_allclose(told, [0.4, 0.7, 0.95, 1.1], atol=0.05)
+    watch(iterate(400))
+    watch(iterate(300))  # another task
+    watch(iterate(550))
+    assert not watch.design_stop.requested
+    watch(iterate(700))
+    assert watch.design_stop.requested
+    assert watch.budget_ended
+    np.testing.assert_allclose(shares, [0.4, 0.7, 0.95, 1.1], atol=0.05)
 
 
-def test_ctrl_c_keeps_the_methods_that_are_finished() -> None:
-    def monitor(glance: Glance) -> None:
-        if glance.place == 1:
-            raise KeyboardInterrupt
+def test_a_request_to_stop_keeps_the_methods_that_are_finished() -> None:
+    token = StopToken()
 
-    c = mjfim.compare(pendulum(), 60.0, 10_000, methods=["chirp", "steps"], monitor=monitor)
+    def stop_in_the_second_method(event: Event) -> None:
+        if isinstance(event, StudyEvent) and event.index == 1:
+            token.request()
+
+    c = mjfim.compare(
+        pendulum(),
+        steps=10_000,
+        methods=["chirp", "steps"],
+        callback=stop_in_the_second_method,
+        stop=token,
+    )
     assert [r.method for r in c.rows] == ["chirp"]
     assert c.interrupted
     assert not c.ok
@@ -360,7 +369,7 @@ def worse(design: Callable[..., Design]) -> Callable[..., Design]:
 def test_a_design_that_is_worse_is_said_to_be_beaten(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compare, "design_task", worse(compare.design_task))
+    monkeypatch.setattr(compare_module, "design_task", worse(design_task))
     result = run(
         "compare", study, "-o", tmp_path, "--seconds", 60, "--steps", 20_000, "--methods", "chirp"
     )
@@ -375,13 +384,18 @@ def test_an_interrupted_comparison_is_written(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*args: Any, **kwargs: Any) -> Design:
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
+        raise NoResultError("stopped before the first iterate")
 
-    monkeypatch.setattr(compare, "design_task", interrupted)
+    def interrupted_baseline(*args: Any, **kwargs: Any) -> SearchResult:
+        signal.raise_signal(signal.SIGINT)
+        return SearchResult()
+
+    monkeypatch.setattr(compare_module, "design_task", interrupted)
     result = run("compare", study, "-o", tmp_path, "--steps", 10_000, "--methods", "chirp")
     assert result.exit_code == 1
     assert read(tmp_path / "compare.json")["interrupted"] is True
-    monkeypatch.setattr(compare, "run_baseline", interrupted)
+    monkeypatch.setattr(compare_module, "run_baseline", interrupted_baseline)
     nothing = run("compare", study, "-o", tmp_path / "none", "--steps", 10_000)
     assert nothing.exit_code == 1
     assert "interrupted before there was a result" in nothing.stderr
