@@ -1,6 +1,6 @@
 """The kinds of inequality constraints along a trajectory: their margins, their barrier and its expansion.
 
-Every kind answers the same questions, so that a constraint set is a sum over its kinds.
+All kinds follow one protocol, so that a constraint set is a sum over its members.
 """
 
 from __future__ import annotations

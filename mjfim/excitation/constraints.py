@@ -106,7 +106,7 @@ class ConstraintSet:
         )
 
     def is_feasible(self, values: ConstraintValues, *, strictly: bool = False) -> bool:
-        """Tell whether all constraints hold.
+        """Check whether all constraints hold.
 
         Args:
             values: The constrained quantities along a trajectory.

@@ -10,10 +10,10 @@ from mjfim.experiment.system import System
 from mjfim.model.coordinates import joint_names
 
 # Gauss-Newton steps; one is enough where forces are linear in the control.
-STEPS = 4
+NEWTON_STEPS = 4
 
 # Difference step of the control, relative to its size.
-DIFFERENCE = 1e-4
+RELATIVE_DIFFERENCE = 1e-4
 
 # Time for which the control has to keep the state below the velocity that `[boundary]` tolerates [s].
 HOLDING_TIME = 0.1
@@ -45,10 +45,10 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
         stepped = plant.simulator.step([plant.model(system.theta)], held, controls)
         return space.minus(stepped.states, state)
 
-    for _ in range(STEPS):
-        moves = np.concatenate([np.zeros((1, len(control))), DIFFERENCE * np.diag(size)])
+    for _ in range(NEWTON_STEPS):
+        moves = np.concatenate([np.zeros((1, len(control))), RELATIVE_DIFFERENCE * np.diag(size)])
         rows = drift(control + moves)
-        B = (rows[1:] - rows[0]).T / (DIFFERENCE * size)
+        B = (rows[1:] - rows[0]).T / (RELATIVE_DIFFERENCE * size)
         control = control - np.linalg.lstsq(B, rows[0])[0]
 
     _require_held(system, state, drift(control[None])[0], key, place)

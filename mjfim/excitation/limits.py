@@ -58,7 +58,7 @@ class _KindOfLimit:
 
     Attributes:
         kind: Name of the kind.
-        stated: What the experiment file states: one number for all, or a table by name.
+        stated: Numbers of the experiment file: one for all, or a table by name.
         addresses: Address of each joint or actuator that can have such a limit, by name.
         model_ranges: Ranges of the MJCF, by name.
     """
@@ -81,7 +81,7 @@ def limits_of(
         stated: The `[limits]` table of the experiment file.
 
     Returns:
-        The limits; where MJCF and file both have a range, what both allow.
+        The limits; where MJCF and file both have a range, the intersection of the two.
 
     Raises:
         ExperimentError: A name is unknown, a range is inverted, or a stated range excludes that of the MJCF.

@@ -1,4 +1,4 @@
-"""The task of a design: a system, the initial control, the cost, the limits and what is known beforehand."""
+"""The task of a design: a system, the initial control, the cost, the limits and the prior information."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ class DesignTask:
             samples_of_parameters=_parameter_samples(system),
         )
 
-    # Shortcuts to what nearly every step of a design asks for.
+    # Shortcuts to the parts of the system that nearly every step of a design needs.
 
     @property
     def experiment(self) -> Experiment:
@@ -228,7 +228,7 @@ class DesignTask:
 
     @property
     def stated_times(self) -> Array:
-        """(N * sample_factor,) sample times of the experiment as it is stated [s]."""
+        """(N * sample_factor,) sample times of the stated experiment [s]."""
         factor = self.system.variant.sample_factor
         return np.arange(self.samples * factor, dtype=np.float64) * (self.dt / factor)
 
@@ -451,7 +451,7 @@ class DesignTask:
         return DesignTask.of(system, added_information=added_information)
 
     def with_horizon(self, horizon: float) -> DesignTask:
-        """The task that the same experiment states with another horizon [s], on the same variant of the plant."""
+        """This task with another horizon [s], on the same variant of the plant."""
         experiment = self.experiment.replace(horizon=horizon)
         stated = replace(self.system.with_variant(STATED), experiment=experiment)
         task = DesignTask.of(stated, added_information=self.added_information)
@@ -526,7 +526,7 @@ def _calibrated(system: System, control: Array) -> tuple[System, Trajectory | No
 
 
 def _require_design_keys(experiment: Experiment) -> None:
-    """Raise ExperimentError where the experiment lacks what only a design needs."""
+    """Raise ExperimentError where the experiment lacks a key that only a design needs."""
     if experiment.horizon is None:
         raise ExperimentError(
             f"{experiment.source}: design needs `horizon`, the duration of the experiment [s], for example horizon = 4.0"

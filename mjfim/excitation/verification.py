@@ -161,7 +161,7 @@ def require_feasible_start(task: DesignTask) -> None:
         task: The task.
 
     Raises:
-        ExperimentError: A limit cannot be kept, excludes the initial or the final state, or what holds one of them.
+        ExperimentError: A limit cannot be kept, or excludes the initial state, the final state or a control that holds one.
     """
     try:
         _require_feasible_start(task)
@@ -179,9 +179,9 @@ def _require_feasible_start(task: DesignTask) -> None:
     boundary = task.experiment.boundary
     start = task.plant.initial_state(task.theta)
 
-    _require_inside(task, constraints, "the start", start)
+    _require_inside(task, constraints, "the initial state", start)
     if boundary.end == "rest":
-        _require_inside(task, constraints, "the end", task.target)
+        _require_inside(task, constraints, "the final state", task.target)
 
     if boundary.start == "rest":
         _require_held(task, "boundary.start", start, task.initial_hold)

@@ -99,7 +99,7 @@ class System:
         parameters: The p unknown parameters.
         outputs: The ny measured outputs.
         stated_noise: Noise of the outputs on the stated grid.
-        start: (ns,) nominal initial state.
+        nominal_initial_state: (ns,) nominal initial state.
         mocap: Where the initial keyframe puts mocap bodies, None where the model has them.
         variant: How the plant differs from the user's model.
         plant: The plant that simulates it at any theta.
@@ -111,7 +111,7 @@ class System:
     parameters: ParameterSet
     outputs: Outputs
     stated_noise: Noise
-    start: Array
+    nominal_initial_state: Array
     mocap: MocapPlacement | None
     variant: ModelVariant
     plant: Plant
@@ -161,7 +161,7 @@ class System:
             decoration(source.spec, model),
             mocap,
         )
-        start = _initial_state(experiment, model)
+        initial_state = _initial_state(experiment, model)
 
         private = _plant_model(source, parameters, outputs, mocap, STATED, None)
         _require_bodies(parameters, private)
@@ -169,7 +169,7 @@ class System:
             source=private,
             parameters=parameters,
             outputs=outputs,
-            nominal_initial_state=start,
+            nominal_initial_state=initial_state,
             substeps=grid.substeps,
             threads=threads,
         )
@@ -181,7 +181,7 @@ class System:
             parameters=parameters,
             outputs=outputs,
             stated_noise=noise,
-            start=start,
+            nominal_initial_state=initial_state,
             mocap=mocap,
             variant=STATED,
             plant=plant,
@@ -212,7 +212,7 @@ class System:
                 source=model,
                 parameters=self.parameters,
                 outputs=self.outputs,
-                nominal_initial_state=self.start,
+                nominal_initial_state=self.nominal_initial_state,
                 substeps=grid.substeps,
                 threads=self.threads,
                 smooth=smooth,
@@ -402,9 +402,9 @@ def _require_supported(source: ModelSource) -> None:
             f"{source.path}: the model has no actuator; an experiment needs at least one"
         )
     if model.nhistory or model.nplugin:
-        what = "delays or interval sensors" if model.nhistory else "engine plugins"
+        feature = "delays or interval sensors" if model.nhistory else "engine plugins"
         raise ModelError(
-            f"{source.path}: {what} keep a state that mjfim does not see; take them out of the model"
+            f"{source.path}: {feature} keep a state that mjfim does not see; take them out of the model"
         )
 
 
@@ -441,7 +441,7 @@ def _playback_steps(experiment: Experiment, substeps: int) -> int:
 
 
 def _initial_state(experiment: Experiment, model: Any) -> Array:
-    """(ns,) state at which the experiment starts: a keyframe, stated numbers, or the model's own."""
+    """(ns,) state at which the experiment starts: a keyframe, stated numbers, or the state of the model."""
     initial = experiment.initial
     key = keyframe(model, "initial.keyframe", initial.keyframe)
 

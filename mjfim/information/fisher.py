@@ -283,7 +283,7 @@ class FisherInformation:
     # Identifiable combinations
 
     def is_estimable(self, combinations: Array) -> np.ndarray:
-        """Tell which combinations of parameters the measurements or the priors determine.
+        """Find which combinations of parameters the measurements or the priors determine.
 
         Args:
             combinations: (t, c) combinations of the scaled wanted parameters.

@@ -33,7 +33,7 @@ from mjfim.records.trajectory import Sensitivity, Trajectory
 PROBES = 3
 
 # Relative error of rows that are taken from an information matrix.
-ROUND_OFF = 1e-7
+ROW_ROUND_OFF = 1e-7
 
 # An effect below this share of the strongest one in earlier experiments is round-off.
 NEGLIGIBLE_EFFECT = 1e-6
@@ -186,7 +186,15 @@ def _identifiability(
     error: Array,
     single_steps: Array | None,
 ) -> Identifiability:
-    """Null space of given rows, and what random trajectories leave of it."""
+    """Null space of given rows, and the part of it that random trajectories leave.
+
+    Args:
+        test: The plant and its parameters.
+        trajectory: One of the trajectories to which the rows belong.
+        J: (n, p) whitened rows of G.
+        error: (n, p) their change with a longer difference step.
+        single_steps: (t, k) directions without effect on single steps, or None.
+    """
     along_trajectory = _null_space(test, [J], [error], single_steps)
     if not along_trajectory.count:
         return _with_groups(test, along_trajectory, along_trajectory)
@@ -300,7 +308,7 @@ def _null_space(
     before = _rows_of_information(test.earlier)
     error = None
     if errors is not None:
-        error = np.concatenate([*errors, ROUND_OFF * np.abs(before)])
+        error = np.concatenate([*errors, ROW_ROUND_OFF * np.abs(before)])
 
     return find_null_space(
         np.concatenate([*stack, before]),

@@ -1,4 +1,4 @@
-"""The null space of sensitivities: combinations of parameters that no measurement shows, told apart from round-off.
+"""The null space of sensitivities: combinations of parameters that no measurement shows, as opposed to round-off.
 
 A direction n with `G n = 0` at every sample is in the null space. The columns of the stacked, whitened G are brought to unit
 length, so that a weak parameter is not mistaken for one without effect. Singular values below the error of G, which is its change
@@ -62,7 +62,7 @@ class NullSpace:
         silent: Indices of the wanted parameters that have no effect by themselves.
         basis: (t, t-k) orthonormal combinations with an effect, in scaled units.
         smallest: Least singular value of the rest, columns normalised, times the least share of a column that the nuisance
-            parameters leave: 1 where all are orthogonal, 0 where one cannot be told from zero.
+            parameters leave: 1 where all are orthogonal, 0 where one is indistinguishable from zero.
     """
 
     directions: Array
@@ -122,7 +122,7 @@ def find_null_space(
     left_by_nuisance = length / np.maximum(columns.length_before, SMALLEST_NORM)
     least_share = float(left_by_nuisance[~dead].min(initial=1.0))
 
-    # Dead columns and known directions are in the null space; the search goes on across them.
+    # Dead columns and known directions are in the null space; the rest is searched orthogonally to them.
     t = len(interest)
     found = np.eye(t)[:, dead]
     if known is not None and known.shape[1]:
@@ -146,7 +146,7 @@ def find_null_space(
 def _wanted_columns(
     J: Array, error: Array | None, size: Array, interest: np.ndarray, prior: Array
 ) -> _Columns:
-    """Columns of the wanted parameters; what nuisance parameters explain is projected out. Arguments as above."""
+    """Columns of the wanted parameters, the effects of nuisance parameters projected out. Arguments as above."""
     J = J * size
     error = np.zeros_like(J) if error is None else error * size
     length_before = np.linalg.norm(J[:, interest], axis=0)

@@ -129,7 +129,7 @@ def _longer_step_factors(plant: Plant) -> Array:
 
 
 def visible_columns(parameters: ParameterSet, G: Array) -> np.ndarray:
-    """Tell which parameters have an effect that stands out of round-off.
+    """Find which parameters have an effect that stands out of round-off.
 
     Args:
         parameters: The p parameters.

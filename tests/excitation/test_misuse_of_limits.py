@@ -31,22 +31,22 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "start outside": (
         "[limits]\nposition = { hinge = [-1.0, 1.0] }",
         [
-            "limits.position.hinge: the start is at 3.14159 rad, outside [-1, 1]; widen the limit",
-            "or move the start",
+            "limits.position.hinge: the initial state is at 3.14159 rad, outside [-1, 1]; widen the limit",
+            "or move the initial state",
         ],
         [],
     ),
     "start outside the model's range": (
         "",
         [
-            "limits.position.slide: the start is at 0 m, outside [0.5, 2]",
+            "limits.position.slide: the initial state is at 0 m, outside [0.5, 2]",
             "where it is the MJCF's, there",
         ],
         [('type="slide" axis="1 0 0"', 'type="slide" axis="1 0 0" range="0.5 2"')],
     ),
     "start too slow": (
         "[limits]\nvelocity = { slide = [0.5, 1.0] }",
-        ["limits.velocity.slide: the start is at 0 m/s, outside [0.5, 1]"],
+        ["limits.velocity.slide: the initial state is at 0 m/s, outside [0.5, 1]"],
         [],
     ),
     "ranges that exclude each other": (
@@ -81,7 +81,10 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     ),
     "end outside": (
         '[boundary]\nend = "rest"\nkeyframe = "far"\n[limits]\nposition = { slide = [-1.0, 1.0] }',
-        ["limits.position.slide: the end is at 2.5 m, outside [-1, 1]", "or move the end"],
+        [
+            "limits.position.slide: the final state is at 2.5 m, outside [-1, 1]",
+            "or move the final state",
+        ],
         [SIDE],
     ),
     "unknown end": (
@@ -112,7 +115,7 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "start in collision": (
         "[limits]\nclearance = 0.01",
         [
-            "limits.clearance: the start is in collision: cart - rail are -0.",
+            "limits.clearance: the initial state is in collision: cart - rail are -0.",
             "wanted 0.01 m",
             "limits.ignored",
         ],
@@ -120,7 +123,9 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     ),
     "start too close": (
         '[limits]\nclearance = 3.0\nignored = [["cart", "world"], ["pendulum", "world"]]',
-        ["limits.clearance: the start is too close: bob - rail are 0.885 m apart, wanted 3 m"],
+        [
+            "limits.clearance: the initial state is too close: bob - rail are 0.885 m apart, wanted 3 m"
+        ],
         [SOLID, ('<geom name="rod" type', '<geom name="rod" contype="0" conaffinity="0" type')],
     ),
     "nothing that could collide": (
