@@ -451,7 +451,9 @@ class RobotBench:
 
         state = np.array(system.plant.nominal_initial_state)
         state[-na:] = start[-na:]
-        return replace(system, start=state, plant=system.plant.with_initial_state(state))
+        return replace(
+            system, nominal_initial_state=state, plant=system.plant.with_initial_state(state)
+        )
 
     def _put_start(self, theta: Array, start: Array, system: System) -> None:
         """Write the true deviation of the start: (ns,) into theta: (p,), as far as it is an unknown."""
