@@ -1,13 +1,13 @@
 """mjfim: system identification on MuJoCo that designs the experiment.
 
-`design` finds the excitation that reveals most about uncertain parameters, `simulate` plays it, `identify` estimates the
-parameters from recordings, `monte_carlo` holds the estimator against the Cramer-Rao bound.
+`check` says what can be identified, `design` finds the excitation that reveals most about uncertain parameters, `simulate` plays
+it, `identify` estimates the parameters from recordings, `monte_carlo` compares the estimates with the Cramér-Rao bound.
 """
 
 from mjfim.budget import Budget, StopToken
 from mjfim.errors import MjfimError
 from mjfim.excitation.design import design
-from mjfim.excitation.evaluation import evaluate_trajectory
+from mjfim.excitation.evaluation import evaluate
 from mjfim.excitation.joint_design import design_jointly
 from mjfim.excitation.shortest_horizon import ShortestExperiment, shortest_experiment
 from mjfim.experiment.schema import Experiment
@@ -49,7 +49,7 @@ __all__ = [
     "compare",
     "design",
     "design_jointly",
-    "evaluate_trajectory",
+    "evaluate",
     "identify",
     "monte_carlo",
     "predict",
@@ -58,3 +58,25 @@ __all__ = [
     "simulate",
 ]
 __version__ = "0.1.0"
+
+# Names of earlier versions, each with its new name.
+RENAMED = {
+    "Study": "MonteCarloStudy",
+    "Shortest": "ShortestExperiment",
+    "design_together": "design_jointly",
+    "evaluate_trajectory": "evaluate",
+    "sequential": "run_campaign",
+    "shortest": "shortest_experiment",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Name the new name of a function or record that was renamed.
+
+    Raises:
+        AttributeError: Always; the message names the new name where there is one.
+    """
+    message = f"module 'mjfim' has no attribute {name!r}"
+    if name in RENAMED:
+        message += f": it is called {RENAMED[name]!r} now"
+    raise AttributeError(message)

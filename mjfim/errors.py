@@ -2,8 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+import inspect
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
+from typing import ParamSpec, TypeVar
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+# Arguments of the public functions that were renamed, each with its new name.
+RENAMED_ARGUMENTS = {
+    "monitor": "callback",
+    "tell": "callback",
+    "progress": "callback",
+    "report": "callback",
+}
 
 
 class MjfimError(Exception):
@@ -51,3 +65,26 @@ def unknown(kind: str, name: str, valid: Iterable[str]) -> str:
     hint = f" (did you mean {near[0]!r}?)" if near else ""
     listing = ", ".join(names) if names else "none"
     return f"unknown {kind} {name!r}{hint}; valid: {listing}"
+
+
+def explain_renamed_arguments(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Decorate a public function so that an argument under its old name is an error that names the new one.
+
+    Args:
+        function: The function.
+
+    Returns:
+        The function with the check.
+    """
+    known = inspect.signature(function).parameters
+
+    @functools.wraps(function)
+    def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        for old, new in RENAMED_ARGUMENTS.items():
+            if old in kwargs and old not in known and new in known:
+                raise TypeError(
+                    f"{function.__name__}() has no argument {old!r} any more: use {new!r}, which is called with one event"
+                )
+        return function(*args, **kwargs)
+
+    return checked

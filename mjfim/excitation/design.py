@@ -11,9 +11,14 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, SimulationDivergedError, UnidentifiableError
+from mjfim.errors import (
+    ExperimentError,
+    SimulationDivergedError,
+    UnidentifiableError,
+    explain_renamed_arguments,
+)
 from mjfim.excitation.constraints import constraint_set_of
-from mjfim.excitation.evaluation import design_warnings, evaluate, point_at_stated_rate
+from mjfim.excitation.evaluation import design_warnings, evaluate_point, point_at_stated_rate
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.levels import Stage, coarse_level, easier_level
 from mjfim.excitation.multistart import Multistart
@@ -36,6 +41,7 @@ from mjfim.records.events import DesignCallback, DesignEvent
 Runs = Generator[DesignEvent, None, list[RunResult]]
 
 
+@explain_renamed_arguments
 def design(
     experiment: Experiment,
     *,
@@ -312,8 +318,8 @@ class _Report:
     ) -> Design:
         """The design of the best run, with its warnings."""
         task = self.stage.task
-        initial = evaluate(self.stage, self.initial)
-        final = evaluate(self.stage, self.final)
+        initial = evaluate_point(self.stage, self.initial)
+        final = evaluate_point(self.stage, self.final)
 
         # The limits, on the model as the user wrote it.
         found = verify(task, final.trajectory)

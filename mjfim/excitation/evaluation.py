@@ -41,7 +41,7 @@ def point_at_stated_rate(stage: Stage, control: Array) -> DesignPoint | None:
     return stage.problem.point(trajectory)
 
 
-def evaluate(stage: Stage, point: DesignPoint) -> Evaluation:
+def evaluate_point(stage: Stage, point: DesignPoint) -> Evaluation:
     """Collect everything that is known along a trajectory, with the regulator about it.
 
     Args:
@@ -76,7 +76,7 @@ def evaluate(stage: Stage, point: DesignPoint) -> Evaluation:
     )
 
 
-def evaluate_trajectory(experiment: Experiment, trajectory: Trajectory) -> Evaluation:
+def evaluate(experiment: Experiment, trajectory: Trajectory) -> Evaluation:
     """Evaluate the information and the cost along the control of a given trajectory, at the experiment's theta.
 
     Args:
@@ -92,7 +92,7 @@ def evaluate_trajectory(experiment: Experiment, trajectory: Trajectory) -> Evalu
 
 
 def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
-    """Evaluate the control of a trajectory in a resolved task. See `evaluate_trajectory`."""
+    """Evaluate the control of a trajectory in a resolved task. See `evaluate`."""
     simulated = task.plant.simulate(task.theta, trajectory.ctrl)
     point = task.problem.point(simulated, CENTRAL_DIFFERENCES)
     if point.trajectory is None or point.sensitivity is None:
@@ -100,7 +100,7 @@ def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
 
     identifiability = task.identifiability_test.along(point.trajectory, point.sensitivity)
     stage = Stage(task, identifiability.basis)
-    return evaluate(stage, stage.problem.reevaluated(point))
+    return evaluate_point(stage, stage.problem.reevaluated(point))
 
 
 def design_warnings(

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.errors import ExperimentError, SimulationDivergedError, explain_renamed_arguments
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
@@ -20,6 +20,7 @@ from mjfim.records.design import Design
 from mjfim.records.events import DesignCallback
 
 
+@explain_renamed_arguments
 def design_jointly(
     experiments: Sequence[Experiment],
     *,

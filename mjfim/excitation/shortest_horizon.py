@@ -15,7 +15,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, MjfimError, NoResultError
+from mjfim.errors import ExperimentError, MjfimError, NoResultError, explain_renamed_arguments
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.levels import AUTO_COARSE_FACTOR, MIN_COARSE_SAMPLES
 from mjfim.excitation.target_accuracy import (
@@ -125,6 +125,7 @@ class ShortestExperiment:
         return f"shortest horizon: {self.horizon:g} s ({below}){ending}"
 
 
+@explain_renamed_arguments
 def shortest_experiment(
     experiment: Experiment,
     *,

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array, evenly_spread_indices
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import SimulationDivergedError
+from mjfim.errors import SimulationDivergedError, explain_renamed_arguments
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.report import FitResult, estimate_from
@@ -78,6 +78,7 @@ SIGMA_PER_MEDIAN = 1.4826
 Callback = Callable[[FitEvent], None]
 
 
+@explain_renamed_arguments
 def identify(
     experiment: Experiment,
     recordings: Sequence[Recording],

@@ -13,7 +13,12 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, MjfimError, SimulationDivergedError
+from mjfim.errors import (
+    ExperimentError,
+    MjfimError,
+    SimulationDivergedError,
+    explain_renamed_arguments,
+)
 from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.target_accuracy import (
     largest_ratio_to_target,
@@ -40,6 +45,7 @@ SUSPICIOUS_CHANGE = 4.0
 Measure = Callable[[Design, int], Recording | Sequence[Recording] | None]
 
 
+@explain_renamed_arguments
 def run_campaign(
     experiment: Experiment,
     measure: Measure,

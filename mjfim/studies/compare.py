@@ -10,7 +10,13 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, NoResultError, SimulationDivergedError, unknown
+from mjfim.errors import (
+    ExperimentError,
+    NoResultError,
+    SimulationDivergedError,
+    explain_renamed_arguments,
+    unknown,
+)
 from mjfim.excitation.design import design_budget, design_task, designable
 from mjfim.excitation.evaluation import point_at_stated_rate
 from mjfim.excitation.feasibility import shrink_until_feasible
@@ -38,6 +44,7 @@ UNLIMITED_ITERATIONS = 100_000
 Progress = Callable[[float, float], None]
 
 
+@explain_renamed_arguments
 def compare(
     experiment: Experiment,
     *,

@@ -18,7 +18,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, SimulationDivergedError
+from mjfim.errors import ExperimentError, SimulationDivergedError, explain_renamed_arguments
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.identify import least_squares, newton_raphson
@@ -51,6 +51,7 @@ JACOBIAN_STEP = 1e-6
 CURVATURE_STEP = 1e-3
 
 
+@explain_renamed_arguments
 def monte_carlo(
     experiment: Experiment,
     trajectory: Trajectory | Mapping[str, Trajectory],

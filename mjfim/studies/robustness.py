@@ -23,7 +23,12 @@ from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken, stop_on_interrupt
-from mjfim.errors import ExperimentError, NoResultError, SimulationDivergedError
+from mjfim.errors import (
+    ExperimentError,
+    NoResultError,
+    SimulationDivergedError,
+    explain_renamed_arguments,
+)
 from mjfim.excitation.constraints import SUBSTEP_KINDS, constraint_set_of
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.task import DesignTask
@@ -72,6 +77,7 @@ MIN_START_DEVIATION = 1e-9
 DRAW_SHRINKAGE = 0.9
 
 
+@explain_renamed_arguments
 def assess_robustness(
     experiment: Experiment,
     design: str | Path,

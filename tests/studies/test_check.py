@@ -53,7 +53,7 @@ def test_sigmas_are_the_square_roots_of_the_inverse_information(tmp_path) -> Non
     assert found.self_test.passed
 
 
-def test_sigmas_are_those_of_evaluate_trajectory_also_with_priors_and_nuisance(tmp_path) -> None:
+def test_sigmas_are_those_of_evaluate_also_with_priors_and_nuisance(tmp_path) -> None:
     parameters = {
         **CART_PARAMETERS,
         "gain": {"target": "actuator/force:gainprm[0]", "nuisance": True, "prior": 0.1},

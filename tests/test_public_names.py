@@ -1,0 +1,62 @@
+"""The names at the top of the package, and the messages for names of earlier versions."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import pytest
+
+import mjfim
+from mjfim.errors import explain_renamed_arguments
+from tests.support.paths import MODELS
+
+# Functions that report their progress to `callback`.
+VERBS_WITH_CALLBACK = (
+    "assess_robustness",
+    "compare",
+    "design",
+    "design_jointly",
+    "identify",
+    "monte_carlo",
+    "run_campaign",
+    "shortest_experiment",
+)
+
+
+def test_all_public_names_exist() -> None:
+    for name in mjfim.__all__:
+        assert getattr(mjfim, name) is not None
+
+
+@pytest.mark.parametrize(("old", "new"), mjfim.RENAMED.items())
+def test_an_old_name_is_an_error_that_names_the_new_one(old: str, new: str) -> None:
+    assert old not in mjfim.__all__
+    assert new in mjfim.__all__
+    with pytest.raises(AttributeError, match=f"{old}.*{new}"):
+        getattr(mjfim, old)
+
+
+def test_an_unknown_name_is_an_ordinary_error() -> None:
+    with pytest.raises(AttributeError, match=r"no attribute 'desing'$"):
+        getattr(mjfim, "desing")  # noqa: B009 - the name does not exist
+
+
+@pytest.mark.parametrize("old", ["monitor", "tell", "progress"])
+@pytest.mark.parametrize("verb", VERBS_WITH_CALLBACK)
+def test_an_old_argument_is_an_error_that_names_the_new_one(verb: str, old: str) -> None:
+    arguments = inspect.signature(getattr(mjfim, verb)).parameters
+    if old in arguments or "callback" not in arguments:
+        pytest.skip("has this argument")
+
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    with pytest.raises(TypeError, match=f"{old}.*callback"):
+        getattr(mjfim, verb)(experiment, **{old: print})
+
+
+def test_an_argument_that_the_function_has_is_passed_on() -> None:
+    @explain_renamed_arguments
+    def function(*, report: Any, callback: Any = None) -> Any:
+        return report
+
+    assert function(report=3) == 3
