@@ -21,9 +21,11 @@ from mjfim.arrays import Array
 from mjfim.errors import MjfimError, RecordingError
 from mjfim.model.coordinates import output_label
 from mjfim.output.labels import Labels
-from mjfim.output.rerun.documents import log_design, log_estimate, log_trajectories, show
-from mjfim.output.rerun.panels import dof_positions, history_series
-from mjfim.output.rerun.scene import camera, entity, motion
+from mjfim.output.rerun import log_design, log_estimate, log_trajectories, show
+from mjfim.output.rerun.camera import place_camera
+from mjfim.output.rerun.history import history_series
+from mjfim.output.rerun.panels import dof_positions
+from mjfim.output.rerun.scene import body_poses, entity_path
 from mjfim.records.design import Design, Evaluation, HistoryRow, StartResult, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.recording import Recording
@@ -180,7 +182,7 @@ def column(
     """(times, values) of one component of one entity; timeline None: static."""
     times: list[int] = []
     values: list[Any] = []
-    for chunk in RrdReader(path).stream().filter(content=entity(at)).to_chunks():
+    for chunk in RrdReader(path).stream().filter(content=entity_path(at)).to_chunks():
         batch = chunk.to_record_batch()
         if component in batch.schema.names and (
             timeline in batch.schema.names or (timeline is None and chunk.is_static)
@@ -207,7 +209,7 @@ def design(cart: mujoco.MjModel) -> Design:
 def file(cart: mujoco.MjModel, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its recording, in a folder that does not exist yet."""
     path = tmp_path_factory.mktemp("rerun") / "new" / "design.rrd"
-    log_design(path, cart, design, Labels.of_model(cart), "| a caller's | table |")
+    log_design(path, cart, design, Labels.of_model(cart), addition="| a caller's | table |")
     return path
 
 
@@ -236,7 +238,7 @@ class TestDesign:
                 ("information", key),
                 ("phase", "mass", key, "now"),
             ]
-        assert {entity(path) for path in expected} <= entities(file)
+        assert {entity_path(path) for path in expected} <= entities(file)
 
     def test_has_no_warnings_and_one_blueprint(self, file: Path) -> None:
         assert not [path for path in entities(file) if "__warnings" in path]
@@ -350,7 +352,7 @@ class TestDesign:
         blind = replace(design.initial, std=np.array([np.inf, 0.1]), min_eigenvalue=np.zeros(41))
         path = tmp_path / "design.rrd"
         log_design(path, cart, replace(design, initial=blind, history=()), Labels.of_model(cart))
-        assert entity(("information", "initial")) in entities(path)
+        assert entity_path(("information", "initial")) in entities(path)
 
 
 @pytest.mark.parametrize("name", ["acrobot", "panda", "panda without geoms", "zoo"])
@@ -365,7 +367,7 @@ class TestAnyModel:
         assert not [entry for entry in logged if "__warnings" in entry]
         for key in ("initial", "optimized"):
             bodies = [model.body(b).name or f"body{b}" for b in range(1, model.nbody)]
-            assert {entity(("robots", key, "bodies", body)) for body in bodies} <= logged
+            assert {entity_path(("robots", key, "bodies", body)) for body in bodies} <= logged
 
     def test_names_count_degrees_of_freedom(self, name: str, tmp_path: Path) -> None:
         model = load(name)
@@ -380,11 +382,11 @@ class TestAnyModel:
     def test_camera_sees_every_moving_body(self, name: str, tmp_path: Path) -> None:
         model = load(name)
         trajectory = simulated(model, 1.0)
-        poses = motion(model, trajectory.t, trajectory.qpos)
-        eye = camera(model, [poses], views=1, aspect=1.3)
+        poses = body_poses(model, trajectory.t, trajectory.qpos)
+        eye = place_camera(model, [poses], views=1, aspect=1.3)
         towards = np.subtract(eye.target, eye.position)
         moving = np.flatnonzero(model.body_weldid)
-        ray = poses.pos[:, moving] - np.array(eye.position)
+        ray = poses.positions[:, moving] - np.array(eye.position)
         cosine = ray @ towards / np.linalg.norm(towards) / np.linalg.norm(ray, axis=2)
         assert np.degrees(np.arccos(cosine.min())) < 40.0
 
@@ -465,9 +467,9 @@ class TestEstimate:
         np.testing.assert_array_equal(values[:, 0], estimate.recordings[0].y[kept, 0])
         residual = column(path, ("residuals", *at), "sim_time", "Scalars:scalars")[1][:, 0]
         np.testing.assert_allclose(residual, 0.01, atol=1e-12)
-        assert entity(("outputs", "recording 2", "hinge_angle [rad]", "predicted")) in entities(
-            path
-        )
+        assert entity_path(
+            ("outputs", "recording 2", "hinge_angle [rad]", "predicted")
+        ) in entities(path)
 
     def test_ghost_is_see_through(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
@@ -492,7 +494,7 @@ class TestEstimate:
             None,
             trajectory,
             Labels.of_model(cart),
-            "see the report",
+            addition="see the report",
         )
         assert not [entry for entry in entities(path) if entry.startswith("/robots/measured")]
         text = str(column(path, ("summary",), None, "TextDocument:text")[1][0, 0])

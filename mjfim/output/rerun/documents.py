@@ -1,11 +1,8 @@
-"""Designs, estimates and trajectories as Rerun recordings: what each file holds and how the viewer lays it out."""
+"""Designs, estimates and trajectories as Rerun recordings: the data that each file holds."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -14,111 +11,138 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from mjfim.arrays import evenly_spread_indices
-from mjfim.atomic_io import replacing
-from mjfim.errors import MjfimError, RecordingError
 from mjfim.model.coordinates import output_label
 from mjfim.output.labels import Labels
+from mjfim.output.rerun.camera import place_camera
+from mjfim.output.rerun.history import history_bars, history_lines, log_history
+from mjfim.output.rerun.layout import (
+    ASPECT_WITH_TEXT,
+    ASPECT_WITHOUT_TEXT,
+    arrange,
+    open_recording,
+    recording_page,
+    robot_views,
+    state_parts,
+)
 from mjfim.output.rerun.panels import (
-    Block,
-    Phase,
+    LayoutPart,
     dof_positions,
-    grid,
-    history_bars,
-    history_lines,
+    grid_parts,
     log_dots,
-    log_history,
     log_line,
     log_steps,
     series_view,
-    series_views,
-    shown_parameters,
-    stack,
+    stack_parts,
 )
-from mjfim.output.rerun.scene import (
-    Camera,
-    Route,
-    camera,
-    entity,
-    has_floor,
-    log_robot,
-    log_trail,
-    motion,
-)
-from mjfim.output.rerun.shapes import Look
+from mjfim.output.rerun.phase_plots import PhasePlot, parameters_with_phase_plot
+from mjfim.output.rerun.scene import body_poses, entity_path, log_end_path, log_robot
+from mjfim.output.rerun.shapes import RobotStyle
 from mjfim.output.rerun.text import design_text, estimate_text
-from mjfim.records.design import Design
+from mjfim.records.design import Design, Evaluation
 from mjfim.records.estimate import Estimate
-from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 
-INITIAL = Look((70, 130, 220))
-OPTIMIZED = Look((220, 60, 60))
-PREDICTED = Look((230, 130, 30))
-MEASURED = Look((125, 135, 150), opacity=0.4)
-OTHERS = (Look((60, 160, 90)), Look((160, 90, 200)), PREDICTED, Look((20, 160, 170)))
-BACKDROP = (214, 219, 226)
-MOST = 20_000  # rows of a recording, or of a motion, in a file
+# Styles of the initial and the optimized trajectory, and of a predicted and a measured motion.
+INITIAL = RobotStyle(accent=(70, 130, 220))
+OPTIMIZED = RobotStyle(accent=(220, 60, 60))
+PREDICTED = RobotStyle(accent=(230, 130, 30))
+MEASURED = RobotStyle(accent=(125, 135, 150), opacity=0.4)
+
+# Styles of further trajectories and series, one after the other.
+FURTHER_STYLES = (
+    RobotStyle(accent=(60, 160, 90)),
+    RobotStyle(accent=(160, 90, 200)),
+    PREDICTED,
+    RobotStyle(accent=(20, 160, 170)),
+)
+
+# Styles of trajectories with a known name.
+STYLES_BY_NAME = {"initial": INITIAL, "optimized": OPTIMIZED, "final": OPTIMIZED}
+
+# Largest number of samples of a recording, or of a motion, in a file.
+MAX_SAMPLES = 20_000
 
 
-SHORT, TALL = 1.35, 0.75  # width over height of the robots' region, with and without text below it
-
-
-BY_NAME = {"initial": INITIAL, "optimized": OPTIMIZED, "final": OPTIMIZED}
+# ---- designs
 
 
 def log_design(
-    path: Path, model: mujoco.MjModel, design: Design, names: Labels, summary: str = ""
+    path: Path, model: mujoco.MjModel, design: Design, labels: Labels, *, addition: str = ""
 ) -> None:
-    """Write design.rrd: both robots, states, controls, information, sensitivities, the optimiser's history and a table.
+    """Write design.rrd: both robots, states, controls, information, sensitivities, history and a summary.
 
-    summary: Markdown to append to the table;  names: labels of the model's columns, usually `Labels.of_model(model)`
+    Args:
+        path: The file.
+        model: The model.
+        design: The design.
+        labels: Labels of the model's columns, usually `Labels.of_model(model)`.
+        addition: Markdown to append to the summary.
     """
-    sides = {"initial": design.initial, "optimized": design.final}
-    phases = [Phase.most_sensitive(design, index, model.nv) for index in shown_parameters(design)]
-    motions = {key: motion(model, e.trajectory.t, e.trajectory.qpos) for key, e in sides.items()}
-    eye = camera(model, list(motions.values()), views=2, aspect=SHORT)
+    evaluations = {"initial": design.initial, "optimized": design.final}
+    poses = {
+        name: body_poses(model, evaluation.trajectory.t, evaluation.trajectory.qpos)
+        for name, evaluation in evaluations.items()
+    }
+    camera = place_camera(model, list(poses.values()), views=2, aspect=ASPECT_WITH_TEXT)
     titles = {
         "initial trajectory (blue)": ("robots", "initial"),
         "optimized trajectory (red)": ("robots", "optimized"),
     }
-    panels = _design_panels(design, names, phases)
-    with _document(
-        path, model, "design", _layout(_robot_views(model, eye, titles), eye, panels)
-    ) as rec:
-        units = names.parameter_units or ("",) * len(design.parameters)
-        _log_text(rec, design_text(design, units, summary))
-        log_history(rec, design.history, (OPTIMIZED, INITIAL, *OTHERS))
-        for phase in phases:
-            phase.log_axes(rec, names)
-        for key, side in sides.items():
-            look, t = BY_NAME[key], side.trajectory.t
-            log_robot(rec, model, ("robots", key), motions[key], look, iteration=True)
-            log_trail(rec, model, ("robots", key), motions[key], look)
-            _log_states(rec, model, side.trajectory, names, key, look)
-            log_line(
-                rec,
-                ("information", key),
-                t,
-                np.sqrt(np.maximum(side.min_eigenvalue, 0.0)),
-                key,
-                look,
-            )
-            for phase in phases:
-                phase.log_curve(rec, t, phase.curve(side.sensitivity, model.nv), key, look)
+    plots = [
+        PhasePlot.of_most_sensitive(design, j, model.nv) for j in parameters_with_phase_plot(design)
+    ]
+    views = robot_views(model, camera, titles)
+    layout = arrange(views, camera, _design_panels(design, labels, plots))
+
+    units = labels.parameter_units or ("",) * len(design.parameters)
+    with open_recording(path, model, "design", layout) as rec:
+        _log_text(rec, design_text(design, units, addition))
+        log_history(rec, design.history, (OPTIMIZED, INITIAL, *FURTHER_STYLES))
+        for plot in plots:
+            plot.log_axes(rec, labels)
+        for name, evaluation in evaluations.items():
+            root, style = ("robots", name), STYLES_BY_NAME[name]
+            log_robot(rec, model, root, poses[name], style, on_iteration=True)
+            log_end_path(rec, model, root, poses[name], style)
+            _log_states(rec, model, evaluation.trajectory, labels, name=name, style=style)
+            _log_information(rec, evaluation, plots, name=name, style=style)
 
 
-def _design_panels(design: Design, names: Labels, phases: Sequence[Phase]) -> list[Block]:
-    """Signals of a design; the optimiser's history has its own tab, since one timeline at a time is drawn."""
-    information = series_view(("information",), "√λ_min of the information so far [√s / θ-unit]")
-    phase_grid = grid("sensitivity ψ", [phase.view(names) for phase in phases])
-    lines = grid("optimiser (timeline: iteration)", history_lines(design.history), columns=2)
+def _log_information(
+    rec: rr.RecordingStream,
+    evaluation: Evaluation,
+    plots: Sequence[PhasePlot],
+    *,
+    name: str,
+    style: RobotStyle,
+) -> None:
+    """Log the root of the information's smallest eigenvalue over time, and the sensitivities of one trajectory."""
+    t = evaluation.trajectory.t
+    root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
+    log_line(rec, ("information", name), t, root, name=name, style=style)
+    for plot in plots:
+        plot.log_curve(rec, t, evaluation.sensitivity, name=name, style=style)
+
+
+def _design_panels(design: Design, labels: Labels, plots: Sequence[PhasePlot]) -> list[LayoutPart]:
+    """Return the signals of a design; the history has its own tab, since the viewer draws one timeline at a time."""
+    states = state_parts(labels)
+    title = "√λ_min of the information so far [√s / θ-unit]"
+    information = series_view(("information",), title)
+    sensitivities = grid_parts("sensitivity ψ", [plot.view(labels) for plot in plots])
+
+    lines = history_lines(design.history)
     if not lines:
-        return [*_state_blocks(names), Block(information), *phase_grid]
-    beside = Block(rrb.Horizontal(information, history_bars(design.history)))
-    signals = stack(
-        [*_state_blocks(names), beside, *phase_grid], name="trajectories (timeline: sim_time)"
-    )
-    return [Block(rrb.Tabs(signals, lines[0].content, active_tab=0))]
+        return [*states, LayoutPart(content=information), *sensitivities]
+
+    beside = LayoutPart(content=rrb.Horizontal(information, history_bars(design.history)))
+    name = "trajectories (timeline: sim_time)"
+    signals = stack_parts([*states, beside, *sensitivities], name=name)
+    history = grid_parts("optimiser (timeline: iteration)", lines, columns=2)[0]
+    return [LayoutPart(content=rrb.Tabs(signals, history.content, active_tab=0))]
+
+
+# ---- estimates
 
 
 def log_estimate(
@@ -127,197 +151,155 @@ def log_estimate(
     estimate: Estimate,
     measured: Trajectory | None,
     predicted: Trajectory,
-    names: Labels,
-    summary: str = "",
+    labels: Labels,
+    *,
+    addition: str = "",
 ) -> None:
-    """Write estimate.rrd: predicted against measured robot and outputs, residuals and the estimated parameters.
+    """Write estimate.rrd: predicted and measured robot and outputs, residuals and the estimated parameters.
 
-    measured: as a see-through robot over the simulated one, or None where positions were not measured
+    Args:
+        path: The file.
+        model: The identified model.
+        estimate: The estimate.
+        measured: Measured motion, drawn as a see-through robot; None where positions were not measured.
+        predicted: Predicted motion.
+        labels: Labels of the model's columns.
+        addition: Markdown to append to the summary.
     """
-    predicted, measured = _thin(predicted), None if measured is None else _thin(measured)
-    robots = {"predicted": (predicted, PREDICTED)} | (
-        {"measured": (measured, MEASURED)} if measured else {}
-    )
-    motions = {
-        key: motion(model, trajectory.t, trajectory.qpos) for key, (trajectory, _) in robots.items()
+    trajectories = {"predicted": _thinned(predicted)}
+    styles = {"predicted": PREDICTED, "measured": MEASURED}
+    title = "predicted robot (orange)"
+    if measured is not None:
+        trajectories["measured"] = _thinned(measured)
+        title += " under the measured one (grey, see-through)"
+
+    poses = {
+        name: body_poses(model, trajectory.t, trajectory.qpos)
+        for name, trajectory in trajectories.items()
     }
-    eye = camera(model, list(motions.values()), views=1, aspect=SHORT)
-    title = "predicted robot (orange)" + (
-        " under the measured one (grey, see-through)" if measured else ""
-    )
-    pages = [
-        _recording_page(model, k, recording) for k, recording in enumerate(estimate.recordings)
-    ]
-    pages.append(stack(_state_blocks(names), name="states and controls"))
-    layout = _layout(
-        _robot_views(model, eye, {title: ("robots",)}), eye, [Block(rrb.Tabs(*pages, active_tab=0))]
-    )
-    with _document(path, model, "estimate", layout) as rec:
-        _log_text(rec, estimate_text(estimate, summary))
-        log_trail(rec, model, ("robots", "predicted"), motions["predicted"], PREDICTED)
-        for key, (trajectory, look) in robots.items():
-            log_robot(rec, model, ("robots", key), motions[key], look)
-            _log_states(rec, model, trajectory, names, key, look)
-        for k, (recording, y) in enumerate(
-            zip(estimate.recordings, estimate.predicted, strict=True)
-        ):
-            rows = evenly_spread_indices(len(recording.t), MOST)
-            t = recording.t[rows]
-            for column, output in enumerate(recording.outputs):
-                root = (f"recording {k + 1}", output_label(model, output))
-                observed, told = recording.y[rows, column], y[rows, column]
-                log_dots(rec, ("outputs", *root, "measured"), t, observed, "measured", MEASURED)
-                log_line(rec, ("outputs", *root, "predicted"), t, told, "predicted", PREDICTED)
-                log_dots(
-                    rec, ("residuals", *root), t, observed - told, "measured - predicted", MEASURED
-                )
+    camera = place_camera(model, list(poses.values()), views=1, aspect=ASPECT_WITH_TEXT)
+    pages = [recording_page(model, k, recording) for k, recording in enumerate(estimate.recordings)]
+    pages.append(stack_parts(state_parts(labels), name="states and controls"))
+    signals = LayoutPart(content=rrb.Tabs(*pages, active_tab=0))
+    views = robot_views(model, camera, {title: ("robots",)})
+    layout = arrange(views, camera, [signals])
+
+    with open_recording(path, model, "estimate", layout) as rec:
+        _log_text(rec, estimate_text(estimate, addition))
+        log_end_path(rec, model, ("robots", "predicted"), poses["predicted"], PREDICTED)
+        for name, trajectory in trajectories.items():
+            log_robot(rec, model, ("robots", name), poses[name], styles[name])
+            _log_states(rec, model, trajectory, labels, name=name, style=styles[name])
+        for k in range(len(estimate.recordings)):
+            _log_outputs(rec, model, estimate, k)
 
 
-def log_trajectories(
-    path: Path, model: mujoco.MjModel, trajectories: Mapping[str, Trajectory], names: Labels
+def _log_outputs(
+    rec: rr.RecordingStream, model: mujoco.MjModel, estimate: Estimate, index: int
 ) -> None:
-    """Write trajectories by name: one robot each, states and controls together."""
-    spare = iter(OTHERS * (1 + len(trajectories) // len(OTHERS)))
-    looks = {key: BY_NAME.get(key) or next(spare) for key in trajectories}
-    motions = {
-        key: motion(model, trajectory.t, trajectory.qpos)
-        for key, trajectory in trajectories.items()
-    }
-    eye = camera(model, list(motions.values()), views=len(motions), aspect=TALL)
-    views = _robot_views(model, eye, {key: ("robots", key) for key in trajectories})
-    layout = _layout(views, eye, _state_blocks(names), text=False)
-    with _document(path, model, "replay", layout) as rec:
-        for key, trajectory in trajectories.items():
-            log_robot(rec, model, ("robots", key), motions[key], looks[key])
-            log_trail(rec, model, ("robots", key), motions[key], looks[key])
-            _log_states(rec, model, trajectory, names, key, looks[key])
+    """Log measured and predicted outputs of one recording, and their differences."""
+    recording = estimate.recordings[index]
+    rows = evenly_spread_indices(len(recording.t), MAX_SAMPLES)
+    t = recording.t[rows]
+    for column, output in enumerate(recording.outputs):
+        parts = (f"recording {index + 1}", output_label(model, output))
+        measured = recording.y[rows, column]
+        predicted = estimate.predicted[index][rows, column]
 
-
-def show(path: Path) -> None:
-    """Open the native viewer on a recording and return; the viewer stays open."""
-    if not Path(path).is_file():
-        raise RecordingError(f"there is no Rerun recording at {str(path)!r}")
-    viewer = subprocess.Popen(
-        [sys.executable, "-m", "rerun", "--new", str(path)], start_new_session=True
-    )
-    try:
-        code = viewer.wait(timeout=3.0)
-    except subprocess.TimeoutExpired:
-        return
-    if code:
-        raise MjfimError(
-            f"the Rerun viewer ended with code {code}; it needs a display, the file {str(path)!r} does not"
+        under = ("outputs", *parts)
+        log_dots(rec, (*under, "measured"), t, measured, name="measured", style=MEASURED)
+        log_line(rec, (*under, "predicted"), t, predicted, name="predicted", style=PREDICTED)
+        log_dots(
+            rec,
+            ("residuals", *parts),
+            t,
+            measured - predicted,
+            name="measured - predicted",
+            style=MEASURED,
         )
 
 
-def _thin(trajectory: Trajectory) -> Trajectory:
-    """At most so many rows, evenly spread."""
-    rows = evenly_spread_indices(len(trajectory.t), MOST)
-    ctrl = trajectory.ctrl[rows[:-1]]
+def _thinned(trajectory: Trajectory) -> Trajectory:
+    """Return at most `MAX_SAMPLES` evenly spread samples of a trajectory."""
+    rows = evenly_spread_indices(len(trajectory.t), MAX_SAMPLES)
     return Trajectory(
         t=trajectory.t[rows],
         qpos=trajectory.qpos[rows],
         qvel=trajectory.qvel[rows],
         act=trajectory.act[rows],
-        ctrl=ctrl,
+        ctrl=trajectory.ctrl[rows[:-1]],
     )
 
 
-def _log_text(rec: rr.RecordingStream, text: str) -> None:
-    """Markdown of the summary panel."""
-    document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-    rec.log(entity(("summary",)), document, static=True, strict=True)
+# ---- trajectories
 
 
-# Parts shared by the documents
+def log_trajectories(
+    path: Path, model: mujoco.MjModel, trajectories: Mapping[str, Trajectory], labels: Labels
+) -> None:
+    """Write trajectories: one robot each, states and controls in shared plots.
 
-
-@contextmanager
-def _document(
-    path: Path, model: mujoco.MjModel, kind: str, layout: rrb.Container
-) -> Iterator[rr.RecordingStream]:
-    """A stream into a temporary file beside `path`, which replaces `path` once it is complete.
-
-    The application id carries the model's name, so that the viewer keeps the layouts of different models apart.
+    Args:
+        path: The file.
+        model: The model.
+        trajectories: The trajectories by name.
+        labels: Labels of the model's columns.
     """
-    name = model.names.split(b"\0", 1)[0].decode()
-    time = rrb.TimePanel(
-        state="collapsed", timeline="sim_time", play_state="playing", loop_mode="all"
-    )
-    panels = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"), time)
-    blueprint = rrb.Blueprint(layout, *panels, auto_layout=False, auto_views=False)
-    with replacing(path) as partial, rr.RecordingStream(f"mjfim {kind} {name}".strip()) as rec:
-        rec.set_log_time_enabled(False)
-        rec.save(partial, default_blueprint=blueprint)
-        yield rec
+    styles = _trajectory_styles(list(trajectories))
+    poses = {
+        name: body_poses(model, trajectory.t, trajectory.qpos)
+        for name, trajectory in trajectories.items()
+    }
+    motions = list(poses.values())
+    camera = place_camera(model, motions, views=len(motions), aspect=ASPECT_WITHOUT_TEXT)
+    views = robot_views(model, camera, {name: ("robots", name) for name in trajectories})
+    layout = arrange(views, camera, state_parts(labels), text=False)
+
+    with open_recording(path, model, "replay", layout) as rec:
+        for name, trajectory in trajectories.items():
+            root, style = ("robots", name), styles[name]
+            log_robot(rec, model, root, poses[name], style)
+            log_end_path(rec, model, root, poses[name], style)
+            _log_states(rec, model, trajectory, labels, name=name, style=style)
 
 
-def _layout(
-    views: Sequence[rrb.View], eye: Camera, panels: Sequence[Block], text: bool = True
-) -> rrb.Horizontal:
-    """Robots and text on the left, signals on the right."""
-    robots = rrb.Vertical(*views) if eye.stacked else rrb.Horizontal(*views)
-    document = rrb.TextDocumentView(origin=entity(("summary",)), name="summary")
-    left = rrb.Vertical(robots, document, row_shares=[3, 2]) if text else robots
-    return (
-        rrb.Horizontal(left, stack(panels), column_shares=[2, 3])
-        if panels
-        else rrb.Horizontal(left)
-    )
+def _trajectory_styles(names: Sequence[str]) -> dict[str, RobotStyle]:
+    """Return a style for every name; names without a fixed style take the further ones in turn."""
+    styles = {}
+    further = 0
+    for name in names:
+        if name in STYLES_BY_NAME:
+            styles[name] = STYLES_BY_NAME[name]
+            continue
+        styles[name] = FURTHER_STYLES[further % len(FURTHER_STYLES)]
+        further += 1
+    return styles
 
 
-def _robot_views(model: mujoco.MjModel, eye: Camera, roots: Mapping[str, Route]) -> list[rrb.View]:
-    """One 3D view per title, all seen from the same camera."""
-    ground = rrb.LineGrid3D(visible=not (has_floor(model) or eye.sideways))
-    return [
-        rrb.Spatial3DView(
-            origin=entity(root),
-            name=title,
-            eye_controls=eye.controls(),
-            line_grid=ground,
-            background=BACKDROP,
-        )
-        for title, root in roots.items()
-    ]
+# ---- parts of several recordings
 
 
-def _state_blocks(names: Labels) -> list[Block]:
-    """Positions, velocities and controls: all visible for small models, in tabs for large ones."""
-    blocks = [
-        *grid("positions", series_views(("positions",), names.positions, legend=True)),
-        *grid("velocities", series_views(("velocities",), names.velocities)),
-        *grid("controls", series_views(("controls",), names.controls)),
-    ]
-    if not blocks or max(len(names.positions), len(names.controls)) <= 3:
-        return blocks
-    return [Block(rrb.Tabs(*(part.content for part in blocks), active_tab=0), blocks[0].rows)]
+def _log_text(rec: rr.RecordingStream, markdown: str) -> None:
+    """Log the text of the summary panel."""
+    document = rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN)
+    rec.log(entity_path(("summary",)), document, static=True, strict=True)
 
 
 def _log_states(
     rec: rr.RecordingStream,
     model: mujoco.MjModel,
     trajectory: Trajectory,
-    names: Labels,
-    key: str,
-    look: Look,
+    labels: Labels,
+    *,
+    name: str,
+    style: RobotStyle,
 ) -> None:
-    """Every position, velocity and control of a trajectory, as the series called `key`."""
-    for name, column in zip(names.positions, dof_positions(model, trajectory.qpos).T, strict=True):
-        log_line(rec, ("positions", name, key), trajectory.t, column, key, look)
-    for name, column in zip(names.velocities, trajectory.qvel.T, strict=True):
-        log_line(rec, ("velocities", name, key), trajectory.t, column, key, look)
-    for name, column in zip(names.controls, trajectory.ctrl.T, strict=True):
-        log_steps(rec, ("controls", name, key), trajectory.t[:-1], column, key, look)
-
-
-def _recording_page(model: mujoco.MjModel, index: int, recording: Recording) -> rrb.Vertical:
-    """Outputs over residuals of one recording."""
-    name = f"recording {index + 1}"
-    titles = [output_label(model, output) for output in recording.outputs]
-    outputs = series_views(("outputs", name), titles, legend=True)
-    residuals = [
-        series_view(("residuals", name, title), f"residual of {title}", legend=False)
-        for title in titles
-    ]
-    parts = grid("outputs", outputs, 2, 6) + grid("residuals", residuals, 2, 6)
-    return stack(parts, name=f"{name}: {Path(recording.name).name}")
+    """Log every position, velocity and control of a trajectory as series with the trajectory's name."""
+    t = trajectory.t
+    positions = dof_positions(model, trajectory.qpos)
+    for label, values in zip(labels.positions, positions.T, strict=True):
+        log_line(rec, ("positions", label, name), t, values, name=name, style=style)
+    for label, values in zip(labels.velocities, trajectory.qvel.T, strict=True):
+        log_line(rec, ("velocities", label, name), t, values, name=name, style=style)
+    for label, values in zip(labels.controls, trajectory.ctrl.T, strict=True):
+        log_steps(rec, ("controls", label, name), t[:-1], values, name=name, style=style)

@@ -1,278 +1,227 @@
-"""Panels of a Rerun recording that show signals: what is logged for each, and the view that draws it.
-
-Series are on the timeline `sim_time`. The optimiser's history is on `iteration` and, as static bars, on both.
-"""
+"""Panels of a Rerun recording that show signals over simulated time: their logged series, their views and the layout."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from mjfim.arrays import Array
-from mjfim.model.coordinates import split_unit
-from mjfim.output.labels import Labels
-from mjfim.output.rerun.scene import Route, entity, time_column
-from mjfim.output.rerun.shapes import Look
-from mjfim.records.design import Design, HistoryRow
+from mjfim.output.rerun.scene import EntityParts, entity_path, time_column
+from mjfim.output.rerun.shapes import RobotStyle
+
+# Width of curves, and size of dots [points].
+LINE_WIDTH, DOT_SIZE = 2.0, 1.5
 
 
 def dof_positions(model: mujoco.MjModel, qpos: Array) -> Array:
-    """(N+1, nv) positions per degree of freedom [m or rad]; quaternions become rotation vectors. qpos: (N+1, nq)."""
-    out = np.empty((len(qpos), model.nv))
+    """Return positions by degree of freedom; quaternions become rotation vectors.
+
+    Args:
+        model: The model.
+        qpos: (N+1, nq) positions.
+
+    Returns:
+        (N+1, nv) positions [m or rad].
+    """
+    positions = np.empty((len(qpos), model.nv))
     for kind, q, v in zip(model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True):
-        joint, shift = mujoco.mjtJoint(int(kind)), 0
+        joint = mujoco.mjtJoint(int(kind))
         if joint in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE):
-            out[:, v] = qpos[:, q]
-            continue
-        if joint == mujoco.mjtJoint.mjJNT_FREE:
-            out[:, v : v + 3], shift = qpos[:, q : q + 3], 3
-        for row, quaternion in zip(out, qpos[:, q + shift : q + shift + 4], strict=True):
-            mujoco.mju_quat2Vel(row[v + shift : v + shift + 3], quaternion, 1.0)
-    return out
+            positions[:, v] = qpos[:, q]
+        elif joint == mujoco.mjtJoint.mjJNT_FREE:
+            positions[:, v : v + 3] = qpos[:, q : q + 3]
+            positions[:, v + 3 : v + 6] = _rotation_vectors(qpos[:, q + 3 : q + 7])
+        else:
+            positions[:, v : v + 3] = _rotation_vectors(qpos[:, q : q + 4])
+    return positions
 
 
-# Series over simulated time
+def _rotation_vectors(quaternions: Array) -> Array:
+    """Return (n, 3) rotation vectors [rad] of quaternions (n, 4), wxyz."""
+    vectors = np.empty((len(quaternions), 3))
+    for vector, quaternion in zip(vectors, quaternions, strict=True):
+        mujoco.mju_quat2Vel(vector, quaternion, 1.0)
+    return vectors
+
+
+# ---- series over simulated time
 
 
 def log_line(
-    rec: rr.RecordingStream, path: Route, t: Array, values: Array, name: str, look: Look
+    rec: rr.RecordingStream,
+    parts: EntityParts,
+    t: Array,
+    values: Array,
+    *,
+    name: str,
+    style: RobotStyle,
 ) -> None:
-    """One curve on `sim_time`. t, values: (n,); rows without a finite value are left out."""
-    rec.log(
-        entity(path),
-        rr.SeriesLines(colors=[look.accent], names=[name], widths=[2.0]),
-        static=True,
-        strict=True,
-    )
-    _send(rec, path, t, values)
+    """Log a curve on `sim_time`.
+
+    Args:
+        rec: The recording.
+        parts: Entity of the curve.
+        t: (n,) times [s].
+        values: (n,) values; those that are not finite are left out.
+        name: Name in the legend.
+        style: Style with the colour.
+    """
+    line = rr.SeriesLines(colors=[style.accent], names=[name], widths=[LINE_WIDTH])
+    _log_series(rec, parts, line, t, values)
 
 
 def log_steps(
-    rec: rr.RecordingStream, path: Route, t: Array, values: Array, name: str, look: Look
+    rec: rr.RecordingStream,
+    parts: EntityParts,
+    t: Array,
+    values: Array,
+    *,
+    name: str,
+    style: RobotStyle,
 ) -> None:
-    """A value held from each sample to the next. t, values: (n,)."""
-    hold = rr.components.InterpolationMode.StepAfter
-    style = rr.SeriesLines(
-        colors=[look.accent], names=[name], widths=[2.0], interpolation_mode=hold
+    """Log a value that is held from each sample to the next.
+
+    Args:
+        rec: The recording.
+        parts: Entity of the curve.
+        t: (n,) times [s].
+        values: (n,) values; those that are not finite are left out.
+        name: Name in the legend.
+        style: Style with the colour.
+    """
+    line = rr.SeriesLines(
+        colors=[style.accent],
+        names=[name],
+        widths=[LINE_WIDTH],
+        interpolation_mode=rr.components.InterpolationMode.StepAfter,
     )
-    rec.log(entity(path), style, static=True, strict=True)
-    _send(rec, path, t, values)
+    _log_series(rec, parts, line, t, values)
 
 
 def log_dots(
-    rec: rr.RecordingStream, path: Route, t: Array, values: Array, name: str, look: Look
+    rec: rr.RecordingStream,
+    parts: EntityParts,
+    t: Array,
+    values: Array,
+    *,
+    name: str,
+    style: RobotStyle,
 ) -> None:
-    """Measured samples as dots. t, values: (n,)."""
-    style = rr.SeriesPoints(colors=[look.accent], names=[name], marker_sizes=[1.5])
-    rec.log(entity(path), style, static=True, strict=True)
-    _send(rec, path, t, values)
+    """Log measured samples as dots.
+
+    Args:
+        rec: The recording.
+        parts: Entity of the dots.
+        t: (n,) times [s].
+        values: (n,) values; those that are not finite are left out.
+        name: Name in the legend.
+        style: Style with the colour.
+    """
+    dots = rr.SeriesPoints(colors=[style.accent], names=[name], marker_sizes=[DOT_SIZE])
+    _log_series(rec, parts, dots, t, values)
 
 
-def _send(rec: rr.RecordingStream, path: Route, t: Array, values: Array) -> None:
-    """The finite rows of a series. t, values: (n,)."""
+def _log_series(
+    rec: rr.RecordingStream,
+    parts: EntityParts,
+    appearance: rr.SeriesLines | rr.SeriesPoints,
+    t: Array,
+    values: Array,
+) -> None:
+    """Log the appearance of a series, and its finite values. t, values: (n,)."""
+    rec.log(entity_path(parts), appearance, static=True, strict=True)
+
     finite = np.isfinite(values)
     if finite.any():
         columns = rr.Scalars.columns(scalars=values[finite])
-        rec.send_columns(entity(path), [time_column(t[finite])], columns, strict=True)
+        rec.send_columns(entity_path(parts), [time_column(t[finite])], columns, strict=True)
 
 
-def series_view(path: Route, title: str, legend: bool = True) -> rrb.TimeSeriesView:
-    """All curves under a path; one legend for several small plots is enough."""
+def series_view(parts: EntityParts, title: str, *, legend: bool = True) -> rrb.TimeSeriesView:
+    """Return a view of all curves under an entity.
+
+    Args:
+        parts: The entity.
+        title: Title of the view.
+        legend: False to hide the legend; one is enough for several small plots.
+    """
     corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
-    return rrb.TimeSeriesView(origin=entity(path), name=title, plot_legend=corner)
+    return rrb.TimeSeriesView(origin=entity_path(parts), name=title, plot_legend=corner)
 
 
-def series_views(path: Route, titles: Sequence[str], legend: bool = False) -> list[rrb.View]:
-    """One view per title, of the curves under `path / title`; the legend, if any, in the first."""
-    return [series_view((*path, title), title, legend and k == 0) for k, title in enumerate(titles)]
+def series_views(
+    parts: EntityParts, titles: Sequence[str], *, legend: bool = False
+) -> list[rrb.View]:
+    """Return a view per title, of the curves under the entity with that name.
+
+    Args:
+        parts: Entity above those of the titles.
+        titles: The titles.
+        legend: True for a legend in the first view.
+    """
+    views: list[rrb.View] = []
+    for k, title in enumerate(titles):
+        views.append(series_view((*parts, title), title, legend=legend and k == 0))
+    return views
 
 
-@dataclass(frozen=True)
-class Block:
-    """A part of the layout and the height it wants, in rows of small plots."""
+# ---- layout
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayoutPart:
+    """A part of the layout.
+
+    Attributes:
+        content: The view or container.
+        rows: Height relative to other parts, in rows of small plots.
+    """
 
     content: rrb.View | rrb.Container
     rows: int = 1
 
 
-def grid(name: str, views: Sequence[rrb.View], columns: int = 3, page: int = 9) -> list[Block]:
-    """Views in one grid, or in tabs of `page` views each where there are more; empty for no views."""
-    pages = [views[k : k + page] for k in range(0, len(views), page)]
-    titles = [f"{name} {k + 1}" for k in range(len(pages))] if len(pages) > 1 else [name]
-    columns = min(columns, len(views))
-    grids = [
-        rrb.Grid(*part, grid_columns=columns, name=title)
-        for part, title in zip(pages, titles, strict=False)
-    ]
-    if not grids:
-        return []
-    rows = -(-len(pages[0]) // columns)
-    return [Block(grids[0] if len(grids) == 1 else rrb.Tabs(*grids, active_tab=0, name=name), rows)]
+def grid_parts(
+    name: str, views: Sequence[rrb.View], *, columns: int = 3, per_page: int = 9
+) -> list[LayoutPart]:
+    """Arrange views in a grid, or in several tabs of one grid each.
 
+    Args:
+        name: Name of the grid.
+        views: The views.
+        columns: Largest number of columns.
+        per_page: Largest number of views in a grid.
 
-def stack(blocks: Sequence[Block], name: str | None = None) -> rrb.Vertical:
-    """Blocks above each other, each as high as it wants."""
-    return rrb.Vertical(
-        *(b.content for b in blocks), row_shares=[b.rows for b in blocks], name=name
-    )
-
-
-# Phase plots of the sensitivity
-
-
-MAX_PHASES = 9
-
-
-def shown_parameters(design: Design) -> list[int]:
-    """Wanted parameters that move something; of many, those of the largest relative standard deviation."""
-    moving = [
-        j
-        for j in design.wanted
-        if any(e.sensitivity[..., j].any() for e in (design.initial, design.final))
-    ]
-    size = np.where(design.theta == 0.0, 1.0, np.abs(design.theta))
-    known = np.where(np.isfinite(design.final.std), design.final.std, 0.0) / size
-    return sorted(sorted(moving, key=lambda j: -known[j])[:MAX_PHASES])
-
-
-@dataclass(frozen=True)
-class Phase:
-    """One phase plot: what parameter `index` does to degree of freedom `dof`, both trajectories on one scale.
-
-    scale: (2,) largest |psi| of position and velocity [x-unit / theta-unit]
+    Returns:
+        A list with one part; an empty one without views.
     """
+    if not views:
+        return []
 
-    index: int
-    dof: int
-    parameter: str
-    scale: Array
+    columns = min(columns, len(views))
+    pages = [views[k : k + per_page] for k in range(0, len(views), per_page)]
+    rows = -(-len(pages[0]) // columns)
+    if len(pages) == 1:
+        return [LayoutPart(content=rrb.Grid(*views, grid_columns=columns, name=name), rows=rows)]
 
-    @classmethod
-    def most_sensitive(cls, design: Design, index: int, nv: int) -> Phase:
-        """The degree of freedom on whose position the parameter has most influence in the designed trajectory."""
-        psi = np.abs(design.final.sensitivity[:, :, index])
-        dof = int(np.argmax(psi[:, :nv].max(axis=0)))
-        both = np.concatenate(
-            [
-                np.abs(e.sensitivity[:, [dof, nv + dof], index])
-                for e in (design.initial, design.final)
-            ]
-        )
-        scale = both.max(axis=0)
-        return cls(index, dof, design.parameters[index], np.where(scale > 0.0, scale, 1.0))
-
-    @property
-    def route(self) -> Route:
-        """Entity under which the plot is logged."""
-        return ("phase", self.parameter)
-
-    def curve(self, sensitivity: Array, nv: int) -> Array:
-        """(N+1, 2) points in the plot's frame (x right in -1.5..1.5, y down in -1..1). sensitivity: (N+1, nx, p)."""
-        psi = sensitivity[:, [self.dof, nv + self.dof], self.index]
-        return np.asarray(psi / self.scale * (1.5, -1.0))
-
-    def log_axes(self, rec: rr.RecordingStream, names: Labels) -> None:
-        """Axes through zero, with the value at each positive end, per unit of the parameter."""
-        units = [
-            split_unit(name)[1] for name in (names.positions[self.dof], names.velocities[self.dof])
-        ]
-        ends = np.array([[1.65, 0.0], [0.0, -1.1]])
-        lines, grey = [[-ends[0], ends[0]], [-ends[1], ends[1]]], [150, 150, 150]
-        style = rr.LineStrips2D(lines, colors=[grey] * 2, radii=rr.Radius.ui_points(0.5))
-        rec.log(entity((*self.route, "axes")), style, static=True, strict=True)
-        labels = [
-            f"{1.1 * value:.2g} {unit}" for value, unit in zip(self.scale, units, strict=True)
-        ]
-        marks = rr.Points2D(
-            ends * (0.8, 1.0),
-            labels=labels,
-            colors=[grey] * 2,
-            radii=rr.Radius.ui_points(1.0),
-            show_labels=True,
-        )
-        rec.log(entity((*self.route, "ends")), marks, static=True, strict=True)
-
-    def log_curve(
-        self, rec: rr.RecordingStream, t: Array, points: Array, name: str, look: Look
-    ) -> None:
-        """The whole curve, and a dot that moves along it with `sim_time`. points: (N+1, 2)."""
-        line = rr.LineStrips2D([points], colors=[look.accent], radii=rr.Radius.ui_points(1.0))
-        rec.log(entity((*self.route, name)), line, static=True, strict=True)
-        path = entity((*self.route, name, "now"))
-        style = rr.Points2D.from_fields(colors=[look.accent], radii=rr.Radius.ui_points(3.5))
-        rec.log(path, style, static=True, strict=True)
-        rec.send_columns(path, [time_column(t)], rr.Points2D.columns(positions=points), strict=True)
-
-    def view(self, names: Labels) -> rrb.Spatial2DView:
-        """The plot, titled with what stands on each axis."""
-        title = f"ψ of {self.parameter}: {split_unit(names.positions[self.dof])[0]} →  velocity ↑"
-        bounds = rrb.VisualBounds2D(x_range=[-1.9, 1.9], y_range=[-1.3, 1.3])
-        return rrb.Spatial2DView(origin=entity(self.route), name=title, visual_bounds=bounds)
-
-
-# History of an optimisation
-
-
-def history_series(history: Sequence[HistoryRow]) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Title -> (iterations, values); log10 where every value is positive, rows without a value left out."""
-    columns: dict[str, Callable[[HistoryRow], float]] = {
-        "cost": lambda row: row.cost,
-        "λ_min": lambda row: row.min_eigenvalue,
-        "slope": lambda row: abs(row.slope),
-    }
-    out = {}
-    iterations = np.array([row.iteration for row in history], dtype=np.int64)
-    for title, column in columns.items():
-        values = np.array([column(row) for row in history], dtype=np.float64)
-        finite = np.isfinite(values) & ((values != 0.0) if title != "cost" else True)
-        n, values = iterations[finite], values[finite]
-        logarithmic = len(values) > 0 and bool(np.all(values > 0.0))
-        out[f"log10 {title}" if logarithmic else title] = (
-            n,
-            np.log10(values) if logarithmic else values,
-        )
-    steps = np.array([row.gamma for row in history], dtype=np.float64)
-    out["step length"] = iterations[np.isfinite(steps)], steps[np.isfinite(steps)]
-    return out
-
-
-def log_history(
-    rec: rr.RecordingStream, history: Sequence[HistoryRow], looks: Sequence[Look]
-) -> None:
-    """Every series on `iteration`, and as static bars over the iteration number."""
-    for (title, (n, values)), look in zip(history_series(history).items(), looks, strict=False):
-        path = ("history", title)
-        style = rr.SeriesLines(colors=[look.accent], names=[title], widths=[2.0])
-        rec.log(entity(path), style, static=True, strict=True)
-        if len(n):
-            columns = rr.Scalars.columns(scalars=values)
-            rec.send_columns(
-                entity(path), [rr.TimeColumn("iteration", sequence=n)], columns, strict=True
-            )
-            bars = rr.BarChart(values, abscissa=n, color=look.accent)
-            rec.log(entity(("bars", title)), bars, static=True, strict=True)
-
-
-def history_bars(history: Sequence[HistoryRow]) -> rrb.Tabs:
-    """Bars of each series by iteration, the same on every timeline."""
-    hidden = rrb.PlotLegend(visible=False)
-    bars = [
-        rrb.BarChartView(
-            origin=entity(("bars", title)), name=f"{title} by iteration", plot_legend=hidden
-        )
-        for title, (n, _) in history_series(history).items()
-        if len(n)
+    grids = [
+        rrb.Grid(*page, grid_columns=columns, name=f"{name} {k}")
+        for k, page in enumerate(pages, start=1)
     ]
-    return rrb.Tabs(*bars, active_tab=0, name="optimiser")
+    return [LayoutPart(content=rrb.Tabs(*grids, active_tab=0, name=name), rows=rows)]
 
 
-def history_lines(history: Sequence[HistoryRow]) -> list[rrb.View]:
-    """Each series as a line; they show on the timeline `iteration` only."""
-    filled = [title for title, (n, _) in history_series(history).items() if len(n)]
-    return [series_view(("history", title), title, legend=False) for title in filled]
+def stack_parts(parts: Sequence[LayoutPart], name: str | None = None) -> rrb.Vertical:
+    """Arrange parts above each other, with heights by their rows.
+
+    Args:
+        parts: The parts.
+        name: Name of the stack.
+    """
+    contents = [part.content for part in parts]
+    return rrb.Vertical(*contents, row_shares=[part.rows for part in parts], name=name)

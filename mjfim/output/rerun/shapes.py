@@ -1,4 +1,4 @@
-"""Geoms of a MuJoCo model as Rerun archetypes, each in its own frame."""
+"""Geoms of a MuJoCo model as Rerun archetypes, each in its own frame, and the colours in which robots are drawn."""
 
 from __future__ import annotations
 
@@ -8,158 +8,250 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import rerun as rr
-
-from mjfim.arrays import Array
+from numpy.typing import NDArray
 
 GeomType = mujoco.mjtGeom
+
+# Surfaces are drawn filled, not as wire frames.
+SOLID = rr.components.FillMode.Solid
+
+# Colour (0..1) of a geom that sets none; MuJoCo then takes the colour of its material.
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 
+# Weights of red, green and blue in the brightness of a colour.
+BRIGHTNESS_WEIGHTS = (0.30, 0.59, 0.11)
 
-@dataclass(frozen=True)
-class Look:
-    """How a robot is drawn: accent colour (0..255), its share over the geoms' own brightness, opacity."""
+# Share of the accent colour in geoms that no joint moves; the rest of their colour is grey.
+FIXED_ACCENT_SHARE = 0.1
+
+# Largest group of geoms that MuJoCo's viewer shows by default.
+LAST_SHOWN_GROUP = 2
+
+# Radius of the sticks of a stick figure, as a share of the model's extent.
+STICK_RADIUS = 0.02
+
+# Squares along each side of a ground plane.
+BOARD_SQUARES = 12
+
+# Brightness of every second square of a ground plane.
+DARK_SQUARE = 0.8
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotStyle:
+    """Style in which one robot and its curves are drawn.
+
+    Attributes:
+        accent: Accent colour (0..255).
+        accent_share: Share of the accent colour in the moving geoms; the rest is the grey of their brightness.
+        opacity: Opacity of the moving geoms (0..1).
+    """
 
     accent: tuple[int, int, int]
-    share: float = 0.9
+    accent_share: float = 0.9
     opacity: float = 1.0
 
-    def paint(self, rgba: Iterable[float], moving: bool) -> list[int]:
-        """Colour of a geom (0..255); what does not move stays grey and opaque."""
-        own = np.fromiter(rgba, dtype=np.float64)
-        grey = np.full(3, 255.0 * float(own[:3] @ (0.30, 0.59, 0.11)))
-        share = self.share if moving else 0.1
+    def geom_colour(self, rgba: Iterable[float], moving: bool) -> list[int]:
+        """Return the colour (0..255, with opacity) in which a geom is drawn.
+
+        Args:
+            rgba: Colour of the geom in the model (0..1).
+            moving: False for a geom that no joint moves; it is grey and opaque.
+        """
+        model_rgba = np.fromiter(rgba, dtype=np.float64)
+        grey = np.full(3, 255.0 * float(model_rgba[:3] @ BRIGHTNESS_WEIGHTS))
+        share = self.accent_share if moving else FIXED_ACCENT_SHARE
+        opacity = self.opacity if moving else 1.0
+
         colour = share * np.array(self.accent) + (1.0 - share) * grey
-        return [
-            round(float(c)) for c in (*colour, 255.0 * own[3] * (self.opacity if moving else 1.0))
-        ]
+        alpha = 255.0 * model_rgba[3] * opacity
+        return [round(float(channel)) for channel in (*colour, alpha)]
+
+
+# ---- geoms of a body
 
 
 def drawn_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """Geoms as MuJoCo's viewer shows them (groups 0 to 2); those of the hidden groups where a body has no others."""
+    """Return the geoms that MuJoCo's viewer shows; those of hidden groups if the body has no others.
+
+    Args:
+        model: The model.
+        body: Number of the body.
+    """
     first = int(model.body_geomadr[body])
-    geoms = [
-        g
-        for g in range(first, first + int(model.body_geomnum[body]))
-        if geom_rgba(model, g)[3] > 0.0
-    ]
-    return [g for g in geoms if model.geom_group[g] <= 2] or geoms
+    geoms = range(first, first + int(model.body_geomnum[body]))
+    visible = [geom for geom in geoms if geom_rgba(model, geom)[3] > 0.0]
+    shown = [geom for geom in visible if model.geom_group[geom] <= LAST_SHOWN_GROUP]
+    return shown or visible
 
 
 def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
-    """Colour (0..1): the material's unless the geom sets its own, as in MuJoCo's renderer."""
-    own = tuple(float(c) for c in model.geom_rgba[geom])
+    """Return the colour (0..1) of a geom: its material's unless the geom sets one, as in MuJoCo's renderer.
+
+    Args:
+        model: The model.
+        geom: Number of the geom.
+    """
+    rgba = tuple(float(channel) for channel in model.geom_rgba[geom])
     material = int(model.geom_matid[geom])
-    if material >= 0 and np.allclose(own, DEFAULT_RGBA):
-        return tuple(float(c) for c in model.mat_rgba[material])
-    return own
+    if material >= 0 and np.allclose(rgba, DEFAULT_RGBA):
+        return tuple(float(channel) for channel in model.mat_rgba[material])
+    return rgba
 
 
-def shape(model: mujoco.MjModel, geom: int, rgba: list[int]) -> rr.AsComponents | None:
-    """Archetype of one geom in its own frame; sizes are half sizes [m]. None for types without a surface."""
-    kind, (a, b, c) = (
-        GeomType(int(model.geom_type[geom])),
-        (float(s) for s in model.geom_size[geom]),
-    )
-    solid, colors = rr.components.FillMode.Solid, [rgba]
+def geom_shape(model: mujoco.MjModel, geom: int, rgba: list[int]) -> rr.AsComponents | None:
+    """Return the archetype of a geom in its own frame.
+
+    Args:
+        model: The model.
+        geom: Number of the geom.
+        rgba: Colour (0..255).
+
+    Returns:
+        The archetype; None for types without a surface.
+    """
+    kind = GeomType(int(model.geom_type[geom]))
+    # Half sizes [m]; a radius and a half length for round types.
+    a, b, c = (float(size) for size in model.geom_size[geom])
     match kind:
         case GeomType.mjGEOM_SPHERE:
-            return rr.Ellipsoids3D(half_sizes=[[a, a, a]], colors=colors, fill_mode=solid)
+            return rr.Ellipsoids3D(half_sizes=[[a, a, a]], colors=[rgba], fill_mode=SOLID)
         case GeomType.mjGEOM_ELLIPSOID:
-            return rr.Ellipsoids3D(half_sizes=[[a, b, c]], colors=colors, fill_mode=solid)
+            return rr.Ellipsoids3D(half_sizes=[[a, b, c]], colors=[rgba], fill_mode=SOLID)
         case GeomType.mjGEOM_BOX:
-            return rr.Boxes3D(half_sizes=[[a, b, c]], colors=colors, fill_mode=solid)
+            return rr.Boxes3D(half_sizes=[[a, b, c]], colors=[rgba], fill_mode=SOLID)
         case GeomType.mjGEOM_CYLINDER:
-            return rr.Cylinders3D(lengths=[2 * b], radii=[a], colors=colors, fill_mode=solid)
+            return rr.Cylinders3D(lengths=[2 * b], radii=[a], colors=[rgba], fill_mode=SOLID)
         case GeomType.mjGEOM_CAPSULE:
-            return capsule(np.array([0.0, 0.0, -b]), 2 * b, a, rgba)
+            return _capsule(b, a, rgba)
         case GeomType.mjGEOM_PLANE:
-            reach = 2.0 * float(model.stat.extent)
-            return checkerboard(min(a, reach) or reach, min(b, reach) or reach, rgba)
+            return _ground_plane(model, a, b, rgba)
         case GeomType.mjGEOM_HFIELD:
-            return height_field(model, int(model.geom_dataid[geom]), rgba)
+            return _height_field(model, int(model.geom_dataid[geom]), rgba)
         case GeomType.mjGEOM_MESH | GeomType.mjGEOM_SDF:
-            return mesh(model, int(model.geom_dataid[geom]), rgba)
+            return _mesh(model, int(model.geom_dataid[geom]), rgba)
     return None
 
 
-def capsule(start: Array, length: float, radius: float, rgba: list[int]) -> rr.Capsules3D:
-    """Capsule that begins at `start` and runs along z [m]."""
-    solid = rr.components.FillMode.Solid
-    return rr.Capsules3D(
-        lengths=[length], radii=[radius], translations=[start], colors=[rgba], fill_mode=solid
-    )
+def stick_figure(model: mujoco.MjModel, body: int, rgba: list[int]) -> tuple[rr.AsComponents, ...]:
+    """Return a ball at the origin of a body without geoms, and sticks to the origins of its children.
 
+    Args:
+        model: The model.
+        body: Number of the body.
+        rgba: Colour (0..255).
+    """
+    radius = STICK_RADIUS * float(model.stat.extent)
+    ball = rr.Ellipsoids3D(half_sizes=[[1.5 * radius] * 3], colors=[rgba], fill_mode=SOLID)
 
-def sticks(model: mujoco.MjModel, body: int, rgba: list[int]) -> tuple[rr.AsComponents, ...]:
-    """A ball at the origin of a body without geoms, and a stick to the origin of each of its children."""
-    solid, radius = rr.components.FillMode.Solid, 0.02 * float(model.stat.extent)
-    ball = rr.Ellipsoids3D(half_sizes=[[1.5 * radius] * 3], colors=[rgba], fill_mode=solid)
-    ends = [model.body_pos[child] for child in np.flatnonzero(model.body_parentid == body)]
+    children = np.flatnonzero(model.body_parentid == body)
+    ends = [model.body_pos[child] for child in children]
     ends = [end for end in ends if np.any(end != 0.0)]
-    turns = np.empty((len(ends), 4))
-    for turn, end in zip(turns, ends, strict=True):
-        mujoco.mju_quatZ2Vec(turn, end / np.linalg.norm(end))
     if not ends:
         return (ball,)
-    return ball, rr.Capsules3D(
+
+    # Capsules run along z: each is turned towards its end. MuJoCo writes quaternions as wxyz, Rerun as xyzw.
+    wxyz = np.empty((len(ends), 4))
+    for quaternion, end in zip(wxyz, ends, strict=True):
+        mujoco.mju_quatZ2Vec(quaternion, end / np.linalg.norm(end))
+    sticks = rr.Capsules3D(
         lengths=np.linalg.norm(ends, axis=1),
         radii=[radius] * len(ends),
-        quaternions=np.roll(turns, -1, axis=1),
+        quaternions=np.roll(wxyz, -1, axis=1),
         colors=[rgba] * len(ends),
-        fill_mode=solid,
+        fill_mode=SOLID,
+    )
+    return ball, sticks
+
+
+# ---- single types
+
+
+def _capsule(half_length: float, radius: float, rgba: list[int]) -> rr.Capsules3D:
+    """Return a capsule along z, centred on its frame; Rerun's own ones begin at the origin. Sizes in [m]."""
+    return rr.Capsules3D(
+        lengths=[2 * half_length],
+        radii=[radius],
+        translations=[np.array([0.0, 0.0, -half_length])],
+        colors=[rgba],
+        fill_mode=SOLID,
     )
 
 
-def checkerboard(half_x: float, half_y: float, rgba: list[int], cells: int = 12) -> rr.Mesh3D:
-    """Plane z = 0 as a two-tone board of squares, so that depth can be read. half_x, half_y [m]."""
-    i, j = (
-        index.ravel() for index in np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")
-    )
-    corners = np.stack(
-        [np.stack([i + di, j + dj], axis=1) for di, dj in ((0, 0), (1, 0), (1, 1), (0, 1))], axis=1
-    )
-    xy = (2.0 * corners / cells - 1.0) * (half_x, half_y)
-    vertices = np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=2).reshape(-1, 3)
-    tone = np.where((i + j) % 2, 1.0, 0.8)[:, None] * np.array(rgba[:3])
-    quads = 4 * np.arange(cells * cells)[:, None]
+def _ground_plane(
+    model: mujoco.MjModel, half_x: float, half_y: float, rgba: list[int]
+) -> rr.Mesh3D:
+    """Return a plane of finite size as a board; half sizes [m] of 0 stand for an infinite plane."""
+    reach = 2.0 * float(model.stat.extent)
+    half_sizes = (min(half_x, reach) or reach, min(half_y, reach) or reach)
+    return _checkerboard(half_sizes, rgba)
+
+
+def _checkerboard(half_sizes: tuple[float, float], rgba: list[int]) -> rr.Mesh3D:
+    """Return the plane z = 0 as a board of squares in two tones, so that depth can be seen. half_sizes: x, y [m]."""
+    indices = np.arange(BOARD_SQUARES)
+    i, j = (index.ravel() for index in np.meshgrid(indices, indices, indexing="ij"))
+
+    # Four corners of every square, counter-clockwise.
+    shifts = ((0, 0), (1, 0), (1, 1), (0, 1))
+    corners = np.stack([np.stack([i + di, j + dj], axis=1) for di, dj in shifts], axis=1)
+    xy = (2.0 * corners / BOARD_SQUARES - 1.0) * half_sizes
+    z = np.zeros((*xy.shape[:2], 1))
+    vertices = np.concatenate([xy, z], axis=2).reshape(-1, 3)
+
+    brightness = np.where((i + j) % 2, 1.0, DARK_SQUARE)
+    colours = brightness[:, None] * np.array(rgba[:3])
+    first_corners = 4 * np.arange(BOARD_SQUARES**2)[:, None]
     return rr.Mesh3D(
         vertex_positions=vertices,
-        triangle_indices=np.concatenate(
-            [quads + np.array(half) for half in ((0, 1, 2), (0, 2, 3))]
-        ),
+        triangle_indices=_two_triangles(first_corners, (0, 1, 2), (0, 2, 3)),
         vertex_normals=np.broadcast_to((0.0, 0.0, 1.0), vertices.shape),
-        vertex_colors=np.repeat(tone, 4, axis=0).astype(np.uint8),
+        vertex_colors=np.repeat(colours, 4, axis=0).astype(np.uint8),
     )
 
 
-def height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh3D:
-    """Top surface of a height field; rows run along y, columns along x."""
-    rows, cols, first = (
-        int(model.hfield_nrow[field]),
-        int(model.hfield_ncol[field]),
-        int(model.hfield_adr[field]),
-    )
+def _two_triangles(
+    first_corners: NDArray[np.intp], one: tuple[int, ...], other: tuple[int, ...]
+) -> NDArray[np.intp]:
+    """Return (2n, 3) triangles, two for each of n squares: the first corners (n, 1) plus the shifts of the corners."""
+    return np.concatenate([first_corners + np.array(one), first_corners + np.array(other)])
+
+
+def _height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh3D:
+    """Return the top surface of a height field; its rows run along y, its columns along x."""
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    first = int(model.hfield_adr[field])
     half_x, half_y, top, _ = model.hfield_size[field]
-    z = top * model.hfield_data[first : first + rows * cols].reshape(rows, cols)
-    x, y = np.meshgrid(np.linspace(-half_x, half_x, cols), np.linspace(-half_y, half_y, rows))
-    slope_y, slope_x = np.gradient(z, 2 * half_y / (rows - 1), 2 * half_x / (cols - 1))
+
+    heights = model.hfield_data[first : first + rows * columns].reshape(rows, columns)
+    z = top * heights
+    x, y = np.meshgrid(np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows))
+
+    # A normal of the surface z(x, y) is (-dz/dx, -dz/dy, 1).
+    slope_y, slope_x = np.gradient(z, 2 * half_y / (rows - 1), 2 * half_x / (columns - 1))
     normals = np.stack([-slope_x, -slope_y, np.ones_like(z)], axis=2).reshape(-1, 3)
-    corner = (np.arange(rows - 1)[:, None] * cols + np.arange(cols - 1)).reshape(-1, 1)
-    halves = (0, 1, cols + 1), (0, cols + 1, cols)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    row_starts = np.arange(rows - 1)[:, None] * columns
+    first_corners = (row_starts + np.arange(columns - 1)).reshape(-1, 1)
     return rr.Mesh3D(
         vertex_positions=np.stack([x, y, z], axis=2).reshape(-1, 3),
-        triangle_indices=np.concatenate([corner + np.array(half) for half in halves]),
-        vertex_normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        triangle_indices=_two_triangles(
+            first_corners, (0, 1, columns + 1), (0, columns + 1, columns)
+        ),
+        vertex_normals=normals,
         albedo_factor=rgba,
     )
 
 
-def mesh(model: mujoco.MjModel, index: int, rgba: list[int]) -> rr.Mesh3D:
-    """A compiled mesh (already re-centred by MuJoCo), one vertex per distinct (vertex, normal) pair."""
-    faces = slice(
-        int(model.mesh_faceadr[index]), int(model.mesh_faceadr[index] + model.mesh_facenum[index])
-    )
-    pairs = np.stack([model.mesh_face[faces].ravel(), model.mesh_facenormal[faces].ravel()], axis=1)
+def _mesh(model: mujoco.MjModel, index: int, rgba: list[int]) -> rr.Mesh3D:
+    """Return a compiled mesh, which MuJoCo has centred; it has a vertex for every distinct pair of vertex and normal."""
+    first = int(model.mesh_faceadr[index])
+    faces = slice(first, first + int(model.mesh_facenum[index]))
+    vertex_indices = model.mesh_face[faces].ravel()
+    normal_indices = model.mesh_facenormal[faces].ravel()
+
+    pairs = np.stack([vertex_indices, normal_indices], axis=1)
     distinct, triangles = np.unique(pairs, axis=0, return_inverse=True)
     return rr.Mesh3D(
         vertex_positions=model.mesh_vert[model.mesh_vertadr[index] + distinct[:, 0]],

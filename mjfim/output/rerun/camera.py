@@ -1,0 +1,164 @@
+"""Camera of the 3D views of a Rerun recording: one for all robots, such that everything that moves is in view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from mjfim.arrays import Array
+from mjfim.output.rerun.scene import BodyPoses, moving_geoms
+
+# Vertical field of view that has to hold the scene [rad]; a little less than the viewer's, which leaves a margin.
+FIELD_OF_VIEW = np.radians(50.0)
+
+# Half the height of the frame at a distance of 1, with a margin.
+HALF_FRAME = 0.56
+
+# Samples of a motion from which the camera is placed.
+CAMERA_SAMPLES = 200
+
+# Ratio of the horizontal extents of a motion below which it counts as planar.
+PLANAR_RATIO = 0.2
+
+# Height of the unit vector towards the camera below which the ground is seen edge-on.
+EDGE_ON = 0.3
+
+# Vectors from the scene towards the camera: for a motion in the x-z plane, in the y-z plane, and in space.
+TOWARDS_CAMERA_XZ = (0.0, -1.0, 0.15)
+TOWARDS_CAMERA_YZ = (1.0, 0.0, 0.15)
+TOWARDS_CAMERA_SPATIAL = (1.0, -1.0, 0.6)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """Camera that is shared by all robots, so that they can be compared.
+
+    Attributes:
+        position: Position in the world [m].
+        target: Point that it looks at [m].
+        stacked: True where several views are larger above each other than beside each other.
+        edge_on: True where the ground is seen edge-on.
+    """
+
+    position: tuple[float, ...]
+    target: tuple[float, ...]
+    stacked: bool
+    edge_on: bool
+
+    def controls(self) -> rrb.EyeControls3D:
+        """Return the camera for the blueprint of a 3D view."""
+        return rrb.EyeControls3D(
+            position=self.position, look_target=self.target, eye_up=(0.0, 0.0, 1.0)
+        )
+
+
+def place_camera(
+    model: mujoco.MjModel, motions: Sequence[BodyPoses], views: int, aspect: float
+) -> Camera:
+    """Place a camera that has all moving geoms of every motion in view; the whole model where nothing moves.
+
+    Args:
+        model: The model.
+        motions: Poses along each trajectory.
+        views: Number of views that share a region of the layout.
+        aspect: Width of that region over its height.
+    """
+    clouds = _moving_points(model, motions)
+    towards_camera = _view_direction(_extents(clouds))
+    axes = _camera_axes(towards_camera)
+    low, high = _bounding_box(model, clouds, axes)
+    width, height, depth = np.maximum(high - low, 1e-6)
+
+    # Views stand above each other if the scene is then drawn larger.
+    stacked_scale = min(1.0 / (views * height), aspect / width)
+    beside_scale = min(1.0 / height, aspect / (views * width))
+    stacked = bool(stacked_scale > beside_scale)
+
+    view_aspect = aspect * views if stacked else aspect / views
+    frame_height = max(height, width / view_aspect)
+    distance = HALF_FRAME * frame_height / np.tan(FIELD_OF_VIEW / 2.0) + depth / 2.0
+    target = (low + high) / 2.0 @ axes
+    position = target + distance * towards_camera
+    return Camera(
+        position=tuple(map(float, position)),
+        target=tuple(map(float, target)),
+        stacked=stacked,
+        edge_on=bool(towards_camera[2] < EDGE_ON),
+    )
+
+
+def _moving_points(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> list[Array]:
+    """Return (samples, n, 3) world paths of the corners of all moving geoms along each motion [m]."""
+    bodies, points = _moving_corners(model)
+    clouds = []
+    for poses in motions:
+        every = max(1, len(poses.t) // CAMERA_SAMPLES)
+        clouds.append(poses.world_paths(bodies, points, every=every))
+    return clouds
+
+
+def _moving_corners(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
+    """Return the origins of moving bodies and the corners of the bounding boxes of their geoms.
+
+    Returns:
+        bodies: (n,) body of each point.
+        points: (n, 3) points in the frames of their bodies [m].
+    """
+    moving = np.flatnonzero(model.body_weldid)
+    bodies = [moving]
+    points = [np.zeros((len(moving), 3))]
+
+    signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
+    for geom in moving_geoms(model):
+        rotation = np.empty(9)
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+        centre, half_sizes = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        corners = centre + signs * half_sizes
+        points.append(model.geom_pos[geom] + corners @ rotation.reshape(3, 3).T)
+        bodies.append(np.full(len(signs), model.geom_bodyid[geom]))
+    return np.concatenate(bodies).astype(np.intp), np.concatenate(points)
+
+
+def _extents(clouds: Sequence[Array]) -> Array:
+    """Return the (3,) largest distance that any point travels along each world axis [m]."""
+    travelled = [np.ptp(cloud, axis=0).max(axis=0, initial=0.0) for cloud in clouds]
+    return np.asarray(np.max(travelled, axis=0))
+
+
+def _view_direction(extents: Array) -> Array:
+    """Return the (3,) unit vector towards the camera: along the normal of a planar motion, else from the front right."""
+    x, y = extents[0], extents[1]
+    if y < PLANAR_RATIO * x:
+        direction = np.array(TOWARDS_CAMERA_XZ)
+    elif x < PLANAR_RATIO * y:
+        direction = np.array(TOWARDS_CAMERA_YZ)
+    else:
+        direction = np.array(TOWARDS_CAMERA_SPATIAL)
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def _camera_axes(towards_camera: Array) -> Array:
+    """Return the (3, 3) axes of the camera as rows: right, up, and towards the camera."""
+    right = np.cross((0.0, 0.0, 1.0), towards_camera) / np.linalg.norm(towards_camera[:2])
+    up = np.cross(towards_camera, right)
+    return np.stack([right, up, towards_camera])
+
+
+def _bounding_box(
+    model: mujoco.MjModel, clouds: Sequence[Array], axes: Array
+) -> tuple[Array, Array]:
+    """Return the (3,) lower and upper ends of all points along the camera's axes [m]; of the model if nothing moves."""
+    seen = np.concatenate([(cloud @ axes.T).reshape(-1, 3) for cloud in clouds])
+    if len(seen):
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        if np.any(high > low):
+            return low, high
+
+    middle = axes @ model.stat.center
+    reach = float(model.stat.extent)
+    return middle - reach, middle + reach
