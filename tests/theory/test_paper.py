@@ -81,7 +81,7 @@ def test_gradient_of_the_information_term() -> None:
         pytest.param("f", 1, marks=pytest.mark.slow),
     ],
 )
-def test_reaches_the_best_known_cost(case: str, starts: int) -> None:
+def test_the_design_reaches_the_best_known_cost(case: str, starts: int) -> None:
     design = mjfim.design(experiment(case, starts=starts))
     assert design.status is Status.CONVERGED
     assert design.final.cost <= 1.000001 * CASES[case][3]
@@ -138,18 +138,22 @@ def test_half_the_sample_period_changes_neither_cost_nor_iteration_count(
 
 
 @pytest.fixture(scope="module")
-def peer() -> ModuleType:
+def casadi_solvers() -> ModuleType:
     """The benchmark's CasADi solvers on the hand-derived model."""
     pytest.importorskip("casadi", reason="casadi is a development dependency")
     return importlib.import_module("scripts.benchmarks.casadi_peer")
 
 
 @pytest.mark.parametrize("case", [pytest.param("b", marks=pytest.mark.slow), "c"])
-def test_agrees_with_exact_derivatives_of_the_hand_derived_model(
-    peer: ModuleType, case: str
+def test_the_optimum_agrees_with_exact_derivatives_of_the_hand_derived_model(
+    casadi_solvers: ModuleType, case: str
 ) -> None:
     design = mjfim.design(experiment(case))
-    J, eigenvalues = peer.objective(peer.CASES[case], design.trajectory.ctrl[:, 0], False)
+    J, eigenvalues = casadi_solvers.objective(
+        casadi_solvers.CASES[case], design.trajectory.ctrl[:, 0], False
+    )
     assert pytest.approx(design.final.cost, rel=1e-6) == J
     np.testing.assert_allclose(eigenvalues, design.final.eigenvalues, rtol=1e-5)
-    assert design.final.cost <= (1 + 1e-6) * peer.lbfgs(peer.CASES[case], False).J
+    assert (
+        design.final.cost <= (1 + 1e-6) * casadi_solvers.lbfgs(casadi_solvers.CASES[case], False).J
+    )

@@ -28,7 +28,7 @@ PARAMETERS = {
 }
 
 
-def tumbling() -> DesignTask:
+def tumbling_task() -> DesignTask:
     """One second of tumbling, driven by all four rotors."""
     return DesignTask.resolve(
         mjfim.Experiment(
@@ -43,7 +43,7 @@ def tumbling() -> DesignTask:
     )
 
 
-def flown(
+def simulated_states(
     path: Path, change: dict[str, float], ctrl: Array, start: Array, substeps: int
 ) -> tuple[Loop, Array]:
     """States (N+1, ns) of a model compiled anew from the MJCF with relative changes of its parameters."""
@@ -63,8 +63,8 @@ def flown(
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_psi_of_a_tumbling_flight_is_that_of_re_simulation(name: str) -> None:
-    task = tumbling()
+def test_psi_of_a_tumbling_flight_agrees_with_re_simulation(name: str) -> None:
+    task = tumbling_task()
     curve, j = task.initial, list(PARAMETERS).index(name)
     turned = np.abs(curve.qvel[:, 3:]).max()
     assert turned > 3.0  # [rad/s] it does tumble
@@ -73,10 +73,10 @@ def test_psi_of_a_tumbling_flight_is_that_of_re_simulation(name: str) -> None:
     start, value = curve.state[0], task.theta[j]
 
     def difference(h: float) -> Array:
-        loop, up = flown(
+        loop, up = simulated_states(
             task.system.model_path, {name: h}, curve.ctrl, start, task.system.grid.substeps
         )
-        _, down = flown(
+        _, down = simulated_states(
             task.system.model_path, {name: -h}, curve.ctrl, start, task.system.grid.substeps
         )
         return np.array([loop.minus(a, b) for a, b in zip(up, down, strict=True)]) / (
@@ -93,7 +93,7 @@ def test_psi_of_a_tumbling_flight_is_that_of_re_simulation(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_shipped_experiment_is_identifiable_and_designs() -> None:
+def test_the_shipped_experiment_is_identifiable_and_can_be_designed() -> None:
     experiment = mjfim.Experiment.from_file(MODELS / "quadrotor.toml")
     looked = mjfim.check(experiment)
     assert looked.self_test.passed

@@ -1,4 +1,4 @@
-"""Models of others (`shared_models`): every file loads, and a design beats the chirp tenfold."""
+"""Models from other projects (`shared_models`): every file loads, and a design has ten times the information of a chirp."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def experiment(name: str) -> mjfim.Experiment:
     return mjfim.Experiment(**EXPERIMENTS[name], directory=SHARED_MODELS, source=name)
 
 
-def whole() -> list[Path]:
-    """Every MJCF that stands alone: no parts that others include, none whose meshes were not copied."""
+def standalone_models() -> list[Path]:
+    """Every MJCF that compiles alone: it is not included by another file and needs no mesh files."""
     files = sorted(SHARED_MODELS.glob("*/*.xml"))
     texts = [path.read_text(encoding="utf-8") for path in files]
     return [
@@ -40,7 +40,7 @@ def test_every_shared_model_loads() -> None:
     if not SHARED_MODELS.is_dir():
         pytest.skip(f"no shared models at {SHARED_MODELS}")
     loaded = set()
-    for path in whole():
+    for path in standalone_models():
         if (
             path.name == "arm26.xml"
         ):  # MuJoCo finds no length range for it; the variant beside it states one
@@ -62,7 +62,7 @@ def test_every_shared_model_loads() -> None:
         for name in EXPERIMENTS
     ],
 )
-def test_every_experiment_starts(name: str) -> None:
+def test_every_initial_trajectory_is_identifiable(name: str) -> None:
     start = mjfim.design(experiment(name).replace(descent={"max_iterations": 0}))
     assert start.final.eigenvalues[0] > 0.0
     assert not start.combinations
@@ -78,7 +78,7 @@ def test_every_experiment_starts(name: str) -> None:
         ),
     ],
 )
-def test_design_knows_ten_times_more_than_the_chirp(name: str) -> None:
+def test_a_design_has_ten_times_the_information_of_the_chirp(name: str) -> None:
     design = mjfim.design(experiment(name))
     gain = design.final.eigenvalues[0] / design.initial.eigenvalues[0]
     assert gain >= GAIN, f"{gain:.3g}, {design.status.value}"
@@ -100,7 +100,7 @@ def test_design_knows_ten_times_more_than_the_chirp(name: str) -> None:
         for name in EXPERIMENTS
     ],
 )
-def test_check_passes_or_names_the_sample(name: str) -> None:
+def test_check_passes_or_names_the_rough_sample(name: str) -> None:
     found = mjfim.check(experiment(name))
     assert not found.not_separable
     assert not found.not_excited

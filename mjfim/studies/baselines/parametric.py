@@ -271,8 +271,9 @@ def optimise_many(
 
 def _cheapest(runs: Sequence[ParametricRun], count: int) -> list[ParametricRun]:
     """The cheapest runs that are not finished."""
-    open_runs = [run for run in runs if not run.finished]
-    return sorted(open_runs, key=lambda run: run.cost)[:count]
+    unfinished = [run for run in runs if not run.finished]
+    unfinished.sort(key=lambda run: run.cost)
+    return unfinished[:count]
 
 
 # with mjfim's own optimiser ---------------------------------------------------------------------------------------------
