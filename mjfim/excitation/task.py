@@ -9,31 +9,32 @@ from functools import cached_property
 import numpy as np
 
 from mjfim.arrays import Array
-from mjfim.errors import ExperimentError, SimulationDivergedError, unknown
+from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.holding_control import holding_control
 from mjfim.excitation.limits import Limit, limits_of
 from mjfim.excitation.objective import DesignProblem, RunningCost
 from mjfim.excitation.prior_information import information_of
 from mjfim.excitation.robust import ParameterSamples
-from mjfim.experiment.control_signal import generate
+from mjfim.excitation.task_parts import (
+    contrast_of,
+    parameter_samples_of,
+    require_bounded_controls,
+    require_design_keys,
+    sample_count,
+    stated_control,
+    tracking_weights_of,
+)
 from mjfim.experiment.schema import Experiment, by_name
 from mjfim.experiment.system import System, keyframe
-from mjfim.experiment.system_tables import Signal
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import IdentifiabilityTest
-from mjfim.model.coordinates import joint_dofs, joint_names
-from mjfim.model.parameter_samples import sample_parameters
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.smooth_friction import has_dry_friction, smoothing_speeds_of
 from mjfim.model.variants import STATED, ModelVariant, Relaxation
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
-from mjfim.recordings.control_table import read_control
 from mjfim.records.trajectory import Trajectory
 from mjfim.signals import multisine
-
-# Largest number of samples of a design, so that a mistyped horizon does not fill the memory.
-MAX_SAMPLES = 10_000_000
 
 # Harmonics of a random multisine.
 RANDOM_HARMONICS = 10
@@ -41,9 +42,6 @@ RANDOM_HARMONICS = 10
 # Amplitudes of random controls that look for identifiable parameters, relative to that of the initial control.
 LEAST_PROBE_AMPLITUDE = 1.0
 MOST_PROBE_AMPLITUDE = 2.0
-
-# Relative deviation of the number of samples from a whole number that is round-off.
-SAMPLE_COUNT_TOLERANCE = 1e-6
 
 # Share of the horizon over which a random control rises from rest, and fades to it.
 FADE_SHARE = 0.1
@@ -100,7 +98,7 @@ class DesignTask:
             ExperimentError: Something is wrong or missing in the experiment; the message names the key.
             ModelError: The model cannot be used.
         """
-        _require_design_keys(experiment)
+        require_design_keys(experiment)
         system = System.resolve(experiment, threads=threads)
         task = cls.of(system, added_information=added_information)
         return task if variant is None else task.with_variant(variant)
@@ -117,11 +115,11 @@ class DesignTask:
             ExperimentError: Something is wrong or missing in the experiment; the message names the key.
         """
         experiment = system.experiment
-        _require_design_keys(experiment)
+        require_design_keys(experiment)
         try:
-            samples = _samples(experiment, system.grid.stride)
+            samples = sample_count(experiment, system.grid.stride)
             t = np.arange(samples, dtype=np.float64) * system.dt
-            return cls._made(system, _initial_control(system, t), added_information)
+            return cls._made(system, stated_control(system, t), added_information)
         except ExperimentError as error:
             raise ExperimentError(f"{experiment.source}: {error}") from None
 
@@ -146,7 +144,7 @@ class DesignTask:
 
         weight = by_name("cost.control", experiment.cost.control, names, "actuator")
         if weighted:
-            _require_bounded_controls(system, limits, weight)
+            require_bounded_controls(system, limits, weight)
 
         about = system.rest
         if experiment.cost.control_about is not None:
@@ -163,13 +161,13 @@ class DesignTask:
             control=control,
             reference=reference,
             limits=limits,
-            tracking=_tracking_weights(system),
+            tracking=tracking_weights_of(system),
             control_weight=weight,
             control_about=about,
-            contrast=_contrast(system),
+            contrast=contrast_of(system),
             prior_information=prior,
             added_information=added,
-            samples_of_parameters=_parameter_samples(system),
+            samples_of_parameters=parameter_samples_of(system),
         )
 
     # Shortcuts to the parts of the system that nearly every step of a design needs.
@@ -523,114 +521,3 @@ def _calibrated(system: System, control: Array) -> tuple[System, Trajectory | No
     except SimulationDivergedError:
         return system, None
     return system.calibrated_along(system.theta, trajectory), trajectory
-
-
-def _require_design_keys(experiment: Experiment) -> None:
-    """Raise ExperimentError where the experiment lacks a key that only a design needs."""
-    if experiment.horizon is None:
-        raise ExperimentError(
-            f"{experiment.source}: design needs `horizon`, the duration of the experiment [s], for example horizon = 4.0"
-        )
-    if experiment.initial.control is None:
-        raise ExperimentError(
-            f"{experiment.source}: design needs `initial.control`, the control from which it starts, for example "
-            'control = { kind = "multisine", amplitude = 1.0 }'
-        )
-
-
-def _samples(experiment: Experiment, stride: int) -> int:
-    """Number of samples in the horizon. Raises ExperimentError where it is not a whole one, or nothing is measured."""
-    horizon = float(experiment.horizon or 0.0)
-    period = 1.0 / experiment.rate
-    exact = horizon * experiment.rate
-    count = round(exact)
-
-    if count < 2 or abs(exact - count) > SAMPLE_COUNT_TOLERANCE * count:
-        near = f"{max(count, 2) * period:g} s, {(max(count, 2) + 1) * period:g} s"
-        raise ExperimentError(
-            f"horizon: {horizon:g} s is not a whole number (>= 2) of samples of {period:g} s; "
-            f"valid for example: {near}"
-        )
-    if count > MAX_SAMPLES:
-        raise ExperimentError(f"horizon: {count:g} samples are too many; at most {MAX_SAMPLES:g}")
-    if stride > count:
-        raise ExperimentError(
-            f"measure_rate: {experiment.measure_rate:g} Hz measures nothing within {horizon:g} s"
-        )
-    return count
-
-
-def _initial_control(system: System, t: Array) -> Array:
-    """(N, nu) control that the experiment states: a generated signal, or a table in a file."""
-    experiment, source = system.experiment, system.experiment.initial.control
-    if isinstance(source, Signal):
-        return generate(source, t, system.controls, system.rest)
-    return read_control(experiment.directory / str(source), t, system.dt, system.controls)
-
-
-def _require_bounded_controls(system: System, limits: tuple[Limit, ...], weight: Array) -> None:
-    """Raise ExperimentError where neither a weight nor an enforced range bounds a control."""
-    enforced = system.experiment.limits.enforce
-    bounded = {limit.name for limit in limits if limit.kind == "control"} if enforced else set()
-
-    for name, value in zip(system.controls, weight.tolist(), strict=True):
-        if value <= 0.0 and name not in bounded:
-            raise ExperimentError(
-                f"cost.control: actuator {name!r} has neither a weight nor a range; it needs a weight > 0, "
-                f"or a hard limit: limits.control.{name} = [lower, upper]"
-            )
-
-
-def _tracking_weights(system: System) -> Array:
-    """(nx,) diagonal of Q_tau: the weight of a joint holds for each of its degrees of freedom."""
-    cost, model = system.experiment.cost, system.model
-    names = joint_names(model)
-    widths = [joint_dofs(model, j) for j in range(model.njnt)]
-
-    position = by_name("cost.tracking", cost.tracking, names, "joint")
-    velocity = by_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint")
-    return np.concatenate(
-        [np.repeat(position, widths), np.repeat(velocity, widths), np.zeros(model.na)]
-    )
-
-
-def _contrast(system: System) -> Array | None:
-    """(t, c) combinations of the scaled wanted parameters whose variances criterion "c" sums; None for other criteria."""
-    cost, parameters = system.experiment.cost, system.parameters
-    if cost.criterion != "c":
-        return None
-
-    wanted = tuple(parameters.names[j] for j in parameters.interest)
-    scale = parameters.scale[parameters.interest]
-    key = "combination" if cost.combination else "subset"
-    chosen = tuple(cost.combination or cost.subset or ())
-
-    for name in chosen:
-        if name not in wanted:
-            raise ExperimentError(f"cost.{key}: {unknown('wanted parameter', name, wanted)}")
-    if not chosen:
-        raise ExperimentError(f"cost.subset: it is empty; valid: {', '.join(wanted)}")
-
-    # One combination of all parameters, or each chosen parameter in the unit of its scale.
-    if cost.combination:
-        coefficients = [cost.combination.get(name, 0.0) for name in wanted]
-        return np.asarray((np.array(coefficients) * scale)[:, None])
-    return np.asarray(np.eye(len(wanted))[:, [wanted.index(name) for name in chosen]])
-
-
-def _parameter_samples(system: System) -> ParameterSamples | None:
-    """Parameter values over which a robust design pools its criterion; None where `[robust]` is not stated."""
-    experiment = system.experiment
-    robust = experiment.robust
-    if robust is None:
-        return None
-    if experiment.descent.psi_weight:
-        raise ExperimentError(
-            "robust: descent.psi_weight belongs to a design at one parameter value"
-        )
-
-    thetas = sample_parameters(
-        system.parameters, system.theta, robust.samples, robust.seed, system.impossible
-    )
-    logarithmic = experiment.cost.criterion == "D"
-    return ParameterSamples(thetas=thetas, over=robust.over, logarithmic=logarithmic)

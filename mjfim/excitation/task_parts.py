@@ -1,0 +1,199 @@
+"""The parts of a design task that an experiment states: number of samples, initial control, weights, contrast, samples."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.errors import ExperimentError, unknown
+from mjfim.excitation.limits import Limit
+from mjfim.excitation.robust import ParameterSamples
+from mjfim.experiment.control_signal import generate
+from mjfim.experiment.schema import Experiment, by_name
+from mjfim.experiment.system import System
+from mjfim.experiment.system_tables import Signal
+from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.model.parameter_samples import sample_parameters
+from mjfim.recordings.control_table import read_control
+
+# Largest number of samples of a design, so that a mistyped horizon does not fill the memory.
+MAX_SAMPLES = 10_000_000
+
+# Relative deviation of the number of samples from a whole number that is round-off.
+SAMPLE_COUNT_TOLERANCE = 1e-6
+
+
+def require_design_keys(experiment: Experiment) -> None:
+    """Check that the experiment states the keys that only a design needs.
+
+    Args:
+        experiment: The experiment.
+
+    Raises:
+        ExperimentError: `horizon` or `initial.control` is missing.
+    """
+    if experiment.horizon is None:
+        raise ExperimentError(
+            f"{experiment.source}: design needs `horizon`, the duration of the experiment [s], for example horizon = 4.0"
+        )
+    if experiment.initial.control is None:
+        raise ExperimentError(
+            f"{experiment.source}: design needs `initial.control`, the control from which it starts, for example "
+            'control = { kind = "multisine", amplitude = 1.0 }'
+        )
+
+
+def sample_count(experiment: Experiment, stride: int) -> int:
+    """Number of samples in the horizon.
+
+    Args:
+        experiment: The experiment.
+        stride: Samples from one measurement to the next.
+
+    Raises:
+        ExperimentError: The horizon is not a whole number of samples, is too long, or ends before the first measurement.
+    """
+    horizon = float(experiment.horizon or 0.0)
+    period = 1.0 / experiment.rate
+    exact = horizon * experiment.rate
+    count = round(exact)
+
+    if count < 2 or abs(exact - count) > SAMPLE_COUNT_TOLERANCE * count:
+        near = f"{max(count, 2) * period:g} s, {(max(count, 2) + 1) * period:g} s"
+        raise ExperimentError(
+            f"horizon: {horizon:g} s is not a whole number (>= 2) of samples of {period:g} s; "
+            f"valid for example: {near}"
+        )
+    if count > MAX_SAMPLES:
+        raise ExperimentError(f"horizon: {count:g} samples are too many; at most {MAX_SAMPLES:g}")
+    if stride > count:
+        raise ExperimentError(
+            f"measure_rate: {experiment.measure_rate:g} Hz measures nothing within {horizon:g} s"
+        )
+    return count
+
+
+def stated_control(system: System, t: Array) -> Array:
+    """Initial control that the experiment states: a generated signal, or a table in a file.
+
+    Args:
+        system: The system.
+        t: (N,) sample times [s].
+
+    Returns:
+        (N, nu) control [u-unit].
+
+    Raises:
+        ExperimentError: The signal or the file cannot be used.
+    """
+    experiment, source = system.experiment, system.experiment.initial.control
+    if isinstance(source, Signal):
+        return generate(source, t, system.controls, system.rest)
+    return read_control(experiment.directory / str(source), t, system.dt, system.controls)
+
+
+def require_bounded_controls(system: System, limits: tuple[Limit, ...], weight: Array) -> None:
+    """Check that a weight or an enforced range bounds every control.
+
+    Args:
+        system: The system.
+        limits: All limits.
+        weight: (nu,) weights of the controls in the running cost.
+
+    Raises:
+        ExperimentError: Neither bounds a control.
+    """
+    enforced = system.experiment.limits.enforce
+    bounded = {limit.name for limit in limits if limit.kind == "control"} if enforced else set()
+
+    for name, value in zip(system.controls, weight.tolist(), strict=True):
+        if value <= 0.0 and name not in bounded:
+            raise ExperimentError(
+                f"cost.control: actuator {name!r} has neither a weight nor a range; it needs a weight > 0, "
+                f"or a hard limit: limits.control.{name} = [lower, upper]"
+            )
+
+
+def tracking_weights_of(system: System) -> Array:
+    """Weights on deviations from the initial trajectory.
+
+    Args:
+        system: The system.
+
+    Returns:
+        (nx,) diagonal of Q_tau; the weight of a joint holds for each of its degrees of freedom.
+
+    Raises:
+        ExperimentError: A table names an unknown joint.
+    """
+    cost, model = system.experiment.cost, system.model
+    names = joint_names(model)
+    widths = [joint_dofs(model, j) for j in range(model.njnt)]
+
+    position = by_name("cost.tracking", cost.tracking, names, "joint")
+    velocity = by_name("cost.tracking_velocity", cost.tracking_velocity, names, "joint")
+    return np.concatenate(
+        [np.repeat(position, widths), np.repeat(velocity, widths), np.zeros(model.na)]
+    )
+
+
+def contrast_of(system: System) -> Array | None:
+    """Combinations whose variances criterion "c" sums.
+
+    Args:
+        system: The system.
+
+    Returns:
+        (t, c) combinations of the scaled wanted parameters; None for other criteria.
+
+    Raises:
+        ExperimentError: A parameter is not a wanted one, or none is named.
+    """
+    cost, parameters = system.experiment.cost, system.parameters
+    if cost.criterion != "c":
+        return None
+
+    wanted = tuple(parameters.names[j] for j in parameters.interest)
+    scale = parameters.scale[parameters.interest]
+    key = "combination" if cost.combination else "subset"
+    chosen = tuple(cost.combination or cost.subset or ())
+
+    for name in chosen:
+        if name not in wanted:
+            raise ExperimentError(f"cost.{key}: {unknown('wanted parameter', name, wanted)}")
+    if not chosen:
+        raise ExperimentError(f"cost.subset: it is empty; valid: {', '.join(wanted)}")
+
+    # One combination of all parameters, or each chosen parameter in the unit of its scale.
+    if cost.combination:
+        coefficients = [cost.combination.get(name, 0.0) for name in wanted]
+        return np.asarray((np.array(coefficients) * scale)[:, None])
+    return np.asarray(np.eye(len(wanted))[:, [wanted.index(name) for name in chosen]])
+
+
+def parameter_samples_of(system: System) -> ParameterSamples | None:
+    """Parameter values over which a robust design pools its criterion.
+
+    Args:
+        system: The system.
+
+    Returns:
+        The samples; None where `[robust]` is not stated.
+
+    Raises:
+        ExperimentError: The parameters cannot be sampled, or the descent weighs psi.
+    """
+    experiment = system.experiment
+    robust = experiment.robust
+    if robust is None:
+        return None
+    if experiment.descent.psi_weight:
+        raise ExperimentError(
+            "robust: descent.psi_weight belongs to a design at one parameter value"
+        )
+
+    thetas = sample_parameters(
+        system.parameters, system.theta, robust.samples, robust.seed, system.impossible
+    )
+    logarithmic = experiment.cost.criterion == "D"
+    return ParameterSamples(thetas=thetas, over=robust.over, logarithmic=logarithmic)
