@@ -14,13 +14,9 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.initial_controls import InitialControl
-from mjfim.excitation.interior_point import (
-    BarrierIterate,
-    BarrierSchedule,
-    InteriorPointMethod,
-    values_of,
-)
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.interior_point import BarrierIterate, BarrierSchedule, InteriorPointMethod
+from mjfim.excitation.interior_problem import values_of
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
@@ -173,7 +169,7 @@ class _Search:
         return cls(
             order=order,
             task=task,
-            exact=Stage(task, order.combinations).problem,
+            exact=DescentLevel(task, order.combinations).problem,
             curves=curves,
             constraints=constraints,
             method=method,
@@ -230,7 +226,7 @@ class _Search:
         return replace(result, control=np.tile(control, (self.order.start.repeats, 1)), cost=cost)
 
     def _final_status(self, result: RunResult, status: Status | None) -> Status:
-        """How the run ended. status: of the last iterate"""
+        """Status of the run, given that of the last iterate."""
         if self.budget.stop.requested:
             return status or Status.INTERRUPTED
         if not np.isfinite(result.cost):
@@ -271,7 +267,7 @@ def smoothed(task: DesignTask, combinations: Array | None) -> DesignProblem:
         The cost, smooth where it is that of E-optimality, without eigenvectors that hardly count.
     """
     power = SMOOTH_POWER if task.experiment.cost.criterion == "E" else np.inf
-    smooth = Stage(task, combinations, power).problem
+    smooth = DescentLevel(task, combinations, power).problem
     information = replace(smooth.information, negligible_weight=MIN_EIGENVECTOR_WEIGHT)
     return replace(smooth, information=information)
 

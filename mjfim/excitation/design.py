@@ -20,7 +20,7 @@ from mjfim.errors import (
 from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.evaluation import design_warnings, evaluate_point, point_at_stated_rate
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
-from mjfim.excitation.levels import Stage, coarse_level, easier_level
+from mjfim.excitation.levels import DescentLevel, coarse_level, easier_level
 from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.run_result import RunResult, consume
@@ -129,7 +129,7 @@ def design_task(
     identifiability = _identifiability(task, first, initial_control)
     require_designable(task, identifiability)
 
-    stage = Stage(task, identifiability.basis)
+    stage = DescentLevel(task, identifiability.basis)
     first = stage.problem.reevaluated(first)
 
     # Search. Matrices are small: threads of the BLAS would only wait for each other.
@@ -159,7 +159,7 @@ def _checked_control(task: DesignTask, control: Array) -> Array:
 def _identifiability(
     task: DesignTask, first: DesignPoint, initial_control: Array | None
 ) -> Identifiability:
-    """What can be identified, along the control with which the search begins and along random ones."""
+    """Identifiable combinations, along the control with which the search begins and along random ones."""
     begin = first
     if initial_control is not None:
         trajectory = task.plant.simulate(task.theta, initial_control)
@@ -185,7 +185,7 @@ class _Search:
         budget: Time of the search and the token that stops it.
     """
 
-    stage: Stage
+    stage: DescentLevel
     first: DesignPoint
     executor: Executor | None
     budget: Budget
@@ -204,7 +204,7 @@ class _Search:
         tasks = [task] if coarse is None else [coarse, task]
 
         search = UnconstrainedSearch(
-            levels=[Stage(level, basis) for level in tasks],
+            levels=[DescentLevel(level, basis) for level in tasks],
             budget=self.budget,
             constraints=constraint_set_of(task) if task.is_limited else None,
             steps_before=sum(level.plant.engine_steps for level in tasks),
@@ -228,7 +228,7 @@ class _Search:
             if left.control is not None:
                 starts[0] = InitialControl(name=starts[0].name, control=left.control)
 
-        free = Stage(self.stage.task.relaxed(), self.stage.basis)
+        free = DescentLevel(self.stage.task.relaxed(), self.stage.basis)
         multistart = Multistart(
             fine=free, coarse=easier_level(free), executor=self.executor, budget=self.budget
         )
@@ -269,7 +269,7 @@ def _is_bounded_by_weights(task: DesignTask) -> bool:
 
 
 def _choose(
-    stage: Stage, first: DesignPoint, results: list[RunResult], interrupted: bool
+    stage: DescentLevel, first: DesignPoint, results: list[RunResult], interrupted: bool
 ) -> tuple[RunResult, DesignPoint]:
     """The best run and the point of the design, which is the initial control where nothing better was found."""
     if not results:
@@ -294,7 +294,7 @@ def _choose(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Report:
-    """What is said about a design.
+    """Evaluates a design and makes its record.
 
     Attributes:
         stage: The stated level.
@@ -303,7 +303,7 @@ class _Report:
         final: The designed control, evaluated.
     """
 
-    stage: Stage
+    stage: DescentLevel
     identifiability: Identifiability
     initial: DesignPoint
     final: DesignPoint

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from mjfim.arrays import Array
 from mjfim.errors import SimulationDivergedError
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.limits import unsupported_ranges
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
@@ -23,7 +23,7 @@ from mjfim.records.trajectory import Trajectory
 UNSTABLE_GROWTH = 1e3
 
 
-def point_at_stated_rate(stage: Stage, control: Array) -> DesignPoint | None:
+def point_at_stated_rate(stage: DescentLevel, control: Array) -> DesignPoint | None:
     """Evaluate a control at the sample rate that the experiment states.
 
     Args:
@@ -41,7 +41,7 @@ def point_at_stated_rate(stage: Stage, control: Array) -> DesignPoint | None:
     return stage.problem.point(trajectory)
 
 
-def evaluate_point(stage: Stage, point: DesignPoint) -> Evaluation:
+def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
     """Collect everything that is known along a trajectory, with the regulator about it.
 
     Args:
@@ -99,7 +99,7 @@ def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:
         raise SimulationDivergedError("the trajectory diverges when the parameters move a little")
 
     identifiability = task.identifiability_test.along(point.trajectory, point.sensitivity)
-    stage = Stage(task, identifiability.basis)
+    stage = DescentLevel(task, identifiability.basis)
     return evaluate_point(stage, stage.problem.reevaluated(point))
 
 

@@ -33,7 +33,7 @@ MAX_CONSTRAINED_COARSE_CHANGE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class DescentLevel:
     """One level of the descent: the task at one sample rate, with the criterion that is minimised there.
 
     Attributes:
@@ -87,11 +87,11 @@ def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> D
 
     coarse = task.coarser(factor)
     size = task.problem.size(first)
-    similar = has_similar_cost(Stage(coarse, basis), first, size, MAX_COARSE_CHANGE)
+    similar = has_similar_cost(DescentLevel(coarse, basis), first, size, MAX_COARSE_CHANGE)
     return coarse if similar else None
 
 
-def has_similar_cost(coarse: Stage, first: DesignPoint, size: float, share: float) -> bool:
+def has_similar_cost(coarse: DescentLevel, first: DesignPoint, size: float, share: float) -> bool:
     """Whether the initial control costs nearly as much on a coarse level as on the stated one.
 
     Args:
@@ -111,7 +111,7 @@ def has_similar_cost(coarse: Stage, first: DesignPoint, size: float, share: floa
     return abs(point.cost - first.cost) <= share * size
 
 
-def easier_level(fine: Stage) -> Stage | None:
+def easier_level(fine: DescentLevel) -> DescentLevel | None:
     """Make a level for the first round under hard limits, where one is worth it.
 
     Args:
@@ -158,7 +158,7 @@ def _coarse_factors(task: DesignTask) -> tuple[int, ...]:
     return () if stated == 1 else (stated,)
 
 
-def _coarser(level: Stage, first: DesignPoint, factor: int) -> Stage | None:
+def _coarser(level: DescentLevel, first: DesignPoint, factor: int) -> DescentLevel | None:
     """A level that is coarser by a factor, where the model allows it.
 
     Args:
@@ -184,7 +184,7 @@ def _coarser(level: Stage, first: DesignPoint, factor: int) -> Stage | None:
     except ExperimentError:
         return None
 
-    coarse = Stage(coarse_task, level.basis)
+    coarse = DescentLevel(coarse_task, level.basis)
     size = task.problem.size(first)
     similar = has_similar_cost(coarse, first, size, MAX_CONSTRAINED_COARSE_CHANGE)
     return coarse if similar else None

@@ -21,7 +21,7 @@ from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.feasibility import shrink_until_feasible
 from mjfim.excitation.initial_controls import InitialControl
 from mjfim.excitation.interior_point import BarrierSchedule, updated_tightening
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult
 from mjfim.excitation.verification import verify
 from mjfim.parallel import results_in_order, workers_of
@@ -70,8 +70,8 @@ class Multistart:
         budget: Time of the whole design, and the token that stops it.
     """
 
-    fine: Stage
-    coarse: Stage | None
+    fine: DescentLevel
+    coarse: DescentLevel | None
     executor: Executor | None = None
     budget: Budget
 
@@ -212,7 +212,7 @@ class Multistart:
         return all(start.basis is None and start.repeats == 1 for start in starts)
 
     def _turns(self, count: int) -> int:
-        """How many tasks each worker runs one after the other."""
+        """Number of tasks that each worker runs one after the other."""
         return -(-max(count, 1) // workers_of(self.executor))
 
     # ---- choice of the survivors
@@ -270,8 +270,10 @@ class Multistart:
     def _choose_survivors(self, candidates: Sequence[RunResult]) -> list[int]:
         """Indices of the best candidates, at least one where there is any; the best one comes first."""
         usable = [i for i, candidate in enumerate(candidates) if candidate.control is not None]
-        order = sorted(usable, key=lambda i: candidates[i].cost)
-        return order[: max(1, len(candidates) // HALVING_RATE)]
+        best_first = sorted(usable, key=lambda i: candidates[i].cost)
+
+        count = max(1, len(candidates) // HALVING_RATE)
+        return best_first[:count]
 
     # ---- the winner on the unmodified model
 
@@ -309,7 +311,7 @@ class Multistart:
 
     def _round(
         self,
-        stage: Stage,
+        stage: DescentLevel,
         starts: Sequence[InitialControl],
         schedule: BarrierSchedule,
         max_iterations: int,
@@ -345,7 +347,7 @@ class Multistart:
             return (yield from self._run_here(searches, stage))
         return (yield from self._run_in_workers(searches, self.executor))
 
-    def _run_here(self, searches: Sequence[ConstrainedSearch], stage: Stage) -> Runs:
+    def _run_here(self, searches: Sequence[ConstrainedSearch], stage: DescentLevel) -> Runs:
         """Run searches one after the other while the budget lasts; the first one always begins."""
         results: list[RunResult] = []
         for search in searches:

@@ -13,7 +13,7 @@ from mjfim.errors import SimulationDivergedError
 from mjfim.excitation.constraints import ConstraintSet
 from mjfim.excitation.extended_system import ExtendedDesignProblem
 from mjfim.excitation.initial_controls import InitialControl
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
 from mjfim.excitation.run_result import RunResult
 from mjfim.excitation.task import DesignTask
@@ -44,7 +44,7 @@ MAX_SMOOTHING_ERROR = 1.01
 MAX_CLAMPED_ITERATES = 10
 
 
-def direction_for(stage: Stage) -> tuple[Direction, DesignProblem]:
+def direction_for(stage: DescentLevel) -> tuple[Direction, DesignProblem]:
     """Make the descent direction that the experiment asks for.
 
     Args:
@@ -131,7 +131,7 @@ class UnconstrainedSearch:
         steps_before: Engine steps of all levels' plants when the search began.
     """
 
-    levels: Sequence[Stage]
+    levels: Sequence[DescentLevel]
     budget: Budget
     constraints: ConstraintSet | None
     steps_before: int
@@ -202,7 +202,7 @@ class UnconstrainedSearch:
 
     def _run_pass(
         self,
-        stage: Stage,
+        stage: DescentLevel,
         controls: Sequence[Array],
         progress: _Progress,
         memory: Direction | None,
@@ -285,7 +285,7 @@ class UnconstrainedSearch:
         return replace(ended, progress=replace(progress, result=result, clamped_iterates=clamped))
 
     def _record(
-        self, ended: _Pass, stage: Stage, iterate: Iterate[DesignPoint], done: int
+        self, ended: _Pass, stage: DescentLevel, iterate: Iterate[DesignPoint], done: int
     ) -> tuple[_Pass, HistoryRow]:
         """Append an iterate to the history."""
         steps = sum(level.task.plant.engine_steps for level in self.levels) - self.steps_before
@@ -309,7 +309,7 @@ class UnconstrainedSearch:
 
 
 def _direction_with_memory(
-    stage: Stage, memory: Direction | None, rate: float
+    stage: DescentLevel, memory: Direction | None, rate: float
 ) -> tuple[Direction, DesignProblem]:
     """The direction of a level, with the curvature that a coarser level at a sample rate [Hz] has learnt."""
     direction, problem = direction_for(stage)
@@ -337,15 +337,17 @@ def _cheapest_point(
     return min(points, key=lambda point: point.cost, default=DIVERGED)
 
 
-def _exact_point(stage: Stage, point: DesignPoint) -> DesignPoint:
+def _exact_point(stage: DescentLevel, point: DesignPoint) -> DesignPoint:
     """The point judged by the exact criterion, where the smooth one is minimised."""
     if np.isinf(stage.power):
         return point
 
-    return Stage(stage.task, stage.basis).problem.reevaluated(point)
+    return DescentLevel(stage.task, stage.basis).problem.reevaluated(point)
 
 
-def _advance(ended: _Pass, stage: Stage, iterate: Iterate[DesignPoint], rate: float) -> _Pass:
+def _advance(
+    ended: _Pass, stage: DescentLevel, iterate: Iterate[DesignPoint], rate: float
+) -> _Pass:
     """Take an iterate into the state of the run."""
     task = stage.task
     trajectory, criterion = iterate.point.trajectory, iterate.point.criterion
@@ -396,7 +398,7 @@ def _worst_margin_sign(task: DesignTask, constraints: ConstraintSet, control: Ar
     return 0.0 if is_clamped else 1.0
 
 
-def _eigenvalues_meet(stage: Stage, eigenvalues: Array) -> bool:
+def _eigenvalues_meet(stage: DescentLevel, eigenvalues: Array) -> bool:
     """Whether the smallest eigenvalues are about to cross while the exact E-criterion is minimised."""
     is_exact = stage.task.experiment.cost.criterion == "E" and np.isinf(stage.power)
     if not is_exact or len(eigenvalues) < 2:
@@ -405,7 +407,7 @@ def _eigenvalues_meet(stage: Stage, eigenvalues: Array) -> bool:
     return bool(eigenvalues[1] < MEETING_RATIO * eigenvalues[0])
 
 
-def _next_power(stage: Stage, ended: _Pass) -> tuple[float, bool]:
+def _next_power(stage: DescentLevel, ended: _Pass) -> tuple[float, bool]:
     """Power of the E-criterion from here on, and whether this level has to be repeated with it."""
     values = ended.eigenvalues
     power = stage.power

@@ -20,7 +20,7 @@ from mjfim.errors import (
 from mjfim.excitation.design import design_budget, design_task, designable
 from mjfim.excitation.evaluation import point_at_stated_rate
 from mjfim.excitation.feasibility import shrink_until_feasible
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, require_feasible_start, verify
 from mjfim.experiment.schema import Experiment
@@ -374,7 +374,7 @@ class MethodEvaluation:
 
     def __init__(self, task: DesignTask, combinations: Array | None) -> None:
         self.task = task
-        self.stage = Stage(task, combinations)
+        self.stage = DescentLevel(task, combinations)
 
         cost = task.experiment.cost
         interest = len(task.parameters.interest)

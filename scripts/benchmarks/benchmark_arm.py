@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mjfim.excitation.design import design_task
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
@@ -81,7 +81,7 @@ def measured(model: Path, p: int, iterations: int) -> Cost:
     sensitivity = task.plant.derivatives.sensitivity(task.theta, curve)
     if sensitivity is None:
         raise SystemExit("the arm diverges")
-    problem = Stage(task, task.identifiability_test.along(curve, sensitivity).basis).problem
+    problem = DescentLevel(task, task.identifiability_test.along(curve, sensitivity).basis).problem
     clock = time.perf_counter()
     point = problem.point(curve, FORWARD_DIFFERENCES)
     value = time.perf_counter() - clock

@@ -21,12 +21,8 @@ from mjfim.excitation.constraints import constraint_set_of
 from mjfim.excitation.design import design_task
 from mjfim.excitation.feasibility import SHRINK_FACTORS
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
-from mjfim.excitation.interior_point import (
-    BarrierSchedule,
-    InteriorPointMethod,
-    updated_tightening,
-)
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.interior_point import BarrierSchedule, InteriorPointMethod, updated_tightening
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
@@ -68,7 +64,7 @@ def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -
 def method_of(free: DesignTask) -> InteriorPointMethod:
     """The interior-point method on a plant without clamps, free to choose any control."""
     return InteriorPointMethod(
-        base=Stage(free, None).problem,
+        base=DescentLevel(free, None).problem,
         constraints=constraint_set_of(free),
         centre=free.centre,
         basis=None,
@@ -78,7 +74,7 @@ def method_of(free: DesignTask) -> InteriorPointMethod:
 
 def multistart_of(free: DesignTask) -> multistart.Multistart:
     """Several starts on a plant without clamps, without a coarse level."""
-    return multistart.Multistart(fine=Stage(free, None), coarse=None, budget=Budget())
+    return multistart.Multistart(fine=DescentLevel(free, None), coarse=None, budget=Budget())
 
 
 # ---- the requirement
@@ -459,7 +455,7 @@ def test_a_fourier_start_is_optimised_as_a_series_in_the_first_round(tmp_path: P
     task = several(tmp_path, descent={"max_iterations": 12, "fourier": (2.0,)})
     starts = list(initial_controls_of(task, None))
     first_round = multistart_of(task.relaxed())._round(
-        Stage(task.relaxed(), None), starts, BarrierSchedule(last=0.01), 6, np.inf
+        DescentLevel(task.relaxed(), None), starts, BarrierSchedule(last=0.01), 6, np.inf
     )
     first = {result.name: result.control for result in consume(first_round, None)}
     assert list(first) == ["initial control", "Fourier series of 2 Hz"]

@@ -12,7 +12,7 @@ import pytest
 
 from mjfim.excitation.constraint_kinds import END_WEIGHT, ConstraintValues
 from mjfim.excitation.constraints import constraint_set_of
-from mjfim.excitation.interior_point import InteriorProblem, values_of
+from mjfim.excitation.interior_problem import InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.barrier import Bounds
 from mjfim.optimize.lq import TangentCurve

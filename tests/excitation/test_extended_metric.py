@@ -9,7 +9,7 @@ import pytest
 
 from mjfim.excitation.design import design_task
 from mjfim.excitation.extended_system import ExtendedDesignProblem, extend
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import direction_for
 from mjfim.information.fisher import FisherInformation
@@ -241,7 +241,7 @@ def test_the_experiment_chooses_the_extended_metric_and_it_lowers_the_cost(tmp_p
     task = cart_task(
         tmp_path, descent={"method": "metric", "psi_weight": 1e-4, "max_iterations": 3}
     )
-    direction, problem = direction_for(Stage(task, None))
+    direction, problem = direction_for(DescentLevel(task, None))
     assert isinstance(direction, ExtendedMetricDescent)
     assert isinstance(problem, ExtendedDesignProblem)
     assert direction.Q.shape == (16, 16)

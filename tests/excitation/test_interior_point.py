@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjfim.excitation.constraints import constraint_set_of
-from mjfim.excitation.interior_point import DIVERGED_POINT, InteriorProblem, values_of
+from mjfim.excitation.interior_problem import DIVERGED_POINT, InteriorProblem, values_of
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.projection_operator import Expansion
 from tests.support.limits import directions_of

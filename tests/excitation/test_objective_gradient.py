@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.lq import TangentCurve, regulator
@@ -108,7 +108,7 @@ def servo(folder: Path) -> DesignTask:
 
 def staged(task: DesignTask, basis: Array | None = None, power: float = np.inf) -> DesignTask:
     """A task with the cost of a stage of the descent."""
-    vars(task)["problem"] = Stage(task, basis, power).problem
+    vars(task)["problem"] = DescentLevel(task, basis, power).problem
     return task
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from mjfim.arrays import Array
 from mjfim.budget import StopToken
-from mjfim.excitation.interior_point import InteriorProblem
+from mjfim.excitation.interior_problem import InteriorProblem
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.signals import (

@@ -11,13 +11,9 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.budget import Budget, StopToken
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
-from mjfim.excitation.interior_point import (
-    MAX_RELAXATION,
-    InteriorPoint,
-    InteriorProblem,
-    values_of,
-)
-from mjfim.excitation.levels import Stage
+from mjfim.excitation.interior_point import MAX_RELAXATION
+from mjfim.excitation.interior_problem import InteriorPoint, InteriorProblem, values_of
+from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.records.trajectory import Trajectory
@@ -128,7 +124,7 @@ class ControlEvaluator:
 
         self.constraints = constraint_set_of(self.task)
         self.centre = self.task.centre
-        self.exact = Stage(self.task, order.combinations).problem
+        self.exact = DescentLevel(self.task, order.combinations).problem
         self.rng = np.random.default_rng((order.seed, *order.part))
 
     @property

@@ -25,11 +25,10 @@ from mjfim.excitation.interior_point import (
     RELAXATION_PER_MU,
     TIGHTENING_MU,
     BarrierSchedule,
-    InteriorPoint,
     InteriorPointMethod,
-    InteriorProblem,
     updated_tightening,
 )
+from mjfim.excitation.interior_problem import InteriorPoint, InteriorProblem
 from mjfim.excitation.objective import DesignProblem
 from mjfim.excitation.run_result import consume
 from mjfim.excitation.unconstrained import regulator_for

@@ -1,0 +1,237 @@
+"""The cost of a design under hard limits: `log J + mu B` with the relaxed barrier B of the limits (Hauser & Saccon 2006).
+
+The logarithm makes the cost free of scale, so that one schedule of mu fits every experiment; its minima are those of J.
+The barrier is relaxed: it is defined outside the limits as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.excitation.constraint_kinds import ConstraintValues
+from mjfim.excitation.constraints import ConstraintSet
+from mjfim.excitation.objective import DIVERGED, DesignPoint, DesignProblem
+from mjfim.optimize.barrier import BarrierExpansion
+from mjfim.optimize.lq import TangentCurve
+from mjfim.optimize.projection_operator import Expansion
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InteriorPoint:
+    """A trajectory with its cost and the values of its constraints.
+
+    Attributes:
+        values: Constrained quantities; None for a trial that diverged.
+        point: The trajectory with its cost J; None where only the constraints are evaluated.
+        merit: log J; 0 without a cost, infinite for a trial that diverged.
+        barrier: Value of the barrier, not multiplied by mu.
+    """
+
+    values: ConstraintValues | None
+    point: DesignPoint | None
+    merit: float
+    barrier: float
+
+    @property
+    def ctrl(self) -> Array:
+        """(N, nu) control [u-unit]."""
+        return values_of(self).trajectory.ctrl
+
+
+# The point of every trial that diverged.
+DIVERGED_POINT = InteriorPoint(values=None, point=None, merit=np.inf, barrier=np.inf)
+
+
+def values_of(point: InteriorPoint) -> ConstraintValues:
+    """Return the constrained quantities of a point.
+
+    Args:
+        point: A point.
+
+    Returns:
+        Its constrained quantities.
+
+    Raises:
+        ValueError: The point is a trial that diverged.
+    """
+    if point.values is None:
+        raise ValueError("a diverged trial has no trajectory")
+
+    return point.values
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InteriorProblem:
+    """Minimise `log J + mu B` over controls, in the form that Algorithm 1 asks for.
+
+    The cost of D-optimality is a logarithm already; in its place stands the cost per parameter.
+
+    Attributes:
+        base: The cost J on the plant without clamps.
+        constraints: The limits.
+        mu: Weight of the barrier B.
+        delta: Relaxation of the barrier, over half of each range.
+        with_cost: False where only the limits have to be reached, without any cost.
+    """
+
+    base: DesignProblem
+    constraints: ConstraintSet
+    mu: float
+    delta: float
+    with_cost: bool = True
+
+    def point(self, ctrl: Array) -> InteriorPoint:
+        """Evaluate a control along its open-loop trajectory.
+
+        Args:
+            ctrl: (N, nu) control [u-unit].
+
+        Returns:
+            The point; `DIVERGED_POINT` where the simulation diverges.
+        """
+        observed = self.base.plant.observe(self.base.theta, ctrl, self.constraints.observations)
+        if observed is None:
+            return DIVERGED_POINT
+
+        values = self.constraints.evaluate(*observed, slopes=False)
+        barrier = self.constraints.value(values, self.delta)
+        if not self.with_cost:
+            return InteriorPoint(values=values, point=None, merit=0.0, barrier=barrier)
+
+        accuracy = self.base.plant.derivatives.quickest_accuracy
+        point = self.base.point(values.trajectory, accuracy)
+        if point is DIVERGED:
+            return DIVERGED_POINT
+
+        return InteriorPoint(values=values, point=point, merit=self._merit(point), barrier=barrier)
+
+    def reevaluate(self, point: InteriorPoint) -> InteriorPoint:
+        """Evaluate a point of another problem, which differs in its criterion, mu, delta or bounds, without a simulation.
+
+        Args:
+            point: Point of the other problem.
+
+        Returns:
+            The point of this problem.
+        """
+        if point.values is None or point.point is None:
+            return point
+
+        evaluated = self.base.reevaluated(point.point)
+        return InteriorPoint(
+            values=point.values,
+            point=evaluated,
+            merit=self._merit(evaluated),
+            barrier=self.constraints.value(point.values, self.delta),
+        )
+
+    def _merit(self, point: DesignPoint) -> float:
+        """Logarithm of the cost, or the cost per parameter of D-optimality; infinite where J is not positive."""
+        if self.base.information.criterion == "D":
+            return point.cost / self._cost_per_nat(point)
+
+        if point.cost > 0.0 and np.isfinite(point.cost):
+            return float(np.log(point.cost))
+        return np.inf
+
+    def _merit_scale(self, point: InteriorPoint) -> float:
+        """Derivative dJ / d(merit)."""
+        if point.point is None:
+            return 1.0
+        if self.base.information.criterion == "D":
+            return self._cost_per_nat(point.point)
+
+        return point.point.cost
+
+    def _cost_per_nat(self, point: DesignPoint) -> float:
+        """Cost of D-optimality that corresponds to one e-fold of every eigenvalue."""
+        count = 1 if point.criterion is None else len(point.criterion.eigenvalues)
+        return self.base.information.weight * count
+
+    def value(self, point: InteriorPoint) -> float:
+        """`log J + mu B` at a point."""
+        return point.merit + self.mu * point.barrier
+
+    def size(self, point: InteriorPoint) -> float:
+        """Scale of the slope in the test of convergence: one e-fold of J, or the barrier where that is more."""
+        weight = self.mu if self.with_cost else 1.0
+        return max(1.0, abs(point.barrier) * weight)
+
+    def expand(self, point: InteriorPoint) -> Expansion:
+        """Expand the sum about a point; the barrier's part is also given separately.
+
+        Args:
+            point: Point that did not diverge.
+
+        Returns:
+            The linearised dynamics, the gradient of the sum and the expansion of the barrier.
+        """
+        values = values_of(point)
+        values = self.constraints.evaluate(values.trajectory, values.observed, slopes=True)
+        expansion, jacobian = self._expand_cost(point, values)
+
+        scale = self._merit_scale(point)
+        barrier: BarrierExpansion = self.constraints.expand(values, jacobian, self.delta)
+        barrier = barrier.scaled(self.mu)
+
+        return Expansion(
+            A=expansion.A,
+            B=expansion.B,
+            a=expansion.a / scale + barrier.a,
+            b=expansion.b / scale + barrier.b,
+            extended=None,
+            barrier=barrier,
+            eigenvalue_model=expansion.eigenvalue_model,
+        )
+
+    def _expand_cost(
+        self, point: InteriorPoint, values: ConstraintValues
+    ) -> tuple[Expansion, Array]:
+        """Expansion of J, and the derivative of the observations: (N, substeps, w, nx+nu)."""
+        observations = self.constraints.observations
+
+        if point.point is not None:
+            expansion, jacobian = self.base.expand_observed(point.point, observations)
+            if jacobian is None:
+                raise ValueError("an expansion along a criterion without directions")
+            return expansion, jacobian
+
+        # Without a cost only the dynamics and the observations are linearised.
+        A, B, jacobian = self.base.plant.derivatives.observation_jacobians(
+            self.base.theta, values.trajectory, observations
+        )
+        a = np.zeros((len(A) + 1, A.shape[1]))
+        b = np.zeros((len(A), B.shape[2]))
+        return Expansion(A=A, B=B, a=a, b=b), jacobian
+
+    def project(
+        self, point: InteriorPoint, zeta: TangentCurve, gamma: float, K: Array
+    ) -> InteriorPoint:
+        """Evaluate P(xi + gamma zeta).
+
+        Args:
+            point: Point at xi.
+            zeta: Direction.
+            gamma: Length of the step.
+            K: (N, nu, nx) gain of the projection operator [u-unit / x-unit].
+
+        Returns:
+            The new point.
+        """
+        trajectory = values_of(point).trajectory
+        if not K.any():
+            return self.point(trajectory.ctrl + gamma * zeta.v)
+
+        moved = self.base.plant.project(self.base.theta, trajectory, zeta, gamma, K)
+        return DIVERGED_POINT if moved is None else self.point(moved.ctrl)
+
+    def difference(self, new: InteriorPoint, old: InteriorPoint) -> TangentCurve:
+        """(x_new - x_old, u_new - u_old) of two points."""
+        return self.base.plant.difference(values_of(new).trajectory, values_of(old).trajectory)
+
+    def refine(self, point: InteriorPoint) -> InteriorPoint | None:
+        """Return None: the schedule ends before the accuracy of the derivatives matters."""
+        return None
