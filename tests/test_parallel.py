@@ -51,7 +51,7 @@ def test_processes_of_a_pool_are_others_and_see_the_request_to_stop() -> None:
 
 
 @pytest.mark.slow
-def test_a_pool_that_was_stopped_serves_again_once_nothing_runs() -> None:
+def test_a_stopped_pool_can_be_used_again_once_nothing_runs() -> None:
     with mjfim.Pool(1) as pool:
         waiting = [pool.submit(wait_for_stop, 60.0) for _ in range(3)]
         time.sleep(0.5)
@@ -79,7 +79,7 @@ def test_finished_tasks_are_collected_in_order_and_the_others_are_left(
 
 
 @pytest.mark.slow
-def test_interrupted_among_workers_a_design_keeps_what_they_found(tmp_path: Path) -> None:
+def test_an_interrupted_design_keeps_the_results_of_its_workers(tmp_path: Path) -> None:
     """SIGINT while two of hundreds of starts are under way."""
     task = cart_inside(tmp_path, horizon=2.0, descent={"starts": 400, "max_iterations": 100_000})
     with mjfim.Pool(2) as pool:
@@ -139,7 +139,7 @@ def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
     assert "out" in names(tmp_path)
 
 
-def test_a_start_that_breaks_does_not_end_the_others(
+def test_a_start_that_fails_does_not_end_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = InteriorPointMethod.run

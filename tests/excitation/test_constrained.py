@@ -1,4 +1,4 @@
-"""Designs under hard limits, from start to end: what a plain loop around mj_step says of them."""
+"""Designs under hard limits, verified by a plain loop around mj_step."""
 
 from __future__ import annotations
 
@@ -89,14 +89,14 @@ def paper() -> Design:
 
 
 @pytest.mark.slow
-def test_the_paper_s_study_under_hard_limits_tells_more_than_a_solver_made_for_them(
+def test_the_study_of_the_paper_under_hard_limits_beats_a_general_solver(
     paper: Design,
 ) -> None:
     assert paper.status is Status.CONVERGED
     assert paper.success
     assert paper.final.eigenvalues[0] >= 399.0
     assert paper.warnings == ()
-    # not by what the package says of itself: differences of plain loops
+    # independent of the package: finite differences of plain loops
     model, ctrl, sigma, h = (
         mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml")),
         paper.trajectory.ctrl,
@@ -124,7 +124,7 @@ def test_the_paper_s_study_under_hard_limits_tells_more_than_a_solver_made_for_t
 
 
 @pytest.mark.slow
-def test_and_no_engine_step_leaves_them(paper: Design) -> None:
+def test_no_engine_step_of_the_study_violates_a_limit(paper: Design) -> None:
     model = mujoco.MjModel.from_xml_path(str(MODELS / "cart_pendulum.xml"))
     rows = played(model, (model.key("hanging").qpos.copy(), np.zeros(2)), paper.trajectory.ctrl, 1)
     assert np.abs(paper.trajectory.ctrl).max() <= 5.0
@@ -158,7 +158,7 @@ def assert_inside(task: DesignTask, ctrl: Array) -> None:
         assert values[:, limit.index].max() <= limit.upper, limit
 
 
-def test_a_start_that_leaves_the_limits_is_driven_inside(tmp_path: Path) -> None:
+def test_an_infeasible_start_is_made_feasible(tmp_path: Path) -> None:
     wild = {"kind": "sine", "amplitude": 40.0, "frequency": 1.0}
     task = cart_inside(tmp_path, control=wild)
     outside = constraint_set_of(task)
@@ -232,8 +232,8 @@ def assert_ends(task: DesignTask, design: Design) -> None:
 
 
 @pytest.mark.slow
-def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> None:
-    """The relaxed barrier brings it there, and the cost has its say from the first iterate on."""
+def test_a_start_that_misses_its_end_is_not_changed(tmp_path: Path) -> None:
+    """The relaxed barrier reaches the end, and the cost counts from the first iterate on."""
     task = swinging_task(tmp_path)
     free = task.relaxed()
     method = method_of(free)
@@ -245,10 +245,10 @@ def test_a_start_that_misses_its_end_is_begun_with_as_it_is(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_start_that_no_shrinking_brings_inside_is_steered(
+def test_a_start_that_cannot_be_shrunk_inside_is_steered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where it is too far outside to begin with: here by decree."""
+    """The start counts as too far outside here because the allowed violation is changed."""
     monkeypatch.setattr(interior_point, "MAX_START_VIOLATION", -np.inf)
     task = swinging_task(tmp_path)
     free = task.relaxed()
@@ -265,8 +265,8 @@ def test_a_start_that_no_shrinking_brings_inside_is_steered(
     assert_ends(task, design)
 
 
-def test_what_no_control_can_keep_ends_as_infeasible(tmp_path: Path) -> None:
-    """The pendulum falls faster than it may, whatever the weak motor does: said, and no success."""
+def test_limits_that_no_control_can_keep_end_as_infeasible(tmp_path: Path) -> None:
+    """The pendulum falls faster than allowed, whatever the weak motor does; a warning says so."""
     weak = {**HARD, "control": {"force": (-0.05, 0.05)}, "velocity": {"hinge": 0.41}}
     task = cart_inside(tmp_path, horizon=0.3, limits=weak, descent={"max_iterations": 15})
     design = design_task(task)
@@ -298,8 +298,8 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     assert np.isfinite(results[1].cost)
 
 
-def test_where_weights_keep_the_limits_there_is_no_barrier(tmp_path: Path) -> None:
-    """The design is that without limits; one that leaves them goes on from where it was still inside."""
+def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> None:
+    """The design equals that without limits; one that leaves them continues from its last feasible control."""
     heavy = {"cost": {"control": 0.05}, "descent": {"max_iterations": 60}}
     wide = {"control": {"force": (-30.0, 30.0)}, "position": {"slide": (-3.0, 3.0)}}
     kept = design_task(cart_inside(tmp_path, limits=wide, **heavy))
@@ -317,8 +317,8 @@ def test_where_weights_keep_the_limits_there_is_no_barrier(tmp_path: Path) -> No
     assert min(left.limits.values()) >= 0.0
 
 
-def test_a_design_does_not_rest_on_a_clamp(tmp_path: Path) -> None:
-    """What clamps a force keeps it at its range, whatever the control: not as a limit is kept."""
+def test_a_design_does_not_use_a_clamp(tmp_path: Path) -> None:
+    """A clamp keeps a force within its range whatever the control is, so it does not count as a kept limit."""
     weak = CART_PENDULUM.format(integrator="RK4").replace(
         'joint="slide"/>', 'joint="slide" forcerange="-1.5 1.5"/>'
     )
@@ -348,7 +348,9 @@ def test_a_design_does_not_rest_on_a_clamp(tmp_path: Path) -> None:
         assert not any("clamp" in sentence for sentence in design.warnings)
 
 
-def test_what_is_not_enforced_may_be_left_while_the_boundary_holds(tmp_path: Path) -> None:
+def test_limits_that_are_not_enforced_may_be_violated_while_the_boundary_holds(
+    tmp_path: Path,
+) -> None:
     tables = {
         "limits": {
             "position": {"slide": (-0.01, 1.0)},
@@ -368,8 +370,8 @@ def test_what_is_not_enforced_may_be_left_while_the_boundary_holds(tmp_path: Pat
     assert len(said) == 1 and "checked, not enforced" in said[0]
 
 
-def test_the_stated_tolerance_ends_the_last_rung_once_the_limits_hold(tmp_path: Path) -> None:
-    """One so wide that any slope will do: the first iterate there that is inside is the last."""
+def test_the_stated_tolerance_ends_the_last_stage_once_the_limits_hold(tmp_path: Path) -> None:
+    """With a tolerance above every slope, the first feasible iterate of the last stage is the last one."""
     task = cart_inside(tmp_path, descent={"max_iterations": 80, "tolerance": 100.0, "coarse": 1})
     design = design_task(task)
     assert design.status is Status.CONVERGED
@@ -380,7 +382,7 @@ def test_the_stated_tolerance_ends_the_last_rung_once_the_limits_hold(tmp_path: 
     assert_inside(task, design.trajectory.ctrl)
 
 
-def test_more_is_held_back_where_a_rung_leaked_and_less_where_it_was_well_inside() -> None:
+def test_limits_are_tightened_where_violated_and_released_where_well_kept() -> None:
     held = updated_tightening(
         {"position": 0.1, "control": 0.1, "force": 0.02},
         {"position": -0.05, "control": 0.06, "force": 0.5},
@@ -399,7 +401,7 @@ def several(folder: Path, **tables: Any) -> DesignTask:
 
 
 @pytest.mark.parametrize("criterion", ["E", pytest.param("D", marks=pytest.mark.slow)])
-def test_starts_in_parallel_find_what_they_find_one_after_the_other(
+def test_starts_in_parallel_give_the_results_of_a_sequential_search(
     criterion: str, tmp_path: Path
 ) -> None:
     task = several(tmp_path, cost={"control": 0.0, "criterion": criterion})
@@ -512,7 +514,9 @@ def standstill(task: DesignTask) -> Array:
     return np.array(data.qfrc_inverse) / np.array([40.0, 25.0])
 
 
-def test_a_design_from_rest_to_rest_begins_and_ends_at_what_holds(tmp_path: Path) -> None:
+def test_a_design_from_rest_to_rest_begins_and_ends_with_the_holding_control(
+    tmp_path: Path,
+) -> None:
     tight = {"start": "rest", "end": "rest", "position": 0.005, "velocity": 0.03}
     task, design = arm_design(tmp_path, boundary=tight)
     hold = standstill(task)
@@ -531,7 +535,7 @@ def test_a_design_from_rest_to_rest_begins_and_ends_at_what_holds(tmp_path: Path
 
 
 def test_a_periodic_design_can_be_repeated(tmp_path: Path) -> None:
-    """Its control has no jump at the seam, its state comes back."""
+    """Its control does not jump between repetitions, and its state returns to the first one."""
     task, design = arm_design(
         tmp_path, boundary={"end": "periodic", "position": 0.005, "velocity": 0.05}
     )
@@ -574,9 +578,7 @@ def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_p
 
 
 @pytest.mark.parametrize("bandwidth", [30.0, 50.0])
-def test_a_bandwidth_near_that_of_the_samples_is_no_trouble(
-    bandwidth: float, tmp_path: Path
-) -> None:
+def test_a_bandwidth_near_that_of_the_samples_works(bandwidth: float, tmp_path: Path) -> None:
     """There are then as many splines as samples or more, of a coarse level twice as many."""
     task = cart_inside(
         tmp_path,
@@ -616,10 +618,10 @@ def nearest(task: DesignTask, ctrl: Array) -> float:
         pytest.param(3, False, id="proved", marks=pytest.mark.slow),
     ],
 )
-def test_a_design_that_comes_too_close_between_its_samples_is_held_back(
+def test_a_design_that_comes_too_close_between_its_samples_gets_tighter_limits(
     proofs: int, shrunk: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The barrier looks at distances at the samples, of 50 ms; the verify at every engine step."""
+    """The barrier evaluates distances at samples of 50 ms, the verification at every engine step."""
     monkeypatch.setattr(multistart, "MAX_TIGHTENED_RUNS", proofs)
     if not shrunk:
         monkeypatch.setattr(feasibility, "SHRINK_FACTORS", np.ones(1))
@@ -681,7 +683,7 @@ def test_a_shorter_design_played_twice_is_a_start(
 @pytest.mark.parametrize(
     ("count", "tables"), [(2, {"cost": {"control": 1e-3}}), (4, {"rate": 100.0})]
 )
-def test_and_where_weights_bound_the_design_or_samples_are_odd(
+def test_repeated_designs_work_with_weights_and_with_odd_samples(
     tmp_path: Path, count: int, tables: dict[str, Any]
 ) -> None:
     wide = {"control": {"force": (-50.0, 50.0)}, "position": {"slide": (-9.0, 9.0)}}
@@ -708,7 +710,7 @@ def test_and_where_weights_bound_the_design_or_samples_are_odd(
     ],
     ids=["A", "D", "c", "robust"],
 )
-def test_every_criterion_gains_within_limits(tmp_path: Path, tables: dict[str, Any]) -> None:
+def test_every_criterion_improves_within_limits(tmp_path: Path, tables: dict[str, Any]) -> None:
     known = {
         name: {**stated, **tables.get("parameters", {}).get(name, {})}
         for name, stated in CART_PARAMETERS.items()

@@ -59,7 +59,7 @@ def test_actuator_delays_are_refused(experiment: Experiment, tmp_path: Path) -> 
         DesignTask.resolve(late)
 
 
-def test_saturation_is_said(experiment: Experiment, tmp_path: Path) -> None:
+def test_saturation_is_reported(experiment: Experiment, tmp_path: Path) -> None:
     old, new = 'joint="slide"/>', 'joint="slide" forcelimited="true" forcerange="-1.5 1.5"/>'
     # hard limits, the default now, keep a design off the clamp: only what is not enforced can rest on it
     tables = {"descent": {"max_iterations": 8}, "limits": {"enforce": False}}
@@ -72,7 +72,7 @@ def test_saturation_is_said(experiment: Experiment, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_instability_is_said(experiment: Experiment) -> None:
+def test_instability_is_reported(experiment: Experiment) -> None:
     # D-optimality with this little effort balances the pendulum upright, where every sensitivity explodes
     wild = mjfim.design(experiment.replace(cost={"criterion": "D"}, descent={"max_iterations": 60}))
     assert wild.final.growth > 1e3
@@ -82,7 +82,7 @@ def test_instability_is_said(experiment: Experiment) -> None:
     assert not any("disturbance" in sentence for sentence in steady.warnings)
 
 
-def test_limits_that_are_left_are_said_and_no_success(experiment: Experiment) -> None:
+def test_violated_limits_are_reported_and_are_no_success(experiment: Experiment) -> None:
     # by default limits hold now; here they are only to be checked
     tight = experiment.replace(limits={"control": {"force": [-1.0, 1.0]}, "enforce": False})
     design = mjfim.design(tight)
@@ -91,7 +91,7 @@ def test_limits_that_are_left_are_said_and_no_success(experiment: Experiment) ->
     assert any("control limits are exceeded" in sentence for sentence in design.warnings)
 
 
-def test_own_start_is_checked(experiment: Experiment) -> None:
+def test_a_given_initial_control_is_checked(experiment: Experiment) -> None:
     with pytest.raises(ExperimentError, match=r"\(400, 1\)"):
         mjfim.design(experiment, initial_control=np.zeros(400))
     with pytest.raises(UnidentifiableError, match="excites nothing"):
@@ -124,7 +124,7 @@ def test_units_come_from_the_path_where_none_is_stated(experiment: Experiment) -
     assert task.system.units == ("kg", "m", "N m s/rad")
 
 
-def test_where_the_smallest_eigenvalues_meet_the_descent_goes_on_smoothly(tmp_path: Path) -> None:
+def test_the_criterion_becomes_smooth_where_the_smallest_eigenvalues_meet(tmp_path: Path) -> None:
     task = cart_task(tmp_path, horizon=1.0, cost={"control": 1e-4})
     made = design_task(task)
     assert made.status is Status.SMOOTHED
@@ -148,7 +148,9 @@ def test_where_the_smallest_eigenvalues_meet_the_descent_goes_on_smoothly(tmp_pa
             assert moved.cost > 0.99 * made.final.cost
 
 
-def test_a_design_that_knows_of_its_nuisances_beats_one_that_does_not(tmp_path: Path) -> None:
+def test_a_design_that_knows_its_nuisance_parameters_beats_one_that_does_not(
+    tmp_path: Path,
+) -> None:
     shared = {"horizon": 1.0, "cost": {"control": 1e-3}}
     unsure = cart_task(tmp_path, **shared, nuisance={"initial": True, "bias": 0.2})
     aware, naive = design_task(unsure), design_task(cart_task(tmp_path, **shared))
@@ -166,7 +168,7 @@ def test_a_design_that_knows_of_its_nuisances_beats_one_that_does_not(tmp_path: 
     np.testing.assert_allclose(aware.final.eigenvalues, seen, rtol=1e-6)
 
 
-def test_a_design_for_one_combination_tells_it_better_than_one_for_all(tmp_path: Path) -> None:
+def test_a_design_for_one_combination_determines_it_better_than_one_for_all(tmp_path: Path) -> None:
     wanted = {"criterion": "c", "combination": {"m": 1.0, "l": -1.0}, "control": 1e-3}
     task = cart_task(tmp_path, horizon=1.0, cost=wanted)
     made, general = design_task(task), design_task(cart_task(tmp_path, horizon=1.0))

@@ -62,8 +62,8 @@ def check(
 
 
 @pytest.mark.parametrize("name", COSTS)
-def test_its_slope_is_that_of_simulated_controls(name: str, tmp_path: Path) -> None:
-    """With the barrier, whose share stands apart, and of the logarithm of the cost alone."""
+def test_the_slope_agrees_with_simulated_controls(name: str, tmp_path: Path) -> None:
+    """With the barrier, whose part is also given separately, and for the logarithm of the cost alone."""
     task, problem = problem_of(name, tmp_path)
     point = problem.point(task.control)
     expansion = problem.expand(point)
@@ -100,8 +100,8 @@ def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> No
     np.testing.assert_array_equal(point.ctrl, task.control)
 
 
-def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
-    """Without a step of the model: another mu, delta, constraints or criterion."""
+def test_a_reevaluated_point_equals_that_of_the_new_problem(tmp_path: Path) -> None:
+    """For another mu, delta, constraints or criterion, without an engine step."""
     task, problem = problem_of("E", tmp_path)
     point = problem.point(task.control)
     tight = problem.constraints.tightened({"control": 0.1, "position": 0.05, "velocity": 0.2})
@@ -124,7 +124,7 @@ def test_judged_anew_a_point_is_that_of_the_new_problem(tmp_path: Path) -> None:
         np.testing.assert_allclose(e.b, f.b, rtol=1e-9)
 
 
-def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
+def test_steering_inside_has_no_cost(tmp_path: Path) -> None:
     task, problem = problem_of("E", tmp_path)
     inward = replace(problem, mu=1.0, with_cost=False)
     begun = task.plant.simulator.steps
@@ -142,7 +142,7 @@ def test_towards_the_inside_there_is_no_cost(tmp_path: Path) -> None:
     assert inward.reevaluate(point) is point
 
 
-def test_a_trial_that_diverges_is_outside_everything(tmp_path: Path) -> None:
+def test_a_diverged_trial_has_infinite_value(tmp_path: Path) -> None:
     task, problem = problem_of("E", tmp_path)
     for own in (problem, replace(problem, with_cost=False)):
         point = own.point(1e12 * task.control)
@@ -154,8 +154,8 @@ def test_a_trial_that_diverges_is_outside_everything(tmp_path: Path) -> None:
             own.expand(point)
 
 
-def test_a_projected_point_is_one_that_is_played_open_loop(tmp_path: Path) -> None:
-    """Feedback makes another control out of a tangent curve; the point is that control's, with or without."""
+def test_a_projected_point_is_simulated_open_loop(tmp_path: Path) -> None:
+    """Feedback changes the control; the point is that of the changed control, with and without feedback."""
     task, problem = problem_of("E", tmp_path)
     point = problem.point(task.control)
     expansion = problem.expand(point)

@@ -52,7 +52,7 @@ def test_each_design_holds_the_information_of_all(tmp_path) -> None:
     assert relative_error(together[1].prior, own(together[0])) < 1e-6
 
 
-def test_what_one_experiment_cannot_see_another_may(tmp_path) -> None:
+def test_one_experiment_may_reveal_what_another_cannot(tmp_path) -> None:
     still = {"qpos": (0.0, 0.0), "control": {"kind": "constant", "amplitude": 0.0}}
     blind, seeing = cart_task(tmp_path, initial=still), cart_task(tmp_path, initial=FAR)
     with pytest.raises(UnidentifiableError):

@@ -1,4 +1,4 @@
-"""The shortest experiment: the search on known laws, designs that reach what is wanted and would not if they were shorter."""
+"""The shortest experiment: its design reaches the targets, and a shorter one does not."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def shorter() -> mjfim.ShortestExperiment:
     return mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.05)
 
 
-def test_it_reaches_what_is_wanted(shorter: mjfim.ShortestExperiment) -> None:
+def test_it_reaches_every_target(shorter: mjfim.ShortestExperiment) -> None:
     assert 0.5 < shorter.horizon < 1.4 and shorter.closed
     task = DesignTask.resolve(shorter.experiment)
     assert shorter.design.trajectory.samples == task.samples
@@ -62,8 +62,8 @@ def test_it_reaches_what_is_wanted(shorter: mjfim.ShortestExperiment) -> None:
     assert shorter.summary()["horizon"] == shorter.horizon
 
 
-def test_a_tolerance_shorter_does_not(shorter: mjfim.ShortestExperiment) -> None:
-    """By a design of its own, from the initial control."""
+def test_an_experiment_shorter_by_the_tolerance_does_not(shorter: mjfim.ShortestExperiment) -> None:
+    """Checked by a separate design from the initial control."""
     below = shorter.missed
     assert below is not None and 0.0 < shorter.horizon - below.horizon <= shorter.tolerance + 1e-9
     less = round(shorter.horizon - shorter.tolerance, 6)
@@ -72,8 +72,8 @@ def test_a_tolerance_shorter_does_not(shorter: mjfim.ShortestExperiment) -> None
 
 
 @pytest.mark.slow
-def test_longer_than_stated_where_it_takes_longer(shorter: mjfim.ShortestExperiment) -> None:
-    """Begun from too short it ends at about the same."""
+def test_the_horizon_may_become_longer_than_stated(shorter: mjfim.ShortestExperiment) -> None:
+    """A search that begins with too short a horizon ends at about the same one."""
     messages: list[str] = []
 
     def callback(event: DesignEvent | StudyEvent) -> None:
@@ -88,7 +88,7 @@ def test_longer_than_stated_where_it_takes_longer(shorter: mjfim.ShortestExperim
     assert not found.tried[0].reached and found.tried[0].horizon == 0.8
 
 
-def test_what_is_out_of_reach_is_said_with_numbers() -> None:
+def test_the_message_names_targets_out_of_reach_with_numbers() -> None:
     hard = wanting({"m": 1e-3, "l": 0.02, "c": 0.0125}, horizon=0.6)
     with pytest.raises(
         OutOfReachError,
@@ -97,7 +97,7 @@ def test_what_is_out_of_reach_is_said_with_numbers() -> None:
         mjfim.shortest_experiment(hard, longest=0.8)
 
 
-def test_default_longest_is_what_a_table_covers(tmp_path: Path) -> None:
+def test_the_default_longest_horizon_is_that_of_the_table(tmp_path: Path) -> None:
     """The four seconds of a CSV are not extrapolated; a design.csv's last row has no control."""
     for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
         shutil.copy(MODELS / name, tmp_path)
@@ -123,7 +123,7 @@ def test_faulty_requests_say_what_is_right() -> None:
         mjfim.shortest_experiment(wanting(SIGMA), longest=0.01)
 
 
-def test_interrupted_it_returns_the_shortest_so_far() -> None:
+def test_a_stopped_search_returns_the_shortest_so_far() -> None:
     stop = StopToken()
     horizons: list[str] = []
 
