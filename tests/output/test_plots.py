@@ -41,7 +41,7 @@ SIZES = [(1, 1), (14, 30), pytest.param(1, 70, marks=pytest.mark.slow)]
 
 
 def make_labels(dofs: int, count: int) -> Labels:
-    """Labels of a chain of hinges."""
+    """Make labels of a chain of hinges."""
     joints = [f"joint_{i}" for i in range(dofs)]
     return Labels(
         qpos=tuple(f"{j} [rad]" for j in joints),
@@ -55,7 +55,7 @@ def make_labels(dofs: int, count: int) -> Labels:
 
 
 def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
-    """Sinusoids of the given size; a larger motion is more informative."""
+    """Make sinusoids of the given size; a larger motion is more informative."""
     t = np.asarray(np.linspace(0.0, 2.0, 51), dtype=np.float64)
     waves = size * np.sin(np.outer(t, 1.0 + np.arange(dofs)))
     control = np.asarray(size * np.cos(t[:-1, None]), dtype=np.float64)
@@ -83,7 +83,7 @@ def make_evaluation(dofs: int, count: int, size: float) -> Evaluation:
 
 
 def make_design(dofs: int = 2, count: int = 3) -> Design:
-    """Ten iterations from a small to a large motion."""
+    """Make a design of ten iterations from a small to a large motion."""
     rows = tuple(
         HistoryRow(
             iteration=i,
@@ -113,7 +113,7 @@ def make_design(dofs: int = 2, count: int = 3) -> Design:
 def make_trials(
     theta: Array, std: float, failed: int, seed: int, trials: int = 200
 ) -> TrialStatistics:
-    """Efficient estimates with the first `failed` rows NaN."""
+    """Make efficient estimates; the first `failed` rows are NaN."""
     count = len(theta)
     estimates = theta + std * np.random.default_rng(seed).normal(size=(trials, count))
     estimates[:failed] = np.nan
@@ -132,7 +132,7 @@ def make_trials(
 
 
 def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
-    """Two sets, the second fifty times tighter."""
+    """Make a study of two trajectories; the scatter of the second is fifty times smaller."""
     theta = np.linspace(1.0, 2.0, count)
     sets = {
         "initial": make_trials(theta, 0.2, failed, 0),
@@ -149,7 +149,7 @@ def make_study(count: int = 3, failed: int = 5) -> MonteCarloStudy:
 
 
 def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estimate:
-    """One recording with gaps; the first parameter sits at its bound."""
+    """Make an estimate from one recording with gaps; the first parameter is at its bound."""
     t = np.linspace(0.0, 2.0, 51)
     predicted = np.sin(np.outer(t, 1.0 + np.arange(dofs)))
     measured = predicted + 0.05 * np.random.default_rng(2).normal(size=predicted.shape)
@@ -182,12 +182,12 @@ def make_estimate(dofs: int = 2, count: int = 3, misfit: bool = False) -> Estima
 
 
 def all_text(figure: Figure) -> str:
-    """Every string drawn."""
+    """Return all text in a figure."""
     return "\n".join(t.get_text() for t in figure.findobj(Text) if isinstance(t, Text))
 
 
 def all_colours(figure: Figure) -> set[str]:
-    """Colours of the drawn lines and patches inside the axes."""
+    """Return the colours of lines, patches and texts inside the axes."""
     colours = set()
     for axes in figure.axes:
         colours |= {to_hex(line.get_color()) for line in axes.get_lines()}
@@ -198,7 +198,7 @@ def all_colours(figure: Figure) -> set[str]:
 
 
 def render(figure: Figure, folder: Path) -> Array:
-    """Save, reload, and return the pixels."""
+    """Save a figure, load it again, and return its pixels."""
     path = plots.save(figure, folder / "figure.png", dpi=50.0)
     pixels = np.asarray(matplotlib.image.imread(path), dtype=np.float64)
     assert pixels.std() > 0.01
@@ -268,12 +268,12 @@ def test_artists_stay_inside_the_figure(name: str) -> None:
     assert box.x1 <= figure.get_figwidth() + 0.01 and box.y1 <= figure.get_figheight() + 0.01
 
 
-def test_trajectories_prints_the_final_information() -> None:
+def test_trajectories_show_the_final_information() -> None:
     text = all_text(plots.trajectories(make_design(), make_labels(2, 3)))
     assert format_number(1.0) in text and format_number(0.1) in text
 
 
-def test_trajectories_accepts_more_positions_than_velocities() -> None:
+def test_trajectories_with_more_positions_than_velocities_are_drawn() -> None:
     design = make_design(6, 3)
 
     def free(e: Evaluation) -> Evaluation:
@@ -286,7 +286,7 @@ def test_trajectories_accepts_more_positions_than_velocities() -> None:
     assert plots.sensitivity_phase(design, labels).axes
 
 
-def test_phase_limits_the_panels_and_says_so() -> None:
+def test_phase_plots_are_limited_in_number_and_say_so() -> None:
     figure = plots.sensitivity_phase(make_design(14, 30), make_labels(14, 30))
     assert len(figure.axes) == 4 * 6
     assert "4 of 14" in all_text(figure) and "6 of 30" in all_text(figure)
@@ -308,7 +308,7 @@ def test_histogram_is_a_density() -> None:
 
 
 @pytest.mark.parametrize("survivors", [0, 1])
-def test_histogram_survives_when_nearly_all_trials_fail(survivors: int, tmp_path: Path) -> None:
+def test_histogram_is_drawn_when_nearly_all_trials_fail(survivors: int, tmp_path: Path) -> None:
     study = make_study(2, failed=200 - survivors)
     render(plots.histogram(study, 1, make_labels(2, 2)), tmp_path)
 
@@ -338,7 +338,7 @@ def test_histogram_without_a_finite_bound(tmp_path: Path) -> None:
     render(figure, tmp_path)
 
 
-def test_one_set_is_enough(tmp_path: Path) -> None:
+def test_study_of_one_trajectory_is_drawn(tmp_path: Path) -> None:
     study = make_study()
     alone = dataclasses.replace(study, sets={"final": study.sets["final"]})
     render(plots.histogram(alone, 0, make_labels(2, 3)), tmp_path)
@@ -346,7 +346,7 @@ def test_one_set_is_enough(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("everything", [False, True])
-def test_singular_information_breaks_neither_bars_nor_tables(
+def test_bars_and_tables_of_singular_information_are_drawn(
     everything: bool, tmp_path: Path
 ) -> None:
     design = make_design()
@@ -373,7 +373,7 @@ def test_zero_parameter_has_no_relative_accuracy(tmp_path: Path) -> None:
     render(figure, tmp_path)
 
 
-def test_convergence_of_odd_histories(tmp_path: Path) -> None:
+def test_convergence_of_empty_short_and_negative_histories(tmp_path: Path) -> None:
     design = make_design()
     negative = tuple(dataclasses.replace(row, cost=-1.0, slope=0.0) for row in design.history)
     for history in ((), design.history[:1], negative):
@@ -443,7 +443,7 @@ def test_intervals_with_infinite_std(tmp_path: Path) -> None:
         lambda: Labels(qpos=(), positions=(), velocities=(), controls=(), parameters=("m",)),
     ],
 )
-def test_misuse_is_refused(misuse: Callable[[], object]) -> None:
+def test_misuse_raises_an_error(misuse: Callable[[], object]) -> None:
     with pytest.raises(MjfimError):
         misuse()
 
@@ -500,7 +500,7 @@ def test_only_the_plot_modules_import_matplotlib() -> None:
         (np.nan, "–"),
     ],
 )
-def test_number(value: float, text: str) -> None:
+def test_number_has_three_digits_and_raised_powers(value: float, text: str) -> None:
     assert format_number(value) == text
 
 

@@ -66,7 +66,7 @@ ZOO = """
 
 
 def load(name: str) -> mujoco.MjModel:
-    """Model by its short name; skips where the shared models are absent."""
+    """Load a model by its short name; skip the test if the shared models are absent."""
     if name == "zoo":
         return mujoco.MjModel.from_xml_string(ZOO)
     if not MODELS[name].is_file():
@@ -75,7 +75,7 @@ def load(name: str) -> mujoco.MjModel:
 
 
 def simulated(model: mujoco.MjModel, amplitude: float, samples: int = 40) -> Trajectory:
-    """Sine controls from the first keyframe, one engine step per sample."""
+    """Simulate sine controls from the first keyframe, one engine step per sample."""
     data = mujoco.MjData(model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -91,7 +91,7 @@ def simulated(model: mujoco.MjModel, amplitude: float, samples: int = 40) -> Tra
 
 
 def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Evaluation:
-    """A made-up evaluation of two parameters: smooth sensitivities, information growing with time."""
+    """Make an evaluation of two parameters: smooth sensitivities, information that grows with time."""
     nx, t = 2 * model.nv + model.na, trajectory.t
     psi = gain * np.sin(t)[:, None, None] * np.arange(1.0, 2 * nx + 1).reshape(1, nx, 2)
     return Evaluation(
@@ -108,7 +108,7 @@ def evaluated(model: mujoco.MjModel, trajectory: Trajectory, gain: float) -> Eva
 
 
 def designed(model: mujoco.MjModel) -> Design:
-    """A hand-made design: a gentle and a vigorous control, three iterations."""
+    """Make a design by hand: a small and a large control, three iterations."""
     history = tuple(
         HistoryRow(
             iteration=k,
@@ -143,7 +143,7 @@ def designed(model: mujoco.MjModel) -> Design:
 
 
 def estimated(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
-    """A hand-made estimate from two recordings, one sample of one output missing."""
+    """Make an estimate from two recordings by hand; one sample of one output is missing."""
     outputs = ("qpos:slide", "hinge_angle")
     predicted = trajectory.qpos[:, :2]
     y = predicted + 0.01
@@ -172,14 +172,14 @@ def estimated(model: mujoco.MjModel, trajectory: Trajectory) -> Estimate:
 
 
 def entities(path: Path) -> set[str]:
-    """Every entity path in a recording."""
+    """Return every entity path in a recording."""
     return {str(chunk.entity_path) for chunk in RrdReader(path).stream().to_chunks()}
 
 
 def column(
     path: Path, at: tuple[str, ...], timeline: str | None, component: str
 ) -> tuple[Any, Array]:
-    """(times, values) of one component of one entity; timeline None: static."""
+    """Return times and values of one component of one entity; without a timeline, those of static data."""
     times: list[int] = []
     values: list[Any] = []
     for chunk in RrdReader(path).stream().filter(content=entity_path(at)).to_chunks():
@@ -207,16 +207,16 @@ def design(cart: mujoco.MjModel) -> Design:
 
 @pytest.fixture(scope="module")
 def file(cart: mujoco.MjModel, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its recording, in a folder that does not exist yet."""
+    """Recording of the design, in a folder that does not exist yet."""
     path = tmp_path_factory.mktemp("rerun") / "new" / "design.rrd"
     log_design(path, cart, design, Labels.of_model(cart), addition="| a caller's | table |")
     return path
 
 
 class TestDesign:
-    """design.rrd"""
+    """Contents of design.rrd."""
 
-    def test_holds_both_robots_and_every_panel(self, file: Path) -> None:
+    def test_file_holds_both_robots_and_every_panel(self, file: Path) -> None:
         expected = [
             ("summary",),
             ("phase", "gear/ratio", "axes"),
@@ -240,12 +240,12 @@ class TestDesign:
             ]
         assert {entity_path(path) for path in expected} <= entities(file)
 
-    def test_has_no_warnings_and_one_blueprint(self, file: Path) -> None:
+    def test_file_has_no_warnings_and_one_blueprint(self, file: Path) -> None:
         assert not [path for path in entities(file) if "__warnings" in path]
         assert len(RrdReader(file).recordings()) == 1
         assert len(RrdReader(file).blueprints()) == 1
 
-    def test_views_look_where_data_is(self, file: Path) -> None:
+    def test_every_view_shows_an_entity_with_data(self, file: Path) -> None:
         reader = RrdReader(file)
         chunks = reader.stream(store=reader.blueprints()[0]).to_chunks()
         batches = [chunk.to_record_batch() for chunk in chunks]
@@ -289,7 +289,7 @@ class TestDesign:
                 np.roll(quaternion[k, 0], 1), data.body("bob").xquat, atol=1e-6
             )
 
-    def test_the_line_is_the_path_of_the_bob(self, file: Path) -> None:
+    def test_line_is_the_path_of_the_bob(self, file: Path) -> None:
         _, translation = column(
             file, ("robots", "initial", "bodies", "bob"), "sim_time", "Transform3D:translation"
         )
@@ -309,7 +309,7 @@ class TestDesign:
         )
         assert len(column(file, ("bars", "log10 λ_min"), None, "BarChart:values")[1]) == 1
 
-    def test_text_says_what_a_reader_needs(self, file: Path) -> None:
+    def test_summary_holds_outcome_accuracy_warnings_and_starts(self, file: Path) -> None:
         text = str(column(file, ("summary",), None, "TextDocument:text")[1][0, 0])
         assert "Stopped at max_iterations" in text
         assert "| mass | 2 | 0.5 | 25 % | 0.0312 | 1.6 % | 16.0 × |" in text
@@ -328,7 +328,7 @@ class TestDesign:
         np.testing.assert_allclose(peak["optimized"], [1.5, 1.0], rtol=1e-6)
         np.testing.assert_allclose(peak["initial"], [1.5 / 16, 1.0 / 16], rtol=1e-6)
 
-    def test_replaces_the_file_only_when_complete(
+    def test_file_is_replaced_only_when_the_new_one_is_complete(
         self, cart: mujoco.MjModel, design: Design, tmp_path: Path
     ) -> None:
         path = tmp_path / "design.rrd"
@@ -346,7 +346,7 @@ class TestDesign:
         assert path.read_text() == "old"
         assert list(tmp_path.iterdir()) == [path]
 
-    def test_manages_without_history_and_with_infinite_sigma(
+    def test_design_without_history_and_with_infinite_sigma_is_logged(
         self, cart: mujoco.MjModel, design: Design, tmp_path: Path
     ) -> None:
         blind = replace(design.initial, std=np.array([np.inf, 0.1]), min_eigenvalue=np.zeros(41))
@@ -357,9 +357,9 @@ class TestDesign:
 
 @pytest.mark.parametrize("name", ["acrobot", "panda", "panda without geoms", "zoo"])
 class TestAnyModel:
-    """Other models than the paper's."""
+    """Recordings of other models than the paper's."""
 
-    def test_design_of(self, name: str, tmp_path: Path) -> None:
+    def test_design_of_any_model_is_logged(self, name: str, tmp_path: Path) -> None:
         model = load(name)
         path = tmp_path / "design.rrd"
         log_design(path, model, designed(model), Labels.of_model(model))
@@ -369,7 +369,7 @@ class TestAnyModel:
             bodies = [model.body(b).name or f"body{b}" for b in range(1, model.nbody)]
             assert {entity_path(("robots", key, "bodies", body)) for body in bodies} <= logged
 
-    def test_names_count_degrees_of_freedom(self, name: str, tmp_path: Path) -> None:
+    def test_labels_count_degrees_of_freedom(self, name: str, tmp_path: Path) -> None:
         model = load(name)
         names = Labels.of_model(model)
         assert (len(names.positions), len(names.velocities), len(names.controls)) == (
@@ -401,7 +401,7 @@ def zoo_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class TestShapes:
-    """Geoms of every type."""
+    """Archetypes of geoms of every type."""
 
     def geom(self, path: Path, body: str, geom: str, component: str) -> Array:
         """First row of a static component of a geom."""
@@ -452,7 +452,7 @@ class TestShapes:
 
 
 class TestEstimate:
-    """estimate.rrd"""
+    """Contents of estimate.rrd."""
 
     def test_measured_and_predicted_outputs_and_their_difference(
         self, cart: mujoco.MjModel, tmp_path: Path
@@ -471,7 +471,7 @@ class TestEstimate:
             ("outputs", "recording 2", "hinge_angle [rad]", "predicted")
         ) in entities(path)
 
-    def test_ghost_is_see_through(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
+    def test_measured_robot_is_see_through(self, cart: mujoco.MjModel, tmp_path: Path) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
         log_estimate(
             path, cart, estimated(cart, trajectory), trajectory, trajectory, Labels.of_model(cart)
@@ -483,7 +483,7 @@ class TestEstimate:
         assert alpha["measured"] < 128
         assert alpha["predicted"] == 255
 
-    def test_no_ghost_where_positions_were_not_measured(
+    def test_without_measured_positions_there_is_no_measured_robot(
         self, cart: mujoco.MjModel, tmp_path: Path
     ) -> None:
         path, trajectory = tmp_path / "estimate.rrd", simulated(cart, 2.0)
@@ -503,7 +503,7 @@ class TestEstimate:
 
 
 class TestLabels:
-    """Names and units."""
+    """Labels with names and units, and the series of a history."""
 
     def test_units_follow_joints_and_plain_actuators(self, cart: mujoco.MjModel) -> None:
         names = Labels.of_model(cart)
@@ -511,7 +511,7 @@ class TestLabels:
         assert names.velocities == ("slide velocity [m/s]", "hinge velocity [rad/s]")
         assert names.controls == ("force [N]",)
 
-    def test_outputs(self, cart: mujoco.MjModel) -> None:
+    def test_labels_of_outputs_have_units(self, cart: mujoco.MjModel) -> None:
         assert output_label(cart, "qvel:hinge") == "qvel:hinge [rad/s]"
         assert output_label(cart, "slide_velocity") == "slide_velocity [m/s]"
         assert output_label(cart, "something else") == "something else"
@@ -527,7 +527,7 @@ class TestLabels:
         np.testing.assert_allclose(out[0, 6:9], turn, atol=1e-12)
         np.testing.assert_array_equal(out[0, :3], qpos[0, :3])
 
-    def test_costs_that_change_sign_are_not_put_on_a_logarithm(self) -> None:
+    def test_costs_that_change_sign_are_not_logarithmic(self) -> None:
         rows = [
             HistoryRow(
                 iteration=k,
@@ -548,7 +548,7 @@ class TestLabels:
 
 
 class FakeViewer:
-    """Stands in for the viewer's process."""
+    """A process that takes the place of the viewer."""
 
     code: int | None = None
     command: tuple[str, ...] = ()
@@ -557,26 +557,26 @@ class FakeViewer:
         FakeViewer.command = tuple(command)
 
     def wait(self, timeout: float) -> int:
-        """Ends with `code`, or keeps running where there is none."""
+        """End with `code`, or keep running if it is None."""
         if FakeViewer.code is None:
             raise subprocess.TimeoutExpired(FakeViewer.command, timeout)
         return FakeViewer.code
 
 
 class TestShow:
-    """Opening the viewer."""
+    """The process of the viewer."""
 
-    def test_says_that_the_file_is_missing(self, tmp_path: Path) -> None:
+    def test_missing_file_is_reported(self, tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match=r"nothing\.rrd"):
             show(tmp_path / "nothing.rrd")
 
-    def test_leaves_the_viewer_open(self, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_viewer_stays_open(self, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(subprocess, "Popen", FakeViewer)
         monkeypatch.setattr(FakeViewer, "code", None)
         show(file)
         assert FakeViewer.command[-1] == str(file)
 
-    def test_reports_a_viewer_that_cannot_start(
+    def test_viewer_that_cannot_start_is_reported(
         self, file: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(subprocess, "Popen", FakeViewer)

@@ -150,8 +150,9 @@ def _densities(values: Array, limits: tuple[float, float]) -> tuple[Array, Array
 
 def _normal_density(x: Array, mean: float, std: float) -> Array:
     """Return the density of a normal distribution at x (n,)."""
-    exponent = -0.5 * ((x - mean) / std) ** 2
-    return np.asarray(np.exp(exponent) / (std * np.sqrt(2.0 * np.pi)), dtype=np.float64)
+    distance = (x - mean) / std
+    density = np.exp(-0.5 * distance**2) / (std * np.sqrt(2.0 * np.pi))
+    return np.asarray(density, dtype=np.float64)
 
 
 def _draw_histogram(

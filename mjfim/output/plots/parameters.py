@@ -354,12 +354,17 @@ def _draw_end(axes: Axes, x: float, row: int, marker: str) -> None:
 
 def _interval_text(estimate: Estimate, j: int, unit: str) -> str:
     """Write guess, estimate and half the width of the thin interval of parameter j in its unit."""
-    low, high = estimate.interval[j]
-    half = 0.5 * float(high - low) if np.isfinite(estimate.std[j]) else np.inf
+    half_width = np.inf
+    if np.isfinite(estimate.std[j]):
+        low, high = estimate.interval[j]
+        half_width = 0.5 * float(high - low)
+
     guess = format_number(float(estimate.initial_theta[j]), 4)
-    value = format_with_uncertainty(float(estimate.theta[j]), half)
+    value = format_with_uncertainty(float(estimate.theta[j]), half_width)
     text = f"{guess} → {value} {unit}".rstrip()
-    return f"{text}   at its bound" if estimate.parameters[j] in estimate.at_bound else text
+    if estimate.parameters[j] in estimate.at_bound:
+        text += "   at its bound"
+    return text
 
 
 def _interval_handles() -> list[Line2D]:
