@@ -8,7 +8,16 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import AsJson, ExperimentFile, Threads, _say, errors, progress, verb, writing
+from mjfim.cli.common import (
+    AsJson,
+    ExperimentFile,
+    Threads,
+    errors,
+    print_result,
+    progress,
+    verb,
+    writing,
+)
 from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import check_folder
@@ -44,13 +53,12 @@ def check(
         archive.check_fits(design_file, trajectory, system)
     if output is not None:
         check_folder(output)
-    with progress() as bar:
-        bar.add_task("looking", total=None)
+    with progress("looking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
     if output is not None:
         with writing(output) as results:
             results.leave_check(output, result)
-    _say(as_json, result.summary(), render(describe_check(result)))
+    print_result(as_json, result.summary(), render(describe_check(result)))
     if output is not None:
         errors.print(f"wrote {output}/")
     raise typer.Exit(0 if result.ok else 1)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import functools
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
+from types import FrameType, ModuleType
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 import mjfim
 from mjfim.errors import MjfimError, NoResultError
+from mjfim.records.events import DesignEvent, Event, FitEvent, StudyEvent
 from mjfim.records.serialization import as_json as records_as_json
 
 app = typer.Typer(
@@ -26,12 +29,17 @@ app = typer.Typer(
 )
 
 
+# Console for messages and progress.
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
 
-
+# Console for results; files get lines that are wide enough for the tables.
 out = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
 
+# Iterations of a design and of an estimation between two lines of progress, where stderr is no terminal.
+DESIGN_LINES = 10
+FIT_LINES = 5
 
+# Arguments and options that several verbs share.
 ExperimentFile = Annotated[
     Path, typer.Argument(metavar="EXPERIMENT", help="Experiment file (TOML).")
 ]
@@ -46,23 +54,60 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the summary to stdou
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads for MuJoCo; default: all cores.")]
 
 
-class Unfinished(Exception):
-    """Ctrl-C while results were being written; says where."""
+class UnfinishedError(Exception):
+    """Ctrl-C while results were being written; the message is their folder."""
+
+
+@contextmanager
+def raise_on_interrupt(error: Exception) -> Iterator[None]:
+    """Raise an error when the user presses Ctrl-C, as long as the context lasts.
+
+    Long work inside replaces this by a stop token (`mjfim.budget.stop_on_interrupt`) and returns its best result so far.
+
+    Args:
+        error: The error.
+    """
+    previous = signal.getsignal(signal.SIGINT)
+    in_main_thread = threading.current_thread() is threading.main_thread()
+
+    # Python delivers signals to the main thread only; a process that ignores Ctrl-C keeps ignoring it.
+    if not in_main_thread or not callable(previous):
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        """Raise the error."""
+        raise error
+
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 @contextmanager
 def writing(folder: Path) -> Iterator[ModuleType]:
-    """Make the folder and bring what writes into it; an interruption in here is not one before any result."""
-    from mjfim.output import folders as results  # brings matplotlib and rerun
+    """Make a folder for results and import what writes them; Ctrl-C in here leaves some of the results.
+
+    Args:
+        folder: The folder.
+
+    Yields:
+        The module `mjfim.output.folders`.
+
+    Raises:
+        UnfinishedError: The user pressed Ctrl-C.
+    """
+    from mjfim.output import folders as results  # imports matplotlib and rerun, which takes a while
 
     folder.mkdir(parents=True, exist_ok=True)
-    try:
+    with raise_on_interrupt(UnfinishedError(str(folder))):
         yield results
-    except KeyboardInterrupt:
-        raise Unfinished(str(folder)) from None
 
 
 def _version(wanted: bool) -> None:
+    """Print the version and exit, where the option is given."""
     if wanted:
         typer.echo(mjfim.__version__)
         raise typer.Exit
@@ -77,52 +122,142 @@ def root(
     """Design the experiment that identifies a MuJoCo model's parameters, then identify them."""
 
 
-def interrupted_without_result() -> typer.Exit:
-    """Say that there is nothing to write, and return the exit that says so to the shell."""
-    errors.print("mjfim: interrupted before there was a result; nothing was written")
-    return typer.Exit(1)
-
-
 def verb(function: Callable[..., None]) -> Callable[..., None]:
-    """Turn misuse into one message and exit code 2, and Ctrl-C before any result into exit code 1."""
+    """Register a function as a verb. This is the one place where errors become exit codes.
+
+    Misuse gives one message and exit code 2; Ctrl-C before any result, or a disk that is full, one message and exit code 1.
+
+    Args:
+        function: The function; underscores in its name become hyphens.
+
+    Returns:
+        The function with the error handling.
+    """
 
     @functools.wraps(function)
     def wrapped(*args: Any, **kwargs: Any) -> None:
         try:
-            function(*args, **kwargs)
+            with raise_on_interrupt(NoResultError()):
+                function(*args, **kwargs)
         except NoResultError:
-            raise interrupted_without_result() from None
+            errors.print("mjfim: interrupted before there was a result; nothing was written")
+            raise typer.Exit(1) from None
         except MjfimError as error:
             errors.print(f"mjfim: {error}", markup=False)
             raise typer.Exit(2) from None
         except OSError as error:
-            errors.print(
-                f"mjfim: {error.filename or 'cannot write'}: {error.strerror or error}",
-                markup=False,
-            )
+            place, fault = error.filename or "cannot write", error.strerror or error
+            errors.print(f"mjfim: {place}: {fault}", markup=False)
             raise typer.Exit(1) from None
-        except Unfinished as unfinished:
+        except UnfinishedError as unfinished:
             errors.print(
                 f"mjfim: interrupted; {unfinished}/ holds some of the results, each file complete",
                 markup=False,
             )
             raise typer.Exit(1) from None
-        except KeyboardInterrupt:
-            raise interrupted_without_result() from None
 
     app.command(function.__name__.replace("_", "-"))(wrapped)
     return wrapped
 
 
+class ProgressDisplay:
+    """Shows the events of long work on stderr: as a bar on a terminal, else as a line now and then."""
+
+    def __init__(self, bar: Progress, description: str) -> None:
+        """Add a row to a progress display.
+
+        Args:
+            bar: The display.
+            description: Text until the first event.
+        """
+        self._bar = bar
+        self._task = bar.add_task(description, total=None)
+        self._announced_part = ""
+
+    def __call__(self, event: Event) -> None:
+        """Show an event.
+
+        Args:
+            event: The event.
+        """
+        if isinstance(event, DesignEvent):
+            self._show_design(event)
+        elif isinstance(event, FitEvent):
+            self._show_fit(event)
+        else:
+            self._show_study(event)
+
+    def _show_design(self, event: DesignEvent) -> None:
+        """Show an iterate of a design."""
+        row = event.row
+        text = (
+            f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}  "
+            f"slope {row.slope:.1e}"
+        )
+        self._show_iterate(text, row.iteration, DESIGN_LINES)
+
+    def _show_fit(self, event: FitEvent) -> None:
+        """Show an iterate of an estimation."""
+        text = (
+            f"{event.phase}: iteration {event.iteration}, half of the squares {event.cost:.6g}, "
+            f"step {event.step:.2g} σ"
+        )
+        self._show_iterate(text, event.iteration, FIT_LINES)
+
+    def _show_iterate(self, text: str, iteration: int, period: int) -> None:
+        """Show an iterate on the bar; without a terminal, print every `period`-th iterate."""
+        self._bar.update(self._task, description=text)
+        if not errors.is_terminal and iteration % period == 0:
+            errors.print(text, markup=False)
+
+    def _show_study(self, event: StudyEvent) -> None:
+        """Show the progress of a study."""
+        # Without a known number of parts there is no bar: each part is a line.
+        if event.count is None:
+            errors.print(event.message, markup=False)
+            return
+
+        part = f"{event.index + 1}/{event.count} {event.part}"
+        self._bar.update(
+            self._task,
+            description=f"{part}  {event.message}",
+            total=event.count,
+            completed=event.index + event.share,
+        )
+        if errors.is_terminal:
+            return
+
+        # Without a terminal: a line per part, or the share where the study reports nothing else.
+        if not event.message:
+            errors.print(f"{event.part}: {100 * event.share:.0f} %", markup=False)
+        elif part != self._announced_part:
+            errors.print(part, markup=False)
+        self._announced_part = part
+
+
 @contextmanager
-def progress() -> Iterator[Progress]:
-    """A transient progress display on stderr; silent where stderr is not a terminal."""
+def progress(description: str) -> Iterator[ProgressDisplay]:
+    """Show the progress of long work on stderr.
+
+    Args:
+        description: Text until the first event.
+
+    Yields:
+        The display, which is called with every event.
+    """
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as bar:
-        yield bar
+        yield ProgressDisplay(bar, description)
 
 
-def _say(as_json: bool, summary: dict[str, Any], text: Any) -> None:
+def print_result(as_json: bool, summary: dict[str, Any], text: RenderableType) -> None:
+    """Print a result on stdout.
+
+    Args:
+        as_json: True for JSON, False for text.
+        summary: The result as values for JSON.
+        text: The result for people.
+    """
     if as_json:
         typer.echo(records_as_json(summary), nl=False)
     else:

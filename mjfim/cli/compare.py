@@ -12,18 +12,17 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Threads,
-    _say,
     errors,
-    interrupted_without_result,
+    print_result,
     progress,
     verb,
     writing,
 )
+from mjfim.errors import NoResultError
 from mjfim.excitation.task import DesignTask
 from mjfim.output.folders import check_folder
 from mjfim.output.summaries import describe_comparison
 from mjfim.output.text import render
-from mjfim.records.events import Event, StudyEvent
 from mjfim.studies.baselines.methods import METHODS
 from mjfim.studies.compare import compare_task
 
@@ -52,34 +51,16 @@ def compare(
         None if methods is None else [name.strip() for name in methods.split(",") if name.strip()]
     )
     check_folder(output)
-    with progress() as bar:
-        progress_task = bar.add_task("comparing", total=None)
-        announced = [-1]
-
-        def show(event: Event) -> None:
-            """Show the method that runs and its best cost."""
-            if not isinstance(event, StudyEvent):
-                return
-            method = f"{event.index + 1}/{event.count} {event.part}"
-            bar.update(
-                progress_task,
-                description=f"{method}  {event.message}",
-                total=event.count,
-                completed=event.index + event.share,
-            )
-            if not errors.is_terminal and event.index > announced[0]:
-                announced[0] = event.index
-                errors.print(method, markup=False)
-
+    with progress("comparing") as show:
         result = compare_task(
             task, seconds=seconds, steps=steps, seed=seed, methods=chosen, callback=show
         )
 
     if not result.rows:
-        raise interrupted_without_result()
+        raise NoResultError
     with writing(output) as results:
         results.leave_comparison(output, result, task.system)
-    _say(as_json, result.summary(), render(describe_comparison(result)))
+    print_result(as_json, result.summary(), render(describe_comparison(result)))
     errors.print(f"wrote {output}/")
     if not result.ok:
         errors.print(f"mjfim: {' '.join(result.verdict)}", markup=False)

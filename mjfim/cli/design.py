@@ -16,8 +16,8 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Threads,
-    _say,
     errors,
+    print_result,
     progress,
     verb,
     writing,
@@ -29,7 +29,7 @@ from mjfim.output.folders import check_folder
 from mjfim.output.summaries import describe_design
 from mjfim.output.text import render
 from mjfim.parallel import Pool
-from mjfim.records.events import Callback, DesignEvent, Event, StudyEvent
+from mjfim.records.events import Callback
 from mjfim.records.serialization import write_json
 
 
@@ -67,41 +67,34 @@ def design(
         stated = stated.replace(descent={"starts": starts})
     task = DesignTask.resolve(stated, threads=threads)
     check_folder(output)
-    with several(task) as executor, progress() as bar, stop_on_interrupt() as stop:
-        progress_task = bar.add_task("designing", total=None)
-
-        def callback(event: Event) -> None:
-            if isinstance(event, StudyEvent):
-                errors.print(event.message, markup=False)
-            if not isinstance(event, DesignEvent):
-                return
-            row = event.row
-            text = f"iteration {row.iteration:3d}  J {row.cost:.6g}  λ_min {row.min_eigenvalue:.5g}  slope {row.slope:.1e}"
-            bar.update(progress_task, description=text)
-            if not errors.is_terminal and row.iteration % 10 == 0:
-                errors.print(text)
-
-        found = _shortest(task, callback, executor, stop) if shortest else None
+    with (
+        several(task) as executor,
+        progress("designing") as show,
+        stop_on_interrupt() as stop,
+    ):
+        found = _shortest(task, show, executor, stop) if shortest else None
         if found is not None:
             result = found.design
         else:
             budget = design_budget(task, stop)
-            result = design_task(task, callback=callback, executor=executor, budget=budget)
+            result = design_task(task, callback=show, executor=executor, budget=budget)
     if found is not None:
         task = DesignTask.resolve(found.experiment, threads=threads)
     with writing(output) as results:
         results.leave_design(output, result, task.system)
         if found is not None:
             write_json(output / "shortest.json", found.summary())
-    told = {} if found is None else {"shortest": found.summary()}
-    _say(
+    summary = result.summary()
+    if found is not None:
+        summary["shortest"] = found.summary()
+    print_result(
         as_json,
-        {**result.summary(), **told},
+        summary,
         render(describe_design(result, task.system.units)),
     )
     if found is not None:
         errors.print(
-            f"{found}\nto go on with it, state horizon = {found.horizon:g} in {experiment}",
+            f"{found}\nto continue with it, state horizon = {found.horizon:g} in {experiment}",
             markup=False,
         )
     errors.print(f"wrote {output}/ (see it move: mjfim replay {output})")

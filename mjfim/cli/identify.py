@@ -13,9 +13,9 @@ from mjfim.cli.common import (
     ExperimentFile,
     Folder,
     Threads,
-    _say,
     errors,
     out,
+    print_result,
     progress,
     verb,
     writing,
@@ -27,7 +27,6 @@ from mjfim.output.folders import check_folder
 from mjfim.output.summaries import describe_estimate, describe_logs
 from mjfim.output.text import render
 from mjfim.recordings.read import read_log
-from mjfim.records.events import FitEvent
 
 
 @verb
@@ -56,35 +55,24 @@ def identify(
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
     system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)
     check_folder(output)
-    with progress() as bar:
-        task = bar.add_task("reading", total=None)
-        loaded, kept = (
-            [read_log(path, system.channels) for path in paths]
-            for paths in (recordings, held_out or [])
-        )
+    with progress("reading") as show:
+        fitted = [read_log(path, system.channels) for path in recordings]
+        predicted = [read_log(path, system.channels) for path in held_out or []]
         if not as_json:
-            out.print(render(describe_logs([log.summary for log in (*loaded, *kept)])))
-
-        def show(event: FitEvent) -> None:
-            text = (
-                f"{event.phase}: iteration {event.iteration}, half of the squares {event.cost:.6g}, "
-                f"step {event.step:.2g} σ"
-            )
-            bar.update(task, description=text)
-            if not errors.is_terminal and event.iteration % 5 == 0:
-                errors.print(text, markup=False)
+            summaries = [log.summary for log in (*fitted, *predicted)]
+            out.print(render(describe_logs(summaries)))
 
         result = identify_system(
             system,
-            [log.recording for log in loaded],
+            [log.recording for log in fitted],
             method="newton" if method == "newton" else "least_squares",
-            held_out=[log.recording for log in kept],
+            held_out=[log.recording for log in predicted],
             callback=show,
         )
     with writing(output) as results:
         for sentence in results.leave_estimate(output, result, system):
             errors.print(f"warning: {sentence}", markup=False)
-    _say(
+    print_result(
         as_json,
         result.summary(),
         render(describe_estimate(result)),

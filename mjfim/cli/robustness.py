@@ -10,16 +10,16 @@ from typing import Annotated
 import typer
 
 import mjfim
+from mjfim.budget import stop_on_interrupt
 from mjfim.cli.common import ExperimentFile, errors, out, progress, verb, writing
 from mjfim.errors import ExperimentError, unknown
-from mjfim.excitation.design import design_task
+from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.output.archive import write_design
 from mjfim.output.folders import check_folder
 from mjfim.output.summaries import describe_robustness
 from mjfim.output.text import render
 from mjfim.parallel import cores
-from mjfim.records.events import Event, StudyEvent
 from mjfim.records.robustness import RobotConditions
 from mjfim.studies.robustness import assess_robustness, default_latency
 
@@ -83,14 +83,7 @@ def robustness(
         design_folder = design_with_reserve(stated, shares, output / "design")
 
     clock = time.perf_counter()
-    with progress() as bar:
-        task = bar.add_task("playing", total=runs)
-
-        def show(event: Event) -> None:
-            """Show how many robots are done."""
-            if isinstance(event, StudyEvent):
-                bar.update(task, completed=runs * event.share)
-
+    with progress("playing") as show:
         result = assess_robustness(
             stated,
             design_folder,
@@ -181,9 +174,8 @@ def design_with_reserve(
         The folder.
     """
     task = DesignTask.resolve(tightened(experiment, reserve))
-    with progress() as bar:
-        bar.add_task("designing", total=None)
-        design = design_task(task)
+    with progress("designing") as show, stop_on_interrupt() as stop:
+        design = design_task(task, callback=show, budget=design_budget(task, stop))
 
     write_design(folder, design, task.system)
     margins = ", ".join(f"{kind} {margin:.3g}" for kind, margin in design.limits.items())

@@ -13,20 +13,19 @@ from mjfim.cli.common import (
     DesignFile,
     ExperimentFile,
     Folder,
-    _say,
     errors,
-    interrupted_without_result,
+    print_result,
     progress,
     verb,
     writing,
 )
+from mjfim.errors import NoResultError
 from mjfim.experiment.simulate import simulate_system
 from mjfim.experiment.system import System
 from mjfim.output import archive
 from mjfim.output.folders import check_file, check_folder
 from mjfim.output.summaries import describe_study
 from mjfim.output.text import render
-from mjfim.records.events import Event, StudyEvent
 from mjfim.studies.monte_carlo import monte_carlo_system
 
 
@@ -69,23 +68,14 @@ def montecarlo(
     for trajectory in named.values():
         archive.check_fits(design_file, trajectory, system)
     check_folder(output)
-    with progress() as bar:
-        tasks = {name: bar.add_task(f"{trials} trials, {name}", total=1.0) for name in named}
-
-        def show(event: Event) -> None:
-            """Show how many trials of a trajectory are done."""
-            if isinstance(event, StudyEvent):
-                bar.update(tasks[event.part], completed=event.share)
-                if not errors.is_terminal:
-                    errors.print(f"{event.part}: {100 * event.share:.0f} %")
-
+    with progress(f"{trials} trials") as show:
         study = monte_carlo_system(system, named, trials=trials, seed=seed, callback=show)
 
     if not study.sets:
-        raise interrupted_without_result()
+        raise NoResultError
     with writing(output) as results:
         results.leave_study(output, study, system)
-    _say(as_json, study.summary(), render(describe_study(study, system.units)))
+    print_result(as_json, study.summary(), render(describe_study(study, system.units)))
     errors.print(f"wrote {output}/")
     if len(study.sets) < len(named):
         errors.print(f"mjfim: interrupted; only {', '.join(study.sets)} is finished")
