@@ -25,7 +25,8 @@ from mjfim.output import archive, plots
 from mjfim.output import folders as results
 from mjfim.output import rerun as rerun_log
 from mjfim.recordings import read as logs
-from mjfim.records.design import HistoryRow, Status
+from mjfim.records.design import Status
+from mjfim.records.events import DesignEvent
 from tests.support.cli import (
     DESIGN,
     ESTIMATE,
@@ -626,13 +627,13 @@ def test_interrupted_on_the_coarse_level() -> None:
     """The best so far is better than the start, also before the stated sample rate is reached."""
     rates = []
 
-    def stop(row: HistoryRow) -> None:
-        rates.append(row.rate)
-        if row.iteration == 5:
+    def interrupt_fifth(event: DesignEvent) -> None:
+        rates.append(event.row.rate)
+        if event.row.iteration == 5:
             interrupt()
 
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
-    result = mjfim.design(experiment, stop)
+    result = mjfim.design(experiment, callback=interrupt_fifth)
     assert set(rates) == {25.0}
     assert result.status is Status.INTERRUPTED
     assert result.final.cost < 0.1 * result.initial.cost
