@@ -1,4 +1,4 @@
-"""`mjfim.compare`: a design beside other methods with the same budget, all evaluated in the same way."""
+"""`mjfim.compare`: a design compared with other methods of equal budget, all evaluated alike."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def compare_task(
             )
             row = run.design(evaluation) if method == DESIGN else run.baseline(evaluation)
 
-            # An interrupted baseline is left out; an interrupted design is as good as it is.
+            # An interrupted baseline is left out; an interrupted design is kept with its best control so far.
             if row is not None:
                 rows.append(row)
             if token.requested:
@@ -364,7 +364,7 @@ class DesignWatch:
 
 
 class MethodEvaluation:
-    """Evaluates the control of every method in the same way: at the stated rate, on the user's model.
+    """Evaluates the controls of all methods alike: at the stated rate, on the user's model.
 
     Attributes:
         task: Task that is compared.
@@ -385,7 +385,7 @@ class MethodEvaluation:
         """Evaluate what a method has found.
 
         The control of a baseline that violates a limit on the user's model is shrunk until it does not; that of a design is
-        evaluated as it is.
+        evaluated without changes.
 
         Args:
             method: Key of the method.
@@ -424,7 +424,7 @@ class MethodEvaluation:
     def _evaluate(
         self, method: str, title: str, found: SearchResult, note: str
     ) -> MethodResult | None:
-        """Evaluate a control as it is; None where the simulation diverges."""
+        """Evaluate a control without changing it; None where the simulation diverges."""
         task = self.task
         point = None
         if found.control is not None:

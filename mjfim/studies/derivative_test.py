@@ -23,7 +23,7 @@ from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.records.check import SelfTest
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
-# Steps along the tested curve, in units of the plant's own difference steps; the smaller error of the two counts.
+# Steps along the tested curve, in units of the plant's difference steps; the smaller error of the two counts.
 SLOPE_STEPS = (1e-3, 1e-4)
 
 # Smallest slope that an error is divided by; avoids a division by zero.
@@ -138,7 +138,7 @@ def _control_metric(task: DesignTask) -> Array:
     if (weights > 0.0).all():
         return np.diag(weights) * task.dt
 
-    # A cost without control weights has no metric of its own: the direction would divide by zero.
+    # A cost without control weights gives no metric: the direction would divide by zero.
     return regulator_for(task).R
 
 

@@ -1,7 +1,7 @@
 """Design at an estimate, with the information of the recordings so far as prior information.
 
 The scales of the parameters remain those of the stated experiment, so that criteria of different rounds can be compared.
-The price of effort must remain the same as well. The first design pays what a relative gain of information is worth to it:
+The price of effort must not change either. The first design pays what a relative gain of information is worth to it:
 phi_1 is the information's share of J there, and `d(log phi) * phi_1 = d(effort)`. The n-th of equal experiments changes log phi
 by 1/n only, so phi is weighted by n phi_1 / phi_n there (by n with D-optimality, whose phi is a logarithm). Otherwise every
 round would be gentler than the one before, and a round at values below the guess gentler than the first.
@@ -168,7 +168,7 @@ def restate_experiment(
             tables[name] = {**table, **_restated_keys(base, index_of[name], theta, estimate)}
             continue
 
-        # A declared inertia is either left as it is, or replaced by its single parameters.
+        # A declared inertia is either left unchanged, or replaced by its single parameters.
         members = [j for j, parameter in enumerate(p.parameters) if parameter.group == name]
         if theta is None or estimate is None or not _are_determined(base, members, estimate):
             tables[name] = table

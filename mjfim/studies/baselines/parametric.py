@@ -1,6 +1,6 @@
 """Optimised Fourier series and B-splines: many of them roughly, the best ones to the end.
 
-They are optimised with SciPy or with mjfim's own optimiser. SciPy gets the best that can be given to it: the exact gradient of
+They are optimised with SciPy or with mjfim's optimiser. SciPy gets the best that can be given to it: the exact gradient of
 `log J + mu * barrier`, with mu falling in the stages of a barrier schedule, and coefficients that are whitened at every stage
 by the Gauss-Newton metric of the barrier.
 """
@@ -275,7 +275,7 @@ def _cheapest(runs: Sequence[ParametricRun], count: int) -> list[ParametricRun]:
     return unfinished[:count]
 
 
-# with mjfim's own optimiser ---------------------------------------------------------------------------------------------
+# with mjfim's optimiser ---------------------------------------------------------------------------------------------
 
 
 def optimise_with_mjfim(
