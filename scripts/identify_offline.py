@@ -2,9 +2,9 @@
 
     python scripts/identify_offline.py models/cart_pendulum.toml recording.csv
 
-A recording of mjfim's own has a column `t`, one `ctrl:<actuator>` per actuator, and the measured columns (`qpos:<joint>`,
-`qvel:<joint>` or a sensor's name); of any other log the experiment's `[recording]` table maps the columns. `mjfim simulate`
-writes one to try with.
+A recording in the format of mjfim has a column `t`, one `ctrl:<actuator>` per actuator, and the measured columns (`qpos:<joint>`,
+`qvel:<joint>` or a sensor's name); the experiment's `[recording]` table maps the columns of any other log. `mjfim simulate`
+writes one to try it.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from mjfim.recordings.design_table import read_playback
 from mjfim.records.playback import Playback
 from mjfim.records.robustness import RobotConditions, Robustness
 from mjfim.studies.robustness import RobotBench, summarize_runs
-from tests.support.cli import misused, run
+from tests.support.cli import misused, run, run_script
 from tests.support.numerics import Array, body_task, cart_task, filtered_task
 
 FILTERED_FINE = {"rate": 50.0, "playback_rate": 100.0}  # of an engine at 200 Hz
@@ -522,6 +522,21 @@ def test_a_stopped_study_keeps_the_robots_that_are_done(
     assert result.runs == 1
     with pytest.raises(NoResultError):
         mjfim.assess_robustness(*cart, stop=stop, **options)
+
+
+def test_the_player_script_walks_through_the_plan(
+    cart: tuple[mjfim.Experiment, Path], tmp_path: Path
+) -> None:
+    """Its log of the simulated robot holds the planned states and controls, and can be read as a recording."""
+    _, path = cart
+    log = tmp_path / "recording.csv"
+    done = run_script("play_design.py", path, "--model", path.parent / "cart.xml", "-o", log)
+    assert done.returncode == 0, done.stderr
+
+    planned, recorded = table(path), table(log)
+    for name in ("t", "qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"):
+        np.testing.assert_allclose(recorded[name], planned[name], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(recorded["ctrl:force"][:-1], planned["ctrl:force"][:-1])
 
 
 @pytest.mark.parametrize(
