@@ -1,4 +1,4 @@
-"""A recording on the grid: the control keeps its impulse, the measured values are left alone, faults are named."""
+"""Recordings on the sample grid: the control keeps its impulse, measured values stay unchanged, faults are named."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def body(tmp_path_factory: pytest.TempPathFactory) -> DesignTask:
 
 
 def stamps(rng: np.random.Generator, mean: float) -> Array:
-    """Random times from 0, some of them a hair apart, with a hole here and there."""
+    """Random times from 0, some of them close together, with gaps."""
     gaps = (
         mean
         * rng.choice([0.001, 0.3, 1.0, 1.0, 1.0, 1.7, 9.0], rng.integers(2, 60))
@@ -44,7 +44,7 @@ def stamps(rng: np.random.Generator, mean: float) -> Array:
 
 
 def reference(t: Array, ctrl: Array, edges: Array) -> Array:
-    """Integral of the held control up to each edge, hold by hold; the last is held on."""
+    """Integral of the held control up to each edge, interval by interval; the last value is held."""
     total = np.zeros((len(edges), ctrl.shape[1]))
     for i, value in enumerate(ctrl):
         end = t[i + 1] if i < len(ctrl) - 1 else np.inf
@@ -54,7 +54,7 @@ def reference(t: Array, ctrl: Array, edges: Array) -> Array:
 
 @pytest.mark.parametrize("mean", [0.11 * DT, 0.5 * DT, DT, 2.3 * DT, 17.0 * DT])
 def test_every_sample_holds_the_mean_of_the_control(mean: float) -> None:
-    """So every integral of the log from the start to a sample, and the impulse of all of it, is kept."""
+    """Every integral of the log from the start to a sample, and so the whole impulse, is kept."""
     rng = np.random.default_rng(round(mean / DT * 100))
     for _ in range(60):
         t = stamps(rng, mean)
@@ -69,8 +69,8 @@ def test_every_sample_holds_the_mean_of_the_control(mean: float) -> None:
         assert (found <= ctrl.max(axis=0) + 1e-9).all()
 
 
-def test_on_the_grid_the_control_is_itself() -> None:
-    """To the last bit, after a million samples too; rows that are several samples apart hold over all of them."""
+def test_control_on_the_grid_is_unchanged() -> None:
+    """To the last bit, also after a million samples; a row holds until the next one."""
     rng = np.random.default_rng(0)
     for count in (2, 7, 200_000):
         ctrl = rng.standard_normal((count, 3))
@@ -84,7 +84,7 @@ def test_on_the_grid_the_control_is_itself() -> None:
 
 
 def log(task: DesignTask, **changes: Any) -> Recording:
-    """A plain recording with something replaced."""
+    """A recording on the grid with some fields replaced."""
     N, ny = 30, len(task.system.outputs)
     rng = np.random.default_rng(0)
     ctrl = rng.standard_normal((N, len(task.controls)))
@@ -98,8 +98,8 @@ def log(task: DesignTask, **changes: Any) -> Recording:
     return Recording(**{**values, **changes})
 
 
-def test_a_recording_on_the_grid_is_taken_as_it_is(task: DesignTask) -> None:
-    """Stamps from anywhere, within a hundredth of a sample; columns in any order, some absent; a last control too much."""
+def test_a_recording_on_the_grid_is_unchanged(task: DesignTask) -> None:
+    """Any first time, stamps within a hundredth of a sample, columns in any order, some absent, one more control."""
     plain = log(task)
     jitter = np.random.default_rng(1).uniform(-4e-5, 4e-5, len(plain.t))
     for t in (plain.t, plain.t + 1.7e9, plain.t + jitter):
@@ -118,7 +118,7 @@ def test_a_recording_on_the_grid_is_taken_as_it_is(task: DesignTask) -> None:
 
 
 def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> None:
-    """And its values; only the control is averaged. Missing rows of an even log leave it even."""
+    """Its values stay as well; only the control is averaged. A log on the grid stays on it where rows are missing."""
     plain = log(task)
     t = np.sort(np.random.default_rng(2).uniform(0.0, 0.3, len(plain.t)))
     track = align(task.system, log(task, t=t + 5.0))
@@ -139,7 +139,7 @@ def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> No
 
 
 def test_two_rows_of_one_sample_do_not_shift_the_control(task: DesignTask) -> None:
-    """A doubled stamp beside a missing row: as many rows as samples, and yet not one for each."""
+    """A repeated stamp and a missing row: the numbers of rows and samples agree, but not every sample has a row."""
     plain = log(task)
     t = np.array(plain.t)
     t[8] = t[7] + 0.005 * task.dt
@@ -175,7 +175,7 @@ def test_faults_are_named(task: DesignTask, changes: dict[str, Any], words: str)
 
 
 def test_quaternions_get_the_sign_of_the_model(body: DesignTask) -> None:
-    """A log that flips signs as it likes, with gaps, is the continuous curve that the model predicts."""
+    """A log with random signs and gaps becomes the continuous curve that the model predicts."""
     ctrl = body.control
     y = body.plant.measure(body.parameters.guess[None], ctrl)[0][0]
     names, flipped = body.system.outputs.names, np.array(y)
@@ -194,7 +194,7 @@ def test_quaternions_get_the_sign_of_the_model(body: DesignTask) -> None:
 
 
 def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
-    """One component alone crosses zero as it likes: whether q or -q was logged cannot be told from it."""
+    """A single component may cross zero: it does not show whether q or -q was logged."""
     some = body_task(tmp_path, noise={"qpos:float.qx": 0.01, "qpos:ball.qy": 0.01}, horizon=3.0)
     y = some.plant.measure(some.parameters.guess[None], some.control)[0][0]
     assert (np.ptp(np.sign(y), axis=0) == 2.0).any(), "nothing crosses zero"
@@ -207,8 +207,8 @@ def test_a_part_of_a_quaternion_keeps_its_sign(tmp_path: Path) -> None:
     np.testing.assert_array_equal(track.y, y)
 
 
-def test_pictures_of_what_was_measured(task: DesignTask, body: DesignTask) -> None:
-    """All positions, gaps bridged; nothing where one was never measured."""
+def test_measured_trajectory_bridges_gaps(task: DesignTask, body: DesignTask) -> None:
+    """All positions, gaps bridged; None where one was never measured."""
     plain = log(task)
     y = np.array(plain.y)
     y[10:13, 1] = np.nan
@@ -224,7 +224,7 @@ def test_pictures_of_what_was_measured(task: DesignTask, body: DesignTask) -> No
     np.testing.assert_allclose(np.linalg.norm(turned.qpos[:, 3:7], axis=1), 1.0)
 
 
-def test_reading_between_samples_is_exact_for_cubics() -> None:
+def test_interpolation_between_samples_is_exact_for_cubics() -> None:
     """At any times, in any order, several at one sample; values and slopes. A quartic shows that the test can fail."""
     rng = np.random.default_rng(0)
     wanted = rng.uniform(0.0, 29.0, 200)
@@ -243,7 +243,7 @@ def test_reading_between_samples_is_exact_for_cubics() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.4 * DT, 3.7 * DT, -1.2 * DT])
-def test_reading_at_the_samples_is_the_lag_of_all_of_them(delay: float) -> None:
+def test_interpolation_at_the_samples_is_the_delay_on_the_grid(delay: float) -> None:
     """`of` is `at` every sample, and any rows of it are `at` those; before the start is the start, without a slope."""
     all_of_them, y = (
         OutputDelay.on_grid(40, delay, DT),
@@ -266,8 +266,8 @@ def test_reading_at_the_samples_is_the_lag_of_all_of_them(delay: float) -> None:
     )
 
 
-def test_a_track_does_not_change(task: DesignTask) -> None:
-    """Its arrays are read-only, and the recording's are left as they were."""
+def test_an_aligned_recording_does_not_change(task: DesignTask) -> None:
+    """Its arrays are read-only, and those of the recording stay unchanged."""
     plain = log(task)
     before = np.array(plain.y)
     track: AlignedRecording = align(task.system, plain)

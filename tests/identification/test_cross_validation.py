@@ -1,4 +1,4 @@
-"""Predictions of what was not fitted, parameters that every recording has its own of, and doubts about the data."""
+"""Predictions of data that were not fitted, parameters of single recordings, and remarks about poor data."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def base() -> mjfim.Experiment:
 
 
 def recorded(task: DesignTask, seed: int, swing: float = 1.0) -> Recording:
-    """One recording at the true values."""
+    """One recording at the true parameters."""
     trajectory = task.plant.simulate(task.theta, swing * task.control)
     return simulate_system(task.system, trajectory, seed)
 
@@ -111,7 +111,7 @@ def test_per_recording_belongs_to_nuisance(base: mjfim.Experiment) -> None:
         base.replace(parameters={"m": {"per_recording": True}})
 
 
-def test_doubtful_data_are_described_and_sound_ones_are_not(base: mjfim.Experiment) -> None:
+def test_poor_data_are_described_and_good_data_are_not(base: mjfim.Experiment) -> None:
     task = DesignTask.resolve(base)
     good = recorded(task, 0)
     assert plausibility_remarks(task.system.channels, good) == ()

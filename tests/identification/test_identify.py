@@ -114,7 +114,7 @@ def test_chi_square_and_misfit(task: DesignTask, recording: Recording) -> None:
     assert any("not the accuracy" in sentence for sentence in wrong.warnings)
 
 
-def test_overstated_noise_is_said(task: DesignTask, recording: Recording) -> None:
+def test_overstated_noise_is_a_warning(task: DesignTask, recording: Recording) -> None:
     estimate = identify_system(task.system, [noiseless(task, recording)])
     assert any("overstated" in sentence for sentence in estimate.warnings)
 
@@ -202,7 +202,7 @@ def test_unknown_method_and_wrong_start_are_refused(task: DesignTask, recording:
         identify_system(task.system, [recording], start=np.ones(2))
 
 
-def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
+def test_an_interrupted_search_keeps_the_best_result_so_far(
     task: DesignTask, recording: Recording
 ) -> None:
     """Ctrl-C in the second iteration."""
@@ -228,10 +228,10 @@ def test_interrupted_while_it_searches_it_keeps_the_best_so_far(
         "cross_validation._prediction_errors",
     ],
 )
-def test_interrupted_after_the_search_the_estimate_stays(
+def test_an_interruption_after_the_search_keeps_the_estimate(
     task: DesignTask, recording: Recording, place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C while terms are looked for that the model lacks, or while the rest is predicted."""
+    """Ctrl-C during the tests for missing terms, or during the predictions."""
     whole = identify_system(task.system, [recording])
 
     pressed: list[bool] = []
@@ -249,10 +249,10 @@ def test_interrupted_after_the_search_the_estimate_stays(
     assert any(sentence.startswith("interrupted after the search") for sentence in found.warnings)
 
 
-def test_an_interrupted_search_gives_no_partial_result(
+def test_functions_without_a_budget_give_no_partial_result(
     task: DesignTask, recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Functions without a budget are interrupted as usual; a round of a campaign is complete or not kept."""
+    """Ctrl-C interrupts them as usual; a round of a campaign is complete or not kept."""
     fit, count = FitProblem.of(task.system, [recording]), [0]
     condense = FitProblem.condense
 
@@ -276,8 +276,10 @@ def test_an_interrupted_search_gives_no_partial_result(
     assert identify_system(task.system, [recording]).interrupted
 
 
-def test_interrupted_where_a_further_start_begins(task: DesignTask, recording: Recording) -> None:
-    """The starts before it stay; none comes after it."""
+def test_an_interruption_between_starts_keeps_the_earlier_ones(
+    task: DesignTask, recording: Recording
+) -> None:
+    """Earlier starts count; no later one is searched."""
     several, seen = DesignTask.resolve(task.experiment.replace(fit={"starts": 6})), list[str]()
 
     def show(event: FitEvent) -> None:
@@ -293,7 +295,7 @@ def test_interrupted_where_a_further_start_begins(task: DesignTask, recording: R
     )
 
 
-def test_interrupted_before_the_last_search_nothing_more_is_searched(
+def test_an_interruption_before_the_last_search_ends_all_searches(
     task: DesignTask, recording: Recording
 ) -> None:
     pieces = DesignTask.resolve(task.experiment.replace(fit={"segments": 1.0}))
@@ -314,7 +316,7 @@ def test_interrupted_before_the_last_search_nothing_more_is_searched(
 def test_a_robust_fit_judges_the_size_of_its_residuals(
     task: DesignTask, recording: Recording, scale: float
 ) -> None:
-    """Right noise is neither too large nor too small, whatever counts as an outlier; noise of three times the size is said."""
+    """Noise as stated is neither too large nor too small, whatever counts as an outlier; three times the noise is a misfit."""
     robust = DesignTask.resolve(
         task.experiment.replace(fit={"loss": "soft_l1", "loss_scale": scale})
     )
@@ -335,7 +337,7 @@ def test_a_robust_fit_judges_the_size_of_its_residuals(
 
 
 def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
-    """Their covariance is infinite; what the others are traded for is told all the same (warnings are errors here)."""
+    """Their covariance is infinite; correlations of the others are computed without a warning (warnings are errors here)."""
     task = DesignTask.resolve(Experiment.from_file(ROOT / "models" / "ball_pendulum.toml"))
     estimate = identify_system(
         task.system,

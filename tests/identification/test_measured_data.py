@@ -1,4 +1,4 @@
-"""Measured data of others: what is identified from some recordings predicts the others, and poor data are named.
+"""Measured data of other groups: parameters from some recordings predict the others, and poor data are named.
 
 The data are not in the repository; without them, these tests are skipped.
 """
@@ -58,7 +58,7 @@ HEAD_SERVO = servo_values(0.3866957, 4.0171292, 0.00181417, 0.030871, 0.01283272
 
 
 def experiment(name: str, guess: dict[str, float] | None = None, **fit: object) -> mjfim.Experiment:
-    """An experiment of models/, its guesses moved."""
+    """An experiment of models/ with other guesses and settings of the fit."""
     found = mjfim.Experiment.from_file(ROOT / "models" / f"{name}.toml")
     return found.replace(
         parameters={key: {"guess": value} for key, value in (guess or {}).items()}, fit=dict(fit)
@@ -66,7 +66,7 @@ def experiment(name: str, guess: dict[str, float] | None = None, **fit: object) 
 
 
 def identified(stated: mjfim.Experiment, files: list[Path], held_out: list[Path]) -> Estimate:
-    """Read, fit, predict."""
+    """Estimate from some files, with predictions of held-out ones."""
     system = System.resolve(stated)
     fitted, kept = (
         [read_recording(path, system.channels) for path in paths] for paths in (files, held_out)

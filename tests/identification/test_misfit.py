@@ -1,4 +1,4 @@
-"""Where residuals are worst and what is said of them: planted faults are found, noise is left in peace."""
+"""Largest residuals and reasons for a misfit: planted faults are found, noise gives none."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def white(seed: int = 0) -> tuple[list[Array], list[Array]]:
 
 
 def place(times: list[Array], z: list[Array]) -> WorstResidual:
-    """The worst of the three recordings a, b, c."""
+    """The worst residual of the three recordings a, b, c."""
     found = find_worst_residual(NAMES, "abc", times, z)
     assert found is not None
     return found
@@ -35,7 +35,7 @@ def place(times: list[Array], z: list[Array]) -> WorstResidual:
 
 @pytest.mark.parametrize(("recording", "output"), [(0, 2), (1, 0), (2, 1)])
 def test_a_planted_burst_is_found(recording: int, output: int) -> None:
-    """Its output, its recording, and its time to within two windows; size and share are those of the window."""
+    """Output, recording and time to within two windows; size and share are those of the interval."""
     times, z = white()
     t = times[recording]
     begin, end = 0.55 * t[-1], 0.67 * t[-1]
@@ -52,8 +52,8 @@ def test_a_planted_burst_is_found(recording: int, output: int) -> None:
     assert worst.share == pytest.approx(squares / sum(np.sum(part**2) for part in z), rel=1e-9)
 
 
-def test_an_output_that_is_wrong_all_along_is_named_as_a_whole() -> None:
-    """Not the window in which it happens to be largest."""
+def test_an_output_with_uniformly_large_residuals_is_named_as_a_whole() -> None:
+    """The interval is the whole recording, not the window in which noise is largest by chance."""
     times, z = white()
     z[1][:, 2] *= 3.0
     worst = place(times, z)
@@ -64,7 +64,7 @@ def test_an_output_that_is_wrong_all_along_is_named_as_a_whole() -> None:
 
 
 def test_gaps_and_outputs_that_are_not_measured() -> None:
-    """Nothing of them counts; a burst beside them is found."""
+    """They do not count; a burst beside them is found."""
     times, z = white()
     z[0][:, 1] = np.nan
     z[0][200:700, 0] = np.nan
@@ -80,7 +80,7 @@ def test_gaps_and_outputs_that_are_not_measured() -> None:
     assert find_worst_residual(NAMES, "", [], []) is None
 
 
-def test_one_value_is_no_place() -> None:
+def test_a_single_value_is_not_an_interval() -> None:
     """A rarely measured output, one value of which is large by chance, does not outdo a burst of a hundred values."""
     for seed in range(20):
         times, z = white(seed)
@@ -95,7 +95,7 @@ def test_one_value_is_no_place() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 5, 9])
 def test_short_recordings(count: int) -> None:
-    """All of it is the place."""
+    """The interval is the whole recording."""
     times, z = [np.arange(count) * 0.1 + 0.5], [np.tile([0.1, 2.0, 0.1], (count, 1))]
     worst = find_worst_residual(NAMES, ["x"], times, z)
     assert worst is not None
@@ -103,8 +103,8 @@ def test_short_recordings(count: int) -> None:
     assert worst.size == pytest.approx(2.0)
 
 
-def test_a_place_in_words() -> None:
-    """What, when, where, how much."""
+def test_a_worst_residual_in_words() -> None:
+    """Output, time, recording, size and share."""
     said = str(
         WorstResidual(
             output="angle", recording="run.csv", begin=1.25, end=2.5, size=7.93, share=0.412
@@ -149,8 +149,8 @@ def test_larger_and_smaller_need_probability_and_size() -> None:
     assert not is_smaller_than_noise(0.98 * 1e5, 100_000)
 
 
-def test_noise_that_follows_itself_matters_where_it_is_large_enough() -> None:
-    """Improbable, corrected for the number of outputs, and more than the noise hides; the worst first."""
+def test_autocorrelation_matters_where_it_is_large_enough() -> None:
+    """Significant, corrected for the number of outputs, and large against the noise; strongest first."""
     assert [
         w.output
         for w in autocorrelated([seen("a", 1e-9, 2.0), seen("b", 1e-9, 5.0), seen("c", 0.1, 9.0)])
@@ -165,7 +165,7 @@ def test_noise_that_follows_itself_matters_where_it_is_large_enough() -> None:
 
 
 def test_reasons_in_sentences() -> None:
-    """Each cause one sentence; of noise that is as stated there is nothing to say."""
+    """One sentence for each cause; none for noise as stated."""
     assert misfit_reasons(1000.0, 1000, True, [seen()], ()) == ()
     assert misfit_reasons(4000.0, 1000, True, [seen()], ()) == (
         "residuals are 2.00 x the stated noise",

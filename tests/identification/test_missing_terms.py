@@ -1,4 +1,4 @@
-"""What a model lacks, told from its residuals; nothing where it lacks nothing."""
+"""Missing terms are found from the residuals of a model; a complete model has none."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CONTROL = {"kind": "multisine", "amplitude": 4.0, "frequency": 0.4, "harmonics":
 
 
 def stated(**tables: object) -> mjfim.Experiment:
-    """The cart-pendulum, swung about."""
+    """The cart-pendulum under a multisine."""
     base = mjfim.Experiment.from_file(ROOT / "models" / "cart_pendulum.toml")
     return base.replace(initial={"control": CONTROL}, fit={"bootstrap": 0}, **tables)
 
@@ -58,7 +58,7 @@ def test_the_missing_term_comes_first_and_in_about_its_size(
     assert any(path in sentence for sentence in found.warnings)
 
 
-def test_a_bias_and_a_lag_are_told(tmp_path: Path) -> None:
+def test_a_bias_and_a_delay_are_found(tmp_path: Path) -> None:
     task = DesignTask.resolve(stated())
     clean = simulate_system(task.system, task.initial, seed=1)
     off = np.array(clean.y)
@@ -76,7 +76,7 @@ def test_a_bias_and_a_lag_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_right_model_lacks_nothing() -> None:
+def test_a_complete_model_has_no_missing_terms() -> None:
     task = DesignTask.resolve(stated())
     found = [
         identify_system(task.system, [simulate_system(task.system, task.initial, seed)])
@@ -85,7 +85,7 @@ def test_a_right_model_lacks_nothing() -> None:
     assert not any(e.missing_terms or e.misfit for e in found)
 
 
-def test_what_is_sought_already_is_no_suspect(tmp_path: Path) -> None:
+def test_estimated_parameters_are_no_missing_terms(tmp_path: Path) -> None:
     recording = robot(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="0.5"/>')
     friction = {"f": {"target": "joint/slide:frictionloss", "guess": 0.1, "bounds": [0.0, 5.0]}}
     found = mjfim.identify(stated(parameters=friction), [recording])

@@ -1,4 +1,4 @@
-"""Tests of whiteness against theory: how often white noise is accused, and what they see that is not white."""
+"""Tests of whiteness against theory: rate of false alarms, and power against coloured residuals."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def autoregressive(phi: float, count: int, rng: np.random.Generator) -> Array:
 
 
 def seen(seed: int, extra: Array | float = 0.0, phi: float = 0.0, count: int = N) -> Whiteness:
-    """Verdict on one series of noise with something added."""
+    """Test of one series of noise with an added signal."""
     rng = np.random.default_rng(seed)
     return whiteness_of("y", [autoregressive(phi, count, rng) + extra])
 
 
 @pytest.mark.parametrize("lengths", [(40,), (400,), (3000,), (700, 90, 1300), tuple([60] * 30)])
-def test_white_noise_is_rarely_accused(lengths: tuple[int, ...]) -> None:
-    """At each level no more often than the level says, within what chance allows for so many draws."""
+def test_white_noise_rarely_fails(lengths: tuple[int, ...]) -> None:
+    """At each level no more often than the level, within the scatter of the number of draws."""
     rng = np.random.default_rng(len(lengths))
     draws = 400
     p = np.array(
@@ -73,7 +73,7 @@ def test_correlated_noise_is_seen(phi: float) -> None:
         pytest.param(np.where(np.arange(N) % 400 < 30, 0.7, 0.0), id="bursts"),
     ],
 )
-def test_what_noise_hides_from_the_eye_is_seen(extra: Array | float) -> None:
+def test_small_signals_in_noise_are_found(extra: Array | float) -> None:
     """All are small against the noise, so small that short lags alone would miss the slow ones."""
     assert sum(seen(seed, extra).p < 1e-3 for seed in range(20)) >= 18
     assert seen(0, extra).variance < 1.2
@@ -89,7 +89,7 @@ def test_long_runs_see_what_short_lags_do_not() -> None:
 
 
 def test_several_recordings_are_seen_together() -> None:
-    """Each too short to tell by itself, all with the same correlation, or each with an offset of its own."""
+    """Each too short by itself, with one correlation in all of them, or with different offsets."""
     rng = np.random.default_rng(7)
     parts = [autoregressive(0.3, 60, rng) for _ in range(40)]
     assert whiteness_of("y", parts).p < 1e-4
@@ -135,7 +135,7 @@ def test_the_integrated_time_is_that_of_theory(phi: float) -> None:
 
 
 def test_white_and_alternating_noise_has_no_memory() -> None:
-    """No more than one row hangs together."""
+    """The autocorrelation time is one row."""
     assert np.mean([seen(seed).time for seed in range(20)]) == pytest.approx(1.0, abs=0.02)
     assert seen(0, phi=-0.6).time == 1.0
 
@@ -155,7 +155,7 @@ def test_variance_and_inflation() -> None:
     "parts",
     [[], [np.zeros(0)], [np.full(9, np.nan)], [np.ones(5)], [np.zeros(100)], [np.ones(1)] * 50],
 )
-def test_too_little_to_tell_accuses_nobody(parts: list[Array]) -> None:
-    """No values, few, or none but zeros."""
+def test_too_few_residuals_pass(parts: list[Array]) -> None:
+    """No values, few values, or only zeros."""
     found = whiteness_of("y", parts)
     assert (found.p, found.inflation, found.time) == (1.0, 1.0, 1.0)

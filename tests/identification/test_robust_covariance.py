@@ -23,7 +23,7 @@ FINE = 8  # rows of a block
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Recordings of `y = X theta + noise`. X: (K, N, c);  own: recordings start from an offset of their own"""
+    """Recordings of `y = X theta + noise`; X: (K, N, c); own: every recording has an offset."""
 
     X: Array
     own: bool = False
@@ -72,7 +72,7 @@ class Linear:
 
 
 def waves(K: int, N: int, c: int, slow: float = 3.0) -> Array:
-    """(K, N, c) slow regressors, where noise that hangs together hurts."""
+    """(K, N, c) slow regressors, which autocorrelated noise disturbs most."""
     t = np.arange(N) / N
     return np.stack(
         [[np.cos(2 * np.pi * slow * (j + 1) * t + j + k) for j in range(c)] for k in range(K)]
@@ -100,7 +100,7 @@ class Study:
 
 @cache
 def study(phi: float, own: bool = False, prior: float = np.inf, repetitions: int = 150) -> Study:
-    """One recording or, with offsets of their own, four."""
+    """One recording, or four with offsets."""
     K, N = (4, 480) if own else (1, 1600)
     model, rng = Linear(waves(K, N, 2), own, prior), np.random.default_rng(11)
     length = block_length([(1 + phi) / (1 - phi)], K * N)
@@ -162,7 +162,7 @@ def test_the_interval_covers_the_truth(phi: float, own: bool) -> None:
     assert s.apart.sum() <= 3
 
 
-def test_a_prior_is_scatter_too() -> None:
+def test_priors_count_as_scatter() -> None:
     """Truths drawn from the prior: sandwich and bootstrap are the spread about them, not the spread of the data alone."""
     s = study(0.0, prior=0.03)
     true = s.theta.std(axis=0)
@@ -171,8 +171,8 @@ def test_a_prior_is_scatter_too() -> None:
         np.testing.assert_allclose(said.mean(axis=0), true, rtol=0.15)
 
 
-def test_recordings_that_differ_are_told_apart() -> None:
-    """The spread between them is found; the interval allows for it. Equal ones are not accused."""
+def test_recordings_that_disagree_are_found() -> None:
+    """Their spread is found and the interval allows for it; equal recordings agree."""
     rng, K, N = np.random.default_rng(5), 8, 480
     model = Linear(waves(K, N, 2))
     apart, between, equal = [], [], []
@@ -196,7 +196,7 @@ def test_recordings_that_differ_are_told_apart() -> None:
     assert np.mean(np.array(between)[:, 1]) < 0.02
 
 
-def test_a_few_blocks_of_each_recording_accuse_nobody() -> None:
+def test_few_blocks_of_each_recording_give_no_false_alarms() -> None:
     """Strongly coloured noise leaves five or so blocks a recording, whose own scatter is often small by chance."""
     rng, K, N = np.random.default_rng(6), 10, 480
     model = Linear(waves(K, N, 3, slow=1.0))
@@ -207,7 +207,7 @@ def test_a_few_blocks_of_each_recording_accuse_nobody() -> None:
     assert sum(bool(s.apart) for s in said) <= 7
 
 
-def test_what_sets_recordings_apart_does_not_hide_itself() -> None:
+def test_differences_between_recordings_do_not_count_as_scatter() -> None:
     """At the common estimate the difference is in all residuals; it must not pass for the scatter of each recording."""
     rng, K, N = np.random.default_rng(8), 5, 1200
     model = Linear(waves(K, N, 3, slow=0.7))
@@ -219,8 +219,8 @@ def test_what_sets_recordings_apart_does_not_hide_itself() -> None:
     assert apart >= 39
 
 
-def test_what_every_recording_says_is_its_own_fit() -> None:
-    """Of a linear model to the last digit; one that tells nothing says nothing."""
+def test_estimates_from_single_recordings_are_their_fits() -> None:
+    """Exactly for a linear model; NaN for a recording that does not determine all unknowns."""
     rng = np.random.default_rng(1)
     X = waves(4, 240, 3)
     X[2, :, 1] = X[2, :, 0]
@@ -262,7 +262,7 @@ def test_units_of_the_unknowns_do_not_matter() -> None:
 
 
 def test_the_interval_is_the_hull() -> None:
-    """Of the formal one, and of the 2.5 and 97.5 % draws."""
+    """The hull of the formal interval, the sandwich interval and the 2.5 and 97.5 % draws."""
     y = noise(0.9, (1, 1600), np.random.default_rng(4))
     theta, formal, said = Linear(waves(1, 1600, 2)).judged(y, 80.0, draws=400)
     low, high = said.interval.T
@@ -281,8 +281,8 @@ def test_the_interval_is_the_hull() -> None:
     np.testing.assert_array_equal(said.between, 0.0)
 
 
-def test_blocks_are_as_long_as_residuals_hang_together() -> None:
-    """Four times that, one row where they are white, and never more than a twentieth of the data."""
+def test_blocks_are_four_autocorrelation_times_long() -> None:
+    """One row for white residuals, and never more than a twentieth of the data."""
     assert block_length([1.0, 1.2], 10_000) == 1.0
     assert block_length([2.0, 9.0], 10_000) == 36.0
     assert block_length([1000.0], 10_000) == 500.0
@@ -291,7 +291,7 @@ def test_blocks_are_as_long_as_residuals_hang_together() -> None:
 
 
 def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
-    """Random recordings: nothing crossed, nothing torn apart, as short as may be."""
+    """Random recordings: blocks do not cross recordings, keep their order and are as short as possible."""
     rng = np.random.default_rng(3)
     for _ in range(200):
         counts = rng.integers(1, 12, rng.integers(1, 6))

@@ -1,4 +1,4 @@
-"""Recordings cut into pieces: nothing lost, nothing twice, each beginning where the data say."""
+"""Recordings cut into segments: every row once, every segment with a measured initial state."""
 
 from __future__ import annotations
 
@@ -68,21 +68,21 @@ def track(
     )
 
 
-def covered(pieces: tuple[Segment, ...], tracks: list[AlignedRecording]) -> None:
-    """Every row of every track belongs to exactly one piece, which simulates it."""
-    for i, one in enumerate(tracks):
-        rows = np.concatenate([np.arange(len(one.t))[p.rows] for p in pieces if p.recording == i])
+def covered(segments: tuple[Segment, ...], recordings: list[AlignedRecording]) -> None:
+    """Every row of every track belongs to exactly one segment, which simulates it."""
+    for i, one in enumerate(recordings):
+        rows = np.concatenate([np.arange(len(one.t))[p.rows] for p in segments if p.recording == i])
         np.testing.assert_array_equal(rows, np.arange(len(one.t)))
-    for p in pieces:
-        t = tracks[p.recording].t[p.rows] / tracks[p.recording].dt
+    for p in segments:
+        t = recordings[p.recording].t[p.rows] / recordings[p.recording].dt
         assert t[0] >= p.begin - 1e-9
         assert t[-1] <= p.begin + p.samples + 0.011
 
 
 @pytest.mark.parametrize("length", [0.04, 0.05, 0.17, 0.33, 1.0, 1.5, 9.0, None])
 @pytest.mark.parametrize("lead", [0.0, 0.004, 0.03])
-def test_every_row_is_in_one_piece(task: DesignTask, length: float | None, lead: float) -> None:
-    """Even logs, logs with missing rows, logs off the grid; pieces of nearly the length asked for."""
+def test_every_row_is_in_one_segment(task: DesignTask, length: float | None, lead: float) -> None:
+    """Even logs, logs with missing rows, logs off the grid; segments of nearly the length asked for."""
     rng = np.random.default_rng(0)
     y = truth(task)
     some = np.sort(rng.choice(len(y), 120, replace=False))
@@ -94,13 +94,13 @@ def test_every_row_is_in_one_piece(task: DesignTask, length: float | None, lead:
         outputs=task.system.outputs.names,
         name="off.csv",
     )
-    tracks = [track(task), track(task, rows=some), align(task.system, off)]
-    assert [t.on_grid for t in tracks] == [True, True, False]
-    pieces = cut_into_segments(task.system, tracks, length, lead)
-    covered(pieces, tracks)
+    recordings = [track(task), track(task, rows=some), align(task.system, off)]
+    assert [t.on_grid for t in recordings] == [True, True, False]
+    segments = cut_into_segments(task.system, recordings, length, lead)
+    covered(segments, recordings)
     ahead = int(np.ceil(lead / task.dt))
-    for i, one in enumerate(tracks):
-        mine = [p for p in pieces if p.recording == i]
+    for i, one in enumerate(recordings):
+        mine = [p for p in segments if p.recording == i]
         sizes = np.array([p.samples - min(ahead, p.begin + ahead) * (p.begin > 0) for p in mine])
         if length is None or length >= one.t[-1]:
             assert len(mine) == 1
@@ -116,25 +116,25 @@ def test_every_row_is_in_one_piece(task: DesignTask, length: float | None, lead:
             assert p.start.shape == (task.space.nq + task.space.nv,)
 
 
-def test_a_piece_begins_as_much_earlier_as_outputs_lag(task: DesignTask) -> None:
-    """So that what its first row shows is simulated; the first piece cannot."""
-    pieces = cut_into_segments(task.system, [track(task)], 0.5, 0.025)
-    assert [p.begin for p in pieces] == [0, 47, 97, 147]
-    assert [p.rows.start for p in pieces] == [0, 50, 100, 150]
-    assert [p.begin + p.samples for p in pieces] == [50, 100, 150, 200]
-    assert pieces[-1].rows.stop == 201
+def test_a_segment_begins_earlier_by_the_delay(task: DesignTask) -> None:
+    """So that what its first row shows is simulated; the first segment cannot."""
+    segments = cut_into_segments(task.system, [track(task)], 0.5, 0.025)
+    assert [p.begin for p in segments] == [0, 47, 97, 147]
+    assert [p.rows.start for p in segments] == [0, 50, 100, 150]
+    assert [p.begin + p.samples for p in segments] == [50, 100, 150, 200]
+    assert segments[-1].rows.stop == 201
 
 
-def test_stretches_without_rows_are_no_pieces(task: DesignTask) -> None:
-    """A hole longer than a piece."""
+def test_gaps_have_no_segments(task: DesignTask) -> None:
+    """A hole longer than a segment."""
     rows = np.concatenate([np.arange(60), np.arange(140, 201)])
-    tracks = [track(task, rows=rows)]
-    pieces = cut_into_segments(task.system, tracks, 0.2, 0.0)
-    covered(pieces, tracks)
-    assert [p.begin for p in pieces] == [0, 20, 40, 140, 160, 180]
+    recordings = [track(task, rows=rows)]
+    segments = cut_into_segments(task.system, recordings, 0.2, 0.0)
+    covered(segments, recordings)
+    assert [p.begin for p in segments] == [0, 20, 40, 140, 160, 180]
 
 
-def test_pieces_that_are_too_short_are_refused(task: DesignTask) -> None:
+def test_segments_that_are_too_short_are_refused(task: DesignTask) -> None:
     """In one sentence with the file, the key and what it takes."""
     with pytest.raises(
         RecordingError, match=r"x\.csv: fit\.segments = 0\.03 s is too short.*4 samples of 0\.01 s"
@@ -142,13 +142,13 @@ def test_pieces_that_are_too_short_are_refused(task: DesignTask) -> None:
         cut_into_segments(task.system, [track(task)], 0.03, 0.0)
 
 
-def test_whole_tracks_start_as_stated(task: DesignTask) -> None:
-    tracks = [track(task), track(task, rows=np.arange(80))]
+def test_whole_recordings_start_as_stated(task: DesignTask) -> None:
+    recordings = [track(task), track(task, rows=np.arange(80))]
     start = np.array([0.1, 3.0, 0.0, 0.4])
-    pieces = whole_recordings(tracks, start)
-    covered(pieces, tracks)
-    assert [(p.recording, p.begin, p.samples) for p in pieces] == [(0, 0, 200), (1, 0, 79)]
-    for p in pieces:
+    segments = whole_recordings(recordings, start)
+    covered(segments, recordings)
+    assert [(p.recording, p.begin, p.samples) for p in segments] == [(0, 0, 200), (1, 0, 79)]
+    for p in segments:
         np.testing.assert_array_equal(p.start, start)
 
 
@@ -198,7 +198,7 @@ def test_a_free_body_starts_with_its_orientation(body: DesignTask) -> None:
     np.testing.assert_allclose(states[:, 11:], y[begins, 11:], rtol=0, atol=0.1 * np.ptp(y[:, 11:]))
 
 
-def test_what_is_not_measured_goes_as_the_model_at_the_guess(body: DesignTask) -> None:
+def test_unmeasured_states_follow_the_model_at_the_guess(body: DesignTask) -> None:
     """Velocities of rotations that the log does not hold; all of it where orientations are missing too."""
     y, guess = truth(body), truth(body, 1.0)
     begins = np.array([0, 40, 120])
@@ -253,23 +253,23 @@ def test_a_start_that_nothing_shows_does_no_harm(
     assert (np.abs(found.theta - theta) < 4.0 * found.std).all()
 
 
-def piece(samples: int) -> Segment:
+def segment(samples: int) -> Segment:
     return Segment(recording=0, begin=0, samples=samples, rows=slice(0, 1), start=np.zeros(1))
 
 
-def test_batches_hold_all_pieces_once_and_not_too_much() -> None:
+def test_batches_hold_every_segment_once_within_the_limit() -> None:
     """Of like length, within the limit unless one alone is longer, and not one by one."""
     rng = np.random.default_rng(0)
     for most in (10, 200, 5000):
-        pieces = [piece(int(n)) for n in rng.integers(4, 120, 60)]
-        found = list(batches(pieces, most))
+        segments = [segment(int(n)) for n in rng.integers(4, 120, 60)]
+        found = list(batches(segments, most))
         assert sorted(i for batch in found for i in batch) == list(range(60))
         for batch in found:
             longest, shortest = (
-                max(pieces[i].samples for i in batch),
-                min(pieces[i].samples for i in batch),
+                max(segments[i].samples for i in batch),
+                min(segments[i].samples for i in batch),
             )
             assert len(batch) == 1 or len(batch) * longest <= most
             assert longest <= 1.1 * shortest
-    assert len(list(batches([piece(50)] * 40, 1000))) == 2
+    assert len(list(batches([segment(50)] * 40, 1000))) == 2
     assert list(batches([], 100)) == []
