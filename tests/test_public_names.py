@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
 import pytest
@@ -45,10 +44,6 @@ def test_an_unknown_name_is_an_ordinary_error() -> None:
 @pytest.mark.parametrize("old", ["monitor", "tell", "progress"])
 @pytest.mark.parametrize("verb", VERBS_WITH_CALLBACK)
 def test_an_old_argument_is_an_error_that_names_the_new_one(verb: str, old: str) -> None:
-    arguments = inspect.signature(getattr(mjfim, verb)).parameters
-    if old in arguments or "callback" not in arguments:
-        pytest.skip("has this argument")
-
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     with pytest.raises(TypeError, match=f"{old}.*callback"):
         getattr(mjfim, verb)(experiment, **{old: print})
