@@ -345,10 +345,21 @@ class _Report:
             status = Status.INFEASIBLE
 
         warnings = tuple(design_warnings(final, found, task, clamped, rough))
-        return self._record(best, results, seconds, steps, status, initial, final, found, warnings)
+        return self._record(
+            best=best,
+            results=results,
+            seconds=seconds,
+            steps=steps,
+            status=status,
+            initial=initial,
+            final=final,
+            found=found,
+            warnings=warnings,
+        )
 
     def _record(
         self,
+        *,
         best: RunResult,
         results: Sequence[RunResult],
         seconds: float,
