@@ -10,7 +10,16 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import ExperimentFile, Folder, Threads, errors, out, verb
+from mjfim.cli.common import (
+    ExperimentFile,
+    Folder,
+    Threads,
+    UnfinishedError,
+    errors,
+    out,
+    raise_on_interrupt,
+    verb,
+)
 from mjfim.errors import ExperimentError, RecordingError
 from mjfim.excitation.target_accuracy import target_accuracies
 from mjfim.excitation.task import DesignTask
@@ -66,7 +75,8 @@ def campaign(
     simulated = not (real or recordings)
     found = run.simulated(rounds, seed) if simulated else run.real(rounds, recordings or [])
 
-    warning = run.folder.write_campaign(found, simulated=simulated)
+    with raise_on_interrupt(UnfinishedError(str(output))):
+        warning = run.folder.write_campaign(found, simulated=simulated)
     if warning:
         errors.print(f"warning: {warning}", markup=False)
     out.print(render(describe_campaign(found, run.task.parameters, simulated=simulated)))

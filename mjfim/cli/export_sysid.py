@@ -8,7 +8,15 @@ from typing import Annotated
 import typer
 
 import mjfim
-from mjfim.cli.common import ExperimentFile, Folder, errors, out, verb
+from mjfim.cli.common import (
+    ExperimentFile,
+    Folder,
+    UnfinishedError,
+    errors,
+    out,
+    raise_on_interrupt,
+    verb,
+)
 from mjfim.experiment.system import System
 from mjfim.output.folders import check_folder
 from mjfim.output.text import render
@@ -38,5 +46,6 @@ def export_sysid(
     for sentence in result.warnings:
         errors.print(f"warning: {sentence}", markup=False)
 
-    sysid_comparison.write_sysid_comparison(output, result)
+    with raise_on_interrupt(UnfinishedError(str(output))):
+        sysid_comparison.write_sysid_comparison(output, result)
     out.print(f"wrote {output}: comparison.json, sysid_report.html", markup=False)

@@ -136,8 +136,9 @@ class System:
             ModelError: The model cannot be used.
         """
         try:
-            path = experiment.directory / experiment.model
-            return cls._resolved(experiment, threads, source or ModelSource(path))
+            if source is None:
+                source = ModelSource(experiment.directory / experiment.model)
+            return cls._resolved(experiment, threads, source)
         except ExperimentError as error:
             raise ExperimentError(f"{experiment.source}: {error}") from None
 
