@@ -1,7 +1,8 @@
 """mjfim: system identification on MuJoCo that designs the experiment.
 
-`check` says what can be identified, `design` finds the excitation that reveals most about uncertain parameters, `simulate` plays
-it, `identify` estimates the parameters from recordings, `monte_carlo` compares the estimates with the Cramér-Rao bound.
+`check` says what can be identified, `design` finds the excitation that reveals most about uncertain
+parameters, `simulate` plays it, `identify` estimates the parameters from recordings, `monte_carlo`
+compares the estimates with the Cramér-Rao bound.
 """
 
 from mjfim.budget import Budget, StopToken

@@ -46,8 +46,8 @@ def scaled_to_unit_diagonal(matrix: Array) -> tuple[Array, Array]:
         matrix: (..., n, n) symmetric positive semidefinite matrices.
 
     Returns:
-        The scaled matrices: (..., n, n), and the square roots of their diagonals: (..., n), by which rows and columns were
-        divided. Rows that are zero stay zero.
+        The scaled matrices: (..., n, n), and the square roots of their diagonals: (..., n), by
+        which rows and columns were divided. Rows that are zero stay zero.
     """
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = np.asarray(np.sqrt(np.maximum(diagonal, SMALLEST_DIAGONAL)), dtype=np.float64)
@@ -59,7 +59,8 @@ def scaled_pseudo_inverse(matrix: Array, tolerance: float) -> Array:
 
     Args:
         matrix: (n, n) symmetric positive semidefinite matrix.
-        tolerance: Eigenvalues of the matrix scaled to unit diagonal below this share of the largest one count as zero.
+        tolerance: Eigenvalues of the matrix scaled to unit diagonal below this share of the largest
+            one count as zero.
 
     Returns:
         (n, n) pseudo-inverse.

@@ -16,8 +16,8 @@ DEFAULT_PERMISSIONS = 0o666
 def replacing(path: str | Path) -> Iterator[Path]:
     """Write a file under a temporary name and rename it at the end.
 
-    The file appears under its name if the block succeeds. If the block fails, the temporary file is removed and an existing
-    file remains unchanged. Missing parent folders are created.
+    The file appears under its name if the block succeeds. If the block fails, the temporary file is
+    removed and an existing file remains unchanged. Missing parent folders are created.
 
     Args:
         path: Name of the final file.

@@ -1,7 +1,8 @@
 """Budget of time, engine steps and iterations for long work, and a token that asks it to stop.
 
-Long work asks `budget.exhausted` in its loops and returns the best result so far; nothing is raised to stop it.
-Ctrl-C becomes a token at the edge, in the verbs and the command line, by `stop_on_interrupt`.
+Long work asks `budget.exhausted` in its loops and returns the best result so far; nothing is raised
+to stop it. Ctrl-C becomes a token at the edge, in the verbs and the command line, by
+`stop_on_interrupt`.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ class StopToken:
     A token may be set from another thread, from a signal handler or from a callback.
 
     Args:
-        also: Function that returns True where work has to stop as well, for example at the request of a parent process.
+        also: Function that returns True where work has to stop as well, for example at the request
+            of a parent process.
     """
 
     def __init__(self, also: Callable[[], bool] | None = None) -> None:
@@ -177,8 +179,8 @@ _active: ContextVar[StopToken | None] = ContextVar("mjfim_stop_token", default=N
 def stop_on_interrupt(stop: StopToken | None = None) -> Iterator[StopToken]:
     """Turn the first Ctrl-C inside the context into a request to stop; a second one interrupts as usual.
 
-    Nested contexts share the token of the outermost one. Outside the main thread, where Python delivers no signals,
-    the token is only yielded.
+    Nested contexts share the token of the outermost one. Outside the main thread, where Python
+    delivers no signals, the token is only yielded.
 
     Args:
         stop: Token to set; default: that of the surrounding context, or a new one.

@@ -83,7 +83,8 @@ def explain_renamed_arguments(function: Callable[Arguments, Result]) -> Callable
         for old, new in RENAMED_ARGUMENTS.items():
             if old in kwargs and old not in known and new in known:
                 raise TypeError(
-                    f"{function.__name__}() has no argument {old!r} any more: use {new!r}, which is called with one event"
+                    f"{function.__name__}() has no argument {old!r} any more: use {new!r}, which "
+                    "is called with one event"
                 )
         return function(*args, **kwargs)
 

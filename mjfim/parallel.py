@@ -15,7 +15,8 @@ from mjfim.budget import Budget, StopToken
 
 T = TypeVar("T")
 
-# Time that running tasks have to return their best result after a request to stop [s]; they ask between two iterates.
+# Time that running tasks have to return their best result after a request to stop [s]; they ask
+# between two iterates.
 GRACE = 20.0
 
 # Time between two looks at the stop token while the parent process waits for a task [s].
@@ -33,9 +34,9 @@ def cores() -> int:
 class Pool(ProcessPoolExecutor):
     """Fresh worker processes, at most one per core, that share a request to stop.
 
-    Only the parent process reacts to Ctrl-C; the workers continue until `stop` is called. Other executors of
-    `concurrent.futures` can be used in place of a pool; their processes do not see the request, so that their tasks run to
-    the end.
+    Only the parent process reacts to Ctrl-C; the workers continue until `stop` is called. Other
+    executors of `concurrent.futures` can be used in place of a pool; their processes do not see the
+    request, so that their tasks run to the end.
 
     Args:
         count: Number of processes; default and maximum: one per core.
@@ -48,7 +49,10 @@ class Pool(ProcessPoolExecutor):
         super().__init__(processes, context, _initialize_worker, (self._stop,))
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Submit a task, as for any executor. Processes that are started here ignore Ctrl-C from the beginning."""
+        """Submit a task, as for any executor.
+
+        Processes that are started here ignore Ctrl-C from the beginning.
+        """
         with _interrupts_blocked():
             return super().submit(fn, *args, **kwargs)
 
@@ -83,8 +87,8 @@ def results_in_order(
     Args:
         executor: Runs the tasks.
         futures: Submitted tasks.
-        budget: When its time is used up, tasks that have not begun are cancelled, except the first one. After a request to
-            stop, all tasks return the best result that they have.
+        budget: When its time is used up, tasks that have not begun are cancelled, except the first
+            one. After a request to stop, all tasks return the best result that they have.
 
     Yields:
         The result of every task that was not cancelled.
@@ -95,7 +99,8 @@ def results_in_order(
     waiting = list(futures)
     try:
         while waiting and not budget.stop.requested:
-            # A task that has not begun by the end of the time is not worth beginning, unless it is the only hope.
+            # A task that has not begun by the end of the time is not worth beginning, unless it is
+            # the only hope.
             is_first = len(waiting) == len(futures)
             if not is_first and budget.exhausted is not None and waiting[0].cancel():
                 waiting.pop(0)
@@ -123,7 +128,8 @@ def collect_finished(executor: Executor, futures: Iterable[Future[T]]) -> list[T
         futures: Submitted tasks; those that have not begun are cancelled.
 
     Returns:
-        Results of the tasks that ended within the grace period without an error, in the given order.
+        Results of the tasks that ended within the grace period without an error, in the given
+        order.
     """
     waiting = list(futures)
     for future in waiting:

@@ -1,6 +1,7 @@
 """Bases and signals for controls: splines, Fourier series, chirps, multisines and random steps, as functions of time.
 
-A parametric excitation maps parameters in [0, 1] to a curve for every actuator, for searches over all excitations of a kind.
+A parametric excitation maps parameters in [0, 1] to a curve for every actuator, for searches over
+all excitations of a kind.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ MIN_RELATIVE_AMPLITUDE = 0.05
 # Amplitudes of a parametric multisine fall at most with this power of the frequency.
 MAX_ROLL_OFF = 2.0
 
-# Smallest share of the time of a level that the transition to it takes; protects a division by zero.
+# Smallest share of the time of a level that the transition to it takes; protects a division by
+# zero.
 SHORTEST_TRANSITION = 1e-9
 
 
@@ -66,7 +68,8 @@ def spline_basis(
         values[:, :SPLINE_DEGREE] += values[:, intervals:]
         return np.asarray(values[:, :intervals])
 
-    # Knots are repeated at both ends, so that the first two splines alone have a value or a slope there.
+    # Knots are repeated at both ends, so that the first two splines alone have a value or a slope
+    # there.
     knots = np.clip(knots, 0.0, horizon)
     values = BSpline.design_matrix(t, knots, SPLINE_DEGREE).toarray()
     first = 2 if starts_at_rest else 0
@@ -84,8 +87,9 @@ def fourier_basis(
 ) -> Array:
     """Sines and cosines of the multiples of a base frequency, each with amplitude 1.
 
-    Where a curve has to begin or end at rest, the polynomial of lowest degree with its value and first two derivatives there is
-    subtracted: a finite Fourier series with a quintic polynomial, as in point-to-point excitation of robots.
+    Where a curve has to begin or end at rest, the polynomial of lowest degree with its value and
+    first two derivatives there is subtracted: a finite Fourier series with a quintic polynomial, as
+    in point-to-point excitation of robots.
 
     Args:
         t: (N,) times [s].
@@ -138,13 +142,15 @@ def _power_derivatives(t: Array, horizon: float, powers: np.ndarray, order: int)
 def independent_curves(curves: Array) -> Array:
     """Linearly independent curves with equal span.
 
-    Curves may be nearly dependent: splines with more knots than there are samples, or waves that resemble polynomials.
+    Curves may be nearly dependent: splines with more knots than there are samples, or waves that
+    resemble polynomials.
 
     Args:
         curves: (N, M) curves.
 
     Returns:
-        The curves themselves where they are independent, else (N, K < M) orthogonal ones with root mean square 1 / sqrt(2).
+        The curves themselves where they are independent, else (N, K < M) orthogonal ones with root
+        mean square 1 / sqrt(2).
     """
     U, sizes, _ = np.linalg.svd(curves, full_matrices=False)
     kept = sizes > DEPENDENCE_TOLERANCE * sizes[0]
@@ -216,7 +222,8 @@ def relative_amplitudes(z: Array) -> Array:
 class Chirp:
     """A linear frequency sweep of every actuator.
 
-    Its parameters are amplitude, first frequency, last frequency, phase and offset of every actuator.
+    Its parameters are amplitude, first frequency, last frequency, phase and offset of every
+    actuator.
 
     Attributes:
         settings: Settings of all excitations.
@@ -263,7 +270,8 @@ def schroeder_phases(power: Array) -> Array:
 class Multisine:
     """Harmonics with Schroeder phases.
 
-    Its parameters are the base frequency, the number of harmonics and their roll-off; then amplitude and delay of every actuator.
+    Its parameters are the base frequency, the number of harmonics and their roll-off; then
+    amplitude and delay of every actuator.
 
     Attributes:
         settings: Settings of all excitations.
@@ -307,8 +315,8 @@ class Multisine:
 class RandomSteps:
     """Random levels, each of which is held for a while.
 
-    Its parameters are how long a level is held and which share of that time is a smooth transition to the next one (none where
-    jumps are allowed); then the levels of every actuator.
+    Its parameters are how long a level is held and which share of that time is a smooth transition
+    to the next one (none where jumps are allowed); then the levels of every actuator.
 
     Attributes:
         settings: Settings of all excitations.

@@ -1,10 +1,11 @@
-"""Identify parameters from a recording file, without the command line of mjfim: a template to copy and change.
+"""Identify parameters from a recording file, without the command line of mjfim: a template to copy
+and change.
 
     python scripts/identify_offline.py models/cart_pendulum.toml recording.csv
 
-A recording in the format of mjfim has a column `t`, one `ctrl:<actuator>` per actuator, and the measured columns (`qpos:<joint>`,
-`qvel:<joint>` or a sensor's name); the experiment's `[recording]` table maps the columns of any other log. `mjfim simulate`
-writes one to try it.
+A recording in the format of mjfim has a column `t`, one `ctrl:<actuator>` per actuator, and the
+measured columns (`qpos:<joint>`, `qvel:<joint>` or a sensor's name); the experiment's `[recording]`
+table maps the columns of any other log. `mjfim simulate` writes one to try it.
 """
 
 from __future__ import annotations

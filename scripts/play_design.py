@@ -2,8 +2,9 @@
 
     python scripts/play_design.py out/design.csv --model models/cart_pendulum.xml
 
-The loop sends every row of design.csv at its time to `send`. Here `send` belongs to a simulated robot; replace it by the
-interface of yours. The log that is written can be identified with `mjfim identify`.
+The loop sends every row of design.csv at its time to `send`. Here `send` belongs to a simulated
+robot; replace it by the interface of yours. The log that is written can be identified with `mjfim
+identify`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""Reproduce the study of Wilson & Murphey (2014) on MuJoCo: every number of Tables I-III and Figures 2-6.
+"""Reproduce the study of Wilson & Murphey (2014) on MuJoCo: every number of Tables I-III and
+Figures 2-6.
 
     python scripts/reproduce_paper.py -o out/paper
 
-The paper's weights are not printed; the experiment file holds ones that reproduce its optimized matrices to a few
-percent. Its Monte-Carlo tables are those of 25 Hz measurements, although its text says 100 Hz; both are run here.
+The paper's weights are not printed; the experiment file holds ones that reproduce its optimized
+matrices to a few percent. Its Monte-Carlo tables are those of 25 Hz measurements, although its text
+says 100 Hz; both are run here.
 """
 
 from __future__ import annotations
@@ -61,9 +63,10 @@ PAPER = {
     ),
 }
 NOTE = (
-    "The paper prints neither its initial control nor its weights; the ones here meet its eigenvalues and diagonals. "
-    "Small off-diagonal entries of the initial trajectory depend on the control's details. The printed covariance of "
-    "the initial trajectory is 1.3 to 1.6 times its own bound in ℓ and c; an efficient estimator stays closer."
+    "The paper prints neither its initial control nor its weights; the ones here meet its "
+    "eigenvalues and diagonals. Small off-diagonal entries of the initial trajectory depend on "
+    "the control's details. The printed covariance of the initial trajectory is 1.3 to 1.6 times "
+    "its own bound in ℓ and c; an efficient estimator stays closer."
 )
 TITLES = {"initial": "initial", "final": "optimized"}
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))
@@ -91,7 +94,10 @@ def new_table(title: str, *headings: str) -> Table:
 
 
 def table_one(design: Design) -> Table:
-    """Eigenvalues and cost. The printed cost leaves the weighted terms out: compared with the criterion 1/lambda_3."""
+    """Eigenvalues and cost.
+
+    The printed cost leaves the weighted terms out: compared with the criterion 1/lambda_3.
+    """
     table = new_table(
         "Table I: eigenvalues of the information, and cost",
         "quantity",
@@ -117,7 +123,8 @@ def matrix_table(name: str, trials: int, covariance: Array, information: Array) 
     """Tables II and III for one trajectory: all six entries of each symmetric matrix, at 25 Hz."""
     printed, bound = PAPER[name], np.asarray(np.linalg.inv(information))
     table = new_table(
-        f"Tables II and III, {TITLES[name]} trajectory, 25 Hz: covariance ({trials} trials), Fisher information, bound",
+        f"Tables II and III, {TITLES[name]} trajectory, 25 Hz: covariance ({trials} trials), "
+        "Fisher information, bound",
         "entry",
         *(
             "paper cov.",

@@ -1,4 +1,5 @@
-"""Picture of a Rerun recording, without a display: `rerun_screenshot.py design.rrd design.png --time 1.5`.
+"""Picture of a Rerun recording, without a display: `rerun_screenshot.py design.rrd design.png
+--time 1.5`.
 
 Needs a Vulkan driver; on Debian the software one of `mesa-vulkan-drivers` will do.
 """
@@ -18,7 +19,9 @@ SETTLE = 3.0  # [s] for the viewer to load and lay out
 
 
 def screenshot(rrd: Path, png: Path, time_s: float = 0.0, iteration: int | None = None) -> None:
-    """Save what the viewer shows at `sim_time` = time_s [s], or at an iteration of the optimiser instead."""
+    """Save what the viewer shows at `sim_time` = time_s [s], or at an iteration of the optimiser
+    instead.
+    """
     # the wheel's own executable: PATH may not hold the environment
     viewer_path = str(files("rerun_cli") / "rerun")
     with ViewerClient.spawn(

@@ -1,4 +1,6 @@
-"""Helpers on arrays: scaling to unit diagonal, the pseudo-inverse on top of it, evenly spread indices."""
+"""Helpers on arrays: scaling to unit diagonal, the pseudo-inverse on top of it, evenly spread
+indices.
+"""
 
 from __future__ import annotations
 

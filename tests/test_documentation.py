@@ -1,8 +1,10 @@
-"""The code that README.md and docs/ show: Python, commands and experiment files run; links point to files.
+"""The code that README.md and docs/ show: Python, commands and experiment files run; links point to
+files.
 
-A block that cannot run here carries the comment `<!-- not run: reason -->` on a line above it. Python blocks stand
-alone. Commands of one file run one after another in one folder that holds a copy of models/. A TOML block with the key
-`model` is an experiment beside models/; the TOML blocks after it extend it.
+A block that cannot run here carries the comment `<!-- not run: reason -->` on a line above it.
+Python blocks stand alone. Commands of one file run one after another in one folder that holds a
+copy of models/. A TOML block with the key `model` is an experiment beside models/; the TOML blocks
+after it extend it.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 DEFAULT_EXPERIMENT = MODELS / "cart_pendulum.toml"
 
 
-# Code that a document names: one or two names in backquotes, then `in`, then a file of the package in backquotes.
+# Code that a document names: one or two names in backquotes, then `in`, then a file of the package
+# in backquotes.
 NAMED_CODE = re.compile(r"`([\w.]+)`(?: and `([\w.]+)`)? in `(mjfim/[\w/]+\.py)`")
 
 
@@ -39,7 +42,9 @@ def runnable(path: Path, language: str) -> list[CodeBlock]:
 
 
 def commands(block: CodeBlock) -> list[tuple[str, int]]:
-    """Commands of a shell block with their exit codes, which a comment `exits with 1` behind a command states."""
+    """Commands of a shell block with their exit codes, which a comment `exits with 1` behind a
+    command states.
+    """
     lines = block.text.replace("\\\n", " ").splitlines()
     found = []
 
@@ -52,7 +57,9 @@ def commands(block: CodeBlock) -> list[tuple[str, int]]:
 
 
 def experiments(path: Path) -> list[tuple[str, dict[str, Any]]]:
-    """The experiment of every TOML block of a file: the block alone, or the experiment before it extended by the block."""
+    """The experiment of every TOML block of a file: the block alone, or the experiment before it
+    extended by the block.
+    """
     whole = tomllib.loads(DEFAULT_EXPERIMENT.read_text(encoding="utf-8"))
     found = []
 
@@ -79,7 +86,9 @@ def merged(whole: dict[str, Any], tables: dict[str, Any]) -> dict[str, Any]:
 
 
 def run(command: list[str], folder: Path, code: int = 0) -> None:
-    """Run a command with this package and this Python first; assert its exit code. Warnings are errors.
+    """Run a command with this package and this Python first; assert its exit code.
+
+    Warnings are errors.
 
     Args:
         command: Program and arguments.
@@ -152,7 +161,9 @@ def test_links_point_to_files(path: Path) -> None:
 
 @pytest.mark.parametrize("path", [*DOCUMENTS, ROOT / "CONTRIBUTING.md"], ids=lambda path: path.name)
 def test_named_code_exists(path: Path) -> None:
-    """Files of the package that a document names exist, and so do the functions and classes that it names with a file."""
+    """Files of the package that a document names exist, and so do the functions and classes that it
+    names with a file.
+    """
     text = path.read_text(encoding="utf-8")
     named_files = set(re.findall(r"mjfim/[\w/]+\.py", text))
     assert [name for name in sorted(named_files) if not (ROOT / name).exists()] == []

@@ -1,4 +1,6 @@
-"""Searches side by side: stopped early they return their best results, and one that fails does not end the others."""
+"""Searches side by side: stopped early they return their best results, and one that fails does not
+end the others.
+"""
 
 from __future__ import annotations
 
@@ -116,7 +118,10 @@ def test_ctrl_c_on_the_command_line_reaches_all_processes_and_leaves_the_best(
     tmp_path: Path,
 ) -> None:
     """A terminal sends SIGINT to the whole process group."""
-    hard = "[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] }\ncontrol_rate = 100.0"
+    hard = (
+        "[limits]\ncontrol = { force = [-5.0, 5.0] }\nposition = { slide = [-0.5, 0.5] "
+        "}\ncontrol_rate = 100.0"
+    )
     path = write_experiment(
         tmp_path, tolerance="1e-12", max_iterations=f"100000\nstarts = 2000\n{hard}"
     )

@@ -1,4 +1,6 @@
-"""Nothing in the package executes or unpickles what a file holds, and importing it loads no plotting library."""
+"""Nothing in the package executes or unpickles what a file holds, and importing it loads no
+plotting library.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ HEAVY_LIBRARIES = {"matplotlib", "rerun", "rich", "typer"}
 
 
 def unsafe_code(source: str) -> list[str]:
-    """Uses of pickling modules, of functions that execute text and of pickles in NumPy files, with line numbers."""
+    """Uses of pickling modules, of functions that execute text and of pickles in NumPy files, with
+    line numbers.
+    """
     found = []
 
     for node in ast.walk(ast.parse(source)):

@@ -1,4 +1,6 @@
-"""Bases and signals: splines of a bandwidth, Fourier series that begin and end at rest, random multisines."""
+"""Bases and signals: splines of a bandwidth, Fourier series that begin and end at rest, random
+multisines.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_spline_basis_spans_all_splines_of_its_knots_and_ends(name: str) -> None:
-    """The basis has full rank and contains random cubic splines with these knots and conditions, but none with finer knots."""
+    """The basis has full rank and contains random cubic splines with these knots and conditions,
+    but none with finer knots.
+    """
     begins, ends, periodic, count = CASES[name]
     basis = spline_basis(T, HORIZON, BANDWIDTH, begins, ends, periodic)
     assert basis.shape == (len(T), count)
@@ -122,7 +126,9 @@ def waves(t: np.ndarray, frequency: float) -> np.ndarray:
 def test_a_fourier_series_at_rest_differs_by_a_polynomial_of_lowest_degree(
     begins: bool, ends: bool, frequency: float
 ) -> None:
-    """Value and two derivatives vanish at ends at rest and only there, by differences of the samples."""
+    """Value and two derivatives vanish at ends at rest and only there, by differences of the
+    samples.
+    """
     t = np.linspace(0.0, HORIZON, 20001)
     basis = fourier_basis(t, HORIZON, frequency, HARMONICS, begins, ends)
     assert basis.shape == (len(t), 2 * HARMONICS)

@@ -1,6 +1,8 @@
-"""Hooks of mkdocs that write the reference pages from the package: the experiment file, its JSON schema, the command line.
+"""Hooks of mkdocs that write the reference pages from the package: the experiment file, its JSON
+schema, the command line.
 
-A page asks for generated text by a comment, `<!-- generated: experiment file -->` or `<!-- generated: command line -->`.
+A page asks for generated text by a comment, `<!-- generated: experiment file -->` or `<!--
+generated: command line -->`.
 """
 
 from __future__ import annotations

@@ -65,8 +65,9 @@ def campaign(
 ) -> None:
     """Repeat design, recording and estimate until every target accuracy is reached.
 
-    Without --real the robot is simulated at the `true` values. With --real each call identifies from all recordings so far,
-    designs the next round into DIR/round_K/ and ends: play its design.csv and repeat the call with --recordings.
+    Without --real the robot is simulated at the `true` values. With --real each call identifies
+    from all recordings so far, designs the next round into DIR/round_K/ and ends: play its
+    design.csv and repeat the call with --recordings.
     """
     stated = with_target_accuracies(mjfim.Experiment.from_file(experiment), wanted)
     check_folder(output)
@@ -128,12 +129,13 @@ class CampaignRun:
         experiment = self.task.experiment
         if all(spec.true is None for spec in experiment.parameters.values()):
             raise ExperimentError(
-                f"{experiment.source}: no parameter states a `true` value, at which a robot could be simulated; "
-                "state some, or use --real"
+                f"{experiment.source}: no parameter states a `true` value, at which a robot could "
+                "be simulated; state some, or use --real"
             )
         if self.folder.has_rounds:
             raise RecordingError(
-                f"{self.folder.path}: holds a campaign already; take another folder, or continue it with --real"
+                f"{self.folder.path}: holds a campaign already; take another folder, or continue "
+                "it with --real"
             )
 
         def measure(design: Design, number: int) -> Recording:

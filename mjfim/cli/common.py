@@ -35,7 +35,8 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True)
 # Console for results; files get lines that are wide enough for the tables.
 out = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
 
-# Iterations of a design and of an estimation between two lines of progress, where stderr is no terminal.
+# Iterations of a design and of an estimation between two lines of progress, where stderr is no
+# terminal.
 DESIGN_LINES = 10
 FIT_LINES = 5
 
@@ -62,7 +63,8 @@ class UnfinishedError(Exception):
 def raise_on_interrupt(error: Exception) -> Iterator[None]:
     """Raise an error when the user presses Ctrl-C, as long as the context lasts.
 
-    Long work inside replaces this by a stop token (`mjfim.budget.stop_on_interrupt`) and returns its best result so far.
+    Long work inside replaces this by a stop token (`mjfim.budget.stop_on_interrupt`) and returns
+    its best result so far.
 
     Args:
         error: The error.
@@ -70,7 +72,8 @@ def raise_on_interrupt(error: Exception) -> Iterator[None]:
     previous = signal.getsignal(signal.SIGINT)
     in_main_thread = threading.current_thread() is threading.main_thread()
 
-    # Python delivers signals to the main thread only; a process that ignores Ctrl-C keeps ignoring it.
+    # Python delivers signals to the main thread only; a process that ignores Ctrl-C keeps ignoring
+    # it.
     if not in_main_thread or not callable(previous):
         yield
         return
@@ -125,7 +128,8 @@ def root(
 def verb(function: Callable[..., None]) -> Callable[..., None]:
     """Register a function as a verb. This is the one place where errors become exit codes.
 
-    Misuse gives one message and exit code 2; Ctrl-C before any result, or a disk that is full, one message and exit code 1.
+    Misuse gives one message and exit code 2; Ctrl-C before any result, or a disk that is full, one
+    message and exit code 1.
 
     Args:
         function: The function; underscores in its name become hyphens.

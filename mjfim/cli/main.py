@@ -1,4 +1,7 @@
-"""The command line: one function per verb. Exit codes: 0 done, 1 ran but did not reach its goal, 2 misuse."""
+"""The command line: one function per verb.
+
+Exit codes: 0 done, 1 ran but did not reach its goal, 2 misuse.
+"""
 
 from __future__ import annotations
 

@@ -26,7 +26,8 @@ from mjfim.studies.robustness import assess_robustness, default_latency
 # Kinds of limits from which a design can keep a reserve.
 KINDS = ("position", "velocity", "acceleration", "control", "control_rate", "force", "clearance")
 
-# Reserve of a design where none is stated, in shares of half ranges: what 20 % wrong parameters need on the servo arm.
+# Reserve of a design where none is stated, in shares of half ranges: what 20 % wrong parameters
+# need on the servo arm.
 DEFAULT_RESERVE = ("position=0.05", "velocity=0.3", "force=0.25")
 
 
@@ -64,7 +65,10 @@ def robustness(
         list[str] | None,
         typer.Option(
             metavar="KIND=SHARE",
-            help="Share of half a range that a design made here stays away from limits of a kind; may be given several times.",
+            help=(
+                "Share of half a range that a design made here stays away from limits of a kind; "
+                "may be given several times."
+            ),
         ),
     ] = None,
 ) -> None:
@@ -98,7 +102,8 @@ def robustness(
         results.leave_robustness(output, result, seconds)
     out.print(render(describe_robustness(result)))
     errors.print(
-        f"{result.runs} runs in {seconds:.0f} s; wrote playback.json, playback.npz, playback.png to {output}/",
+        f"{result.runs} runs in {seconds:.0f} s; wrote playback.json, playback.npz, playback.png "
+        f"to {output}/",
         markup=False,
     )
     if result.runs < runs:

@@ -16,7 +16,8 @@ def bandwidth_basis(task: DesignTask, t: Array) -> Array | None:
         t: (N,) times [s].
 
     Returns:
-        (N, M) splines of which the control minus its centre is made; None where the bandwidth is not limited.
+        (N, M) splines of which the control minus its centre is made; None where the bandwidth is
+        not limited.
 
     Raises:
         ExperimentError: The bandwidth is above half of the sample rate.
@@ -27,7 +28,8 @@ def bandwidth_basis(task: DesignTask, t: Array) -> Array | None:
 
     if e.limits.bandwidth > 0.5 * e.rate:
         raise ExperimentError(
-            f"limits.bandwidth: {e.limits.bandwidth:g} Hz; a control at {e.rate:g} Hz has {0.5 * e.rate:g} Hz at most"
+            f"limits.bandwidth: {e.limits.bandwidth:g} Hz; a control at {e.rate:g} Hz has "
+            f"{0.5 * e.rate:g} Hz at most"
         )
     return boundary_splines(task, t, e.limits.bandwidth)
 

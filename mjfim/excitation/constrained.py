@@ -28,7 +28,8 @@ from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 from mjfim.signals import independent_curves
 
-# Power of the smooth E-criterion. It is always smooth here: several of the smallest eigenvalues meet under hard limits.
+# Power of the smooth E-criterion. It is always smooth here: several of the smallest eigenvalues
+# meet under hard limits.
 SMOOTH_POWER = 40.0
 
 # Growth of deviations from which on feedback is worth its time; steps are short under hard limits.
@@ -47,9 +48,11 @@ class ConstrainedSearch:
         start: Initial control; need not be feasible.
         schedule: Weights mu of the barrier stages and when a stage ends.
         max_iterations: Iterations, at most.
-        budget: Budget of the whole design; the time in the history counts from its beginning, and its token ends the search.
+        budget: Budget of the whole design; the time in the history counts from its beginning, and
+            its token ends the search.
         seconds: Time that this search may take from its own beginning [s].
-        combinations: (t, s) identifiable combinations of the parameters, or None where all are identifiable.
+        combinations: (t, s) identifiable combinations of the parameters, or None where all are
+            identifiable.
         added_information: (p, p) information of other experiments [1/theta^2], or None.
         variant: Plant on which the search runs; the result is evaluated on the stated plant later.
         threads: Threads for simulations; None for one per core.
@@ -100,7 +103,8 @@ def run_in_worker(search: ConstrainedSearch) -> RunResult:
     """Run a search to its end, for an executor.
 
     Args:
-        search: The order. A request to stop by its own token or by that of the worker's pool ends it.
+        search: The order. A request to stop by its own token or by that of the worker's pool ends
+            it.
 
     Returns:
         The best result so far.
@@ -123,7 +127,8 @@ class _Search:
         order: What was asked for.
         task: The task on the plant of the search, over one repetition.
         exact: The cost by which iterates are judged.
-        curves: (N * coarsening, M) curves of which the control is made at the stated rate, or None where it is free.
+        curves: (N * coarsening, M) curves of which the control is made at the stated rate, or None
+            where it is free.
         constraints: The limits, as far as they are tightened.
         method: Minimises the smooth cost within them.
         budget: Time and iterations of the search.
@@ -149,7 +154,8 @@ class _Search:
         )
         steps_before = task.plant.engine_steps
 
-        # A start may have curves of its own, such as a Fourier series; else a limited bandwidth asks for splines.
+        # A start may have curves of its own, such as a Fourier series; else a limited bandwidth
+        # asks for splines.
         curves = order.start.basis
         if curves is None:
             curves = bandwidth_basis(task, task.stated_times)
@@ -232,7 +238,8 @@ class _Search:
         if not np.isfinite(result.cost):
             return Status.INFEASIBLE
 
-        # The last iterate has no status where the time ended the run, or the schedule had no further stage.
+        # The last iterate has no status where the time ended the run, or the schedule had no
+        # further stage.
         return status or Status.MAX_ITERATIONS
 
     def _row(self, iterate: BarrierIterate, point: DesignPoint | None, steps: int) -> HistoryRow:

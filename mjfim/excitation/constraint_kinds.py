@@ -19,7 +19,8 @@ from mjfim.plant.batch import SubstepObservations
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Trajectory
 
-# Weight of a constraint on the final state in the barrier. A constraint that holds at every sample has the weight 1 / N.
+# Weight of a constraint on the final state in the barrier. A constraint that holds at every sample
+# has the weight 1 / N.
 END_WEIGHT = 0.1
 
 
@@ -31,9 +32,11 @@ class ConstraintValues:
         trajectory: The trajectory.
         observed: (N, substeps, w) quantities at every engine step [unit of each quantity].
         distances: (N, m) distances at the samples 1 ... N [m], or None without a clearance.
-        distance_slopes: (N, m, nv) derivatives of the distances by the position [m / q-unit], or None where not asked for.
-        observation_jacobian: (N, S, w, nx+nu) derivatives of the quantities at S engine steps of each sample by the state and
-            the control at the beginning of the sample, or None where not asked for.
+        distance_slopes: (N, m, nv) derivatives of the distances by the position [m / q-unit], or
+            None where not asked for.
+        observation_jacobian: (N, S, w, nx+nu) derivatives of the quantities at S engine steps of
+            each sample by the state and the control at the beginning of the sample, or None where
+            not asked for.
     """
 
     trajectory: Trajectory

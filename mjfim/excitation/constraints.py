@@ -70,7 +70,8 @@ class ConstraintSet:
         """Constraints with bounds that are moved inwards.
 
         Args:
-            fractions: How far, by kind, relative to half of each range; of a clearance, relative to the least distance.
+            fractions: How far, by kind, relative to half of each range; of a clearance, relative to
+                the least distance.
 
         Returns:
             The tighter set; kinds that are not named keep their bounds.
@@ -150,7 +151,8 @@ class ConstraintSet:
 
         Args:
             values: The constrained quantities, with the derivatives of distances.
-            observation_jacobian: (N, S, w, nx+nu) derivatives of the w observations at S engine steps of every sample.
+            observation_jacobian: (N, S, w, nx+nu) derivatives of the w observations at S engine
+                steps of every sample.
             delta: Relaxation of the barrier, a relative margin.
 
         Returns:
@@ -191,8 +193,8 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
 
     Args:
         task: The task.
-        every: Take the limits that are only checked as well. Else only the boundary constrains a design where
-            `limits.enforce` is false.
+        every: Take the limits that are only checked as well. Else only the boundary constrains a
+            design where `limits.enforce` is false.
 
     Returns:
         The constraint set.
@@ -214,7 +216,8 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         reach = stated.clearance + CLEARANCE_REACH
         clearance = ClearanceConstraint(distances=_distances(task, reach), least=stated.clearance)
 
-    # The holding controls are looked for even without limits on rates: a boundary that cannot be kept is an error.
+    # The holding controls are looked for even without limits on rates: a boundary that cannot be
+    # kept is an error.
     before = task.initial_hold if boundary.start == "rest" else None
     after = task.final_hold if boundary.end == "rest" else None
     rate_bounds = _bounds_of_controls(limits, "control_rate", task)

@@ -58,10 +58,11 @@ def design(
     Args:
         experiment: The experiment.
         callback: Called with a `DesignEvent` for every iterate.
-        initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's. The experiment's initial control
-            remains the reference x_d of the tracking term.
+        initial_control: (N, nu) control to begin with [u-unit]; default: the experiment's. The
+            experiment's initial control remains the reference x_d of the tracking term.
         threads: Threads for simulations; default: one per core.
-        executor: Executor of `concurrent.futures` that runs several starts under hard limits side by side.
+        executor: Executor of `concurrent.futures` that runs several starts under hard limits side
+            by side.
         stop: Token that ends the search early.
 
     Returns:
@@ -150,7 +151,8 @@ def _checked_control(task: DesignTask, control: Array) -> Array:
     control = np.asarray(control, dtype=np.float64)
     if control.shape != task.control.shape:
         raise ExperimentError(
-            f"initial_control: shape {control.shape}; it must be (samples, actuators) = {task.control.shape}"
+            f"initial_control: shape {control.shape}; it must be (samples, actuators) = "
+            f"{task.control.shape}"
         )
 
     return control
@@ -168,7 +170,10 @@ def _identifiability(
     if first.information is None or begin.trajectory is None or begin.sensitivity is None:
         reason = "when the parameters move a little along the initial control"
         if task.samples_of_parameters is not None:
-            reason += ", or at a parameter sample of [robust]; bounds keep samples where the model makes sense"
+            reason += (
+                ", or at a parameter sample of [robust]; bounds keep samples where the model "
+                "makes sense"
+            )
         raise SimulationDivergedError(f"the simulation diverges {reason}")
 
     return task.identifiability_test.along(begin.trajectory, begin.sensitivity)
@@ -432,14 +437,16 @@ def designable(task: DesignTask) -> Identifiability:
 def require_designable(task: DesignTask, identifiability: Identifiability) -> None:
     """Require that every parameter has an effect, and that the start excites whatever another control would.
 
-    Members of a declared inertia may have no effect; the design then works on the combinations that have one.
+    Members of a declared inertia may have no effect; the design then works on the combinations that
+    have one.
 
     Args:
         task: The task.
         identifiability: What can be identified.
 
     Raises:
-        UnidentifiableError: A parameter has no effect on the outputs, or the start does not excite it.
+        UnidentifiableError: A parameter has no effect on the outputs, or the start does not excite
+            it.
     """
     along_all = identifiability.along_all
     parameters = task.parameters
@@ -449,8 +456,9 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
     silent = [estimated[i].name for i in along_all.silent if not estimated[i].group]
     if silent:
         raise UnidentifiableError(
-            f"{_subject(silent)} nothing in the measured outputs, neither along the initial control nor along "
-            f"{PROBES} random ones; take {'it' if len(silent) == 1 else 'them'} out, or measure what shows the effect"
+            f"{_subject(silent)} nothing in the measured outputs, neither along the initial "
+            f"control nor along {PROBES} random ones; take {'it' if len(silent) == 1 else 'them'} "
+            "out, or measure what shows the effect"
         )
 
     # A criterion for combinations that cannot be identified.

@@ -123,21 +123,22 @@ def design_warnings(
         yield str(rough)
     if clamped:
         yield (
-            f"forcerange clamps {', '.join(clamped)} along the design: its derivatives do not hold there, it may rest on "
-            "spurious information caused by the saturation, and the descent may have stopped early; raise cost.control or "
-            "start more gently"
+            f"forcerange clamps {', '.join(clamped)} along the design: its derivatives do not hold "
+            "there, it may rest on spurious information caused by the saturation, and the descent "
+            "may have stopped early; raise cost.control or start more gently"
         )
     if final.growth > UNSTABLE_GROWTH:
         yield (
-            f"a small disturbance grows up to {final.growth:.1e}-fold along this trajectory when its control is played "
-            "open loop; the predicted sigma assumes that there is none. Play it with the gains of design.npz, or raise "
-            "cost.control"
+            f"a small disturbance grows up to {final.growth:.1e}-fold along this trajectory when "
+            "its control is played open loop; the predicted sigma assumes that there is none. "
+            "Play it with the gains of design.npz, or raise cost.control"
         )
     yield from _limit_warnings(found)
     yield from open_boundary_warnings(task)
     if found.deviation > SAME_STATE_TOLERANCE:
         yield (
-            f"played on the unmodified model, the design deviates by up to {found.deviation:.2g}: a clamp, stop or contact acts"
+            f"played on the unmodified model, the design deviates by up to {found.deviation:.2g}: "
+            "a clamp, stop or contact acts"
         )
 
 
@@ -149,8 +150,8 @@ def _limit_warnings(found: Verification) -> Iterator[str]:
         advice = "widen it, start more gently, or give the design more time"
         if kind in found.unenforced:
             advice = (
-                "they are checked, not enforced; raise cost.control or cost.tracking until they hold before running "
-                "this on hardware"
+                "they are checked, not enforced; raise cost.control or cost.tracking until they "
+                "hold before running this on hardware"
             )
         yield f"{kind} limits are exceeded by {-margin:.3g}: {advice}"
 
@@ -169,14 +170,14 @@ def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
     may_jump = experiment.limits.bandwidth is None and not with_rate.issuperset(task.controls)
     if at_rest and may_jump:
         yield (
-            "the control may jump where the design begins and ends at rest: for a smooth start state limits.control_rate or "
-            "limits.bandwidth"
+            "the control may jump where the design begins and ends at rest: for a smooth start "
+            "state limits.control_rate or limits.bandwidth"
         )
 
     if experiment.limits.enforce:
         unsupported = unsupported_ranges(task.system.model)
         if unsupported:
             yield (
-                f"the MJCF's ranges of {', '.join(unsupported)} are not among the limits of the design: "
-                "it may run into them"
+                f"the MJCF's ranges of {', '.join(unsupported)} are not among the limits of the "
+                "design: it may run into them"
             )

@@ -11,8 +11,8 @@ from mjfim.arrays import Array
 
 T = TypeVar("T")
 
-# Factors by which the deviation of a control from the centre is multiplied, tried one after the other. The first ones are
-# close to 1, because most controls violate a limit by little.
+# Factors by which the deviation of a control from the centre is multiplied, tried one after the
+# other. The first ones are close to 1, because most controls violate a limit by little.
 SHRINK_FACTORS = np.concatenate([[1.0, 0.997, 0.99, 0.97, 0.94, 0.9], 0.8 ** np.arange(1, 24)])
 
 
@@ -27,7 +27,8 @@ def shrink_until_feasible(
         evaluate: Result for a feasible control, and None for an infeasible one.
 
     Returns:
-        The result for the largest factor that makes the control feasible, or None where no factor does.
+        The result for the largest factor that makes the control feasible, or None where no factor
+        does.
     """
     for factor in SHRINK_FACTORS:
         candidate = control if factor == 1.0 else centre + factor * (control - centre)

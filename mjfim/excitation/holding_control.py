@@ -15,7 +15,8 @@ NEWTON_STEPS = 4
 # Difference step of the control, relative to its size.
 RELATIVE_DIFFERENCE = 1e-4
 
-# Time for which the control has to keep the state below the velocity that `[boundary]` tolerates [s].
+# Time for which the control has to keep the state below the velocity that `[boundary]` tolerates
+# [s].
 HOLDING_TIME = 0.1
 
 
@@ -73,6 +74,7 @@ def _require_held(system: System, state: Array, drift: Array, key: str, place: s
     if moves:
         fault = f"moves at {speed[worst]:.3g} per s"
     raise ExperimentError(
-        f"{key}: no control holds {place}: joint {name!r} {fault}; begin and end where the model can stand still "
+        f"{key}: no control holds {place}: joint {name!r} {fault}; begin and end where the model "
+        "can stand still "
         '(qvel = 0, an equilibrium), or state start = "given", end = "free"'
     )

@@ -30,7 +30,8 @@ class InitialControl:
         name: Its name in histories and messages.
         control: (N / repeats, nu) control [u-unit].
         basis: (N, M) curves within which the control is optimised first, or None for any control.
-        repeats: Number of times that the control is played over the horizon; it is optimised alone first.
+        repeats: Number of times that the control is played over the horizon; it is optimised alone
+            first.
     """
 
     name: str
@@ -52,11 +53,12 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Initi
         given: (N, nu) control that replaces the initial one, or None.
 
     Returns:
-        The given or the initial control, then those that `[descent]` asks for: earlier designs, Fourier series, repeated
-        parts, random multisines. The multisines are made one by one.
+        The given or the initial control, then those that `[descent]` asks for: earlier designs,
+        Fourier series, repeated parts, random multisines. The multisines are made one by one.
 
     Raises:
-        ExperimentError: A file, a frequency or a number of repeats cannot be used; this is found at once.
+        ExperimentError: A file, a frequency or a number of repeats cannot be used; this is found at
+            once.
     """
     descent = task.experiment.descent
     first = InitialControl(name="initial control", control=task.control)
@@ -109,7 +111,8 @@ def _fourier_series(task: DesignTask, frequency: float, rng: np.random.Generator
     harmonics = int(min(MAX_SERIES_HARMONICS, bandwidth / frequency))
     if harmonics < 1:
         raise ExperimentError(
-            f"{experiment.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of {bandwidth:g} Hz"
+            f"{experiment.source}: descent.fourier: {frequency:g} Hz is above the bandwidth of "
+            f"{bandwidth:g} Hz"
         )
 
     starts_at_rest = experiment.boundary.start == "rest"
@@ -136,11 +139,13 @@ def _first_part(task: DesignTask, count: int) -> Array:
     fewest = max(2, task.system.grid.stride)
     if samples < fewest:
         raise ExperimentError(
-            f"{source}: descent.repeats: {count} leaves {samples} of {task.samples} samples; needs {fewest}"
+            f"{source}: descent.repeats: {count} leaves {samples} of {task.samples} samples; needs "
+            f"{fewest}"
         )
     if not task.is_limited:
         raise ExperimentError(
-            f"{source}: descent.repeats needs hard limits; without, start from a shorter design (previous)"
+            f"{source}: descent.repeats needs hard limits; without, start from a shorter design "
+            "(previous)"
         )
 
     deviation = task.control[:samples] - task.centre

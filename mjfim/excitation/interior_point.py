@@ -1,7 +1,7 @@
 """Interior-point method for designs under hard limits: minimise `log J + mu B` in stages with falling barrier weight mu.
 
-A control that is far outside the limits is first steered inside without any cost. A stage that ends outside tightens the
-limits of the next one.
+A control that is far outside the limits is first steered inside without any cost. A stage that ends
+outside tightens the limits of the next one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ RELAXATION_PER_MU = 0.3
 # Largest relaxation delta of the barrier.
 MAX_RELAXATION = 0.1
 
-# Weight mu of the barrier from which on violated limits are answered by tighter limits in the next stage.
+# Weight mu of the barrier from which on violated limits are answered by tighter limits in the next
+# stage.
 TIGHTENING_MU = 4e-3
 
 # A violation at the end of a stage tightens the limit by this many times the violation.
@@ -45,7 +46,8 @@ TIME_SHARE_FACTOR = 1.5
 # Number of times that the last stage is repeated, at most, because its result violates a limit.
 MAX_REPEATED_STAGES = 3
 
-# Violation of a limit, over half of its range, up to which the barrier can bring a control back inside by itself.
+# Violation of a limit, over half of its range, up to which the barrier can bring a control back
+# inside by itself.
 MAX_START_VIOLATION = 1.0
 
 # Iterations that steer a control inside the limits, at most.
@@ -57,7 +59,8 @@ MAX_STEERING_TRIAL = 20
 # Slope of the barrier, over its size, at which steering has converged.
 STEERING_TOLERANCE = 1e-6
 
-# Weight of the control in the metric, times the number of samples, over the square of half of the control's range.
+# Weight of the control in the metric, times the number of samples, over the square of half of the
+# control's range.
 RIDGE = 0.03
 
 
@@ -69,7 +72,8 @@ class BarrierSchedule:
         first: Largest weight.
         last: Smallest weight.
         patience: Iterations of a stage, at most; the last stage may take twice as many.
-        settled: A stage ends when the merit falls by less than this times mu over `window` iterations.
+        settled: A stage ends when the merit falls by less than this times mu over `window`
+            iterations.
         window: Number of iterations over which progress is measured.
         tolerance: Slope, over the size of the merit, at which the last stage has converged.
     """
@@ -97,9 +101,11 @@ class BarrierIterate:
     Attributes:
         iterate: The iterate, numbered over all stages.
         mu: Weight of the barrier; infinite while the control is steered inside the limits.
-        margins: Worst margin of each kind of constraint [unit of the kind], negative where violated.
+        margins: Worst margin of each kind of constraint [unit of the kind], negative where
+            violated.
         status: How the run ended; None except in the last iterate.
-        repaired: True where this is not a new iterate, but the one before, shrunk until it keeps all limits.
+        repaired: True where this is not a new iterate, but the one before, shrunk until it keeps
+            all limits.
     """
 
     iterate: Iterate[InteriorPoint]
@@ -169,7 +175,8 @@ class InteriorPointMethod:
         base: The cost on the plant without clamps.
         constraints: The limits.
         centre: (nu,) control about which an infeasible control is shrunk [u-unit].
-        basis: (N, M) curves of which the control minus its centre is made; None where the control is free.
+        basis: (N, M) curves of which the control minus its centre is made; None where the control
+            is free.
         regulator: Gain of the projection operator.
         schedule: Weights of the barrier and when a stage ends.
     """
@@ -186,7 +193,8 @@ class InteriorPointMethod:
 
         Args:
             control: (N, nu) control [u-unit]; need not be feasible.
-            budget: Time and iterations of the run. Iterations that steer the control inside the limits are not counted.
+            budget: Time and iterations of the run. Iterations that steer the control inside the
+                limits are not counted.
 
         Yields:
             Every iterate.
@@ -337,7 +345,8 @@ class InteriorPointMethod:
             budget.spend(iterations=ended.iterate.index)
             reason = budget.exhausted
 
-            # Repair an infeasible end, since nothing better may follow; but nobody waits for that after Ctrl-C.
+            # Repair an infeasible end, since nothing better may follow; but nobody waits for that
+            # after Ctrl-C.
             if not ended.is_feasible and reason is not StopReason.REQUESTED:
                 yield from self._repair(problem, ended.iterate, first_index)
 
@@ -356,7 +365,8 @@ class InteriorPointMethod:
         stages_left = max(stages_left, 1)
         is_last = stages_left == 1
 
-        # A stage may take somewhat more than its equal share of the time; the last one may take all of it.
+        # A stage may take somewhat more than its equal share of the time; the last one may take all
+        # of it.
         share = 1.0 if is_last else min(TIME_SHARE_FACTOR / stages_left, 1.0)
 
         patience = self.schedule.patience * (2 if is_last else 1)
@@ -378,7 +388,8 @@ class InteriorPointMethod:
         problem = stage.problem
         values: list[float] = []
 
-        # A tighter tolerance than many a stated one: a smaller slope also makes a violation smaller.
+        # A tighter tolerance than many a stated one: a smaller slope also makes a violation
+        # smaller.
         tolerance = min(schedule.tolerance, BarrierSchedule.tolerance)
 
         iterates = optimize(
@@ -471,7 +482,8 @@ def updated_tightening(
 
     Args:
         tightening: Share of half of the range that was held back so far, by kind.
-        relative_margins: Worst margin over half of the range at the end of the stage, by kind; negative where violated.
+        relative_margins: Worst margin over half of the range at the end of the stage, by kind;
+            negative where violated.
 
     Returns:
         The new shares: larger where the limit was violated, smaller where it was well kept.

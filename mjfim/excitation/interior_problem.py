@@ -1,7 +1,7 @@
 """The cost of a design under hard limits: `log J + mu B` with the relaxed barrier B of the limits (Hauser & Saccon 2006).
 
-The logarithm makes the cost free of scale, so that one schedule of mu fits every experiment; its minima are those of J.
-The barrier is relaxed: it is defined outside the limits as well.
+The logarithm makes the cost free of scale, so that one schedule of mu fits every experiment; its
+minima are those of J. The barrier is relaxed: it is defined outside the limits as well.
 """
 
 from __future__ import annotations

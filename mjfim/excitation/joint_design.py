@@ -33,8 +33,8 @@ def design_jointly(
 ) -> tuple[Design, ...]:
     """Design several experiments in turn, each given the information of the others.
 
-    The designs depend on each other through the sum of their information alone. So where no single design can be improved,
-    all of them together cannot be improved to first order either.
+    The designs depend on each other through the sum of their information alone. So where no single
+    design can be improved, all of them together cannot be improved to first order either.
 
     Args:
         experiments: Two or more experiments that state the same parameters in the same order.
@@ -42,15 +42,18 @@ def design_jointly(
         rounds: Number of times that every experiment is designed, at most.
         tolerance: Relative improvement of the criterion in one round below which the search ends.
         threads: Threads for simulations; default: one per core.
-        executor: Executor of `concurrent.futures` that runs several starts under hard limits side by side.
+        executor: Executor of `concurrent.futures` that runs several starts under hard limits side
+            by side.
         stop: Token that ends the search with the best designs so far, as Ctrl-C does.
 
     Returns:
-        One design per experiment. `final.information` of each holds the information of all; deviations of the initial state
-        belong to each experiment alone, all other nuisance parameters are common.
+        One design per experiment. `final.information` of each holds the information of all;
+        deviations of the initial state belong to each experiment alone, all other nuisance
+        parameters are common.
 
     Raises:
-        ExperimentError: There are fewer than two experiments, or their parameters differ. See also `design`.
+        ExperimentError: There are fewer than two experiments, or their parameters differ. See also
+            `design`.
     """
     with stop_on_interrupt(stop) as token:
         tasks = [DesignTask.resolve(experiment, threads=threads) for experiment in experiments]
@@ -62,7 +65,8 @@ def design_jointly(
 
         for _ in range(rounds):
             for i, task in enumerate(tasks):
-                # After a request to stop, only experiments without any design are still designed, and that ends at once.
+                # After a request to stop, only experiments without any design are still designed,
+                # and that ends at once.
                 earlier = designs[i]
                 if token.requested and earlier is not None:
                     continue
@@ -94,7 +98,8 @@ def _require_common_parameters(tasks: Sequence[DesignTask]) -> None:
     if len(tasks) < 2 or any(other != names[0] for other in names):
         stated = "; ".join(", ".join(each) for each in names)
         raise ExperimentError(
-            f"design_jointly takes two or more experiments with the same parameters in one order: {stated}"
+            "design_jointly takes two or more experiments with the same parameters in one order: "
+            f"{stated}"
         )
 
 

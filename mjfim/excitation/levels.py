@@ -21,14 +21,15 @@ MIN_COARSE_SAMPLES = 50
 # Largest relative change of the initial cost that a coarse level without hard limits may cause.
 MAX_COARSE_CHANGE = 0.05
 
-# Factors by which the timestep of a coarse level under hard limits may be longer; the first that suits the model is taken.
+# Factors by which the timestep of a coarse level under hard limits may be longer; the first that
+# suits the model is taken.
 TIMESTEP_FACTORS = (5, 4, 3, 2)
 
 # Factor by which the samples are longer where no timestep factor divides them.
 SAMPLE_FACTOR = 2
 
-# Largest relative change of the initial cost that a coarse level under hard limits may cause. Much is tolerated, because
-# everything is optimised again on the stated level.
+# Largest relative change of the initial cost that a coarse level under hard limits may cause. Much
+# is tolerated, because everything is optimised again on the stated level.
 MAX_CONSTRAINED_COARSE_CHANGE = 0.5
 
 
@@ -38,7 +39,8 @@ class DescentLevel:
 
     Attributes:
         task: The task at the sample rate of the level.
-        basis: (t, s) identifiable combinations of the parameters, or None where all are identifiable.
+        basis: (t, s) identifiable combinations of the parameters, or None where all are
+            identifiable.
         power: Power of the smooth E-criterion; infinite for 1/lambda_min itself.
     """
 
@@ -64,8 +66,8 @@ def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> D
         basis: (t, s) identifiable combinations, or None.
 
     Returns:
-        The task with longer samples; None where the experiment does not want it, or where its initial cost differs by
-        more than 5 % from the stated one.
+        The task with longer samples; None where the experiment does not want it, or where its
+        initial cost differs by more than 5 % from the stated one.
 
     Raises:
         ExperimentError: The stated factor does not divide the samples.
@@ -79,8 +81,8 @@ def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> D
     if not is_auto and task.samples % factor:
         valid = ", ".join(str(k) for k in range(1, 17) if task.samples % k == 0)
         raise ExperimentError(
-            f"{task.experiment.source}: descent.coarse: {factor} does not divide the {task.samples} samples; "
-            f"valid for example: {valid}"
+            f"{task.experiment.source}: descent.coarse: {factor} does not divide the "
+            f"{task.samples} samples; valid for example: {valid}"
         )
     if task.samples % factor or task.samples < MIN_COARSE_SAMPLES * factor:
         return None
@@ -118,11 +120,12 @@ def easier_level(fine: DescentLevel) -> DescentLevel | None:
         fine: The stated level, on the plant without clamps.
 
     Returns:
-        A level with a longer timestep or longer samples, and with smoothed friction where the model has dry friction; one
-        with smoothed friction alone; or None.
+        A level with a longer timestep or longer samples, and with smoothed friction where the model
+        has dry friction; one with smoothed friction alone; or None.
 
     Raises:
-        ExperimentError: A stated factor divides neither the engine steps of a sample nor the samples.
+        ExperimentError: A stated factor divides neither the engine steps of a sample nor the
+            samples.
     """
     has_dry_friction = bool(fine.task.system.variant.smoothing_speeds)
     smooth = replace(fine, task=fine.task.smoothed()) if has_dry_friction else fine
@@ -152,8 +155,8 @@ def _coarse_factors(task: DesignTask) -> tuple[int, ...]:
 
     if substeps % stated and task.samples % stated:
         raise ExperimentError(
-            f"{task.experiment.source}: descent.coarse: {stated} divides neither the {substeps} engine steps of a "
-            f"sample nor the {task.samples} samples"
+            f"{task.experiment.source}: descent.coarse: {stated} divides neither the {substeps} "
+            f"engine steps of a sample nor the {task.samples} samples"
         )
     return () if stated == 1 else (stated,)
 
@@ -167,7 +170,8 @@ def _coarser(level: DescentLevel, first: DesignPoint, factor: int) -> DescentLev
         factor: Factor of the timestep, or of the samples where a sample is too few engine steps.
 
     Returns:
-        The coarse level, or None where samples cannot be divided or the initial cost differs too much.
+        The coarse level, or None where samples cannot be divided or the initial cost differs too
+        much.
     """
     task = level.task
     longer_timestep = task.system.grid.substeps % factor == 0

@@ -24,9 +24,11 @@ class Limit:
     """Range of one scalar.
 
     Attributes:
-        kind: "position", "velocity", "acceleration", "control", "control_rate", "force" or "joint_force".
+        kind: "position", "velocity", "acceleration", "control", "control_rate", "force" or
+            "joint_force".
         name: Name of the joint or the actuator.
-        index: Address in qpos, qvel, qacc, ctrl, ctrl, actuator_force or qfrc_actuator, for the kinds in this order.
+        index: Address in qpos, qvel, qacc, ctrl, ctrl, actuator_force or qfrc_actuator, for the
+            kinds in this order.
         lower: Lower bound, -inf without one [unit of the kind].
         upper: Upper bound, inf without one [unit of the kind].
     """
@@ -40,7 +42,8 @@ class Limit:
     def __post_init__(self) -> None:
         if not self.lower < self.upper:
             raise ExperimentError(
-                f"limits.{self.kind}.{self.name}: [{self.lower:g}, {self.upper:g}] is inverted; needs lower < upper"
+                f"limits.{self.kind}.{self.name}: [{self.lower:g}, {self.upper:g}] is inverted; "
+                "needs lower < upper"
             )
 
     @property
@@ -84,7 +87,8 @@ def limits_of(
         The limits; where MJCF and file both have a range, the intersection of the two.
 
     Raises:
-        ExperimentError: A name is unknown, a range is inverted, or a stated range excludes that of the MJCF.
+        ExperimentError: A name is unknown, a range is inverted, or a stated range excludes that of
+            the MJCF.
     """
     joints = {c.name: c for c in coordinates}
     scalar_actuators = {
@@ -151,7 +155,8 @@ def _limits_of_kind(kind: _KindOfLimit) -> list[Limit]:
         if len(ranges) == 2 and not lower < upper:
             from_file, from_model = (f"[{low:g}, {high:g}]" for low, high in ranges)
             raise ExperimentError(
-                f"limits.{kind.kind}.{name}: {from_file} and the MJCF's range {from_model} exclude each other"
+                f"limits.{kind.kind}.{name}: {from_file} and the MJCF's range {from_model} exclude "
+                "each other"
             )
         if np.isfinite(lower) or np.isfinite(upper):
             limits.append(Limit(kind=kind.kind, name=name, index=index, lower=lower, upper=upper))

@@ -1,8 +1,9 @@
 """Optimisation under hard limits from several initial controls, with successive halving.
 
-All starts compete with a blunt barrier, on a plant that is quicker to simulate where there is one. The best of them continue
-on the stated plant with a sharp barrier. A winner that violates a limit on the unmodified model between the points that the
-barrier evaluates is optimised again within tighter limits.
+All starts compete with a blunt barrier, on a plant that is quicker to simulate where there is one.
+The best of them continue on the stated plant with a sharp barrier. A winner that violates a limit
+on the unmodified model between the points that the barrier evaluates is optimised again within
+tighter limits.
 """
 
 from __future__ import annotations
@@ -139,8 +140,9 @@ class Multistart:
     def tighten_winner(self, results: Sequence[RunResult]) -> Runs:
         """Optimise a winner again within tighter limits while it violates a limit on the unmodified model.
 
-        The barrier evaluates distances at the samples and other quantities at some engine steps; between them a limit may be
-        violated. Where tighter limits do not help, the control is shrunk.
+        The barrier evaluates distances at the samples and other quantities at some engine steps;
+        between them a limit may be violated. Where tighter limits do not help, the control is
+        shrunk.
 
         Args:
             results: Result of every start.
@@ -237,9 +239,10 @@ class Multistart:
             start: Its initial control.
 
         Returns:
-            The result with the better of the found and the initial control, by their costs on the stated plant, and the
-            candidate with which the second round would continue: the same, or a found control that violates a limit here,
-            with its cost on the coarse level, because the second round makes it feasible again.
+            The result with the better of the found and the initial control, by their costs on the
+            stated plant, and the candidate with which the second round would continue: the same, or
+            a found control that violates a limit here, with its cost on the coarse level, because
+            the second round makes it feasible again.
         """
         found = [control for control in (result.control, start.over_horizon) if control is not None]
         costs = [self._cost_on_stated_plant(control) for control in found]
@@ -414,7 +417,8 @@ def _merge_rounds(first: Sequence[RunResult], second: Sequence[RunResult]) -> li
         for result in first
     ]
 
-    # A discarded start may be the best after all, and so may one whose second run found nothing feasible.
+    # A discarded start may be the best after all, and so may one whose second run found nothing
+    # feasible.
     best = min(range(len(merged)), key=lambda i: merged[i].cost)
     if np.isfinite(merged[best].cost) and merged[best].status in (Status.LEFT, Status.INFEASIBLE):
         merged[best] = replace(merged[best], status=Status.MAX_ITERATIONS)

@@ -29,7 +29,8 @@ from mjfim.records.trajectory import Sensitivity, Trajectory
 class RunningCost:
     """Weighted squares of the deviations from a desired trajectory and a desired control.
 
-        1/2 sum_k dt [(x_{k+1} - x_d)' Q (x_{k+1} - x_d) + (u_k - u_d)' R (u_k - u_d)],   k = 0 ... N-1
+        1/2 sum_k dt [(x_{k+1} - x_d)' Q (x_{k+1} - x_d) + (u_k - u_d)' R (u_k - u_d)],   k = 0 ...
+        N-1
 
     The initial state is given and costs nothing.
 
@@ -84,7 +85,8 @@ class DesignPoint:
         criterion: The criterion of the information with its derivative, or None.
         cost: J.
         accuracy: Differences with which the point is expanded.
-        others: Points of the same control at the further parameter samples of a robust design; their cost is left open.
+        others: Points of the same control at the further parameter samples of a robust design;
+            their cost is left open.
     """
 
     trajectory: Trajectory | None
@@ -122,8 +124,8 @@ class DesignProblem:
         information: Fisher information of the measured samples, and the criterion.
         running: Running cost.
         forward_differences_only: The differences are never refined; for coarse levels.
-        parameter_samples: Samples over which a robust design pools the criterion, theta first, or None. The same control
-            drives every sample, open loop.
+        parameter_samples: Samples over which a robust design pools the criterion, theta first, or
+            None. The same control drives every sample, open loop.
     """
 
     plant: Plant
@@ -212,7 +214,8 @@ class DesignProblem:
     def size(self, point: DesignPoint) -> float:
         """Size of J, which makes slopes relative.
 
-        The logarithm of D-optimality has no natural zero: one nat per parameter counts instead, plus the running cost.
+        The logarithm of D-optimality has no natural zero: one nat per parameter counts instead,
+        plus the running cost.
         """
         if self.information.criterion != "D":
             return point.cost
@@ -234,12 +237,14 @@ class DesignProblem:
             observations: The w quantities to observe at S engine steps of every sample, or None.
 
         Returns:
-            The expansion, and (N, S, w, nx+nu) derivatives of the observations by state and control, or None.
+            The expansion, and (N, S, w, nx+nu) derivatives of the observations by state and
+            control, or None.
         """
         trajectory, sensitivity, criterion = _computed(point)
         bilinear, a, b = self._criterion_gradient(self.theta, point, observations)
 
-        # Under hard limits the smooth E-criterion gets a model of its eigenvalues beside the gradient.
+        # Under hard limits the smooth E-criterion gets a model of its eigenvalues beside the
+        # gradient.
         model = None
         under_limits = observations is not None
         if under_limits and self.parameter_samples is None and np.isfinite(criterion.power):
@@ -265,7 +270,8 @@ class DesignProblem:
     ) -> tuple[Array, Array]:
         """Gradient of the pooled criterion, from the gradient (a, b) of the criterion at theta.
 
-        The trajectories of the further samples are functions of the control alone, so that they add to b only.
+        The trajectories of the further samples are functions of the control alone, so that they add
+        to b only.
         """
         weights = samples.weights(point.phi)
         a, b = weights[0] * a, weights[0] * b
@@ -317,7 +323,10 @@ class DesignProblem:
 
 
 def _computed(point: DesignPoint) -> tuple[Trajectory, Sensitivity, Criterion]:
-    """Trajectory, sensitivity and criterion of a point. Raises ValueError for a trial that diverges."""
+    """Trajectory, sensitivity and criterion of a point.
+
+    Raises ValueError for a trial that diverges.
+    """
     if point.trajectory is None or point.sensitivity is None or point.criterion is None:
         raise ValueError("a diverged trial has no expansion")
     return point.trajectory, point.sensitivity, point.criterion

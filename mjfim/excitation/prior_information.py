@@ -17,8 +17,8 @@ from mjfim.records.saved_information import SavedInformation
 def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
     """Sum the information of earlier experiments about the named parameters, without their priors.
 
-    Further parameters that a file knows are marginalised, under the file's priors on them. So are deviations of the initial
-    state, which belong to one experiment alone.
+    Further parameters that a file knows are marginalised, under the file's priors on them. So are
+    deviations of the initial state, which belong to one experiment alone.
 
     Args:
         paths: Files design.json and estimate.json.
@@ -37,7 +37,8 @@ def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
         except RecordingError as error:
             raise ExperimentError(f"earlier: {error}") from None
 
-        # Deviations of the initial state have the same names in every experiment, but not the same values.
+        # Deviations of the initial state have the same names in every experiment, but not the same
+        # values.
         common = [
             name
             for name in names

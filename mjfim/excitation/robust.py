@@ -3,7 +3,8 @@
     mean    1/S sum_s phi_s
     worst   (1/S sum_s phi_s^q)^(1/q), a smooth maximum
 
-The phi of D-optimality is a logarithm already; its smooth maximum is `log(1/S sum_s exp(q phi_s)) / q`.
+The phi of D-optimality is a logarithm already; its smooth maximum is `log(1/S sum_s exp(q phi_s)) /
+q`.
 """
 
 from __future__ import annotations

@@ -22,8 +22,8 @@ class RunResult:
 
     Attributes:
         name: Name of the initial control.
-        control: (N, nu) best control at the stated sample rate: of hard limits the best feasible one, else the last one; None
-            where no iterate could be simulated.
+        control: (N, nu) best control at the stated sample rate: of hard limits the best feasible
+            one, else the last one; None where no iterate could be simulated.
         cost: J of the control; infinite where it is infeasible or unknown.
         status: How the run ended.
         slope: |DJ . zeta| at the last iterate.

@@ -1,8 +1,9 @@
 """`mjfim.shortest_experiment`: the shortest experiment whose design reaches every target standard deviation.
 
-Standard deviations fall like T^-1/2 or faster with the duration T. So a secant on their logarithms finds the duration at
-which the worst ratio of a predicted to a target standard deviation is 1. Both ends of the bracket are designs: the returned
-one reaches the targets, and one that is shorter by the tolerance does not.
+Standard deviations fall like T^-1/2 or faster with the duration T. So a secant on their logarithms
+finds the duration at which the worst ratio of a predicted to a target standard deviation is 1. Both
+ends of the bracket are designs: the returned one reaches the targets, and one that is shorter by
+the tolerance does not.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ class Tried:
 
     Attributes:
         horizon: The duration [s].
-        ratio: Largest ratio of a predicted to a target standard deviation; infinite without a design.
+        ratio: Largest ratio of a predicted to a target standard deviation; infinite without a
+            design.
         parameter: Name of the parameter with this ratio.
         why: Why there is no design; empty where there is one.
     """
@@ -83,8 +85,8 @@ class ShortestExperiment:
         design: Its design, which reaches every target.
         tried: All durations in the order in which they were tried.
         tolerance: The horizon is too long by this at most, where the search is closed [s].
-        closed: True where a duration that is shorter by no more than the tolerance does not reach the targets, or where there
-            is no shorter one.
+        closed: True where a duration that is shorter by no more than the tolerance does not reach
+            the targets, or where there is no shorter one.
     """
 
     experiment: Experiment
@@ -138,17 +140,19 @@ def shortest_experiment(
 ) -> ShortestExperiment:
     """Find the shortest horizon whose design is predicted to reach every target standard deviation, and that design.
 
-    Every design begins with that of the nearest duration so far instead of the initial control, and where that does not
-    reach the targets, with the initial control as well.
+    Every design begins with that of the nearest duration so far instead of the initial control, and
+    where that does not reach the targets, with the initial control as well.
 
     Args:
         experiment: The experiment; at least one parameter states `wanted`.
-        longest: Longest horizon [s]; default: four times that of the experiment, or as long as its table of the initial
-            control lasts.
+        longest: Longest horizon [s]; default: four times that of the experiment, or as long as its
+            table of the initial control lasts.
         tolerance: The horizon may be too long by this [s]; default: 2 % of it; at least one sample.
-        callback: Called with a `DesignEvent` for every iterate, and a `StudyEvent` for every duration that was tried.
+        callback: Called with a `DesignEvent` for every iterate, and a `StudyEvent` for every
+            duration that was tried.
         threads: Threads for simulations; default: one per core.
-        executor: Executor of `concurrent.futures` that runs several starts under hard limits side by side.
+        executor: Executor of `concurrent.futures` that runs several starts under hard limits side
+            by side.
         stop: Token that ends the search with the shortest one so far, as Ctrl-C does.
 
     Returns:
@@ -219,7 +223,8 @@ class _HorizonSearch:
         if found is None:
             self._raise_out_of_reach(largest)
 
-        # The bracket is closed where its lower end was tried as well, or where nothing shorter exists.
+        # The bracket is closed where its lower end was tried as well, or where nothing shorter
+        # exists.
         is_shortest = found <= self.grid.minimum
         is_narrow = below is not None and found - below <= self.slack(found)
         return ShortestExperiment(
@@ -282,7 +287,8 @@ class _HorizonSearch:
 
         Args:
             samples: Number of samples.
-            near: Number of samples of the design with whose control to begin; None for the initial control.
+            near: Number of samples of the design with whose control to begin; None for the initial
+                control.
 
         Returns:
             The outcome, or None where the design was stopped.
@@ -302,7 +308,8 @@ class _HorizonSearch:
                 return None
             require_reachable(task, design, self.targets)
         except MjfimError as error:
-            # A fault at the stated horizon is the user's to see; at another one it only rules that horizon out.
+            # A fault at the stated horizon is the user's to see; at another one it only rules that
+            # horizon out.
             if not self.tried:
                 raise
             return Tried(horizon=horizon, ratio=np.inf, why=str(error))
@@ -330,9 +337,9 @@ class _HorizonSearch:
             missed = missed_targets(names, design.final.std, self.targets)
             reason = f"the target is missed by {missed}"
         raise OutOfReachError(
-            f"{self.experiment.source}: even {longest.horizon:g} s is too short: {reason}. Allow a longer experiment (`longest`, "
-            "or a longer table of the initial control) or a stronger control, or ask for less; `mjfim check` says how many "
-            "repetitions reach it"
+            f"{self.experiment.source}: even {longest.horizon:g} s is too short: {reason}. Allow a "
+            "longer experiment (`longest`, or a longer table of the initial control) or a "
+            "stronger control, or ask for less; `mjfim check` says how many repetitions reach it"
         )
 
 

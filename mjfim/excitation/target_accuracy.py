@@ -27,8 +27,8 @@ def target_accuracies(task: DesignTask) -> Array:
         tables = task.experiment.parameters.items()
         name = next((n for n, table in tables if table.inertial is None), "<name>")
         raise ExperimentError(
-            f"{task.experiment.source}: no parameter states which standard deviation is wanted; state it in the "
-            f"parameter's unit, for example parameters.{name}.wanted = 0.01"
+            f"{task.experiment.source}: no parameter states which standard deviation is wanted; "
+            f"state it in the parameter's unit, for example parameters.{name}.wanted = 0.01"
         )
     return np.array([np.inf if value is None else value for value in stated])
 
@@ -65,6 +65,7 @@ def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
     names = ", ".join(task.parameters.names[j] for j in unreachable)
     known = f": {'; '.join(design.combinations)}" if design.combinations else ""
     raise UnidentifiableError(
-        f"{task.experiment.source}: no standard deviation of {names} can be reached, because this experiment does not "
-        f"identify every parameter by itself{known}. Take one of them out, give it a prior, or measure something else"
+        f"{task.experiment.source}: no standard deviation of {names} can be reached, because this "
+        f"experiment does not identify every parameter by itself{known}. Take one of them out, "
+        "give it a prior, or measure something else"
     )

@@ -39,7 +39,8 @@ from mjfim.signals import multisine
 # Harmonics of a random multisine.
 RANDOM_HARMONICS = 10
 
-# Amplitudes of random controls that look for identifiable parameters, relative to that of the initial control.
+# Amplitudes of random controls that look for identifiable parameters, relative to that of the
+# initial control.
 LEAST_PROBE_AMPLITUDE = 1.0
 MOST_PROBE_AMPLITUDE = 2.0
 
@@ -59,10 +60,14 @@ class DesignTask:
         tracking: (nx,) diagonal of Q_tau, the weight on deviations from the initial trajectory.
         control_weight: (nu,) diagonal of R_tau, the weight on the control.
         control_about: (nu,) control that costs nothing.
-        contrast: (t, c) combinations of the scaled wanted parameters whose variances criterion "c" sums, or None.
-        prior_information: (p, p) information of earlier experiments, without the priors of the parameters.
-        added_information: (p, p) the part of it that the caller added to the experiment's `earlier` files, or None.
-        samples_of_parameters: Parameter values over which a robust design pools its criterion, or None.
+        contrast: (t, c) combinations of the scaled wanted parameters whose variances criterion "c"
+            sums, or None.
+        prior_information: (p, p) information of earlier experiments, without the priors of the
+            parameters.
+        added_information: (p, p) the part of it that the caller added to the experiment's `earlier`
+            files, or None.
+        samples_of_parameters: Parameter values over which a robust design pools its criterion, or
+            None.
     """
 
     system: System
@@ -91,11 +96,13 @@ class DesignTask:
         Args:
             experiment: The experiment as the user states it.
             threads: Threads for the engine; default: one per core.
-            added_information: (p, p) information of other experiments besides the stated `earlier` files.
+            added_information: (p, p) information of other experiments besides the stated `earlier`
+                files.
             variant: How the plant differs from the user's model; default: it does not.
 
         Raises:
-            ExperimentError: Something is wrong or missing in the experiment; the message names the key.
+            ExperimentError: Something is wrong or missing in the experiment; the message names the
+                key.
             ModelError: The model cannot be used.
         """
         require_design_keys(experiment)
@@ -109,10 +116,12 @@ class DesignTask:
 
         Args:
             system: The system.
-            added_information: (p, p) information of other experiments besides the stated `earlier` files.
+            added_information: (p, p) information of other experiments besides the stated `earlier`
+                files.
 
         Raises:
-            ExperimentError: Something is wrong or missing in the experiment; the message names the key.
+            ExperimentError: Something is wrong or missing in the experiment; the message names the
+                key.
         """
         experiment = system.experiment
         require_design_keys(experiment)
@@ -248,7 +257,8 @@ class DesignTask:
         experiment, parameters = self.experiment, self.parameters
         measure_rate = self.system.measure_rate
 
-        # Prior information is a sum over samples; the cost wants it per second, equal on every sample grid.
+        # Prior information is a sum over samples; the cost wants it per second, equal on every
+        # sample grid.
         per_sample = measure_rate / (experiment.measure_rate or experiment.rate)
         all_wanted = len(parameters.interest) == len(parameters)
 
@@ -355,7 +365,10 @@ class DesignTask:
 
     @cached_property
     def final_hold(self) -> Array:
-        """(nu,) control that holds the state at which the design comes to rest. Raises ExperimentError."""
+        """(nu,) control that holds the state at which the design comes to rest.
+
+        Raises ExperimentError.
+        """
         key = keyframe(self.system.model, "boundary.keyframe", self.experiment.boundary.keyframe)
         rest = self.system.rest if key is None else np.array(key.ctrl)
         return holding_control(
@@ -410,7 +423,8 @@ class DesignTask:
             count: Number of controls.
 
         Yields:
-            Trajectories of controls up to twice as large as the initial one; those that diverge are left out.
+            Trajectories of controls up to twice as large as the initial one; those that diverge are
+            left out.
         """
         rng = np.random.default_rng(self.experiment.descent.seed)
         for _ in range(count):

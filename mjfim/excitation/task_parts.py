@@ -34,11 +34,13 @@ def require_design_keys(experiment: Experiment) -> None:
     """
     if experiment.horizon is None:
         raise ExperimentError(
-            f"{experiment.source}: design needs `horizon`, the duration of the experiment [s], for example horizon = 4.0"
+            f"{experiment.source}: design needs `horizon`, the duration of the experiment [s], for "
+            "example horizon = 4.0"
         )
     if experiment.initial.control is None:
         raise ExperimentError(
-            f"{experiment.source}: design needs `initial.control`, the control from which it starts, for example "
+            f"{experiment.source}: design needs `initial.control`, the control from which it "
+            "starts, for example "
             'control = { kind = "multisine", amplitude = 1.0 }'
         )
 
@@ -51,7 +53,8 @@ def sample_count(experiment: Experiment, stride: int) -> int:
         stride: Samples from one measurement to the next.
 
     Raises:
-        ExperimentError: The horizon is not a whole number of samples, is too long, or ends before the first measurement.
+        ExperimentError: The horizon is not a whole number of samples, is too long, or ends before
+            the first measurement.
     """
     horizon = float(experiment.horizon or 0.0)
     period = 1.0 / experiment.rate
@@ -109,8 +112,8 @@ def require_bounded_controls(system: System, limits: tuple[Limit, ...], weight: 
     for name, value in zip(system.controls, weight.tolist(), strict=True):
         if value <= 0.0 and name not in bounded:
             raise ExperimentError(
-                f"cost.control: actuator {name!r} has neither a weight nor a range; it needs a weight > 0, "
-                f"or a hard limit: limits.control.{name} = [lower, upper]"
+                f"cost.control: actuator {name!r} has neither a weight nor a range; it needs a "
+                f"weight > 0, or a hard limit: limits.control.{name} = [lower, upper]"
             )
 
 

@@ -22,7 +22,8 @@ from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regul
 from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 
-# Growth of a small deviation along the open-loop trajectory up to which the projection needs no feedback.
+# Growth of a small deviation along the open-loop trajectory up to which the projection needs no
+# feedback.
 FEEDBACK_THRESHOLD = 10.0
 
 # Smallest tolerance on a coarse level, whose minimum is refined anyway.
@@ -34,13 +35,15 @@ MEETING_RATIO = 1.02
 # The same ratio for a descent that has stalled.
 STALLED_MEETING_RATIO = 1.2
 
-# Powers of the smooth E-criterion: the first one, and the sharper one that may follow on the stated level.
+# Powers of the smooth E-criterion: the first one, and the sharper one that may follow on the stated
+# level.
 SMOOTH_POWERS = (40.0, 160.0)
 
 # Ratio of the smooth to the exact criterion below which the first power is accurate enough.
 MAX_SMOOTHING_ERROR = 1.01
 
-# Number of successive iterates that may use a clamp of the model before a barrier has to keep them off it.
+# Number of successive iterates that may use a clamp of the model before a barrier has to keep them
+# off it.
 MAX_CLAMPED_ITERATES = 10
 
 
@@ -77,7 +80,8 @@ def regulator_for(task: DesignTask) -> Regulator:
         task: The task.
 
     Returns:
-        A regulator with unit weights on state and control, without feedback where deviations do not grow much.
+        A regulator with unit weights on state and control, without feedback where deviations do not
+        grow much.
     """
     Q = np.eye(task.space.nx) * task.dt
     R = np.eye(len(task.controls)) * task.dt
@@ -167,7 +171,8 @@ class UnconstrainedSearch:
     def run(self, start: InitialControl) -> Generator[DesignEvent, None, RunResult]:
         """Descend from one initial control through all levels.
 
-        Where the smallest eigenvalues meet, the E-criterion is replaced by the smooth one, on this and all finer levels.
+        Where the smallest eigenvalues meet, the E-criterion is replaced by the smooth one, on this
+        and all finer levels.
 
         Args:
             start: The initial control.
@@ -258,7 +263,8 @@ class UnconstrainedSearch:
                 if reason is not None:
                     return _stop(ended, reason)
 
-            # Where the smallest eigenvalues cross, the exact criterion has a kink that no step crosses.
+            # Where the smallest eigenvalues cross, the exact criterion has a kink that no step
+            # crosses.
             may_continue = iterate.status is None and iterate.index > 0
             if may_continue and _eigenvalues_meet(stage, ended.eigenvalues):
                 return replace(ended, eigenvalues_meet=True)
@@ -421,7 +427,8 @@ def _next_power(stage: DescentLevel, ended: _Pass) -> tuple[float, bool]:
         meet = ended.eigenvalues_meet or (stalled and close)
         return (SMOOTH_POWERS[0], True) if meet else (power, False)
 
-    # The smooth criterion becomes sharper, once, where it is too far from the exact one at the stated rate.
+    # The smooth criterion becomes sharper, once, where it is too far from the exact one at the
+    # stated rate.
     error = float(np.sum((values[0] / values) ** power) ** (1.0 / power))
     is_stated_rate = stage.task.system.variant.sample_factor == 1
     if error > MAX_SMOOTHING_ERROR and power < SMOOTH_POWERS[-1] and is_stated_rate:

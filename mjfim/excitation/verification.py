@@ -31,9 +31,11 @@ class Verification:
     """Margins of all limits when a control is played open loop on the unmodified model.
 
     Attributes:
-        margins: Smallest margin of each kind over all engine steps, negative outside [unit of the kind].
+        margins: Smallest margin of each kind over all engine steps, negative outside [unit of the
+            kind].
         relative_margins: These margins over half of each range, or over the clearance.
-        deviation: Largest difference of a state at the samples from the designed trajectory [unit of the state].
+        deviation: Largest difference of a state at the samples from the designed trajectory [unit
+            of the state].
         unenforced: Kinds that are checked, not enforced.
         usage: Position of every limited quantity in its range over time.
     """
@@ -161,7 +163,8 @@ def require_feasible_start(task: DesignTask) -> None:
         task: The task.
 
     Raises:
-        ExperimentError: A limit cannot be kept, or excludes the initial state, the final state or a control that holds one.
+        ExperimentError: A limit cannot be kept, or excludes the initial state, the final state or a
+            control that holds one.
     """
     try:
         _require_feasible_start(task)
@@ -203,7 +206,8 @@ def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, st
             unit = units[limit.name] + ("/s" if limit.kind == "velocity" else "")
             raise ExperimentError(
                 f"limits.{limit.kind}.{limit.name}: {where} is at {value:g} {unit}, outside "
-                f"[{limit.lower:g}, {limit.upper:g}]; widen the limit (where it is the MJCF's, there) or move {where}"
+                f"[{limit.lower:g}, {limit.upper:g}]; widen the limit (where it is the MJCF's, "
+                f"there) or move {where}"
             )
 
     if constraints.clearance is None:
@@ -213,8 +217,9 @@ def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, st
     if distance < least:
         fault = "in collision" if distance < 0.0 else "too close"
         raise ExperimentError(
-            f"limits.clearance: {where} is {fault}: {pair.name} are {distance:.3g} m apart, wanted {least:g} m; "
-            f"move {where}, lower the clearance, or list the pair's bodies in limits.ignored"
+            f"limits.clearance: {where} is {fault}: {pair.name} are {distance:.3g} m apart, wanted "
+            f"{least:g} m; move {where}, lower the clearance, or list the pair's bodies in "
+            "limits.ignored"
         )
 
 

@@ -10,7 +10,8 @@ from pydantic import BaseModel, ValidationError
 
 from mjfim.errors import unknown
 
-# Endings of pydantic's names for faults that say that a value has the wrong type or is none of the stated words.
+# Endings of pydantic's names for faults that say that a value has the wrong type or is none of the
+# stated words.
 WRONG_TYPE = ("_type", "literal_error")
 
 
@@ -34,7 +35,8 @@ def explain(
         keys, _ = _walk(table, fault["loc"])
         faults_by_key.setdefault(".".join(keys), []).append(fault)
 
-    # A fault inside a table is repeated for the table itself; the innermost one is the most specific.
+    # A fault inside a table is repeated for the table itself; the innermost one is the most
+    # specific.
     innermost = [
         key
         for key in faults_by_key
@@ -76,7 +78,8 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
     if fault["type"] == "missing":
         return "this key is required"
 
-    # Where no branch has the right type, all of them are offered; else only the faults of the chosen kind.
+    # Where no branch has the right type, all of them are offered; else only the faults of the
+    # chosen kind.
     only_types = fault["type"].endswith(WRONG_TYPE)
     shown_faults = [f for f in faults if only_types or f["type"] == fault["type"]]
     first, *others = dict.fromkeys(_message(f) for f in shown_faults)
@@ -112,7 +115,8 @@ def _message(fault: Mapping[str, Any]) -> str:
 def _walk(table: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], Any]:
     """Follow a location of pydantic through the types.
 
-    pydantic names the branch of a union inside a location, which the user never wrote: these parts are left out.
+    pydantic names the branch of a union inside a location, which the user never wrote: these parts
+    are left out.
 
     Returns:
         The user's keys, and the type at the end of the location.
@@ -151,8 +155,8 @@ def _branches(annotation: Any) -> list[Any]:
 def _chosen(branches: list[Any], tag: str) -> Any:
     """Find the branch of a union by the name that pydantic gives it; None where there is none.
 
-    pydantic writes `Table` for a table, `function-after[_check(), Table]` for a table with a validator, and `dict[...]` or
-    `tuple[...]` for a container.
+    pydantic writes `Table` for a table, `function-after[_check(), Table]` for a table with a
+    validator, and `dict[...]` or `tuple[...]` for a container.
     """
     for branch in branches:
         container = get_origin(branch) or branch

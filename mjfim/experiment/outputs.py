@@ -26,7 +26,8 @@ from mjfim.plant.state_space import StateSpace
 # Relative tolerance with which one rate has to divide another one.
 RATE_TOLERANCE = 1e-6
 
-# Smallest eigenvalue of a covariance over its largest entry, below which it counts as not positive definite.
+# Smallest eigenvalue of a covariance over its largest entry, below which it counts as not positive
+# definite.
 DEFINITENESS = 1e-12
 
 
@@ -148,7 +149,8 @@ class _NoiseTable:
         others = np.setdiff1d(np.arange(len(self.columns)), rows)
         if np.any(self.covariance[np.ix_(rows, others)]):
             raise ExperimentError(
-                "correlated.outputs: one of them is already correlated with an output that is not listed"
+                "correlated.outputs: one of them is already correlated with an output that is not "
+                "listed"
             )
 
         self.covariance[np.ix_(rows, rows)] = _checked_covariance(
@@ -236,7 +238,10 @@ def _key_covariance(key: str, spec: NoiseSpec, sigma_factors: Array) -> Array:
 
 
 def _checked_covariance(key: str, rows: tuple[tuple[float, ...], ...], n: int) -> Array:
-    """(n, n) stated covariance. Raises ExperimentError unless it is symmetric and positive definite."""
+    """(n, n) stated covariance.
+
+    Raises ExperimentError unless it is symmetric and positive definite.
+    """
     if len(rows) != n or any(len(row) != n for row in rows):
         raise ExperimentError(f"{key}: expected {n} rows of {n} numbers, one per output")
 

@@ -71,7 +71,10 @@ def resolve_parameters(
 def _single_parameter(
     name: str, spec: ParameterSpec, model: Any, outputs: Sequence[str]
 ) -> Parameter:
-    """A parameter with targets or a function. Its guess, magnitude and unit default to those of its first target."""
+    """A parameter with targets or a function.
+
+    Its guess, magnitude and unit default to those of its first target.
+    """
     targets = tuple(Target(t.path, t.scale, t.offset) for t in spec.all_targets)
     guess = spec.guess
     magnitude = 0.0
@@ -96,7 +99,8 @@ def _single_parameter(
     bounds = spec.bounds or (-np.inf, np.inf)
     if not bounds[0] <= guess <= bounds[1]:
         raise ExperimentError(
-            f"parameters.{name}.guess: the value {guess:g} in the model is outside bounds {list(bounds)}"
+            f"parameters.{name}.guess: the value {guess:g} in the model is outside bounds "
+            f"{list(bounds)}"
         )
 
     magnitude = max(abs(guess), magnitude)
@@ -128,14 +132,17 @@ def _scale(name: str, spec: ParameterSpec, guess: float, magnitude: float) -> fl
 
     if scale == 0.0:
         raise ExperimentError(
-            f"parameters.{name}.scale: the value in the model or the guess is 0: state a guess, or a scale in the "
-            "parameter's unit"
+            f"parameters.{name}.scale: the value in the model or the guess is 0: state a guess, or "
+            "a scale in the parameter's unit"
         )
     return scale
 
 
 def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[Parameter]:
-    """The ten coordinates of a body's inertia. Their prior is relative to the natural magnitude of each."""
+    """The ten coordinates of a body's inertia.
+
+    Their prior is relative to the natural magnitude of each.
+    """
     key = f"parameters.{name}.inertial"
     kind = spec.coordinates or "logcholesky"
     parametrisation = INERTIA_PARAMETRISATIONS[kind]
@@ -197,7 +204,8 @@ def _nuisance_parameters(
     unnamed = unnamed_count(model, "joint")
     if unnamed and stated.initial is not None and not isinstance(stated.initial, Mapping):
         raise ExperimentError(
-            f"nuisance.initial: {unnamed} joints have no name: give them one in the MJCF, or state deviations by name"
+            f"nuisance.initial: {unnamed} joints have no name: give them one in the MJCF, or state "
+            "deviations by name"
         )
     for name, prior in _priors_by_name("nuisance.initial", stated.initial, list(paths)):
         yield _nuisance_parameter(

@@ -26,13 +26,16 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"  # Dialect of the JSON 
 class Experiment(Section):
     """An experiment: the model, its unknown parameters, the measurements and the task.
 
-    Immutable; `replace` makes a changed copy. Relative paths inside are relative to `directory`, the folder of the experiment
-    file.
+    Immutable; `replace` makes a changed copy. Relative paths inside are relative to `directory`,
+    the folder of the experiment file.
     """
 
     model: str = Field(description="Path of the MJCF file, relative to the experiment file.")
     rate: Positive = Field(
-        description="Rate of the samples and of the control updates [Hz]. One sample is a whole number of engine time steps."
+        description=(
+            "Rate of the samples and of the control updates [Hz]. One sample is a whole number of "
+            "engine time steps."
+        )
     )
     measure_rate: Positive | None = Field(
         default=None,
@@ -40,34 +43,52 @@ class Experiment(Section):
     )
     playback_rate: Positive | None = Field(
         default=None,
-        description="Rate of the rows of design.csv, that of the robot's controller [Hz]; a multiple of `rate`. Default: `rate`.",
+        description=(
+            "Rate of the rows of design.csv, that of the robot's controller [Hz]; a multiple of "
+            "`rate`. Default: `rate`."
+        ),
     )
     horizon: Positive | None = Field(
         default=None,
-        description="Duration of a designed experiment [s], a whole number of samples. Identification does not need it.",
+        description=(
+            "Duration of a designed experiment [s], a whole number of samples. Identification "
+            "does not need it."
+        ),
     )
     initial: Initial = Field(
         default=Initial(), description="Initial state and initial control of the experiment."
     )
     parameters: dict[str, ParameterSpec] = Field(
         min_length=1,
-        description="Unknown parameters by name, one table each. Their order in the file is the order of theta.",
+        description=(
+            "Unknown parameters by name, one table each. Their order in the file is the order of "
+            "theta."
+        ),
     )
     noise: dict[str, Positive | NoiseSpec] = Field(
         default_factory=dict,
-        description="Measured outputs: standard deviation of the noise [output unit] or a table, by `state` (all positions and "
-        "velocities), `qpos:<joint>`, `qvel:<joint>` or sensor name. Default: the sensors whose `noise` the MJCF states.",
+        description=(
+            "Measured outputs: standard deviation of the noise [output unit] or a table, by "
+            "`state` (all positions and velocities), `qpos:<joint>`, `qvel:<joint>` or sensor "
+            "name. Default: the sensors whose `noise` the MJCF states."
+        ),
     )
     correlated: tuple[Correlated, ...] = Field(
         default=(), description="Covariances of outputs whose noise is correlated."
     )
     nuisance: Nuisance = Field(
         default=Nuisance(),
-        description="Unknown deviations of the initial state, biases and delay that the design spends no effort on.",
+        description=(
+            "Unknown deviations of the initial state, biases and delay that the design spends no "
+            "effort on."
+        ),
     )
     earlier: tuple[str, ...] = Field(
         default=(),
-        description="Files design.json or estimate.json of other experiments, whose information adds to that of this one.",
+        description=(
+            "Files design.json or estimate.json of other experiments, whose information adds to "
+            "that of this one."
+        ),
     )
     cost: Cost = Field(default=Cost(), description="The cost that a design minimises.")
     robust: Robust | None = Field(
@@ -81,7 +102,10 @@ class Experiment(Section):
     )
     recording: RecordingSpec = Field(
         default=RecordingSpec(),
-        description="How the columns of a log become a recording. Default: the columns of mjfim's own CSV files.",
+        description=(
+            "How the columns of a log become a recording. Default: the columns of mjfim's own CSV "
+            "files."
+        ),
     )
     fit: FitSpec = Field(
         default=FitSpec(), description="How parameters are estimated from recordings."
@@ -142,8 +166,9 @@ class Experiment(Section):
     def replace(self, **tables: Any) -> Experiment:
         """Make a checked copy with changes.
 
-        Tables merge into the old ones, one level deep: `experiment.replace(cost={"control": 1e-2})` keeps the other keys of
-        `cost`. `parameters` merges parameter by parameter; a parameter cannot be taken out.
+        Tables merge into the old ones, one level deep: `experiment.replace(cost={"control": 1e-2})`
+        keeps the other keys of `cost`. `parameters` merges parameter by parameter; a parameter
+        cannot be taken out.
 
         Args:
             **tables: Keys and tables to change, with the names of the experiment file.

@@ -1,7 +1,8 @@
 """The system that an experiment is about: model, parameters, outputs, noise, time grid and plant.
 
-A system knows no horizon, no cost and no control; `excitation.task` and `identification.task` add what a design and an
-estimation need. Every name in the experiment is checked here against the model.
+A system knows no horizon, no cost and no control; `excitation.task` and `identification.task` add
+what a design and an estimation need. Every name in the experiment is checked here against the
+model.
 """
 
 from __future__ import annotations
@@ -77,7 +78,8 @@ class TimeGrid:
         """This grid with longer samples or a longer timestep; longer samples are all measured."""
         if self.substeps % variant.timestep_factor:
             raise ValueError(
-                f"{self.substeps} engine steps of a sample do not divide by {variant.timestep_factor}"
+                f"{self.substeps} engine steps of a sample do not divide by "
+                f"{variant.timestep_factor}"
             )
 
         return replace(
@@ -132,7 +134,8 @@ class System:
             source: The model of the experiment, where it is parsed already.
 
         Raises:
-            ExperimentError: A name, a file or a number in the experiment is wrong; the message names the key.
+            ExperimentError: A name, a file or a number in the experiment is wrong; the message
+                names the key.
             ModelError: The model cannot be used.
         """
         try:
@@ -219,7 +222,8 @@ class System:
                 smooth=smooth,
             )
 
-        # Friction that is smoothed for derivatives only needs a second plant, on which these are taken.
+        # Friction that is smoothed for derivatives only needs a second plant, on which these are
+        # taken.
         speeds = variant.smoothing_speeds
         if variant.smoothed or not speeds:
             return replace(self, variant=variant, plant=plant(speeds, None))
@@ -351,7 +355,8 @@ class System:
 
         Args:
             theta: (p,) parameter values.
-            at_keyframe: Mocap bodies stand where the initial keyframe has them, else where the MJCF has them.
+            at_keyframe: Mocap bodies stand where the initial keyframe has them, else where the MJCF
+                has them.
 
         Returns:
             MjModel that the caller owns.
@@ -405,12 +410,16 @@ def _require_supported(source: ModelSource) -> None:
     if model.nhistory or model.nplugin:
         feature = "delays or interval sensors" if model.nhistory else "engine plugins"
         raise ModelError(
-            f"{source.path}: {feature} keep a state that mjfim does not see; take them out of the model"
+            f"{source.path}: {feature} keep a state that mjfim does not see; take them out of the "
+            "model"
         )
 
 
 def _substeps(experiment: Experiment, timestep: float) -> int:
-    """Engine steps of a sample. Raises ExperimentError where the rate does not fit the timestep [s]."""
+    """Engine steps of a sample.
+
+    Raises ExperimentError where the rate does not fit the timestep [s].
+    """
     rate = experiment.rate
     ratio = 1.0 / (rate * timestep)
     n = round(ratio)
@@ -425,7 +434,10 @@ def _substeps(experiment: Experiment, timestep: float) -> int:
 
 
 def _playback_steps(experiment: Experiment, substeps: int) -> int:
-    """Engine steps of a row of design.csv. Raises ExperimentError where the controller's rate does not fit."""
+    """Engine steps of a row of design.csv.
+
+    Raises ExperimentError where the controller's rate does not fit.
+    """
     rate, wanted = experiment.rate, experiment.playback_rate
     if wanted is None:
         return substeps
@@ -435,8 +447,8 @@ def _playback_steps(experiment: Experiment, substeps: int) -> int:
     if rows not in valid or abs(wanted / rate - rows) > 1e-6 * rows:
         listed = ", ".join(f"{k * rate:g}" for k in valid)
         raise ExperimentError(
-            f"playback_rate: {wanted:g} Hz is not a multiple of rate ({rate:g} Hz) that divides the engine's rate "
-            f"({substeps * rate:g} Hz); valid: {listed}"
+            f"playback_rate: {wanted:g} Hz is not a multiple of rate ({rate:g} Hz) that divides "
+            f"the engine's rate ({substeps * rate:g} Hz); valid: {listed}"
         )
     return substeps // rows
 
@@ -477,8 +489,8 @@ def _require_rotations(model: Any, qpos: Array) -> None:
         first = int(model.jnt_qposadr[j]) + (3 if is_free else 0)
         if not np.linalg.norm(qpos[first : first + 4]) > NO_ROTATION:
             raise ExperimentError(
-                f"initial.qpos: the quaternion of joint {name!r} (numbers {first} to {first + 3}) is zero; "
-                "no rotation is 1, 0, 0, 0"
+                f"initial.qpos: the quaternion of joint {name!r} (numbers {first} to {first + 3}) "
+                "is zero; no rotation is 1, 0, 0, 0"
             )
 
 
@@ -496,7 +508,8 @@ def _plant_model(
     relaxation: Relaxation | None,
 ) -> PlantModel:
     """The compiled model that a plant of a variant steps."""
-    # A parameter that changes dry friction needs the constraint solver, even where the nominal friction is zero.
+    # A parameter that changes dry friction needs the constraint solver, even where the nominal
+    # friction is zero.
     friction = any(
         parameter.function is not None
         or any("frictionloss" in target.path for target in parameter.targets)

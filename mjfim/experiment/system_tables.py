@@ -17,12 +17,15 @@ PriorOrUnknown = Positive | Literal[True]
 class Signal(Section):
     """A generated control signal.
 
-    Each further actuator gets a frequency that is 17 % higher than that of the actuator before, so that the
-    movements differ. Sines and chirps begin at the offset.
+    Each further actuator gets a frequency that is 17 % higher than that of the actuator before, so
+    that the movements differ. Sines and chirps begin at the offset.
     """
 
     kind: Literal["constant", "sine", "chirp", "multisine"] = Field(
-        description="Waveform. A chirp sweeps its frequency linearly; a multisine is a sum of harmonics with random phases."
+        description=(
+            "Waveform. A chirp sweeps its frequency linearly; a multisine is a sum of harmonics "
+            "with random phases."
+        )
     )
     amplitude: Finite | dict[str, Finite] = Field(
         default=1.0,
@@ -30,8 +33,10 @@ class Signal(Section):
     )
     offset: Finite | dict[str, Finite] | None = Field(
         default=None,
-        description="Constant that is added [actuator unit], one number or a table by actuator name. "
-        "Default: the control of the initial keyframe, 0 without a keyframe.",
+        description=(
+            "Constant that is added [actuator unit], one number or a table by actuator name. "
+            "Default: the control of the initial keyframe, 0 without a keyframe."
+        ),
     )
     frequency: Positive = Field(
         default=0.5,
@@ -52,12 +57,17 @@ class Initial(Section):
 
     keyframe: str | None = Field(
         default=None,
-        description="Name of a keyframe of the MJCF that gives the initial state and the resting control. "
-        "Not together with `qpos`, `qvel` or `act`.",
+        description=(
+            "Name of a keyframe of the MJCF that gives the initial state and the resting control. "
+            "Not together with `qpos`, `qvel` or `act`."
+        ),
     )
     qpos: tuple[Finite, ...] | None = Field(
         default=None,
-        description="Initial positions, nq numbers [m, rad, quaternions as w x y z]. Default: the model's reference positions.",
+        description=(
+            "Initial positions, nq numbers [m, rad, quaternions as w x y z]. Default: the model's "
+            "reference positions."
+        ),
     )
     qvel: tuple[Finite, ...] | None = Field(
         default=None, description="Initial velocities, nv numbers [m/s or rad/s]. Default: 0."
@@ -67,8 +77,10 @@ class Initial(Section):
     )
     control: str | Signal | None = Field(
         default=None,
-        description="Control from which a design starts: a table file with the column `t` [s] and one column per actuator, "
-        "or a generated signal. Identification does not need it.",
+        description=(
+            "Control from which a design starts: a table file with the column `t` [s] and one "
+            "column per actuator, or a generated signal. Identification does not need it."
+        ),
     )
 
     @model_validator(mode="after")
@@ -82,7 +94,10 @@ class TargetSpec(Section):
     """One number inside the model, which is set to `scale * parameter + offset`."""
 
     path: str = Field(
-        description="Parameter path, `kind/name:field[index]` with MuJoCo's field names, for example `body/bob:pos[2]`."
+        description=(
+            "Parameter path, `kind/name:field[index]` with MuJoCo's field names, for example "
+            "`body/bob:pos[2]`."
+        )
     )
     scale: Finite = Field(default=1.0, description="Factor of the parameter; not 0.")
     offset: Finite = Field(
@@ -101,11 +116,17 @@ class ParameterSpec(Section):
 
     target: str | None = Field(
         default=None,
-        description="Path of the number inside the model that this parameter sets, for example `joint/hinge:damping`.",
+        description=(
+            "Path of the number inside the model that this parameter sets, for example "
+            "`joint/hinge:damping`."
+        ),
     )
     targets: tuple[TargetSpec, ...] = Field(
         default=(),
-        description="Several numbers inside the model that this one parameter sets, each by its scale and offset.",
+        description=(
+            "Several numbers inside the model that this one parameter sets, each by its scale and "
+            "offset."
+        ),
     )
     function: SkipJsonSchema[SkipValidation[Callable[[Any, float], None]] | None] = Field(
         default=None,
@@ -113,22 +134,31 @@ class ParameterSpec(Section):
     )
     inertial: str | None = Field(
         default=None,
-        description="Name of a body whose mass, centre of mass and inertia are all unknown: ten parameters, "
-        "named `<this name>.<coordinate>`.",
+        description=(
+            "Name of a body whose mass, centre of mass and inertia are all unknown: ten "
+            "parameters, named `<this name>.<coordinate>`."
+        ),
     )
     coordinates: Literal["logcholesky", "barycentric"] | None = Field(
         default=None,
-        description="Coordinates of `inertial`: log-Cholesky, which is physical for every value, or barycentric, "
-        "in which the dynamics are linear. Default: `logcholesky`.",
+        description=(
+            "Coordinates of `inertial`: log-Cholesky, which is physical for every value, or "
+            "barycentric, in which the dynamics are linear. Default: `logcholesky`."
+        ),
     )
     guess: Finite | None = Field(
         default=None,
-        description="Value at which the design is made and from which the fit starts [parameter unit]. "
-        "Default: the value in the model.",
+        description=(
+            "Value at which the design is made and from which the fit starts [parameter unit]. "
+            "Default: the value in the model."
+        ),
     )
     true: Finite | None = Field(
         default=None,
-        description="Value that `simulate` and `montecarlo` use for the robot [parameter unit]. Default: the guess.",
+        description=(
+            "Value that `simulate` and `montecarlo` use for the robot [parameter unit]. Default: "
+            "the guess."
+        ),
     )
     bounds: Range | None = Field(
         default=None,
@@ -137,13 +167,16 @@ class ParameterSpec(Section):
     scale: Positive | Literal["guess"] | None = Field(
         default=None,
         description='Unit in which the criterion measures the error: a number [parameter unit], or "guess" for the size of the '
-        "guess. 1.0 means absolute errors, as in the paper. Default: the guess or the natural size of the quantity, "
-        "whichever is larger.",
+        "guess. 1.0 means absolute errors, as in the paper. Default: the guess or the natural "
+        "size of the quantity, whichever is larger.",
     )
     prior: Positive | None = Field(
         default=None,
-        description="Standard deviation with which the guess is known before the experiment [parameter unit; for `inertial` "
-        "relative to the natural size of each coordinate]. Default: no prior knowledge.",
+        description=(
+            "Standard deviation with which the guess is known before the experiment [parameter "
+            "unit; for `inertial` relative to the natural size of each coordinate]. Default: no "
+            "prior knowledge."
+        ),
     )
     unit: str = Field(
         default="",
@@ -159,7 +192,10 @@ class ParameterSpec(Section):
     )
     wanted: Positive | None = Field(
         default=None,
-        description="Standard deviation that is aimed at [parameter unit], for `check`, `design --shortest` and campaigns.",
+        description=(
+            "Standard deviation that is aimed at [parameter unit], for `check`, `design "
+            "--shortest` and campaigns."
+        ),
     )
 
     @model_validator(mode="after")
@@ -169,7 +205,8 @@ class ParameterSpec(Section):
 
         if self.per_recording and not self.nuisance:
             raise ValueError(
-                "per_recording needs nuisance = true: other parameters have one value in all recordings"
+                "per_recording needs nuisance = true: other parameters have one value in all "
+                "recordings"
             )
         if self.bounds is not None:
             self._require_inside(*self.bounds)
@@ -236,7 +273,10 @@ class NoiseSpec(Section):
 
     sigma: Positive | tuple[Positive, ...] | None = Field(
         default=None,
-        description="Standard deviation [output unit], one number or one per component. Either this or `covariance`.",
+        description=(
+            "Standard deviation [output unit], one number or one per component. Either this or "
+            "`covariance`."
+        ),
     )
     covariance: Matrix | None = Field(
         default=None,
@@ -244,7 +284,10 @@ class NoiseSpec(Section):
     )
     rate: Positive | None = Field(
         default=None,
-        description="Rate at which this output is measured [Hz]; it divides `rate`. Default: `measure_rate`.",
+        description=(
+            "Rate at which this output is measured [Hz]; it divides `rate`. Default: "
+            "`measure_rate`."
+        ),
     )
 
     @model_validator(mode="after")
@@ -255,7 +298,10 @@ class NoiseSpec(Section):
 
 
 class Correlated(Section):
-    """Covariance of several outputs whose noise is correlated. It replaces their standard deviations."""
+    """Covariance of several outputs whose noise is correlated.
+
+    It replaces their standard deviations.
+    """
 
     outputs: Annotated[tuple[str, ...], Field(min_length=2)] = Field(
         description="Names of the outputs, in the order of the matrix."
@@ -268,23 +314,32 @@ class Correlated(Section):
 class Nuisance(Section):
     """Unknowns that affect the measurements but are of no interest by themselves.
 
-    Each value is the standard deviation with which zero is known beforehand, or `true` where nothing is known.
+    Each value is the standard deviation with which zero is known beforehand, or `true` where
+    nothing is known.
     """
 
     initial: PriorOrUnknown | dict[str, PriorOrUnknown] | None = Field(
         default=None,
-        description="Deviation of the initial state [m, rad, m/s or rad/s]: one value for all of qpos and qvel, or a table by "
-        "coordinate, `qpos:<joint>` and `qvel:<joint>`, with the parts `.x .y .z .rx .ry .rz` of ball and free joints. "
-        "Default: the initial state is known.",
+        description=(
+            "Deviation of the initial state [m, rad, m/s or rad/s]: one value for all of qpos and "
+            "qvel, or a table by coordinate, `qpos:<joint>` and `qvel:<joint>`, with the parts "
+            "`.x .y .z .rx .ry .rz` of ball and free joints. Default: the initial state is known."
+        ),
     )
     bias: PriorOrUnknown | dict[str, PriorOrUnknown] | None = Field(
         default=None,
-        description="Constant bias of the outputs [output unit]: one value for all of them or a table by output. Default: none.",
+        description=(
+            "Constant bias of the outputs [output unit]: one value for all of them or a table by "
+            "output. Default: none."
+        ),
     )
     delay: PriorOrUnknown | None = Field(
         default=None, description="Time by which all outputs lag [s]. Default: none."
     )
     per_recording: bool = Field(
         default=False,
-        description="Each recording has a separate bias and a separate delay. Its initial state is always separate.",
+        description=(
+            "Each recording has a separate bias and a separate delay. Its initial state is always "
+            "separate."
+        ),
     )

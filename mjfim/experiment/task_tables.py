@@ -16,43 +16,62 @@ class Cost(Section):
 
     criterion: Literal["E", "A", "D", "c"] = Field(
         default="E",
-        description="E: largest variance of any combination of parameters. A: sum of the variances. D: volume of the confidence "
-        "ellipsoid. c: variance of a stated combination or subset.",
+        description=(
+            "E: largest variance of any combination of parameters. A: sum of the variances. D: "
+            "volume of the confidence ellipsoid. c: variance of a stated combination or subset."
+        ),
     )
     combination: dict[str, Finite] | None = Field(
         default=None,
-        description="For criterion c: coefficients by parameter name; the variance of this sum is minimised.",
+        description=(
+            "For criterion c: coefficients by parameter name; the variance of this sum is "
+            "minimised."
+        ),
     )
     subset: tuple[str, ...] | None = Field(
         default=None,
-        description="For criterion c: names of the parameters whose variances, in units of their scales, are summed.",
+        description=(
+            "For criterion c: names of the parameters whose variances, in units of their scales, "
+            "are summed."
+        ),
     )
     information: Positive = Field(
         default=1.0, description="Weight of the criterion, Q_p of the paper."
     )
     control: NonNegative | dict[str, NonNegative] = Field(
         default=1e-3,
-        description="Weight of the squared control, R_tau of the paper, one number or a table by actuator name. 0 is allowed "
-        "where a hard limit bounds the control.",
+        description=(
+            "Weight of the squared control, R_tau of the paper, one number or a table by actuator "
+            "name. 0 is allowed where a hard limit bounds the control."
+        ),
     )
     control_about: Finite | dict[str, Finite] | None = Field(
         default=None,
-        description="Control that costs nothing [actuator unit], one number or a table by actuator name. Default: the control of "
-        "the initial keyframe, 0 without a keyframe.",
+        description=(
+            "Control that costs nothing [actuator unit], one number or a table by actuator name. "
+            "Default: the control of the initial keyframe, 0 without a keyframe."
+        ),
     )
     tracking: dict[str, NonNegative] = Field(
         default_factory=dict,
-        description="Weight of the squared deviation of a position [m or rad] from the initial trajectory, by joint name, Q_tau "
-        "of the paper. Default: 0.",
+        description=(
+            "Weight of the squared deviation of a position [m or rad] from the initial "
+            "trajectory, by joint name, Q_tau of the paper. Default: 0."
+        ),
     )
     tracking_velocity: dict[str, NonNegative] = Field(
         default_factory=dict,
-        description="Weight of the squared deviation of a velocity [m/s or rad/s] from the initial trajectory, by joint name. "
-        "Default: 0.",
+        description=(
+            "Weight of the squared deviation of a velocity [m/s or rad/s] from the initial "
+            "trajectory, by joint name. Default: 0."
+        ),
     )
     linearize_at: Literal["guess", "true"] = Field(
         default="guess",
-        description="Parameter values at which the design is made. `true` is for studies on simulated robots.",
+        description=(
+            "Parameter values at which the design is made. `true` is for studies on simulated "
+            "robots."
+        ),
     )
 
     @model_validator(mode="after")
@@ -89,7 +108,10 @@ class Descent(Section):
 
     method: Literal["lbfgs", "metric"] = Field(
         default="lbfgs",
-        description="Direction of descent: limited-memory BFGS on the trajectory manifold, or the paper's metric descent.",
+        description=(
+            "Direction of descent: limited-memory BFGS on the trajectory manifold, or the paper's "
+            "metric descent."
+        ),
     )
     tolerance: Positive = Field(
         default=1e-7,
@@ -109,25 +131,38 @@ class Descent(Section):
     starts: int = Field(
         default=1,
         ge=1,
-        description="Number of initial controls: the stated one, then random multisines. The best result is kept.",
+        description=(
+            "Number of initial controls: the stated one, then random multisines. The best result "
+            "is kept."
+        ),
     )
     previous: tuple[str, ...] = Field(
         default=(),
-        description="Files design.csv of earlier designs that are initial controls as well, repeated where they are shorter.",
+        description=(
+            "Files design.csv of earlier designs that are initial controls as well, repeated "
+            "where they are shorter."
+        ),
     )
     fourier: tuple[Positive, ...] = Field(
         default=(),
-        description="Base frequencies [Hz] of Fourier series that are initial controls as well; each is optimised first.",
+        description=(
+            "Base frequencies [Hz] of Fourier series that are initial controls as well; each is "
+            "optimised first."
+        ),
     )
     repeats: tuple[Annotated[int, Field(ge=2)], ...] = Field(
         default=(),
-        description="Under hard limits: initial controls that are designs of the horizon divided by this number, played as many "
-        "times. Quick for long horizons.",
+        description=(
+            "Under hard limits: initial controls that are designs of the horizon divided by this "
+            "number, played as many times. Quick for long horizons."
+        ),
     )
     coarse: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
         default="auto",
-        description="Factor by which the time step is longer in the first iterations, where they are cheap. 1: never. auto: the "
-        "largest factor that the model tolerates.",
+        description=(
+            "Factor by which the time step is longer in the first iterations, where they are "
+            "cheap. 1: never. auto: the largest factor that the model tolerates."
+        ),
     )
     seed: int = Field(default=0, ge=0, description="Seed of the random initial controls.")
 
@@ -141,8 +176,9 @@ class Descent(Section):
 class Limits(Section):
     """Hard limits, which a design keeps at every engine step.
 
-    The ranges of the MJCF (joint range, ctrlrange, forcerange) always belong to them; where the file states a limit too, both
-    hold. A number means the range from minus this number to this number, for all names where no table is given.
+    The ranges of the MJCF (joint range, ctrlrange, forcerange) always belong to them; where the
+    file states a limit too, both hold. A number means the range from minus this number to this
+    number, for all names where no table is given.
     """
 
     position: dict[str, Range] = Field(
@@ -166,16 +202,20 @@ class Limits(Section):
     )
     clearance: Positive | None = Field(
         default=None,
-        description="Least distance of the robot to itself and to its surroundings [m], by MuJoCo's geom distances. "
-        "Default: distances are not limited.",
+        description=(
+            "Least distance of the robot to itself and to its surroundings [m], by MuJoCo's geom "
+            "distances. Default: distances are not limited."
+        ),
     )
     ignored: tuple[tuple[str, str], ...] = Field(
         default=(), description="Pairs of bodies that may come closer than `clearance`."
     )
     bandwidth: Positive | None = Field(
         default=None,
-        description="Bandwidth of the control [Hz]: it becomes a cubic spline with a knot every 1 / (2 bandwidth) s. "
-        "Default: the control is free at every sample.",
+        description=(
+            "Bandwidth of the control [Hz]: it becomes a cubic spline with a knot every 1 / (2 "
+            "bandwidth) s. Default: the control is free at every sample."
+        ),
     )
     enforce: bool = Field(
         default=True, description="false: limits do not bind the design, they are only reported."
@@ -187,13 +227,17 @@ class Boundary(Section):
 
     start: Literal["given", "rest"] = Field(
         default="given",
-        description="rest: the control begins at the value that holds the initial state, without a jump. given: it may begin "
-        "anywhere.",
+        description=(
+            "rest: the control begins at the value that holds the initial state, without a jump. "
+            "given: it may begin anywhere."
+        ),
     )
     end: Literal["free", "rest", "periodic"] = Field(
         default="free",
-        description="rest: the design ends at a standstill. periodic: it ends in the initial state, ready to be repeated. free: "
-        "it may end anywhere.",
+        description=(
+            "rest: the design ends at a standstill. periodic: it ends in the initial state, ready "
+            "to be repeated. free: it may end anywhere."
+        ),
     )
     keyframe: str | None = Field(
         default=None,
@@ -220,17 +264,24 @@ class FitSpec(Section):
 
     segments: Positive | None = Field(
         default=None,
-        description="Recordings are cut into segments of this length [s], each with an unknown initial state (multiple "
-        "shooting). Default: one segment per recording.",
+        description=(
+            "Recordings are cut into segments of this length [s], each with an unknown initial "
+            "state (multiple shooting). Default: one segment per recording."
+        ),
     )
     start: Literal["stated", "measured"] = Field(
         default="stated",
-        description="Initial state of a recording. stated: as `initial` says, with the deviations of `nuisance.initial`. "
-        "measured: read from the log, then free.",
+        description=(
+            "Initial state of a recording. stated: as `initial` says, with the deviations of "
+            "`nuisance.initial`. measured: read from the log, then free."
+        ),
     )
     loss: Literal["linear", "huber", "soft_l1", "cauchy"] = Field(
         default="linear",
-        description="Loss of a whitened residual, as in scipy.optimize.least_squares; all but linear tolerate outliers.",
+        description=(
+            "Loss of a whitened residual, as in scipy.optimize.least_squares; all but linear "
+            "tolerate outliers."
+        ),
     )
     loss_scale: Positive = Field(
         default=3.0,
@@ -238,13 +289,18 @@ class FitSpec(Section):
     )
     noise: Literal["stated", "estimated"] = Field(
         default="stated",
-        description="stated: standard deviations of the `noise` table. estimated: they are estimated from the residuals by "
-        "iterated reweighting.",
+        description=(
+            "stated: standard deviations of the `noise` table. estimated: they are estimated from "
+            "the residuals by iterated reweighting."
+        ),
     )
     starts: int = Field(
         default=1,
         ge=1,
-        description="Number of initial guesses: the stated one, then random ones within bounds and priors. The best fit is kept.",
+        description=(
+            "Number of initial guesses: the stated one, then random ones within bounds and "
+            "priors. The best fit is kept."
+        ),
     )
     seed: int = Field(
         default=0, ge=0, description="Seed of the random initial guesses and of the bootstrap."
@@ -254,8 +310,11 @@ class FitSpec(Section):
     )
     blocks: Positive | None = Field(
         default=None,
-        description="Length of the blocks of the bootstrap and the sandwich covariance [s]; residuals further apart count as "
-        "independent. Default: from the autocorrelation of the residuals.",
+        description=(
+            "Length of the blocks of the bootstrap and the sandwich covariance [s]; residuals "
+            "further apart count as independent. Default: from the autocorrelation of the "
+            "residuals."
+        ),
     )
     bootstrap: int = Field(
         default=1000, ge=0, description="Number of bootstrap replicates. 0: no bootstrap."

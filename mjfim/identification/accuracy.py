@@ -27,7 +27,8 @@ UNKNOWN_SHARE = 10.0
 # Correlation above which another parameter is named as confounded.
 CONFOUNDED_CORRELATION = 0.5
 
-# Smallest size of a value, relative to the magnitude of its parameter, to which an interval is compared.
+# Smallest size of a value, relative to the magnitude of its parameter, to which an interval is
+# compared.
 SMALLEST_RELATIVE_SIZE = 1e-3
 
 # Smallest variance whose square root is divided by.
@@ -46,7 +47,8 @@ class Accuracy:
         between: (p,) standard deviations from recording to recording [theta-unit].
         groups: Parameters that are known in combination only.
         singular: True where parameters outside these groups are not determined either.
-        single_unidentifiable: True where a parameter that was declared by itself is in one of the groups.
+        single_unidentifiable: True where a parameter that was declared by itself is in one of the
+            groups.
         poorly_known: Names of parameters of interest that are poorly known, and a remark on each.
         data_information: (p, p) information of the recordings alone, without priors.
         robust: Robust uncertainty of the common unknowns; None where one of them is not determined.
@@ -76,7 +78,8 @@ def accuracy_of(
     Args:
         problem: The least-squares problem.
         solution: Its solution.
-        null_space: Directions of theta about which neither recordings nor priors contain information.
+        null_space: Directions of theta about which neither recordings nor priors contain
+            information.
         correlation_rows: Autocorrelation time of the residuals of every output [rows].
 
     Returns:
@@ -160,7 +163,8 @@ def _robust(
     if not np.isfinite(standard_deviations(information)).all():
         return None
 
-    # Length of a block of the bootstrap, stated in seconds or from the autocorrelation of the residuals.
+    # Length of a block of the bootstrap, stated in seconds or from the autocorrelation of the
+    # residuals.
     rows = problem.row_count
     length = block_length(correlation_rows, rows)
     if settings.blocks is not None:

@@ -1,6 +1,7 @@
 """Recordings aligned with the sample grid of an experiment: the control on the grid, the measured values at their times.
 
-Measured values are not interpolated, because that would colour their noise; predictions are interpolated instead.
+Measured values are not interpolated, because that would colour their noise; predictions are
+interpolated instead.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from mjfim.records.trajectory import Trajectory
 # Largest distance from the grid [sample periods] at which a time stamp counts as lying on it.
 GRID_TOLERANCE = 0.01
 
-# Time [sample periods] by which edges of samples are moved before they are compared with time stamps, against round-off.
+# Time [sample periods] by which edges of samples are moved before they are compared with time
+# stamps, against round-off.
 EDGE_TOLERANCE = 1e-9
 
 # Smallest number of rows of a recording.
@@ -41,7 +43,8 @@ class AlignedRecording:
     Attributes:
         name: Name of the recording.
         t: (M,) times of the rows since the first one [s].
-        y: (M, ny) measured values in the order of the experiment's outputs [y-unit]; NaN where not measured.
+        y: (M, ny) measured values in the order of the experiment's outputs [y-unit]; NaN where not
+            measured.
         ctrl: (N, nu) control held over each sample of the grid, which covers all rows [u-unit].
         dt: Sample period of the grid [s].
         on_grid: True where every time stamp lies on the grid.
@@ -107,7 +110,10 @@ def align(system: System, recording: Recording) -> AlignedRecording:
 
 
 def _times(recording: Recording) -> Array:
-    """(M,) times since the first row [s]. Raises RecordingError for too few rows or times that do not increase."""
+    """(M,) times since the first row [s].
+
+    Raises RecordingError for too few rows or times that do not increase.
+    """
     count = len(recording.t)
     if count < MIN_ROWS:
         raise RecordingError(
@@ -125,7 +131,10 @@ def _times(recording: Recording) -> Array:
 
 
 def _control(system: System, recording: Recording) -> Array:
-    """(M-1, nu) control from each row to the next one. Raises RecordingError where values are missing."""
+    """(M-1, nu) control from each row to the next one.
+
+    Raises RecordingError where values are missing.
+    """
     rows = len(recording.t) - 1
     ctrl = recording.ctrl[:rows]
     if ctrl.shape != (rows, len(system.controls)):
@@ -144,7 +153,10 @@ def _control(system: System, recording: Recording) -> Array:
 
 
 def _outputs(system: System, recording: Recording) -> Array:
-    """(M, ny) measured values in the order of the outputs. Raises RecordingError where the recording has none of them."""
+    """(M, ny) measured values in the order of the outputs.
+
+    Raises RecordingError where the recording has none of them.
+    """
     names = system.outputs.names
     recorded = [name for name in names if name in recording.outputs]
     if not recorded:
@@ -187,7 +199,8 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
     at_edges = np.column_stack([np.interp(edges, extended_t, column) for column in integral.T])
     mean = np.diff(at_edges, axis=0) / dt
 
-    # Where the control does not change within a sample, its value itself is free of the round-off of a long sum.
+    # Where the control does not change within a sample, its value itself is free of the round-off
+    # of a long sum.
     margin = EDGE_TOLERANCE * dt
     first = np.searchsorted(t, edges[:-1] + margin, side="right") - 1
     last = np.searchsorted(t, edges[1:] - margin, side="left") - 1
@@ -200,7 +213,8 @@ def resample_control(t: Array, ctrl: Array, dt: float) -> Array:
 def _with_continuous_quaternions(system: System, ctrl: Array, y: Array) -> Array:
     """(M, ny) outputs in which measured quaternions never flip their sign; q and -q are one orientation.
 
-    The sign at the start is that of the model at the guess. The array y: (M, ny) is changed in place.
+    The sign at the start is that of the model at the guess. The array y: (M, ny) is changed in
+    place.
     """
     quaternions = _quaternion_outputs(system)
     if not quaternions:

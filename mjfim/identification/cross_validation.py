@@ -1,7 +1,8 @@
 """Predictions of data that were not fitted, by the identified and by the nominal model.
 
-Without held-out recordings, parts of the fitted ones are left out in turn. Theta stays as it was fitted to the other parts; the
-initial state of a predicted part is estimated from it, for both models alike.
+Without held-out recordings, parts of the fitted ones are left out in turn. Theta stays as it was
+fitted to the other parts; the initial state of a predicted part is estimated from it, for both
+models alike.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ PREDICTED_SHARE = 0.25
 # Largest number of samples that are fitted to predict the others.
 MAX_SAMPLES = 400_000
 
-# Searches for theta without a part of the data, and for initial states, which begin close to their result.
+# Searches for theta without a part of the data, and for initial states, which begin close to their
+# result.
 SEARCH = SearchSettings(max_iterations=8, tolerance=1e-2, relinearise_at_end=False)
 
 
@@ -173,7 +175,8 @@ def _prediction_errors(
 ) -> PredictionErrors:
     """Errors at theta: (p,) of the values in some masks: (M, ny) for every recording.
 
-    Unknown initial states are estimated from the other values of a segment, or from the predicted ones where it has no others.
+    Unknown initial states are estimated from the other values of a segment, or from the predicted
+    ones where it has no others.
     """
     problem = problem.of_segments(problem.masked(masks).segments_with_values)
     at = problem.begin(theta)

@@ -15,7 +15,8 @@ from mjfim.identification.residuals import FitProblem
 from mjfim.optimize.levenberg_marquardt import Solution
 from mjfim.records.estimate import Whiteness, WorstResidual
 
-# Root mean square of residuals over the standard deviation of the measured values, above which a motion is not explained.
+# Root mean square of residuals over the standard deviation of the measured values, above which a
+# motion is not explained.
 UNEXPLAINED_SHARE = 0.5
 
 

@@ -1,7 +1,8 @@
 """Least-squares identification in MuJoCo: `min_theta sum_k |Sigma^-1/2 (y~_k - y_k(theta))|^2` over recordings.
 
-The Jacobian is the sensitivity G = dy/dtheta. The method `newton` is the paper's Newton-Raphson iteration with the Fisher
-information as Hessian (Gauss-Newton); the default is Levenberg-Marquardt inside the bounds.
+The Jacobian is the sensitivity G = dy/dtheta. The method `newton` is the paper's Newton-Raphson
+iteration with the Fisher information as Hessian (Gauss-Newton); the default is Levenberg-Marquardt
+inside the bounds.
 """
 
 from __future__ import annotations
@@ -45,13 +46,15 @@ FINAL_TOLERANCE = 1e-3
 # The same for much data, which are not linearised more often than needed.
 FINAL_TOLERANCE_OF_MUCH_DATA = 1e-2
 
-# Number of simulated samples, summed over the two sides of all differences, from which data count as much.
+# Number of simulated samples, summed over the two sides of all differences, from which data count
+# as much.
 SAMPLES_OF_MUCH_DATA = 10 * SAMPLES_FOR_ONE_SIDED
 
 # Number of samples of the segments on which the search begins where there are more data.
 SUBSET_SAMPLES = 40_000
 
-# Iterations of a search from a random start, before the best one continues, and of initial states on a subset.
+# Iterations of a search from a random start, before the best one continues, and of initial states
+# on a subset.
 SHORT_SEARCH_ITERATIONS = 8
 
 # Length of a step [standard deviations] at which a search from a random start ends.
@@ -92,8 +95,9 @@ def identify(
 ) -> Estimate:
     """Estimate parameters from recordings, with the settings of the table `[fit]`.
 
-    The stated `std` is formal: it is the accuracy only if the model and the noise are right. `misfit` says when they are not, and
-    `interval` remains valid where residuals are autocorrelated. Ctrl-C ends the search with the best result so far.
+    The stated `std` is formal: it is the accuracy only if the model and the noise are right.
+    `misfit` says when they are not, and `interval` remains valid where residuals are
+    autocorrelated. Ctrl-C ends the search with the best result so far.
 
     Args:
         experiment: Model, parameters and noise; nothing else needs to be stated.
@@ -169,7 +173,8 @@ def identify_task(
         null_space = _unseen_directions(task, problem.of_segments(subset))
         problem = problem.pinned(task.start, null_space)
 
-        # Short searches from several starts avoid local minima; the best one continues over all data.
+        # Short searches from several starts avoid local minima; the best one continues over all
+        # data.
         begin = search.best_start(problem, subset, begin)
         problem, solution = search.solve(problem, begin)
 
@@ -328,7 +333,8 @@ class _Search:
         if is_whole:
             return best
 
-        # The other segments keep their measured initial states, improved for the theta that was found.
+        # The other segments keep their measured initial states, improved for the theta that was
+        # found.
         private = np.array(begin.private)
         private[subset] = best.private
         whole = replace(best, private=private)

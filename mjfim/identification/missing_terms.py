@@ -1,8 +1,9 @@
 """Score tests of physical terms that a model which does not fit may lack.
 
-Each candidate (dry friction, damping, stiffness or rotor inertia of a joint; bias or delay of outputs) gets a column of
-sensitivities at the estimate. With g its score and I its information once all parameters follow, `g^2 / I` is the squared
-residual that it would explain and `-g / I` its size. One linearisation tests all candidates.
+Each candidate (dry friction, damping, stiffness or rotor inertia of a joint; bias or delay of
+outputs) gets a column of sensitivities at the estimate. With g its score and I its information once
+all parameters follow, `g^2 / I` is the squared residual that it would explain and `-g / I` its
+size. One linearisation tests all candidates.
 """
 
 from __future__ import annotations
@@ -40,10 +41,12 @@ MAX_CANDIDATES = 60
 # Largest number of terms that are named.
 MAX_NAMED_TERMS = 4
 
-# Share of a term's information that must remain once all parameters follow; below, it cannot be told from them.
+# Share of a term's information that must remain once all parameters follow; below, it cannot be
+# told from them.
 MIN_REMAINING_SHARE = 1e-8
 
-# Eigenvalues of the scaled information of the parameters below this share of the largest one count as zero.
+# Eigenvalues of the scaled information of the parameters below this share of the largest one count
+# as zero.
 INVERSE_TOLERANCE = 1e-12
 
 # Smallest column norm by which a column is divided.
@@ -85,7 +88,8 @@ class _Linearisation:
 
     Attributes:
         H: (m, m) information.
-        g: (m,) gradient of half of the squared residuals, with all candidates at their values in the model.
+        g: (m,) gradient of half of the squared residuals, with all candidates at their values in
+            the model.
         norms: (m,) lengths of the columns.
         columns: Column of every candidate.
         others: Columns of the parameters.
@@ -186,7 +190,8 @@ def _normal_equations(
     H = J.T @ J
     g = J.T @ rows[:, -1]
 
-    # Sensitivities were taken at a small value of each term; the residuals that count are those without it.
+    # Sensitivities were taken at a small value of each term; the residuals that count are those
+    # without it.
     offset = np.zeros(len(H))
     offset[columns] = [candidate.linearised_at - candidate.value for candidate in candidates]
     g = g - H @ (offset * norms)

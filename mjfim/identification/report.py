@@ -27,7 +27,8 @@ from mjfim.records.recording import Recording
 # Distance from the guess [prior standard deviations] above which an estimate contradicts its prior.
 IMPLAUSIBLE_PRIOR_DISTANCE = 4.0
 
-# Distance from a bound, relative to the magnitude of the parameter, at which an estimate counts as at the bound.
+# Distance from a bound, relative to the magnitude of the parameter, at which an estimate counts as
+# at the bound.
 BOUND_TOLERANCE = 1e-6
 
 
@@ -39,7 +40,8 @@ class FitResult:
         task: System, recordings and settings.
         problem: The least-squares problem, with the noise that was used at last.
         solution: Its solution.
-        null_space: Directions of theta about which neither recordings nor priors contain information.
+        null_space: Directions of theta about which neither recordings nor priors contain
+            information.
         held_out: Problem of the held-out recordings; None without any.
         subset: Indices of segments that are quick to simulate, evenly spread over the data.
     """
@@ -85,7 +87,8 @@ class _Findings:
 def estimate_from(result: FitResult, budget: Budget) -> Estimate:
     """Assess a fit and put the estimate together.
 
-    Once somebody asks to stop, missing terms and predictions are left out; the estimate itself is complete.
+    Once somebody asks to stop, missing terms and predictions are left out; the estimate itself is
+    complete.
 
     Args:
         result: The fit.
@@ -262,11 +265,15 @@ def _warnings_of_search(findings: _Findings) -> Iterator[str]:
         yield "interrupted after the search: there are no predictions of data that were not fitted"
     if quality.unexplained:
         yield (
-            f"the fit explains little of the motion of {', '.join(quality.unexplained)}: probably a local minimum. "
-            "Shorter segments (fit.segments), more starts (fit.starts) or a better guess may find a better one"
+            f"the fit explains little of the motion of {', '.join(quality.unexplained)}: probably "
+            "a local minimum. Shorter segments (fit.segments), more starts (fit.starts) or a "
+            "better guess may find a better one"
         )
     for group in accuracy.groups:
-        yield f"not identifiable separately: {group}; what the recordings do not determine was held at the start"
+        yield (
+            f"not identifiable separately: {group}; what the recordings do not determine was held "
+            "at the start"
+        )
     if accuracy.singular:
         yield "the recordings do not determine all parameters: the information is singular"
 
@@ -296,8 +303,8 @@ def _warnings_of_recordings(findings: _Findings) -> Iterator[str]:
     index = findings.result.problem.layout.parameter_of_column
     listed = ", ".join(names[index[column]] for column in robust.apart)
     yield (
-        f"recordings disagree on {listed} by more than the scatter within each recording: something differs between them "
-        "that is not in the model; the intervals allow for it"
+        f"recordings disagree on {listed} by more than the scatter within each recording: "
+        "something differs between them that is not in the model; the intervals allow for it"
     )
 
 

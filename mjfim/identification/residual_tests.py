@@ -33,7 +33,8 @@ MAX_WINDOWS = 25
 # Number of values of a window, about; windows with fewer values count as if the others were zero.
 VALUES_PER_WINDOW = 8
 
-# Root mean square of a window over that of the recording, above which the window is named rather than the whole recording.
+# Root mean square of a window over that of the recording, above which the window is named rather
+# than the whole recording.
 PEAK_RATIO = 1.5
 
 # Share of the peak down to which neighbouring windows belong to it.
@@ -159,7 +160,8 @@ def find_worst_residual(
 ) -> WorstResidual | None:
     """The output and the interval in which residuals are largest.
 
-    An interval is a window or several neighbouring ones; where none stands out, it is the whole recording.
+    An interval is a window or several neighbouring ones; where none stands out, it is the whole
+    recording.
 
     Args:
         outputs: Names of the ny outputs.
@@ -261,7 +263,8 @@ def whiteness_of(output: str, parts: Sequence[Array]) -> Whiteness:
     terms = rho[1 : lags + 1] ** 2 / (count - np.arange(1, lags + 1))
     statistic = count * (count + 2) * float(np.sum(terms))
 
-    # Means over runs show slow drifts that short lags miss. The number of tests corrects the probability.
+    # Means over runs show slow drifts that short lags miss. The number of tests corrects the
+    # probability.
     variance = squares / count
     runs = list(_run_tests(series, variance))
     probabilities = [float(chi2_distribution.sf(statistic, lags)), *(p for _, p in runs)]

@@ -1,6 +1,7 @@
 """The least-squares problem of an identification: whitened residuals of recordings and their linearisation.
 
-Residuals are compared at the times of the logs. The problem is condensed for the solver, block of rows by block of rows.
+Residuals are compared at the times of the logs. The problem is condensed for the solver, block of
+rows by block of rows.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ MIN_BLOCK_ROWS = 8
 # Number of blocks into which all rows are divided at most, about.
 MAX_BLOCKS = 1024
 
-# Standard deviation of the prior on a free initial state [m, rad, m/s, ...]; it holds components that no output shows.
+# Standard deviation of the prior on a free initial state [m, rad, m/s, ...]; it holds components
+# that no output shows.
 FREE_START_SIGMA = 1e3
 
 # Prior standard deviations, or scales, by which a delay may grow during the search.
@@ -51,7 +53,8 @@ class Residuals:
 
     Attributes:
         r: (n,) residuals [standard deviations].
-        J: (n, c + P n_private) derivatives by the common unknowns, then by the private ones of each segment.
+        J: (n, c + P n_private) derivatives by the common unknowns, then by the private ones of each
+            segment.
     """
 
     r: Array
@@ -79,8 +82,8 @@ class Pins:
 class FitProblem:
     """Residuals of a system against recordings as functions of the unknowns (`levenberg_marquardt.Problem`).
 
-    The common unknowns are theta without private deviations of the initial state; every segment has deviations of its own. Where
-    initial states are measured, the whole state is private.
+    The common unknowns are theta without private deviations of the initial state; every segment has
+    deviations of its own. Where initial states are measured, the whole state is private.
 
     Attributes:
         simulation: Simulation of the segments.
@@ -114,7 +117,8 @@ class FitProblem:
 
         Raises:
             RecordingError: There is no recording, or one cannot be used.
-            ExperimentError: The initial state is measured, and deviations of the stated one are asked for.
+            ExperimentError: The initial state is measured, and deviations of the stated one are
+                asked for.
         """
         if not recordings:
             raise RecordingError("identify needs at least one recording")
@@ -123,7 +127,8 @@ class FitProblem:
         parameters = system.parameters
         aligned = tuple(align(system, recording) for recording in recordings)
 
-        # Difference steps suit the motion that was recorded; a part of it shows how strongly each parameter acts.
+        # Difference steps suit the motion that was recorded; a part of it shows how strongly each
+        # parameter acts.
         longest = max(aligned, key=lambda recording: len(recording.ctrl))
         system = system.calibrated(parameters.guess, longest.ctrl[:CALIBRATION_SAMPLES])
 
@@ -390,7 +395,9 @@ class FitProblem:
         )
 
     def dense(self, at: UnknownValues) -> Residuals | None:
-        """All rows without a loss: recordings first, then priors and pins. For small problems and tests.
+        """All rows without a loss: recordings first, then priors and pins.
+
+        For small problems and tests.
 
         Args:
             at: The unknowns.
@@ -434,7 +441,8 @@ class FitProblem:
             at: The unknowns.
 
         Returns:
-            (k, p) rows and (k, p) changes of every segment [standard deviations / theta-unit], k at most 2p + 2n.
+            (k, p) rows and (k, p) changes of every segment [standard deviations / theta-unit], k at
+            most 2p + 2n.
 
         Raises:
             SimulationDivergedError: A perturbed simulation diverges.
@@ -446,7 +454,8 @@ class FitProblem:
             for step in (SENSITIVITY_STEP, COARSER_STEP_FACTOR * SENSITIVITY_STEP)
         )
 
-        # Rows of G and of their change stand side by side while they are condensed, so that they stay together.
+        # Rows of G and of their change stand side by side while they are condensed, so that they
+        # stay together.
         condensed: dict[int, Array] = {}
         for rows, coarse_rows in zip_longest(fine, coarse):
             if rows is None:

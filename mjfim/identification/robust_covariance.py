@@ -1,8 +1,8 @@
 """Uncertainty of an estimate where residuals are not white noise: sandwich covariance, block bootstrap, recordings that differ.
 
-Everything comes from the condensed blocks of the last linearisation, without another simulation. With g_b the score of block b, H
-the information and W that of the priors, `cov = H^-1 (sum g_b g_b' + W) H^-1`. The bootstrap draws blocks with replacement and
-takes a Gauss-Newton step for each draw.
+Everything comes from the condensed blocks of the last linearisation, without another simulation.
+With g_b the score of block b, H the information and W that of the priors, `cov = H^-1 (sum g_b g_b'
++ W) H^-1`. The bootstrap draws blocks with replacement and takes a Gauss-Newton step for each draw.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from mjfim.records.estimate import Uncertainty
 # Confidence level of the intervals.
 LEVEL = 0.95
 
-# Eigenvalues of an information scaled to unit diagonal below this share of the largest one count as zero.
+# Eigenvalues of an information scaled to unit diagonal below this share of the largest one count as
+# zero.
 INVERSE_TOLERANCE = 1e-14
 
 # Probability below which recordings disagree.
@@ -39,10 +40,12 @@ MIN_BLOCKS = 20
 # Number of bootstrap replicates that are computed at once.
 REPLICATES_AT_ONCE = 200
 
-# Condition of the scaled information of one recording above which it does not determine all unknowns.
+# Condition of the scaled information of one recording above which it does not determine all
+# unknowns.
 MAX_CONDITION_OF_RECORDING = 1e12
 
-# Condition of the scaled information of a bootstrap draw above which it does not determine all unknowns.
+# Condition of the scaled information of a bootstrap draw above which it does not determine all
+# unknowns.
 MAX_CONDITION_OF_DRAW = 1e14
 
 # Smallest variance by which is divided.
@@ -78,7 +81,8 @@ class _SingleEstimates:
     Attributes:
         theta: (K, c) estimates, NaN where a recording does not determine all unknowns.
         formal_variance: (K, c) formal variances.
-        variance: (K, c) variances from the scatter of the recording's own scores, infinite where there is no estimate.
+        variance: (K, c) variances from the scatter of the recording's own scores, infinite where
+            there is no estimate.
         information: (c, c) information of the recordings with an estimate.
         scores: (b, c) their scores, each recording's about its own mean.
         count: Number of recordings with an estimate.
@@ -196,7 +200,8 @@ def block_length(correlation_rows: Sequence[float], rows: int) -> float:
 def merge_blocks(recording: np.ndarray, rows: np.ndarray, min_rows: float) -> np.ndarray:
     """Merge blocks to longer ones: consecutive blocks of one recording with enough rows together.
 
-    The last one of a recording has at least half of the rows that are wanted, if the recording has them.
+    The last one of a recording has at least half of the rows that are wanted, if the recording has
+    them.
 
     Args:
         recording: (b,) index of the recording of every block, ascending.
@@ -288,11 +293,13 @@ def _compare_recordings(
         priors: (P_k, k, c+1) rows of the priors on the private unknowns of every recording.
 
     Returns:
-        (K, c) estimates, (c,) standard deviations between recordings, and the indices of unknowns on which they disagree.
+        (K, c) estimates, (c,) standard deviations between recordings, and the indices of unknowns
+        on which they disagree.
     """
     single = _single_estimates(theta, blocks, priors)
 
-    # The scatter within a recording is at least that of all together: few blocks often scatter little by chance.
+    # The scatter within a recording is at least that of all together: few blocks often scatter
+    # little by chance.
     inflation, freedom = _inflation(single)
     variance = np.maximum(single.variance, single.formal_variance * inflation)
 
@@ -341,7 +348,8 @@ def _single_estimates(theta: Array, blocks: _Blocks, priors: Sequence[Array]) ->
         each[k] = theta + step
         formal[k] = np.diag(inverse)
 
-        # Scores at the recording's own estimate: differences between recordings are not scatter within one.
+        # Scores at the recording's own estimate: differences between recordings are not scatter
+        # within one.
         own = scores + information @ step
         own = own - own.mean(axis=0)
         scatter = own.T @ own * (len(own) / max(len(own) - 1, 1))

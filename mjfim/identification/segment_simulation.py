@@ -18,7 +18,8 @@ from mjfim.plant.delay import OutputDelay
 from mjfim.plant.derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.records.trajectory import Trajectory
 
-# Number of simulated samples, summed over the two sides of all differences, from which differences are one-sided.
+# Number of simulated samples, summed over the two sides of all differences, from which differences
+# are one-sided.
 SAMPLES_FOR_ONE_SIDED = 400_000
 
 # One-sided differences take this share of the step of two-sided ones.
@@ -60,7 +61,8 @@ class SegmentSimulation:
         recordings: The K recordings on the sample grid.
         segments: The P segments.
         layout: Which parameters are common, and which are private.
-        start_directions: (nx, n) directions of the initial state along which the private unknowns move it.
+        start_directions: (nx, n) directions of the initial state along which the private unknowns
+            move it.
     """
 
     system: System
@@ -98,7 +100,8 @@ class SegmentSimulation:
             at: The unknowns.
 
         Returns:
-            (M, ny) outputs of every recording [y-unit], NaN in rows without a segment; None where a simulation diverges.
+            (M, ny) outputs of every recording [y-unit], NaN in rows without a segment; None where a
+            simulation diverges.
         """
         outputs = [np.full(recording.y.shape, np.nan) for recording in self.recordings]
         for found in self.rows(at, derivatives=False):
@@ -159,10 +162,12 @@ class SegmentSimulation:
             derivatives: Whether to compute derivatives.
             central: True for two-sided differences; default: two-sided unless there is much data.
             step: Relative step of two-sided differences.
-            by_all_parameters: Whether to differentiate by parameters that have no common columns as well.
+            by_all_parameters: Whether to differentiate by parameters that have no common columns as
+                well.
 
         Yields:
-            Predictions of rows of one segment; None, and nothing after it, where a simulation diverges.
+            Predictions of rows of one segment; None, and nothing after it, where a simulation
+            diverges.
         """
         plant = self.system.plant
         wanted = self.layout.estimated
@@ -256,7 +261,8 @@ class SegmentSimulation:
         delay_derivative = self.system.parameters.delay_derivative
         delayed = bool(delay_derivative.any())
 
-        # Places of the rows in samples since the begin of the segment, earlier by the delay of the outputs.
+        # Places of the rows in samples since the begin of the segment, earlier by the delay of the
+        # outputs.
         delay_samples = float(delay_derivative @ theta) / recording.dt
         wanted = recording.t[segment.rows] / recording.dt - segment.begin - delay_samples
 

@@ -1,7 +1,8 @@
 """Segments of recordings for multiple shooting, and the initial state of each one.
 
-A simulation over a whole recording amplifies what the model cannot know: chaos, slip, a push. Segments of a few time constants
-with initial states of their own do not. The state may jump from one segment to the next.
+A simulation over a whole recording amplifies what the model cannot know: chaos, slip, a push.
+Segments of a few time constants with initial states of their own do not. The state may jump from
+one segment to the next.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from mjfim.experiment.system import System
 from mjfim.identification.aligned_recording import EDGE_TOLERANCE, AlignedRecording
 from mjfim.plant.outputs import outputs_by_state
 
-# Number of measured rows before and after a time through which a polynomial is fitted to find a state.
+# Number of measured rows before and after a time through which a polynomial is fitted to find a
+# state.
 ROWS_PER_SIDE = 12
 
 # Smallest number of samples of a segment.
@@ -80,7 +82,8 @@ def cut_into_segments(
         system: System that was recorded.
         recordings: The recordings.
         length: Length of a segment [s]; None: one segment per recording.
-        lead: Time by which a segment is simulated before its first row, the largest delay of the outputs [s].
+        lead: Time by which a segment is simulated before its first row, the largest delay of the
+            outputs [s].
 
     Returns:
         The segments; parts of a recording without any row have none.
@@ -138,8 +141,9 @@ def measured_initial_states(
 ) -> Array:
     """States at some samples according to the measured values.
 
-    Positions and velocities come from a polynomial through the rows nearby: a line through measured velocities, a parabola
-    through positions. Components that were not measured follow the model at the guess.
+    Positions and velocities come from a polynomial through the rows nearby: a line through measured
+    velocities, a parabola through positions. Components that were not measured follow the model at
+    the guess.
 
     Args:
         system: System that was recorded.
@@ -217,7 +221,8 @@ def _nominal_states(system: System, recording: AlignedRecording, begins: np.ndar
     start = system.plant.initial_state(system.parameters.guess)
     states = np.tile(start, (len(begins), 1))
 
-    # Nothing needs to be simulated where the whole state is measured or only the start is asked for.
+    # Nothing needs to be simulated where the whole state is measured or only the start is asked
+    # for.
     measured = set(_measured_states(system, recording))
     if measured.issuperset(range(len(start))) or not begins.any():
         return states

@@ -16,7 +16,8 @@ from mjfim.experiment.task_tables import FitSpec
 from mjfim.identification.residuals import FitProblem
 from mjfim.records.recording import Recording
 
-# least_squares: Levenberg-Marquardt inside the bounds; newton: the paper's Newton-Raphson without bounds.
+# least_squares: Levenberg-Marquardt inside the bounds; newton: the paper's Newton-Raphson without
+# bounds.
 Method = Literal["least_squares", "newton"]
 
 
@@ -29,7 +30,8 @@ class FitTask:
         recordings: Recordings to which the parameters are fitted.
         held_out: Recordings that are predicted, not fitted.
         method: Method of the search.
-        start: (p,) parameters at which the search starts, inside the bounds if the method has any [theta-unit].
+        start: (p,) parameters at which the search starts, inside the bounds if the method has any
+            [theta-unit].
         settings: The table `[fit]` of the experiment.
     """
 
@@ -65,7 +67,8 @@ class FitTask:
             The task.
 
         Raises:
-            ExperimentError: Something is wrong in the experiment or in the arguments; the message names it.
+            ExperimentError: Something is wrong in the experiment or in the arguments; the message
+                names it.
             ModelError: The model cannot be used.
         """
         system = System.resolve(experiment, threads=threads)

@@ -1,7 +1,7 @@
 """Layout of the unknowns of a fit: shared by all recordings, of each recording, or private to each segment.
 
-The common columns of a linearisation are the shared parameters, then those of the first recording, of the second, and so on.
-Deviations of initial states are the private unknowns of segments.
+The common columns of a linearisation are the shared parameters, then those of the first recording,
+of the second, and so on. Deviations of initial states are the private unknowns of segments.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class UnknownLayout:
         recordings: Number of recordings K.
         lower: (c,) lower bounds of the common unknowns [theta-unit].
         upper: (c,) upper bounds of the common unknowns [theta-unit].
-        free_starts: True where the whole initial state of every segment is private, and theta holds none of it.
+        free_starts: True where the whole initial state of every segment is private, and theta holds
+            none of it.
     """
 
     parameters: ParameterSet

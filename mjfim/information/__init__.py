@@ -1,8 +1,8 @@
 """The Fisher information of a trajectory, its criteria, and the parameters that it cannot identify.
 
 Modules:
-    fisher: Information of the measured samples, the part that a criterion sees, and standard deviations.
-    adjoint: Derivatives of a criterion along a trajectory, by one adjoint sweep.
+    fisher: Information of the measured samples, the part that a criterion sees, and standard
+    deviations. adjoint: Derivatives of a criterion along a trajectory, by one adjoint sweep.
     criteria: Optimality criteria of an information matrix and their derivatives.
     marginal: Schur complement of nuisance parameters.
     null_space: Combinations of parameters without any effect, and the groups that they form.

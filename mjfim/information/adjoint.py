@@ -1,8 +1,9 @@
 """Derivatives of a criterion of the Fisher information along a trajectory, by one adjoint sweep for all sensitivities.
 
-The variation of phi is `sum_k tr V_k' dG_k` with `V_k = 2 Sigma^-1 G_k M` and `M = dphi/dI = sum_r m_r w_r w_r'`.
-psi is eliminated by the adjoint `Lambda_k = A_k' Lambda_{k+1} + C_k' V_k = sum_r l^r_k w_r'`.
-The derivative of `l' DF[psi w, w] + v' Dh[psi w, w]` by (x, u) is left: it takes r directions, not p.
+The variation of phi is `sum_k tr V_k' dG_k` with `V_k = 2 Sigma^-1 G_k M` and `M = dphi/dI = sum_r
+m_r w_r w_r'`. psi is eliminated by the adjoint `Lambda_k = A_k' Lambda_{k+1} + C_k' V_k = sum_r
+l^r_k w_r'`. The derivative of `l' DF[psi w, w] + v' Dh[psi w, w]` by (x, u) is left: it takes r
+directions, not p.
 """
 
 from __future__ import annotations
@@ -81,8 +82,8 @@ def eigenvalue_model(
 ) -> EigenvalueModel:
     """Model of log J about a point of the smooth E-criterion, from the derivatives that its gradient takes.
 
-    With `V = 2 Sigma^-1 G w_i` the change of `w_i' I w_j` is half of the sum of two terms: the ray of w_i along w_j, and the
-    ray of w_j along w_i.
+    With `V = 2 Sigma^-1 G w_i` the change of `w_i' I w_j` is half of the sum of two terms: the ray
+    of w_i along w_j, and the ray of w_j along w_i.
 
     Args:
         weights: (r, N+1, ny) weights of the outputs, by `output_weights`.

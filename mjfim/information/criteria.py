@@ -9,7 +9,8 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-# Smallest eigenvalue over the largest one, at and below which an information matrix counts as singular.
+# Smallest eigenvalue over the largest one, at and below which an information matrix counts as
+# singular.
 SINGULAR_RATIO = 1e-14
 
 # Weight of an eigenvector in a derivative, relative to the largest one, below which it is left out.
@@ -25,8 +26,8 @@ class Criterion:
         weights: (r,) weights m of the derivative.
         directions: (r, p) directions w of the derivative.
         eigenvalues: (p,) eigenvalues of the information, ascending.
-        power: Exponent q of `(sum lambda^-q)^(1/q)`, whose first directions belong to the first eigenvalues; infinite for the
-            other criteria.
+        power: Exponent q of `(sum lambda^-q)^(1/q)`, whose first directions belong to the first
+            eigenvalues; infinite for the other criteria.
     """
 
     value: float
@@ -77,7 +78,8 @@ def smooth_e_optimality(
     Args:
         information: (p, p) information.
         power: Exponent q.
-        negligible_weight: Weight of an eigenvector, relative to the largest one, below which it is left out of the derivative.
+        negligible_weight: Weight of an eigenvector, relative to the largest one, below which it is
+            left out of the derivative.
     """
     values, vectors, regular = _spectrum(information)
     if not regular:

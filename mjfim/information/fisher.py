@@ -2,10 +2,11 @@
 
     I   = I_prior + sum_k G_k' Sigma^-1 G_k            (measured samples)
     I~  = S I S / f_m                                  S = diag(scale), f_m the measurement rate
-    R   = T' (I~_tt - I~_tn I~_nn^+ I~_nt) T           t wanted, n nuisance parameters, T the identifiable combinations
-    phi = Q_p / lambda_min(R)                          E-optimality
+    R   = T' (I~_tt - I~_tn I~_nn^+ I~_nt) T           t wanted, n nuisance parameters, T the
+    identifiable combinations phi = Q_p / lambda_min(R)                          E-optimality
 
-With `P = T' [1, -I~_tn I~_nn^+]`, `dR = P dI~ P'`, so a derivative `sum_r m_r w_r w_r'` by R is one by I~ with directions P'w.
+With `P = T' [1, -I~_tn I~_nn^+]`, `dR = P dI~ P'`, so a derivative `sum_r m_r w_r w_r'` by R is one
+by I~ with directions P'w.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ from mjfim.plant.derivatives import Bilinear
 from mjfim.plant.noise import Noise
 from mjfim.records.trajectory import Sensitivity
 
-# Squared part of a unit vector outside the identifiable combinations that still counts as round-off.
+# Squared part of a unit vector outside the identifiable combinations that still counts as
+# round-off.
 ROUND_OFF_SHARE = 1e-6
 
 
@@ -50,14 +52,17 @@ class FisherInformation:
         prior: (p, p) prior information [1 / (theta_i theta_j unit)].
         criterion: "E", "A", "D" or "c".
         weight: Q_p, factor of the criterion.
-        interest: Indices of the t wanted parameters, None for all; the Schur complement removes the others.
-        basis: (t, s) orthonormal identifiable combinations of the scaled wanted parameters, None for all.
-        contrast: (t, c) combinations of the scaled wanted parameters whose variances criterion "c" sums.
+        interest: Indices of the t wanted parameters, None for all; the Schur complement removes the
+            others.
+        basis: (t, s) orthonormal identifiable combinations of the scaled wanted parameters, None
+            for all.
+        contrast: (t, c) combinations of the scaled wanted parameters whose variances criterion "c"
+            sums.
         power: Exponent q of the smooth E-criterion, infinite for 1/lambda_min.
-        negligible_weight: Weight of an eigenvector in the smooth criterion, relative to the largest one, below which it is left
-            out of the gradient.
-        stated_prior: (p,) information of the stated priors, from which a combination can be known that no measurement shows;
-            None for the diagonal of `prior`.
+        negligible_weight: Weight of an eigenvector in the smooth criterion, relative to the largest
+            one, below which it is left out of the gradient.
+        stated_prior: (p,) information of the stated priors, from which a combination can be known
+            that no measurement shows; None for the diagonal of `prior`.
     """
 
     noise: Noise
@@ -224,7 +229,8 @@ class FisherInformation:
             information: (p, p) information [1 / (theta_i theta_j unit)].
 
         Returns:
-            (p,) standard deviations [theta-unit], infinite for a parameter that is not an identifiable combination by itself.
+            (p,) standard deviations [theta-unit], infinite for a parameter that is not an
+            identifiable combination by itself.
         """
         if self.basis is None:
             return standard_deviations(information)
@@ -241,7 +247,8 @@ class FisherInformation:
             information: (p, p) information [1 / (theta_i theta_j unit)].
 
         Returns:
-            (t, t) covariance [theta_i theta_j unit], NaN for a parameter that is not an identifiable combination by itself.
+            (t, t) covariance [theta_i theta_j unit], NaN for a parameter that is not an
+            identifiable combination by itself.
         """
         covariance, basis = self._identifiable_covariance(information)
         alone = 1.0 - np.sum(basis**2, axis=1) < ROUND_OFF_SHARE

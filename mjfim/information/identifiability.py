@@ -41,7 +41,8 @@ NEGLIGIBLE_EFFECT = 1e-6
 # Number of samples of a trajectory whose single steps are tested first, before all of them.
 FEW_SAMPLES = 60
 
-# Difference steps of the parameters for single engine steps, relative to the size of each parameter.
+# Difference steps of the parameters for single engine steps, relative to the size of each
+# parameter.
 SINGLE_STEP_DIFFERENCES = (1e-4, 4e-4)
 
 
@@ -53,7 +54,8 @@ class Identifiability:
         names: Names of the t wanted parameters.
         along_trajectory: Null space along the given trajectory.
         along_all: Null space that random trajectories share with it.
-        groups_along_trajectory: The null space along the given trajectory in the names of the parameters.
+        groups_along_trajectory: The null space along the given trajectory in the names of the
+            parameters.
         groups_along_all: The shared null space in the names of the parameters.
     """
 
@@ -203,7 +205,8 @@ def _identifiability(
     known = _single_step_null_space(test, [trajectory, *tried])
     stack, errors = [J], [error]
 
-    # Whole motions are differentiated only where single steps do not explain the null space already.
+    # Whole motions are differentiated only where single steps do not explain the null space
+    # already.
     if known is None or along_trajectory.count > known.shape[1]:
         for probe in tried:
             fine = test.plant.derivatives.sensitivity(test.theta, probe)
@@ -222,7 +225,8 @@ def _single_step_null_space(
 ) -> Array | None:
     """Directions without effect on single steps and their outputs, (t, k); None without a parameter inside the model.
 
-    Such a direction moves nothing, whatever is measured. Single steps show it exactly, even where motions are chaotic.
+    Such a direction moves nothing, whatever is measured. Single steps show it exactly, even where
+    motions are chaotic.
     """
     parameters = test.parameters
     inside = parameters.interest[parameters.changes_model[parameters.interest]]
@@ -232,7 +236,8 @@ def _single_step_null_space(
     no_prior = np.zeros_like(test.prior)
     longest = max(trajectory.samples for trajectory in trajectories)
 
-    # A few samples first: where they leave a direction open, a contact between them may still show it.
+    # A few samples first: where they leave a direction open, a contact between them may still show
+    # it.
     for most in (FEW_SAMPLES, longest):
         found = _step_effects(test, trajectories, most)
         if found is None:

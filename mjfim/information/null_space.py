@@ -1,8 +1,9 @@
 """The null space of sensitivities: combinations of parameters that no measurement shows, as opposed to round-off.
 
-A direction n with `G n = 0` at every sample is in the null space. The columns of the stacked, whitened G are brought to unit
-length, so that a weak parameter is not mistaken for one without effect. Singular values below the error of G, which is its change
-with a four times longer difference step, count as zero.
+A direction n with `G n = 0` at every sample is in the null space. The columns of the stacked,
+whitened G are brought to unit length, so that a weak parameter is not mistaken for one without
+effect. Singular values below the error of G, which is its change with a four times longer
+difference step, count as zero.
 """
 
 from __future__ import annotations
@@ -18,16 +19,19 @@ from mjfim.records.combinations import Combination, ParameterGroup
 # The second difference step, whose change of G is the error of G, over the first one.
 COARSER_STEP_FACTOR = 4.0
 
-# A normalised singular value above it is certainly no round-off, so that one difference step is enough.
+# A normalised singular value above it is certainly no round-off, so that one difference step is
+# enough.
 CLEAR_SINGULAR_VALUE = 1e-4
 
-# Normalised singular values that count as zero: below the first in any case, above the second in no case.
+# Normalised singular values that count as zero: below the first in any case, above the second in no
+# case.
 ZERO_SINGULAR_VALUES = (1e-9, 1e-5)
 
 # A singular value below this multiple of the error of G counts as zero.
 ERROR_FACTOR = 3.0
 
-# Standard deviations by which the data move when a parameter changes by its size, up to which it has no effect.
+# Standard deviations by which the data move when a parameter changes by its size, up to which it
+# has no effect.
 LEAST_EFFECT = 1e-6
 
 # A column is compared with its error only where it is below this share of the strongest column.
@@ -36,7 +40,8 @@ LEAST_RELATIVE_EFFECT = 1e-7
 # A column that is so weak counts as zero below this multiple of its error.
 COLUMN_ERROR_FACTOR = 5.0
 
-# Coefficients of a combination, relative to the largest one in units of the sizes, below which they are round-off.
+# Coefficients of a combination, relative to the largest one in units of the sizes, below which they
+# are round-off.
 LEAST_COEFFICIENT = 1e-4
 
 # Directions are linearly dependent below this singular value, relative to the largest one.
@@ -45,11 +50,12 @@ DEPENDENT = 1e-6
 # Norm that replaces zero where a column is divided by its norm.
 SMALLEST_NORM = 1e-300
 
-# Parameters are lumped into others where the remainder of their row exceeds these shares of the longest row, tried in turn:
-# rows that stand out come first, or the coefficients would explode.
+# Parameters are lumped into others where the remainder of their row exceeds these shares of the
+# longest row, tried in turn: rows that stand out come first, or the coefficients would explode.
 LUMPING_SHARES = (0.05, 1e-3, 1e-6)
 
-# Order in which parameters are lumped into others, by unit, as is usual for chains of bodies; other units come last.
+# Order in which parameters are lumped into others, by unit, as is usual for chains of bodies; other
+# units come last.
 LUMPING_ORDER = {"kg": 0, "kg m": 1, "kg m²": 2}
 
 
@@ -61,8 +67,9 @@ class NullSpace:
         directions: (t, k) directions [theta-unit].
         silent: Indices of the wanted parameters that have no effect by themselves.
         basis: (t, t-k) orthonormal combinations with an effect, in scaled units.
-        smallest: Least singular value of the rest, columns normalised, times the least share of a column that the nuisance
-            parameters leave: 1 where all are orthogonal, 0 where one is indistinguishable from zero.
+        smallest: Least singular value of the rest, columns normalised, times the least share of a
+            column that the nuisance parameters leave: 1 where all are orthogonal, 0 where one is
+                indistinguishable from zero.
     """
 
     directions: Array
@@ -122,7 +129,8 @@ def find_null_space(
     left_by_nuisance = length / np.maximum(columns.length_before, SMALLEST_NORM)
     least_share = float(left_by_nuisance[~dead].min(initial=1.0))
 
-    # Dead columns and known directions are in the null space; the rest is searched orthogonally to them.
+    # Dead columns and known directions are in the null space; the rest is searched orthogonally to
+    # them.
     t = len(interest)
     found = np.eye(t)[:, dead]
     if known is not None and known.shape[1]:
@@ -146,7 +154,10 @@ def find_null_space(
 def _wanted_columns(
     J: Array, error: Array | None, size: Array, interest: np.ndarray, prior: Array
 ) -> _Columns:
-    """Columns of the wanted parameters, the effects of nuisance parameters projected out. Arguments as above."""
+    """Columns of the wanted parameters, the effects of nuisance parameters projected out.
+
+    Arguments as above.
+    """
     J = J * size
     error = np.zeros_like(J) if error is None else error * size
     length_before = np.linalg.norm(J[:, interest], axis=0)
@@ -311,7 +322,8 @@ def _combination(
 def _lumped_parameters(N: Array, units: Sequence[str]) -> np.ndarray:
     """Choose k parameters that are lumped into the others: independent rows of N.
 
-    Masses go first, then first moments and inertias; of equal units, those declared last go before the others.
+    Masses go first, then first moments and inertias; of equal units, those declared last go before
+    the others.
 
     Args:
         N: (t, k) directions of the null space, relative to the sizes of the parameters.

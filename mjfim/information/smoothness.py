@@ -22,11 +22,13 @@ LONGER_STEP_FACTOR = 300.0
 # The least factor, for parameters that are so weak that their first step is long already.
 LEAST_STEP_FACTOR = 3.0
 
-# The third step is the second one divided by this number, and at least `LEAST_MEDIUM_FACTOR` times the first one.
+# The third step is the second one divided by this number, and at least `LEAST_MEDIUM_FACTOR` times
+# the first one.
 MEDIUM_STEP_DIVISOR = 3.0
 LEAST_MEDIUM_FACTOR = 1.5
 
-# Where a derivative exists, the disagreement falls at least by this factor from the second to the third step.
+# Where a derivative exists, the disagreement falls at least by this factor from the second to the
+# third step.
 SMOOTH_DECREASE = 6.0
 
 # Relative disagreement of two derivatives above which the trajectory counts as rough.
@@ -102,8 +104,8 @@ def roughness(
     if not error[:, worst].max() > DISAGREEMENT_TOLERANCE:
         return None
 
-    # Where a derivative exists, the error of central differences falls ninefold with a third of the step:
-    # the trajectory is strongly curved, but smooth.
+    # Where a derivative exists, the error of central differences falls ninefold with a third of the
+    # step: the trajectory is strongly curved, but smooth.
     medium = np.maximum(factors / MEDIUM_STEP_DIVISOR, LEAST_MEDIUM_FACTOR)
     between = derivatives.sensitivity(theta, trajectory, medium * SENSITIVITY_STEP)
     if between is not None:

@@ -1,10 +1,11 @@
 """Names and units of the coordinates of a model; the only module that makes names of columns and components.
 
-A coordinate of a slide or hinge joint is called `qpos:<joint>` and `qvel:<joint>`. Ball and free joints have parts,
-`qpos:<joint>.<part>`:
+A coordinate of a slide or hinge joint is called `qpos:<joint>` and `qvel:<joint>`. Ball and free
+joints have parts, `qpos:<joint>.<part>`:
 
 - columns of the state hold the orientation as a quaternion: `x y z qw qx qy qz`;
-- deviations from a state (gains, deviations of the initial state, velocities) hold a rotation vector: `x y z rx ry rz`.
+- deviations from a state (gains, deviations of the initial state, velocities) hold a rotation
+  vector: `x y z rx ry rz`.
 
 Activations are called `act:<actuator>`. Components of sensors have MuJoCo's indices, `gyro[0]`.
 """
@@ -34,11 +35,12 @@ TRANSLATION = ("x", "y", "z")
 # Parts of the orientation of a ball or free joint in a state: a unit quaternion.
 QUATERNION = ("qw", "qx", "qy", "qz")
 
-# Parts of a deviation of the orientation and of the angular velocity: a rotation vector in the body's frame.
+# Parts of a deviation of the orientation and of the angular velocity: a rotation vector in the
+# body's frame.
 ROTATION_VECTOR = ("rx", "ry", "rz")
 
-# Standard deviation of a quaternion's component over that of the orientation. The four components then hold exactly the
-# information of a rotation vector of the stated standard deviation [rad].
+# Standard deviation of a quaternion's component over that of the orientation. The four components
+# then hold exactly the information of a rotation vector of the stated standard deviation [rad].
 QUATERNION_SIGMA_FACTOR = 0.5
 
 # A coordinate written with an index, as in `qpos:base[3]` or `initial/base:qpos[3]`.
@@ -83,10 +85,12 @@ class StateComponent:
 
     Attributes:
         name: Column of the number, `qpos:<joint>`, `qvel:<joint>`, or these with a part.
-        groups: Names of the groups of columns that it belongs to, for example `qpos:base.rot` and `qpos:base`.
+        groups: Names of the groups of columns that it belongs to, for example `qpos:base.rot` and
+            `qpos:base`.
         address: Its place in the state vector (qpos, qvel, act).
         unit: Its unit; empty for components of quaternions.
-        sigma_factor: Its standard deviation over the stated one of a group; 1/2 for components of quaternions.
+        sigma_factor: Its standard deviation over the stated one of a group; 1/2 for components of
+            quaternions.
     """
 
     name: str
@@ -102,8 +106,8 @@ class TangentComponent:
 
     Attributes:
         name: `qpos:<joint>`, `qvel:<joint>`, these with a part, or `act:<actuator>`.
-        path: Parameter path of the deviation of the initial state, `initial/<joint>:qpos`; empty where the joint or
-            actuator has no name in the MJCF.
+        path: Parameter path of the deviation of the initial state, `initial/<joint>:qpos`; empty
+            where the joint or actuator has no name in the MJCF.
         address: Its place in the tangent space.
         unit: Its unit; empty for activations.
     """

@@ -55,7 +55,8 @@ def unnamed_count(model: Any, kind: str) -> int:
 def unique_names(model: Any, kind: str) -> tuple[str, ...]:
     """Unique names of all elements of a kind.
 
-    An element without a name is called `<kind><number>`; underscores are appended where another element has that name.
+    An element without a name is called `<kind><number>`; underscores are appended where another
+    element has that name.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).

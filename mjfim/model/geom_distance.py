@@ -1,6 +1,7 @@
 """Distances of a robot to itself and to the world at many configurations, with their slopes.
 
-Bounding spheres show, for all configurations at once, which geoms could be within reach; MuJoCo is called for these only.
+Bounding spheres show, for all configurations at once, which geoms could be within reach; MuJoCo is
+called for these only.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from mjfim.model.elements import unique_names
 from mjfim.model.geom_pairs import GeomPair
 from mjfim.model.pair_distance import INFINITE_DISTANCE, Indices, PairDistances
 
-# Largest number of bounds that are held in memory at once; more configurations are processed in blocks.
+# Largest number of bounds that are held in memory at once; more configurations are processed in
+# blocks.
 MAX_BOUNDS_AT_ONCE = 1 << 18
 
 
@@ -28,9 +30,10 @@ class SignedDistances:
     """Signed distances at n configurations, in m columns.
 
     Attributes:
-        d: (n, m) distances [m], negative in penetration, at most the reach; NaN at configurations that are not finite.
-        slope: (n, m, nv) d(d)/dq, q in the tangent space of qpos as in `mj_integratePos`; zero where d is the reach. None
-            where slopes were not asked for.
+        d: (n, m) distances [m], negative in penetration, at most the reach; NaN at configurations
+            that are not finite.
+        slope: (n, m, nv) d(d)/dq, q in the tangent space of qpos as in `mj_integratePos`; zero
+            where d is the reach. None where slopes were not asked for.
     """
 
     d: Array
@@ -52,17 +55,20 @@ class GeomDistances:
         """Prepare the computation for pairs of geoms of a model.
 
         Args:
-            model: The model (`mujoco.MjModel`), which is copied; mocap bodies keep the poses that it states.
+            model: The model (`mujoco.MjModel`), which is copied; mocap bodies keep the poses that
+                it states.
             chosen: Pairs by `find_geom_pairs`, at least one.
             reach: Distance beyond which nothing is measured [m].
-            grouped: Columns are pairs of bodies (the minimum over their pairs of geoms) instead of pairs of geoms.
+            grouped: Columns are pairs of bodies (the minimum over their pairs of geoms) instead of
+                pairs of geoms.
 
         Raises:
             ExperimentError: There is no pair, or the reach is not positive and finite.
         """
         if not chosen:
             raise ExperimentError(
-                "clearance: no two geoms can come near each other; needs a moving geom whose contype and conaffinity match"
+                "clearance: no two geoms can come near each other; needs a moving geom whose "
+                "contype and conaffinity match"
             )
         if not 0.0 < reach < INFINITE_DISTANCE:
             raise ExperimentError(
@@ -89,7 +95,8 @@ class GeomDistances:
             for p in leaders
         )
 
-        # (m, nv): +1 where a degree of freedom moves the second body only, -1 where the first only, else 0.
+        # (m, nv): +1 where a degree of freedom moves the second body only, -1 where the first only,
+        # else 0.
         moved = _moved_bodies(model)
         first_bodies = body[[p.first for p in leaders]]
         second_bodies = body[[p.second for p in leaders]]
@@ -136,7 +143,8 @@ class GeomDistances:
         bounds, _ = self._distances.lower_bounds(positions, frames)
         best, row, pair = np.inf, 0, self.pairs[0]
 
-        # Measure in ascending order of the bounds, until a bound exceeds the smallest distance so far.
+        # Measure in ascending order of the bounds, until a bound exceeds the smallest distance so
+        # far.
         ascending = np.unravel_index(np.argsort(bounds, axis=None), bounds.shape)
         for k, p in zip(*ascending, strict=True):
             distance = float(bounds[k, p])
@@ -192,15 +200,18 @@ class GeomDistances:
         Args:
             d: (n, m) distances of the columns [m].
             every: (n, p) distances of the pairs [m].
-            measured: Rows and pairs (h,) that MuJoCo measured, their distances (h,) and nearest points (h, 6).
-            exact: Rows and pairs (e,) over planes, and points (n, number of planes, 3) nearest to the planes.
+            measured: Rows and pairs (h,) that MuJoCo measured, their distances (h,) and nearest
+                points (h, 6).
+            exact: Rows and pairs (e,) over planes, and points (n, number of planes, 3) nearest to
+                the planes.
             poses: Positions, frames and screws by `_poses`.
         """
         positions, frames, screws = poses
         rows, pairs, found, segments = measured
         plane_rows, plane_pairs, plane_points = exact
 
-        # Normals and nearest points of the first geoms: of measured pairs, then of those over planes.
+        # Normals and nearest points of the first geoms: of measured pairs, then of those over
+        # planes.
         normals = self._distances.normals(
             rows,
             pairs,
@@ -223,7 +234,8 @@ class GeomDistances:
         value = every[rows, pairs]
         least = (value == d[rows, column]) & (value < self.reach)
 
-        # The normal as a line (moment about the origin, direction); its product with a screw is the rate of the distance.
+        # The normal as a line (moment about the origin, direction); its product with a screw is the
+        # rate of the distance.
         lines = np.zeros((*d.shape, 6))
         lines[rows[least], column[least], :3] = np.cross(nearest_points[least], normals[least])
         lines[rows[least], column[least], 3:] = normals[least]
@@ -237,8 +249,9 @@ class GeomDistances:
             slopes: Whether the motions are computed.
 
         Returns:
-            (n, ngeom, 3) positions [m], (n, ngeom, 3, 3) frames, and (n, nv, 6) screws about the origin: the angular velocity
-            per degree of freedom, then the velocity of the point of the body that is at the origin. None without slopes.
+            (n, ngeom, 3) positions [m], (n, ngeom, 3, 3) frames, and (n, nv, 6) screws about the
+            origin: the angular velocity per degree of freedom, then the velocity of the point of
+            the body that is at the origin. None without slopes.
         """
         model, data, n = self._model, self._data, len(qpos)
         positions = np.empty((n, model.ngeom, 3))
@@ -246,7 +259,8 @@ class GeomDistances:
         screws = np.empty((n, model.nv, 6))
         centres = np.empty((n, model.nbody, 3))
 
-        # Views of MuJoCo's arrays: looking them up in every round would cost more than the kinematics.
+        # Views of MuJoCo's arrays: looking them up in every round would cost more than the
+        # kinematics.
         q, xpos, xmat = data.qpos, data.geom_xpos, data.geom_xmat
         cdof, com = data.cdof, data.subtree_com
         for k, configuration in enumerate(qpos):

@@ -37,9 +37,10 @@ class GeomPair:
 def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[GeomPair, ...]:
     """All pairs of geoms that move relative to each other and that MuJoCo would let collide, contacts enabled or not.
 
-    The selection is MuJoCo's: no geoms of bodies welded together, of parent and child (unless the parent is fixed in
-    the world or the flag filterparent is off) or of an `<exclude>`; contype and conaffinity must match. An explicit
-    `<pair>` overrules all of these. Flexes have no geoms and are left out.
+    The selection is MuJoCo's: no geoms of bodies welded together, of parent and child (unless the
+    parent is fixed in the world or the flag filterparent is off) or of an `<exclude>`; contype and
+    conaffinity must match. An explicit `<pair>` overrules all of these. Flexes have no geoms and
+    are left out.
 
     Args:
         model: The model (`mujoco.MjModel`).
@@ -87,8 +88,8 @@ def _check_type(model: Any, geom: int, label: str, first_body: str, second_body:
     refused = REFUSED_TYPES.get(int(model.geom_type[geom]))
     if refused is not None:
         raise ExperimentError(
-            f"clearance: {label} is a {refused}, for which MuJoCo has no reliable distance; ignore the bodies "
-            f"{first_body!r} and {second_body!r}, or use boxes or meshes"
+            f"clearance: {label} is a {refused}, for which MuJoCo has no reliable distance; ignore "
+            f"the bodies {first_body!r} and {second_body!r}, or use boxes or meshes"
         )
 
 

@@ -1,9 +1,10 @@
 """The ten inertial parameters of a body in three parametrisations: central (MuJoCo's), barycentric and log-Cholesky.
 
-The pseudo-inertia `J = [[S, h], [h', m]]` holds the second moments S, the first moments h = m c and the mass m about the
-origin of the body frame; `I = tr(S) 1 - S`. A body is physical when J is positive definite. `J = U U'` with
-`U = e^alpha [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0, e^d3, t3], [0, 0, 0, 1]]` always is
-(Rucker & Wensing, Smooth parameterization of rigid-body inertia, RA-L 2022).
+The pseudo-inertia `J = [[S, h], [h', m]]` holds the second moments S, the first moments h = m c and
+the mass m about the origin of the body frame; `I = tr(S) 1 - S`. A body is physical when J is
+positive definite. `J = U U'` with `U = e^alpha [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0,
+e^d3, t3], [0, 0, 0, 1]]` always is (Rucker & Wensing, Smooth parameterization of rigid-body
+inertia, RA-L 2022).
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 # Rows and columns of these entries, (6,) each, for indexing a matrix.
 INERTIA_ROWS, INERTIA_COLUMNS = np.array(INERTIA_ENTRIES).T
 
-# Smallest over largest second moment per mass, up to which a body counts as a point, a rod or a plate.
+# Smallest over largest second moment per mass, up to which a body counts as a point, a rod or a
+# plate.
 DEGENERATE_RATIO = 1e-9
 
 
@@ -116,10 +118,12 @@ def to_logcholesky(body: BodyInertia) -> Array:
     spread = np.linalg.eigvalsh(per_mass)
     if not spread[0] > DEGENERATE_RATIO * max(spread[2], 1e-300):
         raise ValueError(
-            "its inertia is that of a point, a rod or a plate (two principal moments add up to the third)"
+            "its inertia is that of a point, a rod or a plate (two principal moments add up to "
+            "the third)"
         )
 
-    # An upper triangular factor, U U' = per_mass, is the flipped Cholesky factor of the flipped matrix.
+    # An upper triangular factor, U U' = per_mass, is the flipped Cholesky factor of the flipped
+    # matrix.
     flipped = np.linalg.cholesky(per_mass[::-1, ::-1])
     U = flipped[::-1, ::-1]
 

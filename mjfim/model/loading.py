@@ -31,7 +31,8 @@ def compile_spec(spec: Any, path: Path) -> Any:
         raise ModelError(f"{path}: MuJoCo cannot compile the model: {str(error).strip()}") from None
 
 
-# Largest number of compiled models of edited specs that a source keeps; a search revisits few parameter values.
+# Largest number of compiled models of edited specs that a source keeps; a search revisits few
+# parameter values.
 MAX_EDITED_MODELS = 512
 
 
@@ -66,8 +67,8 @@ class ModelSource:
         """The compiled model in which the inertia of some bodies may be written.
 
         Args:
-            moved_bodies: Bodies that MuJoCo must not treat as "simple", because parameters change their inertial frame;
-                None for all bodies.
+            moved_bodies: Bodies that MuJoCo must not treat as "simple", because parameters change
+                their inertial frame; None for all bodies.
 
         Returns:
             MjModel that callers copy and never change.

@@ -2,9 +2,10 @@
 
 `mj_geomDistance` is not used where it is wrong:
 
-- distances to planes are computed exactly here (MuJoCo takes a wrong corner of a box that stands on its edge);
-- between a capsule and a box, MuJoCo measures the capsule's axis, and the radius is subtracted (the primitive collider
-  reports deep penetration as separation);
+- distances to planes are computed exactly here (MuJoCo takes a wrong corner of a box that stands on
+  its edge);
+- between a capsule and a box, MuJoCo measures the capsule's axis, and the radius is subtracted (the
+  primitive collider reports deep penetration as separation);
 - geoms that touch are moved apart a little to find the normal of their surfaces.
 
 Height fields and signed distance fields are refused (`mjfim.model.geom_pairs`).
@@ -37,14 +38,16 @@ BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 # Types of geoms whose distance to a plane is exact here.
 PRIMITIVES = (SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX)
 
-# Tolerance and iterations of the convex collider; MuJoCo's 1e-6 and 35 blur the slopes of curved geoms.
+# Tolerance and iterations of the convex collider; MuJoCo's 1e-6 and 35 blur the slopes of curved
+# geoms.
 CCD_TOLERANCE = 1e-10
 CCD_ITERATIONS = 200
 
 # Distance that is larger than any between geoms [m].
 INFINITE_DISTANCE = 1e6
 
-# Radius of a capsule's axis [m]; with radius 0 the collider now and then reports deep penetration as touching.
+# Radius of a capsule's axis [m]; with radius 0 the collider now and then reports deep penetration
+# as touching.
 AXIS_RADIUS = 1e-9
 
 # Distance below which the nearest points of two surfaces do not determine their normal [m].
@@ -84,7 +87,8 @@ class PairDistances:
         bounding_radii = self._model.geom_rbound
         self._radii = bounding_radii[self.first] + bounding_radii[self.second]
 
-        # Between a capsule and a box MuJoCo measures the capsule's axis; the radius is subtracted from the distance.
+        # Between a capsule and a box MuJoCo measures the capsule's axis; the radius is subtracted
+        # from the distance.
         by_axis = (np.sort(kinds, axis=0) == [[CAPSULE], [BOX]]).all(axis=0)
         capsule = np.where(kinds[0] == CAPSULE, self.first, self.second)
         self._axis_offset = np.where(by_axis, self._model.geom_size[capsule, 0], 0.0)
@@ -104,7 +108,8 @@ class PairDistances:
             frames: (n, ngeom, 3, 3) frames of the geoms.
 
         Returns:
-            (n, p) bounds [m], and (n, number of planes, 3) points of the first geoms nearest to the planes [m].
+            (n, p) bounds [m], and (n, number of planes, 3) points of the first geoms nearest to the
+            planes [m].
         """
         between = positions[:, self.second] - positions[:, self.first]
         bounds = np.sqrt(np.einsum("npi,npi->np", between, between)) - self._radii

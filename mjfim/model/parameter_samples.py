@@ -15,10 +15,12 @@ from mjfim.model.parameters import Parameter, ParameterSet
 # Largest deviation of a sample from the centre of its prior [standard deviations].
 MAX_DEVIATION = 2.5
 
-# Number of times that the distance of a sample from the guess is halved until its bodies are physical; then it is set to zero.
+# Number of times that the distance of a sample from the guess is halved until its bodies are
+# physical; then it is set to zero.
 MAX_HALVINGS = 20
 
-# Smallest share of a scalar's value that a sample of its prior keeps, so that it does not change its sign.
+# Smallest share of a scalar's value that a sample of its prior keeps, so that it does not change
+# its sign.
 MIN_SHARE_OF_VALUE = 0.05
 
 
@@ -31,16 +33,18 @@ def sample_parameters(
 ) -> Array:
     """Sample the parameters: theta itself, then a Latin hypercube over priors (normal) or bounds (uniform).
 
-    Normal samples stay within the bounds, within 2.5 standard deviations, and do not change the sign of a scalar (a mass, a
-    damping). Parameters with neither prior nor bounds, and those outside the model, stay at theta. Where bodies of a sample
-    are unphysical, the distance of the parameters that determine them from theta is halved until they are physical.
+    Normal samples stay within the bounds, within 2.5 standard deviations, and do not change the
+    sign of a scalar (a mass, a damping). Parameters with neither prior nor bounds, and those
+    outside the model, stay at theta. Where bodies of a sample are unphysical, the distance of the
+    parameters that determine them from theta is halved until they are physical.
 
     Args:
         parameters: The parameters.
         theta: (p,) values about which priors are centred.
         count: Number of samples, theta included.
         seed: Seed of the random numbers.
-        unphysical: Gives for a sample (p,) the indices of the parameters that determine unphysical bodies; None for no check.
+        unphysical: Gives for a sample (p,) the indices of the parameters that determine unphysical
+            bodies; None for no check.
 
     Returns:
         (count, p) samples.

@@ -1,7 +1,8 @@
 """The only writer of parameter values into models.
 
-Values are written into private copies in place, followed by `mj_setConst`. Values that need a compile (sizes of
-geoms, functions of an MjSpec) are written into an MjSpec, which is compiled anew. Tests compare both ways.
+Values are written into private copies in place, followed by `mj_setConst`. Values that need a
+compile (sizes of geoms, functions of an MjSpec) are written into an MjSpec, which is compiled anew.
+Tests compare both ways.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from mjfim.model.variants import PlantModel
 if TYPE_CHECKING:
     from mjfim.model.parameters import ParameterSet
 
-# Relative amount by which the largest principal moment of inertia may exceed the sum of the other two: the moments of a
-# plate or rod are often stated with few digits.
+# Relative amount by which the largest principal moment of inertia may exceed the sum of the other
+# two: the moments of a plate or rod are often stated with few digits.
 MOMENT_ROUNDING = 1e-6
 
 
@@ -100,7 +101,8 @@ class ParameterWriter:
             theta: (p,) values.
 
         Returns:
-            For each of these bodies the indices of the parameters that determine its inertia, and the fault in words.
+            For each of these bodies the indices of the parameters that determine its inertia, and
+            the fault in words.
 
         Raises:
             ModelError: MuJoCo refuses to compile the values.
@@ -132,8 +134,8 @@ class ParameterWriter:
         """Write every single number in place.
 
         Returns:
-            Values that are written as a whole: (10,) coordinates of inertias by (parametrisation, body), and (3,)
-            rotation vectors by (array, row).
+            Values that are written as a whole: (10,) coordinates of inertias by (parametrisation,
+            body), and (3,) rotation vectors by (array, row).
         """
         p = self._parameters
         whole: dict[tuple[str, int], Array] = {}
@@ -183,7 +185,8 @@ class ParameterWriter:
 def _write_inertia(model: Any, body: int, kind: str, values: Array) -> None:
     """Set the inertia of a body from its coordinates: (10,) in a parametrisation, in place.
 
-    With the central parametrisation, mass and centre of mass are written separately, as numbers of their fields.
+    With the central parametrisation, mass and centre of mass are written separately, as numbers of
+    their fields.
     """
     inertia = INERTIA_PARAMETRISATIONS[kind].inertia(values)
     moments, quaternion = inertia.principal_axes()
@@ -236,5 +239,8 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> st
     listed = ", ".join(f"{moment:.4g}" for moment in moments)
     wanted = "all must be > 0"
     if moments[0] >= least:
-        wanted = "the sum of the smaller two must be at least the largest (its pseudo-inertia is not positive semidefinite)"
+        wanted = (
+            "the sum of the smaller two must be at least the largest (its pseudo-inertia is not "
+            "positive semidefinite)"
+        )
     return f"principal moments of inertia {listed} kg m²; {wanted}"

@@ -73,9 +73,11 @@ class Parameter:
         scale: Unit in which information about it is compared with that about others.
         prior: Standard deviation of the prior, or None.
         unit: Its unit; empty where it has none.
-        size: Its order of magnitude, to which difference steps are relative; 0 for that of the guess, else the scale.
+        size: Its order of magnitude, to which difference steps are relative; 0 for that of the
+            guess, else the scale.
         function: Edits an MjSpec in place, `function(spec, theta_j)`, instead of targets.
-        nuisance: Whether it is unknown but of no interest, so that the design spends no effort on it.
+        nuisance: Whether it is unknown but of no interest, so that the design spends no effort on
+            it.
         wanted: Standard deviation aimed at, or None.
         group: Name of the group with which it was declared; empty for a single parameter.
         per_recording: Whether every recording has a separate value.
@@ -115,8 +117,8 @@ class ParameterSet:
     Attributes:
         parameters: The parameters.
         fields: For each parameter, the fields that its targets lead to.
-        nominal: Values in the model of quantities that are written as a whole: (10,) coordinates of an inertia by
-            (parametrisation, body), (4,) quaternions by (array, row).
+        nominal: Values in the model of quantities that are written as a whole: (10,) coordinates of
+            an inertia by (parametrisation, body), (4,) quaternions by (array, row).
         mocap: Where mocap bodies start; None where they start as compiled.
     """
 
@@ -143,7 +145,8 @@ class ParameterSet:
             mocap: Where mocap bodies start; None where they start as compiled.
 
         Raises:
-            ExperimentError: A target does not exist, or two parameters contradict each other; the message names them.
+            ExperimentError: A target does not exist, or two parameters contradict each other; the
+                message names them.
         """
         resolved: list[tuple[TargetField, ...]] = []
         for parameter in parameters:
@@ -361,8 +364,9 @@ def _require_compatible(parameter: Parameter, parametrisations: set[str], arrays
     mixed = sorted({*parametrisations, *(array.removeprefix("body_") for array in arrays)})
     raise _parameter_error(
         parameter,
-        f"the inertia of one body is varied in several coordinates at once ({', '.join(mixed)}); valid together: "
-        "mass, ipos and inertia; mass, ipos and fullinertia; mass, firstmoment and origininertia; logcholesky alone",
+        f"the inertia of one body is varied in several coordinates at once ({', '.join(mixed)}); "
+        "valid together: mass, ipos and inertia; mass, ipos and fullinertia; mass, firstmoment "
+        "and origininertia; logcholesky alone",
     )
 
 
@@ -381,7 +385,8 @@ def _require_one_owner(
             if other is not None:
                 raise _parameter_error(
                     parameter,
-                    f"target {target.path!r} already belongs to parameters.{other}; two parameters cannot set one number",
+                    f"target {target.path!r} already belongs to parameters.{other}; two "
+                    "parameters cannot set one number",
                 )
 
             owner_of_field[target_field] = parameter.name
@@ -403,8 +408,8 @@ def _require_movable(
         name = element_name(model, "body", row)
         raise _parameter_error(
             parameter,
-            f"the keyframe states the pose of mocap body {name!r}; remove its mpos and mquat from the keyframe, or the "
-            "parameter from the experiment",
+            f"the keyframe states the pose of mocap body {name!r}; remove its mpos and mquat from "
+            "the keyframe, or the parameter from the experiment",
         )
 
 

@@ -31,12 +31,14 @@ from mjfim.model.targets import (
 )
 from mjfim.model.units import ANGLE, FIELD_UNITS, JOINT_FIELD_UNITS, LENGTH
 
-# A parameter path: kind, name (absent for options and the delay), field, and an index or the part of a joint.
+# A parameter path: kind, name (absent for options and the delay), field, and an index or the part
+# of a joint.
 PATH_PATTERN = re.compile(
     r"^(?P<kind>\w+)(?:/(?P<name>.+))?:(?P<field>\w+)(?:\[(?P<index>\d+)\]|\.(?P<part>\w+))?$"
 )
 
-# Kind -> field of a path -> array of MjModel. The fields of a joint's degrees of freedom are written to each of them.
+# Kind -> field of a path -> array of MjModel. The fields of a joint's degrees of freedom are
+# written to each of them.
 MODEL_ARRAYS: dict[str, dict[str, str]] = {
     "body": {
         "mass": "body_mass",
@@ -105,7 +107,8 @@ class ParameterPath:
 
     Attributes:
         text: The path.
-        kind: Kind of the element: `body`, `joint`, `actuator`, `geom`, `site`, `tendon`, `option`, `initial`, `output`.
+        kind: Kind of the element: `body`, `joint`, `actuator`, `geom`, `site`, `tendon`, `option`,
+            `initial`, `output`.
         name: Name of the element; empty where the path has none.
         field: Field of the element.
         index: Index of the component; None where the path has none.
@@ -182,11 +185,12 @@ def resolve(
         model: The compiled model (`mujoco.MjModel`).
         text: The path.
         outputs: Names of the measured columns, which `output/<name>:bias` may name.
-        decoration: Names of geoms that neither collide nor give their body its inertia, whose place and size can be
-            changed without a compile.
+        decoration: Names of geoms that neither collide nor give their body its inertia, whose place
+            and size can be changed without a compile.
 
     Raises:
-        ExperimentError: The path names nothing in the model; the message lists the valid kinds, names, fields or indices.
+        ExperimentError: The path names nothing in the model; the message lists the valid kinds,
+            names, fields or indices.
     """
     path = ParameterPath.parse(text)
     if path.kind not in KINDS:
@@ -195,8 +199,8 @@ def resolve(
         raise path.error(unknown(f"{path.kind} field", path.field, fields_of(path.kind)))
     if path.part and path.kind != "initial":
         raise path.error(
-            f"only the initial state of a ball or free joint has parts such as '.rx', not {path.kind} {path.field}; "
-            f"write {path.field}[index]"
+            "only the initial state of a ball or free joint has parts such as '.rx', not "
+            f"{path.kind} {path.field}; write {path.field}[index]"
         )
 
     if path.kind == "option":
@@ -223,7 +227,8 @@ def unit_of(model: Any, text: str) -> str:
 
     if path.kind == "joint":
         joint = identifier(model, "joint", path.name)
-        # One number holds for all coordinates of a ball or free joint: it is labelled as that of a rotation.
+        # One number holds for all coordinates of a ball or free joint: it is labelled as that of a
+        # rotation.
         slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
         return JOINT_FIELD_UNITS.get(path.field, {}).get(LENGTH if slides else ANGLE, "")
 

@@ -1,10 +1,10 @@
 """Dry friction, smoothed near zero velocity so that derivatives of a trajectory exist.
 
-The engine's dry friction changes its sign from one step to the next, and sticks for some steps. The information of a
-trajectory then jumps by the contribution of such a step, and small differences do not show the jump. Smoothed
-friction is a viscous force that saturates, `f clip(v / s, -1, 1)`. It is nearly the engine's friction where joints
-move, and smooth where they reverse: a joint stays below the speed s for several engine steps, over which the force
-averages.
+The engine's dry friction changes its sign from one step to the next, and sticks for some steps. The
+information of a trajectory then jumps by the contribution of such a step, and small differences do
+not show the jump. Smoothed friction is a viscous force that saturates, `f clip(v / s, -1, 1)`. It
+is nearly the engine's friction where joints move, and smooth where they reverse: a joint stays
+below the speed s for several engine steps, over which the force averages.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from mjfim.arrays import Array
 # Smoothing speed s of a degree of freedom over its fastest speed.
 SMOOTHING_SPEED_FRACTION = 0.02
 
-# Impedance of the smoothed friction constraint, so low that the force follows velocities and not accelerations.
+# Impedance of the smoothed friction constraint, so low that the force follows velocities and not
+# accelerations.
 SMOOTHED_IMPEDANCE = 1e-3
 
 # Smallest impedance that MuJoCo uses.
@@ -70,7 +71,8 @@ def smooth_dry_friction(model: Any, speeds: tuple[float, ...]) -> None:
 
     Args:
         model: The model (`mujoco.MjModel`).
-        speeds: Smoothing speeds of every degree of freedom, then of every tendon; 0 keeps the engine's friction.
+        speeds: Smoothing speeds of every degree of freedom, then of every tendon; 0 keeps the
+            engine's friction.
     """
     remaining = np.asarray(speeds)
     for arrays in _friction_arrays(model):
@@ -109,12 +111,14 @@ def _friction_arrays(model: Any) -> tuple[_FrictionArrays, _FrictionArrays]:
 def _sticking_speeds(arrays: _FrictionArrays) -> Array:
     """(n,) speeds below which the engine's friction brakes with less than its full force, and so sticks.
 
-    The constraint asks for a deceleration of damping times speed; its force cannot exceed the friction loss.
+    The constraint asks for a deceleration of damping times speed; its force cannot exceed the
+    friction loss.
     """
     impedance = np.maximum(arrays.impedance[:, 1], MIN_IMPEDANCE)
     reference = arrays.reference
 
-    # A positive first reference is a time constant (MuJoCo's standard form); else the second one is the damping itself.
+    # A positive first reference is a time constant (MuJoCo's standard form); else the second one is
+    # the damping itself.
     standard = reference[:, 0] > 0.0
     time_constant = np.where(standard, impedance * reference[:, 0], 1.0)
     damping = np.where(standard, 2.0 / time_constant, -reference[:, 1] / impedance)

@@ -20,8 +20,8 @@ def write_element(spec: Any, compiled: Any, wanted: Any, text: str, value: float
 
     Args:
         spec: The spec (`mujoco.MjSpec`).
-        compiled: The model of this spec. Where the inertia of a body comes from geoms, it is stated explicitly
-            before it is changed.
+        compiled: The model of this spec. Where the inertia of a body comes from geoms, it is stated
+            explicitly before it is changed.
         wanted: The model at the values, from which inertias and orientations are taken as a whole.
         text: The parameter path. Paths of the initial state and of the measurement write nothing.
         value: The value of the number.

@@ -7,7 +7,8 @@
 - `InitialStateField`: a deviation of the initial state;
 - `OutputBiasField`, `OutputDelayField`: the measurement itself.
 
-Each has `read(model)`, its value in a model, and `magnitude(model)`, the size with which a change of it is compared.
+Each has `read(model)`, its value in a model, and `magnitude(model)`, the size with which a change
+of it is compared.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, BodyInertia
 
-# Array of MjModel -> array that says whether the element's frame coincides with its body's. MuJoCo skips the position of
-# elements whose frame coincides, so the flag is cleared when the position is written.
+# Array of MjModel -> array that says whether the element's frame coincides with its body's. MuJoCo
+# skips the position of elements whose frame coincides, so the flag is cleared when the position is
+# written.
 SAME_FRAME_FLAGS = {
     "body_ipos": "body_sameframe",
     "site_pos": "site_sameframe",
@@ -41,8 +43,8 @@ class ModelField:
         column: Column of the number; None for arrays with one dimension.
         in_options: Whether the array belongs to `model.opt`.
         factor: The array holds this factor times the value.
-        followers: Further numbers (array, row, column, factor) that are written with it, as the bias of a servo follows
-            its gain.
+        followers: Further numbers (array, row, column, factor) that are written with it, as the
+            bias of a servo follows its gain.
     """
 
     array: str

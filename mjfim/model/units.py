@@ -15,7 +15,8 @@ LENGTH = "m"
 # Unit of the coordinate of a hinge joint and of every other rotation.
 ANGLE = "rad"
 
-# Unit of each part of a ball or free joint: translation, rotation vector, quaternion (dimensionless).
+# Unit of each part of a ball or free joint: translation, rotation vector, quaternion
+# (dimensionless).
 PART_UNITS = {
     **dict.fromkeys(("x", "y", "z"), LENGTH),
     **dict.fromkeys(("rx", "ry", "rz"), ANGLE),
@@ -34,7 +35,8 @@ JOINT_FIELD_UNITS = {
     "springref": {LENGTH: LENGTH, ANGLE: ANGLE},
 }
 
-# Units of the other fields that a parameter path can name; fields that are absent have none or depend on the model.
+# Units of the other fields that a parameter path can name; fields that are absent have none or
+# depend on the model.
 FIELD_UNITS = {
     "mass": "kg",
     "pos": "m",
@@ -49,7 +51,8 @@ FIELD_UNITS = {
     "delay": "s",
 }
 
-# Units of sensors whose unit does not depend on a joint; sensors that are absent have none or depend on the model.
+# Units of sensors whose unit does not depend on a joint; sensors that are absent have none or
+# depend on the model.
 SENSOR_UNITS = {
     mujoco.mjtSensor.mjSENS_TENDONPOS: "m",
     mujoco.mjtSensor.mjSENS_RANGEFINDER: "m",
@@ -116,8 +119,8 @@ def sensor_unit(model: Any, sensor: int) -> str:
 def control_unit(model: Any, actuator: int) -> str:
     """Unit of the control of an actuator.
 
-    It is evident for actuators that act on one joint with a gear of 1: a direct drive (gain 1, no bias) takes a force, a
-    position servo (`biasprm[1] = -gain`) takes the joint's coordinate.
+    It is evident for actuators that act on one joint with a gear of 1: a direct drive (gain 1, no
+    bias) takes a force, a position servo (`biasprm[1] = -gain`) takes the joint's coordinate.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).

@@ -15,10 +15,12 @@ from mjfim.errors import ExperimentError, ModelError
 from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource, unconstrained
 from mjfim.model.smooth_friction import smooth_dry_friction
 
-# Tolerance of the constraint solver in private copies: differences of steps would show the error that a solver leaves.
+# Tolerance of the constraint solver in private copies: differences of steps would show the error
+# that a solver leaves.
 SOLVER_TOLERANCE = 1e-14
 
-# Sizes that determine the layout of MjData. A model with other sizes would write beyond the end of its arrays.
+# Sizes that determine the layout of MjData. A model with other sizes would write beyond the end of
+# its arrays.
 LAYOUT = (
     "nq",
     "nv",
@@ -50,11 +52,15 @@ class ModelVariant:
 
     Attributes:
         sample_factor: Factor by which timestep and sample period are longer than stated.
-        timestep_factor: Factor by which the timestep alone is longer; a sample has correspondingly fewer engine steps.
-        relaxed: True where clamps, stops and contacts are removed; hard limits keep a design away from them.
-        smoothing_speeds: Speed of every degree of freedom, then of every tendon, below which dry friction is viscous
-            where derivatives are taken; empty for the engine's own friction. [rad/s or m/s]
-        smoothed: Dry friction is viscous below these speeds in the motion as well, not only in its derivatives.
+        timestep_factor: Factor by which the timestep alone is longer; a sample has correspondingly
+            fewer engine steps.
+        relaxed: True where clamps, stops and contacts are removed; hard limits keep a design away
+            from them.
+        smoothing_speeds: Speed of every degree of freedom, then of every tendon, below which dry
+            friction is viscous where derivatives are taken; empty for the engine's own friction.
+            [rad/s or m/s]
+        smoothed: Dry friction is viscous below these speeds in the motion as well, not only in its
+            derivatives.
     """
 
     sample_factor: int = 1
@@ -72,8 +78,9 @@ RELAXED = ModelVariant(relaxed=True)
 class MocapPlacement:
     """Poses of mocap bodies that a keyframe states.
 
-    MjData takes its initial poses from the model, so the keyframe's poses overwrite the compiled ones. MuJoCo
-    derives constants of equalities and tendons from the compiled poses, which must be in the model while it does so.
+    MjData takes its initial poses from the model, so the keyframe's poses overwrite the compiled
+    ones. MuJoCo derives constants of equalities and tendons from the compiled poses, which must be
+    in the model while it does so.
 
     Attributes:
         bodies: (n,) ids of the bodies.
@@ -117,7 +124,8 @@ class Relaxation:
         actuators: Ids of actuators whose force range is removed.
         controls: Whether all control ranges are removed.
         contacts: Whether all contacts are removed.
-        smoothing_speeds: Speeds below which dry friction is viscous; empty for the engine's own friction.
+        smoothing_speeds: Speeds below which dry friction is viscous; empty for the engine's own
+            friction.
     """
 
     joints: tuple[int, ...] = ()
@@ -212,14 +220,15 @@ class PlantModel:
         for size in LAYOUT:
             if getattr(compiled, size) != getattr(stated, size):
                 raise ModelError(
-                    f"{path}: a parameter changes {size} of the model from {getattr(stated, size)} to "
-                    f"{getattr(compiled, size)}; it may change numbers only"
+                    f"{path}: a parameter changes {size} of the model from {getattr(stated, size)} "
+                    f"to {getattr(compiled, size)}; it may change numbers only"
                 )
 
         if compiled.opt.timestep != stated.opt.timestep:
             raise ExperimentError(
-                f"parameters: a function changes option.timestep of {path} from {stated.opt.timestep:g} s to "
-                f"{compiled.opt.timestep:g} s; it determines the samples: state the timestep in the MJCF"
+                f"parameters: a function changes option.timestep of {path} from "
+                f"{stated.opt.timestep:g} s to {compiled.opt.timestep:g} s; it determines the "
+                "samples: state the timestep in the MJCF"
             )
 
     def _adapted(self, compiled: Any) -> Any:
@@ -237,7 +246,8 @@ class PlantModel:
 
         model.opt.timestep *= self._timestep_factor
 
-        # Differences of steps must depend neither on the solver's initial guess nor on the error that it leaves.
+        # Differences of steps must depend neither on the solver's initial guess nor on the error
+        # that it leaves.
         model.opt.tolerance = min(model.opt.tolerance, SOLVER_TOLERANCE)
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
 

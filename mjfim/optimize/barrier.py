@@ -3,8 +3,9 @@
     beta(s) = -log s                                           for s > delta
               1/2 [((s - 2 delta) / delta)^2 - 1] - log delta  else
 
-It is twice differentiable and defined outside the bounds as well, so that a descent may begin there. s is the distance to a bound
-over half of the range: 1 in the middle of the range, where beta is zero.
+It is twice differentiable and defined outside the bounds as well, so that a descent may begin
+there. s is the distance to a bound over half of the range: 1 in the middle of the range, where beta
+is zero.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class Bounds:
     Attributes:
         lower: (w,) lower bounds, -inf without one [unit of each number].
         upper: (w,) upper bounds, inf without one [unit of each number].
-        scale: (w,) half of each range, which makes distances to the bounds relative [unit of each number].
+        scale: (w,) half of each range, which makes distances to the bounds relative [unit of each
+            number].
     """
 
     lower: Array
@@ -76,7 +78,8 @@ class Bounds:
             upper: (w,) upper bounds, inf without one.
 
         Returns:
-            Bounds. The scale of one-sided bounds is the magnitude of the bound, at least 1; without bounds it is 1.
+            Bounds. The scale of one-sided bounds is the magnitude of the bound, at least 1; without
+            bounds it is 1.
         """
         two_sided = np.isfinite(lower) & np.isfinite(upper)
         magnitude = np.where(np.isfinite(lower), np.abs(lower), np.abs(upper))
@@ -166,10 +169,11 @@ class BarrierExpansion:
         a: (N+1, nx) derivative by the state at every sample [1 / x-unit].
         b: (N, nu) derivative by the control at every sample [1 / u-unit].
         weights: Gauss-Newton Hessian of the barrier as a quadratic form on tangent curves.
-        observations: (N, S, w, nx+nu) derivatives of the w limited quantities at S engine steps of every sample by its state and
-            control, over the scale of their bounds.
+        observations: (N, S, w, nx+nu) derivatives of the w limited quantities at S engine steps of
+            every sample by its state and control, over the scale of their bounds.
         control_scale: (nu,) scale of the control [u-unit].
-        control_step_scale: (nu,) scale of the control's change from one sample to the next [u-unit], infinite without a limit.
+        control_step_scale: (nu,) scale of the control's change from one sample to the next
+            [u-unit], infinite without a limit.
     """
 
     a: Array

@@ -9,7 +9,8 @@ import numpy as np
 
 from mjfim.budget import Budget
 
-# Factor between two numbers of samples where the ratio is infinite and says nothing about the distance to feasibility.
+# Factor between two numbers of samples where the ratio is infinite and says nothing about the
+# distance to feasibility.
 BLIND_FACTOR = 2.0
 
 # Smallest factor between the first two numbers of samples; it is squared from step to step.
@@ -21,8 +22,8 @@ MAX_FACTOR = 4.0
 # Number of samples that rounding must not add or remove.
 ROUNDING_TOLERANCE = 1e-9
 
-# A candidate inside the bracket stays away from its ends by this share of the tolerance, so that one evaluation may
-# close the bracket.
+# A candidate inside the bracket stays away from its ends by this share of the tolerance, so that
+# one evaluation may close the bracket.
 END_DISTANCE = 0.9
 
 # Of three candidates inside a bracket, this many come from the secant and the rest from the middle.
@@ -70,11 +71,13 @@ def smallest_feasible(
 ) -> tuple[int | None, int | None]:
     """Find the smallest number of samples whose ratio is at most 1.
 
-    The ratio, e.g. of a reached to a required standard deviation, is assumed to fall at least like the inverse square root of the
-    number of samples. The search brackets the place where the ratio is 1 and narrows the bracket by secants.
+    The ratio, e.g. of a reached to a required standard deviation, is assumed to fall at least like
+    the inverse square root of the number of samples. The search brackets the place where the ratio
+    is 1 and narrows the bracket by secants.
 
     Args:
-        ratio: Ratio of a number of samples; infinite where nothing is known, None where its evaluation was stopped.
+        ratio: Ratio of a number of samples; infinite where nothing is known, None where its
+            evaluation was stopped.
         first: Number of samples to begin with, on the grid.
         largest: Largest number of samples, on the grid.
         grid: Numbers that are allowed.
@@ -82,8 +85,9 @@ def smallest_feasible(
         budget: Asked before every evaluation; default: no limit.
 
     Returns:
-        The smallest number that was found feasible, or None, and the largest smaller one that was found infeasible, or None.
-        Where the search was stopped, the bracket may be wider than the tolerance.
+        The smallest number that was found feasible, or None, and the largest smaller one that was
+        found infeasible, or None. Where the search was stopped, the bracket may be wider than the
+        tolerance.
     """
     search = _Bracket(ratio, grid, Budget() if budget is None else budget)
     search.evaluate(first)
@@ -164,7 +168,8 @@ class _Bracket:
             share = np.log(self.known[low]) / np.log(self.known[low] / self.known[high])
             x = float(low * (high / low) ** share)
 
-        # A candidate within one tolerance of an end closes the bracket if the ratio is on the expected side.
+        # A candidate within one tolerance of an end closes the bracket if the ratio is on the
+        # expected side.
         if high - low > 2 * width:
             x = float(np.clip(x, low + END_DISTANCE * width, high - END_DISTANCE * width))
 

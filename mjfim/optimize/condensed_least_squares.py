@@ -1,8 +1,8 @@
 """Least squares over many segments with private unknowns, condensed so that all rows are never held at once.
 
-The whitened rows `[J_private, J_common, r]` of each block of data are reduced to a triangle with the same inner products (QR
-decomposition). The private unknowns are then eliminated segment by segment. The remaining problem is exact linear algebra of the
-size of the common unknowns.
+The whitened rows `[J_private, J_common, r]` of each block of data are reduced to a triangle with
+the same inner products (QR decomposition). The private unknowns are then eliminated segment by
+segment. The remaining problem is exact linear algebra of the size of the common unknowns.
 """
 
 from __future__ import annotations
@@ -21,24 +21,26 @@ QR_BATCH_ROWS = 128
 # Number of rows above which a QR decomposition takes two passes.
 TALL_ROWS = 512
 
-# Exchanges of active bounds per unknown in a bounded least-squares problem. SciPy's default of one exchange per unknown may end
-# before the minimum is reached.
+# Exchanges of active bounds per unknown in a bounded least-squares problem. SciPy's default of one
+# exchange per unknown may end before the minimum is reached.
 MAX_EXCHANGES_PER_UNKNOWN = 20
 
 # Smallest column norm or scale; protects divisions by zero.
 SMALLEST_NORM = 1e-300
 
-# Smallest damping of the private unknowns, relative to their scale. It keeps the elimination regular where a segment does not
-# determine its private unknowns.
+# Smallest damping of the private unknowns, relative to their scale. It keeps the elimination
+# regular where a segment does not determine its private unknowns.
 MIN_PRIVATE_DAMPING = 1e-12
 
-# Singular values below this share of the largest one are dropped from the pseudo-inverse of the private triangles.
+# Singular values below this share of the largest one are dropped from the pseudo-inverse of the
+# private triangles.
 PRIVATE_RANK_TOLERANCE = 1e-12
 
 # Singular values of the scaled private columns below this value do not count towards the rank.
 PRIVATE_RANK_COUNT_TOLERANCE = 1e-8
 
-# Eigenvalues of the scaled information of the common unknowns below this value do not count towards the rank.
+# Eigenvalues of the scaled information of the common unknowns below this value do not count towards
+# the rank.
 COMMON_RANK_COUNT_TOLERANCE = 1e-12
 
 
@@ -51,7 +53,8 @@ class Step:
         private: (P, n) steps of the private unknowns of each segment.
         predicted_decrease: Decrease of half of the squares according to the linearisation.
         common_length: Length of the step of the common unknowns [standard deviations].
-        private_length: Root mean square length of the steps of the private unknowns [standard deviations].
+        private_length: Root mean square length of the steps of the private unknowns [standard
+            deviations].
     """
 
     common: Array
@@ -139,7 +142,8 @@ class Condensed:
         if not n:
             return np.asarray(R.reshape(-1, R.shape[2]))
 
-        # Rows that a segment without full rank leaves over: the least-squares step of its private unknowns does not cancel them.
+        # Rows that a segment without full rank leaves over: the least-squares step of its private
+        # unknowns does not cancel them.
         private = R[:, :n, :n]
         residual = R[:, :n, -1:]
         remaining_jacobian = private @ self.private_response + R[:, :n, n:-1]
@@ -301,7 +305,8 @@ def triangle(rows: Array) -> Array:
     """Triangular factor R of the QR decomposition: few rows with the same inner products.
 
     Args:
-        rows: (..., k, m) rows; two-dimensional tall ones take two passes, the first over batches that stay in the cache.
+        rows: (..., k, m) rows; two-dimensional tall ones take two passes, the first over batches
+            that stay in the cache.
 
     Returns:
         (..., min(k, m), m) factor R.
@@ -345,7 +350,8 @@ def _bounded_least_squares(A: Array, b: Array, lower: Array, upper: Array) -> Ar
         max_iter=MAX_EXCHANGES_PER_UNKNOWN * len(norms),
     )
 
-    # An unknown that the solver holds at a bound lies exactly there, whatever rounding the scaling by the norms leaves.
+    # An unknown that the solver holds at a bound lies exactly there, whatever rounding the scaling
+    # by the norms leaves.
     inside = np.clip(solved.x / norms, low, high)
     inside = np.where(solved.active_mask < 0, low, inside)
     inside = np.where(solved.active_mask > 0, high, inside)

@@ -11,7 +11,8 @@ from mjfim.optimize.lq import CurveCoordinates, TangentCurve, descent
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.optimize.quasi_newton import CurvaturePair, inverse_hessian_product
 
-# Smallest curvature of a stored pair, relative to the norms of the step and of the change of the gradient.
+# Smallest curvature of a stored pair, relative to the norms of the step and of the change of the
+# gradient.
 MIN_RELATIVE_CURVATURE = 1e-10
 
 
@@ -114,7 +115,8 @@ class _Evaluated:
 class LBFGS:
     """Limited-memory BFGS in the curve coordinate `c = u + K x`, in which P(xi + gamma zeta) is affine in gamma.
 
-    The initial Hessian is the control metric, so that the number of iterations does not depend on the sample period.
+    The initial Hessian is the control metric, so that the number of iterations does not depend on
+    the sample period.
 
     Attributes:
         R: (nu, nu) control metric, already multiplied by the sample period.
@@ -176,7 +178,8 @@ class LBFGS:
     def refined(self, R: Array, factor: int) -> LBFGS:
         """A direction with this memory on a finer grid of samples.
 
-        A step s is held over the finer samples; y is an integral over a sample and is divided among them.
+        A step s is held over the finer samples; y is an integral over a sample and is divided among
+        them.
 
         Args:
             R: (nu, nu) control metric, multiplied by the finer sample period.

@@ -1,12 +1,13 @@
 """A model of the smooth E-criterion that knows how eigenvalues repel each other and exchange their eigenvectors.
 
-With the r smallest eigenvalues Lambda and their vectors w_i, a step s changes the information by `B_ij = d(w_i' I w_j).s`, also
-off the diagonal. The model takes `log I` as linear in the step,
+With the r smallest eigenvalues Lambda and their vectors w_i, a step s changes the information by
+`B_ij = d(w_i' I w_j).s`, also off the diagonal. The model takes `log I` as linear in the step,
 
     h(s) = 1/q log tr exp(-q (log Lambda + B(s))).
 
-It is exact to first order, convex, and stiff where the criterion is: where eigenvalues meet. Larger eigenvalues are left out:
-holding them constant would stop a step where the smallest ones reach them, although they change as well.
+It is exact to first order, convex, and stiff where the criterion is: where eigenvalues meet. Larger
+eigenvalues are left out: holding them constant would stop a step where the smallest ones reach
+them, although they change as well.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ class EigenvalueModel:
         eigenvalues: (r,) smallest eigenvalues of the information, ascending.
         power: Power q of the smooth E-criterion.
         weight: Weight of the criterion in the cost.
-        a: (m, N+1, nx) derivative of each coordinate by the state: of `B_ii`, and of `sqrt(2) B_ij` for i < j.
+        a: (m, N+1, nx) derivative of each coordinate by the state: of `B_ii`, and of `sqrt(2) B_ij`
+            for i < j.
         b: (m, N, nu) derivative of each coordinate by the control.
     """
 
@@ -82,7 +84,8 @@ class EigenvalueModel:
 
     def _value_and_gradient(self, d: Array) -> tuple[float, Array]:
         """The model, up to a constant, and its gradient: (m,), at coordinates d: (m,)."""
-        # Eigenvalues relative to the smallest one, so that the exponentials neither overflow nor vanish.
+        # Eigenvalues relative to the smallest one, so that the exponentials neither overflow nor
+        # vanish.
         logs = np.log(self.eigenvalues / self.eigenvalues[0])
         changed = np.diag(logs) + symmetric_matrix(d, len(logs))
         moved, vectors = np.linalg.eigh(changed)
@@ -96,8 +99,8 @@ class EigenvalueModel:
     def minimising_gradient(self, d0: Array, spread: Array) -> Array:
         """Gradient of the model at the minimum of `h(d) + 1/2 (d - d0)' spread^-1 (d - d0)`.
 
-        There `d = d0 - spread w` with the returned gradient w. Newton's method in y with `d = d0 + L y` and `L L' = spread` also
-        works where spread is singular.
+        There `d = d0 - spread w` with the returned gradient w. Newton's method in y with `d = d0 +
+        L y` and `L L' = spread` also works where spread is singular.
 
         Args:
             d0: (m,) centre of the proximal term.
@@ -173,7 +176,8 @@ def symmetric_coordinates(full: Array) -> Array:
         full: (r, r) symmetric matrix.
 
     Returns:
-        (m,) coordinates: diagonal entries, and sqrt(2) times the entries above the diagonal, row by row.
+        (m,) coordinates: diagonal entries, and sqrt(2) times the entries above the diagonal, row by
+        row.
     """
     rows, columns = np.triu_indices(len(full))
     return np.asarray(full[rows, columns] * np.where(rows == columns, 1.0, SQRT_2))

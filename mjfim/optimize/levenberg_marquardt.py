@@ -1,7 +1,8 @@
 """Levenberg-Marquardt within bounds on condensed least squares, and the undamped Gauss-Newton method of the paper.
 
-The module knows arrays and one protocol, not MuJoCo. The damping follows the ratio of the actual to the predicted decrease of
-the cost (Nielsen 1999). Bounds hold in every step, because each step is solved as a bounded linear least-squares problem.
+The module knows arrays and one protocol, not MuJoCo. The damping follows the ratio of the actual to
+the predicted decrease of the cost (Nielsen 1999). Bounds hold in every step, because each step is
+solved as a bounded linear least-squares problem.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ MAX_DECREASE_RATIO = 10.0
 # Decrease of the cost, relative to the cost, below which an iteration counts as stagnant.
 RELATIVE_STAGNATION = 1e-6
 
-# Decrease of the cost below which an iteration counts as stagnant; about a seventh of a standard deviation, squared.
+# Decrease of the cost below which an iteration counts as stagnant; about a seventh of a standard
+# deviation, squared.
 ABSOLUTE_STAGNATION = 1e-2
 
 # Share of the predicted decrease below which an iteration counts as stagnant.
@@ -49,11 +51,12 @@ PREDICTED_STAGNATION = 0.1
 # Number of consecutive stagnant iterations after which the search ends.
 MAX_STAGNANT_ITERATIONS = 3
 
-# Length of a step [standard deviations] that the roughness of a simulation can explain: a step of this length that is predicted
-# but not found does not speak against convergence.
+# Length of a step [standard deviations] that the roughness of a simulation can explain: a step of
+# this length that is predicted but not found does not speak against convergence.
 SHORT_STEP = 0.3
 
-# A predicted step may exceed the step that was taken by this factor and still count as taken completely.
+# A predicted step may exceed the step that was taken by this factor and still count as taken
+# completely.
 COMPLETE_STEP = 1.1
 
 # Private unknowns count as converged when their steps are below this multiple of the tolerance.
@@ -68,7 +71,8 @@ class UnknownValues:
     """Values of all unknowns of a fit.
 
     Attributes:
-        theta: (p,) parameters that all recordings share; entries that are private or per recording are unused.
+        theta: (p,) parameters that all recordings share; entries that are private or per recording
+            are unused.
         private: (P, n) private unknowns of each segment, e.g. its initial state.
         per_recording: (K, e) parameters that each recording has for itself.
     """
@@ -147,9 +151,11 @@ class SearchSettings:
     Attributes:
         max_iterations: Largest number of iterations.
         tolerance: Length of a step [standard deviations] below which the search has converged.
-        damped: True for Levenberg-Marquardt inside the bounds, False for Gauss-Newton without bounds.
-        relinearise_at_end: Whether to linearise once more at the solution. False saves one linearisation and lets the search
-            end when the next step is predicted to be below the tolerance.
+        damped: True for Levenberg-Marquardt inside the bounds, False for Gauss-Newton without
+            bounds.
+        relinearise_at_end: Whether to linearise once more at the solution. False saves one
+            linearisation and lets the search end when the next step is predicted to be below the
+            tolerance.
     """
 
     max_iterations: int = 60
@@ -170,8 +176,8 @@ def minimise(
 ) -> Solution | None:
     """Search for a local minimum of the cost from an initial guess.
 
-    The budget is asked before every trial step and before every linearisation. When it is exhausted, the best values so far
-    are returned; nothing is raised.
+    The budget is asked before every trial step and before every linearisation. When it is
+    exhausted, the best values so far are returned; nothing is raised.
 
     Args:
         problem: Cost and linearisation.
@@ -258,7 +264,8 @@ class _Search:
         if (reason := self.budget.exhausted) is not None:
             return self._stopped(reason)
 
-        # Marquardt's scaling: column norms never shrink, so that the damping does not forget a column.
+        # Marquardt's scaling: column norms never shrink, so that the damping does not forget a
+        # column.
         self.iteration += 1
         self.scale = np.maximum(self.scale, self.condensed.column_norms)
 
@@ -290,7 +297,8 @@ class _Search:
         while True:
             trial = self._trial()
 
-            # A step below the tolerance may miss the predicted decrease: round-off of the simulation hides it.
+            # A step below the tolerance may miss the predicted decrease: round-off of the
+            # simulation hides it.
             small = self._is_small(trial.step)
             if trial.cost <= self.cost and (trial.ratio > MIN_DECREASE_RATIO or small):
                 return trial
@@ -340,7 +348,10 @@ class _Search:
         return self.condensed.step(damping, self.scale, lower, upper)
 
     def _predicted_step(self) -> Step:
-        """Step to the minimum of the linearised cost. Damped steps are short everywhere and do not show how far it is."""
+        """Step to the minimum of the linearised cost.
+
+        Damped steps are short everywhere and do not show how far it is.
+        """
         return self._step(WEAK_DAMPING if self.settings.damped else 0.0)
 
     def _is_small(self, step: Step) -> bool:
@@ -439,7 +450,8 @@ class _Search:
             return self._solution("converged: the residual stopped falling", success=True)
 
         return self._solution(
-            "stopped: no step lowers the residual any more, though the linearised model predicts one",
+            "stopped: no step lowers the residual any more, though the linearised model predicts "
+            "one",
             success=False,
         )
 

@@ -1,6 +1,7 @@
 """Time-varying linear-quadratic problems on arrays: linear recursions, regulator and constrained descent.
 
-A linear recursion over all samples is a unit-triangular banded system. One BLAS call solves it, without a Python loop.
+A linear recursion over all samples is a unit-triangular banded system. One BLAS call solves it,
+without a Python loop.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ class LinearRecursion:
         band = np.zeros((2 * n, (N + 1) * n), order="F")
         band[0] = 1.0
 
-        # Entry (i, j) of block k couples z_{k+1, i} with z_{k, j}, which is n + i - j rows below the diagonal.
+        # Entry (i, j) of block k couples z_{k+1, i} with z_{k, j}, which is n + i - j rows below
+        # the diagonal.
         i, j = np.indices((n, n))
         columns = (np.arange(N) * n)[:, None, None] + j
         rows = np.broadcast_to(n + i - j, columns.shape)
@@ -122,7 +124,8 @@ def _solve_positive_definite(S: Array, rhs: Array) -> Array:
 def regulator(A: Array, B: Array, Q: Array, R: Array, terminal: Array) -> Array:
     """Feedback gain of the linear-quadratic regulator.
 
-    It minimises `sum_k z_k' Q z_k + v_k' R v_k + z_N' terminal z_N` with `v_k = -K_k z_k` along `z_{k+1} = A_k z_k + B_k v_k`.
+    It minimises `sum_k z_k' Q z_k + v_k' R v_k + z_N' terminal z_N` with `v_k = -K_k z_k` along
+    `z_{k+1} = A_k z_k + B_k v_k`.
 
     Args:
         A: (N, nx, nx) transition matrices.
@@ -228,7 +231,8 @@ def descent(
 ) -> TangentCurve:
     """Steepest descent on the tangent space: the paper's problem (8), solved by its Riccati equations.
 
-    It minimises `sum a'z + b'v + 1/2 z'Qz + 1/2 v'Rv` subject to `z_{k+1} = A_k z_k + B_k v_k` and `z_0 = 0`.
+    It minimises `sum a'z + b'v + 1/2 z'Qz + 1/2 v'Rv` subject to `z_{k+1} = A_k z_k + B_k v_k` and
+    `z_0 = 0`.
 
     Args:
         A: (N, nx, nx) transition matrices.
@@ -256,8 +260,9 @@ def descent(
 class RiccatiSolution:
     """Factored linear-quadratic problem with weights that vary over time, for any number of linear costs.
 
-    After the Riccati equations are solved once, a descent needs two banded systems. With weights on the control's changes, the
-    state of the problem is extended by the control of the previous sample; n is its size then, else nx.
+    After the Riccati equations are solved once, a descent needs two banded systems. With weights on
+    the control's changes, the state of the problem is extended by the control of the previous
+    sample; n is its size then, else nx.
 
     Attributes:
         K: (N, nu, n) feedback gain.
@@ -345,7 +350,8 @@ class RiccatiSolution:
 def _with_previous_control(A: Array, B: Array, weights: Weights) -> tuple[Array, Array, Weights]:
     """The problem with the state extended by the previous control, which turns weights on its changes into ordinary ones.
 
-    A: (N, nx, nx);  B: (N, nx, nu). Returns matrices of the state (x_k, v_{k-1}) and weights without W.
+    A: (N, nx, nx);  B: (N, nx, nu). Returns matrices of the state (x_k, v_{k-1}) and weights
+    without W.
     """
     N, nx, nu = B.shape
     unit = np.eye(nu)

@@ -1,7 +1,7 @@
 """Algorithm 1 of Wilson & Murphey: descent on the trajectory manifold with the projection operator.
 
-The module knows arrays and two protocols, neither MuJoCo nor Fisher information. The loop is a generator of iterates; progress
-bars, logs, checkpoints and early stops consume it.
+The module knows arrays and two protocols, neither MuJoCo nor Fisher information. The loop is a
+generator of iterates; progress bars, logs, checkpoints and early stops consume it.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ P = TypeVar("P")
 # Predicted decrease, relative to the cost, that round-off hides.
 ROUND_OFF = 1e-12
 
-# A step is shortened at least to this fraction of its predecessor in the line search; the largest fraction is a setting.
+# A step is shortened at least to this fraction of its predecessor in the line search; the largest
+# fraction is a setting.
 MIN_SHORTENING = 0.1
 
-# Largest predicted decrease of the first step length that is tried, relative to the scale of the cost.
+# Largest predicted decrease of the first step length that is tried, relative to the scale of the
+# cost.
 MAX_PREDICTED_DECREASE = 2.0
 
 
@@ -39,10 +41,12 @@ class Expansion:
         B: (N, nx, nu) derivative of the next state by the control [x-unit / u-unit].
         a: (N+1, nx) derivative of the cost by the state [1 / x-unit].
         b: (N, nu) derivative of the cost by the control [1 / u-unit].
-        extended: Expansion with psi among the states, nx (1+p) of them, for a metric with weight on psi; else None.
-        barrier: The barrier's share of a and b, with its Gauss-Newton Hessian, or None without limits.
-        eigenvalue_model: Model of the logarithm of the cost that is better than linear, where a and b belong to that logarithm;
-            else None.
+        extended: Expansion with psi among the states, nx (1+p) of them, for a metric with weight on
+            psi; else None.
+        barrier: The barrier's share of a and b, with its Gauss-Newton Hessian, or None without
+            limits.
+        eigenvalue_model: Model of the logarithm of the cost that is better than linear, where a and
+            b belong to that logarithm; else None.
     """
 
     A: Array
@@ -82,7 +86,10 @@ class Expansion:
 
 
 class Problem(Protocol[P]):
-    """Cost and dynamics as Algorithm 1 needs them. A point P is a trajectory with all that was computed along it."""
+    """Cost and dynamics as Algorithm 1 needs them.
+
+    A point P is a trajectory with all that was computed along it.
+    """
 
     def value(self, point: P) -> float:
         """Cost J at a point; infinite where the trial diverged."""
@@ -129,7 +136,8 @@ class Direction(Protocol):
 class Armijo:
     """Backtracking line search until `J(gamma) <= J(0) + sigma gamma DJ.zeta`.
 
-    A rejected gamma is shortened to the minimum of the parabola through J(0), the slope and J(gamma), within [0.1, beta] gamma.
+    A rejected gamma is shortened to the minimum of the parabola through J(0), the slope and
+    J(gamma), within [0.1, beta] gamma.
 
     Attributes:
         sigma: Share of the predicted decrease that a step has to reach.
@@ -179,7 +187,8 @@ class Armijo:
             if new <= value + self.sigma * gamma * slope:
                 return trial, gamma
 
-            # Minimum of the parabola; a diverged trial gives none and is shortened as far as allowed.
+            # Minimum of the parabola; a diverged trial gives none and is shortened as far as
+            # allowed.
             excess = new - value - gamma * slope
             shorter = 0.0
             if np.isfinite(new) and excess > 0.0:
@@ -219,8 +228,9 @@ class Regulator:
         R: (nu, nu) weight of the control, multiplied by the sample period.
         terminal: (nx, nx) weight of the last state.
         period: Number of iterates after which K is renewed.
-        feedback_threshold: K is zero where no deviation is amplified by more than this along the open-loop trajectory, because
-            the projection needs no feedback there. 0 always gives feedback.
+        feedback_threshold: K is zero where no deviation is amplified by more than this along the
+            open-loop trajectory, because the projection needs no feedback there. 0 always gives
+            feedback.
     """
 
     Q: Array
@@ -300,7 +310,8 @@ def optimize(
 
         yield iterate
 
-        # The linear model is wrong for a step that predicts a decrease of more than twice J: begin with a shorter one.
+        # The linear model is wrong for a step that predicts a decrease of more than twice J: begin
+        # with a shorter one.
         found = None
         if slope < 0.0:
             first = min(1.0, -MAX_PREDICTED_DECREASE * size / slope)

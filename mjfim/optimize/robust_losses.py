@@ -10,7 +10,8 @@ from scipy.stats import norm
 
 from mjfim.arrays import Array
 
-# Smallest threshold [standard deviations] beyond which a residual counts as an outlier; normal noise hardly ever exceeds it.
+# Smallest threshold [standard deviations] beyond which a residual counts as an outlier; normal
+# noise hardly ever exceeds it.
 MIN_OUTLIER_THRESHOLD = 3.0
 
 # Smallest squared residual in a weight; protects a negative power of zero.
@@ -22,7 +23,8 @@ class RobustLoss:
     """Loss `scale^2 rho((r / scale)^2)` of a whitened residual r.
 
     Attributes:
-        kind: Function rho: linear is ordinary least squares; huber, soft_l1 and cauchy grow more slowly.
+        kind: Function rho: linear is ordinary least squares; huber, soft_l1 and cauchy grow more
+            slowly.
         scale: Residual [standard deviations] at which the loss departs from the square.
     """
 

@@ -15,7 +15,8 @@ from mjfim.optimize.lq import CurveCoordinates, RiccatiSolution, TangentCurve, W
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.optimize.quasi_newton import CurvaturePair, inverse_hessian_product
 
-# Smallest curvature of a pair that is used, relative to the norms of the step and of the change of the gradient.
+# Smallest curvature of a pair that is used, relative to the norms of the step and of the change of
+# the gradient.
 MIN_RELATIVE_CURVATURE = 1e-8
 
 # Smallest damping that is not zero, in units of mu.
@@ -36,7 +37,8 @@ LOWER_LIMITS = (0.1, 1.0)
 # Fraction of a step that the line search has to take, so that the damping does not rise.
 MIN_TAKEN_FRACTION = 0.3
 
-# Predicted decrease above which a shortened step raises the damping; with a smaller one it would look like convergence.
+# Predicted decrease above which a shortened step raises the damping; with a smaller one it would
+# look like convergence.
 SIGNIFICANT_DECREASE = 0.01
 
 # Smallest squared norm of a step; protects a division by zero.
@@ -228,7 +230,8 @@ class _LocalModel:
         weights: The barrier's Gauss-Newton Hessian and the ridge, as a form on tangent curves.
         gradient: Gradient of cost and barrier.
         cost_gradient: Gradient of the cost without the barrier.
-        eigenvalue_slopes: (m, ...) gradients of the coordinates of the eigenvalue model; m is 0 without one.
+        eigenvalue_slopes: (m, ...) gradients of the coordinates of the eigenvalue model; m is 0
+            without one.
         basis: (N, M) basis of the controls, or None.
     """
 
@@ -283,9 +286,10 @@ class _LocalModel:
 class StructuredBFGS:
     """BFGS of the remaining cost, on top of the barrier's Gauss-Newton Hessian and the eigenvalue model of the criterion.
 
-    Both are exact at every point. The curvature pairs hold the remainder alone, so that they stay valid for a sharper barrier.
-    Steps that are too long are damped by `BarrierExpansion.uniform_weights` (Levenberg & Marquardt). That shortens directions
-    that have little curvature, and not the way back inside the limits.
+    Both are exact at every point. The curvature pairs hold the remainder alone, so that they stay
+    valid for a sharper barrier. Steps that are too long are damped by
+    `BarrierExpansion.uniform_weights` (Levenberg & Marquardt). That shortens directions that have
+    little curvature, and not the way back inside the limits.
 
     Attributes:
         ridge: (nu,) weight of the control at every sample, which keeps the metric positive.

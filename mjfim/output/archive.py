@@ -1,7 +1,7 @@
 """Designs, recordings and controls on disk, with the columns that a robot's controller and other programs read.
 
-`mjfim.records.serialization` saves and loads the records; this module adds the tables that need the experiment:
-design.csv, reference.csv, recordings and controls as CSV.
+`mjfim.records.serialization` saves and loads the records; this module adds the tables that need the
+experiment: design.csv, reference.csv, recordings and controls as CSV.
 """
 
 from __future__ import annotations
@@ -26,14 +26,16 @@ from mjfim.records.trajectory import Trajectory
 # Fewest rows of a trajectory that a design can have.
 MIN_ROWS = 3
 
-# Largest relative difference between the sample periods of a design and of an experiment that belong together.
+# Largest relative difference between the sample periods of a design and of an experiment that
+# belong together.
 PERIOD_TOLERANCE = 1e-6
 
 
 def write_design(folder: Path, design: Design, system: System) -> None:
     """Write design.npz, design.csv, reference.csv and design.json, each whole or not at all.
 
-    `Design.load` reads the design back. design.json names the experiment file, relative to the folder.
+    `Design.load` reads the design back. design.json names the experiment file, relative to the
+    folder.
 
     Args:
         folder: Folder for the files; made if it does not exist.
@@ -110,10 +112,12 @@ def read_design(path: Path) -> dict[str, Trajectory]:
         path: The npz file.
 
     Returns:
-        The designed trajectory as `final`, and as `initial` the initial one where the file holds it.
+        The designed trajectory as `final`, and as `initial` the initial one where the file holds
+        it.
 
     Raises:
-        RecordingError: The file cannot be read, lacks an array, or its arrays do not fit each other. Pickles are refused.
+        RecordingError: The file cannot be read, lacks an array, or its arrays do not fit each
+            other. Pickles are refused.
     """
     arrays = read_arrays(path, "design")
 

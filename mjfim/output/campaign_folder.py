@@ -92,7 +92,8 @@ class CampaignFolder:
             The rounds, the first one first.
 
         Raises:
-            RecordingError: A design or a recording cannot be read, or belongs to another experiment.
+            RecordingError: A design or a recording cannot be read, or belongs to another
+                experiment.
         """
         names = self.system.parameters.names
         for number in range(1, self.recorded + 1):
@@ -140,8 +141,9 @@ class CampaignFolder:
         waiting = self.recorded + 1
         if new and waiting > self.designed:
             raise RecordingError(
-                f"{new[0]}: no design waits for a recording in {self.path}; repeat the call without it to design the next "
-                "round (is it a recording of an earlier one, changed?)"
+                f"{new[0]}: no design waits for a recording in {self.path}; repeat the call "
+                "without it to design the next round (is it a recording of an earlier one, "
+                "changed?)"
             )
 
         for i, file in enumerate(new):

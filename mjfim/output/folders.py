@@ -172,7 +172,8 @@ def leave_estimate(folder: Path, estimate: Estimate, system: System) -> list[str
     """Write estimate.json, estimate.npz, identified.xml, estimate.rrd and figures.
 
     Args:
-        folder: Folder for the results; those of an earlier estimate that are not overwritten are removed.
+        folder: Folder for the results; those of an earlier estimate that are not overwritten are
+            removed.
         estimate: The estimate.
         system: The experiment that was identified.
 

@@ -25,12 +25,14 @@ class Labels:
 
     Attributes:
         qpos: nq labels of the numbers of qpos.
-        positions: nv labels of the positions by degree of freedom; rotations of ball and free joints are rotation vectors.
+        positions: nv labels of the positions by degree of freedom; rotations of ball and free
+            joints are rotation vectors.
         velocities: nv labels of the velocities by degree of freedom.
         controls: nu labels of the controls.
         parameters: p names of the parameters, without unit.
         parameter_units: p units of the parameters; empty where a parameter has none.
-        outputs: Labels of the measured columns, by column; others are shown by the name of their column.
+        outputs: Labels of the measured columns, by column; others are shown by the name of their
+            column.
     """
 
     qpos: tuple[str, ...]
@@ -46,7 +48,8 @@ class Labels:
         names, units = len(self.parameters), len(self.parameter_units)
         if names != units:
             raise MjfimError(
-                f"labels name {names} parameters but {units} units; give one unit (or '') per parameter"
+                f"labels name {names} parameters but {units} units; give one unit (or '') per "
+                "parameter"
             )
 
     @classmethod

@@ -1,8 +1,8 @@
 """Tables with which a robot plays a design: `design.csv` for its controller, `reference.csv` for a position-controlled robot.
 
-Rows are engine steps at the controller's rate; nothing is interpolated. With feedback the robot applies
-`u = ctrl + gain (planned - measured)`, the difference in the tangent space: rotations of ball and free joints are rotation
-vectors in the measured body's frame.
+Rows are engine steps at the controller's rate; nothing is interpolated. With feedback the robot
+applies `u = ctrl + gain (planned - measured)`, the difference in the tangent space: rotations of
+ball and free joints are rotation vectors in the measured body's frame.
 """
 
 from __future__ import annotations
@@ -74,8 +74,9 @@ def design_columns(playback: Playback, system: System) -> dict[str, Array]:
 def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
     """Columns of `reference.csv` by name, each (M+1,): the planned motion and the feed-forward that belongs to it.
 
-    `qpos:<joint>` and `qvel:<joint>` are planned, `qacc:<joint>` is MuJoCo's acceleration under the control of the row, and
-    `force:<joint>` what the actuators apply at the joint. The last row continues the last control.
+    `qpos:<joint>` and `qvel:<joint>` are planned, `qacc:<joint>` is MuJoCo's acceleration under the
+    control of the row, and `force:<joint>` what the actuators apply at the joint. The last row
+    continues the last control.
 
     Args:
         playback: The design by periods of the controller, M of them.

@@ -37,10 +37,12 @@ from mjfim.records.robustness import CONFIDENCE, REQUIRED_COVERAGE, Robustness
 # Largest number of parameters or outputs that have a column each.
 MAX_COLUMNS = 7
 
-# Largest number of eigenvalues that a table shows one by one; of more, the largest three and the smallest two are shown.
+# Largest number of eigenvalues that a table shows one by one; of more, the largest three and the
+# smallest two are shown.
 MAX_EIGENVALUES = 6
 
-# Largest number of eigenvalues that a sentence lists; of more, the smallest four and the largest two are listed.
+# Largest number of eigenvalues that a sentence lists; of more, the smallest four and the largest
+# two are listed.
 MAX_LISTED_EIGENVALUES = 8
 
 # Largest number of parameters for which covariance matrices are shown; of more, variances only.
@@ -77,8 +79,11 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
     before, after = float(design.initial.eigenvalues[0]), float(design.final.eigenvalues[0])
     parts.append(
         Paragraph(
-            text=f"λ_min {before:.4g} → {after:.4g} ({after / max(before, TINY):.1f} ×), "
-            f"cost J {design.initial.cost:.5g} → {design.final.cost:.5g}, found from the {design.found_by}"
+            text=(
+                f"λ_min {before:.4g} → {after:.4g} ({after / max(before, TINY):.1f} ×), cost J "
+                f"{design.initial.cost:.5g} → {design.final.cost:.5g}, found from the "
+                f"{design.found_by}"
+            )
         )
     )
     parts.append(
@@ -95,7 +100,10 @@ def describe_design(design: Design, units: Sequence[str]) -> Summary:
     if design.combinations:
         parts.append(
             Paragraph(
-                text="Some parameters are not identifiable alone: the design is made for their combinations; see design.json"
+                text=(
+                    "Some parameters are not identifiable alone: the design is made for their "
+                    "combinations; see design.json"
+                )
             )
         )
     parts.append(Paragraph(text=BEST_CASE, emphasis=Emphasis.WEAK))
@@ -300,8 +308,10 @@ def describe_estimate(estimate: Estimate) -> Summary:
     rms = ", ".join(f"{name} {value:.3g}" for name, value in estimate.residual_rms.items())
     parts.append(
         Paragraph(
-            text=f"residuals: χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof:,} degrees of freedom, {verdict}; "
-            f"rms: {rms}"
+            text=(
+                f"residuals: χ²/dof = {estimate.chi2 / estimate.dof:.3f} with {estimate.dof:,} "
+                f"degrees of freedom, {verdict}; rms: {rms}"
+            )
         )
     )
     parts.append(_residual_table(estimate))
@@ -310,9 +320,11 @@ def describe_estimate(estimate: Estimate) -> Summary:
         parts.append(_prediction_table(estimate.predictions))
     parts.append(
         Paragraph(
-            text="The formal σ is the true accuracy only if model and noise are right. The honest σ is a quarter of "
-            "the interval, which allows for residuals that are not noise and for recordings that disagree, but not for "
-            "the bias of a wrong model.",
+            text=(
+                "The formal σ is the true accuracy only if model and noise are right. The honest "
+                "σ is a quarter of the interval, which allows for residuals that are not noise "
+                "and for recordings that disagree, but not for the bias of a wrong model."
+            ),
             emphasis=Emphasis.WEAK,
         )
     )
@@ -403,7 +415,10 @@ def _prediction_table(predictions: Sequence[Prediction]) -> SummaryTable:
     held_out = all(prediction.held_out for prediction in predictions)
     return SummaryTable(
         key="predictions",
-        title="Prediction of data that were not fitted: rms error of the identified / the nominal model",
+        title=(
+            "Prediction of data that were not fitted: rms error of the identified / the nominal "
+            "model"
+        ),
         columns=columns("data", *(outputs[j] for j in shown), "ratio"),
         rows=tuple(rows),
         note=""
@@ -500,7 +515,10 @@ def describe_study(study: MonteCarloStudy, units: Sequence[str]) -> Summary:
     ]
     parts.append(
         Paragraph(
-            text="efficiency = Cramér-Rao bound / observed variance; 1 means that the bound is reached.",
+            text=(
+                "efficiency = Cramér-Rao bound / observed variance; 1 means that the bound is "
+                "reached."
+            ),
             emphasis=Emphasis.WEAK,
         )
     )
@@ -616,7 +634,8 @@ def describe_check(check: Check) -> Summary:
 
     for title, groups in (
         (
-            "Identifiable in combination only, with this control and with random ones from the initial state",
+            "Identifiable in combination only, with this control and with random ones from the "
+            "initial state",
             check.not_separable,
         ),
         ("Not excited here; another control would show", check.not_excited),
@@ -695,8 +714,8 @@ def _self_test_sentence(check: Check) -> str:
     passed = "passed" if test.passed else "FAILED"
     agreement = "agree" if test.roughness is None else "disagree"
     return (
-        f"derivative self-test {passed}: psi recursion {test.recursion:.1e}, slope {test.slope:.1e}, "
-        f"two steps {agreement}"
+        f"derivative self-test {passed}: psi recursion {test.recursion:.1e}, slope "
+        f"{test.slope:.1e}, two steps {agreement}"
     )
 
 
@@ -919,16 +938,18 @@ def robustness_sentences(result: Robustness) -> Iterator[str]:
         result: The study.
 
     Yields:
-        Sentences: on the intervals, on fits in doubt, on the limits, and on the reserve that a design needs.
+        Sentences: on the intervals, on fits in doubt, on the limits, and on the reserve that a
+        design needs.
     """
     n = result.runs
     low, high = (int(k) for k in binom.interval(0.99, n, CONFIDENCE))
     inside = result.inside[result.identified]
     stated, every = result.joint
     yield (
-        f"95 % intervals hold the true value in {inside.min(initial=n)} to {inside.max(initial=0)} of {n} runs "
-        f"(chance alone: {low} to {high}); joint region of the experiment's parameters in {stated}, of all unknowns in "
-        f"{every}; chi2 / dof {result.fit:.3f}, {result.misfits} misfits, {result.restarted} searches begun again"
+        f"95 % intervals hold the true value in {inside.min(initial=n)} to {inside.max(initial=0)} "
+        f"of {n} runs (chance alone: {low} to {high}); joint region of the experiment's parameters "
+        f"in {stated}, of all unknowns in {every}; chi2 / dof {result.fit:.3f}, {result.misfits} "
+        f"misfits, {result.restarted} searches begun again"
     )
     for sentence, count in result.troubles.items():
         yield f"{count} of {n} runs: {sentence}"
@@ -946,8 +967,8 @@ def robustness_sentences(result: Robustness) -> Iterator[str]:
     if reserve:
         needed = " ".join(f"{kind}={share:g}" for kind, share in reserve.items())
         yield (
-            "reserve that a design needs so that such robots keep the limits, in shares of half ranges: "
-            f"{needed} (make such a design with --reserve {needed})"
+            "reserve that a design needs so that such robots keep the limits, in shares of half "
+            f"ranges: {needed} (make such a design with --reserve {needed})"
         )
 
 

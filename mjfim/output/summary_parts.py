@@ -83,7 +83,8 @@ class Row:
     Attributes:
         cells: A cell for every column.
         emphasis: How strongly it stands out.
-        trajectory: "initial" or "final" where the row belongs to one of the two trajectories; else empty.
+        trajectory: "initial" or "final" where the row belongs to one of the two trajectories; else
+            empty.
     """
 
     cells: tuple[Cell, ...]

@@ -21,7 +21,9 @@ STYLES = {
 
 
 def render(summary: Summary) -> RenderableType:
-    """Render a summary for a terminal: tables and sentences, how the work ended, warnings. Details are left out.
+    """Render a summary for a terminal: tables and sentences, how the work ended, warnings.
+
+    Details are left out.
 
     Args:
         summary: The summary.

@@ -1,4 +1,7 @@
-"""Many MuJoCo simulations in one call, Python never in the inner loop. Every engine step is counted."""
+"""Many MuJoCo simulations in one call, Python never in the inner loop.
+
+Every engine step is counted.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +18,23 @@ from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.parallel import cores
 from mjfim.plant.state_space import StateSpace
 
-# Components of MuJoCo's state that a rollout records after every engine step: time, then (qpos, qvel, act).
+# Components of MuJoCo's state that a rollout records after every engine step: time, then (qpos,
+# qvel, act).
 RECORDED_STATE = int(
     mujoco.mjtState.mjSTATE_TIME
     | mujoco.mjtState.mjSTATE_QPOS
     | mujoco.mjtState.mjSTATE_QVEL
     | mujoco.mjtState.mjSTATE_ACT
 )
-# Time at which simulations start [s]. MuJoCo resets a diverged state and its time to zero: a later start time reveals that.
+# Time at which simulations start [s]. MuJoCo resets a diverged state and its time to zero: a later
+# start time reveals that.
 START_TIME = 1.0
 # Magnitude above which MuJoCo replaces controls by zero.
 MAX_CONTROL = float(mujoco.mjMAXVAL)
 # Type of the sensors that show the time.
 CLOCK_SENSOR = int(mujoco.mjtSensor.mjSENS_CLOCK)
-# Largest number of rollouts that use the small batch; more, as in a Monte Carlo study, use a second one.
+# Largest number of rollouts that use the small batch; more, as in a Monte Carlo study, use a second
+# one.
 SMALL_BATCH = 64
 
 
@@ -73,10 +79,12 @@ class SubstepObservations:
     Attributes:
         positions: Addresses in qpos, after the step.
         velocities: Addresses in qvel, after the step.
-        accelerations: Addresses in qvel whose change over the step, divided by the timestep, is observed.
+        accelerations: Addresses in qvel whose change over the step, divided by the timestep, is
+            observed.
         actuator_forces: Addresses in actuator_force, during the step.
         joint_forces: Addresses in qfrc_actuator, during the step.
-        derivative_substeps: Engine steps of a sample, counted from 1, at which derivatives are taken.
+        derivative_substeps: Engine steps of a sample, counted from 1, at which derivatives are
+            taken.
         timestep: Engine timestep [s].
     """
 
@@ -127,7 +135,8 @@ class Rollouts:
 
     Attributes:
         states: (m, N+1, ns) states.
-        sensors: (m, N+1, nsensordata) sensor data that belong to the states, or None if not requested.
+        sensors: (m, N+1, nsensordata) sensor data that belong to the states, or None if not
+            requested.
         finite: (m,) False where a simulation diverged.
         observed: (m, N, substeps, w) observations at every engine step, or None if not requested.
     """
@@ -144,8 +153,10 @@ class SampleSteps:
 
     Attributes:
         states: (n, ns) states after the sample, NaN where a simulation diverged.
-        sensors: (n, nsensordata) sensor data that belong to the states before the sample, or None if not requested.
-        observed: (n, derivative substeps, w) observations within the sample, or None if not requested.
+        sensors: (n, nsensordata) sensor data that belong to the states before the sample, or None
+            if not requested.
+        observed: (n, derivative substeps, w) observations within the sample, or None if not
+            requested.
     """
 
     states: Array
@@ -253,7 +264,8 @@ class BatchSimulator:
         held = np.repeat(ctrl, self.substeps, axis=1)
         record: tuple[Any, ...] = (RECORDED_STATE,)
         if self.sensors:
-            # Sensor data belong to the state before a step: one more step gives those of the last state.
+            # Sensor data belong to the state before a step: one more step gives those of the last
+            # state.
             held = np.concatenate([held, held[:, -1:]], axis=1)
             record = (*record, "sensordata")
         if observations is not None:
@@ -302,7 +314,8 @@ class BatchSimulator:
         states[0] = reference[0]
         used = np.empty_like(mu)
 
-        # The loop runs over views: this is the only place where Python steps MuJoCo sample by sample.
+        # The loop runs over views: this is the only place where Python steps MuJoCo sample by
+        # sample.
         ctrl, qpos, qvel, act = data.ctrl, data.qpos, data.qvel, data.act
         next_qpos, next_qvel, next_act = space.split(states[1:])
         curves = (states, next_qpos, next_qvel, next_act, reference, used, mu, K)
@@ -393,7 +406,8 @@ class BatchSimulator:
     ) -> tuple[Array | None, list[Array]]:
         """Step a batch over one sample, in parts between which something is read.
 
-        Returns sensor data (count, nsensordata) or None, and (count, w) observations at every derivative substep.
+        Returns sensor data (count, nsensordata) or None, and (count, w) observations at every
+        derivative substep.
         """
         substeps = () if observations is None else observations.derivative_substeps
         accelerations = observations is not None and len(observations.accelerations) > 0

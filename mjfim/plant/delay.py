@@ -20,7 +20,8 @@ class OutputDelay:
     Before the first sample the first value is held, after the last sample the last one.
 
     Attributes:
-        weights: (M, N+1) sparse interpolation weights; M = N+1 if values are wanted at the samples themselves.
+        weights: (M, N+1) sparse interpolation weights; M = N+1 if values are wanted at the samples
+            themselves.
         weight_slopes: (M, N+1) sparse derivative of the weights by d [1/s].
     """
 

@@ -1,7 +1,7 @@
 """Derivatives of the plant: first and mixed second derivatives of F and h, and sensitivities of whole rollouts.
 
-Every derivative is a difference of MuJoCo steps in tangent-space coordinates (`StateSpace`), with all samples and all
-perturbations batched into one call.
+Every derivative is a difference of MuJoCo steps in tangent-space coordinates (`StateSpace`), with
+all samples and all perturbations batched into one call.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class DifferenceAccuracy:
         central: True for two-sided differences in state and control, False for one-sided ones.
         coordinate_step: Step in state and control, relative to the size of what is perturbed.
         direction_step: Step along (psi w, w), relative to the larger of its two parts.
-        shared_origin: True for differences that are one-sided along (psi w, w) and in the parameters as well, so that
-            all directions share one batch at their origin.
+        shared_origin: True for differences that are one-sided along (psi w, w) and in the
+            parameters as well, so that all directions share one batch at their origin.
     """
 
     central: bool
@@ -46,7 +46,8 @@ FORWARD_DIFFERENCES = DifferenceAccuracy(central=False, coordinate_step=1e-6, di
 SHARED_ORIGIN = DifferenceAccuracy(
     central=False, coordinate_step=1e-6, direction_step=1e-3, shared_origin=True
 )
-# One-sided in everything with a short step, for a plant whose dry friction is smoothed and so bends sharply.
+# One-sided in everything with a short step, for a plant whose dry friction is smoothed and so bends
+# sharply.
 SHARED_ORIGIN_SHORT = DifferenceAccuracy(
     central=False, coordinate_step=1e-6, direction_step=1e-5, shared_origin=True
 )
@@ -64,14 +65,16 @@ TINY = 1e-300  # Smallest divisor; protects a division by zero.
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Response:
-    """Outputs of S curves over some consecutive samples, and their derivatives. Delays of the outputs are left out.
+    """Outputs of S curves over some consecutive samples, and their derivatives.
+
+    Delays of the outputs are left out.
 
     Attributes:
         first: Sample of the curves at which the arrays begin.
         y: (S, n+1, ny) outputs [y-unit].
         common: (S, n+1, ny, p) derivative by theta [y-unit / theta-unit], or None if not requested.
-        private: (S, n+1, ny, k) derivative by directions of the initial state [y-unit / x-unit], or None if not
-            requested.
+        private: (S, n+1, ny, k) derivative by directions of the initial state [y-unit / x-unit], or
+            None if not requested.
     """
 
     first: int
@@ -90,11 +93,12 @@ class Bilinear:
         C: (N+1, ny, nx) h_x [y-unit / x-unit].
         D: (N+1, ny, nu) h_u [y-unit / u-unit].
         F_mixed: (r, N, nx+nu, nx) derivative of `DF[psi w, w]` by (x, u).
-        h_mixed: (r, N+1, nx+nu, ny) derivative of `Dh[psi w, w]` by (x, u), or None where it is zero.
+        h_mixed: (r, N+1, nx+nu, ny) derivative of `Dh[psi w, w]` by (x, u), or None where it is
+            zero.
         output_delay: Time delay of the outputs, or None.
         delay_derivative: (p,) derivative of the delay by theta [s / theta-unit].
-        observation_jacobian: (N, derivative substeps, w, nx+nu) derivative of the observations by (x, u), or None if
-            nothing was observed.
+        observation_jacobian: (N, derivative substeps, w, nx+nu) derivative of the observations by
+            (x, u), or None if nothing was observed.
     """
 
     A: Array
@@ -112,14 +116,16 @@ class Bilinear:
 class _MovedSamples:
     """All n samples of a trajectory, and copies of them that are moved along each coordinate of (x, u).
 
-    There are c = nx+nu coordinates and m rows of moves: c forward ones, then c backward ones or a single zero row.
+    There are c = nx+nu coordinates and m rows of moves: c forward ones, then c backward ones or a
+    single zero row.
 
     Attributes:
         trajectory_states: (n, ns) states that are not moved.
         states: (m*n, ns) moved states.
         ctrl: (m*n, nu) moved controls.
         batch_shape: (m, n).
-        widths: (c, 1, 1) distance between the forward move and the backward or zero one [x-unit, u-unit].
+        widths: (c, 1, 1) distance between the forward move and the backward or zero one [x-unit,
+            u-unit].
     """
 
     trajectory_states: Array
@@ -149,7 +155,8 @@ class _PairDerivatives:
         mixed: (c, n, nx) mixed differences of F.
         sensor_first: (c, n, nsensordata) first differences of the sensors, or None without sensors.
         sensor_mixed: (c, n, nsensordata) mixed differences of the sensors, or None without sensors.
-        observation_jacobian: (N, derivative substeps, w, c) first differences of the observations, or None.
+        observation_jacobian: (N, derivative substeps, w, c) first differences of the observations,
+            or None.
     """
 
     first: Array
@@ -164,7 +171,8 @@ class _ResponseMoves:
     """Moves of theta and of the initial state whose rollouts give the derivatives of a response along q directions.
 
     Attributes:
-        theta: (J, p) moves of theta: a zero move, q forward ones, and q backward ones if two-sided [theta-unit].
+        theta: (J, p) moves of theta: a zero move, q forward ones, and q backward ones if two-sided
+            [theta-unit].
         initial_state: (J, nx) moves of the initial state, in the order of `theta` [x-unit].
         moving: Indices of the parameters among the q directions, which come first.
         widths: (q,) distance between the two moves of a quotient.
@@ -190,7 +198,8 @@ class Derivatives:
 
         Args:
             plant: The plant.
-            step_factors: (p,) factors by which the difference steps of the parameters are lengthened; None takes 1.
+            step_factors: (p,) factors by which the difference steps of the parameters are
+                lengthened; None takes 1.
         """
         self.plant = plant
         self._step_factors = (
@@ -214,7 +223,8 @@ class Derivatives:
             trajectory: The trajectory.
 
         Returns:
-            (nx+nu,) magnitudes, 1 for positions and at least 1 for velocities and activations [x-unit, u-unit].
+            (nx+nu,) magnitudes, 1 for positions and at least 1 for velocities and activations
+            [x-unit, u-unit].
         """
         position = np.ones(self.plant.space.nv)
         velocity = np.maximum(1.0, np.abs(trajectory.qvel).max(axis=0, initial=0.0))
@@ -257,7 +267,8 @@ class Derivatives:
             step: Difference step relative to `parameter_scale`.
 
         Returns:
-            y: (N+1, ny) outputs [y-unit] and G: (N+1, ny, p) [y-unit / theta-unit], or None if a simulation diverges.
+            y: (N+1, ny) outputs [y-unit] and G: (N+1, ny, p) [y-unit / theta-unit], or None if a
+            simulation diverges.
         """
         found = self._rollout_differences(theta, self.plant.initial_state(theta), ctrl, step)
         return None if found is None else (found[0], found[1].G)
@@ -275,7 +286,8 @@ class Derivatives:
             theta: (p,) parameters of the trajectory [theta-unit].
             trajectory: Open-loop or closed-loop trajectory; its control is kept.
             step: Difference step relative to `parameter_scale`, one number or (p,).
-            central: True for two-sided differences. False is honoured only if no sensor is an output.
+            central: True for two-sided differences. False is honoured only if no sensor is an
+                output.
 
         Returns:
             The sensitivities, or None if a perturbed rollout diverges.
@@ -302,8 +314,8 @@ class Derivatives:
     ) -> tuple[Array, Sensitivity] | None:
         """Outputs (N+1, ny) and sensitivities from rollouts at theta +- h, for every parameter that changes the motion.
 
-        states: (N+1, ns) at theta where they are known. Without them, and where sensors are delayed, one more rollout
-        gives the states and sensors at theta.
+        states: (N+1, ns) at theta where they are known. Without them, and where sensors are
+        delayed, one more rollout gives the states and sensors at theta.
         """
         plant = self.plant
         moving = np.flatnonzero(plant.parameters.changes_motion)
@@ -311,7 +323,8 @@ class Derivatives:
         delay = plant.output_delay(theta, N + 1)
         needs_origin = states is None or (delay is not None and plant.outputs.needs_sensors)
 
-        # One row of moves per rollout: forward, backward if two-sided, and a zero move for the origin.
+        # One row of moves per rollout: forward, backward if two-sided, and a zero move for the
+        # origin.
         h = (step * self.parameter_scale)[moving]
         forward = np.zeros((count, p))
         forward[np.arange(count), moving] = h
@@ -379,12 +392,12 @@ class Derivatives:
             theta: (p,) parameters [theta-unit].
             initial_states: (S, ns) initial states.
             ctrl: (S, N, nu) controls.
-            start_directions: (nx, k) directions of the initial state by which to differentiate; None for no
-                derivatives at all, those by theta included.
+            start_directions: (nx, k) directions of the initial state by which to differentiate;
+                None for no derivatives at all, those by theta included.
             central: True for two-sided differences.
             step: Difference step relative to `parameter_scale`.
-            wanted: (p,) True for parameters by which to differentiate; None for all. Biases cost nothing and are always
-                included.
+            wanted: (p,) True for parameters by which to differentiate; None for all. Biases cost
+                nothing and are always included.
             max_numbers: Numbers that the states of one stretch may hold.
 
         Yields:
@@ -515,7 +528,8 @@ class Derivatives:
             step: Difference step relative to `difference_sizes`.
 
         Returns:
-            A: (N, nx, nx), B: (N, nx, nu), C: (N+1, ny, nx) and D: (N+1, ny, nu), see `Linearization`.
+            A: (N, nx, nx), B: (N, nx, nu), C: (N+1, ny, nx) and D: (N+1, ny, nu), see
+            `Linearization`.
 
         Raises:
             SimulationDivergedError: A perturbed step diverges.
@@ -548,7 +562,8 @@ class Derivatives:
             step: Difference step relative to `difference_sizes`.
 
         Returns:
-            A: (N, nx, nx), B: (N, nx, nu), and (N, derivative substeps, w, nx+nu) derivatives of the observations.
+            A: (N, nx, nx), B: (N, nx, nu), and (N, derivative substeps, w, nx+nu) derivatives of
+            the observations.
 
         Raises:
             SimulationDivergedError: A perturbed step diverges.
@@ -580,8 +595,8 @@ class Derivatives:
             step: Difference step relative to `parameter_scale`.
 
         Returns:
-            (n, p) effects per theta-unit; rows are relative to the size of a state component [1/s] or to the largest
-            effect on a sensor.
+            (n, p) effects per theta-unit; rows are relative to the size of a state component [1/s]
+            or to the largest effect on a sensor.
 
         Raises:
             SimulationDivergedError: A perturbed step diverges.
@@ -616,7 +631,8 @@ class Derivatives:
     ) -> tuple[Array, Array | None]:
         """Two-sided quotients (count, n, nx) of F and (count, n, nsensordata) of sensors, or None without sensors.
 
-        The first half of states: (2*count*n, ns) and ctrl: (2*count*n, nu) is the forward side; widths: (count, 1, 1)
+        The first half of states: (2*count*n, ns) and ctrl: (2*count*n, nu) is the forward side;
+        widths: (count, 1, 1)
         """
         stepped = self.plant.simulator.step(models, states, ctrl)
         pair = stepped.states.reshape(2, len(widths), -1, states.shape[1])
@@ -681,7 +697,8 @@ class Derivatives:
             SimulationDivergedError: MuJoCo cannot compile a perturbed model.
         """
         given = (theta, trajectory, psi, directions, accuracy)
-        # Derivatives of sensors would need the mean of both sides: one-sided differences leave sensors out.
+        # Derivatives of sensors would need the mean of both sides: one-sided differences leave
+        # sensors out.
         if accuracy.shared_origin and not self.plant.simulator.sensors:
             return self._shared_origin(*given, observations)
 
@@ -834,7 +851,8 @@ class Derivatives:
     ) -> Bilinear:
         """Assemble the record; quotients by (x, u) are its first axis: first, mixed: (nx+nu, N+1, nx), r of mixed.
 
-        states: (N+1, ns);  sensor_first, sensor_mixed: (nx+nu, N+1, nsensordata), None and empty without sensors
+        states: (N+1, ns);  sensor_first, sensor_mixed: (nx+nu, N+1, nsensordata), None and empty
+        without sensors
         """
         plant, nx = self.plant, self.plant.space.nx
         unit = self._unit_moves(len(states))

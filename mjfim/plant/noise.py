@@ -18,8 +18,8 @@ class Noise:
 
     Attributes:
         covariance: (ny, ny) covariance [y-unit y-unit].
-        strides: (ny,) strides; every strides[i]-th sample measures output i, except the initial state k = 0. Correlated
-            outputs share their stride.
+        strides: (ny,) strides; every strides[i]-th sample measures output i, except the initial
+            state k = 0. Correlated outputs share their stride.
     """
 
     covariance: Array
@@ -125,7 +125,8 @@ class Noise:
         if not self.correlated:
             return np.asarray(self.whiten(values)[present])
 
-        # Samples at which different outputs are present have different factors of their marginal covariance.
+        # Samples at which different outputs are present have different factors of their marginal
+        # covariance.
         whitened = np.zeros(values.shape)
         for pattern in np.unique(present, axis=0):
             if not pattern.any():

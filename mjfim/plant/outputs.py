@@ -37,7 +37,8 @@ class Output:
 class Outputs:
     """The output map h without bias and delay.
 
-    States are scalar coordinates or components of quaternions, for which h and its derivatives are known exactly.
+    States are scalar coordinates or components of quaternions, for which h and its derivatives are
+    known exactly.
 
     Attributes:
         outputs: The ny outputs in the order of y.

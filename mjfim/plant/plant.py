@@ -1,6 +1,7 @@
 """The plant in MuJoCo's discrete time: `x_{k+1} = F(x_k, u_k, theta)` and `y_k = h(x_k, u_k, theta)`.
 
-States are differences in tangent-space coordinates wherever they are subtracted or moved (`StateSpace`).
+States are differences in tangent-space coordinates wherever they are subtracted or moved
+(`StateSpace`).
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ class Plant:
         derivatives: Derivatives of F and h, by differences of MuJoCo steps.
         space: Layout of the state and of its tangent space.
         nominal_initial_state: (ns,) initial state where no parameter moves it.
-        initial_state_derivative: (nx, p) derivative of the initial state by theta [x-unit / theta-unit].
-        bias_derivative: (ny, p) derivative of the constant output biases by theta [y-unit / theta-unit].
+        initial_state_derivative: (nx, p) derivative of the initial state by theta [x-unit /
+            theta-unit].
+        bias_derivative: (ny, p) derivative of the constant output biases by theta [y-unit /
+            theta-unit].
         nu: Number of controls.
         dt: Sample period [s].
     """
@@ -63,7 +66,8 @@ class Plant:
             nominal_initial_state: (ns,) initial state where no parameter moves it.
             substeps: `mj_step` calls per sample.
             threads: Threads of the simulator; None takes all cores.
-            smooth: Plant on which mixed second differences are taken if this one has kinks; None takes this one.
+            smooth: Plant on which mixed second differences are taken if this one has kinks; None
+                takes this one.
         """
         self.source = source
         self.parameters = parameters
@@ -104,8 +108,8 @@ class Plant:
             trajectory: Trajectory on which the effect of every parameter is measured.
 
         Returns:
-            The plant with longer difference steps for parameters that hardly move this trajectory, or the plant itself
-            if a perturbed rollout diverges.
+            The plant with longer difference steps for parameters that hardly move this trajectory,
+            or the plant itself if a perturbed rollout diverges.
         """
         factors = self.derivatives.calibrated_step_factors(theta, trajectory)
         if factors is None:
@@ -189,12 +193,14 @@ class Plant:
             theta: (m, p) parameters [theta-unit].
 
         Returns:
-            m models, and (m,) True where the model is the one at theta; elsewhere it is the nominal one.
+            m models, and (m,) True where the model is the one at theta; elsewhere it is the nominal
+            one.
         """
         if self.parameters.needs_compile.any():
             return self._compile(theta)
 
-        # Parameters that are plain numbers of the model are written into copies that are kept for the next call.
+        # Parameters that are plain numbers of the model are written into copies that are kept for
+        # the next call.
         while len(self._reusable_models) < len(theta):
             self._reusable_models.append(copy.copy(self.source.model))
 
@@ -252,7 +258,8 @@ class Plant:
         )
         if not out.finite[0]:
             raise SimulationDivergedError(
-                "the simulation diverges under this control; a smaller amplitude or timestep may help"
+                "the simulation diverges under this control; a smaller amplitude or timestep may "
+                "help"
             )
         return self.trajectory(out.states[0], ctrl)
 

@@ -1,7 +1,8 @@
 """Differences and moves on MuJoCo's configuration space, for many states at once.
 
-This is the vectorised counterpart of `mj_differentiatePos` and `mj_integratePos` (tests compare it with both): scalar
-joints subtract, ball joints and the rotation of free joints use the quaternion logarithm in the body frame.
+This is the vectorised counterpart of `mj_differentiatePos` and `mj_integratePos` (tests compare it
+with both): scalar joints subtract, ball joints and the rotation of free joints use the quaternion
+logarithm in the body frame.
 """
 
 from __future__ import annotations
@@ -159,7 +160,8 @@ def logarithm(quaternion: Array) -> Array:
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(length, np.abs(real))
 
-    # A quaternion and its negative are the same rotation: the one with a positive real part is the shorter way.
+    # A quaternion and its negative are the same rotation: the one with a positive real part is the
+    # shorter way.
     sign = np.where(real < 0.0, -1.0, 1.0)
     safe_length = np.where(length > 0.0, length, 1.0)
     return sign * vector * np.where(length > 0.0, angle / safe_length, 2.0)

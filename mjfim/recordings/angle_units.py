@@ -22,7 +22,8 @@ TOLERANCE = 0.2
 # Correlation above which a position and a velocity count as measurements of one motion.
 MIN_CORRELATION = 0.5
 
-# Time over which positions are differenced [s], so that their resolution and noise have little effect.
+# Time over which positions are differenced [s], so that their resolution and noise have little
+# effect.
 DIFFERENCE_TIME = 0.05
 
 # Angles beyond this multiple of a joint's range are implausible.
@@ -115,8 +116,8 @@ def _check_range(where: str, name: str, q: Array, limits: Array) -> None:
 
     if is_beyond and is_inside:
         raise RecordingError(
-            f"{where}: column {name!r} ranges from {smallest:g} to {largest:g}, its joint from {low:g} to {high:g} rad; "
-            f"{_advice(name, 'deg', 'rad')}"
+            f"{where}: column {name!r} ranges from {smallest:g} to {largest:g}, its joint from "
+            f"{low:g} to {high:g} rad; {_advice(name, 'deg', 'rad')}"
         )
 
 
@@ -129,7 +130,8 @@ def _check_speed(where: str, name: str, t: Array, q: Array) -> None:
     speed = _largest_slope(t, q)
     if speed > MAX_PLAUSIBLE_SPEED:
         raise RecordingError(
-            f"{where}: column {name!r} reaches {largest:g} rad at {speed:.3g} rad/s; {_advice(name, 'deg', 'rad')}"
+            f"{where}: column {name!r} reaches {largest:g} rad at {speed:.3g} rad/s; "
+            f"{_advice(name, 'deg', 'rad')}"
         )
 
 

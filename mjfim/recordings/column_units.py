@@ -4,7 +4,8 @@ A column of the recording is, with the symbols of `ColumnSpec`:
 
     value = (scale * unit * raw + offset) * product of the columns `multiply_by`          (1)
 
-where raw numbers are first freed of missing signs and counter wraps, and values of jumps by whole turns.
+where raw numbers are first freed of missing signs and counter wraps, and values of jumps by whole
+turns.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ def units_of(model: Any) -> dict[str, str]:
         model: The compiled MuJoCo model.
 
     Returns:
-        By column name the unit; `any` where each of rad, rad/s, m and m/s is possible, `none` where there is none.
+        By column name the unit; `any` where each of rad, rad/s, m and m/s is possible, `none` where
+        there is none.
     """
     units = {component.name: component.unit or "none" for component in state_components(model)}
 
@@ -131,7 +133,8 @@ def _signed(table: Table, name: str, raw: Array, bits: int) -> Array:
     if invalid.any():
         row = int(np.argmax(invalid))
         raise RecordingError(
-            f"{table.source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is no integer of {bits} bits"
+            f"{table.source}: column {name!r} holds {raw[row]:g} in data row {row + 1}, which is "
+            f"no integer of {bits} bits"
         )
 
     return np.asarray(np.where(raw >= half, raw - 2.0 * half, raw))

@@ -27,7 +27,8 @@ def read_control(
     """Read a control that is held from each row of a table to the next one.
 
     Args:
-        path: CSV file with the columns `t` [s] and, for each actuator, its name or `ctrl:<name>`; also a design.csv.
+        path: CSV file with the columns `t` [s] and, for each actuator, its name or `ctrl:<name>`;
+            also a design.csv.
         t: (N,) sample times [s].
         dt: Sample period [s].
         names: nu names of the actuators.
@@ -37,8 +38,8 @@ def read_control(
         (N, nu) control at the sample times [control unit].
 
     Raises:
-        RecordingError: A column is missing or unknown, a number is missing, the times do not increase, or the table
-            does not cover the sample times.
+        RecordingError: A column is missing or unknown, a number is missing, the times do not
+            increase, or the table does not cover the sample times.
     """
     columns = read_table(path)
     stamps, values = _columns_of_control(path, columns, names)
@@ -52,8 +53,8 @@ def read_control(
         t = stamps[0] + np.mod(t - t[0] + STAMP_TOLERANCE * dt, end - stamps[0])
     elif stamps[0] > t[0] + TIME_TOLERANCE or end < t[-1] + dt - TIME_TOLERANCE:
         raise RecordingError(
-            f"{path}: too few rows: the table covers t = {stamps[0]:g} ... {end:g} s with {len(stamps)} rows, "
-            f"the experiment needs 0 ... {t[-1] + dt:g} s ({len(t)} samples)"
+            f"{path}: too few rows: the table covers t = {stamps[0]:g} ... {end:g} s with "
+            f"{len(stamps)} rows, the experiment needs 0 ... {t[-1] + dt:g} s ({len(t)} samples)"
         )
 
     row = np.searchsorted(stamps, t + STAMP_TOLERANCE * dt, side="right") - 1
@@ -71,8 +72,8 @@ def _columns_of_control(
     for name, key in zip(names, keys, strict=True):
         if key not in columns:
             raise RecordingError(
-                f"{path}: no column for actuator {name!r}; expected columns: t, {', '.join(names)}; "
-                f"found: {', '.join(columns)}"
+                f"{path}: no column for actuator {name!r}; expected columns: t, "
+                f"{', '.join(names)}; found: {', '.join(columns)}"
             )
 
     known = {"t", *names, *(f"ctrl:{name}" for name in names)}

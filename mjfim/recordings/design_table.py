@@ -68,7 +68,8 @@ def _grid(path: Path, t: Array, timestep: float) -> Array:
     # The comparison is negated so that NaN is refused, too.
     if steps < 1 or not np.abs(t - grid).max() <= STAMP_TOLERANCE * timestep * len(t):
         raise RecordingError(
-            f"{path}: column 't' does not go from 0 in equal periods of whole timesteps ({timestep:g} s)"
+            f"{path}: column 't' does not go from 0 in equal periods of whole timesteps "
+            f"({timestep:g} s)"
         )
     return np.asarray(grid)
 

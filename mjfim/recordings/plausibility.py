@@ -27,10 +27,12 @@ MAX_ROUGH_SHARE = 0.1
 # A deviation counts only if it exceeds this number of stated standard deviations of the noise.
 SIGNIFICANT_SIGMAS = 3.0
 
-# A control jumps if the running median removes more than this share of its variance; controls may jump by intent.
+# A control jumps if the running median removes more than this share of its variance; controls may
+# jump by intent.
 MAX_ROUGH_CONTROL_SHARE = 0.5
 
-# A control that jumps by intent is still correlated with the row before; below this correlation it looks like noise.
+# A control that jumps by intent is still correlated with the row before; below this correlation it
+# looks like noise.
 MIN_CONTROL_CORRELATION = 0.5
 
 # Share of the rows in which a control may be outside its range.
@@ -39,8 +41,8 @@ MAX_SHARE_OUTSIDE_RANGE = 1e-3
 # Tolerance of that range, as a share of its width.
 RANGE_TOLERANCE = 1e-6
 
-# A position and the integral of its velocity contradict each other if their displacements differ by more than this
-# share of the displacements' standard deviation.
+# A position and the integral of its velocity contradict each other if their displacements differ by
+# more than this share of the displacements' standard deviation.
 MAX_DISAGREEMENT = 0.1
 
 # Time over which displacements are compared [s].
@@ -80,9 +82,10 @@ def _control_remarks(channels: Channels, ctrl: Array) -> Iterator[str]:
         rough, correlation = _rough_share(u), _lag_one_correlation(u)
         if rough > MAX_ROUGH_CONTROL_SHARE and correlation < MIN_CONTROL_CORRELATION:
             yield (
-                f"control {name!r} jumps from row to row ({100 * rough:.0f} % of its variance lies within {MEDIAN_ROWS} rows, "
-                f"correlation with the previous row {correlation:.2f}): if it was measured rather than commanded, its noise "
-                "acts as a force that never existed, and the estimates are biased"
+                f"control {name!r} jumps from row to row ({100 * rough:.0f} % of its variance lies "
+                f"within {MEDIAN_ROWS} rows, correlation with the previous row {correlation:.2f}): "
+                "if it was measured rather than commanded, its noise acts as a force that never "
+                "existed, and the estimates are biased"
             )
 
 
@@ -95,8 +98,9 @@ def _range_remarks(name: str, u: Array, limits: Array) -> Iterator[str]:
     share = float(np.mean(outside))
     if share > MAX_SHARE_OUTSIDE_RANGE:
         yield (
-            f"control {name!r} is outside its ctrlrange [{low:g}, {high:g}] in {100 * share:.2g} % of the rows (it ranges "
-            f"from {u.min():.3g} to {u.max():.3g}); the simulation clamps it to the range"
+            f"control {name!r} is outside its ctrlrange [{low:g}, {high:g}] in {100 * share:.2g} % "
+            f"of the rows (it ranges from {u.min():.3g} to {u.max():.3g}); the simulation clamps "
+            "it to the range"
         )
 
 
@@ -114,8 +118,9 @@ def _roughness_remarks(channels: Channels, recording: Recording) -> Iterator[str
         rough_std = np.sqrt(share * np.var(y))
         if share > MAX_ROUGH_SHARE and rough_std > SIGNIFICANT_SIGMAS * sigma.get(name, 0.0):
             yield (
-                f"{name} is rough: {100 * share:.0f} % of its variance lies within {MEDIAN_ROWS} rows, which is impossible "
-                "for a smooth motion; noise, spikes or steps hide the motion of the robot"
+                f"{name} is rough: {100 * share:.0f} % of its variance lies within {MEDIAN_ROWS} "
+                "rows, which is impossible for a smooth motion; noise, spikes or steps hide the "
+                "motion of the robot"
             )
 
 
@@ -140,8 +145,8 @@ def _contradiction_remarks(channels: Channels, recording: Recording) -> Iterator
         )
         if disagreement > max(MAX_DISAGREEMENT, SIGNIFICANT_SIGMAS * expected):
             yield (
-                f"{position} and the integral of {velocity} differ by {100 * disagreement:.0f} % of the motion: "
-                "one of them is wrong or delayed"
+                f"{position} and the integral of {velocity} differ by {100 * disagreement:.0f} % "
+                "of the motion: one of them is wrong or delayed"
             )
 
 
@@ -158,8 +163,8 @@ def _disagreement(
         sigma_v: Standard deviation of the velocities' noise.
 
     Returns:
-        Standard deviation of the difference and the one expected from the noise, both relative to the standard
-        deviation of the displacement; 0 and 0 if the joint does not move.
+        Standard deviation of the difference and the one expected from the noise, both relative to
+        the standard deviation of the displacement; 0 and 0 if the joint does not move.
     """
     dq, dv, lag = displacements(t, q, v, COMPARISON_TIME, len(t) // 4)
     size = float(np.std(dq))
@@ -184,8 +189,8 @@ def displacements(
         max_lag: Largest length of a stretch [rows].
 
     Returns:
-        (M-lag,) differences of the position, (M-lag,) integrals of the velocity by the trapezoidal rule, and lag,
-        the length of a stretch [rows].
+        (M-lag,) differences of the position, (M-lag,) integrals of the velocity by the trapezoidal
+        rule, and lag, the length of a stretch [rows].
     """
     steps = np.diff(t)
     lag = int(np.clip(round(duration / float(np.median(steps))), 1, max_lag))

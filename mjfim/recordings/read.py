@@ -1,6 +1,7 @@
 """Recordings from logs: the experiment's `[recording]` table applied to the columns of a file.
 
-The times are those of the log, and nothing is interpolated; only controls are held over rows in which they are empty.
+The times are those of the log, and nothing is interpolated; only controls are held over rows in
+which they are empty.
 """
 
 from __future__ import annotations
@@ -130,8 +131,8 @@ def check_spec(channels: Channels) -> None:
 def _sources(table: Table, channels: Channels) -> dict[str, ColumnSpec]:
     """Rule of every column of the recording: first of all controls, then of the measured columns.
 
-    A control without a stated rule is read under its default name; measured columns are read under their default names
-    only where the experiment file states none of them.
+    A control without a stated rule is read under its default name; measured columns are read under
+    their default names only where the experiment file states none of them.
     """
     stated = channels.spec.sources
     default = _columns_by_default_name(table, channels)
@@ -183,7 +184,8 @@ def _columns_by_default_name(table: Table, channels: Channels) -> dict[str, str]
             continue
         if len(labels) != len(parts):
             raise RecordingError(
-                f"{table.source}: array {matrix!r} has {len(labels)} columns, the model {len(parts)}: {', '.join(parts)}"
+                f"{table.source}: array {matrix!r} has {len(labels)} columns, the model "
+                f"{len(parts)}: {', '.join(parts)}"
             )
         found.update(zip(parts, labels, strict=True))
 
@@ -215,13 +217,14 @@ def _window(table: Table, spec: RecordingSpec) -> tuple[Array, slice]:
     since = t - t[0]
     begin = _first_true(since >= spec.window[0] - WINDOW_TOLERANCE)
 
-    # Only rows after the beginning count: a clock that restarts later must not end the window earlier.
+    # Only rows after the beginning count: a clock that restarts later must not end the window
+    # earlier.
     end = begin + _first_true(since[begin:] > spec.window[1] + WINDOW_TOLERANCE)
 
     if end == begin:
         raise RecordingError(
-            f"{table.source}: recording.window: no row between {spec.window[0]:g} and {spec.window[1]:g} s; "
-            f"the log lasts {t[-1] - t[0]:g} s"
+            f"{table.source}: recording.window: no row between {spec.window[0]:g} and "
+            f"{spec.window[1]:g} s; the log lasts {t[-1] - t[0]:g} s"
         )
     return t, slice(begin, end)
 

@@ -44,12 +44,17 @@ class ColumnSpec(Section):
     )
     signed: Literal[8, 16, 32] | None = Field(
         default=None,
-        description="Number of bits of a signed integer that the log holds as an unsigned one. Default: the log's "
-        "numbers already have a sign.",
+        description=(
+            "Number of bits of a signed integer that the log holds as an unsigned one. Default: "
+            "the log's numbers already have a sign."
+        ),
     )
     period: Positive | None = Field(
         default=None,
-        description="Raw number after which a counter begins again at 0; its jumps are removed. Default: no counter.",
+        description=(
+            "Raw number after which a counter begins again at 0; its jumps are removed. Default: "
+            "no counter."
+        ),
     )
     unwrap: bool = Field(
         default=False, description="Jumps of an angle by a whole turn are removed."
@@ -69,8 +74,10 @@ class RecordingSpec(Section):
     )
     records: str | None = Field(
         default=None,
-        description="Place of the list of records inside a JSON file, keys joined by dots, such as `data.entries`. Default: the "
-        "only list of records that the file holds.",
+        description=(
+            "Place of the list of records inside a JSON file, keys joined by dots, such as "
+            "`data.entries`. Default: the only list of records that the file holds."
+        ),
     )
     topics: tuple[str, ...] = Field(
         default=(),
@@ -86,8 +93,11 @@ class RecordingSpec(Section):
     )
     columns: dict[str, str | ColumnSpec] = Field(
         default={},
-        description="Sources of the columns of the recording, by `ctrl:<actuator>`, `qpos:<joint>`, `qvel:<joint>` or sensor: "
-        "the name of a column of the log, or a table. Default: columns with these very names.",
+        description=(
+            "Sources of the columns of the recording, by `ctrl:<actuator>`, `qpos:<joint>`, "
+            "`qvel:<joint>` or sensor: the name of a column of the log, or a table. Default: "
+            "columns with these very names."
+        ),
     )
 
     @model_validator(mode="after")

@@ -10,7 +10,8 @@ from mjfim.errors import RecordingError
 # Smallest number of rows of a usable log.
 MIN_ROWS = 3
 
-# Shortest and longest median step of a robot's log [s]; outside, the unit of time is probably wrong.
+# Shortest and longest median step of a robot's log [s]; outside, the unit of time is probably
+# wrong.
 MIN_MEDIAN_STEP = 1e-6
 MAX_MEDIAN_STEP = 1.0
 
@@ -23,7 +24,8 @@ MIN_GAP_STEPS = 5.0
 # Smallest number of values with which a measured column of equal values counts as a dead channel.
 DEAD_CHANNEL_ROWS = 10
 
-# A clock that falls back below this share of the elapsed time has restarted; above, rows are out of order.
+# A clock that falls back below this share of the elapsed time has restarted; above, rows are out of
+# order.
 RESTART_SHARE = 0.1
 
 # Seconds per unit of time.
@@ -41,8 +43,8 @@ def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None
         gap: Longest gap that is bridged [s].
 
     Raises:
-        RecordingError: There are too few rows, a time is missing or not after the time before, the unit is
-            probably wrong, or there is too long a gap.
+        RecordingError: There are too few rows, a time is missing or not after the time before, the
+            unit is probably wrong, or there is too long a gap.
     """
     if len(t) < MIN_ROWS:
         raise RecordingError(
@@ -70,8 +72,8 @@ def check_clock(where: str, t: Array, first: int, unit: str, gap: float) -> None
     if steps[row] > limit:
         raise RecordingError(
             f"{where}: a gap of {steps[row]:g} s after data row {first + row + 1} "
-            f"({t[row] - t[0]:g} s after the first one); gaps longer than {limit:g} s are not bridged: "
-            "exclude it by recording.window, or raise recording.gap"
+            f"({t[row] - t[0]:g} s after the first one); gaps longer than {limit:g} s are not "
+            "bridged: exclude it by recording.window, or raise recording.gap"
         )
 
 
@@ -92,7 +94,10 @@ def _describe_reversal(where: str, t: Array, steps: Array, first: int) -> str:
     """Message about the first time that is not after the time before. t: (M,), steps: (M-1,) [s]."""
     row = int(np.argmax(steps <= 0.0))
     before, after = t[row], t[row + 1]
-    place = f"{where} does not increase in data row {first + row + 2}: {before:.9g} s, then {after:.9g} s"
+    place = (
+        f"{where} does not increase in data row {first + row + 2}: {before:.9g} s, then "
+        f"{after:.9g} s"
+    )
 
     if steps[row] == 0.0:
         count = int(np.sum(steps == 0.0))
@@ -102,7 +107,10 @@ def _describe_reversal(where: str, t: Array, steps: Array, first: int) -> str:
     # A clock that restarts goes back to the beginning, and continues from there.
     is_last = row + 2 == len(t)
     if after - t[0] < RESTART_SHARE * (before - t[0]) and not is_last:
-        return f"{place} (the clock restarted or wrapped around); cut the log there by recording.window, or in two files"
+        return (
+            f"{place} (the clock restarted or wrapped around); cut the log there by "
+            "recording.window, or in two files"
+        )
 
     return f"{place} (rows out of order); sort them by time"
 
@@ -157,7 +165,8 @@ def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
 
     if len(present) >= DEAD_CHANNEL_ROWS and np.ptp(values[present]) == 0.0:
         raise RecordingError(
-            f"{where} is {values[present[0]]:g} in all of its {len(present)} rows, a dead channel; {cure}"
+            f"{where} is {values[present[0]]:g} in all of its {len(present)} rows, a dead channel; "
+            f"{cure}"
         )
 
     # A slow column is empty in most rows: its gaps are measured against its own steps.
@@ -168,8 +177,8 @@ def check_measured(where: str, t: Array, values: Array, gap: float) -> None:
     if edges[longest + 1] - edges[longest] > limit:
         begin, end = edges[longest] - t[0], edges[longest + 1] - t[0]
         raise RecordingError(
-            f"{where} is empty from {begin:g} to {end:g} s; gaps longer than {limit:g} s are not bridged: "
-            "exclude that time by recording.window, or raise recording.gap"
+            f"{where} is empty from {begin:g} to {end:g} s; gaps longer than {limit:g} s are not "
+            "bridged: exclude that time by recording.window, or raise recording.gap"
         )
 
 
@@ -181,7 +190,8 @@ def hold_last_value(t: Array, values: Array) -> tuple[Array, Array]:
         values: (M,) values of the control, NaN where empty.
 
     Returns:
-        (M,) filled values, NaN before the first value, and (M,) time since each value was logged [s].
+        (M,) filled values, NaN before the first value, and (M,) time since each value was logged
+        [s].
     """
     rows = np.where(np.isfinite(values), np.arange(len(values)), 0)
     last = np.maximum.accumulate(rows)
@@ -207,13 +217,15 @@ def check_held(where: str, t: Array, values: Array, age: Array, gap: float) -> N
             row = int(np.argmax(~np.isnan(values)))
             reason = f"it begins {t[row] - t[0]:g} s later"
         raise RecordingError(
-            f"{where} has no value in the first row; {reason}; every control is needed from the start"
+            f"{where} has no value in the first row; {reason}; every control is needed from the "
+            "start"
         )
 
     limit = longest_bridged_gap(t, gap)
     if age.max() > limit:
         end = int(np.argmax(age))
         raise RecordingError(
-            f"{where} is empty for {age[end]:g} s until {t[end] - t[0]:g} s; a control is not held longer than {limit:g} s: "
-            "exclude that time by recording.window, or raise recording.gap"
+            f"{where} is empty for {age[end]:g} s until {t[end] - t[0]:g} s; a control is not held "
+            f"longer than {limit:g} s: exclude that time by recording.window, or raise "
+            "recording.gap"
         )

@@ -20,7 +20,10 @@ class CampaignStatus(Enum):
     """Outcome of a campaign; the value is a sentence for the user."""
 
     REACHED = "reached: every parameter is known as accurately as wanted"
-    DOUBTFUL = "every formal σ reaches its target, but the fit is in doubt (see warnings), so the true errors may be larger"
+    DOUBTFUL = (
+        "every formal σ reaches its target, but the fit is in doubt (see warnings), so the true "
+        "errors may be larger"
+    )
     EXHAUSTED = "all rounds are used up before every parameter is known as accurately as wanted"
     WAITING = "the next round is designed and waits for its recording"
     INFEASIBLE = "no design keeps the limits at the estimate; nothing more was recorded"
@@ -51,7 +54,8 @@ class Round:
     Attributes:
         number: Number of the round, from 1.
         theta: (p,) parameters at which it was designed [theta-unit].
-        predicted: (p,) standard deviations predicted for the estimate after it [theta-unit]; NaN without a design.
+        predicted: (p,) standard deviations predicted for the estimate after it [theta-unit]; NaN
+            without a design.
         control: (N, nu) control of the design [unit of the actuator].
         recordings: Recordings of this round.
         estimate: Estimate from all recordings up to this round.

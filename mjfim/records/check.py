@@ -15,10 +15,12 @@ from mjfim.records.serialization import SavedRecord
 # Correlation of two estimates (absolute value) above which the parameters count as confounded.
 CONFOUNDED_CORRELATION = 0.95
 
-# Largest relative difference between psi by rollouts and psi by the linear recursion that passes the self-test.
+# Largest relative difference between psi by rollouts and psi by the linear recursion that passes
+# the self-test.
 RECURSION_TOLERANCE = 1e-3
 
-# Largest relative difference between the analytic slope of the cost and finite differences that passes the self-test.
+# Largest relative difference between the analytic slope of the cost and finite differences that
+# passes the self-test.
 SLOPE_TOLERANCE = 1e-2
 
 
@@ -31,12 +33,14 @@ class ParameterCheck:
         unit: Its unit; may be empty.
         value: Value at which the check was made [unit].
         nuisance: True where the experiment does not aim at this parameter.
-        size: Magnitude of its value, or of the whole vector or tensor of which it is a component [unit].
+        size: Magnitude of its value, or of the whole vector or tensor of which it is a component
+            [unit].
         std: Predicted standard deviation [unit]; infinite where it is not identifiable alone.
         relative: `std` over `size`.
         wanted: Standard deviation aimed at [unit]: stated, or 5 % of `size`.
         stated: True where `wanted` was stated in the experiment.
-        repetitions: Repetitions of this experiment that reach `wanted`; 0 where no number of repetitions does.
+        repetitions: Repetitions of this experiment that reach `wanted`; 0 where no number of
+            repetitions does.
         seconds: Duration of these repetitions [s].
     """
 
@@ -108,8 +112,9 @@ class Roughness:
         size = f"{100 * self.error:.2g} %" if np.isfinite(self.error) else "an unlimited amount"
 
         return (
-            f"not smooth: derivatives by two difference steps disagree by {size} for {self.parameter}, first at sample "
-            f"{self.sample} (t = {self.time:.4g} s; {cause}); σ and the design are unreliable, because they use these derivatives"
+            f"not smooth: derivatives by two difference steps disagree by {size} for "
+            f"{self.parameter}, first at sample {self.sample} (t = {self.time:.4g} s; {cause}); σ "
+            "and the design are unreliable, because they use these derivatives"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -127,7 +132,8 @@ class Roughness:
 class SelfTest:
     """Test of the derivatives along a trajectory.
 
-    Errors are relative; infinite where a perturbed motion diverges, NaN where the criterion itself is infinite.
+    Errors are relative; infinite where a perturbed motion diverges, NaN where the criterion itself
+    is infinite.
 
     Attributes:
         roughness: Disagreement of two difference steps that is too large, or None.
@@ -173,13 +179,15 @@ class Check(SavedRecord):
         information: (p, p) information, priors included, initial-state deviations marginalised
             [1 / (unit of theta_i times unit of theta_j)].
         eigenvalues: (s,) ascending, of the information that the criterion sees.
-        correlation: (t, t) correlation of the estimates of `wanted`; NaN where one is not identifiable alone.
+        correlation: (t, t) correlation of the estimates of `wanted`; NaN where one is not
+            identifiable alone.
         confounded: Pairs of parameters with strongly correlated estimates.
         not_separable: Groups of parameters that no experiment with these outputs can separate.
         not_excited: Groups that another control would separate.
         self_test: Test of the derivatives.
         verdict: Sentences for the user.
-        combined: Accuracies of the identifiable combinations (`std_initial` and `std_final` are equal).
+        combined: Accuracies of the identifiable combinations (`std_initial` and `std_final` are
+            equal).
     """
 
     source: str
@@ -212,7 +220,8 @@ class Check(SavedRecord):
     def ok(self) -> bool:
         """True where derivatives agree, every parameter is identifiable and one repetition reaches every stated accuracy."""
         known = {row.name for row in self.rows if np.isfinite(row.std)}
-        # A prior can separate parameters that the data cannot separate; such a group is then no fault.
+        # A prior can separate parameters that the data cannot separate; such a group is then no
+        # fault.
         separable = all(set(group.members) <= known for group in self.not_separable)
 
         stated = [row for row in self.rows if row.stated and not row.nuisance]

@@ -40,7 +40,8 @@ class ParameterGroup:
 
     Attributes:
         members: Names of the parameters.
-        combinations: The identifiable combinations, fewer than members; none where no member has any effect.
+        combinations: The identifiable combinations, fewer than members; none where no member has
+            any effect.
     """
 
     members: tuple[str, ...]

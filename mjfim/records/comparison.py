@@ -41,8 +41,8 @@ class MethodResult:
         criterion: phi, the information term of the cost.
         std: (p,) Cramér-Rao standard deviations [theta-unit].
         min_eigenvalue: Smallest eigenvalue of the information per second that the criterion sees.
-        worst_relative_std: `(lambda_min(S I S))^-1/2`: standard deviation of the worst combination of parameters,
-            relative to their scales S.
+        worst_relative_std: `(lambda_min(S I S))^-1/2`: standard deviation of the worst combination
+            of parameters, relative to their scales S.
         seconds: Wall time [s].
         steps: MuJoCo steps taken.
         margins: Worst margin of each kind of limit [unit of the limit].
@@ -109,7 +109,8 @@ class Comparison(SavedRecord):
     Attributes:
         source: Name of the experiment.
         criterion: "E", "A", "D" or "c".
-        nats: For D-optimality: number by which differences of J are divided to obtain the change per parameter; else 0.
+        nats: For D-optimality: number by which differences of J are divided to obtain the change
+            per parameter; else 0.
         parameters: Names of the p parameters.
         units: Unit of each.
         scale: (p,) scale of each [theta-unit].
@@ -186,7 +187,8 @@ class Comparison(SavedRecord):
             other: The other one.
 
         Returns:
-            Fraction of the other's J; for D-optimality: fraction of its geometric mean of variances.
+            Fraction of the other's J; for D-optimality: fraction of its geometric mean of
+            variances.
         """
         if self.nats:
             return float(-np.expm1((row.cost - other.cost) / self.nats))
@@ -241,7 +243,10 @@ def _verdict(comparison: Comparison) -> str:
         f"worst relative σ {design.worst_relative_std:.3g} against {rival.worst_relative_std:.3g}"
     )
     if not design.sound:
-        return f"The design {design.outcome.value}; the best control that may be used is from {rival.title} ({sigmas})."
+        return (
+            f"The design {design.outcome.value}; the best control that may be used is from "
+            f"{rival.title} ({sigmas})."
+        )
 
     if comparison.beating:
         better = ", ".join(

@@ -25,14 +25,18 @@ class Evaluation:
         trajectory: The trajectory.
         gain: (N, nu, nx) regulator K about the trajectory [u-unit / x-unit].
         sensitivity: (N+1, nx, p) psi [x-unit / theta-unit].
-        information: (p, p) Fisher information, summed over the measured samples [1 / (unit of theta_i times unit of theta_j)].
-        eigenvalues: (s,) ascending, of the information per second that the cost sees: scaled, nuisance marginalised,
-            identifiable combinations only.
-        std: (p,) Cramér-Rao standard deviations [theta-unit]; infinite where a parameter is not identifiable alone.
-        min_eigenvalue: (N+1,) smallest eigenvalue of the information per second, accumulated up to each sample.
+        information: (p, p) Fisher information, summed over the measured samples [1 / (unit of
+            theta_i times unit of theta_j)].
+        eigenvalues: (s,) ascending, of the information per second that the cost sees: scaled,
+            nuisance marginalised, identifiable combinations only.
+        std: (p,) Cramér-Rao standard deviations [theta-unit]; infinite where a parameter is not
+            identifiable alone.
+        min_eigenvalue: (N+1,) smallest eigenvalue of the information per second, accumulated up to
+            each sample.
         criterion: phi, the information term of the cost.
         cost: J.
-        growth: Largest open-loop amplification of a small deviation along the trajectory; NaN where it was not computed.
+        growth: Largest open-loop amplification of a small deviation along the trajectory; NaN where
+            it was not computed.
     """
 
     trajectory: Trajectory
@@ -76,7 +80,10 @@ class Status(Enum):
         "stalled: no step along the descent direction lowers the cost any more, "
         "within the accuracy of the finite differences"
     )
-    MAX_ITERATIONS = "stopped at max_iterations or seconds before convergence; raise them, or start from the result"
+    MAX_ITERATIONS = (
+        "stopped at max_iterations or seconds before convergence; raise them, or start from the "
+        "result"
+    )
     INFEASIBLE = (
         "found no trajectory that keeps all limits; the margins show which limit is violated: "
         "widen it, or begin with a gentler control"
@@ -172,8 +179,8 @@ class LimitUsage:
         kind: Kind of the limit: "position", "velocity", "control", "clearance", ...
         name: Name of the joint, of the actuator or of the nearest pair of geoms.
         t: (n,) times [s].
-        share: (n,) relative position between the bounds: -1 at the lower bound, 1 at the upper one. For a clearance:
-            the required distance over the distance.
+        share: (n,) relative position between the bounds: -1 at the lower bound, 1 at the upper one.
+            For a clearance: the required distance over the distance.
     """
 
     kind: str
@@ -200,8 +207,9 @@ def _npz_names() -> dict[str, str]:
 class Design(SavedRecord):
     """Result of `mjfim.design`: the designed trajectory beside the initial one.
 
-    Saved as design.json and design.npz. The arrays of the designed trajectory are named t, qpos, qvel, act, ctrl, gain and
-    sensitivity in design.npz, those of the initial one likewise with the prefix `initial_`; `Design.load` reads design.npz.
+    Saved as design.json and design.npz. The arrays of the designed trajectory are named t, qpos,
+    qvel, act, ctrl, gain and sensitivity in design.npz, those of the initial one likewise with the
+    prefix `initial_`; `Design.load` reads design.npz.
 
     Attributes:
         status: How the optimisation ended.
@@ -221,8 +229,10 @@ class Design(SavedRecord):
         nuisance: Names of the parameters that the design did not aim at.
         combinations: Groups of parameters that are not identifiable alone, in words.
         combined: Accuracies of the identifiable combinations of these groups.
-        prior: (p, p) information from before this experiment [1 / (unit of theta_i times unit of theta_j)].
-        data: (p, p) information of this experiment alone, the nuisance parameters of a single experiment marginalised.
+        prior: (p, p) information from before this experiment [1 / (unit of theta_i times unit of
+            theta_j)].
+        data: (p, p) information of this experiment alone, the nuisance parameters of a single
+            experiment marginalised.
     """
 
     status: Status

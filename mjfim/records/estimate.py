@@ -26,25 +26,28 @@ class Estimate(SavedRecord):
         std: (p,) formal standard deviations: Cramér-Rao at the estimate [theta-unit].
         covariance: (p, p) formal covariance.
         initial_theta: (p,) initial guess [theta-unit].
-        chi2: Sum of squared whitened residuals. With a robust loss: of the residuals that are no outliers, scaled by what
-            noise would have there.
+        chi2: Sum of squared whitened residuals. With a robust loss: of the residuals that are no
+            outliers, scaled by what noise would have there.
         dof: Degrees of freedom of `chi2`.
         status: How the fit ended, in words.
         success: True where the fit converged and every parameter was determined inside its bounds.
-        misfit: True where the residuals are not noise of the stated size; the formal `std` then underestimates the errors.
+        misfit: True where the residuals are not noise of the stated size; the formal `std` then
+            underestimates the errors.
         iterations: Number of iterations.
         residual_rms: Root mean square residual of each output [unit of the output].
         at_bound: Names of the parameters that ended at a bound.
         predicted: Outputs of the fitted model for each recording, (M, ny) [unit of the output].
         recordings: The recordings as they were fitted.
         warnings: Sentences for the user.
-        combinations: Groups of parameters that the recordings determine in combination only, in words.
-        data: (p, p) information of the recordings, priors left out, private nuisance parameters marginalised.
+        combinations: Groups of parameters that the recordings determine in combination only, in
+            words.
+        data: (p, p) information of the recordings, priors left out, private nuisance parameters
+            marginalised.
         std_sandwich: (p,) standard deviations that allow for autocorrelated residuals [theta-unit].
-        interval: (p, 2) 95 % interval: the hull of formal, sandwich and bootstrap intervals and of the disagreement between
-            recordings [theta-unit].
-        between_recordings: (p,) standard deviation from recording to recording beyond what their standard deviations
-            explain [theta-unit].
+        interval: (p, 2) 95 % interval: the hull of formal, sandwich and bootstrap intervals and of
+            the disagreement between recordings [theta-unit].
+        between_recordings: (p,) standard deviation from recording to recording beyond what their
+            standard deviations explain [theta-unit].
         sigma: Noise of each output, stated or estimated [unit of the output].
         reasons: Reasons for `misfit`, in sentences.
         whiteness: Tests of the residuals of each output.
@@ -52,7 +55,8 @@ class Estimate(SavedRecord):
         predictions: Prediction errors on data that were not fitted.
         sloppy: Names of the parameters whose interval is wide for their value.
         missing_terms: Terms missing in the model that would explain the residuals.
-        per_recording: Values, recording by recording, of parameters that differ between recordings; `theta` holds the first.
+        per_recording: Values, recording by recording, of parameters that differ between recordings;
+            `theta` holds the first.
         robust_uncertainty: Robust uncertainty of the common unknowns, or None.
         motion: The first recording's motion as fitted, or None.
         interrupted: True where the user interrupted the fit.
@@ -206,7 +210,8 @@ class PredictionErrors:
     Attributes:
         name: Name of the recording.
         outputs: Names of the ny outputs.
-        rms: (ny,) root mean square errors [unit of the output]; NaN where nothing was measured or the model diverged.
+        rms: (ny,) root mean square errors [unit of the output]; NaN where nothing was measured or
+            the model diverged.
         mae: (ny,) mean absolute errors, likewise.
     """
 
@@ -231,7 +236,8 @@ class Prediction:
         name: Name of the recording, or of the part of one.
         identified: Errors of the identified model.
         nominal: Errors of the nominal model.
-        held_out: True where the data were stated as held out; False where they were left out of a further fit.
+        held_out: True where the data were stated as held out; False where they were left out of a
+            further fit.
     """
 
     name: str
@@ -308,9 +314,11 @@ class Uncertainty:
     Attributes:
         sandwich: (c,) standard deviations that allow for autocorrelated residuals.
         interval: (c, 2) 95 % intervals: the hull of formal, sandwich and bootstrap intervals.
-        between: (c,) standard deviation from recording to recording beyond what their standard deviations explain.
+        between: (c,) standard deviation from recording to recording beyond what their standard
+            deviations explain.
         apart: Indices of the unknowns on which recordings disagree.
-        each: (K, c) estimates from every recording alone; NaN where a recording has too little information.
+        each: (K, c) estimates from every recording alone; NaN where a recording has too little
+            information.
         blocks: Number of blocks of the bootstrap.
         draws: (n, c) draws of the bootstrap.
     """

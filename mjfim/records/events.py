@@ -26,7 +26,8 @@ class FitEvent:
     """One iterate of an estimation.
 
     Attributes:
-        phase: Data to which the model is fitted: "all data", or a part of the search for an initial guess.
+        phase: Data to which the model is fitted: "all data", or a part of the search for an initial
+            guess.
         iteration: Number of the iterate in this phase.
         cost: Half of the sum of squared whitened residuals.
         step: Length of the last step [standard deviations].
@@ -49,7 +50,8 @@ class StudyEvent:
         count: Number of parts; None where it is not known beforehand.
         share: Share of this part that is done, 0 to 1.
         message: One line about what was found so far; may be empty.
-        result: Result of the part once it is complete, such as the `Round` of a campaign; None before.
+        result: Result of the part once it is complete, such as the `Round` of a campaign; None
+            before.
     """
 
     study: str

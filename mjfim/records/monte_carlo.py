@@ -19,7 +19,8 @@ class TrialStatistics:
         covariance: (p, p) sample covariance of the estimates.
         crlb: (p, p) Cramér-Rao lower bound of the covariance.
         efficiency: (p,) variance of the bound over observed variance; 1 where the bound is reached.
-        efficiency_interval: (p, 2) 95 % confidence interval of each efficiency (chi-square on the variance).
+        efficiency_interval: (p, 2) 95 % confidence interval of each efficiency (chi-square on the
+            variance).
         trials: Number of trials.
         failed: Number of trials whose fit failed.
         seconds: Wall time [s].

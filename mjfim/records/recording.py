@@ -16,7 +16,8 @@ class Recording(SavedRecord):
     Attributes:
         t: (M,) times [s], increasing, at any intervals.
         ctrl: (M-1, nu) controls, held from each row to the next [unit of the actuator].
-        y: (M, ny) measured outputs in the order of `outputs` [unit of the output]; NaN where an output was not measured.
+        y: (M, ny) measured outputs in the order of `outputs` [unit of the output]; NaN where an
+            output was not measured.
         outputs: Names of the ny outputs: `qpos:<joint>`, `qvel:<joint>` or the name of a sensor.
         name: Name of the recording in messages, usually its file.
     """

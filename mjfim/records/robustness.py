@@ -19,7 +19,8 @@ INTERVAL_HALF_WIDTH = 1.959964
 # Share of the robots whose interval has to hold the true value of every parameter.
 REQUIRED_COVERAGE = 0.90
 
-# Delay of the control of a simulated robot, where none is stated [s]; rounded up to whole timesteps.
+# Delay of the control of a simulated robot, where none is stated [s]; rounded up to whole
+# timesteps.
 LATENCY = 5e-3
 
 # Smallest share of half a range that counts as needed reserve; less is round-off.
@@ -51,12 +52,15 @@ class RobotRun:
 
     Attributes:
         theta: (p,) true parameters [theta-unit].
-        estimate: (p,) estimated parameters [theta-unit]; NaN where the robot could not be identified.
+        estimate: (p,) estimated parameters [theta-unit]; NaN where the robot could not be
+            identified.
         covariance: (p, p) covariance of the estimate [theta-unit²].
-        margins: (l,) smallest margin of each limit over half of its range; negative where it was exceeded.
+        margins: (l,) smallest margin of each limit over half of its range; negative where it was
+            exceeded.
         fit: Sum of squared whitened residuals over the degrees of freedom.
         misfit: True where the residuals contradict the model or the noise.
-        restarted: True where the first starting point of the fit ended in a misfit, so that others were tried.
+        restarted: True where the first starting point of the fit ended in a misfit, so that others
+            were tried.
         trouble: Why there is no estimate, or why it is in doubt; else empty.
     """
 
@@ -93,7 +97,8 @@ class AssessedLimit:
     """A limit that is looked at on every robot.
 
     Attributes:
-        kind: Kind of the limit: position, velocity, acceleration, control, control_rate, force, joint_force or clearance.
+        kind: Kind of the limit: position, velocity, acceleration, control, control_rate, force,
+            joint_force or clearance.
         name: Name of the joint or actuator; "nearest pair" for a clearance.
         lower: Lower bound [unit of the quantity].
         upper: Upper bound [unit of the quantity].
@@ -119,10 +124,11 @@ class Robustness(SavedRecord):
         wrong: (p,) root mean square of the errors of the guess [theta-unit].
         z: (g, p) errors of the estimates in standard deviations.
         error: (g, p) errors of the estimates [theta-unit].
-        std: (g, p) formal standard deviations [theta-unit]; NaN for what can only be found in combination with others.
+        std: (g, p) formal standard deviations [theta-unit]; NaN for what can only be found in
+            combination with others.
         predicted: (p,) standard deviations predicted before any run [theta-unit].
-        joint: Number of robots whose joint confidence region holds the truth: of the parameters that the experiment states, and
-            of all unknowns.
+        joint: Number of robots whose joint confidence region holds the truth: of the parameters
+            that the experiment states, and of all unknowns.
         margins: (n, l) smallest margins over half of their ranges.
         planned: (l,) margins of the design on the model over half of their ranges.
         fit: Mean of the sums of squared whitened residuals over their degrees of freedom.

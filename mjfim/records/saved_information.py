@@ -43,7 +43,8 @@ class SavedInformation:
             Its information.
 
         Raises:
-            RecordingError: The file cannot be read, is neither of the two, or its matrices are not finite numbers.
+            RecordingError: The file cannot be read, is neither of the two, or its matrices are not
+                finite numbers.
         """
         path = Path(path)
         try:
@@ -76,7 +77,8 @@ def _information(values: dict[str, Any]) -> tuple[Array, bool]:
     if "data" in values:
         return np.array(values["data"], dtype=np.float64), False
 
-    # Files without `data` hold the information of the design, or the covariance of the estimate, both with priors.
+    # Files without `data` hold the information of the design, or the covariance of the estimate,
+    # both with priors.
     if "final" in values:
         return np.array(values["final"]["information"], dtype=np.float64), True
     return np.linalg.inv(np.array(values["covariance"], dtype=np.float64)), True

@@ -1,13 +1,15 @@
-"""Records on disk: a JSON file for people and an npz file from which the record is built again. No pickles.
+"""Records on disk: a JSON file for people and an npz file from which the record is built again.
+
+No pickles.
 
 A saved record consists of two files with one stem, for example `design`:
 
 * `design.json` holds the record's summary: the keys that users and other programs read.
-* `design.npz` holds the record itself, complete. Every array has a name of its own; the text array `record` holds everything
-  else as JSON, and names the array wherever the record has one.
+* `design.npz` holds the record itself, complete. Every array has a name of its own; the text array
+  `record` holds everything else as JSON, and names the array wherever the record has one.
 
-JSON knows neither infinity nor NaN. Summaries contain `null` instead; the text `record` contains "inf", "-inf" or
-"nan", and the type of the field shows that this is a number.
+JSON knows neither infinity nor NaN. Summaries contain `null` instead; the text `record` contains
+"inf", "-inf" or "nan", and the type of the field shows that this is a number.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ def as_json(values: Mapping[str, Any]) -> str:
         values: Mappings, sequences, arrays, numbers, strings and None, nested at will.
 
     Returns:
-        Standard JSON with a line break at its end. Non-finite numbers become null, because JSON has no name for them.
+        Standard JSON with a line break at its end. Non-finite numbers become null, because JSON has
+        no name for them.
     """
     return json.dumps(_plain(values), indent=2, allow_nan=False) + "\n"
 
@@ -170,7 +173,8 @@ class _Encoder:
         """Start with no arrays.
 
         Args:
-            names: Names of arrays that users know, by path in the record; other arrays are named by their path.
+            names: Names of arrays that users know, by path in the record; other arrays are named by
+                their path.
         """
         self.arrays: dict[str, np.ndarray] = {}
         self._known_names = names
@@ -394,8 +398,8 @@ class SavedRecord:
             The record, equal to the one that was saved.
 
         Raises:
-            RecordingError: The npz file is missing, damaged, of another record, or of a version of mjfim that did not save
-                whole records. The message says how to make it anew.
+            RecordingError: The npz file is missing, damaged, of another record, or of a version of
+                mjfim that did not save whole records. The message says how to make it anew.
         """
         archive = cls._archive_of(Path(path))
         arrays = read_arrays(archive, cls.file_stem)
@@ -436,8 +440,9 @@ class SavedRecord:
         """Return the plain values of the record that an npz file holds."""
         if RECORD not in arrays:
             raise RecordingError(
-                f"{archive}: the array {RECORD!r} is missing, from which {cls.__name__}.load builds the record: written by an "
-                f"older version of mjfim, or not by mjfim; {cls._cure()}"
+                f"{archive}: the array {RECORD!r} is missing, from which {cls.__name__}.load "
+                "builds the record: written by an older version of mjfim, or not by mjfim; "
+                f"{cls._cure()}"
             )
 
         try:

@@ -1,8 +1,8 @@
 """Records of a trajectory: the curve itself, its linearisation, and its sensitivity to the parameters.
 
-Letters are the paper's: `x` state, `u` control, `theta` parameters, `psi` sensitivity dx/dtheta, `I` Fisher
-information. Sizes: N samples; nq, nv, na, nu as in MuJoCo; `nx = 2 nv + na` (tangent space); ny outputs; p parameters.
-Arrays are read-only.
+Letters are the paper's: `x` state, `u` control, `theta` parameters, `psi` sensitivity dx/dtheta,
+`I` Fisher information. Sizes: N samples; nq, nv, na, nu as in MuJoCo; `nx = 2 nv + na` (tangent
+space); ny outputs; p parameters. Arrays are read-only.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """`mjfim.run_campaign`: design, record, identify, and design again with the estimate, until every target is reached.
 
-A redesign is made at the estimate of all recordings so far, whose information it counts as known (see `redesign`). Every
-estimate uses all recordings and starts from the last one. Priors remain centred at the stated guess.
+A redesign is made at the estimate of all recordings so far, whose information it counts as known
+(see `redesign`). Every estimate uses all recordings and starts from the last one. Priors remain
+centred at the stated guess.
 """
 
 from __future__ import annotations
@@ -35,10 +36,12 @@ from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import CampaignHistory, redesign, restate_experiment
 
-# A round makes no progress where the worst ratio of sigma to target stays above this share of the last round's ratio.
+# A round makes no progress where the worst ratio of sigma to target stays above this share of the
+# last round's ratio.
 NO_PROGRESS_RATIO = 0.99
 
-# Change of an estimate from one round to the next, in standard deviations, above which something is wrong.
+# Change of an estimate from one round to the next, in standard deviations, above which something is
+# wrong.
 SUSPICIOUS_CHANGE = 4.0
 
 # Records the experiment that was designed for a round: (design, number of the round from 1).
@@ -61,15 +64,17 @@ def run_campaign(
 
     Args:
         experiment: Experiment whose parameters state the `wanted` standard deviations.
-        measure: Plays a design and returns what was recorded: `measure(design, number)`, the first round being 1. It returns
-            None where nothing is recorded yet; the campaign then ends with that design pending. For a simulated robot:
-            `lambda design, number: mjfim.simulate(robot, design.trajectory, seed=number)`.
+        measure: Plays a design and returns what was recorded: `measure(design, number)`, the first
+            round being 1. It returns None where nothing is recorded yet; the campaign then ends
+            with that design pending. For a simulated robot: `lambda design, number:
+                mjfim.simulate(robot, design.trajectory, seed=number)`.
         rounds: Rounds, at most.
-        callback: Called with the events of every design and estimation, and with a `StudyEvent` after every round, whose
-            `result` is the `Round`.
+        callback: Called with the events of every design and estimation, and with a `StudyEvent`
+            after every round, whose `result` is the `Round`.
         threads: Threads of MuJoCo; None for all cores.
         done: Rounds that are recorded already; their designs are not made again.
-        executor: Executor of `concurrent.futures` that runs several starts under hard limits at once.
+        executor: Executor of `concurrent.futures` that runs several starts under hard limits at
+            once.
         stop: Ends the campaign early, as Ctrl-C does, after the last complete round.
 
     Raises:
@@ -81,8 +86,9 @@ def run_campaign(
         raise ExperimentError(f"run_campaign: {rounds} rounds; at least 1")
     if experiment.earlier:
         raise ExperimentError(
-            f"{experiment.source}: earlier: a campaign's estimate comes from recordings alone; give the recordings of "
-            "earlier experiments (`done` in Python) instead of their information"
+            f"{experiment.source}: earlier: a campaign's estimate comes from recordings alone; "
+            "give the recordings of earlier experiments (`done` in Python) instead of their "
+            "information"
         )
 
     task = DesignTask.resolve(experiment, threads=threads)
@@ -188,7 +194,10 @@ class _CampaignRun:
         try:
             return self._redesign(history, last.estimate.theta), ()
         except MjfimError as error:
-            remark = f"no design at the estimate, so it is made at the parameters of the last one: {error}"
+            remark = (
+                "no design at the estimate, so it is made at the parameters of the last one: "
+                f"{error}"
+            )
             return self._redesign(history, last.theta), (remark,)
 
     def _redesign(self, history: CampaignHistory, theta: Array) -> Design:
@@ -273,17 +282,18 @@ class _CampaignRun:
         change[known] = np.abs(now.theta - before.theta)[known] / before.std[known]
         for j in np.flatnonzero(change > SUSPICIOUS_CHANGE).tolist():
             yield (
-                f"{names[j]} moved from {before.theta[j]:.4g} to {now.theta[j]:.4g}, by {change[j]:.1f} σ of the last "
-                "round's estimate: the formal σ is not the accuracy; the model or the noise is wrong, or the last fit "
-                "ended in a false minimum"
+                f"{names[j]} moved from {before.theta[j]:.4g} to {now.theta[j]:.4g}, by "
+                f"{change[j]:.1f} σ of the last round's estimate: the formal σ is not the "
+                "accuracy; the model or the noise is wrong, or the last fit ended in a false "
+                "minimum"
             )
 
         ratio_before, _ = largest_ratio_to_target(before.std, self.wanted)
         ratio, j = largest_ratio_to_target(now.std, self.wanted)
         if ratio > NO_PROGRESS_RATIO * ratio_before:
             yield (
-                f"no progress: the largest ratio of σ to its target went from {ratio_before:.3g} to {ratio:.3g} "
-                f"({names[j]})"
+                f"no progress: the largest ratio of σ to its target went from {ratio_before:.3g} "
+                f"to {ratio:.3g} ({names[j]})"
             )
 
     def _targets_reached(self) -> bool:
@@ -325,7 +335,8 @@ def identify_all(
         stop: Ends the fit early.
 
     Returns:
-        The better of the two estimates; None where a fit was interrupted, because a round is complete or not kept.
+        The better of the two estimates; None where a fit was interrupted, because a round is
+        complete or not kept.
 
     Raises:
         SimulationDivergedError: The model diverges at both starts.

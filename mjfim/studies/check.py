@@ -98,7 +98,10 @@ def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
 
 
 def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
-    """Check which parameters recordings identify; derivatives are tested along the longest one. See `check`."""
+    """Check which parameters recordings identify; derivatives are tested along the longest one.
+
+    See `check`.
+    """
     fit = FitProblem.of(system, recordings, data_only=True)
     longest = max(fit.recordings, key=lambda recording: len(recording.ctrl))
     task = DesignTask.along(system, longest.ctrl[:MAX_TESTED_SAMPLES])
@@ -107,7 +110,8 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
-    # Rows of G at the times at which the recordings were measured, and the error of their differences.
+    # Rows of G at the times at which the recordings were measured, and the error of their
+    # differences.
     recorded = fit.sensitivity_rows(fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
     identifiability = task.identifiability_test.of_rows(task.initial, J, error)
@@ -172,7 +176,8 @@ class _Assessment:
         information = self._information()
         total = self.data + task.prior
 
-        # Standard deviations of the wanted parameters; infinite where one cannot be identified alone.
+        # Standard deviations of the wanted parameters; infinite where one cannot be identified
+        # alone.
         covariance = information.covariance(total)
         spread = np.sqrt(np.diag(covariance))
         std = np.full(len(task.parameters), np.inf)
@@ -357,8 +362,9 @@ class _Verdict:
             yield f"{tested.roughness}"
         elif not tested.passed:
             yield (
-                f"the derivatives do not agree (psi recursion {tested.recursion:.1e}, slope {tested.slope:.1e}); "
-                f"{tested.likely_cause}. Shorten horizon or timestep, or smooth what switches, before you trust these numbers"
+                f"the derivatives do not agree (psi recursion {tested.recursion:.1e}, slope "
+                f"{tested.slope:.1e}); {tested.likely_cause}. Shorten horizon or timestep, or "
+                "smooth what switches, before you trust these numbers"
             )
 
     def _groups_left_to_priors(self) -> tuple[list[ParameterGroup], list[ParameterGroup]]:
@@ -379,16 +385,16 @@ class _Verdict:
         if unknown:
             yield (
                 "not identifiable separately from this initial state, with any tested control: "
-                f"{_groups_in_words(unknown)}. Remove or fix one parameter of each group, give it a prior, or measure "
-                "another output; a design uses the identifiable combinations"
+                f"{_groups_in_words(unknown)}. Remove or fix one parameter of each group, give it "
+                "a prior, or measure another output; a design uses the identifiable combinations"
             )
         if resolved:
             names = "; ".join(join_names(group.members) for group in resolved)
             yield f"separated by priors only, not by data: {names}"
         if self.not_excited:
             yield (
-                f"not excited by {self.source}, but another control would show: {_groups_in_words(self.not_excited)}. "
-                "Move those joints more"
+                f"not excited by {self.source}, but another control would show: "
+                f"{_groups_in_words(self.not_excited)}. Move those joints more"
             )
 
     def _about_accuracy(self, identifiable: Sequence[ParameterCheck]) -> Iterator[str]:
@@ -402,12 +408,15 @@ class _Verdict:
             if worst.repetitions:
                 needed = f"{worst.repetitions:,} repetitions ({worst.seconds:,.0f} s) reach"
             yield (
-                f"{len(missed)} of {len(identifiable)} parameters miss the wanted sigma with {self.source} alone; "
-                f"the worst is {worst.name}: {needed} {worst.wanted:.3g}. "
-                "A designed excitation (`mjfim design`) needs fewer"
+                f"{len(missed)} of {len(identifiable)} parameters miss the wanted sigma with "
+                f"{self.source} alone; the worst is {worst.name}: {needed} {worst.wanted:.3g}. A "
+                "designed excitation (`mjfim design`) needs fewer"
             )
         elif self.tested.passed and not unknown and not self.not_excited:
-            yield f"every identifiable parameter reaches its wanted sigma with {self.source}: nothing more is needed"
+            yield (
+                f"every identifiable parameter reaches its wanted sigma with {self.source}: "
+                "nothing more is needed"
+            )
 
     def _about_correlation(self) -> Iterator[str]:
         """List confounded pairs."""

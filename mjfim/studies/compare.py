@@ -34,7 +34,8 @@ from mjfim.studies.baselines.methods import METHODS, run_baseline
 # Name of the design for the user.
 DESIGN_TITLE = "mjfim's design"
 
-# Share of the time after which a design is stopped; it watches the time itself, but for its last iterate.
+# Share of the time after which a design is stopped; it watches the time itself, but for its last
+# iterate.
 LATEST_END = 1.05
 
 # Iterations of the design: unlimited for practical purposes, the budget ends it.
@@ -59,17 +60,19 @@ def compare(
 ) -> Comparison:
     """Run baselines and then the design, each until its time or its MuJoCo steps are used up.
 
-    All methods search for a control under the same limits with the same cost J, and are evaluated at every engine step of the
-    user's model.
+    All methods search for a control under the same limits with the same cost J, and are evaluated
+    at every engine step of the user's model.
 
     Args:
         experiment: Experiment for which controls are searched.
         seconds: Time of each method [s].
         steps: MuJoCo steps of each method; None for time alone.
         seed: Seed of the baselines.
-        methods: Keys of the baselines (`mjfim.studies.baselines.methods.METHODS`); None for all that make sense.
+        methods: Keys of the baselines (`mjfim.studies.baselines.methods.METHODS`); None for all
+            that make sense.
         executor: Executor of `concurrent.futures`, among whose workers each method is divided.
-        callback: Called with a `StudyEvent` while a method runs, and with every `DesignEvent` of the design.
+        callback: Called with a `StudyEvent` while a method runs, and with every `DesignEvent` of
+            the design.
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the comparison early, as Ctrl-C does; the methods that are finished are returned.
 
@@ -131,7 +134,8 @@ def compare_task(
             )
             row = run.design(evaluation) if method == DESIGN else run.baseline(evaluation)
 
-            # An interrupted baseline is left out; an interrupted design is kept with its best control so far.
+            # An interrupted baseline is left out; an interrupted design is kept with its best
+            # control so far.
             if row is not None:
                 rows.append(row)
             if token.requested:
@@ -384,8 +388,8 @@ class MethodEvaluation:
     def result(self, method: str, title: str, found: SearchResult, note: str = "") -> MethodResult:
         """Evaluate what a method has found.
 
-        The control of a baseline that violates a limit on the user's model is shrunk until it does not; that of a design is
-        evaluated without changes.
+        The control of a baseline that violates a limit on the user's model is shrunk until it does
+        not; that of a design is evaluated without changes.
 
         Args:
             method: Key of the method.

@@ -1,7 +1,8 @@
 """Tests of the derivatives on the user's model.
 
-Three numbers are compared along one trajectory: dy/dtheta by two difference steps, psi by rollouts against its linear
-recursion, and the slope of the cost against differences of the cost through the projection operator.
+Three numbers are compared along one trajectory: dy/dtheta by two difference steps, psi by rollouts
+against its linear recursion, and the slope of the cost against differences of the cost through the
+projection operator.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.records.check import SelfTest
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
-# Steps along the tested curve, in units of the plant's difference steps; the smaller error of the two counts.
+# Steps along the tested curve, in units of the plant's difference steps; the smaller error of the
+# two counts.
 SLOPE_STEPS = (1e-3, 1e-4)
 
 # Smallest slope that an error is divided by; avoids a division by zero.
@@ -55,7 +57,8 @@ def self_test(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> S
         slope=slope_error(task, problem, point),
     )
 
-    # Roughness names its cause itself; any other failure gets the first constraint that acts as its likely cause.
+    # Roughness names its cause itself; any other failure gets the first constraint that acts as its
+    # likely cause.
     if tested.passed or tested.roughness is not None:
         return tested
     active = first_active_constraint(model, trajectory)
@@ -77,10 +80,12 @@ def recursion_error(task: DesignTask, trajectory: Trajectory, sensitivity: Sensi
     Args:
         task: Task whose model is tested.
         trajectory: Trajectory of N samples.
-        sensitivity: psi: (N+1, nx, p) [x-unit / theta-unit] and G: (N+1, ny, p) along it, by rollouts.
+        sensitivity: psi: (N+1, nx, p) [x-unit / theta-unit] and G: (N+1, ny, p) along it, by
+            rollouts.
 
     Returns:
-        Largest difference, relative to the largest entry of each parameter's psi; infinite where the motion diverges.
+        Largest difference, relative to the largest entry of each parameter's psi; infinite where
+        the motion diverges.
     """
     try:
         linear = task.plant.derivatives.linearize(task.theta, trajectory)
@@ -92,7 +97,8 @@ def recursion_error(task: DesignTask, trajectory: Trajectory, sensitivity: Sensi
     columns = [recursion.forward(psi[0, :, j], linear.E[..., j]) for j in range(psi.shape[2])]
     expected = np.stack(columns, axis=2)
 
-    # Parameters that move nothing measurable have a psi of round-off, which says nothing about the recursion.
+    # Parameters that move nothing measurable have a psi of round-off, which says nothing about the
+    # recursion.
     size = np.abs(psi).max(axis=(0, 1))
     whitened = task.system.noise.whiten(sensitivity.G)
     visible = (size > 0.0) & visible_columns(task.parameters, whitened)

@@ -1,9 +1,10 @@
 """Monte-Carlo studies of the estimator against the Cramér-Rao bound, with all trials stepped together.
 
-Every trial minimises its own squared residual, but the trials share most of the way. A fit of the mean measurement leads
-from the guess to the neighbourhood of all minima. Gauss-Newton steps whose Jacobian is expanded to second order about that
-fit bring each trial close, and steps with the trial's own Jacobian finish it. A trial has converged when its last step is
-small compared with its standard deviation. The few others are solved one by one with the least-squares solver of
+Every trial minimises its own squared residual, but the trials share most of the way. A fit of the
+mean measurement leads from the guess to the neighbourhood of all minima. Gauss-Newton steps whose
+Jacobian is expanded to second order about that fit bring each trial close, and steps with the
+trial's own Jacobian finish it. A trial has converged when its last step is small compared with its
+standard deviation. The few others are solved one by one with the least-squares solver of
 `identify`; a trial that this does not solve has failed.
 """
 
@@ -32,7 +33,8 @@ from mjfim.records.trajectory import Trajectory
 # Length of the last step, in standard deviations, below which a trial has converged.
 CONVERGED_STEP = 0.03
 
-# Gauss-Newton steps with the shared Jacobian, the first one from the fit of the mean measurement included.
+# Gauss-Newton steps with the shared Jacobian, the first one from the fit of the mean measurement
+# included.
 SHARED_STEPS = 3
 
 # Gauss-Newton steps with a trial's own Jacobian, at most.
@@ -65,7 +67,8 @@ def monte_carlo(
 ) -> MonteCarloStudy:
     """Estimate the parameters from many noisy repetitions of one or several trajectories.
 
-    Parameters are estimated without bounds and priors: the study holds the information of the data alone.
+    Parameters are estimated without bounds and priors: the study holds the information of the data
+    alone.
 
     Args:
         experiment: Experiment with the true values.

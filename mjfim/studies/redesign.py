@@ -1,10 +1,12 @@
 """Design at an estimate, with the information of the recordings so far as prior information.
 
-The scales of the parameters remain those of the stated experiment, so that criteria of different rounds can be compared.
-The price of effort must not change either. The first design pays what a relative gain of information is worth to it:
-phi_1 is the information's share of J there, and `d(log phi) * phi_1 = d(effort)`. The n-th of equal experiments changes log phi
-by 1/n only, so phi is weighted by n phi_1 / phi_n there (by n with D-optimality, whose phi is a logarithm). Otherwise every
-round would be gentler than the one before, and a round at values below the guess gentler than the first.
+The scales of the parameters remain those of the stated experiment, so that criteria of different
+rounds can be compared. The price of effort must not change either. The first design pays what a
+relative gain of information is worth to it: phi_1 is the information's share of J there, and `d(log
+phi) * phi_1 = d(effort)`. The n-th of equal experiments changes log phi by 1/n only, so phi is
+weighted by n phi_1 / phi_n there (by n with D-optimality, whose phi is a logarithm). Otherwise
+every round would be gentler than the one before, and a round at values below the guess gentler than
+the first.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback
 
-# Distance that guesses keep from bounds, relative to the size of a parameter, and the largest share of its range.
+# Distance that guesses keep from bounds, relative to the size of a parameter, and the largest share
+# of its range.
 BOUND_GAP = 1e-3
 MAX_BOUND_GAP = 0.25
 
@@ -149,8 +152,9 @@ def restate_experiment(
 ) -> Experiment:
     """State the experiment of a redesign: guesses at the given parameters, unchanged scales, no true values.
 
-    Guesses keep a small distance from bounds. The parameters of a declared inertia move only where the recordings determine
-    all of them. With `[robust]`, bounds shrink to the region that the estimate leaves, from which the samples are drawn.
+    Guesses keep a small distance from bounds. The parameters of a declared inertia move only where
+    the recordings determine all of them. With `[robust]`, bounds shrink to the region that the
+    estimate leaves, from which the samples are drawn.
 
     Args:
         base: Task of the experiment as stated.

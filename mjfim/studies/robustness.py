@@ -1,8 +1,8 @@
 """Robustness of a design: it is played on simulated robots that differ from the model, each of which is then identified.
 
-A delay of the control acts like a delay of the measurement: before the start all stands still, so the robot moves as it would
-without the delay, only later. That holds with feedback as well, as long as the recorded control is the one that was sent, not
-the one that has arrived.
+A delay of the control acts like a delay of the measurement: before the start all stands still, so
+the robot moves as it would without the delay, only later. That holds with feedback as well, as long
+as the recorded control is the one that was sent, not the one that has arrived.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ from mjfim.records.robustness import (
 # Largest number of attempts at drawing a robot whose bodies can exist.
 MAX_DRAWS = 500
 
-# Largest acceleration of a robot that counts as standing still [1/s² times the unit of the coordinate].
+# Largest acceleration of a robot that counts as standing still [1/s² times the unit of the
+# coordinate].
 MAX_REST_ACCELERATION = 1e-5
 
 # Largest number of Newton steps towards standing still.
@@ -73,7 +74,8 @@ FURTHER_DELAYS = (2e-3, 4e-3, 8e-3, 16e-3)
 # Smallest deviation of a start that makes it an unknown.
 MIN_START_DEVIATION = 1e-9
 
-# Factor on the errors of the parameters after each round of draws that made bodies that cannot exist.
+# Factor on the errors of the parameters after each round of draws that made bodies that cannot
+# exist.
 DRAW_SHRINKAGE = 0.9
 
 
@@ -90,14 +92,16 @@ def assess_robustness(
 ) -> Robustness:
     """Play a design on simulated robots that differ from the model, and identify each from its recording.
 
-    Every parameter of each robot is off by the stated share, up or down at random, and the robot stands still at its own
-    equilibrium before it begins. Limits are looked at at every engine step. The fit starts from the guess, with the delay and,
-    where the parameters move it, the start as further unknowns.
+    Every parameter of each robot is off by the stated share, up or down at random, and the robot
+    stands still at its own equilibrium before it begins. Limits are looked at at every engine step.
+    The fit starts from the guess, with the delay and, where the parameters move it, the start as
+    further unknowns.
 
     Args:
         experiment: The experiment of the design.
         design: Folder of the design, or its design.csv.
-        conditions: How the robots differ from the model; default: parameters 20 % off and 5 ms of latency.
+        conditions: How the robots differ from the model; default: parameters 20 % off and 5 ms of
+            latency.
         runs: Number of robots.
         processes: Number of processes; default: one per core.
         callback: Called with a `StudyEvent` after every robot.
@@ -163,15 +167,16 @@ class RobotBench:
     Attributes:
         conditions: How the robots differ from the model.
         stated: The task as the experiment states it.
-        task: The task by which recordings are read: on the grid of the engine, where a delay is exact, with the delay and the
-            start as unknowns.
+        task: The task by which recordings are read: on the grid of the engine, where a delay is
+            exact, with the delay and the start as unknowns.
         plan: Rows of design.csv.
         timestep: Timestep of the engine [s].
         steps_per_row: Engine steps per row of the plan.
         late_steps: Engine steps by which the control is late.
         constraints: Constraints of the stated task.
         limits: All l limits that are looked at.
-        rest: (nu,) control before the start [unit of the actuator]; None where the experiment begins in motion.
+        rest: (nu,) control before the start [unit of the actuator]; None where the experiment
+            begins in motion.
         sensed: (ns,) index of the output that measures each entry of the state; -1 where none does.
     """
 
@@ -184,7 +189,8 @@ class RobotBench:
             conditions: How the robots differ from the model.
 
         Raises:
-            ExperimentError: The design is of another duration, or the conditions cannot be simulated.
+            ExperimentError: The design is of another duration, or the conditions cannot be
+                simulated.
             RecordingError: The design cannot be read.
         """
         self.conditions = conditions
@@ -203,7 +209,8 @@ class RobotBench:
         remainder = abs(conditions.latency - self.late_steps * self.timestep)
         if self.late_steps < 0 or remainder > 1e-6 * self.timestep:
             raise ExperimentError(
-                f"latency: {conditions.latency:g} s is no whole number of timesteps of {self.timestep:g} s"
+                f"latency: {conditions.latency:g} s is no whole number of timesteps of "
+                f"{self.timestep:g} s"
             )
 
         self.constraints = constraint_set_of(self.stated)
@@ -218,7 +225,8 @@ class RobotBench:
         self.sensed = _sensed(self.stated)
         if conditions.feedback and (self.sensed < 0).all():
             raise ExperimentError(
-                "--feedback: no position or velocity of a joint is measured, the gains have nothing to act on"
+                "--feedback: no position or velocity of a joint is measured, the gains have "
+                "nothing to act on"
             )
 
         # Robots are drawn with the stated unknowns first, to see which starts they move.
@@ -274,7 +282,8 @@ class RobotBench:
     def _drawn(self, rng: np.random.Generator) -> Array:
         """(p,) parameters of a robot that can exist, its delay and biases included [theta-unit]; its start comes later.
 
-        No parameter is off by more than its prior, which says how well it is known, or than bodies allow.
+        No parameter is off by more than its prior, which says how well it is known, or than bodies
+        allow.
         """
         p = self.task.parameters
         wrong = self.conditions.wrong
@@ -303,7 +312,8 @@ class RobotBench:
         """(ns,) state at which a robot stands still before the start.
 
         Raises:
-            SimulationDivergedError: It stands still nowhere near the start, and the control is late.
+            SimulationDivergedError: It stands still nowhere near the start, and the control is
+                late.
         """
         if self.rest is None:
             return self.task.plant.initial_state(theta)
@@ -413,7 +423,8 @@ class RobotBench:
         """Play on one robot, look at its limits, and identify it.
 
         Args:
-            number: Number of the robot; with the seed of the conditions it decides everything random.
+            number: Number of the robot; with the seed of the conditions it decides everything
+                random.
         """
         rng = np.random.default_rng([self.conditions.seed, number])
         theta = self._drawn(rng)
@@ -505,7 +516,8 @@ class RobotBench:
             The recording, (l,) margins over half of their ranges, and (ns,) start of the robot.
 
         Raises:
-            SimulationDivergedError: The simulation diverges, or the robot does not stand still at the start.
+            SimulationDivergedError: The simulation diverges, or the robot does not stand still at
+                the start.
         """
         task, rows = self.task, len(self.plan.ctrl)
         model = task.system.model_at(theta)

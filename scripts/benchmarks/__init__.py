@@ -1,1 +1,3 @@
-"""Benchmarks: timings, comparisons with other solvers, and the tables of docs/benchmarks.md; `python -m scripts.benchmarks`."""
+"""Benchmarks: timings, comparisons with other solvers, and the tables of docs/benchmarks.md;
+`python -m scripts.benchmarks`.
+"""

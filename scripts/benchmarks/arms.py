@@ -1,25 +1,30 @@
-"""Two arms under hard limits, rest to rest: their models, their experiments, and what these are like before any design.
+"""Two arms under hard limits, rest to rest: their models, their experiments, and what these are
+like before any design.
 
-    python -m scripts.benchmarks arms FOLDER [--arms panda so_arm100] [--horizons 5 10] [--skip-check]
+    python -m scripts.benchmarks arms FOLDER [--arms panda so_arm100] [--horizons 5 10]
+    [--skip-check]
 
-The models are made at run time, into FOLDER, from ../shared/models beside the repository: the same kinematics, inertias,
-servos and ranges, and in addition
+The models are made at run time, into FOLDER, from ../shared/models beside the repository: the same
+kinematics, inertias, servos and ranges, and in addition
 
 - a payload, rigid at the flange or at the fixed jaw, its centre of mass off every axis;
 - damping, armature and dry friction of the joints where the MJCF has none (see `ARMS`);
-- a floor, and capsules without mass that stand for the links, which the mesh-free MJCF lack. They serve for distance: pairs
-  that always overlap are excluded from contact and listed under `limits.ignored`;
+- a floor, and capsules without mass that stand for the links, which the mesh-free MJCF lack. They
+  serve for distance: pairs that always overlap are excluded from contact and listed under
+  `limits.ignored`;
 - servo gains as numbers: `dampratio` would follow the payload;
 - the keyframe `home` (of the SO-ARM100 with the jaw open) with the control that holds it.
 
 Numbers have the six digits that MuJoCo writes to XML. Timestep and integrator are the MJCF's.
 
-Each arm comes smooth (no dry friction, that of the SO-ARM100's MJCF taken out; p = 18 and 16: damping and armature of every
-joint, mass and centre of mass of the payload) and dry (frictionloss of every joint in the model and unknown, p = 25 and 22).
+Each arm comes smooth (no dry friction, that of the SO-ARM100's MJCF taken out; p = 18 and 16:
+damping and armature of every joint, mass and centre of mass of the payload) and dry (frictionloss
+of every joint in the model and unknown, p = 25 and 22).
 
-"Worst relative sigma" is `1 / sqrt(lambda_min(S I S))`, S the parameters' scales, I the sum over all samples: the standard
-deviation of the worst combination of unit length, at least as large as that of every single parameter. A scale is the
-parameter's guess, but 0.05 m for the coordinates of the centre of mass.
+"Worst relative sigma" is `1 / sqrt(lambda_min(S I S))`, S the parameters' scales, I the sum over
+all samples: the standard deviation of the worst combination of unit length, at least as large as
+that of every single parameter. A scale is the parameter's guess, but 0.05 m for the coordinates of
+the centre of mass.
 """
 
 from __future__ import annotations
@@ -62,7 +67,9 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Capsule:
-    """What stands for a link. start, end: of its axis in the body's frame [m], equal for a sphere;  radius: [m]"""
+    """What stands for a link. start, end: of its axis in the body's frame [m], equal for a sphere;
+    radius: [m]
+    """
 
     body: str
     start: Point
@@ -72,7 +79,9 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Payload:
-    """A body welded to `parent`. mass: [kg];  com: [m] in the parent's frame;  inertia: principal [kg m²];  radius: [m]"""
+    """A body welded to `parent`. mass: [kg];  com: [m] in the parent's frame;  inertia: principal
+    [kg m²];  radius: [m]
+    """
 
     parent: str
     mass: float
@@ -88,8 +97,8 @@ class Arm:
     file: under ../shared/models;  joints: names, each with an actuator of the same name
     home: [rad];  damping: [N m s/rad], armature: [kg m²], friction: [N m] of every joint, nominal
     timestep: [s];  overlapping: pairs of bodies whose capsules always overlap
-    velocity: [rad/s], force: [N m] beside the MJCF's, rate: [rad/s] of the reference, per joint or for all
-    amplitude: [rad] of the starting motion
+    velocity: [rad/s], force: [N m] beside the MJCF's, rate: [rad/s] of the reference, per joint or
+    for all amplitude: [rad] of the starting motion
     """
 
     file: str
@@ -112,8 +121,9 @@ PANDA = tuple(f"joint{i}" for i in range(1, 8))
 PANDA_SPEED = {name: 2.175 if i < 4 else 2.61 for i, name in enumerate(PANDA)}
 SO_ARM = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
 ARMS = {
-    # capsules: franka_description's coarse self-collision model, link1's cut off where link0's begins; speeds: its limits;
-    # damping and armature: those of Menagerie's own actuated Panda; forces: the MJCF's forcerange (87 and 12 N m)
+    # capsules: franka_description's coarse self-collision model, link1's cut off where link0's
+    # begins; speeds: its limits; damping and armature: those of Menagerie's own actuated Panda;
+    # forces: the MJCF's forcerange (87 and 12 N m)
     "panda": Arm(
         file="menagerie_panda/panda_nohand_nomesh.xml",
         joints=PANDA,
@@ -141,8 +151,9 @@ ARMS = {
         force=None,
         amplitude=0.2,
     ),
-    # capsules: about servos of 45 x 25 x 35 mm; damping and force: what is published of the STS3215 at 12 V (4.8 rad/s idle);
-    # armature and friction: the MJCF's; home: its keyframe with the jaw open
+    # capsules: about servos of 45 x 25 x 35 mm; damping and force: what is published of the STS3215
+    # at 12 V (4.8 rad/s idle); armature and friction: the MJCF's; home: its keyframe with the jaw
+    # open
     "so_arm100": Arm(
         file="menagerie_so_arm100/so_arm100_nomesh.xml",
         joints=SO_ARM,
@@ -195,13 +206,18 @@ def model_file(
 
 
 def _state_gains(spec: Any, model: Any) -> None:
-    """Write the servos' gains as they were compiled: those that follow a damping ratio would change with the payload."""
+    """Write the servos' gains as they were compiled: those that follow a damping ratio would change
+    with the payload.
+    """
     for actuator in spec.actuators:
         actuator.biasprm[:] = model.actuator(actuator.name).biasprm
 
 
 def _embody(spec: Any, arm: Arm) -> None:
-    """Payload, floor and capsules. Boxes that the MJCF has on its jaws make way for the jaws' capsules."""
+    """Payload, floor and capsules.
+
+    Boxes that the MJCF has on its jaws make way for the jaws' capsules.
+    """
     for geom in list(spec.geoms):
         spec.delete(geom)
     load = arm.payload
@@ -227,7 +243,9 @@ def _embody(spec: Any, arm: Arm) -> None:
 
 
 def holding(model: Any, qpos: Array) -> Array:
-    """(nu,) references at which position servos, one per joint, hold qpos: (nq,) [rad] against gravity."""
+    """(nu,) references at which position servos, one per joint, hold qpos: (nq,) [rad] against
+    gravity.
+    """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
@@ -237,7 +255,8 @@ def holding(model: Any, qpos: Array) -> Array:
 
 
 def start_control(hold: Array, horizon: float, amplitude: float) -> Array:
-    """(N, nu) a small multisine about the hold: (nu,), that swells from it and dies back to it, so that it rests at both ends.
+    """(N, nu) a small multisine about the hold: (nu,), that swells from it and dies back to it, so
+    that it rests at both ends.
 
     horizon: [s];  amplitude: [rad] of every joint
     """
@@ -270,9 +289,11 @@ def experiment(
     model_folder: str | Path,
     timestep: float | None = None,
 ) -> Experiment:
-    """An arm's experiment, rest to rest from home, designed under hard limits; its model and start are written beside.
+    """An arm's experiment, rest to rest from home, designed under hard limits; its model and start
+    are written beside.
 
-    name: of `ARMS`;  horizon: [s];  friction: dry friction in the model, and unknown;  timestep: [s], default: the arm's
+    name: of `ARMS`;  horizon: [s];  friction: dry friction in the model, and unknown;  timestep:
+    [s], default: the arm's
     """
     arm, folder = ARMS[name], Path(model_folder)
     path = model_file(arm, name, friction, folder, timestep)
@@ -313,16 +334,20 @@ def write_control(path: Path, names: tuple[str, ...], control: Array) -> None:
 
 
 def worst_relative_sigma(information: Array, scale: Array) -> float:
-    """`1 / sqrt(lambda_min(S I S))` of the information (p, p) that all samples hold together; scale: (p,)."""
+    """`1 / sqrt(lambda_min(S I S))` of the information (p, p) that all samples hold together;
+    scale: (p,).
+    """
     return float(np.linalg.eigvalsh(information * np.outer(scale, scale))[0] ** -0.5)
 
 
-# what the arms are like -----------------------------------------------------------------------------------------------
+# what the arms are like
+# -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A simulated motion: qpos, qvel: (n+1, nv), force: (n, nv) [rad, rad/s, N m] at every engine step.
+    """A simulated motion: qpos, qvel: (n+1, nv), force: (n, nv) [rad, rad/s, N m] at every engine
+    step.
 
     distance: (N,) least at every sample [m];  closest: names of the two bodies that come closest
     """
@@ -335,7 +360,9 @@ class Motion:
 
 
 def pairs(model: Any) -> list[tuple[int, int]]:
-    """Pairs of geoms that MuJoCo would let collide: not of one body, not of parent and child, not excluded."""
+    """Pairs of geoms that MuJoCo would let collide: not of one body, not of parent and child, not
+    excluded.
+    """
     excluded = set(model.exclude_signature.tolist())
     found = []
     for one, other in itertools.combinations(range(model.ngeom), 2):
@@ -358,7 +385,9 @@ def clearance(model: Any, data: Any, among: list[tuple[int, int]]) -> tuple[floa
 
 
 def moved(model: Any, start: Array, control: Array, velocity: Array | None = None) -> Motion:
-    """Simulate control: (N, nu), held over samples, from start: (nq,) [rad], at rest or at a velocity: (nv,) [rad/s]."""
+    """Simulate control: (N, nu), held over samples, from start: (nq,) [rad], at rest or at a
+    velocity: (nv,) [rad/s].
+    """
     data, among = mujoco.MjData(model), pairs(model)
     data.qpos[:] = start
     if velocity is not None:
@@ -379,7 +408,9 @@ def moved(model: Any, start: Array, control: Array, velocity: Array | None = Non
 
 
 def margins(e: Experiment, model: Any, control: Array, motion: Motion) -> dict[str, float]:
-    """Least distance to each kind of limit as a share of the range's half (of the limit itself for the clearance)."""
+    """Least distance to each kind of limit as a share of the range's half (of the limit itself for
+    the clearance).
+    """
     position = model.jnt_range[:, 0], model.jnt_range[:, 1]
     stated = e.limits.force if isinstance(e.limits.force, float) else np.inf
     limits = {"velocity": _each(e.limits.velocity), "control rate": _each(e.limits.control_rate)}
@@ -408,7 +439,9 @@ def _inside(data: Array, low: Array, high: Array) -> float:
 
 
 def lifted(model: Any) -> Any:
-    """In place: without ranges, clamps and contacts, as a design steps it; without constraints where no joint is dry."""
+    """In place: without ranges, clamps and contacts, as a design steps it; without constraints
+    where no joint is dry.
+    """
     model.jnt_limited[:] = 0
     model.actuator_forcelimited[:] = 0
     model.actuator_ctrllimited[:] = 0
@@ -443,7 +476,8 @@ def step_seconds(
 def settling(
     model: Any, start: Array, hold: Array, speed: Array, e: Experiment
 ) -> tuple[float, float]:
-    """Seconds until the boundary's tolerances hold for good when the hold meets all joints at full speed, and the error left.
+    """Seconds until the boundary's tolerances hold for good when the hold meets all joints at full
+    speed, and the error left.
 
     speed: (nv,) [rad/s];  the error: largest of the positions [rad], 2 s later
     """
@@ -454,7 +488,9 @@ def settling(
 
 
 def prepared(e: Experiment) -> tuple[Any, Array, Array, Array]:
-    """The model as it is, start: (nq,), hold: (nu,) and the starting control: (N, nu) of an experiment."""
+    """The model as it is, start: (nq,), hold: (nu,) and the starting control: (N, nu) of an
+    experiment.
+    """
     model = mujoco.MjModel.from_xml_path(str(e.directory / e.model))
     key = model.key("home")
     control = np.loadtxt(e.directory / str(e.initial.control), delimiter=",", skiprows=1)[:, 1:]
@@ -496,7 +532,9 @@ def described(e: Experiment) -> Iterator[tuple[str, str]]:
 
 
 def identifiable(e: Experiment) -> Iterator[tuple[str, str]]:
-    """What can be identified along the starting motion, and what no motion shows, as `mjfim check` finds it."""
+    """What can be identified along the starting motion, and what no motion shows, as `mjfim check`
+    finds it.
+    """
     task = DesignTask.resolve(e)
     told = task.plant.derivatives.sensitivity(task.theta, task.initial)
     if told is None:

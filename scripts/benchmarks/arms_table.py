@@ -1,11 +1,14 @@
-"""Two arms under hard limits: the design beside Fourier series with the same seconds on the same cores, as a table.
+"""Two arms under hard limits: the design beside Fourier series with the same seconds on the same
+cores, as a table.
 
-    python -m scripts.benchmarks arms_table FOLDER [--seconds 600] [--arms panda so_arm100] [--horizons 5 10]
-    python -m scripts.benchmarks arms_table FOLDER --show        # the table of what was run so far
+    python -m scripts.benchmarks arms_table FOLDER [--seconds 600] [--arms panda so_arm100]
+    [--horizons 5 10] python -m scripts.benchmarks arms_table FOLDER --show        # the table of
+    what was run so far
 
-Every case is run by `mjfim.compare` and kept in FOLDER as JSON; cases that are there already are left alone. The experiments
-are those of arms: from home, rest to rest, limits of position, velocity, force, control rate and distance. Among the
-design's own starts is a Fourier series of 15 harmonics; all methods use all cores, in as many processes.
+Every case is run by `mjfim.compare` and kept in FOLDER as JSON; cases that are there already are
+left alone. The experiments are those of arms: from home, rest to rest, limits of position,
+velocity, force, control rate and distance. Among the design's own starts is a Fourier series of 15
+harmonics; all methods use all cores, in as many processes.
 """
 
 from __future__ import annotations
@@ -32,10 +35,11 @@ WANTED = 0.1  # least gain over five harmonics
 
 @dataclass(frozen=True)
 class Case:
-    """One comparison. few, many, design: worst relative sigma, infinite where nothing keeps the limits
+    """One comparison. few, many, design: worst relative sigma, infinite where nothing keeps the
+    limits
 
-    tightest, share: kind of the design's worst margin, and that over half of its range;  kept: whether all are, everywhere
-    seconds: of the design;  budget: of every method
+    tightest, share: kind of the design's worst margin, and that over half of its range;  kept:
+    whether all are, everywhere seconds: of the design;  budget: of every method
     """
 
     arm: str
@@ -75,7 +79,8 @@ def run(
         )
     for row in found.rows:
         console.print(
-            f"  {row.title}: {row.worst_relative_std:.4g}, {row.outcome.value}, {row.seconds:.0f} s, {row.found_by}"
+            f"  {row.title}: {row.worst_relative_std:.4g}, {row.outcome.value}, {row.seconds:.0f} "
+            f"s, {row.found_by}"
         )
     ours = found.design
     if ours is None:
@@ -110,13 +115,15 @@ def best(found: Comparison, methods: tuple[str, ...]) -> float:
 def markdown(cases: list[Case]) -> str:
     """A table per arm, for the README."""
     lines = [
-        f"Worst relative σ; every method with {cases[0].budget:g} s on {cores()} cores. 'Inside': the design keeps all limits "
-        "at every engine step of the untouched model, by at least so much of half of the range.",
+        f"Worst relative σ; every method with {cases[0].budget:g} s on {cores()} cores. 'Inside': "
+        "the design keeps all limits at every engine step of the untouched model, by at least so "
+        "much of half of the range.",
     ]
     for arm in dict.fromkeys(c.arm for c in cases):
         lines += [
             "",
-            f"| {arm} | horizon | unknowns | Fourier, 5 harmonics | 15 harmonics | mjfim | smaller than 5 by | inside |",
+            f"| {arm} | horizon | unknowns | Fourier, 5 harmonics | 15 harmonics | mjfim | "
+            "smaller than 5 by | inside |",
             "|---|---|---|---|---|---|---|---|",
         ]
         for c in cases:
@@ -125,8 +132,9 @@ def markdown(cases: list[Case]) -> str:
                     f"{100 * c.share:.2g} % ({c.tightest.replace('_', ' ')})" if c.kept else "no"
                 )
                 lines.append(
-                    f"| {'dry' if c.dry else 'smooth'} | {c.horizon:g} s | {c.parameters} | {c.few:.3g} | {c.many:.3g} "
-                    f"| **{c.design:.3g}** | {100 * c.gain:.0f} % | {inside} |"
+                    f"| {'dry' if c.dry else 'smooth'} | {c.horizon:g} s | {c.parameters} | "
+                    f"{c.few:.3g} | {c.many:.3g} | **{c.design:.3g}** | {100 * c.gain:.0f} % | "
+                    f"{inside} |"
                 )
     return "\n".join(lines)
 

@@ -1,16 +1,18 @@
-"""Where the time goes, as ratios inside one run: mjfim against the engine, against CasADi, against its own metric descent.
+"""Where the time goes, as ratios inside one run: mjfim against the engine, against CasADi, against
+its own metric descent.
 
     python -m scripts.benchmarks benchmark                  # all tables, some minutes
     python -m scripts.benchmarks benchmark --quick          # case a only, few trials
     python -m scripts.benchmarks benchmark --markdown FILE  # the same tables for the README
 
 (a) wall time of a design over MuJoCo steps taken x time of one `mj_step` in C / threads
-(b) time until J is within 1e-6 (relative) of the best J of all solvers, beside CasADi on the hand-derived model
-(c) iterations and time beside the paper's metric descent, to the same J
+(b) time until J is within 1e-6 (relative) of the best J of all solvers, beside CasADi on the
+hand-derived model (c) iterations and time beside the paper's metric descent, to the same J
 (d) 1500 Monte-Carlo trials at 100 Hz
-(e) seconds per iteration by number of parameters on a seven-joint arm, where its model is at hand (benchmark_arm)
-(f) the hard-limited design beside CasADi + IPOPT with many starts, the same seconds for both (benchmark_limits)
-(g) an hour of two joints at 1 kHz read and fitted, over bare engine time (benchmark_hour)
+(e) seconds per iteration by number of parameters on a seven-joint arm, where its model is at hand
+(benchmark_arm) (f) the hard-limited design beside CasADi + IPOPT with many starts, the same seconds
+for both (benchmark_limits) (g) an hour of two joints at 1 kHz read and fitted, over bare engine
+time (benchmark_hour)
 """
 
 from __future__ import annotations
@@ -62,7 +64,9 @@ CASES: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """One solver on one case. history: (seconds, J) of every iterate; task: seconds before the first of them."""
+    """One solver on one case. history: (seconds, J) of every iterate; task: seconds before the
+    first of them.
+    """
 
     case: str
     solver: str
@@ -87,7 +91,9 @@ def experiment(case: str, **descent: Any) -> Experiment:
 
 
 def step_seconds(task: DesignTask, trajectory: mjfim.Trajectory) -> float:
-    """Seconds of one `mj_step` in C: the user's model, stepped many times per call along the designed motion."""
+    """Seconds of one `mj_step` in C: the user's model, stepped many times per call along the
+    designed motion.
+    """
     model, data = task.system.model_at(task.theta), mujoco.MjData(task.system.model)
     best = np.inf
     for k in range(0, trajectory.samples, 20):
@@ -261,8 +267,8 @@ def engine_verdict(designs: list[tuple[Run, Design]], threads: int) -> str:
         f"{name} {min(r):.2f} to {max(r):.2f}, {judged(max(r), 1.3)}" for name, r in ratios.items()
     ]
     return (
-        f"Ratios: {'; '.join(told)}. What is over 1: the projection runs on one thread; Riccati and L-BFGS "
-        "run in Python; a coarse level has few steps to spread that over."
+        f"Ratios: {'; '.join(told)}. What is over 1: the projection runs on one thread; Riccati "
+        "and L-BFGS run in Python; a coarse level has few steps to spread that over."
     )
 
 
@@ -290,8 +296,9 @@ def peer_verdict(runs: list[Run]) -> str:
         for name, r in worst.items()
     ]
     return (
-        f"mjfim's time over theirs: {'; '.join(told)}. The limit is the engine: a general mj_step takes microseconds where "
-        "a step of the hand-derived model, compiled for this one plant, takes a fraction of one."
+        f"mjfim's time over theirs: {'; '.join(told)}. The limit is the engine: a general mj_step "
+        "takes microseconds where a step of the hand-derived model, compiled for this one plant, "
+        "takes a fraction of one."
     )
 
 

@@ -2,8 +2,9 @@
 
     python -m scripts.benchmarks benchmark_arm [--model panda_nohand_nomesh.xml] [--iterations 10]
 
-p = 3, 10, 30, 70 parameters of the last links' inertias (barycentric), 5 s at 100 Hz, position servos inside the model.
-The value of J needs psi, 2p rollouts; its gradient needs one direction, whatever p is.
+p = 3, 10, 30, 70 parameters of the last links' inertias (barycentric), 5 s at 100 Hz, position
+servos inside the model. The value of J needs psi, 2p rollouts; its gradient needs one direction,
+whatever p is.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""An hour of two joints at 1 kHz: 3.6 million samples are written as CSV, read and fitted by the command line.
+"""An hour of two joints at 1 kHz: 3.6 million samples are written as CSV, read and fitted by the
+command line.
 
     python -m scripts.benchmarks benchmark_hour [--hours 1.0] [--seed 0]
 
-Says how long reading and fitting took, beside the bare engine time of one rollout over all samples on as many threads, and how
-much memory the process had at most. The limits are 6 minutes and 3 GiB on two cores.
+Says how long reading and fitting took, beside the bare engine time of one rollout over all samples
+on as many threads, and how much memory the process had at most. The limits are 6 minutes and 3 GiB
+on two cores.
 """
 
 from __future__ import annotations
@@ -47,9 +49,11 @@ print(time.perf_counter() - clock)
 
 @dataclass(frozen=True)
 class Hour:
-    """What was measured. engine: seconds of one rollout over all samples;  gigabytes: of the fit's process at most
+    """What was measured. engine: seconds of one rollout over all samples;  gigabytes: of the fit's
+    process at most
 
-    wrong: largest error of a parameter in formal standard deviations;  steps: MuJoCo steps of the fit
+    wrong: largest error of a parameter in formal standard deviations;  steps: MuJoCo steps of the
+    fit
     """
 
     samples: int

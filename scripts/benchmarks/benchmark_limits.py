@@ -1,10 +1,12 @@
-"""The hard-limited cart-pendulum beside CasADi + IPOPT with many starts on the hand-derived model: the same seconds for both.
+"""The hard-limited cart-pendulum beside CasADi + IPOPT with many starts on the hand-derived model:
+the same seconds for both.
 
     python -m scripts.benchmarks benchmark_limits [--seconds 60] [--seed 0]
 
-|u| <= 5 N, |s| <= 1 m, E at the actual values, no weights (models/cart_pendulum_limits.toml). Both use all cores, in as many
-processes. mjfim's clock runs from before the experiment is built; the peer's starts once its derivatives are compiled. As long
-as seconds are left, mjfim designs again, with other random starts.
+|u| <= 5 N, |s| <= 1 m, E at the actual values, no weights (models/cart_pendulum_limits.toml). Both
+use all cores, in as many processes. mjfim's clock runs from before the experiment is built; the
+peer's starts once its derivatives are compiled. As long as seconds are left, mjfim designs again,
+with other random starts.
 """
 
 from __future__ import annotations
@@ -38,9 +40,11 @@ found = [r.history, len(r.searched), r.build_seconds]
 
 @dataclass(frozen=True)
 class Race:
-    """One side. history: (seconds, lambda_min) of every better control inside the limits;  starts: that were tried
+    """One side. history: (seconds, lambda_min) of every better control inside the limits;  starts:
+    that were tried
 
-    prepared: seconds before its clock began;  margin: worst one at any engine step [N or m], or None where only samples count
+    prepared: seconds before its clock began;  margin: worst one at any engine step [N or m], or
+    None where only samples count
     """
 
     solver: str

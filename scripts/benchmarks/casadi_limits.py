@@ -1,16 +1,20 @@
-"""Peer solver of the hard-limited design: multi-start CasADi + IPOPT on the hand-derived cart-pendulum.
+"""Peer solver of the hard-limited design: multi-start CasADi + IPOPT on the hand-derived
+cart-pendulum.
 
     maximise lambda_min(I)    subject to    |u_k| <= 5 N, k = 0..N-1,    |s_k| <= 1 m, k = 1..N
 
-I is as in casadi_peer.py, at theta = (2, 1, 1).  Single shooting in the N = 400 controls, compiled C, exact Hessian of
-the Lagrangian; IPOPT minimises 100 / lambda_min, whose barrier then acts as a homotopy.  Every result is feasible: what
-counts is the best iterate within the limits at all samples, evaluated anew.
+I is as in casadi_peer.py, at theta = (2, 1, 1).  Single shooting in the N = 400 controls, compiled
+C, exact Hessian of the Lagrangian; IPOPT minimises 100 / lambda_min, whose barrier then acts as a
+homotopy.  Every result is feasible: what counts is the best iterate within the limits at all
+samples, evaluated anew.
 
-Many local optima lie close together, so starts are searched on a grid with fewer samples (N = 100: a twelfth of the
-time per start) and the promising ones refined on the full grid.  With `--search 400` every start is solved in full.
-Starts are small: from multisines of 0.01 N 75 % reach the best basin, from 1..5 N 28 %, from 5 N 19 % (150 starts each).
+Many local optima lie close together, so starts are searched on a grid with fewer samples (N = 100:
+a twelfth of the time per start) and the promising ones refined on the full grid.  With `--search
+400` every start is solved in full. Starts are small: from multisines of 0.01 N 75 % reach the best
+basin, from 1..5 N 28 %, from 5 N 19 % (150 starts each).
 
-Usage:  python -m scripts.benchmarks casadi_limits --seconds 60 --seed 0 [--processes 2] [--search 400] [--peak 1 5]
+Usage:  python -m scripts.benchmarks casadi_limits --seconds 60 --seed 0 [--processes 2] [--search
+400] [--peak 1 5]
 """
 
 from __future__ import annotations
@@ -43,7 +47,8 @@ SMALL = 0.01  # N, peak of a random start: the smaller, the more often IPOPT end
 HARMONICS = 10  # of 1 / HORIZON in a random multisine
 TURN = 3.0  # s of search before a start is refined
 CLOSE = 0.99  # share of the best lambda_min on the search grid that makes a start promising
-SHAKE = 0.01  # s, standard deviation by which the best control's switches are moved to refine it once more
+# s, standard deviation by which the best control's switches are moved to refine it once more
+SHAKE = 0.01
 APART = 0.1  # N, mean distance of controls that are not the same optimum
 MAX_ITERATIONS = 200
 COMMON: dict[str, Any] = {
@@ -66,7 +71,8 @@ WARM: dict[str, Any] = {
 }
 
 
-# -- random controls -----------------------------------------------------------------------------------------------
+# -- random controls
+# -----------------------------------------------------------------------------------------------
 
 
 def multisine(t: Array, rng: np.random.Generator) -> Array:
@@ -82,7 +88,9 @@ def sine(t: Array, rng: np.random.Generator) -> Array:
 
 
 def switched(t: Array, times: Array) -> Array:
-    """Return 1 at times t [s] before the first of the switching times [s], then -1, then 1, and so on."""
+    """Return 1 at times t [s] before the first of the switching times [s], then -1, then 1, and so
+    on.
+    """
     return np.asarray((-1.0) ** np.searchsorted(np.sort(times), t, side="right"))
 
 
@@ -121,7 +129,8 @@ class Draw:
             )
 
 
-# -- one sampling of the horizon -----------------------------------------------------------------------------------
+# -- one sampling of the horizon
+# -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -154,14 +163,18 @@ class Grid:
         return np.asarray(u)
 
     def hold(self, u: Array) -> Array:
-        """Return the same control [N] on this grid, coarser or finer than its own by an integer factor."""
+        """Return the same control [N] on this grid, coarser or finer than its own by an integer
+        factor.
+        """
         if self.samples >= len(u):
             return np.repeat(u, self.samples // len(u))
         return np.asarray(u.reshape(self.samples, -1).mean(axis=1))
 
 
 def slide_rows(x: ca.MX, u: ca.MX, theta: ca.MX, dt: float) -> ca.MX:
-    """Return ds/du (samples, samples) along the states x (4, samples) before each sample, by one forward sweep."""
+    """Return ds/du (samples, samples) along the states x (4, samples) before each sample, by one
+    forward sweep.
+    """
     samples, now, held, p = (
         u.shape[0],
         ca.SX.sym("x", peer.NX),
@@ -219,7 +232,8 @@ def grid(samples: int) -> Grid:
     return Grid(samples, value, gradient, by_u, hessian, time.perf_counter() - begin)
 
 
-# -- one solve -----------------------------------------------------------------------------------------------------
+# -- one solve
+# -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -279,12 +293,15 @@ def solver(samples: int, warm: bool) -> tuple[ca.Function, FeasibleWatch]:
     ), watch
 
 
-# -- the race ------------------------------------------------------------------------------------------------------
+# -- the race
+# ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class LimitedRun:
-    """Outcome of a multi-start. history: (seconds, lambda_min) of every better control on the full grid."""
+    """Outcome of a multi-start. history: (seconds, lambda_min) of every better control on the full
+    grid.
+    """
 
     best: Solve | None
     searched: tuple[Solve, ...]
@@ -298,7 +315,9 @@ class LimitedRun:
 
 
 class Race:
-    """Random starts on the search grid, the promising ones refined on the full grid, until the time is used."""
+    """Random starts on the search grid, the promising ones refined on the full grid, until the time
+    is used.
+    """
 
     def __init__(
         self, seconds: float, search: int, draw: Draw, process: int, seed: np.random.SeedSequence
@@ -338,7 +357,9 @@ class Race:
         )
 
     def promising(self) -> Solve | None:
-        """Return the best searched optimum that is near the best of all and was not refined, nor one like it."""
+        """Return the best searched optimum that is near the best of all and was not refined, nor
+        one like it.
+        """
         taken = {solve.start for solve in self.refined}
         known = [solve.u for solve in self.searched if solve.start in taken]
         least = CLOSE * max(
@@ -414,9 +435,11 @@ def race(
 def limited_starts(
     seconds: float, seed: int, processes: int = 1, search: int = SEARCH, draw: Draw | None = None
 ) -> LimitedRun:
-    """Solve from random starts until `seconds` of wall time are used in each process; building comes before.
+    """Solve from random starts until `seconds` of wall time are used in each process; building
+    comes before.
 
-    search: samples of the grid on which starts are first solved, a divisor of 400;  draw: how starts are drawn
+    search: samples of the grid on which starts are first solved, a divisor of 400;  draw: how
+    starts are drawn
     """
     if search < 1 or peer.N % search:
         raise ValueError(f"search = {search}: needs a divisor of {peer.N}")
@@ -431,12 +454,16 @@ def limited_starts(
 def show(run: LimitedRun, seconds: float) -> None:
     """Print every solve, the best lambda_min by time and the switches of the best control."""
     print(
-        f"built in {run.build_seconds:.1f} s; {len(run.searched)} starts, {len(run.refined)} refined"
+        f"built in {run.build_seconds:.1f} s; {len(run.searched)} starts, {len(run.refined)} "
+        "refined"
     )
     print("          process  start  lambda_min  violation  iter      s    at s")
     for name, solves in (("searched", run.searched), ("refined", run.refined)):
         for r in solves:
-            result = f"{r.process:7d}  {r.start:5d}  {r.information:10.3f}  {r.violation:9.1e}  {r.iterations:4d}"
+            result = (
+                f"{r.process:7d}  {r.start:5d}  {r.information:10.3f}  {r.violation:9.1e}  "
+                f"{r.iterations:4d}"
+            )
             note = "" if r.converged else "  not converged"
             print(f"{name:8}  {result}  {r.seconds:5.1f}  {r.ended:6.1f}{note}")
     marks = [t for t in (10.0, 30.0, 60.0, 120.0) if t < seconds] + [np.inf]

@@ -1,15 +1,19 @@
-"""Peer solvers for the benchmark: CasADi + IPOPT and CasADi + L-BFGS on a hand-derived cart-pendulum.
+"""Peer solvers for the benchmark: CasADi + IPOPT and CasADi + L-BFGS on a hand-derived
+cart-pendulum.
 
-Development only; the package `mjfim` never imports this file.  Both peers use single shooting: the unknowns are
-the N = 400 cart forces [N], held for 10 ms each, and every derivative is exact for the discrete RK4 map.
+Development only; the package `mjfim` never imports this file.  Both peers use single shooting: the
+unknowns are the N = 400 cart forces [N], held for 10 ms each, and every derivative is exact for the
+discrete RK4 map.
 
     J(u) = Q_p / lambda_min(I) + dt/2 * sum_{k=0..N-1} [q (s_{k+1} - s^d_{k+1})^2 + R u_k^2]
-    I    = dt / sigma^2 * sum_{k=1..N} psi_k' psi_k,      psi_{k+1} = F_x psi_k + F_theta,   psi_0 = 0
+    I    = dt / sigma^2 * sum_{k=1..N} psi_k' psi_k,      psi_{k+1} = F_x psi_k + F_theta,   psi_0 =
+    0
 
-With a C compiler on the path the functions are generated as C and built once per process; without one the same
-functions run in CasADi's virtual machine, slower but with equal results.  The peers are timed on one core: L-BFGS can
-spend most of its time in threads that wait for each other if OpenBLAS may use several, so this file asks for one
-thread, which only works if it is imported before NumPy (or the variable is set outside).
+With a C compiler on the path the functions are generated as C and built once per process; without
+one the same functions run in CasADi's virtual machine, slower but with equal results.  The peers
+are timed on one core: L-BFGS can spend most of its time in threads that wait for each other if
+OpenBLAS may use several, so this file asks for one thread, which only works if it is imported
+before NumPy (or the variable is set outside).
 
 Usage:  python -m scripts.benchmarks casadi_peer a c [--vm]
 """
@@ -52,7 +56,9 @@ ENTRIES = tuple((i, j) for j in range(NP) for i in range(j + 1))  # upper triang
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the study: theta = (m [kg], l [m], c [N m s/rad]) and the weights of the running cost."""
+    """One row of the study: theta = (m [kg], l [m], c [N m s/rad]) and the weights of the running
+    cost.
+    """
 
     name: str
     theta: tuple[float, float, float]
@@ -130,7 +136,9 @@ def information_rate(psi: ca.SX, dt: float = DT) -> ca.SX:
 
 
 def smallest_eigenvalue(entries: ca.SX) -> ca.SX:
-    """Return lambda_min of the symmetric 3x3 matrix in closed trigonometric form; smooth while it is simple."""
+    """Return lambda_min of the symmetric 3x3 matrix in closed trigonometric form; smooth while it
+    is simple.
+    """
     a = ca.SX(NP, NP)
     for value, (i, j) in zip(ca.vertsplit(entries), ENTRIES, strict=True):
         a[i, j] = a[j, i] = value
@@ -187,7 +195,9 @@ def stage(dt: float = DT) -> Stage:
 
 @dataclass(frozen=True)
 class Rollout:
-    """Symbols shared by the whole-horizon functions; p = (theta, r_tau, q_slide, s^d at samples 1..N)."""
+    """Symbols shared by the whole-horizon functions; p = (theta, r_tau, q_slide, s^d at samples
+    1..N).
+    """
 
     u: ca.MX
     p: ca.MX
@@ -209,7 +219,9 @@ def rollout() -> Rollout:
 
 @dataclass(frozen=True)
 class Slopes:
-    """First and second derivatives of a Lagrangian L(I, s_1..s_N, u) that is a sum but for its dependence on I."""
+    """First and second derivatives of a Lagrangian L(I, s_1..s_N, u) that is a sum but for its
+    dependence on I.
+    """
 
     info: ca.MX  # (6,) dL/dI
     info_bend: ca.MX  # (6, 6) d2L/dI2
@@ -228,9 +240,10 @@ def slopes_of(roll: Rollout) -> Slopes:
 def condensed_hessian(u: ca.MX, theta: ca.MX, z: ca.MX, slopes: Slopes, parts: Stage) -> ca.MX:
     """Return the upper triangle of d2L/du2 by one backward sweep.
 
-    The sweep carries, at each sample, the adjoints of the six information entries and of the slide cost, the
-    curvature P of the cost to come, and the columns W = d2L/(dz du_j) of all later controls.  Since 1/lambda_min
-    is no sum over samples, its own curvature enters at the end through dI/du.
+    The sweep carries, at each sample, the adjoints of the six information entries and of the slide
+    cost, the curvature P of the cost to come, and the columns W = d2L/(dz du_j) of all later
+    controls.  Since 1/lambda_min is no sum over samples, its own curvature enters at the end
+    through dI/du.
     """
     samples, rate_hessian = u.shape[0], parts.rate_hessian(slopes.info)
     slide = ca.DM.eye(NZ)[:, 0]
@@ -292,8 +305,9 @@ def compile_c(functions: list[ca.Function], folder: str) -> list[ca.Function]:
 def problem(use_c: bool = True) -> Problem:
     """Build the functions once per process; without a working C compiler `use_c` has no effect.
 
-    Only the two large stage blocks of the Hessian become C: the sweep around them is matrix products that CasADi's
-    virtual machine runs as fast, and, unrolled over the horizon, compiling it would take over a minute.
+    Only the two large stage blocks of the Hessian become C: the sweep around them is matrix
+    products that CasADi's virtual machine runs as fast, and, unrolled over the horizon, compiling
+    it would take over a minute.
     """
     begin, parts, roll = time.perf_counter(), stage(), rollout()
     variables = [roll.u, roll.p]
@@ -491,7 +505,8 @@ def main() -> None:
     use_c = not arguments.vm
     built = problem(use_c)
     print(
-        f"built in {built.build_seconds:.1f} s, {'compiled C' if built.compiled else 'virtual machine'}"
+        f"built in {built.build_seconds:.1f} s, "
+        f"{'compiled C' if built.compiled else 'virtual machine'}"
     )
     counts = f"{'iter':>4}  {'eval':>4}  {'task s':>7}  {'solve s':>7}"
     print(f"{'case':4}  {'solver':15}  {'J':>15}  {'lambda':>35}  {counts}")
@@ -499,6 +514,9 @@ def main() -> None:
         for solve in (ipopt, lbfgs):
             run = solve(CASES[name], use_c)
             spectrum = " ".join(f"{value:11.6g}" for value in run.eigenvalues)
-            counts = f"{run.iterations:4d}  {run.evaluations:4d}  {run.setup_seconds:7.3f}  {run.seconds:7.3f}"
+            counts = (
+                f"{run.iterations:4d}  {run.evaluations:4d}  {run.setup_seconds:7.3f}  "
+                f"{run.seconds:7.3f}"
+            )
             note = "" if run.converged else "  not converged"
             print(f"{name:4}  {run.name:15}  {run.J:15.9g}  {spectrum:>35}  {counts}{note}")

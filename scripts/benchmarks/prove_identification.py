@@ -1,11 +1,14 @@
-"""Does identification keep its word? Many recordings of a simulated robot, fitted without knowing what was done to them.
+"""Does identification keep its word?
+
+Many recordings of a simulated robot, fitted without knowing what was done to them.
 
     python -m scripts.benchmarks prove_identification [--runs 200] [--seed 0] [-o FILE.json]
 
-The robot is the cart-pendulum on the designed control, stepped at 2 kHz. Its controller ticks with 2 ms of jitter and logs at its
-own ticks; what it logs is read 10 ms late, with noise and constant biases; it starts somewhere else than stated. Fitted are the
-parameters, delay, biases, start and the noise itself. Counted is how often each lies inside its 95 % interval, and how often
-`misfit` is raised: without a reason, and with dry friction in the cart's slide that the model does not have.
+The robot is the cart-pendulum on the designed control, stepped at 2 kHz. Its controller ticks with
+2 ms of jitter and logs at its own ticks; what it logs is read 10 ms late, with noise and constant
+biases; it starts somewhere else than stated. Fitted are the parameters, delay, biases, start and
+the noise itself. Counted is how often each lies inside its 95 % interval, and how often `misfit` is
+raised: without a reason, and with dry friction in the cart's slide that the model does not have.
 """
 
 from __future__ import annotations
@@ -47,7 +50,8 @@ FRICTION = 0.5  # [N] in the slide, where the model has none
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Of one run. inside, formally: (p,) truth inside the interval, and inside the formal one;  error: (p,) in formal sigmas
+    """Of one run. inside, formally: (p,) truth inside the interval, and inside the formal one;
+    error: (p,) in formal sigmas
 
     misfit: it was raised;  named: the friction was named as what is missing
     """
@@ -178,7 +182,8 @@ def main() -> int:
     console.print(coverage_table(names, right))
     console.print(f"misfit raised without a reason: {100 * false:.1f} %")
     console.print(
-        f"misfit raised with {FRICTION:g} N of dry friction that the model lacks: {100 * caught:.1f} % (95 % wanted)"
+        f"misfit raised with {FRICTION:g} N of dry friction that the model lacks: "
+        f"{100 * caught:.1f} % (95 % wanted)"
     )
     console.print(f"  and this friction named first as what is missing: {100 * named:.1f} %")
     console.print(f"{2 * args.runs} fits in {time.perf_counter() - clock:.0f} s on {cores()} cores")

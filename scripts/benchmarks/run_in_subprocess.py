@@ -17,14 +17,16 @@ MARK = "RESULT "
 
 
 def run_in_subprocess(code: str, *arguments: object) -> Any:
-    """Run code in a new process and return the value of its variable `found`, which travels as JSON.
+    """Run code in a new process and return the value of its variable `found`, which travels as
+    JSON.
 
     Args:
         code: Python code; it can import `scripts.benchmarks` and assigns `found`.
         *arguments: Arguments of the process, `sys.argv[1:]`.
 
     Returns:
-        The value; None, with a message on stderr, where the code fails because a library is missing.
+        The value; None, with a message on stderr, where the code fails because a library is
+        missing.
     """
     first = f"import sys; sys.path.insert(0, {str(ROOT)!r})"
     last = f"import json; print({MARK!r} + json.dumps(found))"

@@ -95,7 +95,9 @@ def test_design_leaves_its_files(home: Path, designed: Result) -> None:
 
 
 def test_design_json_is_the_file(home: Path, designed: Result) -> None:
-    """stdout holds the summary and nothing else; only the way back to the experiment is the file's own."""
+    """stdout holds the summary and nothing else; only the way back to the experiment is the file's
+    own.
+    """
     data = read(home / "out" / "design.json")
     assert (home / "out" / data.pop("experiment")).resolve() == home / "study.toml"
     assert loads(designed.stdout) == data
@@ -136,7 +138,9 @@ def test_identify_leaves_its_files(home: Path, identified: Result) -> None:
 def test_identify_several_recordings(
     home: Path, study: Path, recorded: Path, identified: Result, tmp_path: Path
 ) -> None:
-    """Two recordings tell more than one, and each gets its picture; newton arrives at the same place."""
+    """Two recordings tell more than one, and each gets its picture; newton arrives at the same
+    place.
+    """
     assert (
         run(
             "simulate", study, home / "out" / "design.npz", "-o", tmp_path / "b.csv", "--seed", 5
@@ -279,7 +283,9 @@ def test_design_that_misses_its_goal(
 
 
 def test_misfit(study: Path, recorded: Path, tmp_path: Path) -> None:
-    """A recording that the model cannot explain: results are written, the exit code and the text say so."""
+    """A recording that the model cannot explain: results are written, the exit code and the text
+    say so.
+    """
     header, *rows = recorded.read_text(encoding="utf-8").splitlines()
     cells = [row.split(",") for row in rows]
     bent = [[t, u, str(float(s) + 0.5 * float(t)), *rest] for t, u, s, *rest in cells]

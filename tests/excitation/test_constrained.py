@@ -42,7 +42,9 @@ from tests.support.paths import MODELS
 
 
 def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -> dict[str, Array]:
-    """Positions, velocities, accelerations and actuator forces at every engine step of a plain loop around mj_step."""
+    """Positions, velocities, accelerations and actuator forces at every engine step of a plain loop
+    around mj_step.
+    """
     data, rows = mujoco.MjData(model), {key: [] for key in ("q", "v", "a", "f")}
     data.qpos[:], data.qvel[:] = start
     for held in ctrl:
@@ -82,7 +84,9 @@ def multistart_of(free: DesignTask) -> multistart.Multistart:
 
 @pytest.fixture(scope="module")
 def paper() -> Design:
-    """The paper's study at its true values, within 5 N and 1 m, without any weight on control or position."""
+    """The paper's study at its true values, within 5 N and 1 m, without any weight on control or
+    position.
+    """
     experiment = Experiment.from_file(MODELS / "cart_pendulum.toml")
     hard = {"control": {"force": [-5.0, 5.0]}, "position": {"slide": [-1.0, 1.0]}}
     return mjfim.design(experiment.replace(cost={"control": 0.0, "tracking": {}}, limits=hard))
@@ -299,7 +303,9 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
 
 
 def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> None:
-    """The design equals that without limits; one that leaves them continues from its last feasible control."""
+    """The design equals that without limits; one that leaves them continues from its last feasible
+    control.
+    """
     heavy = {"cost": {"control": 0.05}, "descent": {"max_iterations": 60}}
     wide = {"control": {"force": (-30.0, 30.0)}, "position": {"slide": (-3.0, 3.0)}}
     kept = design_task(cart_inside(tmp_path, limits=wide, **heavy))
@@ -318,7 +324,9 @@ def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> No
 
 
 def test_a_design_does_not_use_a_clamp(tmp_path: Path) -> None:
-    """A clamp keeps a force within its range whatever the control is, so it does not count as a kept limit."""
+    """A clamp keeps a force within its range whatever the control is, so it does not count as a
+    kept limit.
+    """
     weak = CART_PENDULUM.format(integrator="RK4").replace(
         'joint="slide"/>', 'joint="slide" forcerange="-1.5 1.5"/>'
     )
@@ -371,7 +379,9 @@ def test_limits_that_are_not_enforced_may_be_violated_while_the_boundary_holds(
 
 
 def test_the_stated_tolerance_ends_the_last_stage_once_the_limits_hold(tmp_path: Path) -> None:
-    """With a tolerance above every slope, the first feasible iterate of the last stage is the last one."""
+    """With a tolerance above every slope, the first feasible iterate of the last stage is the last
+    one.
+    """
     task = cart_inside(tmp_path, descent={"max_iterations": 80, "tolerance": 100.0, "coarse": 1})
     design = design_task(task)
     assert design.status is Status.CONVERGED
@@ -426,7 +436,9 @@ def test_starts_in_parallel_give_the_results_of_a_sequential_search(
 
 
 def test_an_interrupted_multistart_keeps_the_best_so_far(tmp_path: Path) -> None:
-    """Also in its second round, also where the callback asks to stop: no worse than what was reported before."""
+    """Also in its second round, also where the callback asks to stop: no worse than what was
+    reported before.
+    """
     task = several(tmp_path)
     reported: list[HistoryRow] = []
 
@@ -475,7 +487,9 @@ def test_a_fourier_start_is_optimised_as_a_series_in_the_first_round(tmp_path: P
 
 
 def arm_design(folder: Path, **tables: Any) -> tuple[DesignTask, Design]:
-    """The arm of two servos for half a second, from a standstill that its motors have to hold against gravity."""
+    """The arm of two servos for half a second, from a standstill that its motors have to hold
+    against gravity.
+    """
     defaults: dict[str, Any] = {
         "horizon": 0.5,
         "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/elbow:damping"}},
@@ -554,7 +568,9 @@ def test_a_periodic_design_can_be_repeated(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("coarse", [1, "auto"])
 def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_path: Path) -> None:
-    """On the stated samples, from the coarse level as well; from rest its first control is what holds, without a slope."""
+    """On the stated samples, from the coarse level as well; from rest its first control is what
+    holds, without a slope.
+    """
     boundary = {"start": "rest", "end": "rest", "position": 0.02, "velocity": 0.1}
     task, design = arm_design(
         tmp_path,
@@ -593,7 +609,9 @@ def test_a_bandwidth_near_that_of_the_samples_works(bandwidth: float, tmp_path: 
 
 
 def nearest(task: DesignTask, ctrl: Array) -> float:
-    """Smallest distance of the arm to post and floor at any engine step of a plain loop, by MuJoCo's own distances."""
+    """Smallest distance of the arm to post and floor at any engine step of a plain loop, by
+    MuJoCo's own distances.
+    """
     model = task.system.model
     data, geoms = (
         mujoco.MjData(model),
@@ -624,7 +642,8 @@ def test_a_design_that_comes_too_close_between_its_samples_gets_tighter_limits(
     """The barrier evaluates distances at samples of 50 ms, the verification at every engine step."""
     monkeypatch.setattr(multistart, "MAX_TIGHTENED_RUNS", proofs)
     if not shrunk:
-        # The interior-point method itself may still shrink a control; only the last resort is taken away.
+        # The interior-point method itself may still shrink a control; only the last resort is taken
+        # away.
         monkeypatch.setattr(multistart.Multistart, "_shrink", lambda _, result: result)
     monkeypatch.setattr(multistart, "TIGHTENED_RUN_ITERATIONS", 12)
     task, design = arm_design(
@@ -658,7 +677,9 @@ def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
 def test_a_shorter_design_played_twice_is_a_start(
     tmp_path: Path, executor: type[ThreadPoolExecutor] | None
 ) -> None:
-    """Half of the horizon alone tells about as much per second; together they are judged over all of it."""
+    """Half of the horizon alone tells about as much per second; together they are judged over all
+    of it.
+    """
     rest = {"start": "rest", "end": "rest"}
     descent = {"repeats": (2,), "max_iterations": 60}
     hanging = {"qpos": (0.0, np.pi), "qvel": (0.0, 0.0)}

@@ -1,4 +1,6 @@
-"""Hard limits along a trajectory: margins by hand, the expansion of the barrier against differences of simulations."""
+"""Hard limits along a trajectory: margins by hand, the expansion of the barrier against differences
+of simulations.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +75,9 @@ def arm_task(folder: Path, **tables: Any) -> DesignTask:
 
 
 def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
-    """Largest relative error of the slope of the barrier along random controls, against differences of simulations."""
+    """Largest relative error of the slope of the barrier along random controls, against differences
+    of simulations.
+    """
     problem = InteriorProblem(
         base=task.problem, constraints=constraint_set_of(task), mu=1.0, delta=delta, with_cost=False
     )
@@ -105,7 +109,9 @@ def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
 
 
 def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -> None:
-    """Half a turn away the difference of rotations is not linear; a floating hull does not return to its initial state."""
+    """Half a turn away the difference of rotations is not linear; a floating hull does not return
+    to its initial state.
+    """
     wild = {
         "initial": {
             "qvel": (0.1, 0.0, 0.2, 3.5, -2.4, 4.3, 1.0, -2.0),
@@ -124,7 +130,9 @@ def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -
 def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
     name: str, tmp_path: Path
 ) -> None:
-    """Changes of all constrained quantities along a tangent curve are squared, and weighted by the barrier's curvature."""
+    """Changes of all constrained quantities along a tangent curve are squared, and weighted by the
+    barrier's curvature.
+    """
     task = arm_task(tmp_path, **TOGETHER[name])
     constraints, delta = constraint_set_of(task), 0.05
     problem = InteriorProblem(
@@ -215,7 +223,9 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
 
 
 def test_relative_moves_of_an_expansion_are_those_of_the_simulation(tmp_path: Path) -> None:
-    """They are relative to half of each range; the largest at any engine step with derivatives counts."""
+    """They are relative to half of each range; the largest at any engine step with derivatives
+    counts.
+    """
     task = arm_task(tmp_path, limits=EVERY)
     constraints = constraint_set_of(task)
     problem = InteriorProblem(

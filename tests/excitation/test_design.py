@@ -61,7 +61,8 @@ def test_actuator_delays_are_refused(experiment: Experiment, tmp_path: Path) -> 
 
 def test_saturation_is_reported(experiment: Experiment, tmp_path: Path) -> None:
     old, new = 'joint="slide"/>', 'joint="slide" forcelimited="true" forcerange="-1.5 1.5"/>'
-    # hard limits, the default now, keep a design off the clamp: only what is not enforced can rest on it
+    # hard limits, the default now, keep a design off the clamp: only what is not enforced can rest
+    # on it
     tables = {"descent": {"max_iterations": 8}, "limits": {"enforce": False}}
     weak = altered(
         tmp_path, experiment, f'<motor name="force" {old}', f'<motor name="force" {new}', **tables
@@ -73,7 +74,8 @@ def test_saturation_is_reported(experiment: Experiment, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_instability_is_reported(experiment: Experiment) -> None:
-    # D-optimality with this little effort balances the pendulum upright, where every sensitivity explodes
+    # D-optimality with this little effort balances the pendulum upright, where every sensitivity
+    # explodes
     wild = mjfim.design(experiment.replace(cost={"criterion": "D"}, descent={"max_iterations": 60}))
     assert wild.final.growth > 1e3
     assert any("disturbance" in sentence for sentence in wild.warnings)
@@ -160,7 +162,8 @@ def test_a_design_that_knows_its_nuisance_parameters_beats_one_that_does_not(
     assert aware.final.eigenvalues.shape == (3,)
     there = evaluate_task(unsure, naive.trajectory)
     assert aware.final.cost < 0.95 * there.cost
-    # the trajectory is judged by the block of the full inverse that belongs to the wanted parameters
+    # the trajectory is judged by the block of the full inverse that belongs to the wanted
+    # parameters
     block = np.linalg.inv(aware.final.information)[:3, :3] / np.outer(
         unsure.theta[:3], unsure.theta[:3]
     )

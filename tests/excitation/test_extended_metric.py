@@ -1,4 +1,6 @@
-"""Problem (8) with psi among the states: without weight on psi the ordinary direction, with it the right linearisation."""
+"""Problem (8) with psi among the states: without weight on psi the ordinary direction, with it the
+right linearisation.
+"""
 
 from __future__ import annotations
 
@@ -176,7 +178,9 @@ def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_t
 def psi_step(
     task: DesignTask, thetas: tuple[Loop, Loop], h: float, x: Array, u: Array, psi: Array, j: int
 ) -> Array:
-    """psi_{k+1} of parameter j as a function of (x, u, psi): a plain difference of two steps at theta_j +- h."""
+    """psi_{k+1} of parameter j as a function of (x, u, psi): a plain difference of two steps at
+    theta_j +- h.
+    """
     up, down = thetas
     ahead, back = up.plus(x, h * psi), up.plus(x, -h * psi)
     return up.minus(up.F(ahead, u), down.F(back, u)) / (2 * h)

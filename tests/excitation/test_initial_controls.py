@@ -1,4 +1,6 @@
-"""Initial controls of a design: names, sizes and ranges, windows at both ends, and earlier designs that are repeated."""
+"""Initial controls of a design: names, sizes and ranges, windows at both ends, and earlier designs
+that are repeated.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Several experiments whose information adds up: designed in turn, never worse than apart, seeing what one alone does not."""
+"""Several experiments whose information adds up: designed in turn, never worse than apart, seeing
+what one alone does not.
+"""
 
 from __future__ import annotations
 

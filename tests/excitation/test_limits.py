@@ -1,4 +1,6 @@
-"""Limits from the ranges of the MJCF and of the experiment file, and the smallest margins of a trajectory."""
+"""Limits from the ranges of the MJCF and of the experiment file, and the smallest margins of a
+trajectory.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +96,9 @@ def test_the_file_narrows_ranges_and_adds_others(model: mujoco.MjModel) -> None:
 
 
 def test_one_number_stands_for_all_names(model: mujoco.MjModel) -> None:
-    """It holds for joints with one degree of freedom, for controls, and for actuators with a single force."""
+    """It holds for joints with one degree of freedom, for controls, and for actuators with a single
+    force.
+    """
     found = limits(model, velocity=2.0, acceleration=9.0, control_rate=7.0, force=1.5)
     joints, places = (("lift", 3), ("turn", 4)), (("push", 0), ("twist", 1))
     assert set(found) - set(limits(model)) == {
@@ -173,7 +177,9 @@ def test_wrong_limits_are_refused(
 
 
 def margins(text: str, folder: Path, trajectory: Trajectory, **tables: object) -> dict[str, float]:
-    """Smallest margins of a trajectory with one engine step per sample, for an experiment on a model."""
+    """Smallest margins of a trajectory with one engine step per sample, for an experiment on a
+    model.
+    """
     task = make_task(
         text,
         folder,
@@ -231,7 +237,9 @@ def test_the_margin_of_a_kind_is_the_smallest_of_its_joints(
 def test_accelerations_and_rates_of_the_control_are_changes_over_their_time(
     model: mujoco.MjModel, tmp_path
 ) -> None:
-    """The velocity changes over an engine step (2 ms), the control over a sample (10 ms); the first control is free."""
+    """The velocity changes over an engine step (2 ms), the control over a sample (10 ms); the first
+    control is free.
+    """
     moving = curve(model, qvel=(4, [0.0, 0.01, -0.02]), ctrl=(1, [0.5, 0.2]))
     found = margins(
         XML,
@@ -264,7 +272,10 @@ SERVOED = """
 
 
 def test_every_control_of_an_actuator_has_its_range() -> None:
-    """MuJoCo has one range per control. The range of a single force is a limit too, that of a norm is not."""
+    """MuJoCo has one range per control.
+
+    The range of a single force is a limit too, that of a norm is not.
+    """
     found = limits(mujoco.MjModel.from_xml_string(SERVOED))
     aims = [
         Limit(kind="control", name=f"aim[{i}]", index=i, lower=-1.0, upper=1.0) for i in range(3)

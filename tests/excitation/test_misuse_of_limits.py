@@ -1,4 +1,6 @@
-"""Hard limits and boundaries that cannot be kept: one message with file and key and exit code 2, before any optimisation."""
+"""Hard limits and boundaries that cannot be kept: one message with file and key and exit code 2,
+before any optimisation.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "start outside": (
         "[limits]\nposition = { hinge = [-1.0, 1.0] }",
         [
-            "limits.position.hinge: the initial state is at 3.14159 rad, outside [-1, 1]; widen the limit",
+            "limits.position.hinge: the initial state is at 3.14159 rad, outside [-1, 1]; widen "
+            "the limit",
             "or move the initial state",
         ],
         [],
@@ -62,7 +65,8 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "start that falls": (
         '[boundary]\nstart = "rest"',
         [
-            "boundary.start: no control holds the initial state: joint 'hinge' still accelerates by 7.59 per s²",
+            "boundary.start: no control holds the initial state: joint 'hinge' still accelerates "
+            "by 7.59 per s²",
             "an equilibrium",
         ],
         [("3.141592653589793", "2.0")],
@@ -75,7 +79,8 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "end that falls": (
         '[boundary]\nend = "rest"\nkeyframe = "side"',
         [
-            "boundary.end: no control holds the final state: joint 'hinge' still accelerates by 6.38 per s²"
+            "boundary.end: no control holds the final state: joint 'hinge' still accelerates by "
+            "6.38 per s²"
         ],
         [SIDE],
     ),
@@ -124,7 +129,8 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "start too close": (
         '[limits]\nclearance = 3.0\nignored = [["cart", "world"], ["pendulum", "world"]]',
         [
-            "limits.clearance: the initial state is too close: bob - rail are 0.885 m apart, wanted 3 m"
+            "limits.clearance: the initial state is too close: bob - rail are 0.885 m apart, "
+            "wanted 3 m"
         ],
         [SOLID, ('<geom name="rod" type', '<geom name="rod" contype="0" conaffinity="0" type')],
     ),
@@ -136,7 +142,8 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "unknown body": (
         '[limits]\nclearance = 0.01\nignored = [["bob", "carts"]]',
         [
-            "limits.ignored: unknown body 'carts' (did you mean 'cart'?); valid: bob, cart, pendulum, world"
+            "limits.ignored: unknown body 'carts' (did you mean 'cart'?); valid: bob, cart, "
+            "pendulum, world"
         ],
         [],
     ),

@@ -1,7 +1,8 @@
-"""The adjoint gradient of J against central differences of J through the projection, on models of every kind.
+"""The adjoint gradient of J against central differences of J through the projection, on models of
+every kind.
 
-In every experiment here limits, clamps and contacts do not act: the models have none, or the control is too weak to
-reach them (a docstring says so).
+In every experiment here limits, clamps and contacts do not act: the models have none, or the
+control is too weak to reach them (a docstring says so).
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ TRACKING = {
 
 
 def cartpole(folder: Path) -> DesignTask:
-    """dm_control's cart-pole, RK4. |u| <= 0.3 of 1 and the slide stays inside its +-1.8 m: no constraint acts."""
+    """dm_control's cart-pole, RK4. |u| <= 0.3 of 1 and the slide stays inside its +-1.8 m: no
+    constraint acts.
+    """
     parameters = {
         "m": {"target": "body/pole_1:mass"},
         "drag": {"target": "joint/slider:damping", "guess": 0.1},
@@ -189,7 +192,8 @@ SETUPS: dict[str, Callable[[Path], DesignTask]] = {
     "qube_furuta": furuta,
 }
 
-# Where feedback takes most of the effect of a direction away, a longer step keeps clear of the round-off in J.
+# Where feedback takes most of the effect of a direction away, a longer step keeps clear of the
+# round-off in J.
 STEPS = {"dmc_cartpole": 2e-2}
 
 
@@ -201,7 +205,9 @@ def gain(task: DesignTask) -> Array:
 
 
 def directions(task: DesignTask, gradient: Array) -> list[Array]:
-    """Curve directions (N, nu): random smooth, white noise, and the gradient itself; in the size of the control."""
+    """Curve directions (N, nu): random smooth, white noise, and the gradient itself; in the size of
+    the control.
+    """
     rng, size = np.random.default_rng(7), np.abs(task.control).max()
     t, nu = task.t / task.t[-1], task.plant.nu
     phase = rng.uniform(0, 2 * np.pi, nu)

@@ -1,4 +1,6 @@
-"""Information of earlier experiments: summed by name, the rest marginalised, no prior counted twice."""
+"""Information of earlier experiments: summed by name, the rest marginalised, no prior counted
+twice.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def test_designs_and_estimates_add_up_by_name(tmp_path: Path) -> None:
 
 
 def test_what_the_file_knows_besides_is_marginalised(tmp_path: Path) -> None:
-    """The covariance of the shared parameters stays what the file says, not what it would be were the rest known."""
+    """The covariance of the shared parameters stays what the file says, not what it would be were
+    the rest known.
+    """
     matrix = information(2, 4)
     path = design_file(tmp_path / "design.json", ["x", "a", "y", "b"], matrix)
     found = information_of([path], ("a", "b"))
@@ -68,7 +72,9 @@ def test_what_cannot_be_told_apart_from_the_rest_is_not_known(tmp_path: Path) ->
 
 
 def test_the_files_own_prior_is_left_out(tmp_path: Path) -> None:
-    """Else it would be counted once more with every file; priors on what is marginalised stay, they belong to the file."""
+    """Else it would be counted once more with every file; priors on what is marginalised stay, they
+    belong to the file.
+    """
     data = information(3, 3)
     prior = np.diag([5.0, 0.0, 7.0])
     path = design_file(tmp_path / "design.json", ["a", "b", "x"], data + prior, prior)
@@ -159,7 +165,9 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
 
 
 def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
-    """Its data's information becomes part of the next experiment's prior, and of that one's file no more than its own."""
+    """Its data's information becomes part of the next experiment's prior, and of that one's file no
+    more than its own.
+    """
     tables = {"descent": {"max_iterations": 1}, "cost": {"criterion": "A"}}
     priors = {
         "m": {"target": "body/bob:mass", "prior": 0.1},

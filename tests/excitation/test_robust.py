@@ -1,4 +1,6 @@
-"""Samples of the parameters, pooled criteria against differences, and a design for the worst of them."""
+"""Samples of the parameters, pooled criteria against differences, and a design for the worst of
+them.
+"""
 
 from __future__ import annotations
 
@@ -143,7 +145,8 @@ def test_parameters_without_prior_and_bounds_cannot_be_sampled(tmp_path) -> None
         )
 
 
-# The pendulum's length is known to a factor of two only: what swings it well at one length does not at another.
+# The pendulum's length is known to a factor of two only: what swings it well at one length does not
+# at another.
 VAGUE = {
     "m": {**CART_PARAMETERS["m"], "bounds": (1.0, 2.2)},
     "l": {**CART_PARAMETERS["l"], "bounds": (0.5, 1.4)},

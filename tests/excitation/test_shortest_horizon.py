@@ -181,7 +181,9 @@ def test_control_of_another_duration(tmp_path: Path) -> None:
 
 
 def test_the_command_line(tmp_path: Path) -> None:
-    """Everything as usual at the horizon found, which it prints and keeps; 1 where none is long enough."""
+    """Everything as usual at the horizon found, which it prints and keeps; 1 where none is long
+    enough.
+    """
     for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
         shutil.copy(MODELS / name, tmp_path)
     text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")

@@ -1,4 +1,6 @@
-"""Verification of a design on the model as the user wrote it: between samples, at clamps and stops, and where it diverges."""
+"""Verification of a design on the model as the user wrote it: between samples, at clamps and stops,
+and where it diverges.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -
 
 
 def test_limits_hold_between_the_samples_too(tmp_path: Path) -> None:
-    """At every sample the ball is in the middle, at full speed and without acceleration; between samples it swings."""
+    """At every sample the ball is in the middle, at full speed and without acceleration; between
+    samples it swings.
+    """
     limits = {
         "position": {"slide": (-0.1, 0.12)},
         "velocity": {"slide": (0.9 * SPEED, 2 * SPEED)},
@@ -131,7 +135,9 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
 def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
     enforce: bool, tmp_path: Path
 ) -> None:
-    """A boundary alone does not keep a force within its range: the plant of the design must clamp it."""
+    """A boundary alone does not keep a force within its range: the plant of the design must clamp
+    it.
+    """
     motor = 'ctrlrange="-0.05 0.05" forcerange="-0.04 0.04"'
     control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
     tables = {

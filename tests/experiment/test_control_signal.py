@@ -52,7 +52,9 @@ def test_sine_has_its_frequency() -> None:
 
 
 def test_chirp_sweeps_its_frequencies() -> None:
-    """Starts at zero, its frequency grows linearly to the end; the next actuator sweeps 17 % higher."""
+    """Starts at zero, its frequency grows linearly to the end; the next actuator sweeps 17 %
+    higher.
+    """
     u = generate(
         Signal(kind="chirp", amplitude=2.0, frequency=1.0, frequency_end=5.0), T, NAMES, REST
     )
@@ -112,7 +114,9 @@ def test_unknown_actuator(key: str) -> None:
 
 
 def test_setup_samples_the_signal_at_its_rate() -> None:
-    """At 20 Hz it has every fifth sample of 100 Hz; a coarser task has the mean over its longer samples."""
+    """At 20 Hz it has every fifth sample of 100 Hz; a coarser task has the mean over its longer
+    samples.
+    """
     e = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
         horizon=2.0, initial={"control": {"kind": "sine", "frequency": 0.7}}
     )

@@ -67,7 +67,9 @@ def test_every_component_of_any_joint_has_a_column(tmp_path: Path) -> None:
 
 
 def test_groups_of_columns_can_be_named(tmp_path: Path) -> None:
-    """`.pos` and `.rot`, the whole joint, one component; the key that names fewer columns wins, in any order of the file."""
+    """`.pos` and `.rot`, the whole joint, one component; the key that names fewer columns wins, in
+    any order of the file.
+    """
     table = {
         "qpos:float.rot": 0.2,
         "qpos:float": 0.1,
@@ -87,7 +89,9 @@ def test_groups_of_columns_can_be_named(tmp_path: Path) -> None:
 def test_four_components_hold_exactly_the_information_of_a_rotation_vector(
     joint: str, tmp_path: Path
 ) -> None:
-    """At every attitude of a tumbling body: derivatives of the quaternion by MuJoCo's own integration, over sigma / 2."""
+    """At every attitude of a tumbling body: derivatives of the quaternion by MuJoCo's own
+    integration, over sigma / 2.
+    """
     sigma = 0.05
     task = body_task(
         tmp_path, noise={f"qpos:{joint}.rot": sigma} if joint == "float" else {"qpos:ball": sigma}
@@ -113,7 +117,9 @@ def test_four_components_hold_exactly_the_information_of_a_rotation_vector(
 
 
 def test_information_about_parameters_is_that_of_the_rotation_vector(tmp_path: Path) -> None:
-    """Through the whole chain: from measured quaternions, against psi in the tangent space over sigma."""
+    """Through the whole chain: from measured quaternions, against psi in the tangent space over
+    sigma.
+    """
     task = body_task(tmp_path, noise={"qpos:ball": 0.05})
     found = task.plant.derivatives.sensitivity(task.theta, task.initial)
     psi = found.psi[1:, 6:9] / 0.05
@@ -215,7 +221,9 @@ def test_a_key_of_one_column_overrules_a_covariance(tmp_path: Path) -> None:
 
 
 def test_correlated_outputs_replace_their_sigmas(tmp_path: Path) -> None:
-    """In the order in which the block names them, and measured even where the noise table does not name them."""
+    """In the order in which the block names them, and measured even where the noise table does not
+    name them.
+    """
     names = ["acc[2]", "qpos:hinge", "drive"]
     task = cart_task(
         tmp_path,

@@ -1,4 +1,6 @@
-"""Unknown parameters: guesses, scales and units, inertias of bodies, the nuisance table, functions of an MjSpec."""
+"""Unknown parameters: guesses, scales and units, inertias of bodies, the nuisance table, functions
+of an MjSpec.
+"""
 
 from __future__ import annotations
 
@@ -253,7 +255,9 @@ def test_guess_unit_and_scale_come_from_the_first_target(
 
 
 def test_positions_are_scaled_by_the_size_of_the_body(tmp_path: Path) -> None:
-    """A centre of mass at zero still has a scale: the radius of gyration; `scale = "guess"` asks for the value itself."""
+    """A centre of mass at zero still has a scale: the radius of gyration; `scale = "guess"` asks
+    for the value itself.
+    """
     task = body_task(tmp_path, parameters={"y": {"target": "body/arm:ipos[1]"}})
     radius = body_inertia(task.system.model, task.system.model.body("arm").id).gyration_radius
     assert task.parameters.guess.tolist() == [0.0]
@@ -278,7 +282,9 @@ def test_integers_are_valid_scales(tmp_path: Path) -> None:
 
 
 def test_deviations_of_all_components_of_the_initial_state(tmp_path: Path) -> None:
-    """One deviation for each degree of freedom in position and velocity, with the prior, as nuisance."""
+    """One deviation for each degree of freedom in position and velocity, with the prior, as
+    nuisance.
+    """
     task = body_task(
         tmp_path, parameters={"m": {"target": "body/arm:mass"}}, nuisance={"initial": 0.02}
     )

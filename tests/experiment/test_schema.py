@@ -1,4 +1,6 @@
-"""The experiment file: all keys are read, and every fault names the file, the key and what would be right."""
+"""The experiment file: all keys are read, and every fault names the file, the key and what would be
+right.
+"""
 
 from __future__ import annotations
 
@@ -412,7 +414,8 @@ def test_shipped_experiments_resolve(name: str) -> None:
 E, M, R = ExperimentError, ModelError, RecordingError
 HOME = "bad.toml"
 
-# By name: text of the file, kind of the error, fragments of the message. The first fragment is the file.
+# By name: text of the file, kind of the error, fragments of the message. The first fragment is the
+# file.
 FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     # keys
     "top-level key": (
@@ -451,7 +454,8 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
         [
             HOME,
             "limits.speed",
-            "acceleration, bandwidth, clearance, control, control_rate, enforce, force, ignored, position, velocity",
+            "acceleration, bandwidth, clearance, control, control_rate, enforce, force, ignored, "
+            "position, velocity",
         ],
     ),
     "boundary key": (

@@ -1,4 +1,6 @@
-"""Recordings on the sample grid: the control keeps its impulse, measured values stay unchanged, faults are named."""
+"""Recordings on the sample grid: the control keeps its impulse, measured values stay unchanged,
+faults are named.
+"""
 
 from __future__ import annotations
 
@@ -99,7 +101,9 @@ def log(task: DesignTask, **changes: Any) -> Recording:
 
 
 def test_a_recording_on_the_grid_is_unchanged(task: DesignTask) -> None:
-    """Any first time, stamps within a hundredth of a sample, columns in any order, some absent, one more control."""
+    """Any first time, stamps within a hundredth of a sample, columns in any order, some absent, one
+    more control.
+    """
     plain = log(task)
     jitter = np.random.default_rng(1).uniform(-4e-5, 4e-5, len(plain.t))
     for t in (plain.t, plain.t + 1.7e9, plain.t + jitter):
@@ -118,7 +122,10 @@ def test_a_recording_on_the_grid_is_unchanged(task: DesignTask) -> None:
 
 
 def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> None:
-    """Its values stay as well; only the control is averaged. A log on the grid stays on it where rows are missing."""
+    """Its values stay as well; only the control is averaged.
+
+    A log on the grid stays on it where rows are missing.
+    """
     plain = log(task)
     t = np.sort(np.random.default_rng(2).uniform(0.0, 0.3, len(plain.t)))
     track = align(task.system, log(task, t=t + 5.0))
@@ -139,7 +146,9 @@ def test_a_recording_between_the_samples_keeps_its_times(task: DesignTask) -> No
 
 
 def test_two_rows_of_one_sample_do_not_shift_the_control(task: DesignTask) -> None:
-    """A repeated stamp and a missing row: the numbers of rows and samples agree, but not every sample has a row."""
+    """A repeated stamp and a missing row: the numbers of rows and samples agree, but not every
+    sample has a row.
+    """
     plain = log(task)
     t = np.array(plain.t)
     t[8] = t[7] + 0.005 * task.dt
@@ -225,7 +234,10 @@ def test_measured_trajectory_bridges_gaps(task: DesignTask, body: DesignTask) ->
 
 
 def test_interpolation_between_samples_is_exact_for_cubics() -> None:
-    """At any times, in any order, several at one sample; values and slopes. A quartic shows that the test can fail."""
+    """At any times, in any order, several at one sample; values and slopes.
+
+    A quartic shows that the test can fail.
+    """
     rng = np.random.default_rng(0)
     wanted = rng.uniform(0.0, 29.0, 200)
     wanted[:3] = 0.0, 29.0, 14.0
@@ -244,7 +256,9 @@ def test_interpolation_between_samples_is_exact_for_cubics() -> None:
 
 @pytest.mark.parametrize("delay", [0.0, 0.4 * DT, 3.7 * DT, -1.2 * DT])
 def test_interpolation_at_the_samples_is_the_delay_on_the_grid(delay: float) -> None:
-    """`of` is `at` every sample, and any rows of it are `at` those; before the start is the start, without a slope."""
+    """`of` is `at` every sample, and any rows of it are `at` those; before the start is the start,
+    without a slope.
+    """
     all_of_them, y = (
         OutputDelay.on_grid(40, delay, DT),
         np.random.default_rng(0).standard_normal((40, 2)),

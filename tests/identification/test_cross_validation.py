@@ -1,4 +1,6 @@
-"""Predictions of data that were not fitted, parameters of single recordings, and remarks about poor data."""
+"""Predictions of data that were not fitted, parameters of single recordings, and remarks about poor
+data.
+"""
 
 from __future__ import annotations
 

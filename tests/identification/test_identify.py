@@ -316,7 +316,9 @@ def test_an_interruption_before_the_last_search_ends_all_searches(
 def test_a_robust_fit_judges_the_size_of_its_residuals(
     task: DesignTask, recording: Recording, scale: float
 ) -> None:
-    """Noise as stated is neither too large nor too small, whatever counts as an outlier; three times the noise is a misfit."""
+    """Noise as stated is neither too large nor too small, whatever counts as an outlier; three
+    times the noise is a misfit.
+    """
     robust = DesignTask.resolve(
         task.experiment.replace(fit={"loss": "soft_l1", "loss_scale": scale})
     )
@@ -337,7 +339,9 @@ def test_a_robust_fit_judges_the_size_of_its_residuals(
 
 
 def test_parameters_in_combination_only_make_no_numerical_warning() -> None:
-    """Their covariance is infinite; correlations of the others are computed without a warning (warnings are errors here)."""
+    """Their covariance is infinite; correlations of the others are computed without a warning
+    (warnings are errors here).
+    """
     task = DesignTask.resolve(Experiment.from_file(ROOT / "models" / "ball_pendulum.toml"))
     estimate = identify_system(
         task.system,

@@ -1,4 +1,5 @@
-"""Measured data of other groups: parameters from some recordings predict the others, and poor data are named.
+"""Measured data of other groups: parameters from some recordings predict the others, and poor data
+are named.
 
 The data are not in the repository; without them, these tests are skipped.
 """

@@ -81,7 +81,9 @@ def test_gaps_and_outputs_that_are_not_measured() -> None:
 
 
 def test_a_single_value_is_not_an_interval() -> None:
-    """A rarely measured output, one value of which is large by chance, does not outdo a burst of a hundred values."""
+    """A rarely measured output, one value of which is large by chance, does not outdo a burst of a
+    hundred values.
+    """
     for seed in range(20):
         times, z = white(seed)
         sparse = np.full(1000, np.nan)
@@ -133,7 +135,9 @@ def seen(
 
 
 def test_larger_and_smaller_need_probability_and_size() -> None:
-    """Chi-square beyond its 0.1 % tail, and a ratio that matters; with much data the tail alone is not enough."""
+    """Chi-square beyond its 0.1 % tail, and a ratio that matters; with much data the tail alone is
+    not enough.
+    """
     for dof in (10, 300, 10_000):
         top, bottom = chi2.isf(1e-3, dof), chi2.ppf(1e-3, dof)
         assert is_larger_than_noise(1.01 * top, dof) == (np.sqrt(1.01 * top / dof) > 1.03)
@@ -150,7 +154,9 @@ def test_larger_and_smaller_need_probability_and_size() -> None:
 
 
 def test_autocorrelation_matters_where_it_is_large_enough() -> None:
-    """Significant, corrected for the number of outputs, and large against the noise; strongest first."""
+    """Significant, corrected for the number of outputs, and large against the noise; strongest
+    first.
+    """
     assert [
         w.output
         for w in autocorrelated([seen("a", 1e-9, 2.0), seen("b", 1e-9, 5.0), seen("c", 0.1, 9.0)])

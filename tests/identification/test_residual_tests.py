@@ -80,7 +80,9 @@ def test_small_signals_in_noise_are_found(extra: Array | float) -> None:
 
 
 def test_long_runs_see_what_short_lags_do_not() -> None:
-    """A drift far below the noise: the runs bring it out, and their inflation says how much averaging is lost."""
+    """A drift far below the noise: the runs bring it out, and their inflation says how much
+    averaging is lost.
+    """
     drift = 0.15 * np.sign(np.sin(2 * np.pi * np.arange(N) / 2000))
     found = [seen(seed, drift) for seed in range(20)]
     assert sum(w.p < 1e-3 for w in found) >= 18
@@ -106,7 +108,10 @@ def test_borders_of_recordings_are_not_crossed() -> None:
 
 
 def test_the_statistic_is_that_of_ljung_and_box() -> None:
-    """From its formula, in plain sums; p is its tail, times the number of looks. A fast oscillation leaves means small."""
+    """From its formula, in plain sums; p is its tail, times the number of looks.
+
+    A fast oscillation leaves means small.
+    """
     rng = np.random.default_rng(0)
     for phi in (-0.06, -0.1):
         y = autoregressive(phi, 600, rng)

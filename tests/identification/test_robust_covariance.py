@@ -1,6 +1,8 @@
-"""Robust uncertainty of an estimate against the spread of many repetitions of a simulated experiment.
+"""Robust uncertainty of an estimate against the spread of many repetitions of a simulated
+experiment.
 
-The models are linear and the truth is known, so that every part of `robust_uncertainty` can be compared with that spread.
+The models are linear and the truth is known, so that every part of `robust_uncertainty` can be
+compared with that spread.
 """
 
 from __future__ import annotations
@@ -88,7 +90,9 @@ def noise(phi: float, shape: tuple[int, int], rng: np.random.Generator) -> Array
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Many repetitions. theta, formal, sandwich, bootstrap: (n, c);  covered: (n, c) the interval holds the truth, 0"""
+    """Many repetitions. theta, formal, sandwich, bootstrap: (n, c);  covered: (n, c) the interval
+    holds the truth, 0
+    """
 
     theta: Array
     formal: Array
@@ -163,7 +167,9 @@ def test_the_interval_covers_the_truth(phi: float, own: bool) -> None:
 
 
 def test_priors_count_as_scatter() -> None:
-    """Truths drawn from the prior: sandwich and bootstrap are the spread about them, not the spread of the data alone."""
+    """Truths drawn from the prior: sandwich and bootstrap are the spread about them, not the spread
+    of the data alone.
+    """
     s = study(0.0, prior=0.03)
     true = s.theta.std(axis=0)
     assert (true < 0.03).all()
@@ -197,7 +203,9 @@ def test_recordings_that_disagree_are_found() -> None:
 
 
 def test_few_blocks_of_each_recording_give_no_false_alarms() -> None:
-    """Strongly coloured noise leaves five or so blocks a recording, whose own scatter is often small by chance."""
+    """Strongly coloured noise leaves five or so blocks a recording, whose own scatter is often
+    small by chance.
+    """
     rng, K, N = np.random.default_rng(6), 10, 480
     model = Linear(waves(K, N, 3, slow=1.0))
     said = [
@@ -208,7 +216,9 @@ def test_few_blocks_of_each_recording_give_no_false_alarms() -> None:
 
 
 def test_differences_between_recordings_do_not_count_as_scatter() -> None:
-    """At the common estimate the difference is in all residuals; it must not pass for the scatter of each recording."""
+    """At the common estimate the difference is in all residuals; it must not pass for the scatter
+    of each recording.
+    """
     rng, K, N = np.random.default_rng(8), 5, 1200
     model = Linear(waves(K, N, 3, slow=0.7))
     apart = 0
@@ -291,7 +301,9 @@ def test_blocks_are_four_autocorrelation_times_long() -> None:
 
 
 def test_merged_blocks_are_runs_of_one_recording_long_enough() -> None:
-    """Random recordings: blocks do not cross recordings, keep their order and are as short as possible."""
+    """Random recordings: blocks do not cross recordings, keep their order and are as short as
+    possible.
+    """
     rng = np.random.default_rng(3)
     for _ in range(200):
         counts = rng.integers(1, 12, rng.integers(1, 6))

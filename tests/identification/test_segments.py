@@ -82,7 +82,9 @@ def covered(segments: tuple[Segment, ...], recordings: list[AlignedRecording]) -
 @pytest.mark.parametrize("length", [0.04, 0.05, 0.17, 0.33, 1.0, 1.5, 9.0, None])
 @pytest.mark.parametrize("lead", [0.0, 0.004, 0.03])
 def test_every_row_is_in_one_segment(task: DesignTask, length: float | None, lead: float) -> None:
-    """Even logs, logs with missing rows, logs off the grid; segments of nearly the length asked for."""
+    """Even logs, logs with missing rows, logs off the grid; segments of nearly the length asked
+    for.
+    """
     rng = np.random.default_rng(0)
     y = truth(task)
     some = np.sort(rng.choice(len(y), 120, replace=False))
@@ -157,7 +159,10 @@ def test_whole_recordings_start_as_stated(task: DesignTask) -> None:
 def test_measured_starts_are_where_the_motion_was(
     task: DesignTask, hidden: tuple[str, ...], gaps: bool
 ) -> None:
-    """A slide and a hinge; velocities measured, or read off the positions. Against the motion itself."""
+    """A slide and a hinge; velocities measured, or read off the positions.
+
+    Against the motion itself.
+    """
     y = truth(task)
     begins = np.array([0, 3, 60, 117, 199])
     shown = np.array(y)
@@ -181,7 +186,9 @@ def test_noise_is_averaged_over_the_rows_around(task: DesignTask) -> None:
 
 
 def test_a_free_body_starts_with_its_orientation(body: DesignTask) -> None:
-    """Position, measured quaternion (the nearest, of unit length), velocities; for a ball joint too."""
+    """Position, measured quaternion (the nearest, of unit length), velocities; for a ball joint
+    too.
+    """
     y = truth(body)
     begins = np.array([0, 50, 133])
     noisy = np.array(y)
@@ -199,7 +206,9 @@ def test_a_free_body_starts_with_its_orientation(body: DesignTask) -> None:
 
 
 def test_unmeasured_states_follow_the_model_at_the_guess(body: DesignTask) -> None:
-    """Velocities of rotations that the log does not hold; all of it where orientations are missing too."""
+    """Velocities of rotations that the log does not hold; all of it where orientations are missing
+    too.
+    """
     y, guess = truth(body), truth(body, 1.0)
     begins = np.array([0, 40, 120])
     slow = measured_initial_states(body.system, track(body, y, hidden=("qvel",)), begins)
@@ -235,7 +244,9 @@ def test_an_output_that_a_recording_lacks_does_not_spoil_its_starts(
 def test_a_start_that_nothing_shows_does_no_harm(
     tmp_path: Path, fit: dict[str, object], names: tuple[str, ...]
 ) -> None:
-    """Where the cart stands is in no output: only round-off of differences speaks of it, and must not steer the search."""
+    """Where the cart stands is in no output: only round-off of differences speaks of it, and must
+    not steer the search.
+    """
     noise = dict.fromkeys(names, 0.01)
     blind = cart_task(tmp_path, horizon=3.0, noise=noise, fit={**fit, "bootstrap": 0})
     theta, y = 1.1 * blind.parameters.guess, truth(blind)

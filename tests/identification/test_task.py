@@ -110,7 +110,9 @@ def test_a_stop_token_ends_the_search_with_the_best_result_so_far(
 def test_variants_of_a_problem_leave_the_problem_unchanged(
     experiment: mjfim.Experiment, recording: Recording
 ) -> None:
-    """Variants share what they do not change, and nothing of them shows in the problem that they were made from."""
+    """Variants share what they do not change, and nothing of them shows in the problem that they
+    were made from.
+    """
     task = FitTask.resolve(experiment.replace(fit={"segments": 0.5}), [recording])
     problem = task.problem()
     begin = problem.begin(task.start)

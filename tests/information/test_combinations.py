@@ -1,4 +1,6 @@
-"""Parameters that are identifiable only in combination: in designs, joint designs, prior information, estimates and criteria."""
+"""Parameters that are identifiable only in combination: in designs, joint designs, prior
+information, estimates and criteria.
+"""
 
 from __future__ import annotations
 

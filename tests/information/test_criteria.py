@@ -1,4 +1,6 @@
-"""Optimality criteria against their definitions, their derivatives against differences, and where eigenvalues meet."""
+"""Optimality criteria against their definitions, their derivatives against differences, and where
+eigenvalues meet.
+"""
 
 from __future__ import annotations
 

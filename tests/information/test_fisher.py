@@ -1,4 +1,6 @@
-"""Fisher information against its sum, nuisance and combinations against the full inverse, and what cannot be identified."""
+"""Fisher information against its sum, nuisance and combinations against the full inverse, and what
+cannot be identified.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Identifiable parameters along the initial control and along random ones, and experiments that are refused."""
+"""Identifiable parameters along the initial control and along random ones, and experiments that are
+refused.
+"""
 
 from __future__ import annotations
 
@@ -125,7 +127,8 @@ def test_a_combination_that_only_the_initial_control_hides_is_refused_with_advic
     )
     (group,) = seen.groups_along_trajectory
     assert group.members == ("mass", "drag")
-    # d(drag / mass) = 0 along (mass, drag) = (1, 0.3): what remains is drag - 0.3 mass, or mass - drag / 0.3
+    # d(drag / mass) = 0 along (mass, drag) = (1, 0.3): what remains is drag - 0.3 mass, or mass -
+    # drag / 0.3
     coefficients = dict(
         zip(group.combinations[0].members, group.combinations[0].coefficients, strict=True)
     )
@@ -138,7 +141,9 @@ def test_a_combination_that_only_the_initial_control_hides_is_refused_with_advic
 
 @pytest.mark.parametrize("sigma", [0.05, 1e-7], ids=["coarse", "fine sensor"])
 def test_a_wanted_parameter_confounded_with_a_nuisance_is_named(sigma: float, tmp_path) -> None:
-    """The initial position of the cart and the bias of its position sensor change every measurement alike."""
+    """The initial position of the cart and the bias of its position sensor change every measurement
+    alike.
+    """
     wanted = {"offset": {"target": "output/qpos:slide:bias"}}
     noise = {"qpos:slide": sigma, "qvel:slide": sigma}
     task = cart_task(

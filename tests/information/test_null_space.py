@@ -1,4 +1,6 @@
-"""Null spaces of synthetic sensitivities and of a double pendulum whose base parameters are known in closed form."""
+"""Null spaces of synthetic sensitivities and of a double pendulum whose base parameters are known
+in closed form.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ SIZES = np.array([1e-6, 1e-3, 1.0, 1e3, 1e6])
 
 
 def rows(null: Array, seed: int = 0, n: int = 60) -> Array:
-    """Random (n, p) whose null space, with parameters in units of their sizes, is spanned by the columns of null: (p, k)."""
+    """Random (n, p) whose null space, with parameters in units of their sizes, is spanned by the
+    columns of null: (p, k).
+    """
     p, k = null.shape
     seen = np.linalg.qr(null, mode="complete")[0][:, k:]
     return np.random.default_rng(seed).normal(size=(n, p - k)) @ seen.T
@@ -232,7 +236,8 @@ def test_a_double_pendulum_shows_its_base_parameters(tmp_path) -> None:
     assert (seen.along_trajectory.count, seen.along_all.count) == (14, 14)
     assert seen.basis.shape == (20, 6)
     lumped, silent = seen.groups_along_all
-    # first moment m1 r1 + l m2 and inertia J1 + l^2 m2 about the first hinge, each a textbook base parameter
+    # first moment m1 r1 + l m2 and inertia J1 + l^2 m2 about the first hinge, each a textbook base
+    # parameter
     assert lumped.members == ("a.mz", "a.Jyy", "b.mass")
     (first, inertia) = lumped.combinations
     assert first.members == ("a.mz", "b.mass")

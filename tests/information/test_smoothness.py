@@ -1,4 +1,6 @@
-"""Disagreement of two difference steps: dry friction and contacts are flagged with sample and cause, smooth models are not."""
+"""Disagreement of two difference steps: dry friction and contacts are flagged with sample and
+cause, smooth models are not.
+"""
 
 from __future__ import annotations
 

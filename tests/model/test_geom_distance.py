@@ -1,4 +1,6 @@
-"""Geom distances: selection of pairs, distances against MuJoCo and by hand, slopes against differences."""
+"""Geom distances: selection of pairs, distances against MuJoCo and by hand, slopes against
+differences.
+"""
 
 from __future__ import annotations
 
@@ -89,7 +91,9 @@ def scattered(model: mujoco.MjModel, count: int, spread: float, seed: int = 0) -
 
 
 def asked(model: mujoco.MjModel, chosen: GeomDistances, qpos: Array, limit: float) -> Array:
-    """Distances by `mj_geomDistance` for every pair at every configuration, nothing left out: (n, p)."""
+    """Distances by `mj_geomDistance` for every pair at every configuration, nothing left out: (n,
+    p).
+    """
     data, out = mujoco.MjData(model), np.empty((len(qpos), len(chosen.pairs)))
     for k, now in enumerate(qpos):
         data.qpos[:] = now
@@ -112,7 +116,9 @@ def slope_errors(
     qpos: Array,
     h: float = 2e-4,
 ) -> Array:
-    """Largest error of slopes of the first column against differences along every dof, of each configuration: (n,)."""
+    """Largest error of slopes of the first column against differences along every dof, of each
+    configuration: (n,).
+    """
     slope = measured(qpos).slope
     assert slope is not None
     worst = []
@@ -152,7 +158,9 @@ CROWD = """
 
 @pytest.mark.parametrize("flag", ['filterparent="enable"', 'filterparent="disable"'])
 def test_pairs_agree_with_mujocos_collisions(flag: str) -> None:
-    """Welded bodies, parents and children, excluded bodies, collision bits, explicit pairs, the world's exception."""
+    """Welded bodies, parents and children, excluded bodies, collision bits, explicit pairs, the
+    world's exception.
+    """
     model = mujoco.MjModel.from_xml_string(CROWD.format(flag=flag))
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
@@ -319,7 +327,9 @@ def test_distances_by_hand(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_planes_agree_with_contacts(kind: str) -> None:
-    """The deepest of the contacts that MuJoCo's collision detection makes with a margin of ten metres."""
+    """The deepest of the contacts that MuJoCo's collision detection makes with a margin of ten
+    metres.
+    """
     model = on_floor(KINDS[kind])
     chosen, qpos, data = between(model, 9.0), scattered(model, 200, 1.0), mujoco.MjData(model)
     d, deepest = chosen(qpos, False).d[:, 0], []
@@ -415,7 +425,9 @@ def test_slopes_to_the_floor_agree_with_differences(kind: str) -> None:
     + [("cylinder", "cylinder"), ("ellipsoid", "box")],
 )
 def test_slopes_in_penetration_agree_with_differences(first: str, second: str) -> None:
-    """Distances are negative, slopes still point outwards; curved surfaces are found to fewer digits inside."""
+    """Distances are negative, slopes still point outwards; curved surfaces are found to fewer
+    digits inside.
+    """
     model = two(KINDS[first], KINDS[second])
     chosen, qpos = between(model, 2.0), scattered(model, 60, 0.1, seed=3)
     d = chosen(qpos, False).d[:, 0]
@@ -427,7 +439,9 @@ def test_slopes_in_penetration_agree_with_differences(first: str, second: str) -
 @pytest.mark.parametrize("offset", [1e-6, 1e-10, 0.0, -1e-10, -1e-6])
 @pytest.mark.parametrize("second", ["sphere", "capsule", "ellipsoid", "cylinder"])
 def test_touching_geoms_have_slopes(second: str, offset: float) -> None:
-    """A sphere is brought to an offset along the slope of the distance; nearest points no longer tell the normal."""
+    """A sphere is brought to an offset along the slope of the distance; nearest points no longer
+    tell the normal.
+    """
     model = two(KINDS["sphere"], KINDS[second])
     chosen, qpos = between(model, 2.0), scattered(model, 1, 0.4)[0]
     start = model.joint(2).qposadr[0]

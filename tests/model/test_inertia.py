@@ -1,4 +1,6 @@
-"""Parametrisations of a body's inertia: their inverses, their meaning in the dynamics, what they refuse."""
+"""Parametrisations of a body's inertia: their inverses, their meaning in the dynamics, what they
+refuse.
+"""
 
 from __future__ import annotations
 
@@ -139,7 +141,9 @@ def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
 
 
 def test_the_dynamics_are_linear_in_barycentric_coordinates() -> None:
-    """MuJoCo's mass matrix, bias forces and energies of a mixture are the mixture of those; not so in the others."""
+    """MuJoCo's mass matrix, bias forces and energies of a mixture are the mixture of those; not so
+    in the others.
+    """
     first, second = solids(2, 3)
     ends = dynamics(first), dynamics(second)
     errors = {}
@@ -162,7 +166,9 @@ def test_the_barycentric_regressor_predicts_the_dynamics() -> None:
 
 
 def test_log_cholesky_is_physical_for_every_vector() -> None:
-    """MuJoCo compiles each of them, triangle inequality included; ten random central ones mostly fail."""
+    """MuJoCo compiles each of them, triangle inequality included; ten random central ones mostly
+    fail.
+    """
     rng = np.random.default_rng(6)
     failed = 0
     for v in rng.standard_normal((100, 10)):
@@ -255,7 +261,9 @@ def test_radius_of_gyration_is_about_the_bodys_origin() -> None:
 
 
 def test_first_moments_at_the_origin_do_not_move_with_the_mass() -> None:
-    """The mass alone changes the centre of mass and the inertia about it, not the inertia about the origin."""
+    """The mass alone changes the centre of mass and the inertia about it, not the inertia about the
+    origin.
+    """
     v = to_barycentric(solids(1, 11)[0])
     heavier = from_barycentric(np.append(2.0 * v[0], v[1:]))
     np.testing.assert_allclose(heavier.com, 0.5 * v[1:4] / v[0], rtol=1e-13)

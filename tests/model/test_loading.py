@@ -1,4 +1,6 @@
-"""Every example of the repository goes through `check` and `design`, pictures and Rerun file included."""
+"""Every example of the repository goes through `check` and `design`, pictures and Rerun file
+included.
+"""
 
 from __future__ import annotations
 

@@ -46,7 +46,8 @@ ARM = """
 </mujoco>
 """
 
-# A box on a slide and a hinge, and one in free flight: bodies that MuJoCo would compile as 'simple'.
+# A box on a slide and a hinge, and one in free flight: bodies that MuJoCo would compile as
+# 'simple'.
 SIMPLE = """
 <mujoco>
   <option integrator="RK4"/>
@@ -69,7 +70,8 @@ SIMPLE = """
 </mujoco>
 """
 
-# Inertia is spelled out, so geoms only matter for contact: a sphere dropped onto a plane while sliding.
+# Inertia is spelled out, so geoms only matter for contact: a sphere dropped onto a plane while
+# sliding.
 CONTACT = """
 <mujoco>
   <worldbody>
@@ -123,7 +125,8 @@ COUPLED = """
 </mujoco>
 """
 
-# Spelled-out inertia and a geom that is drawn only: its size and place reach nothing but a sensor that looks at it.
+# Spelled-out inertia and a geom that is drawn only: its size and place reach nothing but a sensor
+# that looks at it.
 DRAWN = """
 <mujoco>
   <worldbody>
@@ -193,7 +196,8 @@ EDITS = [
     (TENDON, "joint/j:stiffness", 2.0, ()),
 ]
 
-# Geoms that collide or give their body its inertia: model, path, new value, what must follow. These are compiled anew.
+# Geoms that collide or give their body its inertia: model, path, new value, what must follow. These
+# are compiled anew.
 COMPILES = [
     (CONTACT, "geom/ball:size", 0.15, ("geom_rbound", "geom_aabb")),
     (CONTACT, "geom/ball:pos[0]", 0.05, ("geom_sameframe",)),
@@ -211,7 +215,8 @@ COMPILES = [
     ),
 ]
 
-# Coordinates that are written together: an eigendecomposition or a product of quaternions lies between.
+# Coordinates that are written together: an eigendecomposition or a product of quaternions lies
+# between.
 CHARTED = [
     *(f"body/{body}:fullinertia[{i}]" for body in "ab" for i in range(6)),
     *(f"body/{body}:firstmoment[{i}]" for body in "ab" for i in range(3)),
@@ -292,7 +297,8 @@ def test_writing_in_place_equals_a_compile_bit_for_bit(
         for n in theirs
         if not np.array_equal(mine[n], theirs[n], equal_nan=mine[n].dtype.kind == "f")
     ]
-    # a tendon that gains inertia ends the shortcut of 'simple' bodies, which MuJoCo then does not take either
+    # a tendon that gains inertia ends the shortcut of 'simple' bodies, which MuJoCo then does not
+    # take either
     assert unequal == (["body_simple"] if path == "tendon/t:armature" else [])
     moved = rollout(own)
     np.testing.assert_array_equal(moved, rollout(again))
@@ -347,7 +353,8 @@ def written_by_hand(spec: Any, base: Any, path: str, change: float) -> None:
     element.fullinertia = [I[k] for k in tensor]
 
 
-# A solid body: two boxes, so that no principal moments coincide; and one whose frames coincide where MuJoCo takes shortcuts.
+# A solid body: two boxes, so that no principal moments coincide; and one whose frames coincide
+# where MuJoCo takes shortcuts.
 SOLID = ARM.replace(
     'type="capsule" fromto="0 0 0 .3 .1 .5" size=".05"',
     'type="box" pos=".1 .05 .2" size=".1 .2 .3"',
@@ -499,7 +506,9 @@ def test_geoms_that_change_the_dynamics_are_compiled_anew(
 
 
 def test_decoration_neither_collides_nor_has_mass() -> None:
-    """A drawn geom is written in place; once it collides, or its body takes inertia from geoms, it is not."""
+    """A drawn geom is written in place; once it collides, or its body takes inertia from geoms, it
+    is not.
+    """
     for xml, drawn in (
         (DRAWN, True),
         (DRAWN.replace('contype="0" conaffinity="0"', 'contype="0" conaffinity="1"'), False),
@@ -555,7 +564,9 @@ FRAMED = """
 def test_elements_inside_frames_are_placed_in_the_coordinates_of_their_body(
     path: str, tmp_path
 ) -> None:
-    """`<frame>` is MJCF's way to write, not the compiled model's: at its own value the model stays the model."""
+    """`<frame>` is MJCF's way to write, not the compiled model's: at its own value the model stays
+    the model.
+    """
     table = {"theta": {"target": path}}
     task = make_task(FRAMED, tmp_path, rate=500.0, parameters=table, noise={"acc": 0.1})
     plain, same = (
@@ -584,7 +595,10 @@ MESHED = ARM.replace(
 
 
 def test_a_mesh_moves_from_its_compiled_place() -> None:
-    """MuJoCo shifts a mesh to its centre; that offset must not be added twice. Its size is no number of the geom."""
+    """MuJoCo shifts a mesh to its centre; that offset must not be added twice.
+
+    Its size is no number of the geom.
+    """
     parameters = [one("geom/h:pos[2]")]
     spec, base = compiled(MESHED, parameters)
     source = PlantModel(
@@ -692,7 +706,9 @@ BALL = """
     ],
 )
 def test_servos_with_several_controls_have_gains_too(written: str, path: str) -> None:
-    """Bit for bit what a compile of the other number gives; a PID controller's first gain is another one."""
+    """Bit for bit what a compile of the other number gives; a PID controller's first gain is
+    another one.
+    """
     base, again = (
         mujoco.MjModel.from_xml_string(BALL.format(written.format(gain))) for gain in ("2", "3.5")
     )
@@ -724,7 +740,9 @@ def test_the_damping_of_a_servo_does_not_follow_its_gain() -> None:
 
 @pytest.mark.parametrize("thing", ["body/b", "site/t"])
 def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
-    """In the element's own axes, from its compiled orientation: exp of the vector, not three turns one after the other."""
+    """In the element's own axes, from its compiled orientation: exp of the vector, not three turns
+    one after the other.
+    """
     xml = ARM.replace('pos=".3 .1 .5"', 'pos=".3 .1 .5" euler=".4 .1 -.2"').replace(
         'name="t" ', 'name="t" euler="1 0 .3" '
     )
@@ -784,7 +802,9 @@ def test_mixed_parametrisations_of_one_body_are_refused(
 
 
 def test_mass_beside_first_moments_keeps_them() -> None:
-    """The barycentric mass: m c and the inertia about the origin stay while the mass changes; alone, the centre stays."""
+    """The barycentric mass: m c and the inertia about the origin stay while the mass changes;
+    alone, the centre stays.
+    """
     _, base = compiled(SOLID, [one("body/a:mass")])
     before = INERTIA_PARAMETRISATIONS["barycentric"].coordinates(
         body_inertia(base, base.body("a").id)
@@ -803,7 +823,9 @@ def test_mass_beside_first_moments_keeps_them() -> None:
 
 
 def test_a_change_of_the_layout_is_refused(tmp_path) -> None:
-    """Functions and parameters that change the layout are caught before MuJoCo writes past the end of its data."""
+    """Functions and parameters that change the layout are caught before MuJoCo writes past the end
+    of its data.
+    """
 
     def add_geoms(spec: Any, value: float) -> None:
         for _ in range(3):
@@ -1078,7 +1100,8 @@ def test_difference_steps_and_priors_follow_guess_and_scale() -> None:
 HINGED = TENDON.replace('type="ball"', 'axis="0 1 0"').replace('springlength=".3"', "")
 FULL = '<inertial pos=".1 0 .2" mass="1" fullinertia=".1 .12 .11 .01 .02 .01"/><site name="s"/>'
 
-# Models whose compiler would resolve something anew, or undo the edit, when the identified values are compiled again.
+# Models whose compiler would resolve something anew, or undo the edit, when the identified values
+# are compiled again.
 AWKWARD = {
     "nothing awkward": (ARM, "body/b:mass", 2.0),
     "springref in degrees, which is the default of MJCF": (

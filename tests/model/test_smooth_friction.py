@@ -1,4 +1,6 @@
-"""Softened dry friction against its law, on single joints and tendons, and its derivative by the frictionloss."""
+"""Softened dry friction against its law, on single joints and tendons, and its derivative by the
+frictionloss.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Levels of a descent: the same experiment on plants that are quicker to step or smoother, and what they leave alone."""
+"""Levels of a descent: the same experiment on plants that are quicker to step or smoother, and what
+they leave alone.
+"""
 
 from __future__ import annotations
 
@@ -184,7 +186,9 @@ def test_the_gradient_of_the_softened_level_is_that_of_its_cost(tmp_path: Path) 
 def test_and_of_the_stated_one_it_points_where_long_moves_lead(
     tmp_path: Path, amplitudes: tuple[float, float]
 ) -> None:
-    """Its cost jumps with every engine step that a joint sticks for: no size is right, and short moves mislead."""
+    """Its cost jumps with every engine step that a joint sticks for: no size is right, and short
+    moves mislead.
+    """
     task = arm(tmp_path).relaxed()
     wave = np.sin(np.pi * task.t)[:, None] ** 2 * np.array(amplitudes)
     found = slope(task, wave)

@@ -1,4 +1,6 @@
-"""The relaxed barrier: twice differentiable, defined outside the bounds, and checked by hand on bounds of every kind."""
+"""The relaxed barrier: twice differentiable, defined outside the bounds, and checked by hand on
+bounds of every kind.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ S = np.array([-3.0, -0.2, 0.0, 0.04, 0.0499, 0.0501, 0.06, 0.4, 1.0, 3.0])
 
 @pytest.mark.parametrize("delta", [0.1, 1e-4])
 def test_the_barrier_is_twice_continuous_where_it_relaxes(delta: float) -> None:
-    """Value, slope and curvature agree from both sides; the curvature falls towards the inside and is constant outside."""
+    """Value, slope and curvature agree from both sides; the curvature falls towards the inside and
+    is constant outside.
+    """
     h = 1e-9
     below, above = (
         relaxed_log_barrier(np.array([delta * (1.0 + sign * h)]), delta) for sign in (-1.0, 1.0)

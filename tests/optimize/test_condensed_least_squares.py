@@ -15,7 +15,10 @@ from tests.support.numerics import Array
 
 @dataclass(frozen=True, eq=False)
 class Dense:
-    """A problem in condensed and in dense form. J: (rows, P n + c), r: (rows,) all rows;  blocks: rows `[private, common, r]`."""
+    """A problem in condensed and in dense form.
+
+    J: (rows, P n + c), r: (rows,) all rows;  blocks: rows `[private, common, r]`.
+    """
 
     condensed: Condensed
     J: Array
@@ -42,7 +45,9 @@ class Dense:
 
 
 def condense(rows: Array) -> Array:
-    """(m, m) matrix with the inner products of (k, m) rows, by singular values; the package uses QR."""
+    """(m, m) matrix with the inner products of (k, m) rows, by singular values; the package uses
+    QR.
+    """
     m = rows.shape[1]
     _, s, V = np.linalg.svd(rows, full_matrices=True)
     out = np.zeros((m, m))
@@ -68,7 +73,9 @@ def problem(
     outer: int = 2,
     lame: bool = False,
 ) -> Dense:
-    """Random segments of one to three blocks in shuffled order, with priors. lame: no row depends on the last private unknown."""
+    """Random segments of one to three blocks in shuffled order, with priors. lame: no row depends
+    on the last private unknown.
+    """
     rng = np.random.default_rng(seed)
     m = n + c + 1
     owner = rng.permutation(np.concatenate([np.full(rng.integers(1, 4), i) for i in range(P)]))

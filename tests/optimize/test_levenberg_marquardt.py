@@ -1,4 +1,6 @@
-"""The bounded Levenberg-Marquardt search against SciPy's on small analytic problems, and its status where it fails."""
+"""The bounded Levenberg-Marquardt search against SciPy's on small analytic problems, and its status
+where it fails.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +29,13 @@ SHARP = SearchSettings(max_iterations=200, tolerance=1e-9)
 
 @dataclass(eq=False)
 class Analytic:
-    """Residuals of each segment as a function of (theta, its private unknowns); derivatives by complex steps.
+    """Residuals of each segment as a function of (theta, its private unknowns); derivatives by
+    complex steps.
 
     Every evaluated point is kept.
 
-    spoil: changes the Jacobian of a segment, (k, n + c);  stop: number of the evaluation that sets the stop token
+    spoil: changes the Jacobian of a segment, (k, n + c);  stop: number of the evaluation that sets
+    the stop token
     """
 
     segments: tuple[Rows, ...]
@@ -117,7 +121,9 @@ def solved(p: Analytic, start: UnknownValues, search: SearchSettings = SHARP) ->
 
 
 def decays(sigma: float = 0.01) -> tuple[Rows, ...]:
-    """Exponential decays with one rate and one offset, each segment with its amplitude as private unknown."""
+    """Exponential decays with one rate and one offset, each segment with its amplitude as private
+    unknown.
+    """
     rng = np.random.default_rng(0)
     t = np.linspace(0.0, 2.0, 25)
     found = []
@@ -232,7 +238,9 @@ def test_gauss_newton_finds_the_minimum_and_ignores_bounds() -> None:
 
 
 def cliff(theta: Array, own: Array) -> Array:
-    """Diverges for theta below 0.2, close to the minimum; the first steps from the right overshoot into that region."""
+    """Diverges for theta below 0.2, close to the minimum; the first steps from the right overshoot
+    into that region.
+    """
     bad = np.real(theta[0]) < 0.2
     x = np.linspace(0.0, 1.0, 12)
     y = 1.0 / (0.25 + x)
@@ -269,7 +277,9 @@ def test_a_minimum_at_a_cliff_is_not_called_converged() -> None:
 
 
 def test_a_diverging_neighbourhood_is_reported() -> None:
-    """Where the linearisation fails after a step, the best point is returned with the previous linearisation."""
+    """Where the linearisation fails after a step, the best point is returned with the previous
+    linearisation.
+    """
 
     class Once(Analytic):
         def condense(self, at: UnknownValues) -> Condensed | None:
@@ -286,7 +296,9 @@ def test_a_diverging_neighbourhood_is_reported() -> None:
 @pytest.mark.parametrize("damped", [True, False])
 @pytest.mark.parametrize("fault", ["sign", "swapped", "noise"])
 def test_a_wrong_jacobian_is_noticed(damped: bool, fault: str) -> None:
-    """No step helps although the linearisation predicts a decrease: not converged, however short the damped steps are."""
+    """No step helps although the linearisation predicts a decrease: not converged, however short
+    the damped steps are.
+    """
     rng = np.random.default_rng(3)
     spoils = {
         "sign": lambda J: -J,
@@ -334,7 +346,9 @@ def test_a_search_from_the_minimum_ends_at_once() -> None:
 
 
 def test_short_first_steps_in_a_flat_valley_are_not_convergence() -> None:
-    """The first steps on the floor of a narrow valley are short; the minimum is ten standard deviations away."""
+    """The first steps on the floor of a narrow valley are short; the minimum is ten standard
+    deviations away.
+    """
     for thin in (1e-2, 1e-3, 1e-4, 1e-5):
 
         def rows(theta: Array, own: Array, thin: float = thin) -> Array:

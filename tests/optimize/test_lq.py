@@ -1,4 +1,6 @@
-"""Linear recursions, regulator and descent against plain loops, SciPy's RiccatiSolution solver and a dense KKT system."""
+"""Linear recursions, regulator and descent against plain loops, SciPy's RiccatiSolution solver and
+a dense KKT system.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ from tests.support.lq import positive, random_system, random_weights
 
 
 def dense_solution(A, B, a, b, Q, R, terminal) -> tuple[np.ndarray, np.ndarray]:
-    """(z, v) of the LQ problem by one dense KKT solve over z_1 ... z_N, v_0 ... v_{N-1} and the multipliers."""
+    """(z, v) of the LQ problem by one dense KKT solve over z_1 ... z_N, v_0 ... v_{N-1} and the
+    multipliers.
+    """
     N, nx, nu = B.shape
     nz, nv = N * nx, N * nu
     H, g, J = np.zeros((nz + nv, nz + nv)), np.zeros(nz + nv), np.zeros((nz, nz + nv))

@@ -1,4 +1,6 @@
-"""Algorithm 1 on a pendulum written in NumPy, with exact derivatives: no MuJoCo, nothing but the algorithm is tested."""
+"""Algorithm 1 on a pendulum written in NumPy, with exact derivatives: no MuJoCo, nothing but the
+algorithm is tested.
+"""
 
 from __future__ import annotations
 
@@ -54,8 +56,8 @@ def jacobians(x: Array) -> tuple[Array, Array]:
 class Pendulum:
     """Swing towards upright with quadratic cost. Keeps every value that was evaluated.
 
-    shift: subtracted from the cost;  sign: of the gradient of `expand`;  wall: |u| beyond which a trial diverges
-    refinements: how often `refine` has something better
+    shift: subtracted from the cost;  sign: of the gradient of `expand`;  wall: |u| beyond which a
+    trial diverges refinements: how often `refine` has something better
     """
 
     shift: float = 0.0
@@ -280,7 +282,9 @@ def test_an_ascent_direction_is_not_called_converged() -> None:
 def searched(
     problem: Pendulum, factor: float, armijo: Armijo, first: float = 1.0
 ) -> tuple[Any, float, float]:
-    """Result of the line search, J at the start and slope, along the metric direction times a factor."""
+    """Result of the line search, J at the start and slope, along the metric direction times a
+    factor.
+    """
     point = start(problem)
     expansion = problem.expand(point)
     K = REGULATOR.gain(expansion)

@@ -1,4 +1,6 @@
-"""Losses against scipy's: the same optimum of a line through points with outliers, and weights that follow from values."""
+"""Losses against scipy's: the same optimum of a line through points with outliers, and weights that
+follow from values.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def test_the_optimum_agrees_with_scipy(kind: Kind, scale: float) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_weight_follows_from_the_value(kind: Kind) -> None:
-    """Half of the slope of the value is the squared weight times the residual, below and above the scale."""
+    """Half of the slope of the value is the squared weight times the residual, below and above the
+    scale.
+    """
     loss = RobustLoss(kind=kind, scale=2.0)
     for r in (-40.0, -2.5, -1.0, -1e-3, 0.3, 1.9, 2.1, 7.0, 1e3):
         slope = 0.5 * richardson(
@@ -94,7 +98,9 @@ def test_the_mean_square_of_inliers(scale: float) -> None:
 
 
 def test_outliers_hardly_move_a_robust_line() -> None:
-    """Over many draws the ordinary fit is biased, and robust fits stay within a few standard deviations."""
+    """Over many draws the ordinary fit is biased, and robust fits stay within a few standard
+    deviations.
+    """
     found = {
         kind: np.array(
             [reweighted_few(RobustLoss(kind=kind, scale=1.5), points(seed)) for seed in range(30)]

@@ -1,4 +1,6 @@
-"""Directions under hard limits: metrics against dense matrices, and a small problem with a barrier against SciPy's optimum."""
+"""Directions under hard limits: metrics against dense matrices, and a small problem with a barrier
+against SciPy's optimum.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +109,8 @@ class ToyPoint:
 
 @dataclass(frozen=True, eq=False)
 class Toy:
-    """A linear plant, a convex quadratic cost with its minimum outside the limits, and a barrier on first state and control.
+    """A linear plant, a convex quadratic cost with its minimum outside the limits, and a barrier on
+    first state and control.
 
     mu: of the barrier;  steps: also on the steps of the control
     """
@@ -262,7 +265,9 @@ def test_the_optimum_of_the_toy_problem_agrees_with_scipy(kind: str, mu: float) 
 
 
 def test_stored_pairs_do_not_contain_the_barrier() -> None:
-    """They hold the change of the cost's gradient alone, so that they stay valid for a sharper barrier."""
+    """They hold the change of the cost's gradient alone, so that they stay valid for a sharper
+    barrier.
+    """
     direction, blunt = StructuredBFGS(np.full(NU, 1e-3)), Toy(1e-1)
     for iterate in optimize(
         blunt,
@@ -304,7 +309,9 @@ def test_no_step_changes_a_limited_quantity_by_more_than_the_reach() -> None:
 
 
 def test_damping_keeps_the_step_back_inside_the_limits() -> None:
-    """From outside a bound, with a cost that pulls elsewhere, the damped step returns further than the scaled one."""
+    """From outside a bound, with a cost that pulls elsewhere, the damped step returns further than
+    the scaled one.
+    """
     toy, outside = Toy(1e-4), np.zeros((N, NU))
     outside[3, 0] = toy.control.upper[0] + 0.2 * toy.control.scale[0]
     e = toy.expand(toy.point(outside))

@@ -1,4 +1,6 @@
-"""Files: what was written comes back, keys and shapes are the promised ones, nothing half-written, nothing unpickled."""
+"""Files: what was written comes back, keys and shapes are the promised ones, nothing half-written,
+nothing unpickled.
+"""
 
 from __future__ import annotations
 
@@ -162,7 +164,9 @@ def test_json_holds_what_is_promised(folder: Path, design: Design) -> None:
 
 
 def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
-    """Information holds the prior, which is written beside it so that a later experiment can take it out."""
+    """Information holds the prior, which is written beside it so that a later experiment can take
+    it out.
+    """
     e = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     table = {"m": {"prior": 0.5}, "c": {"nuisance": True}}
     known = DesignTask.resolve(
@@ -191,7 +195,9 @@ def test_json_says_what_is_nuisance_and_what_was_known(tmp_path: Path) -> None:
 
 
 def test_csv_plays_back(folder: Path, design: Design, task: DesignTask) -> None:
-    """Columns by name, all digits, no control in the last row; and it starts another design as it is. Gains stand behind."""
+    """Columns by name, all digits, no control in the last row; and it starts another design as it
+    is. Gains stand behind.
+    """
     with (folder / "design.csv").open(newline="", encoding="utf-8") as stream:
         header, *rows = csv.reader(stream)
     states = ["qpos:slide", "qpos:hinge", "qvel:slide", "qvel:hinge"]
@@ -535,7 +541,8 @@ def test_misspelled_output_is_not_ignored(task: DesignTask, tmp_path: Path) -> N
 
 VALUES = np.array([2.3456789, 1.2345678, 0.7654321])
 
-# Entries of MjModel that the three parameters of the cart-pendulum set; the rest MuJoCo derives from them.
+# Entries of MjModel that the three parameters of the cart-pendulum set; the rest MuJoCo derives
+# from them.
 IDENTIFIED = {
     "body_mass": [(3,)],
     "body_pos": [(3, 2)],
@@ -567,7 +574,9 @@ def arrays(model: mujoco.MjModel) -> dict[str, Array]:
 
 
 def changes(new: mujoco.MjModel, old: mujoco.MjModel) -> dict[str, list[tuple[int, ...]]]:
-    """Indices at which two models of one structure differ by more than the six digits that MuJoCo prints."""
+    """Indices at which two models of one structure differ by more than the six digits that MuJoCo
+    prints.
+    """
     left, right = arrays(new), arrays(old)
     assert {name: value.shape for name, value in left.items()} == {
         name: value.shape for name, value in right.items()

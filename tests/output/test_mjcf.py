@@ -1,4 +1,6 @@
-"""The user's MJCF with identified values: only these change, with all digits, however the file is written."""
+"""The user's MJCF with identified values: only these change, with all digits, however the file is
+written.
+"""
 
 from __future__ import annotations
 
@@ -247,7 +249,8 @@ def test_parameters_outside_the_model_change_nothing(tmp_path: Path) -> None:
     assert (tmp_path / "identified.xml").read_bytes() == (tmp_path / "model.xml").read_bytes()
 
 
-# Without masses of geoms, which the compiled model does not keep, and inertias, of which a body takes one parametrisation.
+# Without masses of geoms, which the compiled model does not keep, and inertias, of which a body
+# takes one parametrisation.
 UNCHANGED = [
     p
     for p in STATED
@@ -275,7 +278,9 @@ def test_without_a_change_the_file_keeps_every_byte(more: tuple[str, ...], tmp_p
 
 
 def test_an_identified_file_reproduces_itself(tmp_path: Path) -> None:
-    """A written file has the identified values, and as the model of the next experiment it does not change any more."""
+    """A written file has the identified values, and as the model of the next experiment it does not
+    change any more.
+    """
     paths = [p for p in UNCHANGED if p != 'body/b "2":mass'] + [
         "body/a:firstmoment[0]",
         "body/c:fullinertia[3]",
@@ -448,7 +453,9 @@ def test_included_files_are_found_from_another_folder(tmp_path: Path) -> None:
 
 
 def test_attached_models_are_printed_by_mujoco(tmp_path: Path) -> None:
-    """The elements of an attached model are in another file, which the text would not find from another folder."""
+    """The elements of an attached model are in another file, which the text would not find from
+    another folder.
+    """
     part = '<mujoco model="leg"><worldbody><body name="d"><joint name="dj"/><geom size=".1"/></body></worldbody></mujoco>'
     (tmp_path / "leg.xml").write_text(part, encoding="utf-8")
     xml = RICH.replace(
@@ -511,7 +518,8 @@ def test_only_asset_folders_in_use_change(compiler: str, line: str, tmp_path: Pa
     assert len(lines(tmp_path / "model" / "model.xml", away)[1]) == 1
 
 
-# Numbers that the compiler would derive: (old, new) text, path, value, object whose number is stated.
+# Numbers that the compiler would derive: (old, new) text, path, value, object whose number is
+# stated.
 DERIVED = {
     "damping ratio": (
         ('kp="12.0" kv="0.60"', 'kp="12.0" dampratio="1"'),
@@ -561,7 +569,9 @@ def test_an_option_is_made_where_there_is_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("turned", ["", ' euler="10 20 30"', ' quat="0.6 0.8 0 0"'])
 def test_axes_that_a_sensor_reads_are_those_of_the_model(turned: str, tmp_path: Path) -> None:
-    """`objtype="body"` is the frame of the principal axes: the matrix alone would leave their order open."""
+    """`objtype="body"` is the frame of the principal axes: the matrix alone would leave their order
+    open.
+    """
     watch = '<framequat objtype="body" objname="a" name="axes" noise=".01"/></sensor>'
     xml = RICH.replace("</sensor>", watch).replace('mass="1.50"', f'mass="1.50"{turned}')
     task = task_of(xml, tmp_path, "body/a:fullinertia[3]")

@@ -1,4 +1,6 @@
-"""Figures from hand-made records: units, legends, both trajectories, odd sizes, failed trials, singular information."""
+"""Figures from hand-made records: units, legends, both trajectories, odd sizes, failed trials,
+singular information.
+"""
 
 from __future__ import annotations
 

@@ -179,7 +179,9 @@ def entities(path: Path) -> set[str]:
 def column(
     path: Path, at: tuple[str, ...], timeline: str | None, component: str
 ) -> tuple[Any, Array]:
-    """Return times and values of one component of one entity; without a timeline, those of static data."""
+    """Return times and values of one component of one entity; without a timeline, those of static
+    data.
+    """
     times: list[int] = []
     values: list[Any] = []
     for chunk in RrdReader(path).stream().filter(content=entity_path(at)).to_chunks():

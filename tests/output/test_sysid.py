@@ -1,4 +1,6 @@
-"""Export to mujoco.sysid: sysid and mjfim simulate, compare and weigh alike, so they find the same values."""
+"""Export to mujoco.sysid: sysid and mjfim simulate, compare and weigh alike, so they find the same
+values.
+"""
 
 from __future__ import annotations
 

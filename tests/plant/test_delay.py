@@ -1,4 +1,6 @@
-"""Output delay: a shifted curve, its derivative by the delay, its adjoint, and its values before the first sample."""
+"""Output delay: a shifted curve, its derivative by the delay, its adjoint, and its values before
+the first sample.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,9 @@ def test_whole_samples_are_exact() -> None:
 
 
 def test_before_the_first_sample_the_first_value_is_held() -> None:
-    """It does not change with the delay; a negative delay holds the last value after the last sample."""
+    """It does not change with the delay; a negative delay holds the last value after the last
+    sample.
+    """
     y = curve(T)
     output_delay = OutputDelay.on_grid(len(T), 0.055, DT)
     np.testing.assert_array_equal(output_delay.apply(y)[:6], np.broadcast_to(y[0], (6, 2)))

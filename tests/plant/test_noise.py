@@ -1,4 +1,6 @@
-"""Noise: whitening against SciPy's normal density, missing values marginalised, and information per second kept."""
+"""Noise: whitening against SciPy's normal density, missing values marginalised, and information per
+second kept.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def test_independent_outputs_are_the_special_case() -> None:
 
 
 def test_jacobians_are_whitened_like_residuals() -> None:
-    """With any trailing axes; products of whitened rows are the Fisher information by the precision matrix."""
+    """With any trailing axes; products of whitened rows are the Fisher information by the precision
+    matrix.
+    """
     G = np.random.default_rng(2).standard_normal((5, 4, 3))
     noise = correlated()
     white = noise.whiten(G)
@@ -86,7 +90,9 @@ def test_strides_select_the_samples_of_each_output() -> None:
 
 
 def test_missing_values_are_marginalised() -> None:
-    """The density of the present values agrees with SciPy, whatever stands in place of missing ones."""
+    """The density of the present values agrees with SciPy, whatever stands in place of missing
+    ones.
+    """
     rng = np.random.default_rng(4)
     values = rng.standard_normal((12, 4))
     present = rng.random((12, 4)) < 0.6

@@ -1,4 +1,6 @@
-"""The plant in discrete time: derivatives against MuJoCo's and plain loops, sensors, projection, divergence."""
+"""The plant in discrete time: derivatives against MuJoCo's and plain loops, sensors, projection,
+divergence.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def linear(task: DesignTask) -> Linearization:
 
 
 def furuta(folder: Path) -> DesignTask:
-    """The Qube, RK4 with 20 steps per sample; a torque that swings the pole without limits or contacts (it has none)."""
+    """The Qube, RK4 with 20 steps per sample; a torque that swings the pole without limits or
+    contacts (it has none).
+    """
     parameters = {
         "stiff": {"target": "joint/theta:damping"},
         "weak": {"target": "joint/alpha:damping"},
@@ -54,7 +58,9 @@ def furuta(folder: Path) -> DesignTask:
 
 
 def acrobot_without_rk4(folder: Path, integrator: str) -> DesignTask:
-    """dm_control's acrobot under another integrator; its constraints are off and |u| stays below its range of 1."""
+    """dm_control's acrobot under another integrator; its constraints are off and |u| stays below
+    its range of 1.
+    """
     source = shared_model("dmc_acrobot/acrobot.xml")
     spec = mujoco.MjSpec.from_file(str(source))
     for kind in ("textures", "materials"):  # pictures are not needed and not copied
@@ -804,8 +810,8 @@ def test_one_step_effects_are_E_and_H_in_natural_units(tmp_path) -> None:
     )
 
 
-# A cart that hangs on two mocap bodies: on one by a spring, on the other by an equality, whose constants MuJoCo derives
-# from where they compile.
+# A cart that hangs on two mocap bodies: on one by a spring, on the other by an equality, whose
+# constants MuJoCo derives from where they compile.
 CARRIED = """
 <mujoco>
   <option timestep="0.01" gravity="0 0 0"/>

@@ -1,4 +1,6 @@
-"""Observations at engine steps within the samples, against plain loops around mj_step, and their derivatives."""
+"""Observations at engine steps within the samples, against plain loops around mj_step, and their
+derivatives.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ SHOWN = [
 
 
 def played(model: Any, state: Array, ctrl: Array, substeps: int) -> Array:
-    """(N, substeps, 9) values that SHOWN names at every engine step under ctrl: (N, nu), by a plain loop around mj_step."""
+    """(N, substeps, 9) values that SHOWN names at every engine step under ctrl: (N, nu), by a plain
+    loop around mj_step.
+    """
     data, rows = mujoco.MjData(model), np.empty((len(ctrl), substeps, len(SHOWN)))
     data.qpos[:], data.qvel[:], data.act[:] = np.split(state, [model.nq, model.nq + model.nv])
     for k, held in enumerate(ctrl):
@@ -148,7 +152,9 @@ def test_observations_cost_no_further_steps(tmp_path: Path) -> None:
 def differences(
     task: DesignTask, sample: int, substeps: tuple[int, ...], step: float = 1e-6
 ) -> Array:
-    """(derivative substeps, 9, nx+nu) central differences of plain loops over one sample of the lifted plant."""
+    """(derivative substeps, 9, nx+nu) central differences of plain loops over one sample of the
+    lifted plant.
+    """
     plant, u = task.plant, task.control[sample]
     model, x = plant.model(task.theta), task.initial.state[sample]
     loop, nx, columns = Loop(model, task.system.grid.substeps), task.space.nx, []

@@ -1,4 +1,6 @@
-"""All formats give equal columns; damaged files, decompression bombs and pickles are refused with one sentence."""
+"""All formats give equal columns; damaged files, decompression bombs and pickles are refused with
+one sentence.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +105,9 @@ def test_formats_agree(ending: str, columns: Columns, tmp_path: Path) -> None:
 
 @formats
 def test_truncated_files(ending: str, columns: Columns, tmp_path: Path) -> None:
-    """A truncated file is refused; a CSV file that ends inside a row is recognised by its number of fields."""
+    """A truncated file is refused; a CSV file that ends inside a row is recognised by its number of
+    fields.
+    """
     path = tmp_path / f"log{ending}"
     WRITERS[ending](path, columns)
     whole = path.read_bytes()
@@ -291,7 +295,9 @@ def test_pickles_are_not_loaded(tmp_path: Path) -> None:
 
 
 def test_matrices_become_columns(tmp_path: Path) -> None:
-    """A matrix gives columns `name[i]`; a control may lack the last row; a number holds for all rows; cubes are ignored."""
+    """A matrix gives columns `name[i]`; a control may lack the last row; a number holds for all
+    rows; cubes are ignored.
+    """
     q = np.arange(8.0).reshape(4, 2)
     np.savez(
         tmp_path / "log.npz", t=np.arange(4.0), qpos=q, ctrl=q[:3], kp=2.5, gain=np.zeros((3, 2, 2))
@@ -361,7 +367,9 @@ def read_json(content: object, tmp_path: Path, spec: RecordingSpec = ALL) -> Tab
 
 
 def test_json_records(tmp_path: Path) -> None:
-    """Constants, booleans, nested objects and lists become columns; a field that a record lacks is empty."""
+    """Constants, booleans, nested objects and lists become columns; a field that a record lacks is
+    empty.
+    """
     content = {
         "kp": 100,
         "motor": {"kt": 0.3, "name": "xl"},
@@ -433,7 +441,9 @@ def test_json_without_records(content: object, tmp_path: Path) -> None:
 
 
 def test_json_of_numbers_beyond_float64(tmp_path: Path) -> None:
-    """A number beyond float64 is infinite, which a recording refuses; content that is too deep or too long is not readable."""
+    """A number beyond float64 is infinite, which a recording refuses; content that is too deep or
+    too long is not readable.
+    """
     assert read_json([{"t": 10**400}], tmp_path).column("t").tolist() == [np.inf]
     for text in ("[" * 100_000, "1" * 5000):
         (tmp_path / "log.json").write_text(text, encoding="utf-8")

@@ -1,4 +1,6 @@
-"""Logs as recordings: formula, units, counters, windows, gaps; the message of every refusal; logs of real robots."""
+"""Logs as recordings: formula, units, counters, windows, gaps; the message of every refusal; logs
+of real robots.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +71,9 @@ def task_of(folder: Path, recording: Mapping[str, Any], model: str = ARM) -> Des
 
 @pytest.fixture
 def read(tmp_path: Path) -> Read:
-    """Write columns as CSV and read them by a [recording] table; the time and the controls are added unless `bare`."""
+    """Write columns as CSV and read them by a [recording] table; the time and the controls are
+    added unless `bare`.
+    """
 
     def run(columns: Mapping[str, Any], /, bare: bool = False, **recording: Any) -> Log:
         path = tmp_path / "lab.csv"
@@ -251,7 +255,9 @@ def test_time_units(unit: str, factor: float, read: Read) -> None:
 
 
 def test_window(read: Read) -> None:
-    """Rows from begin to end are read, time begins at zero, and a control is held from before the window."""
+    """Rows from begin to end are read, time begins at zero, and a control is held from before the
+    window.
+    """
     ctrl = np.where(np.arange(M) % 3 == 0, np.arange(M, dtype=float), np.nan)
     columns = {"qpos:pin": wave(), "ctrl:push": ctrl}
     logged = read({**columns, "t": T + 5.0}, window=(0.52, 1.0))
@@ -335,7 +341,9 @@ def test_measured_at_several_rates(read: Read) -> None:
 
 
 def test_gaps_in_columns(read: Read) -> None:
-    """Empty rows for longer than the gap are refused, inside and at the ends; shorter ones stay empty."""
+    """Empty rows for longer than the gap are refused, inside and at the ends; shorter ones stay
+    empty.
+    """
     for begin, end, said in (
         (100, 160, r"from 0\.495 to 0\.8 s"),
         (0, 30, "from 0 to 0.15 s"),
@@ -355,7 +363,9 @@ def test_gaps_in_columns(read: Read) -> None:
 
 
 def test_controls_are_held(read: Read) -> None:
-    """A control is held for less than the gap, never before its first value; the last row needs none."""
+    """A control is held for less than the gap, never before its first value; the last row needs
+    none.
+    """
     u = np.arange(M, dtype=float)
     u[10:20] = u[-5:] = np.nan
     logged = read({"qpos:pin": wave(), "ctrl:push": u})
@@ -425,7 +435,9 @@ def test_columns_that_are_missing(read: Read) -> None:
 
 
 def test_degrees_are_found_by_the_slope(read: Read) -> None:
-    """Position or velocity in degrees is found from their ratio, despite noise and a coarse resolution."""
+    """Position or velocity in degrees is found from their ratio, despite noise and a coarse
+    resolution.
+    """
     rng = np.random.default_rng(4)
     q = np.round((1 - np.cos(2 * T)) / 1e-3) * 1e-3
     v = 2.0 * np.sin(2 * T) + 0.1 * rng.standard_normal(M)
@@ -473,7 +485,9 @@ def test_degrees_are_found_by_the_range_of_the_joint(read: Read) -> None:
 
 
 def test_degrees_are_found_by_the_speed(read: Read) -> None:
-    """Many turns at an implausible speed are refused, also where the velocity is in degrees as well."""
+    """Many turns at an implausible speed are refused, also where the velocity is in degrees as
+    well.
+    """
     with pytest.raises(
         RecordingError, match=r"'qpos:pin' reaches 89.* rad at 5\d\d rad/s; .*in deg"
     ):
@@ -523,7 +537,9 @@ def test_resolution_ignores_rounding(read: Read) -> None:
 
 
 def test_design_archives_are_recordings(tmp_path: Path) -> None:
-    """Matrices are in the order of the model's joints and actuators, with one control less than states."""
+    """Matrices are in the order of the model's joints and actuators, with one control less than
+    states.
+    """
     task = task_of(tmp_path, {})
     rng = np.random.default_rng(0)
     qpos, qvel, ctrl = (rng.standard_normal((n, k)) for n, k in ((M, 3), (M, 3), (M - 1, 2)))
@@ -546,7 +562,9 @@ def test_design_archives_are_recordings(tmp_path: Path) -> None:
 
 
 def test_archives_with_one_array_per_column(tmp_path: Path) -> None:
-    """An archive may have one array per column; the last row of a control of full length is dropped."""
+    """An archive may have one array per column; the last row of a control of full length is
+    dropped.
+    """
     task = task_of(tmp_path, {})
     arrays = {
         "t": T,

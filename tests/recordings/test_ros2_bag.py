@@ -38,7 +38,9 @@ def swing(count: int = 20) -> list[State]:
 
 @both
 def test_joints_are_found_by_name(storage: Any, tmp_path: Path) -> None:
-    """The folder of a bag and the file in it are read, times to the nanosecond; effort may be empty."""
+    """The folder of a bag and the file in it are read, times to the nanosecond; effort may be
+    empty.
+    """
     path = write(tmp_path / "bag", storage, {"/joint_states": swing()}, text=True)
     file = next(p for p in path.iterdir() if p.suffix in (".mcap", ".db3"))
     for place in (path, file):

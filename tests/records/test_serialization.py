@@ -1,4 +1,6 @@
-"""Records are saved and loaded without loss, and files that cannot be loaded are refused with one clear message."""
+"""Records are saved and loaded without loss, and files that cannot be loaded are refused with one
+clear message.
+"""
 
 from __future__ import annotations
 
@@ -94,7 +96,9 @@ class AwkwardValues:
     """Builds a value of any type that records have, from numbers and texts that are easily spoilt."""
 
     def __init__(self, count: int, optional: bool) -> None:
-        """Build tuples, dictionaries and arrays with `count` entries; optional values are present or None."""
+        """Build tuples, dictionaries and arrays with `count` entries; optional values are present
+        or None.
+        """
         self.count, self.optional, self._turn = count, optional, 0
 
     def next_of(self, values: Any) -> Any:
@@ -135,7 +139,9 @@ class AwkwardValues:
 def test_awkward_values_survive(
     kind: type[SavedRecord], count: int, optional: bool, tmp_path: Path
 ) -> None:
-    """Infinity, NaN, negative zero, empty tuples, names with quotes and dots, and every optional field."""
+    """Infinity, NaN, negative zero, empty tuples, names with quotes and dots, and every optional
+    field.
+    """
     record = AwkwardValues(count, optional).build(kind)
     record.save_archive(tmp_path / "new" / "folder")
     assert_same(kind.load(tmp_path / "new" / "folder"), record)

@@ -1,4 +1,6 @@
-"""Baselines: their curves, their budgets, their limits by an independent simulation, and their gradients."""
+"""Baselines: their curves, their budgets, their limits by an independent simulation, and their
+gradients.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,8 @@ from tests.support.paths import MODELS
 
 STEPS = 120_000
 
-# One method of each kind that runs without `-m slow`: a sweep, random steps, a series, a series refined by mjfim.
+# One method of each kind that runs without `-m slow`: a sweep, random steps, a series, a series
+# refined by mjfim.
 FAST_METHODS = ("chirp", "steps", "fourier5", "fourier5-mjfim")
 
 FRAME = ExcitationSettings(

@@ -1,4 +1,6 @@
-"""Campaigns: they reach the targets and the truth, gain by redesigns, name suspicious results, and can be continued."""
+"""Campaigns: they reach the targets and the truth, gain by redesigns, name suspicious results, and
+can be continued.
+"""
 
 from __future__ import annotations
 
@@ -84,7 +86,9 @@ def test_a_campaign_ends_at_the_targets_and_at_the_truth(
 
 
 def test_a_round_holds_its_design_recording_and_estimate(campaign: Campaign) -> None:
-    """All recordings so far count, once; the first design is at the guess, the next at the estimate; promises are kept."""
+    """All recordings so far count, once; the first design is at the guess, the next at the
+    estimate; promises are kept.
+    """
     task = DesignTask.resolve(STUDY)
     recordings = [r for each in campaign.rounds for r in each.recordings]
     alone = identify_system(task.system, recordings)
@@ -101,7 +105,9 @@ def test_a_round_holds_its_design_recording_and_estimate(campaign: Campaign) -> 
 
 
 def gained(controls: Sequence[Array], truth: DesignTask) -> float:
-    """Smallest eigenvalue of what the controls tell at the truth, over that of as many repetitions of the first."""
+    """Smallest eigenvalue of what the controls tell at the truth, over that of as many repetitions
+    of the first.
+    """
     told = [
         evaluate_task(truth, truth.plant.simulate(truth.theta, c)).information for c in controls
     ]
@@ -113,14 +119,18 @@ def gained(controls: Sequence[Array], truth: DesignTask) -> float:
 def test_a_redesign_gains_more_information_than_repeating_the_first_design(
     campaign: Campaign, truth: DesignTask
 ) -> None:
-    """For about the same effort: information that is there already makes later rounds neither gentler nor wilder."""
+    """For about the same effort: information that is there already makes later rounds neither
+    gentler nor wilder.
+    """
     assert gained([r.control for r in campaign.rounds], truth) > 1.03
     efforts = [float((r.control**2).sum()) for r in campaign.rounds]
     assert 0.8 * efforts[0] < min(efforts) and max(efforts) < 1.25 * efforts[0]
 
 
 def test_a_redesign_is_at_the_estimate_on_the_same_scales(tmp_path: Path) -> None:
-    """Relative scales stay those of the stated guess; guesses keep inside bounds; true values are not told."""
+    """Relative scales stay those of the stated guess; guesses keep inside bounds; true values are
+    not told.
+    """
     tables = {
         "m": {"target": "body/bob:mass", "true": 1.4, "bounds": (0.5, 2.0)},
         "c": {"target": "joint/hinge:damping"},
@@ -136,7 +146,9 @@ def test_a_redesign_is_at_the_estimate_on_the_same_scales(tmp_path: Path) -> Non
 
 
 def test_a_whole_inertia_moves_where_the_recordings_show_it(tmp_path: Path) -> None:
-    """Coordinate by coordinate, by the same names in the same order; what does not show stays where it was stated."""
+    """Coordinate by coordinate, by the same names in the same order; what does not show stays where
+    it was stated.
+    """
     tables = {
         "c": {"target": "joint/hinge:damping"},
         "bob": {"inertial": "bob", "coordinates": "barycentric"},
@@ -198,7 +210,9 @@ def test_friction_too_weak_for_chi_squared_shows_in_successive_residuals(tmp_pat
 
 
 def test_a_round_without_progress_is_named(campaign: Campaign) -> None:
-    """Three rows of a recording are no progress; the rounds are used up, and it says what is missing."""
+    """Three rows of a recording are no progress; the rounds are used up, and it says what is
+    missing.
+    """
     first = campaign.rounds[0]
     start = replace(
         first.recordings[0],
@@ -313,7 +327,9 @@ def test_without_a_design_at_the_estimate_the_parameters_of_the_last_design_serv
 
 @pytest.mark.slow
 def test_each_recording_has_its_own_start() -> None:
-    """Deviations of the start are private: what one round learned about its own says nothing about the next's."""
+    """Deviations of the start are private: what one round learned about its own says nothing about
+    the next's.
+    """
     loose = STUDY.replace(
         nuisance={"initial": 0.05},
         parameters={name: {"wanted": 1e-4} for name in "mlc"},
@@ -397,7 +413,9 @@ def write_study(folder: Path) -> Path:
 
 @pytest.mark.slow
 def test_round_by_round_is_the_simulated_campaign(tmp_path: Path) -> None:
-    """Calls that share nothing but the folder design and estimate as one call does; misuse is named."""
+    """Calls that share nothing but the folder design and estimate as one call does; misuse is
+    named.
+    """
     study = write_study(tmp_path)
     together, apart = tmp_path / "together", tmp_path / "apart"
 

@@ -1,4 +1,6 @@
-"""`mjfim.check`: independent numbers, names of null directions, and wrong derivatives that the self-test must catch."""
+"""`mjfim.check`: independent numbers, names of null directions, and wrong derivatives that the
+self-test must catch.
+"""
 
 from __future__ import annotations
 
@@ -266,7 +268,9 @@ def test_the_summary_is_strict_json(tmp_path) -> None:
     ],
 )
 def test_every_example_can_be_checked_whatever_its_weights(file: Path, tmp_path: Path) -> None:
-    """A cost without control weights has no metric of its own; the slope is tested along a unit-weight direction."""
+    """A cost without control weights has no metric of its own; the slope is tested along a
+    unit-weight direction.
+    """
     found = check(mjfim.Experiment.from_file(design_file(file.stem, tmp_path)))
     assert found.verdict
     assert np.isfinite(found.self_test.slope)

@@ -1,4 +1,6 @@
-"""`mjfim compare`: equal budgets, the same evaluation of every method, honest verdicts; files, exit codes, misuse."""
+"""`mjfim compare`: equal budgets, the same evaluation of every method, honest verdicts; files, exit
+codes, misuse.
+"""
 
 from __future__ import annotations
 

@@ -67,7 +67,9 @@ def starting(rows: dict[str, Array], prefix: str) -> Array:
 
 @pytest.mark.parametrize("kind", BUILD)
 def test_the_table_alone_replays_exactly(kind: str, tmp_path: Path) -> None:
-    """A bare mj_step loop on the model file, fed from the CSV, walks through its positions, velocities and activations."""
+    """A bare mj_step loop on the model file, fed from the CSV, walks through its positions,
+    velocities and activations.
+    """
     task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
     path, _ = written(task, tmp_path)
     rows = table(path)
@@ -103,7 +105,9 @@ def test_rows_at_samples_are_the_design(kind: str, tmp_path: Path) -> None:
 
 
 def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Array]:
-    """States and controls of a loop that knows only the CSV and the model file, and the planned ones. push: (nx,) of the start"""
+    """States and controls of a loop that knows only the CSV and the model file, and the planned
+    ones. push: (nx,) of the start
+    """
     rows = table(path)
     model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
     data, nv, na = mujoco.MjData(model), model.nv, model.na
@@ -134,7 +138,9 @@ def closed_loop(path: Path, folder: Path, push: Array) -> tuple[Array, Array, Ar
 
 @pytest.mark.parametrize("kind", BUILD)
 def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: Path) -> None:
-    """On the plan it changes nothing; pushed off it, it is the engine's own loop with the arrays of design.npz."""
+    """On the plan it changes nothing; pushed off it, it is the engine's own loop with the arrays of
+    design.npz.
+    """
     task = BUILD[kind](tmp_path)
     path, played = written(task, tmp_path)
     nx = task.space.nx
@@ -191,7 +197,9 @@ def test_gain_columns_name_what_they_act_on(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", BUILD)
 def test_reference_is_what_mujoco_says(kind: str, tmp_path: Path) -> None:
-    """Accelerations and joint forces are those of mj_forward at each row, not differences; no field is empty."""
+    """Accelerations and joint forces are those of mj_forward at each row, not differences; no field
+    is empty.
+    """
     task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
     played = simulate_playback(task.system, task.initial, gains(task))
     archive.write_table(tmp_path / "reference.csv", reference_columns(played, task.system))
@@ -212,7 +220,9 @@ def test_reference_is_what_mujoco_says(kind: str, tmp_path: Path) -> None:
 
 
 def test_a_design_leaves_both_tables(tmp_path: Path) -> None:
-    """At the controller's rate; design.csv is a control to start from and an earlier design, gains and all."""
+    """At the controller's rate; design.csv is a control to start from and an earlier design, gains
+    and all.
+    """
     task = BUILD["filtered"](
         tmp_path, **FILTERED_FINE, descent={"max_iterations": 1}, cost={"control": 0.1}
     )
@@ -323,7 +333,9 @@ CART = """
 
 @pytest.fixture(scope="module")
 def cart(tmp_path_factory: pytest.TempPathFactory) -> tuple[mjfim.Experiment, Path]:
-    """A cart on a spring with a bob that rests where its mass says, and the table of its initial control."""
+    """A cart on a spring with a bob that rests where its mass says, and the table of its initial
+    control.
+    """
     home = tmp_path_factory.mktemp("cart")
     (home / "cart.xml").write_text(CART, encoding="utf-8")
     model = mujoco.MjModel.from_xml_string(CART)
@@ -356,7 +368,9 @@ def bench_of(cart: tuple[mjfim.Experiment, Path], **conditions: Any) -> Any:
 def test_a_robot_is_what_a_bare_loop_says(
     cart: tuple[mjfim.Experiment, Path], feedback: bool
 ) -> None:
-    """Wrong parameters written by hand, commands three steps late, limits at every engine step, noisy feedback."""
+    """Wrong parameters written by hand, commands three steps late, limits at every engine step,
+    noisy feedback.
+    """
     bench = bench_of(cart, feedback=feedback)
     rng = np.random.default_rng(3)
     noise = bench.task.system.noise.sample(len(bench.plan.t), rng)
@@ -447,7 +461,9 @@ def test_intervals_hold_the_truth(cart: tuple[mjfim.Experiment, Path], feedback:
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", ["noise", "delay"])
 def test_the_check_can_fail(cart: tuple[mjfim.Experiment, Path], fault: str) -> None:
-    """Noise three times as loud as stated, or a latency that is believed to be known: intervals no longer hold the truth."""
+    """Noise three times as loud as stated, or a latency that is believed to be known: intervals no
+    longer hold the truth.
+    """
     experiment, path = cart
     if fault == "delay":
         found = judged((experiment.replace(nuisance={"delay": 1e-5}), path), FEW)
@@ -515,7 +531,9 @@ def test_the_verb_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: 
 def test_a_stopped_study_keeps_the_robots_that_are_done(
     cart: tuple[mjfim.Experiment, Path],
 ) -> None:
-    """A token that is set before the first robot leaves no result; one that is set after it leaves that robot."""
+    """A token that is set before the first robot leaves no result; one that is set after it leaves
+    that robot.
+    """
     stop = mjfim.StopToken()
     options = {"runs": 3, "processes": 1}
     result = mjfim.assess_robustness(*cart, callback=lambda _: stop.request(), stop=stop, **options)
@@ -527,7 +545,9 @@ def test_a_stopped_study_keeps_the_robots_that_are_done(
 def test_the_player_script_walks_through_the_plan(
     cart: tuple[mjfim.Experiment, Path], tmp_path: Path
 ) -> None:
-    """Its log of the simulated robot holds the planned states and controls, and can be read as a recording."""
+    """Its log of the simulated robot holds the planned states and controls, and can be read as a
+    recording.
+    """
     _, path = cart
     log = tmp_path / "recording.csv"
     done = run_script("play_design.py", path, "--model", path.parent / "cart.xml", "-o", log)

@@ -61,7 +61,8 @@ def run_script(name: str, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 def write_experiment(home: Path, **lines: str) -> Path:
-    """Write the paper's study with a short horizon and a loose tolerance; return its experiment file.
+    """Write the paper's study with a short horizon and a loose tolerance; return its experiment
+    file.
 
     Args:
         home: Folder that receives the experiment, its model and its initial control.
@@ -107,7 +108,9 @@ def names(folder: Path) -> set[str]:
 
 
 def misused(result: Result, *fragments: str) -> None:
-    """Assert exit code 2 and one message of one line on stderr that contains all fragments, without a traceback."""
+    """Assert exit code 2 and one message of one line on stderr that contains all fragments, without
+    a traceback.
+    """
     assert isinstance(result.exception, SystemExit), repr(result.exception)
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr.startswith("mjfim: ")

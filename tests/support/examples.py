@@ -1,6 +1,7 @@
 """Experiments of the repository as files that can be designed.
 
-Experiments that are made for identification state no horizon, no initial control and no cost; tests of designs add them.
+Experiments that are made for identification state no horizon, no initial control and no cost; tests
+of designs add them.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ DESIGN_TABLES = {
         horizon=5.0,
         control='{ kind = "chirp", amplitude = { shoulder = 0.6, elbow = 0.4 }, frequency = 0.4, frequency_end = 2.0 }',
     ),
-    # The goal (pull) swings at kp = 100; the brake fades in and out, which separates it from damping.
+    # The goal (pull) swings at kp = 100; the brake fades in and out, which separates it from
+    # damping.
     "bam_xl330": DesignTables(
         horizon=6.0,
         control='{ kind = "sine", amplitude = { pull = 2.0, brake = 0.5 }, '
@@ -51,7 +53,9 @@ DESIGN_TABLES = {
 
 
 def design_file(name: str, folder: Path) -> Path:
-    """The file of an example, in `folder` and with the tables of a design where the example itself has none."""
+    """The file of an example, in `folder` and with the tables of a design where the example itself
+    has none.
+    """
     file = MODELS / f"{name}.toml"
     if name not in DESIGN_TABLES:
         return file

@@ -10,8 +10,9 @@ import numpy as np
 from mjfim.excitation.task import DesignTask
 from tests.support.numerics import Array, cart_task, make_task
 
-# An arm of two servos on a floating hull: the addresses of positions, velocities, joints and actuators all differ.
-# One servo has an activation state, the other a limited force; one joint limits the force of its actuators.
+# An arm of two servos on a floating hull: the addresses of positions, velocities, joints and
+# actuators all differ. One servo has an activation state, the other a limited force; one joint
+# limits the force of its actuators.
 FLOATING = """
 <mujoco model="floating">
   <option timestep="0.002" integrator="{integrator}" gravity="0 0 -1"><flag contact="disable"/></option>
@@ -120,7 +121,9 @@ HARD = {
 
 
 def cart_inside(folder: Path, **tables: Any) -> DesignTask:
-    """The cart-pendulum over one second under the limits `HARD`, without weights on control or state."""
+    """The cart-pendulum over one second under the limits `HARD`, without weights on control or
+    state.
+    """
     defaults: dict[str, Any] = {
         "horizon": 1.0,
         "cost": {"control": 0.0},

@@ -6,7 +6,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-# A constraints that opens a block, with its language; the block ends at the next line with the same constraints.
+# A constraints that opens a block, with its language; the block ends at the next line with the same
+# constraints.
 FENCE = re.compile(r"^(?P<constraints>```+|~~~+)(?P<language>\w*)\s*$")
 
 # A comment above a block that is not run, with the reason, e.g. `<!-- not run: needs a robot -->`.
@@ -25,7 +26,8 @@ class CodeBlock:
         line: Line of the opening constraints, counted from 1.
         language: Word behind the opening constraints; empty if there is none.
         text: Lines between the constraint_sets.
-        skip_reason: Reason of the comment `<!-- not run: reason -->` above the block; empty if there is none.
+        skip_reason: Reason of the comment `<!-- not run: reason -->` above the block; empty if
+            there is none.
     """
 
     path: Path

@@ -1,4 +1,6 @@
-"""What the tests of the numerical core share: models, experiments, plain-loop references, checks of derivatives."""
+"""What the tests of the numerical core share: models, experiments, plain-loop references, checks of
+derivatives.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,8 @@ CART_PENDULUM = """
 </mujoco>
 """
 
-# A body in free flight, pushed off its centre; an arm hangs from it by a ball joint. All four joint types but slide.
+# A body in free flight, pushed off its centre; an arm hangs from it by a ball joint. All four joint
+# types but slide.
 FREE_BODY = """
 <mujoco model="free_body">
   <option timestep="0.01" integrator="{integrator}" gravity="0 0 -0.5"><flag contact="disable"/></option>
@@ -119,7 +122,10 @@ def shared_model(relative: str) -> Path:
 
 
 def make_task(model: str | Path, folder: Path, **tables: Any) -> DesignTask:
-    """DesignTask of an experiment on an MJCF string (written into folder) or file. Default: 100 Hz, 0.5 s, a chirp."""
+    """DesignTask of an experiment on an MJCF string (written into folder) or file.
+
+    Default: 100 Hz, 0.5 s, a chirp.
+    """
     path = model
     if isinstance(model, str):
         path = folder / "model.xml"
@@ -163,7 +169,9 @@ def filtered_task(folder: Path, integrator: str = "implicitfast", **tables: Any)
 
 
 class Loop:
-    """F, h and their differences by plain Python around `mj_step`, one simulation at a time: the slow independent way."""
+    """F, h and their differences by plain Python around `mj_step`, one simulation at a time: the
+    slow independent way.
+    """
 
     def __init__(self, model: Any, substeps: int) -> None:
         self.model, self.substeps, self.data = model, substeps, mujoco.MjData(model)
@@ -231,7 +239,9 @@ def richardson(f: Callable[[float], float], h: float) -> float:
 def directional_check(
     slopes: Sequence[float], curves: Sequence[Callable[[float], float]], h: float
 ) -> float:
-    """Largest error of claimed slopes against differences of f(t) at 0, relative to the largest of those differences."""
+    """Largest error of claimed slopes against differences of f(t) at 0, relative to the largest of
+    those differences.
+    """
     measured = np.array([richardson(f, h) for f in curves])
     return float(np.abs(np.array(slopes) - measured).max() / np.abs(measured).max())
 

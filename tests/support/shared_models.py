@@ -189,7 +189,8 @@ EXPERIMENTS: dict[str, dict[str, Any]] = {
         "noise": state_noise(PANDA),
         "cost": {
             "criterion": "E",
-            # dear enough to keep the stiff servos (kp 2000, 500) inside forcerange when the command jumps
+            # dear enough to keep the stiff servos (kp 2000, 500) inside forcerange when the command
+            # jumps
             "control": {j: 5e5 if j in PANDA[:4] else 1.5e6 for j in PANDA},
         },
         "descent": {"tolerance": 2e-2, "max_iterations": 20},

@@ -1,4 +1,6 @@
-"""Models from other projects (`shared_models`): every file loads, and a design has ten times the information of a chirp."""
+"""Models from other projects (`shared_models`): every file loads, and a design has ten times the
+information of a chirp.
+"""
 
 from __future__ import annotations
 

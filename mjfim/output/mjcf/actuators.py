@@ -29,7 +29,8 @@ def _muscle(column: int) -> tuple[Entry, ...]:
     return (("gainprm", column, 1.0), ("biasprm", column, 1.0))
 
 
-# By element and attribute, for each number of the attribute, the entries that it sets. `general` sets the arrays directly.
+# By element and attribute, for each number of the attribute, the entries that it sets. `general`
+# sets the arrays directly.
 SHORTCUTS: dict[str, dict[str, tuple[tuple[Entry, ...], ...]]] = {
     "position": {"kp": (KP,), "kv": (KV,), "timeconst": (TIME_CONSTANT,)},
     "intvelocity": {"kp": (KP,), "kv": (KV,)},
@@ -84,7 +85,8 @@ def attribute_changes(element: str, old: Any, wanted: Any, actuator: int) -> lis
         Changes of the attributes that differ.
 
     Raises:
-        ModelError: No attribute of the element sets one of the numbers alone. The message is a clause.
+        ModelError: No attribute of the element sets one of the numbers alone. The message is a
+            clause.
     """
     before = {name: np.array(getattr(old, f"actuator_{name}")[actuator]) for name in ARRAYS}
     after = {name: np.array(getattr(wanted, f"actuator_{name}")[actuator]) for name in ARRAYS}

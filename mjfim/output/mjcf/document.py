@@ -28,7 +28,8 @@ SECTIONS = ("actuator", "tendon")
 # Attributes that state an orientation.
 ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 
-# Attributes that state the same quantity as another one, which MuJoCo would refuse or prefer beside it.
+# Attributes that state the same quantity as another one, which MuJoCo would refuse or prefer beside
+# it.
 ALTERNATIVES = {
     "quat": ORIENTATIONS[1:],
     "fullinertia": ("diaginertia", *ORIENTATIONS),
@@ -50,7 +51,8 @@ class MjcfDocument(XmlText):
             text: The MJCF in UTF-8.
 
         Raises:
-            ModelError: The text is not well-formed XML or no MJCF. The message is a clause that completes a sentence.
+            ModelError: The text is not well-formed XML or no MJCF. The message is a clause that
+                completes a sentence.
         """
         super().__init__(text)
         if self.tags[0].name != "mujoco":
@@ -72,7 +74,8 @@ class MjcfDocument(XmlText):
         """
         if (kind, name) not in self._elements:
             raise ModelError(
-                f"{kind} {name!r} is not in the MJCF file itself (it comes from <include>, <attach>, <replicate> or the like)"
+                f"{kind} {name!r} is not in the MJCF file itself (it comes from <include>, "
+                "<attach>, <replicate> or the like)"
             )
         return self._elements[kind, name]
 
@@ -161,7 +164,8 @@ def nearly_equal(a: Array, b: Array, magnitude: float = 0.0) -> np.ndarray:
     Args:
         a: (n,) numbers.
         b: (n,) numbers.
-        magnitude: Typical size, relative to which a difference counts as rounding if it exceeds the numbers.
+        magnitude: Typical size, relative to which a difference counts as rounding if it exceeds the
+            numbers.
 
     Returns:
         (n,) True where two numbers differ only by rounding; never where one is NaN.

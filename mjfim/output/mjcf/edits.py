@@ -34,7 +34,8 @@ LENGTH_COLUMNS = {
 }
 DEFAULT_LENGTH_COLUMN = 2
 
-# Arrays of MjModel that the compiler may derive from other numbers, by kind of object and attribute.
+# Arrays of MjModel that the compiler may derive from other numbers, by kind of object and
+# attribute.
 DERIVED = {
     "actuator": {"gainprm": "actuator_gainprm", "biasprm": "actuator_biasprm"},
     "joint": {"stiffness": "jnt_stiffness", "damping": "dof_damping"},
@@ -48,7 +49,8 @@ DERIVED_TOLERANCE = 1e-12
 class ParameterEdits:
     """Edits of an MJCF text that turn the model it compiles to into a wanted one.
 
-    The methods raise ModelError, with a clause that gives the reason, where the text cannot express a change.
+    The methods raise ModelError, with a clause that gives the reason, where the text cannot express
+    a change.
 
     Attributes:
         document: The text.

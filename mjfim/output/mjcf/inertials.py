@@ -21,10 +21,12 @@ from mjfim.output.mjcf.document import (
 # Products of inertia below this share of the trace are rounding errors of the parametrisation.
 PRODUCT_TOLERANCE = 1e-13
 
-# Significant decimal digits of a matrix that was rotated, counted from its trace; the next digit is rounding.
+# Significant decimal digits of a matrix that was rotated, counted from its trace; the next digit is
+# rounding.
 DIGITS = 15
 
-# Changes of inertia and centre of mass are rounding relative to this multiple of the trace and of the body's radius.
+# Changes of inertia and centre of mass are rounding relative to this multiple of the trace and of
+# the body's radius.
 MAGNITUDE_FACTOR = 10.0
 
 # Quaternion of the body's axes.
@@ -41,7 +43,8 @@ def write_inertial(
         name: Name of the body.
         old: Model that the text compiles to.
         wanted: Model that it shall compile to.
-        as_matrix: Whether the parameters vary the matrix as a whole, so that its principal axes may turn.
+        as_matrix: Whether the parameters vary the matrix as a whole, so that its principal axes may
+            turn.
 
     Raises:
         ModelError: The body is not in the text.
@@ -89,7 +92,8 @@ def _write_inertia(
     magnitude = MAGNITUDE_FACTOR * float(np.trace(before))
     is_full = document.attribute(tag, "fullinertia") is not None
 
-    # The model's principal axes are written where they matter, or where only the moments are parameters.
+    # The model's principal axes are written where they matter, or where only the moments are
+    # parameters.
     if (as_matrix and _axes_are_measured(old, body)) or (is_full and not as_matrix):
         _write_principal(document, tag, wanted, body)
         return
@@ -140,8 +144,8 @@ def _principal_inertia(model: Any, body: int) -> dict[str, str]:
 def _rounded(inertia: Array) -> Array:
     """(6,) entries of `fullinertia` without the rounding errors of the rotation out of the principal axes.
 
-    These errors are about 1e-16 of the trace and depend on the processor's linear algebra kernel, so that 0.013 would be
-    written as 0.01299999999999999 on some machines.
+    These errors are about 1e-16 of the trace and depend on the processor's linear algebra kernel,
+    so that 0.013 would be written as 0.01299999999999999 on some machines.
     """
     entries = inertia[INERTIA_ROWS, INERTIA_COLUMNS]
     trace = float(np.trace(inertia))

@@ -39,7 +39,8 @@ COMPARED = (
     "geom_solref",
 )
 
-# Prefixes of arrays that COMPARED covers but that only speed up the computation, or are compared as matrices.
+# Prefixes of arrays that COMPARED covers but that only speed up the computation, or are compared as
+# matrices.
 NOT_DYNAMICS = (
     "body_bvh",
     "body_simple",
@@ -87,16 +88,17 @@ def write_identified(path: Path, system: System, theta: Array) -> str | None:
     else:
         if stated:
             remarks.append(
-                "it also states numbers that MuJoCo would otherwise derive from the identified values: "
-                f"{', '.join(stated)}"
+                "it also states numbers that MuJoCo would otherwise derive from the identified "
+                f"values: {', '.join(stated)}"
             )
 
     found = mujoco.MjModel.from_xml_path(str(path))
     reweighted = _reweighted_bodies(found, wanted, same_class=False)
     if reweighted and not unconstrained(found):
         remarks.append(
-            f"contacts and other constraints of {', '.join(map(repr, reweighted))} are slightly softer or stiffer than in "
-            "the fit, where MuJoCo could not treat these bodies as 'simple' (body_invweight0)"
+            f"contacts and other constraints of {', '.join(map(repr, reweighted))} are slightly "
+            "softer or stiffer than in the fit, where MuJoCo could not treat these bodies as "
+            "'simple' (body_invweight0)"
         )
     return f"{path.name}: {'; '.join(remarks)}" if remarks else None
 
@@ -104,7 +106,8 @@ def write_identified(path: Path, system: System, theta: Array) -> str | None:
 def _write_edited(path: Path, system: System, theta: Array, wanted: Any) -> list[str]:
     """Write the edited text; return the objects whose derived numbers had to be stated.
 
-    Raises ModelError, with a clause that gives the reason, where the text cannot express the values.
+    Raises ModelError, with a clause that gives the reason, where the text cannot express the
+    values.
     """
     source = system.model_path.resolve()
     document = MjcfDocument(source.read_bytes())
@@ -123,7 +126,8 @@ def _write_edited(path: Path, system: System, theta: Array, wanted: Any) -> list
         different = _differences(found, wanted)
         if different:
             raise ModelError(
-                f"with the identified values the text compiles to a different {', '.join(different)}"
+                "with the identified values the text compiles to a different "
+                f"{', '.join(different)}"
             )
     return stated
 
@@ -161,7 +165,8 @@ def _write_printed(path: Path, system: System, theta: Array, wanted: Any) -> Non
             return
 
     raise ModelError(
-        f"{path}: not written: with the identified values the MJCF compiles to another model than the identified one"
+        f"{path}: not written: with the identified values the MJCF compiles to another model than "
+        "the identified one"
     )
 
 
@@ -222,8 +227,9 @@ def _equal(x: Any, y: Any) -> bool:
 def _reweighted_bodies(a: Any, b: Any, same_class: bool) -> list[str]:
     """Names of the bodies whose constraint weight differs between two models.
 
-    In a fit the bodies that a parameter moves are never 'simple', and MuJoCo averages the weight of a simple body
-    differently. same_class: whether bodies are meant that are 'simple' in both models or in neither, else in one of them.
+    In a fit the bodies that a parameter moves are never 'simple', and MuJoCo averages the weight of
+    a simple body differently. same_class: whether bodies are meant that are 'simple' in both models
+    or in neither, else in one of them.
     """
     close = np.isclose(
         a.body_invweight0, b.body_invweight0, rtol=RELATIVE_TOLERANCE, atol=ABSOLUTE_TOLERANCE

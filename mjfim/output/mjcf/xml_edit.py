@@ -13,7 +13,8 @@ from mjfim.errors import ModelError
 # Name of an element, up to white space or the end of its tag.
 NAME = re.compile(rb"[^\s/>]+")
 
-# An attribute with the white space before it: groups are that space, the name, and the value with its quotes.
+# An attribute with the white space before it: groups are that space, the name, and the value with
+# its quotes.
 ATTRIBUTE = re.compile(rb"""(\s+)([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
 
 # White space, possibly none.
@@ -60,8 +61,8 @@ class XmlText:
             text: XML in UTF-8.
 
         Raises:
-            ModelError: The text is not well-formed, or has a DOCTYPE, which could declare entities. The message is a
-                clause that completes a sentence.
+            ModelError: The text is not well-formed, or has a DOCTYPE, which could declare entities.
+                The message is a clause that completes a sentence.
         """
         self._text = text
         self.tags: list[Tag] = []
@@ -203,7 +204,8 @@ class XmlText:
         """Changes to the attributes that begin at a position.
 
         Returns:
-            Changes to existing attributes, the position after the last attribute, and the text of new attributes.
+            Changes to existing attributes, the position after the last attribute, and the text of
+            new attributes.
         """
         pending = dict(self._values.get(tag, {}))
         changes: list[TextChange] = []

@@ -60,8 +60,14 @@ def campaign_figure(campaign: Campaign, parameters: ParameterSet, *, simulated: 
     ]
     if simulated:
         handles.append(Line2D([], [], color=style.MEASURED_COLOUR, label="true"))
-    note = "Bars and the last round's band: ± 1 and ± 2 formal σ, which are accuracy only if the model and the noise are right."
-    title = f"{len(campaign.rounds)} rounds of design, recording and estimate: {campaign.status.value.split(':')[0]}"
+    note = (
+        "Bars and the last round's band: ± 1 and ± 2 formal σ, which are accuracy only if the "
+        "model and the noise are right."
+    )
+    title = (
+        f"{len(campaign.rounds)} rounds of design, recording and estimate: "
+        f"{campaign.status.value.split(':')[0]}"
+    )
     style.add_title(new, style.shorten(title, 100), handles, note)
     return new
 

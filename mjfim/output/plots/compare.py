@@ -46,7 +46,8 @@ METHOD_NAME_WIDTH, PARAMETER_NAME_WIDTH = 34, 18
 # Mean number of characters above which the names of parameters are turned upright.
 MAX_LEVEL_CHARACTERS = 8
 
-# Largest number of parameters whose names are written in the usual size, and the font size of more [points].
+# Largest number of parameters whose names are written in the usual size, and the font size of more
+# [points].
 MAX_USUAL_FONT, MANY_PARAMETERS_FONT = 30, 5.0
 
 # Share of the coloured range above which a cell is so dark that its number is white.

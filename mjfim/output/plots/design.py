@@ -42,7 +42,8 @@ MAX_PHASE_PARAMETERS, MAX_PHASE_DOFS = 6, 4
 # Characters to which the names of parameters are shortened in the phase plots.
 PARAMETER_NAME_WIDTH = 18
 
-# Ratio of the optimized to the initial loop of sensitivities above which the initial one is drawn enlarged.
+# Ratio of the optimized to the initial loop of sensitivities above which the initial one is drawn
+# enlarged.
 ENLARGING_RATIO = 4.0
 
 # Height that a panel gains for the enlarged loop, as a share of its own height.
@@ -209,7 +210,8 @@ def sensitivity_phase(design: Design, labels: Labels) -> Figure:
     if len(dofs) < nv or len(parameters) < count:
         note += (
             f" Shown: {len(dofs)} of {nv} degrees of freedom (most sensitive), "
-            f"{len(parameters)} of {count} parameters (largest predicted relative standard deviation)."
+            f"{len(parameters)} of {count} parameters (largest predicted relative standard "
+            "deviation)."
         )
     start = Line2D(
         [], [], color=TEXT_COLOUR, marker="o", markersize=3.5, linestyle="", label="start"

@@ -32,7 +32,8 @@ LIMIT_KINDS = (
     "clearance",
 )
 
-# Colours of the curves that come closest to a bound, the closest first; these curves are named in the legend.
+# Colours of the curves that come closest to a bound, the closest first; these curves are named in
+# the legend.
 NAMED_COLOURS = (OPTIMIZED_COLOUR, "#ee7733", "#aa3377")
 
 # Characters to which the names of curves are shortened.

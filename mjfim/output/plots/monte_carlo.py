@@ -28,13 +28,15 @@ from mjfim.output.plots.style import (
 )
 from mjfim.records.monte_carlo import MonteCarloStudy, TrialStatistics
 
-# Distance from the quartiles beyond which estimates are outliers, as a multiple of the distance between the quartiles.
+# Distance from the quartiles beyond which estimates are outliers, as a multiple of the distance
+# between the quartiles.
 OUTLIER_DISTANCE = 4.0
 
 # Standard deviations of the Cramér-Rao bound on each side of the true value that a histogram shows.
 SHOWN_STDS = 4.0
 
-# Ratio of the bound's standard deviation to half the range of the estimates above which the range ignores the bound.
+# Ratio of the bound's standard deviation to half the range of the estimates above which the range
+# ignores the bound.
 HUGE_BOUND = 20.0
 
 # Smallest relative width of a histogram's range.

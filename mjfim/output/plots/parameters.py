@@ -38,7 +38,8 @@ QUANTILE_95 = 1.959964
 # Largest number of rows that are high; more rows are lower and their bars have no numbers.
 MAX_HIGH_ROWS = 12
 
-# Height of a bar, and distance of the two bars of a row from its middle, as shares of the height of a row.
+# Height of a bar, and distance of the two bars of a row from its middle, as shares of the height of
+# a row.
 BAR_HEIGHT, BAR_OFFSET = 0.36, 0.19
 
 # Median half widths beyond which an interval is cut off, so that the others stay visible.
@@ -140,7 +141,8 @@ def _draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
     Args:
         axes: Axes with their final limits.
         std: (n,) standard deviations [theta-unit].
-        offset: Distance of the bars from the middle of their rows, as a share of the height of a row.
+        offset: Distance of the bars from the middle of their rows, as a share of the height of a
+            row.
         colour: Colour of the trajectory.
     """
     places = np.arange(len(std)) + offset

@@ -42,7 +42,8 @@ TOO_SHORT = 8
 # Characters to which the names of recordings are shortened.
 RECORDING_NAME_WIDTH = 34
 
-# Height of a bar, and distance of the two bars of a row from its middle, as shares of the height of a row.
+# Height of a bar, and distance of the two bars of a row from its middle, as shares of the height of
+# a row.
 BAR_HEIGHT, BAR_OFFSET = 0.34, 0.19
 
 # Probability below which a p-value is not written as a number.
@@ -142,7 +143,8 @@ def _draw_spectrum(axes: Axes, estimate: Estimate, column: int, sigma: float) ->
         write_message(axes, "not measured")
         return
 
-    # An average of periodograms of white noise is chi-squared with two degrees of freedom per segment.
+    # An average of periodograms of white noise is chi-squared with two degrees of freedom per
+    # segment.
     low, high = chi2.ppf([0.025, 0.975], 2.0 * count) / (2.0 * count)
     axes.axhspan(low, high, color=GRID_COLOUR, alpha=0.8, linewidth=0)
     axes.axhline(1.0, color=TEXT_COLOUR, linewidth=0.8)

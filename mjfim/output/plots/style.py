@@ -1,6 +1,7 @@
 """Style of the figures: colours, fonts, number formats, labels, blank figures, atomic saving.
 
-Only Figure and Agg objects are used: pyplot and its global state stay untouched, so several threads may draw at once.
+Only Figure and Agg objects are used: pyplot and its global state stay untouched, so several threads
+may draw at once.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ NOTE_FONT = 7.5
 # Characters of a footnote that fit in one inch.
 NOTE_CHARACTERS_PER_INCH = 17
 
-# Name and colour in figures of the two trajectories of a design or study, by their name in the records.
+# Name and colour in figures of the two trajectories of a design or study, by their name in the
+# records.
 TRAJECTORY_STYLES: dict[str, tuple[str, str]] = {
     "initial": ("initial", INITIAL_COLOUR),
     "final": ("optimized", OPTIMIZED_COLOUR),

@@ -56,7 +56,8 @@ def design_table(design: Design, labels: Labels) -> Figure:
     labels.check(parameters=len(design.theta))
     summary = describe_design(design, labels.parameter_units)
     notes = (
-        "λ in s / (unit of θ)²: information per unit of measurement rate; σ in the parameter's unit.",
+        "λ in s / (unit of θ)²: information per unit of measurement rate; σ in the parameter's "
+        "unit.",
         BEST_CASE,
     )
     tables = [summary.table("eigenvalues"), summary.table("accuracy")]
@@ -75,8 +76,8 @@ def study_table(study: MonteCarloStudy, labels: Labels) -> Figure:
 
     if len(study.theta) <= MAX_MATRIX:
         units = (
-            "Symmetric matrices, upper triangle; entry i, j in unit of θᵢ × unit of θⱼ (information: its inverse). "
-            "Variance and bound of one parameter in (unit of θ)²."
+            "Symmetric matrices, upper triangle; entry i, j in unit of θᵢ × unit of θⱼ "
+            "(information: its inverse). Variance and bound of one parameter in (unit of θ)²."
         )
     else:
         units = "Observed variance and bound in (unit of θ)², information in its inverse."

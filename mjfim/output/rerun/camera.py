@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from mjfim.arrays import Array
 from mjfim.output.rerun.scene import BodyPoses, moving_geoms
 
-# Vertical field of view that has to hold the scene [rad]; a little less than the viewer's, which leaves a margin.
+# Vertical field of view that has to hold the scene [rad]; a little less than the viewer's, which
+# leaves a margin.
 FIELD_OF_VIEW = np.radians(50.0)
 
 # Half the height of the frame at a distance of 1, with a margin.
@@ -28,7 +29,8 @@ PLANAR_RATIO = 0.2
 # Height of the unit vector towards the camera below which the ground is seen edge-on.
 EDGE_ON = 0.3
 
-# Vectors from the scene towards the camera: for a motion in the x-z plane, in the y-z plane, and in space.
+# Vectors from the scene towards the camera: for a motion in the x-z plane, in the y-z plane, and in
+# space.
 TOWARDS_CAMERA_XZ = (0.0, -1.0, 0.15)
 TOWARDS_CAMERA_YZ = (1.0, 0.0, 0.15)
 TOWARDS_CAMERA_SPATIAL = (1.0, -1.0, 0.6)

@@ -161,7 +161,8 @@ def log_estimate(
         path: The file.
         model: The identified model.
         estimate: The estimate.
-        measured: Measured motion, drawn as a see-through robot; None where positions were not measured.
+        measured: Measured motion, drawn as a see-through robot; None where positions were not
+            measured.
         predicted: Predicted motion.
         labels: Labels of the model's columns.
         addition: Markdown to append to the summary.

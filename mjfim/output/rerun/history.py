@@ -26,8 +26,8 @@ def history_series(history: Sequence[HistoryRow]) -> dict[str, Series]:
         history: The history.
 
     Returns:
-        Iterations and values by title. Quantities that are always positive are log10, which their title says; iterations
-        without a value are left out.
+        Iterations and values by title. Quantities that are always positive are log10, which their
+        title says; iterations without a value are left out.
     """
     iterations = np.array([row.iteration for row in history], dtype=np.int64)
     cost = np.array([row.cost for row in history], dtype=np.float64)

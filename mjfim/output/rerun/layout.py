@@ -34,7 +34,8 @@ ASPECT_WITH_TEXT, ASPECT_WITHOUT_TEXT = 1.35, 0.75
 ROBOTS_TO_TEXT = [3, 2]
 LEFT_TO_RIGHT = [2, 3]
 
-# Largest number of positions and of controls of a model whose signals are all visible; those of others are in tabs.
+# Largest number of positions and of controls of a model whose signals are all visible; those of
+# others are in tabs.
 MAX_VISIBLE_SIGNALS = 3
 
 # Columns, and largest number of views, of a grid of outputs or residuals.
@@ -49,7 +50,8 @@ def open_recording(
 
     Args:
         path: The file.
-        model: The model; the application id holds its name, so that the viewer keeps layouts of different models apart.
+        model: The model; the application id holds its name, so that the viewer keeps layouts of
+            different models apart.
         kind: Kind of the recording, for the application id.
         layout: The layout.
 

@@ -18,17 +18,20 @@ from mjfim.records.design import Design
 # Largest number of phase plots.
 MAX_PHASE_PLOTS = 9
 
-# Plot coordinates of the largest position and the largest velocity; Rerun's y axis points downwards.
+# Plot coordinates of the largest position and the largest velocity; Rerun's y axis points
+# downwards.
 PLOT_SCALE = (1.5, -1.0)
 
-# Ends of the positive axes, in plot coordinates, and the factor by which they exceed the largest values.
+# Ends of the positive axes, in plot coordinates, and the factor by which they exceed the largest
+# values.
 AXIS_ENDS = ((1.65, 0.0), (0.0, -1.1))
 AXIS_FACTOR = 1.1
 
 # Colour of the axes (0..255).
 AXIS_COLOUR = [150, 150, 150]
 
-# Thickness of axes and curves, and radius of the dots at the ends of the axes and on the curves [points].
+# Thickness of axes and curves, and radius of the dots at the ends of the axes and on the curves
+# [points].
 AXIS_THICKNESS, CURVE_THICKNESS, END_DOT, MOVING_DOT = 0.5, 1.0, 1.0, 3.5
 
 

@@ -150,7 +150,8 @@ def log_robot(
         root: Entity of the robot.
         poses: Poses of its bodies.
         style: Style in which it is drawn.
-        on_iteration: True to log the first pose on the timeline `iteration` too, so that the robot is visible there.
+        on_iteration: True to log the first pose on the timeline `iteration` too, so that the robot
+            is visible there.
     """
     for body in range(model.nbody):
         parts = body_parts(model, root, body)

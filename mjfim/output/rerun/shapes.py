@@ -43,7 +43,8 @@ class RobotStyle:
 
     Attributes:
         accent: Accent colour (0..255).
-        accent_share: Share of the accent colour in the moving geoms; the rest is the grey of their brightness.
+        accent_share: Share of the accent colour in the moving geoms; the rest is the grey of their
+            brightness.
         opacity: Opacity of the moving geoms (0..1).
     """
 
@@ -150,7 +151,8 @@ def stick_figure(model: mujoco.MjModel, body: int, rgba: list[int]) -> tuple[rr.
     if not ends:
         return (ball,)
 
-    # Capsules run along z: each is turned towards its end. MuJoCo writes quaternions as wxyz, Rerun as xyzw.
+    # Capsules run along z: each is turned towards its end. MuJoCo writes quaternions as wxyz, Rerun
+    # as xyzw.
     wxyz = np.empty((len(ends), 4))
     for quaternion, end in zip(wxyz, ends, strict=True):
         mujoco.mju_quatZ2Vec(quaternion, end / np.linalg.norm(end))
@@ -168,7 +170,10 @@ def stick_figure(model: mujoco.MjModel, body: int, rgba: list[int]) -> tuple[rr.
 
 
 def _capsule(half_length: float, radius: float, rgba: list[int]) -> rr.Capsules3D:
-    """Return a capsule along z, centred on its frame; Rerun's own ones begin at the origin. Sizes in [m]."""
+    """Return a capsule along z, centred on its frame; Rerun's own ones begin at the origin.
+
+    Sizes in [m].
+    """
     return rr.Capsules3D(
         lengths=[2 * half_length],
         radii=[radius],

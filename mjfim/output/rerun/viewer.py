@@ -34,5 +34,6 @@ def show(path: Path) -> None:
 
     if code:
         raise MjfimError(
-            f"the Rerun viewer ended with code {code}; it needs a display, the file {str(path)!r} does not"
+            f"the Rerun viewer ended with code {code}; it needs a display, the file {str(path)!r} "
+            "does not"
         )

@@ -1,7 +1,7 @@
 """Fits by `mujoco.sysid` beside the estimate of mjfim, on the same recordings.
 
-sysid fits twice: weighted by the noise that the experiment states, and unweighted, where each signal counts relative to the norm
-of its measured values.
+sysid fits twice: weighted by the noise that the experiment states, and unweighted, where each
+signal counts relative to the norm of its measured values.
 """
 
 from __future__ import annotations

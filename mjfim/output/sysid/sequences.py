@@ -22,13 +22,16 @@ from mjfim.output.mjcf.write import same_dynamics, write_spec
 from mjfim.output.sysid.signals import SignalLayout, WhitenedComparison
 from mjfim.records.recording import Recording
 
-# Distance from the guess to a bound that is not stated, in sizes of the parameter; sysid takes finite bounds only.
+# Distance from the guess to a bound that is not stated, in sizes of the parameter; sysid takes
+# finite bounds only.
 UNSTATED_BOUND = 1e3
 
-# Change of the parameters that shows whether a compiled model follows them, in sizes of each parameter.
+# Change of the parameters that shows whether a compiled model follows them, in sizes of each
+# parameter.
 PROBE_STEP = 1e-2
 
-# Fields that are written as a whole from a compiled model, because several parameters change them together.
+# Fields that are written as a whole from a compiled model, because several parameters change them
+# together.
 FIELDS_WRITTEN_WHOLE = {*INERTIAL_FIELDS, *SERVO_FIELDS, "rot", "springlength"}
 
 
@@ -77,8 +80,8 @@ class Exported:
         """Return the residual function of sysid.
 
         Args:
-            weighted: True for residuals that are whitened by the stated noise, followed by those of the priors; False for the
-                residuals of sysid, without priors.
+            weighted: True for residuals that are whitened by the stated noise, followed by those of
+                the priors; False for the residuals of sysid, without priors.
         """
         h, noise = (
             float(self.system.model.opt.timestep),
@@ -154,7 +157,8 @@ def export(system: System, recordings: Sequence[Recording]) -> Exported:
 def control_of(system: System, track: AlignedRecording) -> Any:
     """Return the control at every engine step as a TimeSeries, held over each sample.
 
-    sysid drops the last row; one more row makes it step past the end, so that the sensors there are evaluated.
+    sysid drops the last row; one more row makes it step past the end, so that the sensors there are
+    evaluated.
 
     Args:
         system: The experiment.
@@ -204,7 +208,8 @@ def _require_alike(system: System) -> None:
     if p.outside_model.any():
         name = p.names[int(np.argmax(p.outside_model))]
         raise ExperimentError(
-            f"{e.source}: {name}: sysid fits numbers of the model only; take starts, biases, delays out"
+            f"{e.source}: {name}: sysid fits numbers of the model only; take starts, biases, "
+            "delays out"
         )
     if e.fit.segments is not None or e.fit.start != "stated":
         raise ExperimentError(
@@ -213,7 +218,10 @@ def _require_alike(system: System) -> None:
 
 
 def _require_followed(system: System, parameters: Any, spec: Any) -> None:
-    """Make sure that the compile of moved parameters is the model that mjfim simulates. Raises ModelError."""
+    """Make sure that the compile of moved parameters is the model that mjfim simulates.
+
+    Raises ModelError.
+    """
     p, moved = system.parameters, parameters.copy()
     theta = np.clip(p.guess + PROBE_STEP * p.magnitude, p.lower, p.upper)
     moved.update_from_vector(theta)
@@ -229,7 +237,8 @@ def _require_followed(system: System, parameters: Any, spec: Any) -> None:
                     f"{system.model_path}: MuJoCo refuses the parameters a little off: {error}"
                 ) from None
     raise ModelError(
-        f"{system.model_path}: a compile with other parameters gives another model than mjfim simulates"
+        f"{system.model_path}: a compile with other parameters gives another model than mjfim "
+        "simulates"
     )
 
 
@@ -245,7 +254,8 @@ def _notes(system: System) -> tuple[str, ...]:
     notes = [f"sysid without weights gets no priors: {', '.join(with_prior)}"] if with_prior else []
     if unbounded:
         notes.append(
-            f"sysid wants bounds: {', '.join(unbounded)} within {UNSTATED_BOUND:g} sizes of the guess"
+            f"sysid wants bounds: {', '.join(unbounded)} within {UNSTATED_BOUND:g} sizes of the "
+            "guess"
         )
     if fit.loss != "linear":
         notes.append(f"sysid minimises squares, mjfim the loss {fit.loss!r}")

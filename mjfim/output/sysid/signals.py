@@ -1,8 +1,9 @@
 """Outputs of an experiment as signals of `mujoco.sysid`, and the comparison of measured and predicted signals.
 
-sysid stamps the sensor values of a step with the time after the step, though they belong to the state before it; states are not
-delayed. So positions and velocities become state signals, and sensors are read one step earlier. sysid divides residuals by the
-norm of each measured signal, whatever its noise, and takes weights by name for sensors only; here residuals are whitened, or
+sysid stamps the sensor values of a step with the time after the step, though they belong to the
+state before it; states are not delayed. So positions and velocities become state signals, and
+sensors are read one step earlier. sysid divides residuals by the norm of each measured signal,
+whatever its noise, and takes weights by name for sensors only; here residuals are whitened, or
 divided in the manner of sysid.
 """
 
@@ -33,7 +34,8 @@ class SignalLayout:
         sensed: (c,) True for columns of sensors.
         source: (c,) place of each column in sensordata or in the state (qpos, qvel, act).
         outputs: (ny,) column of each output of the experiment.
-        shown: Type and column of each of the ny outputs by name; sysid's report can draw single components only.
+        shown: Type and column of each of the ny outputs by name; sysid's report can draw single
+            components only.
     """
 
     mapping: dict[str, tuple[Any, np.ndarray]]
@@ -67,7 +69,8 @@ class SignalLayout:
             hits = [name for name, (_, indices) in wholes[sensed].items() if place in indices]
             if not hits or hits[0] in ("_qpos", "_qvel"):
                 raise ExperimentError(
-                    f"output {output.name!r}: sysid goes by names; give joint and body one in the MJCF"
+                    f"output {output.name!r}: sysid goes by names; give joint and body one in the "
+                    "MJCF"
                 )
             kind, indices = wholes[sensed][hits[0]]
             if hits[0] not in mapping:
@@ -106,7 +109,8 @@ class WhitenedComparison:
     Attributes:
         layout: Columns of the signals.
         timestep: Timestep of the engine [s].
-        noise: Noise that whitens the residuals; None where each signal is divided by its measured norm.
+        noise: Noise that whitens the residuals; None where each signal is divided by its measured
+            norm.
     """
 
     layout: SignalLayout

@@ -21,8 +21,8 @@ NUMBERS = (bool, int, float)
 def read_json(path: Path, spec: RecordingSpec) -> Table:
     """Read the records of a JSON file; where there are none, its lists of numbers are the columns.
 
-    A field inside an object is named `a.b`, an item of a list `a[0]`. null is an empty field. Numbers beside the
-    list of records hold for all rows.
+    A field inside an object is named `a.b`, an item of a list `a[0]`. null is an empty field.
+    Numbers beside the list of records hold for all rows.
 
     Args:
         path: The file.
@@ -85,7 +85,8 @@ def _keys_of_records(path: Path, content: Any, spec: RecordingSpec) -> tuple[str
     if isinstance(content, Mapping) and any(isinstance(v, list) for v in content.values()):
         return None
     raise RecordingError(
-        f"{path}: holds no list of records (objects); a log is such a list, or an object that holds one"
+        f"{path}: holds no list of records (objects); a log is such a list, or an object that "
+        "holds one"
     )
 
 

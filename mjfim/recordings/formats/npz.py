@@ -76,12 +76,14 @@ def _header(path: Path, archive: zipfile.ZipFile, member: str) -> tuple[tuple[in
     name = member.removesuffix(".npy")
     if dtype.hasobject:
         raise RecordingError(
-            f"{path}: array {name!r} holds pickled objects, which are never read; save it as numbers"
+            f"{path}: array {name!r} holds pickled objects, which are never read; save it as "
+            "numbers"
         )
 
     if len(shape) == 2 and shape[1] > MAX_COLUMNS:
         raise RecordingError(
-            f"{path}: array {name!r} of shape {shape} has too many columns; each row must be one time"
+            f"{path}: array {name!r} of shape {shape} has too many columns; each row must be one "
+            "time"
         )
 
     # NumPy allocates the whole array before it reads the content.

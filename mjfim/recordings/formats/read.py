@@ -64,7 +64,8 @@ def read_columns(path: Path, spec: RecordingSpec) -> Table:
     reader = next((read for ending, read in READERS.items() if name.endswith(ending)), None)
     if reader is None:
         raise RecordingError(
-            f"{path}: not a known kind of log; valid endings: {', '.join(READERS)}; or the folder of a bag"
+            f"{path}: not a known kind of log; valid endings: {', '.join(READERS)}; or the folder "
+            "of a bag"
         )
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty")

@@ -1,7 +1,9 @@
-"""ROS 2 bags as columns: joint states by topic. The library `rosbags` is imported only when a bag is read.
+"""ROS 2 bags as columns: joint states by topic.
 
-Messages are read by the definition that ROS publishes, not by the one inside the bag: the library generates code from
-definitions, and a file of unknown origin must not control that code.
+The library `rosbags` is imported only when a bag is read.
+
+Messages are read by the definition that ROS publishes, not by the one inside the bag: the library
+generates code from definitions, and a file of unknown origin must not control that code.
 """
 
 from __future__ import annotations
@@ -68,8 +70,9 @@ class _Block:
 def read_bag(path: Path, spec: RecordingSpec) -> Table:
     """Read the joint states of a ROS 2 bag.
 
-    The columns are `t` [s after the first stamp] and `position:<joint>`, `velocity:<joint>`, `effort:<joint>`. Where
-    the recording has several topics, they are `<topic>:position:<joint>`, and the rows of all topics are merged by time.
+    The columns are `t` [s after the first stamp] and `position:<joint>`, `velocity:<joint>`,
+    `effort:<joint>`. Where the recording has several topics, they are `<topic>:position:<joint>`,
+    and the rows of all topics are merged by time.
 
     Args:
         path: The folder of the bag, or its file.
@@ -79,8 +82,8 @@ def read_bag(path: Path, spec: RecordingSpec) -> Table:
         All columns, NaN where a topic has no message at a time.
 
     Raises:
-        RecordingError: The bag is damaged, has no joint states, or it is not clear which topic to read; or the library
-            is not installed.
+        RecordingError: The bag is damaged, has no joint states, or it is not clear which topic to
+            read; or the library is not installed.
     """
     if spec.time_unit != "s":
         raise RecordingError(
@@ -136,7 +139,8 @@ def _connections(path: Path, connections: Iterable[Any], topics: tuple[str, ...]
             raise RecordingError(f"{path}: recording.topics: {unknown('topic', topic, available)}")
     if len(available) > 1 and not topics:
         raise RecordingError(
-            f"{path}: several topics of joint states: {', '.join(available)}; select one by recording.topics"
+            f"{path}: several topics of joint states: {', '.join(available)}; select one by "
+            "recording.topics"
         )
 
     return [c for c in states if c.topic in (topics or available)]
@@ -146,7 +150,8 @@ def _blocks(path: Path, reader: Any, connections: list[Any], store: Any) -> dict
     """Read all messages and collect them by layout."""
     blocks: dict[_Layout, _Block] = {}
 
-    # Several publishers of one topic may interleave: the stamps of each set of joints increase separately.
+    # Several publishers of one topic may interleave: the stamps of each set of joints increase
+    # separately.
     last: dict[tuple[str, frozenset[str]], int] = {}
 
     for number, (connection, received, raw) in enumerate(reader.messages(connections=connections)):

@@ -33,7 +33,8 @@ class Table:
     Attributes:
         source: The file.
         columns: (M,) float64 numbers by column name, NaN where a field is empty.
-        faults: Reason why a column cannot be used, by column name, as the end of a sentence (`is not numeric`).
+        faults: Reason why a column cannot be used, by column name, as the end of a sentence (`is
+            not numeric`).
         unread: Names of the columns that were not read because they were not requested.
     """
 
@@ -104,14 +105,14 @@ def check_unpacked_size(path: Path, packed: int, unpacked: int) -> None:
     """
     if unpacked > MAX_UNPACKED_SIZE:
         raise RecordingError(
-            f"{path}: unpacks to more than {MAX_UNPACKED_SIZE / 2**30:.3g} GiB, the largest size that is read; "
-            "split the file"
+            f"{path}: unpacks to more than {MAX_UNPACKED_SIZE / 2**30:.3g} GiB, the largest size "
+            "that is read; split the file"
         )
 
     if unpacked > UNSUSPICIOUS_SIZE and unpacked > MAX_PACKING_RATIO * packed:
         raise RecordingError(
-            f"{path}: unpacks to more than {MAX_PACKING_RATIO:g} times its size, which is unusual for a log; "
-            "if it is one, unpack it first"
+            f"{path}: unpacks to more than {MAX_PACKING_RATIO:g} times its size, which is unusual "
+            "for a log; if it is one, unpack it first"
         )
 
 
@@ -128,8 +129,9 @@ def check_column_size(path: Path, rows: int, columns: int) -> None:
     """
     if rows * columns * 8 > MAX_UNPACKED_SIZE:
         raise RecordingError(
-            f"{path}: {rows} rows of {columns} columns are more than {MAX_UNPACKED_SIZE / 2**30:.3g} GiB, "
-            "the largest size that is read; name fewer columns in [recording.columns]"
+            f"{path}: {rows} rows of {columns} columns are more than "
+            f"{MAX_UNPACKED_SIZE / 2**30:.3g} GiB, the largest size that is read; name fewer "
+            "columns in [recording.columns]"
         )
 
 

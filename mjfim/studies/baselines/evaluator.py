@@ -42,7 +42,8 @@ class BaselineSearch:
         steps: MuJoCo steps that it may take.
         seed: Seed of its random numbers.
         part: (i, n): this is part i, from 0, of n parts of the search that run side by side.
-        combinations: (t, s) identifiable combinations of the t wanted parameters, or None where all are identifiable.
+        combinations: (t, s) identifiable combinations of the t wanted parameters, or None where all
+            are identifiable.
         added_information: (p, p) information of other experiments [1 / theta-unit^2], or None.
         threads: Threads of MuJoCo; None for all cores.
     """
@@ -63,7 +64,8 @@ class SearchResult:
     """The best control that a search has found.
 
     Attributes:
-        control: (N, nu) the cheapest feasible control, else the one that is nearest to feasible; None before the first one.
+        control: (N, nu) the cheapest feasible control, else the one that is nearest to feasible;
+            None before the first one.
         cost: J of the control; infinite where it is infeasible.
         margin: Its smallest relative margin; negative where it is infeasible.
         found_by: Name of the attempt that found it.
@@ -96,7 +98,8 @@ class ControlEvaluator:
         callback: Called whenever the budget is asked, or None.
         stop: Ends the search early.
         best: The best control so far.
-        protected_looks: Number of looks at the budget for which only the whole budget counts, not a share of it.
+        protected_looks: Number of looks at the budget for which only the whole budget counts, not a
+            share of it.
         task: The experiment, on the plant without clamps where it is limited.
         constraints: Its constraints.
         centre: (nu,) control about which deviations are scaled [unit of the actuator].

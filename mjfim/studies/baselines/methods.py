@@ -1,8 +1,8 @@
 """Baselines that a design is compared with: searches for a control within a budget of time and MuJoCo steps.
 
-All baselines search under the same limits, on the same plant, with the same cost J. Chirps, multisines and random steps are
-searched at random over the few numbers that describe them, each scaled up to the limits. Fourier series and B-splines are
-in `parametric`.
+All baselines search under the same limits, on the same plant, with the same cost J. Chirps,
+multisines and random steps are searched at random over the few numbers that describe them, each
+scaled up to the limits. Fourier series and B-splines are in `parametric`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ LARGEST_UNBOUNDED_SCALE = 6.0
 # Largest deviation of a control with a range, over half of the range.
 LARGEST_BOUNDED_SCALE = 2.0
 
-# Smallest deviation, over the largest feasible one, where weights in the cost may make a small control the best.
+# Smallest deviation, over the largest feasible one, where weights in the cost may make a small
+# control the best.
 SMALLEST_WEIGHTED_SCALE = 0.03
 
 # Share of the trials of the random search that are drawn anywhere, not about the best one.
@@ -89,7 +90,8 @@ def run_baseline(
 
     Args:
         search: The order.
-        callback: Called during the search with the used share of the budget and the best result so far.
+        callback: Called during the search with the used share of the budget and the best result so
+            far.
         stop: Ends the search early; in a worker process, default: the request of its pool.
 
     Returns:
@@ -157,7 +159,8 @@ class ExcitationFitter:
 
     Attributes:
         settings: Frequencies and duration of the excitations.
-        has_weights: True where the cost has weights, which may make a smaller control the better one.
+        has_weights: True where the cost has weights, which may make a smaller control the better
+            one.
         largest_scale: Largest scale of a deviation that is worth trying.
     """
 
@@ -198,7 +201,8 @@ class ExcitationFitter:
             wave: (N, nu) wave of size 1.
 
         Returns:
-            (N, nu) deviation [unit of the actuator]; its size is about half of the range of the control.
+            (N, nu) deviation [unit of the actuator]; its size is about half of the range of the
+            control.
         """
         windowed = self._window * wave * self._size
         if self._basis is None or self._fit is None:

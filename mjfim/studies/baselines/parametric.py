@@ -1,8 +1,9 @@
 """Optimised Fourier series and B-splines: many of them roughly, the best ones to the end.
 
-They are optimised with SciPy or with mjfim's optimiser. SciPy gets the best that can be given to it: the exact gradient of
-`log J + mu * barrier`, with mu falling in the stages of a barrier schedule, and coefficients that are whitened at every stage
-by the Gauss-Newton metric of the barrier.
+They are optimised with SciPy or with mjfim's optimiser. SciPy gets the best that can be given to
+it: the exact gradient of `log J + mu * barrier`, with mu falling in the stages of a barrier
+schedule, and coefficients that are whitened at every stage by the Gauss-Newton metric of the
+barrier.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ FOURIER_FREQUENCIES = (0.2, 0.1, 0.4, 0.8, 0.15)
 # Bandwidths of the first B-splines [Hz].
 SPLINE_BANDWIDTHS = (1.0, 2.0)
 
-# Periods of the first harmonic within the horizon, fewest and most, of Fourier series with random base frequencies.
+# Periods of the first harmonic within the horizon, fewest and most, of Fourier series with random
+# base frequencies.
 RANDOM_PERIODS = (0.4, 5.0)
 
 # Harmonics that series with random base frequencies have at least, where the bandwidth allows them.
@@ -56,13 +58,15 @@ RANDOM_BANDWIDTH_FACTORS = (0.5, 2.0)
 # Barrier weight mu down to which all series are optimised.
 ROUGH_MU = 0.03
 
-# Shares of the remaining budget after which only the better series continue, and after which only the best one does.
+# Shares of the remaining budget after which only the better series continue, and after which only
+# the best one does.
 ROUGH_SHARE, BETTER_SHARE = 0.3, 0.45
 
 # One in three series belongs to the better ones.
 SELECTION_RATE = 3
 
-# Evaluations that every series gets at least; where the budget does not allow them, fewer series take part.
+# Evaluations that every series gets at least; where the budget does not allow them, fewer series
+# take part.
 MIN_EVALUATIONS = 12
 
 # Iterations of mjfim's optimiser: unlimited for practical purposes, the budget ends it.
@@ -117,12 +121,15 @@ class ParametricRun:
             self.control, self.cost = point.ctrl, cost
 
 
-# Optimises a run down to a barrier weight, or until a share of the budget is used: (evaluator, run, last weight, share).
+# Optimises a run down to a barrier weight, or until a share of the budget is used: (evaluator, run,
+# last weight, share).
 Optimiser = Callable[[ControlEvaluator, ParametricRun, float, float], None]
 
 
 def fourier_runs(evaluator: ControlEvaluator, harmonics: int) -> Iterator[ParametricRun]:
-    """Finite Fourier series (Swevers et al. 1997), with usual base frequencies first and random ones after them.
+    """Finite Fourier series (Swevers et al.
+
+    1997), with usual base frequencies first and random ones after them.
 
     Args:
         evaluator: Scales the initial controls to the limits.
@@ -275,17 +282,22 @@ def _cheapest(runs: Sequence[ParametricRun], count: int) -> list[ParametricRun]:
     return unfinished[:count]
 
 
-# with mjfim's optimiser ---------------------------------------------------------------------------------------------
+# with mjfim's optimiser
+# ---------------------------------------------------------------------------------------------
 
 
 def optimise_with_mjfim(
     evaluator: ControlEvaluator, run: ParametricRun, last: float, limit: float
 ) -> None:
-    """Optimise within the curves of a run as designs under hard limits are optimised. See `Optimiser`."""
+    """Optimise within the curves of a run as designs under hard limits are optimised.
+
+    See `Optimiser`.
+    """
     order = evaluator.search
     stop = StopToken()
 
-    # Only the last search gets a time limit: with one, the barrier of the others would fall too early.
+    # Only the last search gets a time limit: with one, the barrier of the others would fall too
+    # early.
     seconds = (1.0 - evaluator.used) * order.seconds if limit >= 1.0 else np.inf
     search = ConstrainedSearch(
         experiment=order.experiment,
@@ -558,7 +570,8 @@ class _ScipyStage:
         if not self.ended and descent.evaluator.exhausted(descent.limit):
             descent.out_of_budget = self.ended = True
 
-        # SciPy cannot be stopped here: a large value ends its line search within a few cheap evaluations.
+        # SciPy cannot be stopped here: a large value ends its line search within a few cheap
+        # evaluations.
         diverged = DIVERGED_VALUE, np.zeros(y.size)
         if self.ended:
             return diverged
