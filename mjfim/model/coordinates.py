@@ -1,4 +1,6 @@
-"""Names and units of the coordinates of a model; the only module that makes names of columns and components.
+"""Names and units of the coordinates of a model.
+
+No other module makes names of columns and of components.
 
 A coordinate of a slide or hinge joint is called `qpos:<joint>` and `qvel:<joint>`. Ball and free
 joints have parts, `qpos:<joint>.<part>`:
@@ -35,12 +37,13 @@ TRANSLATION = ("x", "y", "z")
 # Parts of the orientation of a ball or free joint in a state: a unit quaternion.
 QUATERNION = ("qw", "qx", "qy", "qz")
 
-# Parts of a deviation of the orientation and of the angular velocity: a rotation vector in the
-# body's frame.
+# Parts of a deviation of the orientation and of the angular velocity: a rotation vector, in the
+# frame of the body.
 ROTATION_VECTOR = ("rx", "ry", "rz")
 
-# Standard deviation of a quaternion's component over that of the orientation. The four components
-# then hold exactly the information of a rotation vector of the stated standard deviation [rad].
+# Standard deviation of a component of a quaternion, divided by that of the orientation [1/rad].
+# With 1/2, the four components hold exactly the information of a rotation vector that has the
+# stated standard deviation.
 QUATERNION_SIGMA_FACTOR = 0.5
 
 # A coordinate written with an index, as in `qpos:base[3]` or `initial/base:qpos[3]`.
@@ -129,7 +132,7 @@ def actuator_names(model: Any) -> tuple[str, ...]:
 
 
 def control_names(model: Any) -> tuple[str, ...]:
-    """Names of the nu controls; an actuator with several controls has one name for each, `<actuator>[<i>]`."""
+    """Names of the nu controls; an actuator with several controls names them `<actuator>[<i>]`."""
     names: list[str] = []
     for i, name in enumerate(actuator_names(model)):
         count = int(model.actuator_ctrlnum[i])
@@ -138,7 +141,10 @@ def control_names(model: Any) -> tuple[str, ...]:
 
 
 def control_labels(model: Any) -> tuple[str, ...]:
-    """Labels of the nu controls for axes: with the unit where the model determines it, else with `(control)`."""
+    """Labels of the nu controls for the axes of figures.
+
+    A label ends with the unit where the model determines it, else with `(control)`.
+    """
     labels: list[str] = []
     for i, name in enumerate(actuator_names(model)):
         count = int(model.actuator_ctrlnum[i])
@@ -254,7 +260,7 @@ def tangent_components(model: Any) -> tuple[TangentComponent, ...]:
 
 
 def _activation_components(model: Any) -> tuple[TangentComponent, ...]:
-    """The na activations by their address: `act:<actuator>`, with `[i]` where an actuator has several."""
+    """The na activations by their address: `act:<actuator>`, with `[i]` if there are several."""
     found: dict[int, TangentComponent] = {}
     for i, name in enumerate(actuator_names(model)):
         first = int(model.actuator_actadr[i])
@@ -272,7 +278,7 @@ def _activation_components(model: Any) -> tuple[TangentComponent, ...]:
 
 
 def dof_names(model: Any) -> tuple[str, ...]:
-    """Names of the nv degrees of freedom: `<joint>`, or `<joint>.<part>` with the parts of a rotation vector."""
+    """Names of the nv degrees of freedom: `<joint>`, of ball and free joints `<joint>.<part>`."""
     components = tangent_components(model)[: model.nv]
     return tuple(component.name.removeprefix("qpos:") for component in components)
 
@@ -294,11 +300,14 @@ def tangent_names(model: Any) -> tuple[str, ...]:
 
 
 def gain_names(model: Any, controls: Sequence[str]) -> tuple[str, ...]:
-    """Columns of the gain K: (nu, nx), row by row: `gain:<control>:<component of the deviation>`.
+    """Columns of the gain K: (nu, nx), row by row.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
         controls: nu names of the controls.
+
+    Returns:
+        nu * nx names `gain:<control>:<component of the deviation>`.
     """
     names: list[str] = []
     for control in controls:
@@ -352,10 +361,10 @@ def split_unit(label: str) -> tuple[str, str]:
 
 
 def unknown_coordinate(kind: str, name: str, valid: Sequence[str]) -> str:
-    """Sentence for a coordinate that does not exist, which names the right spelling where it is known.
+    """Message about a coordinate that does not exist, with the right spelling where it is known.
 
     Args:
-        kind: What the name should have been, for the message.
+        kind: Kind of thing that was looked for, for the message.
         name: The name that does not exist.
         valid: All valid names, those of one joint in the order of its degrees of freedom.
     """
@@ -378,7 +387,7 @@ def unknown_coordinate(kind: str, name: str, valid: Sequence[str]) -> str:
 
 
 def _names_with_parts(joint_column: str, valid: Sequence[str]) -> list[str]:
-    """The valid names that consist of a joint's column, such as `qpos:base`, and a part."""
+    """All valid names that consist of the column of a joint, such as `qpos:base`, and a part."""
     return [
         name
         for name in valid
@@ -387,5 +396,5 @@ def _names_with_parts(joint_column: str, valid: Sequence[str]) -> list[str]:
 
 
 def _indexed(name: str, count: int) -> list[str]:
-    """Names of the components of one element: its name if there is one component, else `<name>[<i>]`."""
+    """Names of the components of an element: `<name>` of a single one, else `<name>[<i>]`."""
     return [name] if count == 1 else [f"{name}[{i}]" for i in range(count)]

@@ -20,8 +20,8 @@ from mjfim.model.elements import unique_names
 from mjfim.model.geom_pairs import GeomPair
 from mjfim.model.pair_distance import INFINITE_DISTANCE, Indices, PairDistances
 
-# Largest number of bounds that are held in memory at once; more configurations are processed in
-# blocks.
+# Largest number of lower bounds of distances that are held in memory at once. Where there are
+# more, the configurations are processed in blocks.
 MAX_BOUNDS_AT_ONCE = 1 << 18
 
 
@@ -143,8 +143,8 @@ class GeomDistances:
         bounds, _ = self._distances.lower_bounds(positions, frames)
         best, row, pair = np.inf, 0, self.pairs[0]
 
-        # Measure in ascending order of the bounds, until a bound exceeds the smallest distance so
-        # far.
+        # Measure in ascending order of the bounds. Stop at the first bound that exceeds the
+        # smallest distance found: no later pair can be nearer.
         ascending = np.unravel_index(np.argsort(bounds, axis=None), bounds.shape)
         for k, p in zip(*ascending, strict=True):
             distance = float(bounds[k, p])
@@ -195,7 +195,9 @@ class GeomDistances:
         exact: tuple[Indices, Indices, Array],
         poses: tuple[Array, Array, Array],
     ) -> Array:
-        """(n, m, nv) slopes of the distances of all columns: each is that of the nearest pair of its column.
+        """Slopes of the distances of all columns.
+
+        The slope of a column is that of its nearest pair.
 
         Args:
             d: (n, m) distances of the columns [m].
@@ -205,12 +207,15 @@ class GeomDistances:
             exact: Rows and pairs (e,) over planes, and points (n, number of planes, 3) nearest to
                 the planes.
             poses: Positions, frames and screws by `_poses`.
+
+        Returns:
+            (n, m, nv) slopes [m / tangent unit of qpos].
         """
         positions, frames, screws = poses
         rows, pairs, found, segments = measured
         plane_rows, plane_pairs, plane_points = exact
 
-        # Normals and nearest points of the first geoms: of measured pairs, then of those over
+        # Normals, and nearest points of the first geoms: measured pairs first, then pairs over
         # planes.
         normals = self._distances.normals(
             rows,
@@ -234,8 +239,8 @@ class GeomDistances:
         value = every[rows, pairs]
         least = (value == d[rows, column]) & (value < self.reach)
 
-        # The normal as a line (moment about the origin, direction); its product with a screw is the
-        # rate of the distance.
+        # The normal as a line (moment about the origin, direction). The product of a line and a
+        # screw is the rate of the distance.
         lines = np.zeros((*d.shape, 6))
         lines[rows[least], column[least], :3] = np.cross(nearest_points[least], normals[least])
         lines[rows[least], column[least], 3:] = normals[least]
@@ -259,8 +264,8 @@ class GeomDistances:
         screws = np.empty((n, model.nv, 6))
         centres = np.empty((n, model.nbody, 3))
 
-        # Views of MuJoCo's arrays: looking them up in every round would cost more than the
-        # kinematics.
+        # Views of MuJoCo's arrays. Looking up the attributes for every configuration would take
+        # longer than the kinematics.
         q, xpos, xmat = data.qpos, data.geom_xpos, data.geom_xmat
         cdof, com = data.cdof, data.subtree_com
         for k, configuration in enumerate(qpos):

@@ -1,4 +1,7 @@
-"""Pairs of geoms of a model that can come near each other, selected as MuJoCo selects them for collisions."""
+"""Pairs of geoms of a model that can come near each other.
+
+They are selected by MuJoCo's rules for collisions.
+"""
 
 from __future__ import annotations
 
@@ -35,12 +38,12 @@ class GeomPair:
 
 
 def find_geom_pairs(model: Any, ignored: Collection[frozenset[str]]) -> tuple[GeomPair, ...]:
-    """All pairs of geoms that move relative to each other and that MuJoCo would let collide, contacts enabled or not.
+    """All pairs of geoms that move relative to each other and that may collide.
 
-    The selection is MuJoCo's: no geoms of bodies welded together, of parent and child (unless the
-    parent is fixed in the world or the flag filterparent is off) or of an `<exclude>`; contype and
-    conaffinity must match. An explicit `<pair>` overrules all of these. Flexes have no geoms and
-    are left out.
+    The rules are MuJoCo's, except that it does not matter whether contacts are enabled. Left out
+    are geoms of bodies that are welded together, of parent and child (unless the parent is fixed
+    in the world or the flag filterparent is off), and of an `<exclude>`; contype and conaffinity
+    must match. An explicit `<pair>` overrules these rules. Flexes have no geoms and are left out.
 
     Args:
         model: The model (`mujoco.MjModel`).
@@ -84,7 +87,15 @@ def _check_ignored(ignored: Collection[frozenset[str]], bodies: tuple[str, ...])
 
 
 def _check_type(model: Any, geom: int, label: str, first_body: str, second_body: str) -> None:
-    """Raise where MuJoCo has no reliable distance for a geom. first_body, second_body: bodies of its pair."""
+    """Raise where MuJoCo has no reliable distance for a geom.
+
+    Args:
+        model: The model (`mujoco.MjModel`).
+        geom: Number of the geom.
+        label: Name of the geom, for the message.
+        first_body: Name of the body of the first geom of the pair, for the message.
+        second_body: Name of the body of the second geom of the pair.
+    """
     refused = REFUSED_TYPES.get(int(model.geom_type[geom]))
     if refused is not None:
         raise ExperimentError(
@@ -121,7 +132,10 @@ class _Selection:
         return bool(self._tree[self._body[geom]] >= 0)
 
     def can_come_near(self, first: int, second: int) -> bool:
-        """Whether two geoms, of which the first moves if one does, move relative to each other and may collide."""
+        """Whether two geoms move relative to each other and may collide.
+
+        Where only one of them can move, it is the first one.
+        """
         a = self._body[first]
         b = self._body[second]
         if not self.can_move(first) or self._weld[a] == self._weld[b]:
@@ -133,7 +147,10 @@ class _Selection:
         return self._bits_match(first, second)
 
     def _are_parent_and_child(self, a: int, b: int) -> bool:
-        """Whether MuJoCo filters two bodies as parent and child; a body that is fixed in the world does not count as a parent."""
+        """Whether MuJoCo lets two bodies not collide because they are parent and child.
+
+        A body that is fixed in the world does not count as a parent.
+        """
         if not self._filters_parents:
             return False
         a = self._weld[a]

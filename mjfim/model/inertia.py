@@ -1,10 +1,16 @@
-"""The ten inertial parameters of a body in three parametrisations: central (MuJoCo's), barycentric and log-Cholesky.
+"""The ten inertial parameters of a body in three parametrisations.
 
-The pseudo-inertia `J = [[S, h], [h', m]]` holds the second moments S, the first moments h = m c and
-the mass m about the origin of the body frame; `I = tr(S) 1 - S`. A body is physical when J is
-positive definite. `J = U U'` with `U = e^alpha [[e^d1, s12, s13, t1], [0, e^d2, s23, t2], [0, 0,
-e^d3, t3], [0, 0, 0, 1]]` always is (Rucker & Wensing, Smooth parameterization of rigid-body
-inertia, RA-L 2022).
+They are called central (that of MuJoCo), barycentric and log-Cholesky.
+
+The pseudo-inertia `J = [[S, h], [h', m]]` holds the second moments S, the first moments h = m c
+and the mass m about the origin of the body frame; the inertia is `I = tr(S) 1 - S`. A body is
+physical when J is positive definite. The log-Cholesky parametrisation ensures this (Rucker &
+Wensing, Smooth parameterization of rigid-body inertia, RA-L 2022): `J = U U'` with
+
+    U = e^alpha [[e^d1,  s12,  s13, t1],
+                 [   0, e^d2,  s23, t2],
+                 [   0,    0, e^d3, t3],
+                 [   0,    0,    0,  1]].
 """
 
 from __future__ import annotations
@@ -23,8 +29,8 @@ INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 # Rows and columns of these entries, (6,) each, for indexing a matrix.
 INERTIA_ROWS, INERTIA_COLUMNS = np.array(INERTIA_ENTRIES).T
 
-# Smallest over largest second moment per mass, up to which a body counts as a point, a rod or a
-# plate.
+# A body counts as a point, a rod or a plate where the ratio of its smallest to its largest second
+# moment is at most this.
 DEGENERATE_RATIO = 1e-9
 
 
@@ -57,7 +63,12 @@ class BodyInertia:
         return BodyInertia(mass=float(mass), com=np.array(com), inertia=inertia)
 
     def principal_axes(self) -> tuple[Array, Array]:
-        """Principal moments (3,) [kg m²], descending, and the quaternion (w, x, y, z) of their right-handed axes."""
+        """Principal moments and axes.
+
+        Returns:
+            (3,) principal moments [kg m²] in descending order, and the quaternion (w, x, y, z) of
+            the principal axes, which are right-handed.
+        """
         moments, R = np.linalg.eigh(self.inertia)
         moments = moments[::-1]
         R = R[:, ::-1]
@@ -81,7 +92,7 @@ class BodyInertia:
 
 
 def to_central(body: BodyInertia) -> Array:
-    """(10,) mass, centre of mass, `fullinertia` about it."""
+    """(10,) mass, centre of mass, and `fullinertia` about the centre of mass."""
     entries = _entries(body.inertia)
     return np.concatenate([[body.mass], body.com, entries])
 
@@ -94,7 +105,10 @@ def from_central(values: Array) -> BodyInertia:
 
 
 def to_barycentric(body: BodyInertia) -> Array:
-    """(10,) mass, first moments m c, inertia about the origin of the body frame; the dynamics are linear in them."""
+    """(10,) mass, first moments m c, and inertia about the origin of the body frame.
+
+    The dynamics are linear in these coordinates.
+    """
     first_moments = body.mass * body.com
     about_origin = body.inertia + _steiner(body.mass, body.com)
     return np.concatenate([[body.mass], first_moments, _entries(about_origin)])
@@ -122,8 +136,8 @@ def to_logcholesky(body: BodyInertia) -> Array:
             "the third)"
         )
 
-    # An upper triangular factor, U U' = per_mass, is the flipped Cholesky factor of the flipped
-    # matrix.
+    # The upper triangular factor U, with U U' = per_mass, is the flipped Cholesky factor of the
+    # flipped matrix.
     flipped = np.linalg.cholesky(per_mass[::-1, ::-1])
     U = flipped[::-1, ::-1]
 
@@ -187,7 +201,7 @@ class InertiaParametrisation:
     inertia: Callable[[Array], BodyInertia]
 
     def magnitudes(self, body: BodyInertia) -> Array:
-        """(10,) sizes with which a change of each coordinate is naturally compared [unit of the coordinate]."""
+        """(10,) natural magnitudes of a change of the coordinates [units of the coordinates]."""
         mass = body.mass
         radius = body.gyration_radius
         by_unit = {

@@ -14,7 +14,14 @@ from mjfim.model.smooth_friction import has_dry_friction
 
 
 def load_spec(path: Path) -> Any:
-    """MjSpec of an MJCF (or URDF) file. Raises ModelError with MuJoCo's message."""
+    """MjSpec of an MJCF or URDF file.
+
+    Args:
+        path: The file.
+
+    Raises:
+        ModelError: The file is absent, or MuJoCo cannot read it; the message is MuJoCo's.
+    """
     if not path.is_file():
         raise ModelError(f"{path}: no such model file")
     try:
@@ -24,7 +31,15 @@ def load_spec(path: Path) -> Any:
 
 
 def compile_spec(spec: Any, path: Path) -> Any:
-    """MjModel of a spec. Raises ModelError with MuJoCo's message."""
+    """MjModel of a spec.
+
+    Args:
+        spec: The spec (`mujoco.MjSpec`).
+        path: The file that it was read from, for the message.
+
+    Raises:
+        ModelError: MuJoCo cannot compile the spec; the message is MuJoCo's.
+    """
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
@@ -37,9 +52,10 @@ MAX_EDITED_MODELS = 512
 
 
 class ModelSource:
-    """An MJCF file, parsed once and compiled once for each set of bodies whose inertia parameters may change.
+    """An MJCF file that is parsed only once.
 
-    All variants of a plant are copies of these compiled models with other settings.
+    It is compiled once for each set of bodies whose inertia may change. All variants of a plant are
+    copies of these compiled models with other settings.
 
     Attributes:
         path: The MJCF file.
@@ -105,7 +121,7 @@ class ModelSource:
         return self._edited[place]
 
     def _editable_spec(self, moved_bodies: frozenset[str] | None) -> Any:
-        """A copy of the spec whose moved bodies are not compiled as "simple"."""
+        """A copy of the spec in which the moved bodies are not compiled as "simple"."""
         spec = self.spec.copy()
         for body in spec.bodies[1:]:
             if moved_bodies is None or body.name in moved_bodies:
@@ -114,7 +130,10 @@ class ModelSource:
 
 
 def decoration(spec: Any, model: Any) -> frozenset[str]:
-    """Names of geoms without collisions and without influence on inertia: their size and position affect nothing else."""
+    """Names of geoms that neither collide nor contribute to the inertia of their body.
+
+    Their size and position can be changed without a compile.
+    """
     forced = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     return frozenset(
@@ -130,7 +149,7 @@ def decoration(spec: Any, model: Any) -> frozenset[str]:
 
 
 def unconstrained(model: Any) -> bool:
-    """True where no constraint can ever be active, so that switching the solver off changes nothing."""
+    """Whether no constraint can ever be active, so that the solver can be switched off."""
     no_contact = bool(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT)) or (
         model.npair == 0 and not (np.any(model.geom_contype) and np.any(model.geom_conaffinity))
     )

@@ -1,4 +1,7 @@
-"""Suppression of MuJoCo's warnings on the console and in log files, where mjfim reports problems by return values."""
+"""Suppression of MuJoCo's warnings on the console and in log files.
+
+It is used where mjfim reports a problem by a return value.
+"""
 
 from __future__ import annotations
 

@@ -38,16 +38,16 @@ BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 # Types of geoms whose distance to a plane is exact here.
 PRIMITIVES = (SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX)
 
-# Tolerance and iterations of the convex collider; MuJoCo's 1e-6 and 35 blur the slopes of curved
-# geoms.
+# Tolerance and largest number of iterations of the convex collider. MuJoCo's defaults, 1e-6 and 35,
+# make the slopes of curved geoms inaccurate.
 CCD_TOLERANCE = 1e-10
 CCD_ITERATIONS = 200
 
 # Distance that is larger than any between geoms [m].
 INFINITE_DISTANCE = 1e6
 
-# Radius of a capsule's axis [m]; with radius 0 the collider now and then reports deep penetration
-# as touching.
+# Radius that the axis of a capsule gets [m]. With radius 0 the collider sometimes reports deep
+# penetration as contact at distance 0.
 AXIS_RADIUS = 1e-9
 
 # Distance below which the nearest points of two surfaces do not determine their normal [m].
@@ -87,8 +87,8 @@ class PairDistances:
         bounding_radii = self._model.geom_rbound
         self._radii = bounding_radii[self.first] + bounding_radii[self.second]
 
-        # Between a capsule and a box MuJoCo measures the capsule's axis; the radius is subtracted
-        # from the distance.
+        # Between a capsule and a box, MuJoCo measures the distance of the capsule's axis, from
+        # which the radius is subtracted.
         by_axis = (np.sort(kinds, axis=0) == [[CAPSULE], [BOX]]).all(axis=0)
         capsule = np.where(kinds[0] == CAPSULE, self.first, self.second)
         self._axis_offset = np.where(by_axis, self._model.geom_size[capsule, 0], 0.0)
@@ -101,7 +101,9 @@ class PairDistances:
         ]
 
     def lower_bounds(self, positions: Array, frames: Array) -> tuple[Array, Array]:
-        """Lower bounds of the distances from bounding spheres; the distances themselves of `exact` pairs.
+        """Lower bounds of the distances, from bounding spheres.
+
+        For `exact` pairs these are the distances themselves.
 
         Args:
             positions: (n, ngeom, 3) positions of the geoms [m].
@@ -136,17 +138,25 @@ class PairDistances:
         return bounds, points
 
     def set_pose(self, positions: Array, frames: Array) -> None:
-        """Put all geoms in one pose for `distance`. positions: (ngeom, 3) [m], frames: (ngeom, 3, 3)."""
+        """Set the pose of all geoms in which `distance` measures.
+
+        Args:
+            positions: (ngeom, 3) positions of the geoms [m].
+            frames: (ngeom, 3, 3) frames of the geoms.
+        """
         self._data.geom_xpos[:] = positions
         self._data.geom_xmat[:] = frames.reshape(-1, 9)
 
     def distance(self, p: int, limit: float, segment: Array | None = None) -> float:
-        """Distance of pair p in the pose that was set [m]; at least `limit` where it is not below it.
+        """Distance of one pair in the pose set by `set_pose`.
 
         Args:
             p: Number of the pair.
-            limit: Distance beyond which MuJoCo does not look [m].
+            limit: Distance beyond which MuJoCo does not search [m].
             segment: (6,) overwritten by the nearest points of the first and of the second geom [m].
+
+        Returns:
+            The distance [m] if it is below `limit`, else some number that is at least `limit`.
         """
         model, first, second, offset = self._calls[p]
         found = mujoco.mj_geomDistance(model, self._data, first, second, limit + offset, segment)
@@ -194,7 +204,7 @@ class PairDistances:
         frames: Array,
         reach: float,
     ) -> Array:
-        """Unit vectors (h, 3) from the first to the second geoms along which `measure` measured.
+        """Unit vectors (h, 3) from the first to the second geoms, along the measured distances.
 
         Args:
             rows: (h,) numbers of the poses.
@@ -217,7 +227,10 @@ class PairDistances:
         return np.asarray(normals / np.where(length > 0.0, length, 1.0))
 
     def _normal_when_parted(self, p: int, positions: Array, frames: Array, reach: float) -> Array:
-        """(3,) vector from the first to the second geom of a touching pair, after they are moved apart a little."""
+        """(3,) vector from the first to the second geom of a pair that touches.
+
+        The geoms are moved apart a little to find it.
+        """
         model, first, second, offset = self._calls[p]
         parted = positions.copy()
         between = parted[second] - parted[first]
@@ -232,7 +245,7 @@ class PairDistances:
 
 
 def _with_capsule_axes(model: Any) -> Any:
-    """A copy of a model in which capsules are thin cylinders: their axes."""
+    """A copy of a model in which capsules are replaced by their axes: thin cylinders."""
     axes = copy.copy(model)
     capsules = axes.geom_type == CAPSULE
     axes.geom_type[capsules] = CYLINDER
@@ -241,12 +254,15 @@ def _with_capsule_axes(model: Any) -> Any:
 
 
 def _farthest_points(kind: int, size: Array, direction: Array) -> Array:
-    """Points (n, 3) of a primitive that lie farthest along unit vectors (n, 3), in the primitive's frame [m].
+    """Points of a primitive that lie farthest along given directions.
 
     Args:
         kind: Type of the geom.
-        size: (3,) its size [m].
-        direction: (n, 3) unit vectors in its frame.
+        size: (3,) size of the geom [m].
+        direction: (n, 3) unit vectors in the frame of the geom.
+
+    Returns:
+        (n, 3) points in the frame of the geom [m].
     """
     if kind == BOX:
         return np.asarray(size * np.sign(direction))

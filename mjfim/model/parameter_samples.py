@@ -19,8 +19,8 @@ MAX_DEVIATION = 2.5
 # physical; then it is set to zero.
 MAX_HALVINGS = 20
 
-# Smallest share of a scalar's value that a sample of its prior keeps, so that it does not change
-# its sign.
+# A sample of the prior of a scalar is at least this share of the scalar's value, so that it does
+# not change its sign.
 MIN_SHARE_OF_VALUE = 0.05
 
 
@@ -31,12 +31,14 @@ def sample_parameters(
     seed: int,
     unphysical: Callable[[Array], Sequence[int]] | None = None,
 ) -> Array:
-    """Sample the parameters: theta itself, then a Latin hypercube over priors (normal) or bounds (uniform).
+    """Sample the parameters from their priors or bounds.
 
-    Normal samples stay within the bounds, within 2.5 standard deviations, and do not change the
-    sign of a scalar (a mass, a damping). Parameters with neither prior nor bounds, and those
-    outside the model, stay at theta. Where bodies of a sample are unphysical, the distance of the
-    parameters that determine them from theta is halved until they are physical.
+    The first sample is theta; the others form a Latin hypercube over normal priors or, without a
+    prior, uniformly over the bounds. Samples of a prior stay within the bounds and within 2.5
+    standard deviations, and do not change the sign of a scalar (a mass, a damping). Parameters with
+    neither prior nor bounds, and those outside the model, stay at theta. Where bodies of a sample
+    are unphysical, the distance of the parameters that determine them from theta is halved until
+    they are physical.
 
     Args:
         parameters: The parameters.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mjfim.model.parameters import ParameterSet
 
 # Relative amount by which the largest principal moment of inertia may exceed the sum of the other
-# two: the moments of a plate or rod are often stated with few digits.
+# two, because the moments of a plate or rod are often stated with few digits.
 MOMENT_ROUNDING = 1e-6
 
 
@@ -55,7 +55,10 @@ class ParameterWriter:
         return base.refresh(model) if isinstance(base, PlantModel) else model
 
     def base(self, source: PlantModel | Any, theta: Array) -> Any:
-        """The model into which theta is written in place: compiled anew where theta needs it, then kept."""
+        """The model into which theta can be written in place.
+
+        It is compiled, and kept for later calls, where theta changes values that need a compile.
+        """
         if not isinstance(source, PlantModel):
             return source
 
@@ -67,9 +70,10 @@ class ParameterWriter:
         return source.edited(key, lambda spec: self._edit(spec, source, theta))
 
     def write(self, model: Any, theta: Array) -> None:
-        """Write theta: (p,) into a model that the caller owns, in place, then recompute MuJoCo's derived constants.
+        """Write theta: (p,) into a private model, in place.
 
-        Values that need a compile are not written here, but by `model`.
+        MuJoCo's derived constants are computed anew. Values that need a compile are not written
+        here, but by `model`.
         """
         mocap = self._parameters.mocap
 
@@ -210,7 +214,7 @@ def _inertia_fault(model: Any, body: int, kind: str, values: Array | None) -> st
         model: The model with the numbers of theta.
         body: Number of the body.
         kind: Parametrisation of its inertia; empty where the model holds all of it.
-        values: (10,) its coordinates in the parametrisation; None where the model holds all of it.
+        values: (10,) coordinates in the parametrisation; None where the model holds all of them.
     """
     if kind == "logcholesky":
         return ""

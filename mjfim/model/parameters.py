@@ -1,4 +1,4 @@
-"""Unknown parameters of an experiment: guesses, bounds, scales and priors, and what each of them acts on."""
+"""Unknown parameters of an experiment: guesses, bounds, scales, priors and targets."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ from mjfim.model.targets import (
 )
 from mjfim.model.variants import MocapPlacement
 
-# Fields of a body that change its inertial frame, so that it must not be compiled as "simple".
+# Fields of a body that change its inertial frame, so that the body must not be compiled as
+# "simple".
 FRAME_FIELDS = {"pos", "ipos", "inertia", "mass", "rot", *INERTIAL_FIELDS}
 
 # Fields that are outside the model: the initial state and the measurement.
 FIELDS_OUTSIDE_MODEL = (InitialStateField, OutputBiasField, OutputDelayField)
 
-# Parametrisation of a body's inertia -> arrays of MjModel that may be varied beside it.
+# Parametrisation of a body's inertia -> arrays of MjModel that may be varied together with it.
 ARRAYS_BESIDE_INERTIA = {
     "central": {"body_mass", "body_ipos"},
     "barycentric": {"body_mass"},
@@ -65,16 +66,16 @@ class Parameter:
     """One unknown. Values are in the unit of its targets.
 
     Attributes:
-        name: Its name, unique in the experiment.
+        name: Name, unique in the experiment.
         targets: Numbers that it determines.
         guess: Value at which the design is made.
         true: Value for simulated studies, or None.
         bounds: Smallest and largest value.
-        scale: Unit in which information about it is compared with that about others.
+        scale: Unit in which its information is compared with that of other parameters.
         prior: Standard deviation of the prior, or None.
         unit: Its unit; empty where it has none.
-        size: Its order of magnitude, to which difference steps are relative; 0 for that of the
-            guess, else the scale.
+        size: Order of magnitude, to which the steps of finite differences are relative. With 0,
+            the magnitude of the guess is taken, or the scale where the guess is 0.
         function: Edits an MjSpec in place, `function(spec, theta_j)`, instead of targets.
         nuisance: Whether it is unknown but of no interest, so that the design spends no effort on
             it.
@@ -100,7 +101,10 @@ class Parameter:
 
 
 def moved_bodies(parameters: Sequence[Parameter]) -> set[str]:
-    """Names of bodies whose inertial frame a parameter may move; they must not be compiled as "simple"."""
+    """Names of bodies whose inertial frame a parameter may move.
+
+    These bodies must not be compiled as "simple".
+    """
     targets = [target for parameter in parameters for target in parameter.targets]
     paths = [ParameterPath.parse(target.path) for target in targets]
     return {
@@ -258,7 +262,10 @@ class ParameterSet:
 
     @cached_property
     def recording_specific(self) -> np.ndarray:
-        """(p,) True where every experiment and recording has a separate value, as for deviations of the initial state."""
+        """(p,) True where every experiment and recording has a separate value.
+
+        Deviations of the initial state always have one.
+        """
         stated = np.array([p.per_recording for p in self.parameters], dtype=bool)
         return np.asarray(self.initial_deviations | stated)
 
@@ -270,7 +277,7 @@ class ParameterSet:
 
     @cached_property
     def changes_motion(self) -> np.ndarray:
-        """(p,) True where a parameter changes the motion, through the model or the initial state."""
+        """(p,) True where a parameter changes the motion, by the model or the initial state."""
         return np.asarray(self.changes_model | self._has_field(InitialStateField))
 
     @cached_property
@@ -356,7 +363,13 @@ def _body_of(target_field: TargetField) -> int:
 
 
 def _require_compatible(parameter: Parameter, parametrisations: set[str], arrays: set[str]) -> None:
-    """Raise unless the inertia of a body is varied in one parametrisation, with fitting arrays beside it."""
+    """Raise unless the parameters of one body's inertia can be varied together.
+
+    Args:
+        parameter: Parameter of the body, for the message.
+        parametrisations: Parametrisations in which the inertia is varied; at least one.
+        arrays: Inertial arrays of MjModel that are varied as well.
+    """
     first = next(iter(parametrisations))
     if len(parametrisations) == 1 and arrays <= ARRAYS_BESIDE_INERTIA[first]:
         return
@@ -416,7 +429,7 @@ def _require_movable(
 def _nominal_values(
     parameters: Sequence[Parameter], fields: Sequence[tuple[TargetField, ...]], model: Any
 ) -> dict[tuple[str, int], Array]:
-    """Values in the model of inertias and orientations, which are written as a whole (`ParameterSet.nominal`)."""
+    """Values of inertias and orientations in the model, as in `ParameterSet.nominal`."""
     nominal: dict[tuple[str, int], Array] = {}
     for parameter, row in zip(parameters, fields, strict=True):
         for target_field in row:

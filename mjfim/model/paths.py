@@ -1,4 +1,7 @@
-"""Parameter paths `kind/name:field[index]` with MuJoCo's field names, and the fields of a model that they lead to."""
+"""Parameter paths `kind/name:field[index]`, and the fields of a model that they lead to.
+
+The names of the fields are MuJoCo's.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +34,14 @@ from mjfim.model.targets import (
 )
 from mjfim.model.units import ANGLE, FIELD_UNITS, JOINT_FIELD_UNITS, LENGTH
 
-# A parameter path: kind, name (absent for options and the delay), field, and an index or the part
-# of a joint.
+# A parameter path: the kind, the name (absent for options and the delay), the field, and
+# optionally an index or the part of a joint.
 PATH_PATTERN = re.compile(
     r"^(?P<kind>\w+)(?:/(?P<name>.+))?:(?P<field>\w+)(?:\[(?P<index>\d+)\]|\.(?P<part>\w+))?$"
 )
 
-# Kind -> field of a path -> array of MjModel. The fields of a joint's degrees of freedom are
-# written to each of them.
+# Kind -> field of a path -> array of MjModel. A field that exists for every degree of freedom is
+# written to all degrees of freedom of a joint.
 MODEL_ARRAYS: dict[str, dict[str, str]] = {
     "body": {
         "mass": "body_mass",
@@ -77,7 +80,7 @@ MODEL_ARRAYS: dict[str, dict[str, str]] = {
     },
 }
 
-# Field of a body -> (parametrisation of its inertia, first of its coordinates, how many).
+# Field of a body -> (parametrisation of its inertia, place of the first coordinate, their number).
 INERTIAL_FIELDS = {
     "fullinertia": ("central", 4, 6),
     "firstmoment": ("barycentric", 1, 3),
@@ -213,7 +216,16 @@ def resolve(
 
 
 def unit_of(model: Any, text: str) -> str:
-    """Unit of the number that a valid path names; empty where it has none or depends on the model (gains, tendons)."""
+    """Unit of the number that a valid path names.
+
+    Args:
+        model: The compiled model (`mujoco.MjModel`).
+        text: The path.
+
+    Returns:
+        The unit; empty where the number has none, or where it depends on the model (gains,
+        tendons).
+    """
     path = ParameterPath.parse(text)
 
     if path.field in INERTIAL_FIELDS:
@@ -227,7 +239,7 @@ def unit_of(model: Any, text: str) -> str:
 
     if path.kind == "joint":
         joint = identifier(model, "joint", path.name)
-        # One number holds for all coordinates of a ball or free joint: it is labelled as that of a
+        # One number holds for all coordinates of a ball or free joint; it gets the unit for a
         # rotation.
         slides = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)
         return JOINT_FIELD_UNITS.get(path.field, {}).get(LENGTH if slides else ANGLE, "")
@@ -339,7 +351,10 @@ def _geom_field(
 
 
 def _servo_field(model: Any, path: ParameterPath, actuator: int) -> ModelField:
-    """Gain of a position or velocity servo together with its bias: kp moves gainprm[0] and biasprm[1], kv biasprm[2]."""
+    """Gain of a position or velocity servo, with the entries of its bias that follow the gain.
+
+    kp sets gainprm[0] and biasprm[1]. kv sets biasprm[2], and gainprm[0] of a velocity servo.
+    """
     gain = float(model.actuator_gainprm[actuator, 0])
     bias = model.actuator_biasprm[actuator]
     rows = (actuator,)
@@ -388,7 +403,11 @@ def _array_field(model: Any, path: ParameterPath, number: int) -> ModelField:
 
 
 def _rows(model: Any, array: str, number: int, path: ParameterPath) -> tuple[int, ...]:
-    """Rows of an array that belong to an element: several for degrees of freedom and force outputs."""
+    """Rows of an array that belong to an element.
+
+    There are several for a joint with several degrees of freedom and for an actuator with several
+    force outputs.
+    """
     if array.startswith("dof_"):
         first = int(model.jnt_dofadr[number])
         return tuple(range(first, first + joint_dofs(model, number)))

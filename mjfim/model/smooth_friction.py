@@ -1,10 +1,10 @@
 """Dry friction, smoothed near zero velocity so that derivatives of a trajectory exist.
 
-The engine's dry friction changes its sign from one step to the next, and sticks for some steps. The
-information of a trajectory then jumps by the contribution of such a step, and small differences do
-not show the jump. Smoothed friction is a viscous force that saturates, `f clip(v / s, -1, 1)`. It
-is nearly the engine's friction where joints move, and smooth where they reverse: a joint stays
-below the speed s for several engine steps, over which the force averages.
+The dry friction of the engine changes its sign from one step to the next, and joints stick for some
+steps. The information of a trajectory then jumps by the contribution of such a step, and small
+differences do not show the jump. Smoothed friction is a viscous force that saturates,
+`f clip(v / s, -1, 1)`. It is nearly the engine's friction where joints move, and smooth where they
+reverse: a joint stays below the speed s for several engine steps, over which the force averages.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 
 from mjfim.arrays import Array
 
-# Smoothing speed s of a degree of freedom over its fastest speed.
+# Smoothing speed s of a degree of freedom, divided by its fastest speed.
 SMOOTHING_SPEED_FRACTION = 0.02
 
-# Impedance of the smoothed friction constraint, so low that the force follows velocities and not
-# accelerations.
+# Impedance of the smoothed friction constraint. It is so low that the force depends on velocities
+# and not on accelerations.
 SMOOTHED_IMPEDANCE = 1e-3
 
 # Smallest impedance that MuJoCo uses.
@@ -32,7 +32,7 @@ MIN_DAMPING = 1e-9
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _FrictionArrays:
-    """Arrays of MjModel that hold the friction constraints of n joints' degrees of freedom, or of n tendons.
+    """Arrays of MjModel with the friction constraints of n degrees of freedom or of n tendons.
 
     Attributes:
         loss: (n,) friction loss [N or N m].
@@ -55,7 +55,7 @@ def has_dry_friction(model: Any) -> bool:
 def smoothing_speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
     """Smoothing speeds s of every degree of freedom, then of every tendon [m/s or rad/s].
 
-    None is below the speed at which the engine's friction sticks.
+    No smoothing speed is below the speed at which the engine's friction sticks.
 
     Args:
         model: The model (`mujoco.MjModel`).
@@ -67,10 +67,10 @@ def smoothing_speeds_of(model: Any, fastest: Array) -> tuple[float, ...]:
 
 
 def smooth_dry_friction(model: Any, speeds: tuple[float, ...]) -> None:
-    """Write smoothed friction into a model that the caller owns, in place, wherever it has dry friction.
+    """Replace the dry friction of a model by smoothed friction, in place.
 
     Args:
-        model: The model (`mujoco.MjModel`).
+        model: The model (`mujoco.MjModel`), a private copy of the caller.
         speeds: Smoothing speeds of every degree of freedom, then of every tendon; 0 keeps the
             engine's friction.
     """
@@ -109,16 +109,16 @@ def _friction_arrays(model: Any) -> tuple[_FrictionArrays, _FrictionArrays]:
 
 
 def _sticking_speeds(arrays: _FrictionArrays) -> Array:
-    """(n,) speeds below which the engine's friction brakes with less than its full force, and so sticks.
+    """(n,) speeds below which the engine's friction sticks.
 
-    The constraint asks for a deceleration of damping times speed; its force cannot exceed the
-    friction loss.
+    Below such a speed, friction brakes with less than its full force: the constraint asks for a
+    deceleration of damping times speed, and its force cannot exceed the friction loss.
     """
     impedance = np.maximum(arrays.impedance[:, 1], MIN_IMPEDANCE)
     reference = arrays.reference
 
-    # A positive first reference is a time constant (MuJoCo's standard form); else the second one is
-    # the damping itself.
+    # In MuJoCo's standard form the first number of `solref` is positive and is a time constant.
+    # Otherwise the second number is the damping itself.
     standard = reference[:, 0] > 0.0
     time_constant = np.where(standard, impedance * reference[:, 0], 1.0)
     damping = np.where(standard, 2.0 / time_constant, -reference[:, 1] / impedance)

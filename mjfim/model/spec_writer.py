@@ -1,4 +1,7 @@
-"""Parameter values written into an MjSpec, for values that need a compile and for the identified MJCF."""
+"""Writing of parameter values into an MjSpec.
+
+It is needed for values that need a compile, and for the MJCF file of identified values.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,10 @@ INERTIA_FIELDS = ("mass", "ipos", "inertia", *INERTIAL_FIELDS)
 
 
 def write_element(spec: Any, compiled: Any, wanted: Any, text: str, value: float) -> None:
-    """Write what a path names into an MjSpec that the caller owns, in place.
+    """Write the number that a path names into an MjSpec, in place.
 
     Args:
-        spec: The spec (`mujoco.MjSpec`).
+        spec: The spec (`mujoco.MjSpec`), a private copy of the caller.
         compiled: The model of this spec. Where the inertia of a body comes from geoms, it is stated
             explicitly before it is changed.
         wanted: The model at the values, from which inertias and orientations are taken as a whole.

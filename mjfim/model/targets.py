@@ -1,4 +1,6 @@
-"""Fields that a parameter writes: a number inside a model, of the initial state, or of the measurement.
+"""Fields that a parameter writes.
+
+A field is a number inside a model, of the initial state, or of the measurement:
 
 - `ModelField`: a number of an MjModel array;
 - `InertiaField`: one of the ten inertial parameters of a body;
@@ -7,8 +9,8 @@
 - `InitialStateField`: a deviation of the initial state;
 - `OutputBiasField`, `OutputDelayField`: the measurement itself.
 
-Each has `read(model)`, its value in a model, and `magnitude(model)`, the size with which a change
-of it is compared.
+Each field has `read(model)`, its value in a model, and `magnitude(model)`, the order of magnitude
+with which a change of it is compared.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from mjfim.errors import ExperimentError
 from mjfim.model.elements import element_name
 from mjfim.model.inertia import INERTIA_PARAMETRISATIONS, BodyInertia
 
-# Array of MjModel -> array that says whether the element's frame coincides with its body's. MuJoCo
-# skips the position of elements whose frame coincides, so the flag is cleared when the position is
+# Array of MjModel -> array that says whether the frame of the element coincides with that of its
+# body. MuJoCo skips the position of such elements, so the flag is cleared when the position is
 # written.
 SAME_FRAME_FLAGS = {
     "body_ipos": "body_sameframe",
@@ -73,7 +75,7 @@ class ModelField:
         return float(number) / self.factor
 
     def magnitude(self, model: Any) -> float:
-        """The radius of gyration for a centre of mass; 0 for other numbers, whose magnitude is their value."""
+        """Radius of gyration [m] for a centre of mass; 0 where the value is the magnitude."""
         if self.array == "body_ipos" and float(model.body_mass[self.rows[0]]) > 0.0:
             return body_inertia(model, self.rows[0]).gyration_radius
         return 0.0
@@ -104,12 +106,14 @@ class ModelField:
 
 @dataclass(frozen=True)
 class InertiaField:
-    """One of the ten inertial parameters of a body; all that are varied are written together (`ParameterWriter.write`).
+    """One of the ten inertial parameters of a body.
+
+    `ParameterWriter.write` writes all inertial parameters of a body that are varied at once.
 
     Attributes:
         body: Number of the body.
         parametrisation: Key of `INERTIA_PARAMETRISATIONS`.
-        component: Place among the ten.
+        component: Place among the ten coordinates of the parametrisation.
     """
 
     body: int
@@ -158,12 +162,12 @@ class DeviationField:
 
 @dataclass(frozen=True)
 class RotationField(DeviationField):
-    """One component of a rotation vector [rad] by which a body or site is turned from its compiled orientation.
+    """One component of the rotation [rad] of a body or site from its compiled orientation.
 
     Attributes:
         array: Array of quaternions in MjModel.
         row: Row of the body or site.
-        component: 0, 1 or 2 of the rotation vector.
+        component: Component of the rotation vector: 0, 1 or 2.
     """
 
     array: str
@@ -173,7 +177,9 @@ class RotationField(DeviationField):
 
 @dataclass(frozen=True)
 class SpecField:
-    """A number of the MJCF from which the compiler derives others, so that a change needs a compile.
+    """A number of the MJCF from which the compiler derives others.
+
+    A change of such a number needs a compile.
 
     Attributes:
         kind: Kind of the element.
@@ -200,7 +206,7 @@ class SpecField:
         )
 
     def magnitude(self, model: Any) -> float:
-        """The geom's bounding radius for positions; 0 for other numbers, whose magnitude is their value."""
+        """Bounding radius of the geom [m] for positions; 0 where the value is the magnitude."""
         return float(model.geom_rbound[model.geom(self.name).id]) if self.field == "pos" else 0.0
 
 

@@ -15,8 +15,8 @@ LENGTH = "m"
 # Unit of the coordinate of a hinge joint and of every other rotation.
 ANGLE = "rad"
 
-# Unit of each part of a ball or free joint: translation, rotation vector, quaternion
-# (dimensionless).
+# Unit of each part of a ball or free joint: of the translation, of the rotation vector and of the
+# quaternion, which is dimensionless.
 PART_UNITS = {
     **dict.fromkeys(("x", "y", "z"), LENGTH),
     **dict.fromkeys(("rx", "ry", "rz"), ANGLE),
@@ -35,8 +35,8 @@ JOINT_FIELD_UNITS = {
     "springref": {LENGTH: LENGTH, ANGLE: ANGLE},
 }
 
-# Units of the other fields that a parameter path can name; fields that are absent have none or
-# depend on the model.
+# Units of the other fields that a parameter path can name. Fields that are absent here have no unit
+# or one that depends on the model.
 FIELD_UNITS = {
     "mass": "kg",
     "pos": "m",
@@ -51,8 +51,8 @@ FIELD_UNITS = {
     "delay": "s",
 }
 
-# Units of sensors whose unit does not depend on a joint; sensors that are absent have none or
-# depend on the model.
+# Units of sensors whose unit does not depend on a joint. Sensors that are absent here have no unit
+# or one that depends on the model.
 SENSOR_UNITS = {
     mujoco.mjtSensor.mjSENS_TENDONPOS: "m",
     mujoco.mjtSensor.mjSENS_RANGEFINDER: "m",
@@ -85,11 +85,14 @@ def per_second(unit: str) -> str:
 
 
 def joint_unit(model: Any, joint: int) -> str:
-    """Unit of the first coordinate of a joint: metres for slide and free joints, radians for hinge and ball joints.
+    """Unit of the first coordinate of a joint.
 
     Args:
         model: The compiled model (`mujoco.MjModel`).
         joint: Number of the joint.
+
+    Returns:
+        Metres for slide and free joints, radians for hinge and ball joints.
     """
     kind = mujoco.mjtJoint(int(model.jnt_type[joint]))
     translates = kind in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_FREE)

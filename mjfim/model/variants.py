@@ -1,4 +1,4 @@
-"""Variants of the user's model that a plant steps: quicker or smoother copies of one compiled model."""
+"""Variants of the user's model: copies of one compiled model that are quicker or smoother."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mjfim.errors import ExperimentError, ModelError
 from mjfim.model.loading import MAX_EDITED_MODELS, ModelSource, unconstrained
 from mjfim.model.smooth_friction import smooth_dry_friction
 
-# Tolerance of the constraint solver in private copies: differences of steps would show the error
-# that a solver leaves.
+# Tolerance of the constraint solver in private copies. With a larger one, the error of the solver
+# would appear in differences between steps.
 SOLVER_TOLERANCE = 1e-14
 
-# Sizes that determine the layout of MjData. A model with other sizes would write beyond the end of
-# its arrays.
+# Fields of MjModel that determine the layout of MjData. A model with other sizes would write beyond
+# the end of the arrays.
 LAYOUT = (
     "nq",
     "nv",
@@ -57,8 +57,8 @@ class ModelVariant:
         relaxed: True where clamps, stops and contacts are removed; hard limits keep a design away
             from them.
         smoothing_speeds: Speed of every degree of freedom, then of every tendon, below which dry
-            friction is viscous where derivatives are taken; empty for the engine's own friction.
-            [rad/s or m/s]
+            friction is viscous where derivatives are taken [rad/s or m/s]; empty for the friction
+            of the engine.
         smoothed: Dry friction is viscous below these speeds in the motion as well, not only in its
             derivatives.
     """
@@ -70,7 +70,10 @@ class ModelVariant:
     smoothed: bool = False
 
 
+# The model as the user states it.
 STATED = ModelVariant()
+
+# The model without clamps, stops and contacts.
 RELAXED = ModelVariant(relaxed=True)
 
 
@@ -94,7 +97,15 @@ class MocapPlacement:
 
     @staticmethod
     def of(model: Any, key: Any) -> MocapPlacement | None:
-        """Poses that a keyframe states (`model.key(name)` or None); None where it moves no mocap body."""
+        """Poses of mocap bodies in a keyframe.
+
+        Args:
+            model: The compiled model (`mujoco.MjModel`).
+            key: The keyframe, `model.key(name)`, or None.
+
+        Returns:
+            The poses; None where there is no keyframe or where it moves no mocap body.
+        """
         if key is None or model.nmocap == 0:
             return None
 
@@ -116,7 +127,9 @@ class MocapPlacement:
 
 @dataclass(frozen=True, kw_only=True)
 class Relaxation:
-    """Clamps, stops and dry friction that are changed in a private copy, because they hide derivatives.
+    """Clamps, stops and dry friction that are changed in a private copy of the model.
+
+    They are changed because they hide derivatives.
 
     Attributes:
         joints: Ids of joints whose range is removed.
@@ -124,8 +137,8 @@ class Relaxation:
         actuators: Ids of actuators whose force range is removed.
         controls: Whether all control ranges are removed.
         contacts: Whether all contacts are removed.
-        smoothing_speeds: Speeds below which dry friction is viscous; empty for the engine's own
-            friction.
+        smoothing_speeds: Speeds below which dry friction is viscous [m/s or rad/s]; empty for the
+            friction of the engine.
     """
 
     joints: tuple[int, ...] = ()
@@ -185,7 +198,7 @@ class PlantModel:
 
     @property
     def smoothing_speeds(self) -> tuple[float, ...]:
-        """Speeds below which its dry friction is viscous; empty for the engine's own friction."""
+        """Speeds below which its dry friction is viscous; empty for the friction of the engine."""
         return () if self._relaxation is None else self._relaxation.smoothing_speeds
 
     def edited(self, key: bytes, edit: Callable[[Any], None]) -> Any:
@@ -208,7 +221,14 @@ class PlantModel:
         return self._edited[key]
 
     def refresh(self, model: Any) -> Any:
-        """Write again, in place, the settings that depend on parameters written into a copy of this model."""
+        """Write again the settings that depend on the parameters of a model.
+
+        Args:
+            model: A copy of this model into which parameters were written; changed in place.
+
+        Returns:
+            The changed model.
+        """
         if self.smoothing_speeds:
             smooth_dry_friction(model, self.smoothing_speeds)
         return model
@@ -246,8 +266,8 @@ class PlantModel:
 
         model.opt.timestep *= self._timestep_factor
 
-        # Differences of steps must depend neither on the solver's initial guess nor on the error
-        # that it leaves.
+        # Differences between steps must depend neither on the initial guess of the solver nor on
+        # its remaining error.
         model.opt.tolerance = min(model.opt.tolerance, SOLVER_TOLERANCE)
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
 
