@@ -1,4 +1,4 @@
-"""Designs, recordings and controls on disk, with the columns that a robot's controller and other programs read.
+"""Files of designs, recordings and controls, for robot controllers and other programs.
 
 `mjfim.records.serialization` saves and loads the records; this module adds the tables that need the
 experiment: design.csv, reference.csv, recordings and controls as CSV.
@@ -84,7 +84,10 @@ def write_control(path: Path, control: Array, system: System) -> None:
 
 
 def write_recording(path: Path, recording: Recording, system: System) -> None:
-    """Write a recording as CSV: `t`, `ctrl:<actuator>` and its outputs, empty where nothing was measured.
+    """Write a recording as CSV.
+
+    The columns are `t`, `ctrl:<actuator>` and the outputs. A field is empty where nothing was
+    measured.
 
     Args:
         path: CSV file to write.

@@ -1,4 +1,7 @@
-"""The folder of a campaign: designs, recordings and estimates by round, from which a later call continues."""
+"""The folder of a campaign, which holds a subfolder for each round.
+
+A later call continues the campaign from the designs, recordings and estimates in it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders of results: which files every verb writes there, and how earlier ones are found."""
+"""Folders of results: writes the files of every verb and finds those of earlier runs."""
 
 from __future__ import annotations
 
@@ -153,7 +153,9 @@ def leave_robustness(folder: Path, result: Robustness, seconds: float) -> None:
 
 
 def leave_comparison(folder: Path, comparison: Comparison, system: System) -> None:
-    """Write compare.json, compare.npz, a figure, and the control of each method for `initial.control` of an experiment.
+    """Write compare.json, compare.npz, a figure, and the control of each method.
+
+    An experiment can read each control as its `initial.control`.
 
     Args:
         folder: Folder for the results; controls of an earlier comparison are removed.
@@ -201,7 +203,7 @@ def leave_estimate(folder: Path, estimate: Estimate, system: System) -> list[str
 
 
 def _leave_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None:
-    """Write a figure of the fit of each recording, and those of parameters, residuals and predictions."""
+    """Write figures of parameters, residuals and predictions, and of the fit of each recording."""
     sigma = list(estimate.sigma.values())
     for i in range(len(estimate.recordings)):
         name = "fit.png" if len(estimate.recordings) == 1 else f"fit_{i + 1}.png"

@@ -1,4 +1,4 @@
-"""Names with units for axes and panels, such as `slide [m]`, made from a model and an experiment."""
+"""Labels of axes and panels with units, such as `slide [m]`, from a model and an experiment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Tables with which a robot plays a design: `design.csv` for its controller, `reference.csv` for a position-controlled robot.
+"""Tables with which a robot plays a design.
+
+`design.csv` is for a controller that applies the control, `reference.csv` for a position-controlled
+robot.
 
 Rows are engine steps at the controller's rate; nothing is interpolated. With feedback the robot
 applies `u = ctrl + gain (planned - measured)`, the difference in the tangent space: rotations of
@@ -48,7 +51,7 @@ def simulate_playback(system: System, trajectory: Trajectory, gain: Array) -> Pl
 
 
 def design_columns(playback: Playback, system: System) -> dict[str, Array]:
-    """Columns of `design.csv`: time, state, controls and gains by name, each (M+1,).
+    """Return the columns of `design.csv` by name, each (M+1,): time, state, controls and gains.
 
     Controls and gains hold until the next row; the last row has none (NaN).
 
@@ -72,7 +75,9 @@ def design_columns(playback: Playback, system: System) -> dict[str, Array]:
 
 
 def reference_columns(playback: Playback, system: System) -> dict[str, Array]:
-    """Columns of `reference.csv` by name, each (M+1,): the planned motion and the feed-forward that belongs to it.
+    """Return the columns of `reference.csv` by name, each (M+1,).
+
+    They hold the planned motion and the feed-forward forces that belong to it.
 
     `qpos:<joint>` and `qvel:<joint>` are planned, `qacc:<joint>` is MuJoCo's acceleration under the
     control of the row, and `force:<joint>` what the actuators apply at the joint. The last row

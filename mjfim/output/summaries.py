@@ -1,4 +1,4 @@
-"""Results in words and tables, made once from each record, for the terminal, Rerun and figures alike."""
+"""Results in words and tables, for the terminal, Rerun and figures."""
 
 from __future__ import annotations
 
@@ -187,7 +187,9 @@ def improvement(before: float, after: float) -> str:
 
 
 def eigenvalue_table(design: Design) -> SummaryTable:
-    """Tabulate eigenvalues (largest first), criterion and cost of both trajectories; of many, the middle ones are left out.
+    """Tabulate eigenvalues (largest first), criterion and cost of both trajectories.
+
+    Of many eigenvalues, those in the middle are left out.
 
     Args:
         design: The design.
@@ -287,7 +289,7 @@ def _start_parts(design: Design) -> list[Part]:
 
 
 def describe_estimate(estimate: Estimate) -> Summary:
-    """Describe estimates with intervals, the fit of every output, and predictions of data that were not fitted.
+    """Describe estimates with intervals, the fit of every output, and predictions.
 
     Args:
         estimate: The estimate.
@@ -385,7 +387,10 @@ def _residual_table(estimate: Estimate) -> SummaryTable:
 
 
 def _prediction_table(predictions: Sequence[Prediction]) -> SummaryTable:
-    """Tabulate prediction errors of the identified and of the nominal model, for the first outputs."""
+    """Tabulate prediction errors of the identified and of the nominal model.
+
+    At most `MAX_COLUMNS` outputs are shown.
+    """
     outputs = predictions[0].identified.outputs
     measured = [
         j
@@ -560,7 +565,7 @@ def _efficiency_table(
 
 
 def _covariance_tables(study: MonteCarloStudy, units: Sequence[str]) -> list[SummaryTable]:
-    """Tabulate covariance, information and bound of all trajectories; of many parameters, the variances only."""
+    """Tabulate covariance, information and bound; of many parameters, the variances only."""
     if len(study.parameters) > MAX_MATRIX:
         return [_variance_table(study, units)]
     return [
@@ -600,7 +605,10 @@ def _matrix_table(
 
 
 def _variance_table(study: MonteCarloStudy, units: Sequence[str]) -> SummaryTable:
-    """Tabulate observed variance, information and bound of every parameter, trajectories side by side."""
+    """Tabulate observed variance, information and bound of every parameter.
+
+    Trajectories are side by side.
+    """
     cells: list[list[Cell]] = [
         [Name(name=name, unit=unit)] for name, unit in zip(study.parameters, units, strict=True)
     ]
@@ -625,7 +633,7 @@ def _variance_table(study: MonteCarloStudy, units: Sequence[str]) -> SummaryTabl
 
 
 def describe_check(check: Check) -> Summary:
-    """Describe predicted standard deviations, what is identifiable in combination only, and the verdict.
+    """Describe predicted standard deviations, inseparable parameters, and the verdict.
 
     Args:
         check: The check.
@@ -685,7 +693,7 @@ def _check_row(row: ParameterCheck) -> Row:
 
 
 def _group_lines(group: ParameterGroup, check: Check) -> str:
-    """Return a group's members, then one combination a line with its value and standard deviation."""
+    """Return a group's members, and a line per combination with its value and its σ."""
     if not group.combinations:
         return str(group)
 
@@ -723,7 +731,9 @@ def _self_test_sentence(check: Check) -> str:
 
 
 def describe_comparison(comparison: Comparison) -> Summary:
-    """Describe the result of each method with the same budget, in the order in which they ran; then which is the best.
+    """Describe the result of each method with equal budgets, and which is the best.
+
+    Methods are in the order in which they ran.
 
     Args:
         comparison: The comparison.
@@ -835,7 +845,10 @@ def _method_title(comparison: Comparison, row: MethodResult) -> str:
 
 
 def _method_emphasis(comparison: Comparison, row: MethodResult) -> Emphasis:
-    """Emphasis of a method: strong for the design and for methods that are better, weak for results that must not be used."""
+    """Return the emphasis of a method.
+
+    It is strong for the design, a warning for better methods, and weak for unusable results.
+    """
     if not row.sound:
         return Emphasis.WEAK
     if row.method == DESIGN:
@@ -861,7 +874,7 @@ def describe_robustness(result: Robustness) -> Summary:
 
 
 def _unknown_table(result: Robustness) -> SummaryTable:
-    """Tabulate how wrong the guess of every unknown was, and how accurate prediction and estimate are."""
+    """Tabulate the errors of the guess, of the prediction and of the estimate by unknown."""
     rows = []
     for j, name in enumerate(result.names):
         errors = (result.wrong[j], result.predicted[j], result.formal[j], result.observed[j])

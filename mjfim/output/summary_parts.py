@@ -1,4 +1,4 @@
-"""The parts of a summary of results: tables, lists and paragraphs that know neither a terminal nor Markdown nor a figure."""
+"""Tables, lists and paragraphs of a summary, independent of how they are shown."""
 
 from __future__ import annotations
 

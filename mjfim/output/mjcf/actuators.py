@@ -1,4 +1,7 @@
-"""Attributes of MJCF's actuator elements, and the numbers of gain, bias and dynamics that each of them sets."""
+"""Attributes of MJCF's actuator elements.
+
+Each attribute sets some of the numbers of an actuator's gain, bias and dynamics.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ TIME_CONSTANT: tuple[Entry, ...] = (("dynprm", 0, 1.0),)
 
 
 def _muscle(column: int) -> tuple[Entry, ...]:
-    """Entries of a muscle parameter: the passive force has a copy of the active force's parameters."""
+    """Return the entries that a muscle parameter sets: in the active and in the passive force."""
     return (("gainprm", column, 1.0), ("biasprm", column, 1.0))
 
 

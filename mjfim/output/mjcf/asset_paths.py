@@ -72,7 +72,7 @@ def _any_relative(files: Iterable[str]) -> bool:
 
 
 def _relocated(name: str, source: Path, target: Path) -> str:
-    """Name, relative to the target folder, of a file or folder that is named relative to the source folder."""
+    """Return the name, relative to `target`, of a file that is named relative to `source`."""
     if Path(name).is_absolute():
         return name
     return Path(os.path.relpath(source / name, target)).as_posix()

@@ -134,7 +134,9 @@ class MjcfDocument(XmlText):
         min_count: int = 1,
         magnitude: float = 0.0,
     ) -> None:
-        """Write those numbers of an attribute that differ between two models; the others stay as they are written.
+        """Write those numbers of an attribute that differ between two models.
+
+        The other numbers of the attribute keep their spelling.
 
         Args:
             tag: Index of the tag.
@@ -188,7 +190,10 @@ def all_digits(*values: float) -> str:
 
 
 def _named_elements(tags: Sequence[Tag]) -> Iterator[tuple[tuple[str, str], int]]:
-    """Yield (kind, name) and tag of the elements that define exactly one object: neither copied nor generated."""
+    """Yield (kind, name) and the tag of every element that defines exactly one object.
+
+    Elements that MuJoCo copies or generates are left out.
+    """
     tree: set[int] = set()
 
     for i, tag in enumerate(tags):

@@ -1,4 +1,7 @@
-"""Parameter values written into the user's MJCF: each changes the attributes that state it, and nothing else."""
+"""Parameter values written into the user's MJCF.
+
+Each value changes only the attributes that state it.
+"""
 
 from __future__ import annotations
 
@@ -154,7 +157,7 @@ class ParameterEdits:
             self._write_number(kind, name, field, target_field)
 
     def _write_number(self, kind: str, name: str, field: str, target_field: ModelField) -> None:
-        """Write a number that the MJCF states under the name of the field, or a number of an actuator."""
+        """Write a number that the text states by the name of its field, or one of an actuator."""
         if target_field.array.removeprefix("actuator_") in ARRAYS:
             self._write_actuator(name)
             return
@@ -187,7 +190,11 @@ class ParameterEdits:
         return bool(self._spec.compiler.degree and is_hinge)
 
     def _write_option(self, field: str, old: Array, new: Array) -> None:
-        """Write into the last `<option>` that states a field, else into the last one; make one if there is none."""
+        """Write a field of `<option>`.
+
+        The last `<option>` that states the field is changed, else the last one; without any, a new
+        one is made.
+        """
         options = self.document.top_level("option")
         if not options:
             self._new_option[field] = all_digits(*new)
@@ -274,7 +281,7 @@ class ParameterEdits:
         )
 
     def _check_coordinates(self, tag: int, kind: str, name: str) -> None:
-        """Refuse an object whose `pos` and `quat` are not its pose in the coordinates of its body."""
+        """Refuse an object whose pose in its body is not stated by its `pos` and `quat`."""
         parent = self.document.tags[self.document.tags[tag].parent]
         if parent.name == "frame":
             raise ModelError(f"{kind} {name!r} is inside a <frame>")
@@ -290,7 +297,7 @@ def _numbers(model: Any, target_field: ModelField) -> Array:
 
 
 def _derived_rows(model: Any) -> Iterator[tuple[str, str, str, int, int]]:
-    """Yield kind, attribute, array, row and index of every object with a number that the compiler may derive."""
+    """Yield every number that the compiler may derive: kind, attribute, array, row and index."""
     for kind, fields in DERIVED.items():
         for field, array in fields.items():
             # Arrays of degrees of freedom hold a joint in the row of its first one.

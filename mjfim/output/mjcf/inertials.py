@@ -1,4 +1,8 @@
-"""Changes of a body's `<inertial>` element: of single numbers, of its matrix, or a new element where geoms gave the mass."""
+"""Changes of a body's `<inertial>` element.
+
+Single numbers or the whole matrix are changed. A body whose mass came from its geoms gets a new
+element.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +91,7 @@ def _child(document: MjcfDocument, parent: int, name: str) -> int | None:
 def _write_inertia(
     document: MjcfDocument, tag: int, old: Any, wanted: Any, *, body: int, as_matrix: bool
 ) -> None:
-    """Write the inertia matrix of an `<inertial>`, in its present form where that can express it."""
+    """Write the inertia matrix of an `<inertial>`, in its present form if that can express it."""
     before, after = body_inertia(old, body).inertia, body_inertia(wanted, body).inertia
     magnitude = MAGNITUDE_FACTOR * float(np.trace(before))
     is_full = document.attribute(tag, "fullinertia") is not None
@@ -142,7 +146,9 @@ def _principal_inertia(model: Any, body: int) -> dict[str, str]:
 
 
 def _rounded(inertia: Array) -> Array:
-    """(6,) entries of `fullinertia` without the rounding errors of the rotation out of the principal axes.
+    """Return the (6,) entries of `fullinertia` without the rounding errors of a rotation.
+
+    The matrix was rotated out of its principal axes.
 
     These errors are about 1e-16 of the trace and depend on the processor's linear algebra kernel,
     so that 0.013 would be written as 0.01299999999999999 on some machines.
@@ -159,7 +165,7 @@ def _rounded(inertia: Array) -> Array:
 
 
 def _axes_are_measured(model: Any, body: int) -> bool:
-    """Whether a sensor reads the principal axes of a body, so that they matter besides the matrix."""
+    """Return whether a sensor reads a body's principal axes, which matter then."""
     kind = int(mujoco.mjtObj.mjOBJ_BODY)
     is_object = (model.sensor_objtype == kind) & (model.sensor_objid == body)
     is_reference = (model.sensor_reftype == kind) & (model.sensor_refid == body)

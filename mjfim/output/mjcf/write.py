@@ -1,4 +1,7 @@
-"""The user's MJCF with identified values. It is refused unless it compiles to the identified model."""
+"""The user's MJCF with identified values.
+
+A file is written only if it compiles to the identified model.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,9 @@ INVERSE_WEIGHT = "body_invweight0"
 
 
 def write_identified(path: Path, system: System, theta: Array) -> str | None:
-    """Write the user's MJCF with parameter values: the user's text with the numbers replaced, with all their digits.
+    """Write the user's MJCF with parameter values.
+
+    In the user's text the numbers are replaced, with all their digits.
 
     Where the text cannot express the values, MuJoCo prints the model (six significant digits).
 

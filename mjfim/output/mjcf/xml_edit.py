@@ -119,7 +119,9 @@ class XmlText:
         return edited[name] if name in edited else self.tags[tag].attributes.get(name)
 
     def set(self, tag: int, name: str, value: str | None) -> None:
-        """Change the value of an attribute in place, add the attribute after the others, or remove it.
+        """Change or remove an attribute.
+
+        A changed attribute stays in its place; a new one comes after the others.
 
         Args:
             tag: Index of the tag.
@@ -152,7 +154,9 @@ class XmlText:
         self._names[tag] = name
 
     def insert_child(self, parent: int, name: str, attributes: dict[str, str]) -> None:
-        """Add an empty element as the first child of another one, with the indentation of the present first child.
+        """Add an empty element as the first child of another one.
+
+        It gets the indentation of the present first child.
 
         Args:
             parent: Index of the tag of the enclosing element.

@@ -1,4 +1,6 @@
-"""Every figure of the package: each function turns records into a matplotlib Figure, and `save` writes it as PNG.
+"""All figures of the package.
+
+Each function turns records into a matplotlib Figure; `save` writes it as PNG.
 
 Only the modules of this package import matplotlib.
 """

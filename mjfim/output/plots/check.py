@@ -1,4 +1,4 @@
-"""Figure of a check: predicted accuracy of every parameter beside the correlations of the estimates."""
+"""Figure of a check: predicted accuracy of every parameter, and correlations of the estimates."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ DARK_CELL = 0.6
 
 
 def check_figure(check: Check) -> Figure:
-    """Draw predicted and wanted relative standard deviations, and the correlation matrix of the estimates.
+    """Draw predicted and wanted relative standard deviations, and the correlation matrix.
 
     Args:
         check: The check.
@@ -82,7 +82,10 @@ def check_figure(check: Check) -> Figure:
 
 
 def _draw_standard_deviations(axes: Axes, rows: list[ParameterCheck]) -> None:
-    """Draw a bar per parameter, hatched where it is not identifiable alone, and a mark at the wanted value."""
+    """Draw a bar per parameter and a mark at its wanted value.
+
+    The bar is hatched where the parameter is not identifiable alone.
+    """
     relative_std = np.array([row.relative for row in rows])
     wanted = np.array([row.wanted / row.size for row in rows])
     known = np.isfinite(relative_std) & (relative_std > 0.0)
@@ -127,7 +130,7 @@ def _draw_standard_deviations(axes: Axes, rows: list[ParameterCheck]) -> None:
 
 
 def _write_percentages(axes: Axes, relative_std: Array, places: Array, right: float) -> None:
-    """Write relative standard deviations (n,) at the rows `places` (n,), aligned at the right end of the axis."""
+    """Write relative standard deviations (n,) at the rows `places` (n,), aligned at `right`."""
     for value, place in zip(relative_std, places, strict=True):
         axes.text(
             right,
@@ -204,7 +207,7 @@ def _write_correlations(axes: Axes, correlation: Array) -> None:
 
 
 def _mark_confounded(axes: Axes, correlation: Array) -> None:
-    """Draw a dot into the cells of parameters that are hardly distinguishable. correlation: (n, n)."""
+    """Draw a dot into each cell of `correlation` (n, n) with hardly distinguishable parameters."""
     for (i, j), value in np.ndenumerate(correlation):
         if i != j and np.isfinite(value) and abs(value) > CONFOUNDED_CORRELATION:
             axes.plot(j, i, marker="o", color=TEXT_COLOUR, markersize=2.0)

@@ -1,4 +1,4 @@
-"""Figure of a comparison: standard deviations of all methods side by side, and that of the worst combination."""
+"""Figure of a comparison: standard deviations of all methods, and of the worst combination."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ COLOUR_BAR_RATIOS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8)
 
 
 def compare_figure(comparison: Comparison) -> Figure:
-    """Draw each method's standard deviations over the design's (cells), and that of the worst combination (bars).
+    """Draw standard deviations relative to the design's (cells), and the worst combination (bars).
 
     Args:
         comparison: The comparison.
@@ -137,7 +137,10 @@ class _Ratios:
 
 
 def _ratios(comparison: Comparison) -> _Ratios | None:
-    """Divide standard deviations by the design's, else by the scales; None if no parameter is identifiable alone."""
+    """Divide standard deviations by the design's, or by the scales if the design has none.
+
+    The result is None if no parameter is identifiable alone.
+    """
     wanted = list(comparison.wanted)
     design = comparison.design
     against_design = design is not None and bool(np.isfinite(design.std[wanted]).any())
@@ -248,7 +251,7 @@ def _write_ratios(axes: Axes, ratios: _Ratios) -> None:
 
 
 def _draw_worst_combination(axes: Axes, comparison: Comparison) -> None:
-    """Draw the relative standard deviation of the worst combination by method, and its tightest limit in words."""
+    """Draw the relative σ of the worst combination by method, and the tightest limit in words."""
     rows = comparison.rows
     worst = np.array([row.worst_relative_std for row in rows])
     known = worst[np.isfinite(worst)]
@@ -280,7 +283,7 @@ def _draw_worst_combination(axes: Axes, comparison: Comparison) -> None:
 
 
 def _bar_range(axes: Axes, known: Array) -> tuple[float, float]:
-    """Set the axis of the bars, with room for text behind them. known: (n,) finite standard deviations.
+    """Set the axis of the bars for standard deviations `known` (n,), with room for text.
 
     Returns:
         Left end of the axis and right end of the longest bar.

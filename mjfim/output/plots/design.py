@@ -1,4 +1,4 @@
-"""Figures of a design: trajectories, sensitivities of the motion to the parameters, convergence of the optimisation."""
+"""Figures of a design: trajectories, sensitivities of the motion, convergence."""
 
 from __future__ import annotations
 
@@ -69,7 +69,9 @@ class _Panel:
 
 
 def trajectories(design: Design, labels: Labels) -> Figure:
-    """Draw states, controls, and the root of the information's smallest eigenvalue up to time t (the paper's figure 2).
+    """Draw states, controls and the information gathered up to each time (the paper's figure 2).
+
+    The information is the square root of the smallest eigenvalue of the Fisher information.
 
     Args:
         design: The design.
@@ -118,7 +120,10 @@ def trajectories(design: Design, labels: Labels) -> Figure:
 
 
 def _state_panels(labels: Labels) -> list[_Panel]:
-    """Return a panel for every state and control; position and velocity alternate where they pair up."""
+    """Return a panel for every state and control.
+
+    Positions and velocities alternate if there are equally many.
+    """
     positions = _panels("qpos", labels.qpos)
     velocities = _panels("qvel", labels.velocities)
     controls = _panels("ctrl", labels.controls)
@@ -157,7 +162,7 @@ def _draw_state(axes: Axes, design: Design, panel: _Panel) -> None:
 
 
 def _draw_information(axes: Axes, design: Design) -> None:
-    """Draw the root of the smallest eigenvalue accumulated up to each time, with its value at the end."""
+    """Draw the root of the smallest eigenvalue up to each time, with its last value."""
     for evaluation, colour, width in _styled_evaluations(design):
         t = evaluation.trajectory.t
         root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
@@ -178,7 +183,9 @@ def _draw_information(axes: Axes, design: Design) -> None:
 
 
 def sensitivity_phase(design: Design, labels: Labels) -> Figure:
-    """Draw phase plots of the sensitivities psi: a row per degree of freedom, a column per parameter (figure 3).
+    """Draw phase plots of the sensitivities psi (the paper's figure 3).
+
+    There is a row per degree of freedom and a column per parameter.
 
     Args:
         design: The design.
@@ -227,7 +234,10 @@ def _parameter_sizes(design: Design) -> Array:
 
 
 def _least_known_parameters(design: Design) -> NDArray[np.intp]:
-    """Return the wanted parameters of the largest predicted relative standard deviations, in ascending order."""
+    """Return the wanted parameters with the largest predicted relative standard deviations.
+
+    Their numbers are in ascending order.
+    """
     wanted = np.array(design.wanted, dtype=np.intp)
 
     # A parameter that the design does not determine has nothing to show.
@@ -239,7 +249,10 @@ def _least_known_parameters(design: Design) -> NDArray[np.intp]:
 
 
 def _most_sensitive_dofs(design: Design, nv: int) -> NDArray[np.intp]:
-    """Return the degrees of freedom whose positions are most sensitive to relative changes, in ascending order."""
+    """Return the degrees of freedom that react most to relative changes of the parameters.
+
+    Their numbers are in ascending order.
+    """
     relative_psi = np.abs(design.final.sensitivity[:, :nv] * _parameter_sizes(design))
     largest = relative_psi.max(axis=(0, 2))
     descending = np.argsort(-largest, kind="stable")
@@ -359,7 +372,7 @@ def convergence(design: Design) -> Figure:
 def _draw_history(
     axes: Axes, iterations: Array, values: Array, relative: Array | None = None
 ) -> None:
-    """Draw one quantity over the iterations, with its first and last value in the colours of the trajectories.
+    """Draw one quantity over the iterations; dots mark its first and its last value.
 
     Args:
         axes: Axes of the panel; they become logarithmic unless no value is positive.
@@ -390,7 +403,7 @@ def _draw_history(
 
 
 def _mark_rates(panels: NDArray[np.object_], design: Design, iterations: Array) -> None:
-    """Mark the iterations at which the time grid becomes finer, with the rates before and after it [Hz]."""
+    """Mark the iterations at which the time grid becomes finer, with both rates [Hz]."""
     rates = np.array([row.rate for row in design.history])
     for k in np.flatnonzero(np.diff(rates)):
         for axes in panels:

@@ -1,4 +1,4 @@
-"""Figure of a design's limits: the share of each limit that the trajectory uses, at every engine step."""
+"""Figure of a design's limits: the used share of each limit at every engine step."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CURVE_NAME_WIDTH = 24
 
 
 def limits(design: Design) -> Figure:
-    """Draw a panel per kind of limit with all its curves, relative to their bounds; those that come closest are named.
+    """Draw a panel per kind of limit; the curves that come closest to a bound are named.
 
     Args:
         design: A design with limits.
@@ -106,7 +106,7 @@ def _largest_share(usage: LimitUsage) -> float:
 
 
 def _draw_curves(axes: Axes, curves: list[LimitUsage]) -> None:
-    """Draw the curves of one kind; the closest ones are strong and named, the others stay in the background."""
+    """Draw the curves of one kind; those closest to a bound are strong and named, others pale."""
     closest_first = sorted(curves, key=lambda usage: -_largest_share(usage))
     for rank, usage in enumerate(closest_first):
         if rank >= len(NAMED_COLOURS):

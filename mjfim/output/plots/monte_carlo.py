@@ -1,4 +1,4 @@
-"""Figure of a Monte Carlo study: histograms of the estimates of one parameter along each trajectory."""
+"""Figure of a Monte Carlo study: histograms of the estimates of one parameter."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def _bound_std(trials: TrialStatistics, index: int) -> float:
 
 
 def _central_range(values: Array, theta: float, std: float) -> tuple[float, float]:
-    """Return a range that shows most estimates, the true value and four standard deviations of the bound.
+    """Return a range that shows most estimates, the true value and four bounds on each side.
 
     Args:
         values: (n,) estimates [theta-unit].
@@ -143,7 +143,10 @@ def _central_range(values: Array, theta: float, std: float) -> tuple[float, floa
 
 
 def _densities(values: Array, limits: tuple[float, float]) -> tuple[Array, Array]:
-    """Return heights (bins,) and edges (bins+1,) of a histogram; values outside the limits count in the normalisation."""
+    """Return heights (bins,) and edges (bins+1,) of a histogram.
+
+    Values outside the limits count in the normalisation.
+    """
     bins = int(np.clip(2.0 * len(values) ** 0.5, 8, 60))
     counts, edges = np.histogram(values, bins=bins, range=limits)
     heights = counts / (len(values) * np.diff(edges))
@@ -160,7 +163,7 @@ def _normal_density(x: Array, mean: float, std: float) -> Array:
 def _draw_histogram(
     axes: Axes, study: MonteCarloStudy, trajectory: str, index: int, unit: str
 ) -> None:
-    """Draw the estimates along one trajectory, with the true value and the normal curve of the bound."""
+    """Draw the estimates along one trajectory, the true value and the bound's normal curve."""
     trials = study.sets[trajectory]
     name, colour = trajectory_style(trajectory)
     axes.set_title(name, loc="left", fontsize=NORMAL_FONT + 1, color=colour, weight="bold", pad=49)
@@ -195,7 +198,10 @@ def _draw_histogram(
 
 
 def _statistics_in_words(trials: TrialStatistics, index: int, unit: str, hidden: int) -> str:
-    """Write variance, bound, efficiency and counts of one panel; `hidden` estimates lie outside its range."""
+    """Return variance, bound, efficiency and counts of one panel in words.
+
+    `hidden` is the number of estimates outside its range.
+    """
     variance = format_number(float(trials.covariance[index, index]))
     bound = format_number(float(trials.crlb[index, index]))
     efficiency = format_number(float(trials.efficiency[index]))

@@ -1,4 +1,4 @@
-"""Figures with a row per parameter: predicted standard deviations, and estimates with their intervals."""
+"""Figures with a row per parameter: predicted standard deviations, estimates with intervals."""
 
 from __future__ import annotations
 
@@ -67,7 +67,9 @@ class _Accuracies:
 
 
 def std_bars(design: Design, labels: Labels) -> Figure:
-    """Draw the predicted standard deviation of every wanted parameter and combination along both trajectories.
+    """Draw the predicted standard deviations along both trajectories.
+
+    Each wanted parameter and each combination has a row.
 
     Args:
         design: The design.
@@ -136,7 +138,9 @@ def _bar_limits(stds: Array) -> tuple[float, float]:
 
 
 def _draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
-    """Draw the bars of one trajectory; that of an infinite value is hatched and crosses the whole axis.
+    """Draw the bars of one trajectory.
+
+    The bar of an infinite value is hatched and crosses the whole axis.
 
     Args:
         axes: Axes with their final limits.
@@ -178,7 +182,7 @@ def _draw_bars(axes: Axes, std: Array, offset: float, colour: str) -> None:
 
 
 def _write_columns(axes: Axes, accuracies: _Accuracies) -> None:
-    """Write three columns beside the bars: both standard deviations over the value, and their ratio."""
+    """Write three columns beside the bars: both relative standard deviations, and their ratio."""
     with np.errstate(divide="ignore", invalid="ignore"):
         relative_initial = np.abs(accuracies.std_initial / accuracies.values)
         relative_final = np.abs(accuracies.std_final / accuracies.values)
@@ -212,7 +216,10 @@ def _write_at_offset(
     text: str,
     colour: str,
 ) -> None:
-    """Write right-aligned text at an offset [points] from the right end of the axes at a height of a coordinate system."""
+    """Write text that ends at an offset [points] from the right end of the axes.
+
+    `height` is in the coordinates `system`.
+    """
     axes.annotate(
         text,
         (1.0, height),
@@ -296,7 +303,7 @@ def _relative_to_guess(estimate: Estimate) -> _RelativeEstimate:
 
 
 def _interval_limits(relative: _RelativeEstimate) -> tuple[float, float]:
-    """Return the limits of the axis [%]: it holds the guess, all estimates and all intervals of usual width."""
+    """Return the limits of the axis [%]; few very wide intervals do not widen it."""
     known = np.isfinite(relative.centre)
     centre = relative.centre[known]
     reach = np.abs(relative.interval - relative.centre[:, None])[known]
@@ -316,7 +323,10 @@ def _interval_limits(relative: _RelativeEstimate) -> tuple[float, float]:
 
 
 def _draw_interval(axes: Axes, relative: _RelativeEstimate, j: int, *, at_bound: bool) -> None:
-    """Draw one estimate with its formal interval (thick) and its other one (thin); arrows where the axis cuts it off."""
+    """Draw one estimate with its formal interval (thick) and its honest one (thin).
+
+    Arrows mark where the axis cuts an interval off.
+    """
     low, high = axes.get_xlim()
     centre = float(relative.centre[j])
     half = float(relative.formal_half_width[j])

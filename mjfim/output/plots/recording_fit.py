@@ -1,4 +1,4 @@
-"""Figure of an estimate's fit to a recording: measured and predicted outputs, and their residuals."""
+"""Figure of the fit to a recording: measured and predicted outputs, and their residuals."""
 
 from __future__ import annotations
 
@@ -85,7 +85,10 @@ def fit(estimate: Estimate, index: int, labels: Labels, sigma: Sequence[float] |
 
 
 def _checked_noise(estimate: Estimate, index: int, sigma: Sequence[float] | Array) -> Array:
-    """Return sigma as an array (ny,) after a check of the index and of sigma; raise MjfimError for misuse."""
+    """Return sigma as an array (ny,), after a check.
+
+    Raises MjfimError if the recording does not exist or sigma does not fit its outputs.
+    """
     count = len(estimate.recordings)
     if not 0 <= index < count:
         raise MjfimError(f"the estimate has no recording {index}; valid: 0 to {count - 1}")
@@ -98,7 +101,7 @@ def _checked_noise(estimate: Estimate, index: int, sigma: Sequence[float] | Arra
 
 
 def shown_outputs(residual: Array, sigma: Array) -> NDArray[np.intp]:
-    """Return the outputs to draw: all, or those with the largest residuals over sigma, in ascending order.
+    """Return the outputs to draw: of many, those with the largest residuals over sigma.
 
     Args:
         residual: (n, ny) residuals, NaN where nothing was measured [output's unit].
@@ -114,14 +117,14 @@ def shown_outputs(residual: Array, sigma: Array) -> NDArray[np.intp]:
 
 
 def _drawn_samples(count: int) -> tuple[NDArray[np.intp], float]:
-    """Return the samples to draw of a recording with `count` ones, and the size of their dots [points]."""
+    """Return which of `count` samples are drawn, and the size of their dots [points]."""
     rows = evenly_spread_indices(count, MAX_SAMPLES)
     size = float(np.clip(900.0 / len(rows), 1.5, 4.0))
     return rows, size
 
 
 def _draw_outputs(axes: Axes, recording: Recording, predicted: Array, column: int) -> None:
-    """Draw one output: dots for what was measured, a line for what is predicted. predicted: (n, ny)."""
+    """Draw one output: measured samples as dots, `predicted` (n, ny) as a line."""
     rows, size = _drawn_samples(len(recording.t))
     t = recording.t[rows]
     axes.plot(t, recording.y[rows, column], ".", color=MEASURED_COLOUR, markersize=size)
@@ -129,7 +132,7 @@ def _draw_outputs(axes: Axes, recording: Recording, predicted: Array, column: in
 
 
 def _draw_residual(axes: Axes, t: Array, residual: Array, sigma: float) -> None:
-    """Draw the residual of one output over the band of two sigma, and say how many samples lie outside.
+    """Draw the residual of one output over the band of two sigma, with its rms in words.
 
     Args:
         axes: Axes of the panel.

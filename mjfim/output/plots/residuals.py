@@ -1,4 +1,4 @@
-"""Figures of an estimate's residual spectra, and of predictions of recordings that were not fitted."""
+"""Figures of residual spectra, and of predictions of recordings that were not fitted."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ SMALLEST_WRITTEN_P = 1e-6
 
 
 def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
-    """Draw the spectrum of the residuals of every output, relative to white noise of the stated or estimated sigma.
+    """Draw the spectrum of the residuals of every output, relative to white noise of sigma.
 
     Args:
         estimate: The estimate.
@@ -94,7 +94,10 @@ def residual_spectra(estimate: Estimate, labels: Labels) -> Figure:
 
 
 def _scaled_residuals(estimate: Estimate, column: int, sigma: float) -> list[tuple[Array, Array]]:
-    """Return times (n,) [s] and residuals over sigma (n,) of one output, a pair per recording that is long enough."""
+    """Return times (n,) [s] and residuals over sigma (n,) of one output.
+
+    There is a pair per recording that is long enough.
+    """
     parts = []
     for recording, predicted in zip(estimate.recordings, estimate.predicted, strict=True):
         residual = recording.y[:, column] - predicted[:, column]
@@ -105,7 +108,9 @@ def _scaled_residuals(estimate: Estimate, column: int, sigma: float) -> list[tup
 
 
 def _averaged_periodogram(parts: list[tuple[Array, Array]]) -> tuple[Array, Array, float]:
-    """Average the periodograms of several recordings; rows count as evenly spaced at each recording's mean rate.
+    """Average the periodograms of several recordings.
+
+    Rows count as evenly spaced at each recording's mean rate.
 
     Args:
         parts: Times (n,) [s] and residuals (n,) of each recording.
@@ -129,7 +134,7 @@ def _averaged_periodogram(parts: list[tuple[Array, Array]]) -> tuple[Array, Arra
 
 
 def _draw_spectrum(axes: Axes, estimate: Estimate, column: int, sigma: float) -> None:
-    """Draw the spectrum of one output over that of white noise, with the band that holds 95 % of white noise.
+    """Draw the spectrum of one output over that of white noise, with a band of 95 %.
 
     Args:
         axes: Axes of the panel.
@@ -168,7 +173,9 @@ def _draw_spectrum(axes: Axes, estimate: Estimate, column: int, sigma: float) ->
 
 
 def predictions(estimate: Estimate, labels: Labels) -> Figure:
-    """Draw the errors of predictions of recordings that were not fitted, by the identified and the nominal model.
+    """Draw prediction errors of the identified and of the nominal model.
+
+    The predicted recordings were not fitted.
 
     Args:
         estimate: An estimate with predictions.
@@ -238,7 +245,7 @@ def _recording_name(prediction: Prediction) -> str:
 
 
 def _error_ratio(prediction: Prediction, j: int) -> float:
-    """Return the error of the identified model over that of the nominal one; NaN where the latter is 0."""
+    """Return the identified model's error over the nominal model's; NaN if the latter is 0."""
     identified = float(prediction.identified.rms[j])
     nominal = float(prediction.nominal.rms[j])
     return identified / nominal if nominal > 0.0 else float("nan")

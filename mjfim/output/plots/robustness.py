@@ -1,4 +1,4 @@
-"""Figure of a robustness study: margins of the limits, errors, coverage, and errors before and after the experiment."""
+"""Figure of a robustness study: margins of the limits, errors of the estimates, coverage."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LARGEST_DRAWN_ERROR = 5.0
 
 
 def robustness_figure(result: Robustness) -> Figure:
-    """Draw the margins of every limit on every robot, the errors, the coverage, and the errors before and after.
+    """Draw the margins of every limit, the errors, the coverage, and the errors of the guess.
 
     Args:
         result: The study.

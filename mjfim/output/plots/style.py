@@ -68,7 +68,9 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def quotient_unit(unit: str, divisor: str) -> str:
-    """Return the unit of a quotient: `quotient_unit("m", "kg")` is "m/kg"; compound units are put in brackets.
+    """Return the unit of a quotient: `quotient_unit("m", "kg")` is "m/kg".
+
+    Compound units are put in brackets.
 
     Args:
         unit: Unit of the numerator; may be empty.
@@ -303,7 +305,7 @@ def trajectory_handles() -> list[Line2D]:
 
 
 def save(figure: Figure, path: str | os.PathLike[str], dpi: float = 200.0) -> Path:
-    """Write a figure as PNG in one step, so that readers find either the old file or the complete new one.
+    """Write a figure as PNG in one step: readers find the old file or the complete new one.
 
     Args:
         figure: The figure.

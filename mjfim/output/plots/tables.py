@@ -47,7 +47,7 @@ HEADING_WIDTH = 16
 
 
 def design_table(design: Design, labels: Labels) -> Figure:
-    """Draw eigenvalues and cost (the paper's table I), and the predicted standard deviation of every parameter.
+    """Draw eigenvalues and cost (the paper's table I), and predicted standard deviations.
 
     Args:
         design: The design.
@@ -65,7 +65,7 @@ def design_table(design: Design, labels: Labels) -> Figure:
 
 
 def study_table(study: MonteCarloStudy, labels: Labels) -> Figure:
-    """Draw Monte Carlo covariance, Fisher information, Cramér-Rao bound and efficiency (the paper's tables II and III).
+    """Draw covariances, information, bounds and efficiency (the paper's tables II and III).
 
     Args:
         study: The study.

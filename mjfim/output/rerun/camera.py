@@ -1,4 +1,4 @@
-"""Camera of the 3D views of a Rerun recording: one for all robots, such that everything that moves is in view."""
+"""Camera of the 3D views of a Rerun recording, shared by all robots."""
 
 from __future__ import annotations
 
@@ -62,7 +62,9 @@ class Camera:
 def place_camera(
     model: mujoco.MjModel, motions: Sequence[BodyPoses], views: int, aspect: float
 ) -> Camera:
-    """Place a camera that has all moving geoms of every motion in view; the whole model where nothing moves.
+    """Place a camera that has all moving geoms of every motion in view.
+
+    If nothing moves, the whole model is in view.
 
     Args:
         model: The model.
@@ -95,7 +97,10 @@ def place_camera(
 
 
 def _moving_points(model: mujoco.MjModel, motions: Sequence[BodyPoses]) -> list[Array]:
-    """Return (samples, n, 3) world paths of the corners of all moving geoms along each motion [m]."""
+    """Return (samples, n, 3) world paths of the corners of all moving geoms [m].
+
+    There is an array for each motion.
+    """
     bodies, points = _moving_corners(model)
     clouds = []
     for poses in motions:
@@ -133,7 +138,10 @@ def _extents(clouds: Sequence[Array]) -> Array:
 
 
 def _view_direction(extents: Array) -> Array:
-    """Return the (3,) unit vector towards the camera: along the normal of a planar motion, else from the front right."""
+    """Return the (3,) unit vector towards the camera.
+
+    It is along the normal of a planar motion, else from the front right.
+    """
     x, y = extents[0], extents[1]
     if y < PLANAR_RATIO * x:
         direction = np.array(TOWARDS_CAMERA_XZ)
@@ -154,7 +162,10 @@ def _camera_axes(towards_camera: Array) -> Array:
 def _bounding_box(
     model: mujoco.MjModel, clouds: Sequence[Array], axes: Array
 ) -> tuple[Array, Array]:
-    """Return the (3,) lower and upper ends of all points along the camera's axes [m]; of the model if nothing moves."""
+    """Return the (3,) lower and upper ends of all points along the camera's axes [m].
+
+    If nothing moves, they enclose the model.
+    """
     seen = np.concatenate([(cloud @ axes.T).reshape(-1, 3) for cloud in clouds])
     if len(seen):
         low, high = seen.min(axis=0), seen.max(axis=0)

@@ -69,7 +69,7 @@ MAX_SAMPLES = 20_000
 def log_design(
     path: Path, model: mujoco.MjModel, design: Design, labels: Labels, *, addition: str = ""
 ) -> None:
-    """Write design.rrd: both robots, states, controls, information, sensitivities, history and a summary.
+    """Write design.rrd: both robots, their signals, sensitivities, history and a summary.
 
     Args:
         path: The file.
@@ -116,7 +116,10 @@ def _log_information(
     name: str,
     style: RobotStyle,
 ) -> None:
-    """Log the root of the information's smallest eigenvalue over time, and the sensitivities of one trajectory."""
+    """Log the information over time and the sensitivities of one trajectory.
+
+    The information is the root of its smallest eigenvalue.
+    """
     t = evaluation.trajectory.t
     root = np.sqrt(np.maximum(evaluation.min_eigenvalue, 0.0))
     log_line(rec, ("information", name), t, root, name=name, style=style)
@@ -125,7 +128,10 @@ def _log_information(
 
 
 def _design_panels(design: Design, labels: Labels, plots: Sequence[PhasePlot]) -> list[LayoutPart]:
-    """Return the signals of a design; the history has its own tab, since the viewer draws one timeline at a time."""
+    """Return the signals of a design.
+
+    The history has a tab for itself, because the viewer draws one timeline at a time.
+    """
     states = state_parts(labels)
     title = "√λ_min of the information so far [√s / θ-unit]"
     information = series_view(("information",), title)
@@ -155,7 +161,7 @@ def log_estimate(
     *,
     addition: str = "",
 ) -> None:
-    """Write estimate.rrd: predicted and measured robot and outputs, residuals and the estimated parameters.
+    """Write estimate.rrd: predicted and measured robot and outputs, residuals and a summary.
 
     Args:
         path: The file.
@@ -295,7 +301,7 @@ def _log_states(
     name: str,
     style: RobotStyle,
 ) -> None:
-    """Log every position, velocity and control of a trajectory as series with the trajectory's name."""
+    """Log positions, velocities and controls as series with the trajectory's name."""
     t = trajectory.t
     positions = dof_positions(model, trajectory.qpos)
     for label, values in zip(labels.positions, positions.T, strict=True):

@@ -1,4 +1,7 @@
-"""History of an optimisation in Rerun: series on the timeline `iteration`, and static bars, visible on every timeline."""
+"""History of an optimisation in Rerun.
+
+Series are on the timeline `iteration`; static bars are visible on every timeline.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,7 @@ def history_series(history: Sequence[HistoryRow]) -> dict[str, Series]:
 def log_history(
     rec: rr.RecordingStream, history: Sequence[HistoryRow], styles: Sequence[RobotStyle]
 ) -> None:
-    """Log every series on the timeline `iteration`, and as static bars over the number of the iteration.
+    """Log every series on the timeline `iteration`, and as static bars.
 
     Args:
         rec: The recording.

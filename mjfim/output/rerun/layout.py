@@ -1,4 +1,7 @@
-"""Layout of a Rerun recording: robots and text on the left, signals on the right; and the file that holds both."""
+"""Layout of a Rerun recording, and the stream that writes the file.
+
+Robots and text are on the left, signals on the right.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +49,7 @@ OUTPUT_COLUMNS, OUTPUTS_PER_PAGE = 2, 6
 def open_recording(
     path: Path, model: mujoco.MjModel, kind: str, layout: rrb.Container
 ) -> Iterator[rr.RecordingStream]:
-    """Open a stream into a temporary file beside a path; the file replaces that path once it is complete.
+    """Open a stream into a temporary file, which replaces `path` once it is complete.
 
     Args:
         path: The file.
@@ -127,7 +130,7 @@ def robot_views(
 
 
 def state_parts(labels: Labels) -> list[LayoutPart]:
-    """Return positions, velocities and controls: all visible for small models, in tabs for large ones.
+    """Return panels of positions, velocities and controls; those of large models are in tabs.
 
     Args:
         labels: Labels of the model's columns.

@@ -1,4 +1,4 @@
-"""Panels of a Rerun recording that show signals over simulated time: their logged series, their views and the layout."""
+"""Panels of signals over simulated time: their logged series, views and layout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Phase plots of the sensitivities in Rerun: position and velocity per unit of a parameter, as a curve in the plane."""
+"""Phase plots of the sensitivities in Rerun.
+
+A curve shows how position and velocity change per unit of a parameter.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +58,7 @@ class PhasePlot:
 
     @classmethod
     def of_most_sensitive(cls, design: Design, index: int, nv: int) -> PhasePlot:
-        """Return the plot of the degree of freedom on whose position a parameter has most influence.
+        """Return the plot of the degree of freedom whose position reacts most to a parameter.
 
         Args:
             design: The design; its final trajectory decides.
@@ -162,7 +165,9 @@ class PhasePlot:
 
 
 def parameters_with_phase_plot(design: Design) -> list[int]:
-    """Return the wanted parameters that move something; of many, those of the largest relative standard deviation.
+    """Return the wanted parameters that change the motion.
+
+    Of many, those with the largest relative standard deviations are returned.
 
     Args:
         design: The design.

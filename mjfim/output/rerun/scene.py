@@ -1,4 +1,7 @@
-"""Robots that move in Rerun: all bodies directly under one entity with their world poses, geoms as static children."""
+"""Robots that move in Rerun.
+
+All bodies are directly under one entity with their world poses; geoms are their static children.
+"""
 
 from __future__ import annotations
 
@@ -199,7 +202,10 @@ def _log_fixed_pose(rec: rr.RecordingStream, path: str, poses: BodyPoses, body: 
 def _log_motion(
     rec: rr.RecordingStream, path: str, poses: BodyPoses, body: int, *, on_iteration: bool
 ) -> None:
-    """Log the poses of a moving body, a row per sample; none is static, since static data would override them."""
+    """Log the poses of a moving body, a row per sample.
+
+    No pose is static, because static data would override the others.
+    """
     xyz = poses.positions[:, body]
     xyzw = np.roll(poses.quaternions[:, body], -1, axis=1)
     rows = rr.Transform3D.columns(translation=xyz, quaternion=xyzw)
@@ -217,7 +223,7 @@ def _log_shapes(
     body: int,
     style: RobotStyle,
 ) -> None:
-    """Log the geoms of one body in its frame; a moving body without geoms is drawn as a stick figure."""
+    """Log the geoms of one body; a moving body without geoms is drawn as a stick figure."""
     moving = is_moving(model, body)
     geoms = drawn_geoms(model, body)
     for geom in geoms:
@@ -264,7 +270,9 @@ def _moving_centres(model: mujoco.MjModel) -> tuple[NDArray[np.intp], Array]:
 
 
 def _end_path(model: mujoco.MjModel, poses: BodyPoses) -> Array:
-    """Return the path of the robot's end: of the points deepest in the tree, the one that travels farthest.
+    """Return the path of the robot's end.
+
+    Of the points deepest in the tree, it is the one that travels farthest.
 
     Returns:
         (N+1, 3) world path [m]; (0, 3) where nothing moves.

@@ -1,4 +1,4 @@
-"""Geoms of a MuJoCo model as Rerun archetypes, each in its own frame, and the colours in which robots are drawn."""
+"""Geoms of a MuJoCo model as Rerun archetypes, and the colours of robots."""
 
 from __future__ import annotations
 
@@ -73,7 +73,9 @@ class RobotStyle:
 
 
 def drawn_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return the geoms that MuJoCo's viewer shows; those of hidden groups if the body has no others.
+    """Return the geoms that MuJoCo's viewer shows.
+
+    If a body has geoms of hidden groups only, these are returned.
 
     Args:
         model: The model.
@@ -87,7 +89,9 @@ def drawn_geoms(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
-    """Return the colour (0..1) of a geom: its material's unless the geom sets one, as in MuJoCo's renderer.
+    """Return the colour (0..1) of a geom, as MuJoCo's renderer chooses it.
+
+    The colour of the material counts unless the geom sets one.
 
     Args:
         model: The model.
@@ -135,7 +139,7 @@ def geom_shape(model: mujoco.MjModel, geom: int, rgba: list[int]) -> rr.AsCompon
 
 
 def stick_figure(model: mujoco.MjModel, body: int, rgba: list[int]) -> tuple[rr.AsComponents, ...]:
-    """Return a ball at the origin of a body without geoms, and sticks to the origins of its children.
+    """Return shapes for a body without geoms: a ball, and sticks to its children.
 
     Args:
         model: The model.
@@ -193,7 +197,10 @@ def _ground_plane(
 
 
 def _checkerboard(half_sizes: tuple[float, float], rgba: list[int]) -> rr.Mesh3D:
-    """Return the plane z = 0 as a board of squares in two tones, so that depth can be seen. half_sizes: x, y [m]."""
+    """Return the plane z = 0 as a board of squares in two tones, which shows depth.
+
+    `half_sizes` are along x and y [m].
+    """
     indices = np.arange(BOARD_SQUARES)
     i, j = (index.ravel() for index in np.meshgrid(indices, indices, indexing="ij"))
 
@@ -218,7 +225,10 @@ def _checkerboard(half_sizes: tuple[float, float], rgba: list[int]) -> rr.Mesh3D
 def _two_triangles(
     first_corners: NDArray[np.intp], one: tuple[int, ...], other: tuple[int, ...]
 ) -> NDArray[np.intp]:
-    """Return (2n, 3) triangles, two for each of n squares: the first corners (n, 1) plus the shifts of the corners."""
+    """Return (2n, 3) triangles, two for each of n squares.
+
+    Corners are the first corners (n, 1) plus the shifts `one` and `other`.
+    """
     return np.concatenate([first_corners + np.array(one), first_corners + np.array(other)])
 
 
@@ -250,7 +260,10 @@ def _height_field(model: mujoco.MjModel, field: int, rgba: list[int]) -> rr.Mesh
 
 
 def _mesh(model: mujoco.MjModel, index: int, rgba: list[int]) -> rr.Mesh3D:
-    """Return a compiled mesh, which MuJoCo has centred; it has a vertex for every distinct pair of vertex and normal."""
+    """Return a compiled mesh, which MuJoCo has centred.
+
+    It has a vertex for every distinct pair of vertex and normal.
+    """
     first = int(model.mesh_faceadr[index])
     faces = slice(first, first + int(model.mesh_facenum[index]))
     vertex_indices = model.mesh_face[faces].ravel()

@@ -40,7 +40,7 @@ def estimate_text(estimate: Estimate, addition: str = "") -> str:
 
 
 def render(summary: Summary, legend: str = "", addition: str = "") -> str:
-    """Render a summary as Markdown: how the work ended and warnings first, then all tables and sentences.
+    """Render a summary as Markdown: outcome and warnings first, then tables and sentences.
 
     Args:
         summary: The summary.

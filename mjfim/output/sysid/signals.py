@@ -1,4 +1,4 @@
-"""Outputs of an experiment as signals of `mujoco.sysid`, and the comparison of measured and predicted signals.
+"""Outputs of an experiment as signals of `mujoco.sysid`, and their residuals.
 
 sysid stamps the sensor values of a step with the time after the step, though they belong to the
 state before it; states are not delayed. So positions and velocities become state signals, and
@@ -127,7 +127,7 @@ class WhitenedComparison:
         state: Array,
         **_: Any,
     ) -> tuple[Array, Any, Any]:
-        """Return the residuals of all measured values in one row, and both TimeSeries after the start.
+        """Return the residuals of all measured values, and both TimeSeries after time 0.
 
         Args:
             params: Parameters, not used.
