@@ -57,7 +57,7 @@ def check(
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
     if output is not None:
         with writing(output) as results:
-            results.leave_check(output, result)
+            results.write_check_folder(output, result)
     print_result(as_json, result.summary(), render(describe_check(result)))
     if output is not None:
         errors.print(f"wrote {output}/")

@@ -59,7 +59,7 @@ def compare(
     if not result.rows:
         raise NoResultError
     with writing(output) as results:
-        results.leave_comparison(output, result, task.system)
+        results.write_comparison_folder(output, result, task.system)
     print_result(as_json, result.summary(), render(describe_comparison(result)))
     errors.print(f"wrote {output}/")
     if not result.ok:

@@ -81,7 +81,7 @@ def design(
     if found is not None:
         task = DesignTask.resolve(found.experiment, threads=threads)
     with writing(output) as results:
-        results.leave_design(output, result, task.system)
+        results.write_design_folder(output, result, task.system)
         if found is not None:
             write_json(output / "shortest.json", found.summary())
     summary = result.summary()

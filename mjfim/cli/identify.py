@@ -70,7 +70,7 @@ def identify(
             callback=show,
         )
     with writing(output) as results:
-        for sentence in results.leave_estimate(output, result, system):
+        for sentence in results.write_estimate_folder(output, result, system):
             errors.print(f"warning: {sentence}", markup=False)
     print_result(
         as_json,

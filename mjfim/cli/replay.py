@@ -15,7 +15,7 @@ from mjfim.cli.common import errors, verb
 from mjfim.errors import RecordingError
 from mjfim.experiment.system import System
 from mjfim.output import archive
-from mjfim.output.folders import check_file, experiment_beside, recording_of
+from mjfim.output.folders import check_file, find_experiment_file, find_rerun_file
 from mjfim.output.labels import Labels
 
 
@@ -42,7 +42,9 @@ def replay(
     if save is not None:
         check_file(save)
     if source.suffix == ".npz":
-        system = System.resolve(mjfim.Experiment.from_file(experiment or experiment_beside(source)))
+        system = System.resolve(
+            mjfim.Experiment.from_file(experiment or find_experiment_file(source))
+        )
         named = archive.read_design(source)
         for trajectory in named.values():
             archive.check_fits(source, trajectory, system)
@@ -50,7 +52,7 @@ def replay(
             target, system.model_at(system.theta), named, Labels.of_system(system)
         )
     else:
-        found = recording_of(source)
+        found = find_rerun_file(source)
         if save is not None:
             with replacing(save) as temporary:
                 shutil.copyfile(found, temporary)

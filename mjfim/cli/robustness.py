@@ -99,7 +99,7 @@ def robustness(
 
     seconds = time.perf_counter() - clock
     with writing(output) as results:
-        results.leave_robustness(output, result, seconds)
+        results.write_robustness_folder(output, result, seconds)
     out.print(render(describe_robustness(result)))
     errors.print(
         f"{result.runs} runs in {seconds:.0f} s; wrote playback.json, playback.npz, playback.png "

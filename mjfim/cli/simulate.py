@@ -74,7 +74,7 @@ def montecarlo(
     if not study.sets:
         raise NoResultError
     with writing(output) as results:
-        results.leave_study(output, study, system)
+        results.write_study_folder(output, study, system)
     print_result(as_json, study.summary(), render(describe_study(study, system.units)))
     errors.print(f"wrote {output}/")
     if len(study.sets) < len(named):

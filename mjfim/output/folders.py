@@ -22,7 +22,7 @@ from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import read_json, write_json
 
 
-def recording_of(source: Path) -> Path:
+def find_rerun_file(source: Path) -> Path:
     """Find the Rerun file that a folder of results or a file names.
 
     Args:
@@ -48,7 +48,7 @@ def recording_of(source: Path) -> Path:
     return source
 
 
-def experiment_beside(source: Path) -> Path:
+def find_experiment_file(source: Path) -> Path:
     """Find the experiment file that the design.json beside a design.npz names.
 
     Args:
@@ -102,7 +102,7 @@ def check_file(path: Path) -> None:
     check_folder(path.parent)
 
 
-def leave_design(folder: Path, design: Design, system: System) -> None:
+def write_design_folder(folder: Path, design: Design, system: System) -> None:
     """Write a design's files, its Rerun file and its figures.
 
     Args:
@@ -128,7 +128,7 @@ def leave_design(folder: Path, design: Design, system: System) -> None:
     rerun_log.log_design(folder / "design.rrd", system.model_at(system.theta), design, labels)
 
 
-def leave_check(folder: Path, check: Check) -> None:
+def write_check_folder(folder: Path, check: Check) -> None:
     """Write check.json, check.npz and a figure of accuracies and correlations.
 
     Args:
@@ -139,7 +139,7 @@ def leave_check(folder: Path, check: Check) -> None:
     plots.save(plots.check_figure(check), folder / "check.png")
 
 
-def leave_robustness(folder: Path, result: Robustness, seconds: float) -> None:
+def write_robustness_folder(folder: Path, result: Robustness, seconds: float) -> None:
     """Write playback.json, playback.npz and a figure of limits, errors and coverage.
 
     Args:
@@ -152,7 +152,7 @@ def leave_robustness(folder: Path, result: Robustness, seconds: float) -> None:
     plots.save(plots.robustness_figure(result), folder / "playback.png")
 
 
-def leave_comparison(folder: Path, comparison: Comparison, system: System) -> None:
+def write_comparison_folder(folder: Path, comparison: Comparison, system: System) -> None:
     """Write compare.json, compare.npz, a figure, and the control of each method.
 
     An experiment can read each control as its `initial.control`.
@@ -170,7 +170,7 @@ def leave_comparison(folder: Path, comparison: Comparison, system: System) -> No
     plots.save(plots.compare_figure(comparison), folder / "compare.png")
 
 
-def leave_estimate(folder: Path, estimate: Estimate, system: System) -> list[str]:
+def write_estimate_folder(folder: Path, estimate: Estimate, system: System) -> list[str]:
     """Write estimate.json, estimate.npz, identified.xml, estimate.rrd and figures.
 
     Args:
@@ -193,7 +193,7 @@ def leave_estimate(folder: Path, estimate: Estimate, system: System) -> list[str
         remarks.append(str(error))
 
     labels = Labels.of_system(system)
-    _leave_fit_figures(folder, estimate, labels)
+    _write_fit_figures(folder, estimate, labels)
     if estimate.motion is not None:
         measured = measured_trajectory(system, estimate.recordings[0])
         model = system.model_at(estimate.theta)
@@ -202,7 +202,7 @@ def leave_estimate(folder: Path, estimate: Estimate, system: System) -> list[str
     return remarks
 
 
-def _leave_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None:
+def _write_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None:
     """Write figures of parameters, residuals and predictions, and of the fit of each recording."""
     sigma = list(estimate.sigma.values())
     for i in range(len(estimate.recordings)):
@@ -215,7 +215,7 @@ def _leave_fit_figures(folder: Path, estimate: Estimate, labels: Labels) -> None
         plots.save(plots.predictions(estimate, labels), folder / "predictions.png")
 
 
-def leave_study(folder: Path, study: MonteCarloStudy, system: System) -> None:
+def write_study_folder(folder: Path, study: MonteCarloStudy, system: System) -> None:
     """Write montecarlo.json, montecarlo.npz, a histogram per parameter, and the tables as a figure.
 
     Args:

@@ -235,7 +235,7 @@ def test_reports_name_the_parameters(
     study: Path, recorded: Path, archived: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without --json stdout is for people: every number in full, whatever the terminal."""
-    for name in ("leave_design", "leave_estimate", "leave_study"):
+    for name in ("write_design_folder", "write_estimate_folder", "write_study_folder"):
         monkeypatch.setattr(results, name, lambda *_: [])
     for words in (
         ("design", study),
@@ -255,7 +255,7 @@ def test_reports_name_the_parameters(
 @pytest.fixture
 def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where files are not the question, drawing them would only take time."""
-    for name in ("leave_design", "leave_estimate", "leave_study"):
+    for name in ("write_design_folder", "write_estimate_folder", "write_study_folder"):
         monkeypatch.setattr(results, name, lambda *_: [])
 
 

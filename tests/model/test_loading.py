@@ -64,7 +64,7 @@ def test_a_short_design_improves_and_leaves_everything(name: str, tmp_path: Path
     design = design_task(task)
     assert design.final.cost < design.initial.cost
     folder = tmp_path / "out"
-    results.leave_design(folder, design, task.system)
+    results.write_design_folder(folder, design, task.system)
     assert names(folder) == DESIGN | ({"limits.png"} if design.usage else set())
     told = read(folder / "design.json")
     assert len(told["final"]["std"]) == len(told["parameters"])
