@@ -70,14 +70,23 @@ RENAMED = {
     "shortest": "shortest_experiment",
 }
 
+# Names of earlier versions that several names replace.
+REPLACED = {
+    "Setup": "mjfim.experiment.System and mjfim.excitation.DesignTask",
+}
+
 
 def __getattr__(name: str) -> object:
     """Name the new name of a function or record that was renamed.
 
     Raises:
-        AttributeError: Always; the message names the new name where there is one.
+        ImportError: The name was renamed; the message names the new one. An AttributeError would be
+            replaced by Python in `from mjfim import name`, together with its message.
+        AttributeError: The name does not exist and did not exist before.
     """
-    message = f"module 'mjfim' has no attribute {name!r}"
     if name in RENAMED:
-        message += f": it is called {RENAMED[name]!r} now"
-    raise AttributeError(message)
+        raise ImportError(f"mjfim.{name} is called mjfim.{RENAMED[name]} now")
+    if name in REPLACED:
+        raise ImportError(f"mjfim.{name} does not exist any more: use {REPLACED[name]}")
+
+    raise AttributeError(f"module 'mjfim' has no attribute {name!r}")

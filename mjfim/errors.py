@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
-from typing import ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, ParamSpec, TypeVar
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
-# Arguments of the public functions that were renamed, each with its new name.
+# Arguments of the public functions that were renamed, each with its new name and what to pass now.
 RENAMED_ARGUMENTS = {
-    "monitor": "callback",
-    "tell": "callback",
-    "progress": "callback",
-    "report": "callback",
+    "monitor": ("callback", "which is called with one event"),
+    "tell": ("callback", "which is called with one event"),
+    "progress": ("callback", "which is called with one event"),
+    "report": ("callback", "which is called with one event"),
+    "start": ("initial_control", "an (N, nu) array"),
 }
 
 
@@ -80,12 +81,34 @@ def explain_renamed_arguments(function: Callable[Arguments, Result]) -> Callable
 
     @functools.wraps(function)
     def checked(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        for old, new in RENAMED_ARGUMENTS.items():
+        for old, (new, meaning) in RENAMED_ARGUMENTS.items():
             if old in kwargs and old not in known and new in known:
                 raise TypeError(
-                    f"{function.__name__}() has no argument {old!r} any more: use {new!r}, which "
-                    "is called with one event"
+                    f"{function.__name__}() has no argument {old!r} any more: use {new!r}, "
+                    f"{meaning}"
                 )
         return function(*args, **kwargs)
 
     return checked
+
+
+class RenamedFields:
+    """Base of records whose fields were renamed: an old name is an error that names the new one.
+
+    Attributes:
+        renamed_fields: Names of fields in earlier versions, each with its new name.
+    """
+
+    renamed_fields: ClassVar[Mapping[str, str]] = {}
+
+    # A type checker must not take this for a promise that every attribute exists.
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Raise AttributeError; called only where there is no attribute of this name."""
+            record = type(self).__name__
+            if name in type(self).renamed_fields:
+                new = type(self).renamed_fields[name]
+                raise AttributeError(f"{record}.{name} is called {record}.{new} now")
+
+            raise AttributeError(f"{record!r} object has no attribute {name!r}")

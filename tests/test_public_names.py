@@ -32,8 +32,15 @@ def test_all_public_names_exist() -> None:
 def test_an_old_name_is_an_error_that_names_the_new_one(old: str, new: str) -> None:
     assert old not in mjfim.__all__
     assert new in mjfim.__all__
-    with pytest.raises(AttributeError, match=f"{old}.*{new}"):
+    with pytest.raises(ImportError, match=f"{old}.*{new}"):
         getattr(mjfim, old)
+    with pytest.raises(ImportError, match=f"{old}.*{new}"):
+        exec(f"from mjfim import {old}")
+
+
+def test_the_setup_of_earlier_versions_is_an_error_that_names_system_and_task() -> None:
+    with pytest.raises(ImportError, match=r"Setup.*System.*DesignTask"):
+        mjfim.Setup  # noqa: B018 - the attribute does not exist
 
 
 def test_an_unknown_name_is_an_ordinary_error() -> None:
@@ -47,6 +54,12 @@ def test_an_old_argument_is_an_error_that_names_the_new_one(verb: str, old: str)
     experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
     with pytest.raises(TypeError, match=f"{old}.*callback"):
         getattr(mjfim, verb)(experiment, **{old: print})
+
+
+def test_the_old_name_of_the_initial_control_is_an_error_that_names_the_new_one() -> None:
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    with pytest.raises(TypeError, match=r"start.*initial_control"):
+        mjfim.design(experiment, start=None)  # type: ignore[call-arg]
 
 
 def test_an_argument_that_the_function_has_is_passed_on() -> None:

@@ -76,19 +76,25 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
     )
 
 
-def evaluate(experiment: Experiment, trajectory: Trajectory) -> Evaluation:
+def evaluate(
+    experiment: Experiment, trajectory: Trajectory, *, threads: int | None = None
+) -> Evaluation:
     """Evaluate the information and the cost along the control of a given trajectory, at the experiment's theta.
 
     Args:
         experiment: The experiment.
         trajectory: The trajectory whose control is simulated.
+        threads: Threads for the engine; default: one per core.
+
+    Returns:
+        The information, the standard deviations and the cost along the simulated trajectory.
 
     Raises:
         ExperimentError: Something is wrong or missing in the experiment; the message names the key.
         ModelError: The model cannot be used.
         SimulationDivergedError: The simulation diverges under this control.
     """
-    return evaluate_task(DesignTask.resolve(experiment), trajectory)
+    return evaluate_task(DesignTask.resolve(experiment, threads=threads), trajectory)
 
 
 def evaluate_task(task: DesignTask, trajectory: Trajectory) -> Evaluation:

@@ -1,1 +1,11 @@
 """What the user states (schema), and the system that it resolves to."""
+
+from mjfim.experiment.schema import Experiment, json_schema
+from mjfim.experiment.system import System, TimeGrid
+
+__all__ = [
+    "Experiment",
+    "System",
+    "TimeGrid",
+    "json_schema",
+]

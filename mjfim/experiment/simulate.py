@@ -12,7 +12,11 @@ from mjfim.records.trajectory import Trajectory
 
 
 def simulate(
-    experiment: Experiment, trajectory: Trajectory, seed: int | np.random.Generator = 0
+    experiment: Experiment,
+    trajectory: Trajectory,
+    seed: int | np.random.Generator = 0,
+    *,
+    threads: int | None = None,
 ) -> Recording:
     """Simulate a recording at the `true` parameter values.
 
@@ -22,6 +26,7 @@ def simulate(
         experiment: The experiment.
         trajectory: The trajectory whose control is played.
         seed: Seed of the noise, or a generator of random numbers.
+        threads: Threads for the engine; default: one per core.
 
     Returns:
         The recording; outputs that are not measured at a sample are NaN.
@@ -29,7 +34,7 @@ def simulate(
     Raises:
         SimulationDivergedError: The simulation diverges under this control.
     """
-    return simulate_system(System.resolve(experiment), trajectory, seed)
+    return simulate_system(System.resolve(experiment, threads=threads), trajectory, seed)
 
 
 def simulate_system(

@@ -92,7 +92,7 @@ class FitTask:
         if settings.noise == "estimated" and system.noise.correlated:
             raise ExperimentError(
                 f'{system.experiment.source}: fit.noise = "estimated" assumes uncorrelated outputs; '
-                "remove `noise.correlated`"
+                "remove `correlated`"
             )
 
         return cls(

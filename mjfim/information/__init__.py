@@ -9,3 +9,17 @@ Modules:
     identifiability: Null spaces along the trajectory of an experiment and along random ones.
     smoothness: Detection of derivatives that do not exist.
 """
+
+from mjfim.information.criteria import Criterion
+from mjfim.information.fisher import FisherInformation
+from mjfim.information.identifiability import IdentifiabilityTest
+from mjfim.information.marginal import standard_deviations
+from mjfim.information.null_space import NullSpace
+
+__all__ = [
+    "Criterion",
+    "FisherInformation",
+    "IdentifiabilityTest",
+    "NullSpace",
+    "standard_deviations",
+]

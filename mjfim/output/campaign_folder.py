@@ -172,7 +172,7 @@ class CampaignFolder:
         finished.estimate.save(self.round(finished.number))
 
     def write_campaign(self, campaign: Campaign, *, simulated: bool) -> str:
-        """Write campaign.json, campaign.png and identified.xml.
+        """Write campaign.json, campaign.npz, campaign.png and identified.xml.
 
         Args:
             campaign: The campaign.
@@ -181,6 +181,7 @@ class CampaignFolder:
         Returns:
             A warning where identified.xml could not be written; else empty.
         """
+        campaign.save_archive(self.path)
         write_json(self.path / "campaign.json", self._summary(campaign, simulated=simulated))
         if campaign.estimate is None:
             return ""

@@ -10,3 +10,17 @@ Modules:
     delay: Time delay of the outputs.
     active_constraints: Contacts, limits, friction and clamps that act along a trajectory.
 """
+
+from mjfim.plant.derivatives import Derivatives
+from mjfim.plant.noise import Noise
+from mjfim.plant.outputs import Outputs
+from mjfim.plant.plant import Plant
+from mjfim.plant.state_space import StateSpace
+
+__all__ = [
+    "Derivatives",
+    "Noise",
+    "Outputs",
+    "Plant",
+    "StateSpace",
+]

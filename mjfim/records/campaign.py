@@ -117,7 +117,7 @@ class Campaign(SavedRecord):
     warnings: tuple[str, ...] = ()
 
     file_stem: ClassVar[str] = "campaign"
-    made_by: ClassVar[str] = "Campaign.save"
+    made_by: ClassVar[str] = "`mjfim campaign EXPERIMENT -o DIR`"
 
     def __post_init__(self) -> None:
         freeze(self, "wanted")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -206,6 +207,10 @@ class Check(SavedRecord):
 
     file_stem: ClassVar[str] = "check"
     made_by: ClassVar[str] = "`mjfim check EXPERIMENT -o DIR`"
+    renamed_fields: ClassVar[Mapping[str, str]] = {
+        "never": "not_separable",
+        "not_here": "not_excited",
+    }
 
     def __post_init__(self) -> None:
         freeze(self, "information", "eigenvalues", "correlation")

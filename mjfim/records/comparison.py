@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, ClassVar
@@ -9,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.errors import RenamedFields
 from mjfim.records.serialization import SavedRecord
 
 # Key of mjfim's own design among the methods.
@@ -29,7 +31,7 @@ class MethodOutcome(Enum):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MethodResult:
+class MethodResult(RenamedFields):
     """The best control that one method found. Without a control, numbers are NaN.
 
     Attributes:
@@ -66,6 +68,12 @@ class MethodResult:
     relative_margins: dict[str, float]
     found_by: str = ""
     note: str = ""
+
+    renamed_fields: ClassVar[Mapping[str, str]] = {
+        "smallest": "min_eigenvalue",
+        "worst": "worst_relative_std",
+        "shares": "relative_margins",
+    }
 
     def __post_init__(self) -> None:
         freeze(self, "std")

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mjfim.arrays import Array, freeze
+from mjfim.errors import RenamedFields
 from mjfim.records.serialization import SavedRecord
 from mjfim.records.trajectory import Trajectory
 
@@ -18,7 +19,7 @@ TRAJECTORY_ARRAYS = ("t", "qpos", "qvel", "act", "ctrl")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Evaluation:
+class Evaluation(SavedRecord):
     """A trajectory and the information that it carries about the parameters.
 
     Attributes:
@@ -49,6 +50,9 @@ class Evaluation:
     criterion: float
     cost: float
     growth: float = float("nan")
+
+    file_stem: ClassVar[str] = "evaluation"
+    made_by: ClassVar[str] = "Evaluation.save"
 
     def __post_init__(self) -> None:
         freeze(self, "gain", "sensitivity", "information", "eigenvalues", "std", "min_eigenvalue")
@@ -155,7 +159,7 @@ class StartResult:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CombinationAccuracy:
+class CombinationAccuracy(RenamedFields):
     """Accuracy of an identifiable combination of parameters that are not identifiable alone.
 
     Attributes:
@@ -169,6 +173,12 @@ class CombinationAccuracy:
     value: float
     std_initial: float
     std_final: float
+
+    renamed_fields: ClassVar[Mapping[str, str]] = {
+        "words": "expression",
+        "initial": "std_initial",
+        "final": "std_final",
+    }
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

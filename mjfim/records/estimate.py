@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -105,6 +106,14 @@ class Estimate(SavedRecord):
 
     file_stem: ClassVar[str] = "estimate"
     made_by: ClassVar[str] = "`mjfim identify EXPERIMENT RECORDING... -o DIR`"
+    renamed_fields: ClassVar[Mapping[str, str]] = {
+        "suspects": "missing_terms",
+        "worst": "worst_residual",
+        "sandwich": "std_sandwich",
+        "between": "between_recordings",
+        "each": "per_recording",
+        "detail": "robust_uncertainty",
+    }
 
     def __post_init__(self) -> None:
         count = len(self.parameters)

@@ -1,4 +1,4 @@
-"""Events that long work reports while it runs. Every verb calls `callback(event)` with one of them."""
+"""Events that long work reports while it runs, by calling `callback(event)`."""
 
 from __future__ import annotations
 

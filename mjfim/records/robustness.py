@@ -155,7 +155,7 @@ class Robustness(SavedRecord):
     troubles: dict[str, int]
 
     file_stem: ClassVar[str] = "playback"
-    made_by: ClassVar[str] = "Robustness.save"
+    made_by: ClassVar[str] = "`mjfim robustness EXPERIMENT -o DIR`"
 
     def __post_init__(self) -> None:
         freeze(self, "wrong", "z", "error", "std", "predicted", "margins", "planned")

@@ -30,7 +30,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
-from mjfim.errors import RecordingError
+from mjfim.errors import RecordingError, RenamedFields
 
 # Name of the text array in an npz file that holds everything of a record that is no array.
 RECORD = "record"
@@ -347,7 +347,7 @@ def _join(path: str, name: str | int) -> str:
 # ---- what a record inherits
 
 
-class SavedRecord:
+class SavedRecord(RenamedFields):
     """Saving and loading, for records that are dataclasses.
 
     Attributes:

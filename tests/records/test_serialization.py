@@ -25,11 +25,12 @@ from mjfim.identification.identify import identify_system
 from mjfim.output import archive
 from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
-from mjfim.records.comparison import Comparison
-from mjfim.records.design import Design
+from mjfim.records.comparison import Comparison, MethodResult
+from mjfim.records.design import CombinationAccuracy, Design, Evaluation
 from mjfim.records.estimate import Estimate
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.recording import Recording
+from mjfim.records.robustness import Robustness
 from mjfim.records.serialization import RECORD, SavedRecord, as_json
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.check import check_task
@@ -42,8 +43,10 @@ SAVED: tuple[type[SavedRecord], ...] = (
     Comparison,
     Design,
     Estimate,
+    Evaluation,
     MonteCarloStudy,
     Recording,
+    Robustness,
     Trajectory,
 )
 
@@ -406,3 +409,20 @@ def test_records_may_be_moved(saved: Path, design: Design, tmp_path: Path) -> No
     """The npz file alone is enough, under any name."""
     shutil.copy(saved / "design.npz", tmp_path / "best.npz")
     assert_same(Design.load(tmp_path / "best.npz"), design)
+
+
+@pytest.mark.parametrize(
+    ("kind", "old", "new"),
+    [
+        (kind, old, new)
+        for kind in (Check, CombinationAccuracy, Estimate, MethodResult)
+        for old, new in kind.renamed_fields.items()
+    ],
+)
+def test_the_old_name_of_a_field_is_an_error_that_names_the_new_one(
+    kind: Any, old: str, new: str
+) -> None:
+    record = AwkwardValues(count=1, optional=True).build(kind)
+    assert hasattr(record, new)
+    with pytest.raises(AttributeError, match=f"{old} is called .*{new}"):
+        getattr(record, old)
