@@ -11,7 +11,8 @@ import numpy as np
 from mjfim.model.coordinates import actuator_names, joint_names
 from mjfim.records.trajectory import Trajectory
 
-# Relative distance from its bound at which the norm of several forces counts as clamped.
+# An actuator with several forces counts as clamped where the norm of its forces is at most this
+# relative amount below its bound.
 CLAMP_TOLERANCE = 1e-12
 
 
@@ -74,7 +75,7 @@ def saturated_actuators(model: Any, trajectory: Trajectory) -> tuple[str, ...]:
 def first_active_constraint(
     model: Any, trajectory: Trajectory
 ) -> tuple[int, tuple[str, ...]] | None:
-    """First sample at which a contact, friction, limit or clamp acts.
+    """First sample at which a contact, dry friction, a limit or a clamp acts.
 
     Args:
         model: Compiled MuJoCo model.
@@ -94,7 +95,7 @@ def first_active_constraint(
 def active_constraints(
     model: Any, trajectory: Trajectory, samples: Iterable[int]
 ) -> tuple[str, ...]:
-    """Contacts, frictions, limits and clamps that act at some samples.
+    """Contacts, dry frictions, limits and clamps that act at given samples.
 
     Args:
         model: Compiled MuJoCo model.
@@ -112,7 +113,10 @@ def active_constraints(
 
 
 def _is_clamped(model: Any, data: Any, actuator: int) -> bool:
-    """True if forcerange acts: on the force, or on the norm of the several forces of an actuator."""
+    """Whether forcerange clamps an actuator.
+
+    It limits the force of the actuator, or the norm of its forces where it has several.
+    """
     first = int(model.actuator_outadr[actuator])
     count = int(model.actuator_outnum[actuator])
     force = data.actuator_force[first : first + count]
@@ -129,7 +133,7 @@ def _force_ranges(model: Any, actuators: Iterable[int]) -> list[str]:
 
 
 def _constraints(model: Any, data: Any) -> Iterator[str]:
-    """Descriptions of the contacts, and of the frictions and limits among the active constraints."""
+    """Descriptions of all contacts and of the frictions and limits that act."""
     for contact in data.contact[: data.ncon]:
         names = [
             mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"geom{geom}"

@@ -1,4 +1,4 @@
-"""Many MuJoCo simulations in one call, Python never in the inner loop.
+"""Many MuJoCo simulations in one call, without a Python loop over engine steps.
 
 Every engine step is counted.
 """
@@ -18,23 +18,27 @@ from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.parallel import cores
 from mjfim.plant.state_space import StateSpace
 
-# Components of MuJoCo's state that a rollout records after every engine step: time, then (qpos,
-# qvel, act).
+# Components of MuJoCo's state that a rollout records after every engine step: the time, then qpos,
+# qvel and act.
 RECORDED_STATE = int(
     mujoco.mjtState.mjSTATE_TIME
     | mujoco.mjtState.mjSTATE_QPOS
     | mujoco.mjtState.mjSTATE_QVEL
     | mujoco.mjtState.mjSTATE_ACT
 )
-# Time at which simulations start [s]. MuJoCo resets a diverged state and its time to zero: a later
-# start time reveals that.
+
+# Time at which simulations start [s]. MuJoCo resets a diverged state and its time to zero; the time
+# then shows that the simulation diverged.
 START_TIME = 1.0
+
 # Magnitude above which MuJoCo replaces controls by zero.
 MAX_CONTROL = float(mujoco.mjMAXVAL)
+
 # Type of the sensors that show the time.
 CLOCK_SENSOR = int(mujoco.mjtSensor.mjSENS_CLOCK)
-# Largest number of rollouts that use the small batch; more, as in a Monte Carlo study, use a second
-# one.
+
+# Largest number of rollouts that use the small batch. A larger number, as in a Monte Carlo study,
+# uses a second batch, so that the small one stays small.
 SMALL_BATCH = 64
 
 
@@ -74,7 +78,9 @@ def state_space(model: Any) -> StateSpace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SubstepObservations:
-    """Quantities that are observed at the engine steps within a sample: w numbers per step, in the order of the fields.
+    """Quantities that are observed at the engine steps within a sample.
+
+    There are w numbers per engine step, in the order of the attributes.
 
     Attributes:
         positions: Addresses in qpos, after the step.
@@ -98,7 +104,7 @@ class SubstepObservations:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """MjData fields that have to be recorded beside the state."""
+        """MjData fields that have to be recorded in addition to the state."""
         names = []
         if len(self.actuator_forces):
             names.append("actuator_force")
@@ -261,23 +267,17 @@ class BatchSimulator:
         batch.set_models(models[0] if len(models) == 1 else [*models, *padding])
         ids = self._load(batch, start, models)
 
-        held = np.repeat(ctrl, self.substeps, axis=1)
-        record: tuple[Any, ...] = (RECORDED_STATE,)
-        if self.sensors:
-            # Sensor data belong to the state before a step: one more step gives those of the last
-            # state.
-            held = np.concatenate([held, held[:, -1:]], axis=1)
-            record = (*record, "sensordata")
-        if observations is not None:
-            record = (*record, *observations.fields)
+        held = self._held(ctrl)
+        record = self._recorded_fields(observations)
         with silence_mujoco_log():
-            out = batch.rollout(held.shape[1], np.ascontiguousarray(held), record=record, ids=ids)
+            out = batch.rollout(held.shape[1], held, record=record, ids=ids)
         self.steps += count * held.shape[1]
 
         # Engine step i is recorded after the step: sample k ends with step k * substeps.
         engine_steps = ctrl.shape[1] * self.substeps
         rows = out[RECORDED_STATE][:, self.substeps - 1 : engine_steps : self.substeps]
         states = np.concatenate([start[:, None], rows[:, :, 1:]], axis=1)
+
         finite = self._on_time(rows[:, -1, 0], engine_steps)
         finite &= np.isfinite(states).all(axis=(1, 2))
         finite &= _is_accepted(ctrl).all(axis=(1, 2))
@@ -289,10 +289,29 @@ class BatchSimulator:
             observed = self._observed(observations, start, out, engine_steps)
         return Rollouts(states=states, sensors=sensors, finite=finite, observed=observed)
 
+    def _held(self, ctrl: Array) -> Array:
+        """(m, engine steps, nu) control of every engine step of rollouts under ctrl: (m, N, nu)."""
+        held = np.repeat(ctrl, self.substeps, axis=1)
+
+        # Sensor data belong to the state before a step. One more step gives those of the last
+        # state.
+        if self.sensors:
+            held = np.concatenate([held, held[:, -1:]], axis=1)
+        return np.ascontiguousarray(held)
+
+    def _recorded_fields(self, observations: SubstepObservations | None) -> tuple[Any, ...]:
+        """MuJoCo's fields that a rollout records after every engine step."""
+        record: tuple[Any, ...] = (RECORDED_STATE,)
+        if self.sensors:
+            record = (*record, "sensordata")
+        if observations is not None:
+            record = (*record, *observations.fields)
+        return record
+
     def closed_loop(
         self, model: Any, reference: Array, mu: Array, K: Array
     ) -> tuple[Array, Array, bool]:
-        """Simulate one curve under `u = mu + K (alpha - x)`, the projection of the curve (alpha, mu).
+        """Simulate one curve under `u = mu + K (alpha - x)`: the projection of (alpha, mu).
 
         Args:
             model: The model.
@@ -314,8 +333,8 @@ class BatchSimulator:
         states[0] = reference[0]
         used = np.empty_like(mu)
 
-        # The loop runs over views: this is the only place where Python steps MuJoCo sample by
-        # sample.
+        # This is the only place where Python steps MuJoCo sample by sample. The loop runs over
+        # views, because every look-up of an attribute costs time.
         ctrl, qpos, qvel, act = data.ctrl, data.qpos, data.qvel, data.act
         next_qpos, next_qvel, next_act = space.split(states[1:])
         curves = (states, next_qpos, next_qvel, next_act, reference, used, mu, K)
@@ -336,7 +355,11 @@ class BatchSimulator:
         return states, used, bool(finite)
 
     def _batch(self, kind: str, count: int) -> Batch:
-        """A batch of at least `count` simulations; making one costs milliseconds, so it grows and is kept."""
+        """A batch of at least `count` simulations.
+
+        It is kept for later calls, because making one takes milliseconds, and replaced where a
+        larger one is needed.
+        """
         batch = self._batches.get(kind)
         if batch is None or batch.nsim < count:
             batch = Batch(self.model, count, min(self.threads, count))
@@ -344,7 +367,11 @@ class BatchSimulator:
         return batch
 
     def _load(self, batch: Batch, states: Array, models: Sequence[Any]) -> np.ndarray | None:
-        """Write states: (n, ns) into the first simulations of a batch; returns their ids, or None for all of them."""
+        """Write states: (n, ns) into the first n simulations of a batch.
+
+        Returns:
+            (n,) ids of these simulations, or None if they are all simulations of the batch.
+        """
         n = len(states)
         qpos, qvel, act = self.space.split(states)
         batch.bind("qpos")[:n] = qpos
@@ -404,10 +431,11 @@ class BatchSimulator:
         count: int,
         observations: SubstepObservations | None,
     ) -> tuple[Array | None, list[Array]]:
-        """Step a batch over one sample, in parts between which something is read.
+        """Step a batch over one sample, and read sensors and observations in between.
 
-        Returns sensor data (count, nsensordata) or None, and (count, w) observations at every
-        derivative substep.
+        Returns:
+            (count, nsensordata) sensor data or None, and a list of (count, w) observations, one
+            for each derivative substep.
         """
         substeps = () if observations is None else observations.derivative_substeps
         accelerations = observations is not None and len(observations.accelerations) > 0
@@ -447,7 +475,7 @@ class BatchSimulator:
         out: dict[Any, Array],
         engine_steps: int,
     ) -> Array:
-        """(m, N, substeps, w) observations from the records of a rollout that starts at start: (m, ns)."""
+        """(m, N, substeps, w) observations from the records of a rollout from start: (m, ns)."""
         _, first_qvel, _ = self.space.split(start)
         qpos, qvel, _ = self.space.split(out[RECORDED_STATE][:, :engine_steps, 1:])
         before = np.concatenate([first_qvel[:, None], qvel[:, :-1]], axis=1)
@@ -457,17 +485,22 @@ class BatchSimulator:
         return np.asarray(rows.reshape(len(start), samples, self.substeps, rows.shape[-1]))
 
     def _sensor_data(self, data: Array) -> Array:
-        """A copy of sensor data: (..., nsensordata), its clocks as if time had begun at zero."""
+        """A copy of sensor data: (..., nsensordata) whose clocks count from zero."""
         copied = np.array(data)
         copied[..., self._clocks] -= START_TIME
         return copied
 
     def _on_time(self, time: Array, engine_steps: int, model: Any = None) -> np.ndarray:
-        """True where a simulation ends at the expected time; MuJoCo resets the time of one that diverges."""
+        """True where a simulation ends at the expected time.
+
+        MuJoCo resets the time of a simulation that diverges.
+        """
         stepped = self.model if model is None else model
         timestep = float(stepped.opt.timestep)
-        delay = np.abs(time - START_TIME - engine_steps * timestep)
-        return np.asarray(delay < 0.5 * timestep)
+
+        duration = engine_steps * timestep
+        error = np.abs(time - START_TIME - duration)
+        return np.asarray(error < 0.5 * timestep)
 
 
 def _is_accepted(ctrl: Array) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""Time delay of the outputs: interpolation between samples as a linear operator, and its derivative by the delay."""
+"""Time delay of the outputs.
+
+It is interpolation between samples, written as a linear operator, with its derivative by the delay.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,16 @@ from scipy.sparse import csr_array
 
 from mjfim.arrays import Array
 
-NODES = 4  # Number of samples through which the cubic polynomial of the interpolation passes.
+# Number of samples through which the cubic polynomial of the interpolation passes.
+NODES = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OutputDelay:
-    """Values `y(t - d)` from samples y_k by cubic Lagrange interpolation, of lower order below four samples.
+    """Values `y(t - d)` from samples y_k, by cubic Lagrange interpolation.
 
-    Before the first sample the first value is held, after the last sample the last one.
+    The order is lower where there are fewer than four samples. Before the first sample the first
+    value is held, after the last sample the last one.
 
     Attributes:
         weights: (M, N+1) sparse interpolation weights; M = N+1 if values are wanted at the samples
@@ -45,7 +50,7 @@ class OutputDelay:
 
     @staticmethod
     def at(wanted: Array, samples: int, dt: float) -> OutputDelay:
-        """Values at any times, for outputs that are read between the samples.
+        """Delayed values at any times, for outputs that are measured between the samples.
 
         Args:
             wanted: (M,) places `(t - d) / dt` in samples.
@@ -58,7 +63,7 @@ class OutputDelay:
         place = np.clip(wanted, 0.0, samples - 1.0)
         count = min(NODES, samples)
 
-        # The nodes lie around the place, moved inwards at both ends.
+        # The nodes lie around the place; at both ends they are shifted to existing samples.
         first = np.clip(np.floor(place).astype(int) - 1, 0, samples - count)
         nodes = first[:, None] + np.arange(count)
         value, slope = _lagrange(place[:, None] - first[:, None], count)
@@ -122,12 +127,23 @@ class OutputDelay:
 
 def _apply(operator: Any, values: Array) -> Array:
     """Apply a sparse operator (M, N+1) to the first axis of values: (N+1, ...)."""
-    flat = operator @ values.reshape(len(values), -1)
-    return np.asarray(flat.reshape(operator.shape[0], *values.shape[1:]))
+    rows = values.reshape(len(values), -1)
+    applied = operator @ rows
+
+    shape = (operator.shape[0], *values.shape[1:])
+    return np.asarray(applied.reshape(shape))
 
 
 def _lagrange(s: Array, count: int) -> tuple[Array, Array]:
-    """Weights of the nodes 0, 1, ..., count - 1 at s: (n, 1), and their derivatives by s, both (n, count)."""
+    """Lagrange weights of equidistant nodes.
+
+    Args:
+        s: (n, 1) places, in units of the distance between two nodes.
+        count: Number of nodes; they are at 0, 1, 2 and so on.
+
+    Returns:
+        (n, count) weights, and (n, count) their derivatives by s.
+    """
     value = np.ones((len(s), count))
     slope = np.zeros((len(s), count))
     for i in range(count):
@@ -136,7 +152,7 @@ def _lagrange(s: Array, count: int) -> tuple[Array, Array]:
         factors = np.concatenate([s - j for j in others], axis=1)
         value[:, i] = factors.prod(axis=1) / scale
 
-        # Product rule: the sum over the factors that are left out.
+        # The product rule: a sum of products, each without one of the factors.
         products = [np.delete(factors, k, axis=1).prod(axis=1) for k in range(count - 1)]
         slope[:, i] = sum(products) / scale
     return value, slope

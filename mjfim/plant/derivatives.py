@@ -1,7 +1,8 @@
-"""Derivatives of the plant: first and mixed second derivatives of F and h, and sensitivities of whole rollouts.
+"""Derivatives of the plant.
 
-Every derivative is a difference of MuJoCo steps in tangent-space coordinates (`StateSpace`), with
-all samples and all perturbations batched into one call.
+These are first and mixed second derivatives of F and h, and sensitivities of whole rollouts. Every
+derivative is a difference of MuJoCo steps in tangent-space coordinates (`StateSpace`). All samples
+and all perturbations are stepped in one call.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class DifferenceAccuracy:
-    """Kind and steps of the differences that make mixed second derivatives.
+    """Kind and steps of the differences for mixed second derivatives.
 
     Attributes:
         central: True for two-sided differences in state and control, False for one-sided ones.
-        coordinate_step: Step in state and control, relative to the size of what is perturbed.
+        coordinate_step: Step in state and control, relative to the size of the perturbed number.
         direction_step: Step along (psi w, w), relative to the larger of its two parts.
-        shared_origin: True for differences that are one-sided along (psi w, w) and in the
-            parameters as well, so that all directions share one batch at their origin.
+        shared_origin: True for differences that are one-sided along (psi w, w) as well, so that
+            all directions share the steps at the origin.
     """
 
     central: bool
@@ -40,32 +41,48 @@ class DifferenceAccuracy:
     shared_origin: bool = False
 
 
-# One-sided in state and control, two-sided along (psi w, w): about 1e-5 relative error.
+# One-sided in state and control, two-sided along (psi w, w): a relative error of about 1e-5.
 FORWARD_DIFFERENCES = DifferenceAccuracy(central=False, coordinate_step=1e-6, direction_step=3e-3)
-# One-sided in everything: the quickest differences for a plant without kinks.
+
+# One-sided in everything: the quickest differences, for a plant whose derivatives do not jump.
 SHARED_ORIGIN = DifferenceAccuracy(
     central=False, coordinate_step=1e-6, direction_step=1e-3, shared_origin=True
 )
-# One-sided in everything with a short step, for a plant whose dry friction is smoothed and so bends
-# sharply.
+
+# One-sided in everything with a short step, for a plant with smoothed dry friction, whose
+# derivatives change quickly.
 SHARED_ORIGIN_SHORT = DifferenceAccuracy(
     central=False, coordinate_step=1e-6, direction_step=1e-5, shared_origin=True
 )
+
 # Two-sided in everything: the most accurate differences.
 CENTRAL_DIFFERENCES = DifferenceAccuracy(central=True, coordinate_step=1e-4, direction_step=1e-3)
 
-FIRST_DERIVATIVE_STEP = 1e-6  # Relative step of the differences that make A, B, C, D, E, H
-SENSITIVITY_STEP = 1e-5  # Relative step of the differences between whole rollouts
-MIN_PARAMETER_EFFECT = 1e-2  # Relative effect of a parameter below which its steps are lengthened
-MAX_STEP_FACTOR = 100.0  # Largest factor by which the difference step of a parameter is lengthened
-MAX_NUMBERS_AT_ONCE = 8_000_000  # Largest number of state values in memory at once.
-MIN_CONTROL_SIZE = 1e-3  # Control magnitude below which an actuator's difference step is absolute.
-TINY = 1e-300  # Smallest divisor; protects a division by zero.
+# Relative step of the differences that give A, B, C, D, E and H.
+FIRST_DERIVATIVE_STEP = 1e-6
+
+# Relative step of the differences between whole rollouts.
+SENSITIVITY_STEP = 1e-5
+
+# Relative effect of a parameter on the trajectory below which its steps are lengthened.
+MIN_PARAMETER_EFFECT = 1e-2
+
+# Largest factor by which the difference step of a parameter is lengthened.
+MAX_STEP_FACTOR = 100.0
+
+# Largest number of state values that are in memory at once.
+MAX_NUMBERS_AT_ONCE = 8_000_000
+
+# Magnitude of a control [u-unit] below which its difference step is absolute instead of relative.
+MIN_CONTROL_SIZE = 1e-3
+
+# Smallest divisor; it prevents a division by zero.
+TINY = 1e-300
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Response:
-    """Outputs of S curves over some consecutive samples, and their derivatives.
+    """Outputs of S curves over an interval of samples, and their derivatives.
 
     Delays of the outputs are left out.
 
@@ -114,10 +131,10 @@ class Bilinear:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _MovedSamples:
-    """All n samples of a trajectory, and copies of them that are moved along each coordinate of (x, u).
+    """Samples of a trajectory that are moved along each coordinate of (x, u).
 
-    There are c = nx+nu coordinates and m rows of moves: c forward ones, then c backward ones or a
-    single zero row.
+    There are n samples, c = nx+nu coordinates and m moves: c forward moves, then c backward moves
+    or a single zero move.
 
     Attributes:
         trajectory_states: (n, ns) states that are not moved.
@@ -137,13 +154,29 @@ class _MovedSamples:
     def unflatten(self, values: Array) -> Array:
         """(b, m, n, ...) values of b batches of the moved samples from (b * m * n, ...)."""
         moves, samples = self.batch_shape
-        batches = len(values) // (moves * samples)  # not -1: there may be no numbers per sample
+
+        # `reshape` cannot find this number itself where there are no values per sample.
+        batches = len(values) // (moves * samples)
         return values.reshape(batches, moves, samples, *values.shape[1:])
 
     def quotient(self, values: Array) -> Array:
-        """(c, n, k) differences by (x, u) from (m, n, k) values of the moved samples."""
+        """(c, n, k) derivative by (x, u) from (m, n, k) values of the moved samples."""
         count = len(self.widths)
-        return np.asarray((values[:count] - values[count:]) / self.widths)
+        difference = values[:count] - values[count:]
+        return np.asarray(difference / self.widths)
+
+    def observation_jacobian(self, change: Array) -> Array:
+        """Derivative of observations by (x, u).
+
+        Args:
+            change: (c, n, derivative substeps, w) differences of the observations between the
+                forward moves and the backward or zero ones.
+
+        Returns:
+            (n, derivative substeps, w, c) derivative.
+        """
+        quotient = change / self.widths[..., None]
+        return np.moveaxis(quotient, 0, 3)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,11 +201,11 @@ class _PairDerivatives:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _ResponseMoves:
-    """Moves of theta and of the initial state whose rollouts give the derivatives of a response along q directions.
+    """Moves whose rollouts give the derivatives of a response along q directions.
 
     Attributes:
-        theta: (J, p) moves of theta: a zero move, q forward ones, and q backward ones if two-sided
-            [theta-unit].
+        theta: (J, p) moves of theta [theta-unit]: a zero move, q forward moves, and q backward
+            moves for two-sided differences.
         initial_state: (J, nx) moves of the initial state, in the order of `theta` [x-unit].
         moving: Indices of the parameters among the q directions, which come first.
         widths: (q,) distance between the two moves of a quotient.
@@ -213,11 +246,11 @@ class Derivatives:
 
     @property
     def parameter_scale(self) -> Array:
-        """(p,) change of each parameter that moves the trajectory noticeably [theta-unit]; steps are relative to it."""
+        """(p,) magnitude of each parameter, to which its steps are relative [theta-unit]."""
         return np.asarray(self.plant.parameters.magnitude * self._step_factors)
 
     def difference_sizes(self, trajectory: Trajectory) -> Array:
-        """Magnitudes of state and control along a trajectory; difference steps are relative to them.
+        """Magnitudes of state and control along a trajectory, to which steps are relative.
 
         Args:
             trajectory: The trajectory.
@@ -234,7 +267,7 @@ class Derivatives:
         return np.concatenate([position, velocity, activation, control])
 
     def calibrated_step_factors(self, theta: Array, trajectory: Trajectory) -> Array | None:
-        """Factors on the parameters' difference steps with which their effect exceeds round-off.
+        """Factors of the parameters' difference steps with which their effect exceeds round-off.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -280,7 +313,7 @@ class Derivatives:
         step: float | Array = SENSITIVITY_STEP,
         central: bool = True,
     ) -> Sensitivity | None:
-        """Sensitivities psi and G of a trajectory at fixed control, by differences of whole rollouts.
+        """Sensitivities psi and G of a trajectory at fixed control, by differences of rollouts.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -312,29 +345,35 @@ class Derivatives:
         states: Array | None = None,
         central: bool = True,
     ) -> tuple[Array, Sensitivity] | None:
-        """Outputs (N+1, ny) and sensitivities from rollouts at theta +- h, for every parameter that changes the motion.
+        """Outputs and sensitivities from rollouts at theta +- h.
 
-        states: (N+1, ns) at theta where they are known. Without them, and where sensors are
-        delayed, one more rollout gives the states and sensors at theta.
+        There is one pair of rollouts for every parameter that changes the motion. Without `states`,
+        and where sensors are delayed, one more rollout gives the states and sensors at theta.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            initial_state: (ns,) initial state at theta.
+            ctrl: (N, nu) controls.
+            step: Difference step relative to `parameter_scale`, one number or (p,).
+            states: (N+1, ns) states at theta, or None where they are not known.
+            central: True for two-sided differences.
+
+        Returns:
+            y: (N+1, ny) outputs [y-unit] and the sensitivities, or None if a rollout diverges. The
+            outputs of sensors are NaN where the rollout at theta was not simulated.
         """
         plant = self.plant
-        moving = np.flatnonzero(plant.parameters.changes_motion)
-        count, p, N = len(moving), len(theta), len(ctrl)
-        delay = plant.output_delay(theta, N + 1)
+        delay = plant.output_delay(theta, len(ctrl) + 1)
         needs_origin = states is None or (delay is not None and plant.outputs.needs_sensors)
 
-        # One row of moves per rollout: forward, backward if two-sided, and a zero move for the
-        # origin.
+        moving = np.flatnonzero(plant.parameters.changes_motion)
         h = (step * self.parameter_scale)[moving]
-        forward = np.zeros((count, p))
-        forward[np.arange(count), moving] = h
-        backward = -forward if central else forward[:0]
-        moves = np.concatenate([forward, backward, np.zeros((int(needs_origin), p))])
+        moves = _theta_moves(len(theta), moving, h, central, needs_origin)
 
-        psi = np.zeros((N + 1, plant.space.nx, p))
-        G = np.zeros((N + 1, len(plant.outputs), p))
         sensors = None
-        origin = np.zeros((N + 1, 0)) if states is None else states
+        origin = np.zeros((len(ctrl) + 1, 0)) if states is None else states
+        psi = np.zeros((len(origin), plant.space.nx, len(theta)))
+        G = np.zeros((len(origin), len(plant.outputs), len(theta)))
         if len(moves):
             out = self._moved_rollouts(theta, initial_state, ctrl, moves)
             if out is None:
@@ -342,16 +381,11 @@ class Derivatives:
             if needs_origin:
                 origin = out.states[-1]
                 sensors = None if out.sensors is None else out.sensors[-1]
-
-            width = (2.0 if central else 1.0) * h[:, None, None]
-            other = out.states[count : 2 * count] if central else origin
-            dx = plant.space.minus(out.states[:count], other) / width
-            ds = None
-            if out.sensors is not None:
-                ds = (out.sensors[:count] - out.sensors[count : 2 * count]) / width
+            dx, dy = self._rollout_quotients(out, origin, h, central)
             psi[..., moving] = np.moveaxis(dx, 0, 2)
-            G[..., moving] = np.moveaxis(plant.outputs.tangent(origin, dx, ds), 0, 2)
+            G[..., moving] = np.moveaxis(dy, 0, 2)
 
+        # Biases and the delay act on the outputs of the simulation.
         G += plant.bias_derivative
         y = plant.outputs(origin, sensors) + plant.bias_derivative @ theta
         if delay is not None:
@@ -360,18 +394,50 @@ class Derivatives:
             y = delay.apply(y)
         return y, Sensitivity(psi=psi, G=G)
 
+    def _rollout_quotients(
+        self, out: Rollouts, origin: Array, h: Array, central: bool
+    ) -> tuple[Array, Array]:
+        """Difference quotients of states and outputs.
+
+        Args:
+            out: Rollouts at the moves of `_theta_moves`.
+            origin: (N+1, ns) states at theta.
+            h: (n,) difference steps of the n parameters that are moved [theta-unit].
+            central: True for two-sided differences.
+
+        Returns:
+            (n, N+1, nx) quotients of the states [x-unit / theta-unit], and (n, N+1, ny) of the
+            outputs [y-unit / theta-unit].
+        """
+        plant, count = self.plant, len(h)
+        width = (2.0 if central else 1.0) * h[:, None, None]
+
+        other = out.states[count : 2 * count] if central else origin
+        dx = plant.space.minus(out.states[:count], other) / width
+
+        # Differences are two-sided wherever sensors are simulated.
+        ds = None
+        if out.sensors is not None:
+            ds = (out.sensors[:count] - out.sensors[count : 2 * count]) / width
+        return dx, plant.outputs.tangent(origin, dx, ds)
+
     def _moved_rollouts(
         self, theta: Array, initial_state: Array, ctrl: Array, moves: Array
     ) -> Rollouts | None:
-        """Rollouts under one control at theta plus each row of moves: (m, p), which also move the initial state.
+        """Rollouts at theta plus each row of moves: (m, p), all under one control.
 
-        None if one of them diverges or its model cannot be compiled.
+        The parameters move the initial state as well.
+
+        Returns:
+            The rollouts, or None if one of them diverges or its model cannot be compiled.
         """
         plant = self.plant
-        starts = plant.space.plus(initial_state, moves @ plant.initial_state_derivative.T)
+        state_moves = moves @ plant.initial_state_derivative.T
+        initial_states = plant.space.plus(initial_state, state_moves)
+
         held = np.broadcast_to(ctrl, (len(moves), *ctrl.shape))
         models, compiled = plant.try_models(theta + moves)
-        out = plant.simulator.rollout(models, starts, held)
+        out = plant.simulator.rollout(models, initial_states, held)
         return out if (out.finite & compiled).all() else None
 
     def responses(
@@ -386,37 +452,42 @@ class Derivatives:
         wanted: np.ndarray | None = None,
         max_numbers: int = MAX_NUMBERS_AT_ONCE,
     ) -> Iterator[Response | None]:
-        """Simulate S curves, one stretch of time after the other, with derivatives by theta and by the initial state.
+        """Simulate S curves, with derivatives by theta and by the initial state.
+
+        The samples are divided into intervals, which are simulated one after the other, so that the
+        memory is bounded.
 
         Args:
             theta: (p,) parameters [theta-unit].
             initial_states: (S, ns) initial states.
             ctrl: (S, N, nu) controls.
             start_directions: (nx, k) directions of the initial state by which to differentiate;
-                None for no derivatives at all, those by theta included.
+                None for no derivatives, neither by the initial state nor by theta.
             central: True for two-sided differences.
             step: Difference step relative to `parameter_scale`.
-            wanted: (p,) True for parameters by which to differentiate; None for all. Biases cost
-                nothing and are always included.
-            max_numbers: Numbers that the states of one stretch may hold.
+            wanted: (p,) True for parameters by which to differentiate; None for all. Biases are
+                always included, because they need no simulation.
+            max_numbers: Largest number of state values of one interval.
 
         Yields:
-            The response over each stretch; None, and nothing after it, if a simulation diverges.
+            The response over each interval; None, and nothing after it, if a simulation diverges.
         """
         plant = self.plant
         moves = self._response_moves(theta, start_directions, central, step, wanted)
         models, compiled = plant.try_models(theta + moves.theta)
-        now = plant.space.plus(initial_states, moves.initial_state[:, None])
-        J, S, state_size = now.shape
+
+        # States at the beginning of the interval: those of each of the J moves for all S curves.
+        current = plant.space.plus(initial_states, moves.initial_state[:, None])
+        J, S, state_size = current.shape
         if J > 1:
             models = [model for model in models for _ in range(S)]
 
         numbers_per_sample = J * S * plant.simulator.substeps * (1 + state_size)
-        stretch = int(np.clip(max_numbers / numbers_per_sample, 1, ctrl.shape[1]))
-        for first in range(0, ctrl.shape[1], stretch):
-            held = ctrl[:, first : first + stretch]
+        interval = int(np.clip(max_numbers / numbers_per_sample, 1, ctrl.shape[1]))
+        for first in range(0, ctrl.shape[1], interval):
+            held = ctrl[:, first : first + interval]
             every = np.broadcast_to(held, (J, *held.shape)).reshape(J * S, *held.shape[1:])
-            out = plant.simulator.rollout(models, now.reshape(J * S, -1), every)
+            out = plant.simulator.rollout(models, current.reshape(J * S, -1), every)
             if not (out.finite.all() and compiled.all()):
                 yield None
                 return
@@ -425,7 +496,7 @@ class Derivatives:
             states = out.states.reshape(J, S, samples, -1)
             sensors = None if out.sensors is None else out.sensors.reshape(J, S, samples, -1)
             yield self._response(theta, first, states, sensors, moves, start_directions is not None)
-            now = states[:, :, -1]
+            current = states[:, :, -1]
 
     def _response_moves(
         self,
@@ -435,7 +506,11 @@ class Derivatives:
         step: float,
         wanted: np.ndarray | None,
     ) -> _ResponseMoves:
-        """Moves along the wanted parameters that change the motion, then along k directions of the initial state."""
+        """Moves along parameters, then along k directions of the initial state.
+
+        Parameters are moved if they are wanted and change the motion. The arguments are those of
+        `responses`.
+        """
         plant, p = self.plant, len(theta)
         if start_directions is None:
             start_directions = np.zeros((plant.space.nx, 0))
@@ -444,17 +519,18 @@ class Derivatives:
             chosen = plant.parameters.changes_motion
             moving = np.flatnonzero(chosen if wanted is None else chosen & wanted)
 
-        # A parameter may be a deviation of the initial state: it then moves both.
         h = (step * self.parameter_scale)[moving]
         k = start_directions.shape[1]
-        by_theta = np.zeros((len(moving) + k, p))
-        by_theta[np.arange(len(moving)), moving] = h
-        by_start = by_theta @ plant.initial_state_derivative.T
-        by_start[len(moving) :] = step * start_directions.T
+        theta_moves = np.zeros((len(moving) + k, p))
+        theta_moves[np.arange(len(moving)), moving] = h
+
+        # A parameter that is a deviation of the initial state moves theta and the initial state.
+        state_moves = theta_moves @ plant.initial_state_derivative.T
+        state_moves[len(moving) :] = step * start_directions.T
 
         return _ResponseMoves(
-            theta=_with_origin(by_theta, central),
-            initial_state=_with_origin(by_start, central),
+            theta=_with_origin(theta_moves, central),
+            initial_state=_with_origin(state_moves, central),
             moving=moving,
             widths=np.concatenate([h, np.full(k, step)]) * (2.0 if central else 1.0),
             central=central,
@@ -469,7 +545,16 @@ class Derivatives:
         moves: _ResponseMoves,
         differentiate: bool,
     ) -> Response:
-        """Response over a stretch from states: (J, S, n+1, ns) and sensors: (J, S, n+1, nsensordata) of all moves."""
+        """Response over one interval.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            first: Sample at which the interval begins.
+            states: (J, S, n+1, ns) states of all moves.
+            sensors: (J, S, n+1, nsensordata) sensor data of all moves, or None.
+            moves: The J moves.
+            differentiate: Whether derivatives are requested.
+        """
         outputs, bias = self.plant.outputs, self.plant.bias_derivative
         y = outputs(states[0], None if sensors is None else sensors[0]) + bias @ theta
         if not differentiate:
@@ -481,9 +566,11 @@ class Derivatives:
         dx = self.plant.space.minus(states[1 : q + 1], other) / width
         ds = None
         if sensors is not None:
-            ds = (sensors[1 : q + 1] - (sensors[q + 1 :] if moves.central else sensors[0])) / width
+            other_sensors = sensors[q + 1 :] if moves.central else sensors[0]
+            ds = (sensors[1 : q + 1] - other_sensors) / width
         G = np.moveaxis(outputs.tangent(states[0], dx, ds), 0, 3)
 
+        # Directions along parameters come first, then those of the initial state.
         count = len(moves.moving)
         common = np.zeros((*y.shape, len(theta)))
         common[..., moves.moving] = G[..., :count]
@@ -494,7 +581,7 @@ class Derivatives:
     def linearize(
         self, theta: Array, trajectory: Trajectory, step: float = FIRST_DERIVATIVE_STEP
     ) -> Linearization:
-        """First derivatives A, B, E, C, D, H along a trajectory by two-sided differences, in one batch per model.
+        """First derivatives A, B, C, D, E and H along a trajectory, by two-sided differences.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -553,7 +640,7 @@ class Derivatives:
         observations: SubstepObservations,
         step: float = FIRST_DERIVATIVE_STEP,
     ) -> tuple[Array, Array, Array]:
-        """Derivatives of F and of observations within the samples by state and control, by one-sided differences.
+        """Derivatives of F and of observations by state and control, by one-sided differences.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -562,8 +649,8 @@ class Derivatives:
             step: Difference step relative to `difference_sizes`.
 
         Returns:
-            A: (N, nx, nx), B: (N, nx, nu), and (N, derivative substeps, w, nx+nu) derivatives of
-            the observations.
+            A: (N, nx, nx), B: (N, nx, nu), and (N, derivative substeps, w, nx+nu) derivative of the
+            observations.
 
         Raises:
             SimulationDivergedError: A perturbed step diverges.
@@ -575,18 +662,19 @@ class Derivatives:
         if stepped.observed is None:
             raise ValueError("the simulator returned no observations")
 
+        # The last of the moves is the zero one.
         states = moved.unflatten(stepped.states)[0]
-        AB = np.moveaxis(
-            _require_finite(plant.space.minus(states[:-1], states[-1:]) / moved.widths), 0, 2
-        )
+        by_z = plant.space.minus(states[:-1], states[-1:]) / moved.widths
+        AB = np.moveaxis(_require_finite(by_z), 0, 2)
+
         observed = moved.unflatten(stepped.observed)[0]
-        slopes = np.moveaxis((observed[:-1] - observed[-1:]) / moved.widths[..., None], 0, 3)
-        return AB[..., :nx], AB[..., nx:], slopes
+        jacobian = moved.observation_jacobian(observed[:-1] - observed[-1:])
+        return AB[..., :nx], AB[..., nx:], jacobian
 
     def one_step(
         self, theta: Array, trajectory: Trajectory, samples: np.ndarray, step: float
     ) -> Array:
-        """Effects of each parameter on the next state and on the sensors at some samples.
+        """Effect of each parameter on the next state and on the sensors at given samples.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -595,7 +683,7 @@ class Derivatives:
             step: Difference step relative to `parameter_scale`.
 
         Returns:
-            (n, p) effects per theta-unit; rows are relative to the size of a state component [1/s]
+            (n, p) effects per theta-unit. A row is relative to the size of a state component [1/s],
             or to the largest effect on a sensor.
 
         Raises:
@@ -616,7 +704,18 @@ class Derivatives:
     def _one_step_by_theta(
         self, theta: Array, states: Array, ctrl: Array, step: float
     ) -> tuple[Array, Array | None]:
-        """Derivatives of single steps by theta: (p, n, nx) of the next state, (p, n, nsensordata) of sensors or None."""
+        """Derivatives of single steps by theta, by two-sided differences.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            states: (n, ns) states.
+            ctrl: (n, nu) controls.
+            step: Difference step relative to `parameter_scale`.
+
+        Returns:
+            (p, n, nx) derivative of the next state, and (p, n, nsensordata) of the sensors, or None
+            without sensors.
+        """
         h = step * self.parameter_scale
         forward = theta + np.diag(h)
         backward = theta - np.diag(h)
@@ -629,10 +728,17 @@ class Derivatives:
     def _central_quotients(
         self, models: list[Any], states: Array, ctrl: Array, widths: Array
     ) -> tuple[Array, Array | None]:
-        """Two-sided quotients (count, n, nx) of F and (count, n, nsensordata) of sensors, or None without sensors.
+        """Two-sided difference quotients of the next state and of the sensors.
 
-        The first half of states: (2*count*n, ns) and ctrl: (2*count*n, nu) is the forward side;
-        widths: (count, 1, 1)
+        Args:
+            models: One model, or one for each of the 2*count moves.
+            states: (2*count*n, ns) states; the first half is moved forward, the second backward.
+            ctrl: (2*count*n, nu) controls, in the order of the states.
+            widths: (count, 1, 1) distances between the forward and the backward move.
+
+        Returns:
+            (count, n, nx) quotients of the next state, and (count, n, nsensordata) of the sensors,
+            or None without sensors.
         """
         stepped = self.plant.simulator.step(models, states, ctrl)
         pair = stepped.states.reshape(2, len(widths), -1, states.shape[1])
@@ -646,7 +752,14 @@ class Derivatives:
     def _move_samples(
         self, states: Array, ctrl: Array, steps: Array, central: bool
     ) -> _MovedSamples:
-        """Move states: (n, ns) and ctrl: (n, nu) along each coordinate of (x, u) by its step: (nx+nu,)."""
+        """Move samples along each coordinate of (x, u).
+
+        Args:
+            states: (n, ns) states.
+            ctrl: (n, nu) controls.
+            steps: (nx+nu,) step along each coordinate [x-unit, u-unit].
+            central: True for two-sided differences.
+        """
         plant, nx = self.plant, self.plant.space.nx
         backward = -np.diag(steps) if central else np.zeros((1, len(steps)))
         moves = np.concatenate([np.diag(steps), backward])
@@ -678,9 +791,10 @@ class Derivatives:
         accuracy: DifferenceAccuracy,
         observations: SubstepObservations | None = None,
     ) -> Bilinear:
-        """First derivatives, and derivatives of `DF[psi w, w]` and `Dh[psi w, w]` by (x, u) for each direction w.
+        """First derivatives and mixed second derivatives along a trajectory.
 
-        The mixed second derivatives are those of the smooth plant, everything else is this plant's.
+        The latter are derivatives of `DF[psi w, w]` and `Dh[psi w, w]` by (x, u), for each
+        direction w. They are taken on the smooth plant, all others on this plant.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -697,8 +811,9 @@ class Derivatives:
             SimulationDivergedError: MuJoCo cannot compile a perturbed model.
         """
         given = (theta, trajectory, psi, directions, accuracy)
-        # Derivatives of sensors would need the mean of both sides: one-sided differences leave
-        # sensors out.
+
+        # Derivatives of sensors need the mean of both sides, so one-sided differences are used only
+        # without sensors.
         if accuracy.shared_origin and not self.plant.simulator.sensors:
             return self._shared_origin(*given, observations)
 
@@ -717,12 +832,16 @@ class Derivatives:
         accuracy: DifferenceAccuracy,
         observations: SubstepObservations | None,
     ) -> Bilinear:
-        """`bilinear` by pairs at +-epsilon along (psi w, w) at every moved (x, u); means over the pairs give A and B."""
+        """`bilinear` by pairs of steps at +-epsilon along (psi w, w), at every moved (x, u).
+
+        Means over the pairs give A and B.
+        """
         steps = accuracy.coordinate_step * self.difference_sizes(trajectory)
         moved = self._move_samples(*_all_samples(trajectory), steps, accuracy.central)
         pairs = []
         for number, w in enumerate(directions):
-            # First derivatives of the observations do not depend on w: the first pair gives them.
+            # First derivatives of the observations do not depend on w, so the first pair gives
+            # them.
             wanted = observations if number == 0 else None
             state_direction = psi @ w
             epsilon = self._direction_step(accuracy, state_direction, w)
@@ -750,7 +869,18 @@ class Derivatives:
         epsilon: float,
         observations: SubstepObservations | None,
     ) -> _PairDerivatives:
-        """Differences by (x, u) of the mean and of the quotient of two steps at +-epsilon along (psi w, w)."""
+        """Differences by (x, u) of two steps at +-epsilon along (psi w, w).
+
+        The mean of the two steps gives first differences, their quotient gives mixed ones.
+
+        Args:
+            theta: (p,) parameters of the trajectory [theta-unit].
+            moved: The n moved samples.
+            state_direction: (n, nx) direction psi w of the states.
+            w: (p,) direction of the parameters [theta-unit].
+            epsilon: Step along (psi w, w).
+            observations: Quantities observed within the samples, or None.
+        """
         plant, count = self.plant, len(moved.widths)
         shift = _tiled(epsilon * state_direction, moved.batch_shape[0])
         forward = plant.space.plus(moved.states, shift)
@@ -763,23 +893,22 @@ class Derivatives:
         )
 
         states = moved.unflatten(stepped.states)
-        rise = np.mean(plant.space.minus(states[:, :count], states[:, count:]), axis=0)
-        slope = plant.space.minus(states[0], states[1]) / (2.0 * epsilon)
+        by_z = np.mean(plant.space.minus(states[:, :count], states[:, count:]), axis=0)
+        by_direction = plant.space.minus(states[0], states[1]) / (2.0 * epsilon)
 
         sensor_first = sensor_mixed = None
         if stepped.sensors is not None:
-            sensors = moved.unflatten(stepped.sensors)
-            sensor_first = np.mean(sensors[:, :count] - sensors[:, count:], axis=0) / moved.widths
-            sensor_mixed = moved.quotient((sensors[0] - sensors[1]) / (2.0 * epsilon))
+            sensor_first, sensor_mixed = _sensor_differences(moved, stepped.sensors, epsilon)
 
+        # The state after the last sample is no state of the trajectory.
         jacobian = None
         if stepped.observed is not None:
             observed = moved.unflatten(stepped.observed)
             change = np.mean(observed[:, :count] - observed[:, count:], axis=0)
-            jacobian = np.moveaxis((change / moved.widths[..., None])[:, :-1], 0, 3)
+            jacobian = moved.observation_jacobian(change)[:-1]
         return _PairDerivatives(
-            first=rise / moved.widths,
-            mixed=moved.quotient(slope),
+            first=by_z / moved.widths,
+            mixed=moved.quotient(by_direction),
             sensor_first=sensor_first,
             sensor_mixed=sensor_mixed,
             observation_jacobian=jacobian,
@@ -794,7 +923,10 @@ class Derivatives:
         accuracy: DifferenceAccuracy,
         observations: SubstepObservations | None,
     ) -> Bilinear:
-        """`bilinear` by one-sided differences for outputs that are no sensors; all directions share a batch at their origin."""
+        """`bilinear` by one-sided differences, for outputs without sensors.
+
+        The steps at the origin, from the moved samples at theta, serve all directions.
+        """
         plant, smooth = self.plant, self.plant.smooth
         steps = accuracy.coordinate_step * self.difference_sizes(trajectory)
         moved = self._move_samples(*_all_samples(trajectory), steps, False)
@@ -803,13 +935,14 @@ class Derivatives:
         stepped = plant.simulator.step([plant.model(theta)], moved.states, moved.ctrl, observations)
         origin = moved.unflatten(stepped.states)[0]
         first = plant.space.minus(origin[:count], origin[count:]) / moved.widths
+
+        # The state after the last sample is no state of the trajectory.
         jacobian = None
         if stepped.observed is not None:
             observed = moved.unflatten(stepped.observed)[0]
-            change = observed[:count, :-1] - observed[count:, :-1]
-            jacobian = np.moveaxis(change / moved.widths[..., None], 0, 3)
+            jacobian = moved.observation_jacobian(observed[:count, :-1] - observed[count:, :-1])
 
-        # Mixed differences are taken on the smooth plant, relative to its unmoved step.
+        # Mixed differences are taken on the smooth plant, relative to its steps at the origin.
         if smooth is not plant:
             smooth_step = smooth.simulator.step([smooth.model(theta)], moved.states, moved.ctrl)
             origin = moved.unflatten(smooth_step.states)[0]
@@ -817,12 +950,9 @@ class Derivatives:
         for w in directions:
             state_direction = psi @ w
             epsilon = self._direction_step(accuracy, state_direction, w)
-            shifted = plant.space.plus(
-                moved.states, _tiled(epsilon * state_direction, moved.batch_shape[0])
+            mixed.append(
+                self._one_sided_difference(theta, moved, origin, state_direction, w, epsilon)
             )
-            models = smooth.models((theta + epsilon * w)[None])
-            states = moved.unflatten(smooth.simulator.step(models, shifted, moved.ctrl).states)[0]
-            mixed.append(moved.quotient(plant.space.minus(states, origin) / epsilon))
 
         return self._bilinear_from(
             theta,
@@ -835,6 +965,33 @@ class Derivatives:
             sensor_mixed=[],
             observation_jacobian=jacobian,
         )
+
+    def _one_sided_difference(
+        self,
+        theta: Array,
+        moved: _MovedSamples,
+        origin: Array,
+        state_direction: Array,
+        w: Array,
+        epsilon: float,
+    ) -> Array:
+        """(c, n, nx) mixed differences of F on the smooth plant, by (x, u) and along (psi w, w).
+
+        Args:
+            theta: (p,) parameters of the trajectory [theta-unit].
+            moved: The n moved samples.
+            origin: (m, n, ns) states of the smooth plant after the moved samples, at theta.
+            state_direction: (n, nx) direction psi w of the states.
+            w: (p,) direction of the parameters [theta-unit].
+            epsilon: Step along (psi w, w).
+        """
+        space, smooth = self.plant.space, self.plant.smooth
+        shift = _tiled(epsilon * state_direction, moved.batch_shape[0])
+        models = smooth.models((theta + epsilon * w)[None])
+        stepped = smooth.simulator.step(models, space.plus(moved.states, shift), moved.ctrl)
+
+        states = moved.unflatten(stepped.states)[0]
+        return moved.quotient(space.minus(states, origin) / epsilon)
 
     def _bilinear_from(
         self,
@@ -849,10 +1006,21 @@ class Derivatives:
         sensor_mixed: list[Array],
         observation_jacobian: Array | None,
     ) -> Bilinear:
-        """Assemble the record; quotients by (x, u) are its first axis: first, mixed: (nx+nu, N+1, nx), r of mixed.
+        """The record of derivatives, from differences by (x, u).
 
-        states: (N+1, ns);  sensor_first, sensor_mixed: (nx+nu, N+1, nsensordata), None and empty
-        without sensors
+        Args:
+            theta: (p,) parameters of the trajectory [theta-unit].
+            states: (N+1, ns) states.
+            psi: (N+1, nx, p) sensitivity [x-unit / theta-unit].
+            directions: (r, p) directions w [theta-unit].
+            first: (nx+nu, N+1, nx) first differences of F.
+            mixed: r mixed differences of F, each (nx+nu, N+1, nx).
+            sensor_first: (nx+nu, N+1, nsensordata) first differences of the sensors, or None
+                without sensors.
+            sensor_mixed: r mixed differences of the sensors, each (nx+nu, N+1, nsensordata); empty
+                without sensors.
+            observation_jacobian: (N, derivative substeps, w, nx+nu) derivative of the observations,
+                or None.
         """
         plant, nx = self.plant, self.plant.space.nx
         unit = self._unit_moves(len(states))
@@ -864,13 +1032,11 @@ class Derivatives:
 
         h_mixed = None
         if sensor_mixed or plant.outputs.curved:
-            bends = [
-                plant.outputs.mixed_change(
-                    states, unit, psi @ w, sensor_mixed[r] if sensor_mixed else None
-                )
-                for r, w in enumerate(directions)
-            ]
-            h_mixed = np.moveaxis(np.array(bends), 1, 2)
+            changes = []
+            for r, w in enumerate(directions):
+                of_sensors = sensor_mixed[r] if sensor_mixed else None
+                changes.append(plant.outputs.mixed_change(states, unit, psi @ w, of_sensors))
+            h_mixed = np.moveaxis(np.array(changes), 1, 2)
 
         return Bilinear(
             A=AB[..., :nx],
@@ -887,7 +1053,11 @@ class Derivatives:
     def _direction_step(
         self, accuracy: DifferenceAccuracy, state_direction: Array, w: Array
     ) -> float:
-        """Step along (psi w, w), relative to the larger of its two parts: psi w (N+1, nx), and w over `parameter_scale`."""
+        """Step along (psi w, w).
+
+        It is relative to the larger of the two parts: the state direction psi w: (N+1, nx), and w
+        divided by `parameter_scale`.
+        """
         in_model = self.plant.parameters.changes_model
         relative = np.where(in_model, np.abs(w / self.parameter_scale), 0.0).max(initial=0.0)
         largest = max(np.abs(state_direction).max(initial=0.0), relative, TINY)
@@ -895,12 +1065,60 @@ class Derivatives:
 
 
 def _all_samples(trajectory: Trajectory) -> tuple[Array, Array]:
-    """States (N+1, ns) and controls (N+1, nu); the last control is held for the outputs of the last sample."""
+    """States (N+1, ns) and controls (N+1, nu) of all samples.
+
+    The last control is held for the outputs of the last sample.
+    """
     return trajectory.state, np.concatenate([trajectory.ctrl, trajectory.ctrl[-1:]])
 
 
+def _theta_moves(p: int, moving: np.ndarray, h: Array, central: bool, needs_origin: bool) -> Array:
+    """(m, p) moves of theta, one for each rollout.
+
+    There are n forward moves, n backward moves for two-sided differences, and a zero move if the
+    rollout at theta is needed.
+
+    Args:
+        p: Number of parameters.
+        moving: (n,) indices of the parameters that are moved.
+        h: (n,) difference steps of these parameters [theta-unit].
+        central: True for two-sided differences.
+        needs_origin: Whether the rollout at theta is needed.
+    """
+    count = len(moving)
+    forward = np.zeros((count, p))
+    forward[np.arange(count), moving] = h
+
+    backward = -forward if central else forward[:0]
+    origin = np.zeros((int(needs_origin), p))
+    return np.concatenate([forward, backward, origin])
+
+
+def _sensor_differences(
+    moved: _MovedSamples, sensors: Array, epsilon: float
+) -> tuple[Array, Array]:
+    """First and mixed differences of sensors by (x, u).
+
+    Args:
+        moved: The n moved samples.
+        sensors: (2*m*n, nsensordata) sensor data of steps at +epsilon, then at -epsilon.
+        epsilon: Step along (psi w, w).
+
+    Returns:
+        (c, n, nsensordata) first differences and (c, n, nsensordata) mixed differences.
+    """
+    count = len(moved.widths)
+    pair = moved.unflatten(sensors)
+    first = np.mean(pair[:, :count] - pair[:, count:], axis=0) / moved.widths
+    mixed = moved.quotient((pair[0] - pair[1]) / (2.0 * epsilon))
+    return first, mixed
+
+
 def _with_origin(moves: Array, central: bool) -> Array:
-    """(J, k) moves of rollouts: a zero move, the rows of moves: (q, k), and the opposite ones if differences are two-sided."""
+    """(J, k) moves of rollouts from the forward moves: (q, k).
+
+    There is a zero move, then the forward moves, then the backward moves for two-sided differences.
+    """
     origin = np.zeros((1, moves.shape[1]))
     backward = -moves if central else moves[:0]
     return np.concatenate([origin, moves, backward])
@@ -912,7 +1130,11 @@ def _tiled(curve: Array, count: int) -> Array:
 
 
 def _require_finite(derivative: Array) -> Array:
-    """The derivative itself. Raises SimulationDivergedError where it is not finite."""
+    """Return a derivative after a check.
+
+    Raises:
+        SimulationDivergedError: A number of the derivative is not finite.
+    """
     if not np.isfinite(derivative).all():
         raise SimulationDivergedError("a perturbed step diverged during linearization")
     return derivative

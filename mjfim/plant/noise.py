@@ -1,4 +1,4 @@
-"""Measurement noise: its covariance over the outputs, the samples at which outputs are measured, and whitening."""
+"""Measurement noise: covariance of the outputs, sampling of the measurements, and whitening."""
 
 from __future__ import annotations
 
@@ -60,7 +60,9 @@ class Noise:
         return np.asarray(np.linalg.inv(self.covariance))
 
     def at_every_sample(self, stride: int) -> Noise:
-        """Noise with equal information per second on another grid that measures every output at every sample.
+        """Noise on a grid that measures every output at every sample.
+
+        The information per second is equal to that of this noise.
 
         Args:
             stride: Stride of the measurement rate to which information is related.
@@ -125,8 +127,8 @@ class Noise:
         if not self.correlated:
             return np.asarray(self.whiten(values)[present])
 
-        # Samples at which different outputs are present have different factors of their marginal
-        # covariance.
+        # The marginal covariance, and with it the factor, depends on which outputs are present at a
+        # sample. All samples with an equal pattern are whitened together.
         whitened = np.zeros(values.shape)
         for pattern in np.unique(present, axis=0):
             if not pattern.any():

@@ -1,4 +1,4 @@
-"""Measured outputs `y = h(x, u, theta)`: which components of the state and which sensors are recorded."""
+"""Measured outputs `y = h(x, u, theta)`: components of the state, and sensors."""
 
 from __future__ import annotations
 
@@ -69,18 +69,24 @@ class Outputs:
     @cached_property
     def _states(self) -> np.ndarray:
         """(2, n) output and address in the state vector of every measured state component."""
-        rows = [(i, o.state) for i, o in enumerate(self.outputs) if o.state is not None]
+        rows = []
+        for i, output in enumerate(self.outputs):
+            if output.state is not None:
+                rows.append((i, output.state))
         return _columns(rows, 2)
 
     @cached_property
     def _sensors(self) -> np.ndarray:
         """(2, n) output and address in sensordata of every measured sensor."""
-        rows = [(i, o.sensor) for i, o in enumerate(self.outputs) if o.sensor is not None]
+        rows = []
+        for i, output in enumerate(self.outputs):
+            if output.sensor is not None:
+                rows.append((i, output.sensor))
         return _columns(rows, 2)
 
     @cached_property
     def _scalars(self) -> np.ndarray:
-        """(2, n) output and tangent index of every measured state component that belongs to no quaternion."""
+        """(2, n) output and tangent index of every measured component outside quaternions."""
         space = self.space
         tangent = dict(zip(space.scalar_q.tolist(), space.scalar_v.tolist(), strict=True))
         rows = []
@@ -93,7 +99,12 @@ class Outputs:
 
     @cached_property
     def _quaternions(self) -> np.ndarray:
-        """(4, n) output, component, and addresses in qpos and qvel of every measured quaternion component."""
+        """Measured components of quaternions.
+
+        Returns:
+            (4, n) for each of them the output, the component, and the addresses of the quaternion
+            in qpos and of its angular velocity in qvel.
+        """
         rows = []
         for i, address in self._states.T.tolist():
             for q, v in self.space.quaternions:
@@ -140,7 +151,9 @@ class Outputs:
     def mixed_change(
         self, states: Array, first: Array, second: Array, dsensors: Array | None
     ) -> Array:
-        """Mixed second-order change of the outputs along two tangent vectors, the second taken where the first leads.
+        """Mixed second-order change of the outputs along two tangent vectors.
+
+        The second vector is applied at the state to which the first one leads.
 
         Args:
             states: (..., ns) states.
@@ -162,7 +175,7 @@ class Outputs:
 
 
 def outputs_by_state(model: Any, outputs: Outputs) -> dict[int, int]:
-    """Outputs that measure a component of the state: the component itself, or a sensor of its joint.
+    """Outputs that measure a component of the state, directly or by a sensor of its joint.
 
     Args:
         model: Compiled MuJoCo model.
@@ -175,7 +188,8 @@ def outputs_by_state(model: Any, outputs: Outputs) -> dict[int, int]:
         output.state: i for i, output in enumerate(outputs.outputs) if output.state is not None
     }
 
-    sensors = {}  # address in sensordata to address in the state vector
+    # Address in sensordata -> address in the state vector.
+    sensors = {}
     for s in range(model.nsensor):
         joint = int(model.sensor_objid[s])
         kind = int(model.sensor_type[s])
@@ -197,6 +211,15 @@ def _columns(rows: Sequence[tuple[int, ...]], width: int) -> np.ndarray:
 
 
 def _turned(quaternion: Array, rotation: Array) -> Array:
-    """(..., 4) first-order change of quaternions (..., 4) along rotation vectors (..., 3) in the body frame."""
+    """First-order change of quaternions under a rotation.
+
+    Args:
+        quaternion: (..., 4) quaternions (w, x, y, z).
+        rotation: (..., 3) rotation vectors in the body frame [rad].
+
+    Returns:
+        (..., 4) changes of the quaternions.
+    """
     real = np.zeros((*rotation.shape[:-1], 1))
-    return quaternion_product(quaternion, np.concatenate([real, 0.5 * rotation], axis=-1))
+    half_rotation = np.concatenate([real, 0.5 * rotation], axis=-1)
+    return quaternion_product(quaternion, half_rotation)

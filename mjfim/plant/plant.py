@@ -1,7 +1,6 @@
-"""The plant in MuJoCo's discrete time: `x_{k+1} = F(x_k, u_k, theta)` and `y_k = h(x_k, u_k, theta)`.
+"""The plant in discrete time: `x_{k+1} = F(x_k, u_k, theta)` and `y_k = h(x_k, u_k, theta)`.
 
-States are differences in tangent-space coordinates wherever they are subtracted or moved
-(`StateSpace`).
+Differences of states are vectors of the tangent space, along which states are moved (`StateSpace`).
 """
 
 from __future__ import annotations
@@ -22,9 +21,8 @@ from mjfim.plant.derivatives import Derivatives
 from mjfim.plant.outputs import Outputs
 from mjfim.records.trajectory import Trajectory
 
-MAX_CACHED_MODELS = (
-    64  # Largest number of compiled models at single parameter values that a plant keeps.
-)
+# Largest number of compiled models at single parameter values that a plant keeps.
+MAX_CACHED_MODELS = 64
 
 
 class Plant:
@@ -66,8 +64,8 @@ class Plant:
             nominal_initial_state: (ns,) initial state where no parameter moves it.
             substeps: `mj_step` calls per sample.
             threads: Threads of the simulator; None takes all cores.
-            smooth: Plant on which mixed second differences are taken if this one has kinks; None
-                takes this one.
+            smooth: Plant on which mixed second differences are taken, if the derivatives of this
+                one jump; None for this one.
         """
         self.source = source
         self.parameters = parameters
@@ -89,7 +87,10 @@ class Plant:
 
     @property
     def smooth(self) -> Plant:
-        """The plant on which mixed second differences are taken: one without kinks, or this one."""
+        """The plant on which mixed second differences are taken.
+
+        It is this plant, or one with smooth derivatives where those of this plant jump.
+        """
         return self if self._smooth is None else self._smooth
 
     @property
@@ -101,7 +102,9 @@ class Plant:
         return steps
 
     def calibrated(self, theta: Array, trajectory: Trajectory) -> Plant:
-        """A plant with difference steps whose effect exceeds the round-off of a trajectory; simulator and models are shared.
+        """A plant with difference steps whose effect exceeds the round-off of a trajectory.
+
+        Simulator and models are shared.
 
         Args:
             theta: (p,) parameters of the trajectory [theta-unit].
@@ -159,7 +162,14 @@ class Plant:
         return OutputDelay.on_grid(samples, delay, self.dt)
 
     def model(self, theta: Array) -> Any:
-        """Compiled model at theta: (p,), cached for the few values in use."""
+        """Compiled model at one parameter value, kept for later calls.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+
+        Returns:
+            The model, which callers do not change.
+        """
         key = np.asarray(theta, dtype=np.float64).tobytes()
         if key not in self._cached_models:
             if len(self._cached_models) > MAX_CACHED_MODELS:
@@ -168,7 +178,9 @@ class Plant:
         return self._cached_models[key]
 
     def models(self, theta: Array) -> list[Any]:
-        """Models at many parameter values; the next call may overwrite them.
+        """Models at many parameter values.
+
+        The next call may overwrite the models.
 
         Args:
             theta: (m, p) parameters [theta-unit].
@@ -187,20 +199,21 @@ class Plant:
         return models
 
     def try_models(self, theta: Array) -> tuple[list[Any], np.ndarray]:
-        """Models at many parameter values, as far as they can be compiled; the next call may overwrite them.
+        """Models at many parameter values, of which some may be impossible to compile.
+
+        The next call may overwrite the models.
 
         Args:
             theta: (m, p) parameters [theta-unit].
 
         Returns:
-            m models, and (m,) True where the model is the one at theta; elsewhere it is the nominal
-            one.
+            m models, and (m,) True where the model could be compiled; elsewhere it is the nominal
+            model.
         """
         if self.parameters.needs_compile.any():
             return self._compile(theta)
 
-        # Parameters that are plain numbers of the model are written into copies that are kept for
-        # the next call.
+        # Parameters that need no compile are written into copies, which the next call uses again.
         while len(self._reusable_models) < len(theta):
             self._reusable_models.append(copy.copy(self.source.model))
 
@@ -211,7 +224,12 @@ class Plant:
         return models, np.ones(len(theta), dtype=bool)
 
     def _compile(self, theta: Array) -> tuple[list[Any], np.ndarray]:
-        """Compile one model per row of theta: (m, p), and return which of them (m,) could be compiled."""
+        """Compile one model for each row of theta: (m, p).
+
+        Returns:
+            m models, and (m,) True where the model could be compiled; elsewhere it is the nominal
+            model.
+        """
         models = []
         compiled = np.ones(len(theta), dtype=bool)
         for i, row in enumerate(theta):
@@ -230,7 +248,7 @@ class Plant:
             ctrl: (N, nu) controls.
 
         Returns:
-            The trajectory, its time beginning at zero.
+            The trajectory; its time begins at zero.
         """
         qpos, qvel, act = self.space.split(states)
         t = np.arange(len(states), dtype=np.float64) * self.dt
@@ -310,7 +328,9 @@ class Plant:
     def project(
         self, theta: Array, base: Trajectory, zeta: TangentCurve, gamma: float, K: Array
     ) -> Trajectory | None:
-        """Projection operator `P(xi + gamma zeta)` about a trajectory xi: closed loop with `u = mu + K (alpha - x)`.
+        """Projection operator `P(xi + gamma zeta)` about a trajectory xi.
+
+        The plant is simulated in closed loop, with `u = mu + K (alpha - x)`.
 
         Args:
             theta: (p,) parameters [theta-unit].
@@ -328,7 +348,7 @@ class Plant:
             out = self.simulator.rollout([model], base.state[:1], mu[None])
             return self.trajectory(out.states[0], mu) if out.finite[0] else None
 
-        # A step that is far too long may overflow: the simulation then counts as diverged.
+        # A step that is much too long may overflow; the simulation then counts as diverged.
         with np.errstate(over="ignore", invalid="ignore"):
             alpha = self.space.plus(base.state, gamma * zeta.z)
 

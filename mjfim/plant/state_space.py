@@ -1,8 +1,8 @@
 """Differences and moves on MuJoCo's configuration space, for many states at once.
 
-This is the vectorised counterpart of `mj_differentiatePos` and `mj_integratePos` (tests compare it
-with both): scalar joints subtract, ball joints and the rotation of free joints use the quaternion
-logarithm in the body frame.
+This is the vectorised form of `mj_differentiatePos` and `mj_integratePos`, and tests compare it
+with both. Coordinates of scalar joints are subtracted; ball joints and the rotation of free joints
+use the logarithm of quaternions in the body frame.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 
 from mjfim.arrays import Array
 
-SMALL_ANGLE = (
-    1e-3  # [rad] below which the logarithm's derivative takes the limit of its second-order term
-)
+# Angle below which the derivative of the logarithm uses the limit of its second-order term [rad].
+SMALL_ANGLE = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateSpace:
-    """Layout of states (qpos, qvel, act), ns numbers, and of their tangent vectors (dq, dv, da), nx numbers.
+    """Layout of states and of their tangent vectors.
+
+    A state (qpos, qvel, act) has ns numbers, a tangent vector (dq, dv, da) has nx numbers.
 
     Attributes:
         nq: Length of qpos.
@@ -160,8 +161,8 @@ def logarithm(quaternion: Array) -> Array:
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(length, np.abs(real))
 
-    # A quaternion and its negative are the same rotation: the one with a positive real part is the
-    # shorter way.
+    # A quaternion and its negative describe one rotation. The one with a positive real part gives
+    # the shorter rotation vector.
     sign = np.where(real < 0.0, -1.0, 1.0)
     safe_length = np.where(length > 0.0, length, 1.0)
     return sign * vector * np.where(length > 0.0, angle / safe_length, 2.0)
