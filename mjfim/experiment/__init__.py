@@ -1,4 +1,4 @@
-"""What the user states (schema), and the system that it resolves to."""
+"""The experiment file as a checked record (schema), and the system that it resolves to."""
 
 from mjfim.experiment.schema import Experiment, json_schema
 from mjfim.experiment.system import System, TimeGrid

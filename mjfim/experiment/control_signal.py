@@ -10,7 +10,7 @@ from mjfim.experiment.schema import by_name
 from mjfim.experiment.system_tables import Signal
 from mjfim.signals import multisine
 
-# Each actuator's frequency exceeds that of the one before by this share of the first frequency.
+# Frequencies of successive actuators differ by this fraction of the first actuator's frequency.
 FREQUENCY_SPREAD = 0.17
 
 # Last frequency of a chirp over its first one, where the experiment file does not state it.
@@ -18,15 +18,16 @@ CHIRP_SPAN = 5.0
 
 
 def generate(signal: Signal, t: Array, names: tuple[str, ...], rest: Array) -> Array:
-    """Generate the control of all actuators; every actuator has a frequency different from the others.
+    """Generate the control of all actuators.
 
-    Sines and chirps begin at their offset, without a jump.
+    Every actuator has a different frequency, so that the movements differ. Sines and chirps begin
+    at their offset, without a jump.
 
     Args:
         signal: Kind of signal, its amplitude, offset and frequencies.
         t: (N,) sample times [s].
         names: nu names of the actuators.
-        rest: (nu,) offset where the signal states none [control unit].
+        rest: (nu,) offset that is used if the signal states none [control unit].
 
     Returns:
         (N, nu) control [control unit].
@@ -44,7 +45,7 @@ def generate(signal: Signal, t: Array, names: tuple[str, ...], rest: Array) -> A
 
 
 def _shape(signal: Signal, t: Array, nu: int) -> Array:
-    """(N, nu) curve of each actuator, with amplitude 1 about zero."""
+    """(N, nu) waveform of each actuator with amplitude 1 and no offset; ones for a constant."""
     spread = 1.0 + FREQUENCY_SPREAD * np.arange(nu)
 
     if signal.kind == "sine":

@@ -1,4 +1,7 @@
-"""Validation errors of pydantic as one line per fault: file, key, what is wrong and what would be right."""
+"""Validation errors of pydantic in the words of the experiment file.
+
+Each fault becomes one line with the file, the key, what is wrong and what would be right.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from mjfim.errors import unknown
 
-# Endings of pydantic's names for faults that say that a value has the wrong type or is none of the
-# stated words.
+# pydantic's names of faults end so if a value has the wrong type or is none of the allowed words.
 WRONG_TYPE = ("_type", "literal_error")
 
 
@@ -35,8 +37,8 @@ def explain(
         keys, _ = _walk(table, fault["loc"])
         faults_by_key.setdefault(".".join(keys), []).append(fault)
 
-    # A fault inside a table is repeated for the table itself; the innermost one is the most
-    # specific.
+    # pydantic repeats a fault inside a table for the table itself. Only the innermost key, which
+    # is the most specific one, is reported.
     innermost = [
         key
         for key in faults_by_key
@@ -60,15 +62,18 @@ def valid_keys(table: Any, hidden: Sequence[str] = ()) -> list[str]:
 
 
 def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) -> str:
-    """Say what is wrong with one key, for which every branch of a union has reported a fault."""
-    # A branch whose type fits but whose value does not is the one that the user meant.
+    """Say what is wrong with one key.
+
+    faults: the faults that the branches of a union have reported for this key.
+    """
+    # The user meant a branch whose type fits, even if the value is not valid there.
     fault = next((f for f in faults if not f["type"].endswith(WRONG_TYPE)), faults[0])
 
     if fault["type"] == "extra_forbidden":
         keys, _ = _walk(table, fault["loc"])
         _, parent = _walk(table, fault["loc"][:-1])
 
-        # A key of an earlier version is answered with its present name.
+        # For a key of an earlier version, the message states its present name.
         present = getattr(parent, "renamed_keys", {}).get(keys[-1])
         if present is not None:
             return f"this key is called {present!r} now"
@@ -78,8 +83,8 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
     if fault["type"] == "missing":
         return "this key is required"
 
-    # Where no branch has the right type, all of them are offered; else only the faults of the
-    # chosen kind.
+    # If the value has the right type for no branch, all branches are suggested; otherwise only
+    # faults of the chosen kind are shown.
     only_types = fault["type"].endswith(WRONG_TYPE)
     shown_faults = [f for f in faults if only_types or f["type"] == fault["type"]]
     first, *others = dict.fromkeys(_message(f) for f in shown_faults)
@@ -92,7 +97,7 @@ def _sentence(faults: list[Any], table: type[BaseModel], hidden: Sequence[str]) 
 
 
 def _message(fault: Mapping[str, Any]) -> str:
-    """The sentence of pydantic about one fault, in the words of the experiment file."""
+    """Message of pydantic about one fault, in the words of the experiment file."""
     kind = fault["type"]
 
     if kind in ("dict_type", "model_type"):
@@ -113,10 +118,10 @@ def _message(fault: Mapping[str, Any]) -> str:
 
 
 def _walk(table: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], Any]:
-    """Follow a location of pydantic through the types.
+    """Follow a location of pydantic through the types of the tables.
 
-    pydantic names the branch of a union inside a location, which the user never wrote: these parts
-    are left out.
+    A location of pydantic also holds the names of the branches of unions. These parts are left
+    out, because the user did not write them.
 
     Returns:
         The user's keys, and the type at the end of the location.
@@ -138,7 +143,7 @@ def _walk(table: type[BaseModel], location: Sequence[str | int]) -> tuple[list[s
 
 
 def _branches(annotation: Any) -> list[Any]:
-    """Alternatives of a type, None left out; the type itself where it is no union."""
+    """Alternatives of a union without None; a list of the type itself if it is not a union."""
     if get_origin(annotation) is Annotated:
         return _branches(get_args(annotation)[0])
     if get_origin(annotation) not in (Union, UnionType):
@@ -153,7 +158,7 @@ def _branches(annotation: Any) -> list[Any]:
 
 
 def _chosen(branches: list[Any], tag: str) -> Any:
-    """Find the branch of a union by the name that pydantic gives it; None where there is none.
+    """Find the branch of a union by the name that pydantic gives it; None if there is none.
 
     pydantic writes `Table` for a table, `function-after[_check(), Table]` for a table with a
     validator, and `dict[...]` or `tuple[...]` for a container.
@@ -169,7 +174,7 @@ def _chosen(branches: list[Any], tag: str) -> Any:
 
 
 def _member(annotation: Any, key: str | int) -> Any:
-    """The type behind a key of a table, a name of a dictionary or an index of a tuple; None where there is none."""
+    """Type of one entry of a table, dictionary or tuple, by its key or index; None if unknown."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         field = annotation.model_fields.get(str(key))
         return None if field is None else field.annotation
@@ -178,8 +183,9 @@ def _member(annotation: Any, key: str | int) -> Any:
     if get_origin(annotation) is dict:
         return members[1]
     if get_origin(annotation) is tuple and isinstance(key, int):
-        return (
-            members[0] if members[-1] is Ellipsis else members[key] if key < len(members) else None
-        )
+        if members[-1] is Ellipsis:
+            return members[0]
+        if key < len(members):
+            return members[key]
 
     return None

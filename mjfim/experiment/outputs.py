@@ -1,4 +1,7 @@
-"""The measured outputs of an experiment: its tables `noise` and `correlated` resolved against the state and the sensors."""
+"""The measured outputs of an experiment and their noise.
+
+They follow from its tables `noise` and `correlated`, the state and the sensors of the model.
+"""
 
 from __future__ import annotations
 
@@ -23,18 +26,18 @@ from mjfim.plant.noise import Noise
 from mjfim.plant.outputs import Output, Outputs
 from mjfim.plant.state_space import StateSpace
 
-# Relative tolerance with which one rate has to divide another one.
+# A ratio of two rates counts as a whole number within this relative tolerance.
 RATE_TOLERANCE = 1e-6
 
-# Smallest eigenvalue of a covariance over its largest entry, below which it counts as not positive
-# definite.
+# A covariance is not positive definite if its smallest eigenvalue is below this fraction of its
+# largest entry.
 DEFINITENESS = 1e-12
 
 
 def resolve_outputs(
     experiment: Experiment, model: Any, space: StateSpace, stride: int
 ) -> tuple[Outputs, Noise]:
-    """The measured outputs and their noise.
+    """Resolve the measured outputs and their noise.
 
     Args:
         experiment: The experiment.
@@ -42,8 +45,11 @@ def resolve_outputs(
         space: The state space of the model.
         stride: Samples from one measurement to the next at `measure_rate`.
 
+    Returns:
+        The outputs, and the noise with their covariance and strides.
+
     Raises:
-        ExperimentError: The tables ask for something impossible; the message names the key.
+        ExperimentError: A key of the tables is not valid for the model; the message names it.
     """
     components = {component.name: component for component in state_components(model)}
     sensors = names_of(model, "sensor")
@@ -59,7 +65,8 @@ def resolve_outputs(
 
     table = _NoiseTable(components, list(measurable_columns(model)), stride)
 
-    # A key for fewer outputs takes precedence over a key for more of them.
+    # Keys that cover fewer outputs are entered last, so that they take precedence over keys that
+    # cover more outputs.
     for key in sorted(stated, key=lambda k: -len(columns_of_key[k])):
         table.set_key(key, stated[key], columns_of_key[key], experiment)
     for block in experiment.correlated:
@@ -74,7 +81,7 @@ def resolve_outputs(
 
 
 def measurement_stride(experiment: Experiment) -> int:
-    """Samples from one measurement to the next at `measure_rate`."""
+    """Samples from one measurement to the next at the experiment's `measure_rate`."""
     measure_rate = experiment.measure_rate or experiment.rate
     return _stride("measure_rate", experiment.rate, measure_rate)
 
@@ -86,13 +93,16 @@ class _NoiseTable:
         columns: Names of the n columns.
         covariance: (n, n) covariance of the noise; zero for columns that are not measured.
         strides: (n,) samples from one measurement to the next.
-        measured: Places of the columns that are measured.
+        measured: Indices of the columns that are measured.
     """
 
     def __init__(
         self, components: Mapping[str, StateComponent], columns: list[str], stride: int
     ) -> None:
-        """Begin without measured columns. stride: samples from one measurement to the next unless stated otherwise."""
+        """Begin without measured columns.
+
+        stride: samples from one measurement to the next, for keys that state no rate.
+        """
         n = len(columns)
         self.columns = columns
         self.covariance = np.zeros((n, n))
@@ -104,8 +114,8 @@ class _NoiseTable:
             [components[name].sigma_factor if name in components else 1.0 for name in columns]
         )
 
-    def places(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
-        """Places of columns by name."""
+    def indices(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
+        """Indices of columns by their names."""
         found = [self.columns.index(name) for name in names]
         return np.array(found, dtype=np.intp)
 
@@ -119,7 +129,7 @@ class _NoiseTable:
             )
 
         spec = value if isinstance(value, NoiseSpec) else NoiseSpec(sigma=value)
-        rows = self.places(names)
+        rows = self.indices(names)
         self.covariance[rows] = 0.0
         self.covariance[:, rows] = 0.0
         self.covariance[np.ix_(rows, rows)] = _key_covariance(
@@ -139,7 +149,7 @@ class _NoiseTable:
                 fault = unknown_coordinate("output", name, self.columns)
                 raise ExperimentError(f"correlated.outputs: {fault}")
 
-        rows = self.places(block.outputs)
+        rows = self.indices(block.outputs)
         listed = ", ".join(block.outputs)
         if len(set(rows.tolist())) < len(rows):
             raise ExperimentError(f"correlated.outputs: an output is listed twice: {listed}")
@@ -174,14 +184,18 @@ def _columns_of_keys(
 
 
 def _noise_of_mjcf(model: Any, sensors: list[str], required: bool) -> dict[str, Any]:
-    """Standard deviation of the sensors whose `noise` the MJCF states, used where the experiment states none."""
+    """Standard deviations of the sensors whose `noise` the MJCF states.
+
+    They are used if the experiment states no noise. Raises ExperimentError if `required` and the
+    MJCF states none either.
+    """
     sigmas = {name: float(model.sensor(name).noise[0]) for name in sensors}
     stated = {name: sigma for name, sigma in sigmas.items() if sigma > 0}
     if required and not stated:
         valid = ", ".join(["state", *measurable_columns(model)])
         raise ExperimentError(
-            "noise: nothing is measured: give `state`, or sensors by name, or `noise` in the MJCF; "
-            f"valid: {valid}"
+            "noise: no output is measured; state `state` or outputs by name here, or `noise` of "
+            f"sensors in the MJCF; valid: {valid}"
         )
     return stated
 
@@ -220,8 +234,8 @@ def _key_covariance(key: str, spec: NoiseSpec, sigma_factors: Array) -> Array:
 
     Args:
         key: The key, for messages.
-        spec: What the table states.
-        sigma_factors: (n,) standard deviation of each column over the stated one.
+        spec: The stated noise.
+        sigma_factors: (n,) ratio of each column's standard deviation to the stated one.
     """
     n = len(sigma_factors)
     if spec.covariance is not None:
@@ -256,10 +270,13 @@ def _checked_covariance(key: str, rows: tuple[tuple[float, ...], ...], n: int) -
 
 
 def _require_measurement(key: str, rate: float, horizon: float | None) -> None:
-    """Raise where a rate [Hz] gives no measurement within a horizon [s]; None: the experiment has no horizon."""
+    """Raise ExperimentError if a rate [Hz] gives no measurement within the horizon [s].
+
+    horizon: None if the experiment states none; then every rate is accepted.
+    """
     if horizon is not None and rate * horizon < 1.0 - RATE_TOLERANCE:
         raise ExperimentError(
-            f"noise.{key}.rate: {rate:g} Hz measures nothing within {horizon:g} s"
+            f"noise.{key}.rate: {rate:g} Hz gives no measurement within the horizon ({horizon:g} s)"
         )
 
 

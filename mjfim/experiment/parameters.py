@@ -1,4 +1,4 @@
-"""The unknowns of an experiment: its tables `parameters` and `nuisance` resolved into `Parameter`s."""
+"""The unknown parameters of an experiment, resolved from its tables `parameters` and `nuisance`."""
 
 from __future__ import annotations
 
@@ -38,12 +38,17 @@ DELAY_MAGNITUDE = 0.01
 def resolve_parameters(
     experiment: Experiment, model: Any, outputs: Sequence[str]
 ) -> list[Parameter]:
-    """All parameters in the order of theta: those of the table `parameters`, then those of `nuisance`.
+    """Resolve all parameters in the order of theta.
+
+    Those of the table `parameters` come first, then those of the table `nuisance`.
 
     Args:
         experiment: The experiment.
         model: Its compiled model (`mujoco.MjModel`).
         outputs: Names of the measured columns.
+
+    Returns:
+        The p parameters.
 
     Raises:
         ExperimentError: A parameter cannot be resolved; the message names its key.
@@ -89,7 +94,7 @@ def _single_parameter(
             magnitude = field.magnitude(model) / abs(first.scale)
         except ExperimentError as error:
             raise ExperimentError(f"parameters.{name}: {error}") from None
-        # The parameter has the unit of its target only where it is the target's number itself.
+        # A parameter whose factor is not 1 may have another unit than its target.
         if not unit and first.scale == 1.0:
             unit = unit_of(model, first.path)
 
@@ -122,7 +127,10 @@ def _single_parameter(
 
 
 def _scale(name: str, spec: ParameterSpec, guess: float, magnitude: float) -> float:
-    """Unit in which information about a parameter is compared: the stated one, that of the guess, or its magnitude."""
+    """Unit in which the criterion measures the error of a parameter [parameter unit].
+
+    It is the stated number, the size of the guess, or the magnitude of the quantity.
+    """
     if isinstance(spec.scale, float):
         scale = spec.scale
     elif spec.scale == "guess":
@@ -132,8 +140,8 @@ def _scale(name: str, spec: ParameterSpec, guess: float, magnitude: float) -> fl
 
     if scale == 0.0:
         raise ExperimentError(
-            f"parameters.{name}.scale: the value in the model or the guess is 0: state a guess, or "
-            "a scale in the parameter's unit"
+            f"parameters.{name}.scale: the guess (or the value in the model) is 0; state another "
+            "guess, or a scale in the parameter's unit"
         )
     return scale
 
@@ -141,7 +149,7 @@ def _scale(name: str, spec: ParameterSpec, guess: float, magnitude: float) -> fl
 def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[Parameter]:
     """The ten coordinates of a body's inertia.
 
-    Their prior is relative to the natural magnitude of each.
+    The stated prior is relative to the natural magnitude of each coordinate.
     """
     key = f"parameters.{name}.inertial"
     kind = spec.coordinates or "logcholesky"
@@ -155,7 +163,7 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
         scale = abs(value) if spec.scale == "guess" else magnitude
         if scale == 0.0:
             raise ExperimentError(
-                f'parameters.{name}.scale: {coordinate} is 0; leave scale = "guess" out'
+                f'parameters.{name}.scale: {coordinate} is 0; leave out scale = "guess"'
             )
 
         yield Parameter(
@@ -173,7 +181,14 @@ def _inertia_parameters(name: str, spec: ParameterSpec, model: Any) -> Iterator[
 
 
 def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[Array, Array]:
-    """Coordinates (10,) of the inertia of the named body in a parametrisation, and their magnitudes (10,)."""
+    """(10,) coordinates of a body's inertia in a parametrisation, and their (10,) magnitudes.
+
+    Args:
+        key: Key that names the body, for messages.
+        name: Name of the body.
+        kind: Name of the parametrisation, a key of INERTIA_PARAMETRISATIONS.
+        model: The compiled model.
+    """
     body = identifier(model, "body", name)
     if body < 0:
         raise ExperimentError(f"{key}: {unknown('body', name, names_of(model, 'body'))}")
@@ -193,7 +208,10 @@ def _inertia_coordinates(key: str, name: str, kind: str, model: Any) -> tuple[Ar
 def _nuisance_parameters(
     experiment: Experiment, model: Any, outputs: Sequence[str]
 ) -> Iterator[Parameter]:
-    """Parameters of the table `nuisance`: deviations of the initial state, biases of outputs, delay of all outputs."""
+    """Parameters of the table `nuisance`.
+
+    They are deviations of the initial state, biases of outputs, and the delay of all outputs.
+    """
     stated = experiment.nuisance
 
     paths = {
@@ -204,8 +222,8 @@ def _nuisance_parameters(
     unnamed = unnamed_count(model, "joint")
     if unnamed and stated.initial is not None and not isinstance(stated.initial, Mapping):
         raise ExperimentError(
-            f"nuisance.initial: {unnamed} joints have no name: give them one in the MJCF, or state "
-            "deviations by name"
+            f"nuisance.initial: {unnamed} joints have no name; name them in the MJCF, or state "
+            "deviations by coordinate"
         )
     for name, prior in _priors_by_name("nuisance.initial", stated.initial, list(paths)):
         yield _nuisance_parameter(
@@ -252,7 +270,10 @@ def _nuisance_parameter(
     magnitude: float = 1.0,
     per_recording: bool = False,
 ) -> Parameter:
-    """A nuisance parameter whose guess is zero. prior: standard deviation, or True where none is known."""
+    """A nuisance parameter whose guess is zero.
+
+    prior: standard deviation [parameter unit], or True if nothing is known beforehand.
+    """
     return Parameter(
         name=name,
         targets=(Target(path),),

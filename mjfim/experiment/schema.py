@@ -1,4 +1,4 @@
-"""The experiment file as a checked record: what TOML can state, Python can state with the same names."""
+"""The experiment file as a checked record, with the names of its keys in TOML and in Python."""
 
 from __future__ import annotations
 
@@ -79,21 +79,24 @@ class Experiment(Section):
     nuisance: Nuisance = Field(
         default=Nuisance(),
         description=(
-            "Unknown deviations of the initial state, biases and delay that the design spends no "
-            "effort on."
+            "Deviations of the initial state, biases and delay that are unknown, but whose "
+            "accuracy the design does not optimise."
         ),
     )
     earlier: tuple[str, ...] = Field(
         default=(),
         description=(
-            "Files design.json or estimate.json of other experiments, whose information adds to "
-            "that of this one."
+            "Files design.json or estimate.json of other experiments. Their information is added "
+            "to the information of this experiment."
         ),
     )
     cost: Cost = Field(default=Cost(), description="The cost that a design minimises.")
     robust: Robust | None = Field(
         default=None,
-        description="Design for a wrong guess. Default: the design is made at the guess alone.",
+        description=(
+            "Design that allows for an inaccurate guess. Default: the design is made for the guess "
+            "alone."
+        ),
     )
     descent: Descent = Field(default=Descent(), description="How a design minimises the cost.")
     limits: Limits = Field(default=Limits(), description="Hard limits of a design.")
@@ -103,8 +106,8 @@ class Experiment(Section):
     recording: RecordingSpec = Field(
         default=RecordingSpec(),
         description=(
-            "How the columns of a log become a recording. Default: the columns of mjfim's own CSV "
-            "files."
+            "How the columns of a log become a recording. Default: the columns are named as in the "
+            "CSV files that mjfim writes."
         ),
     )
     fit: FitSpec = Field(
@@ -128,7 +131,7 @@ class Experiment(Section):
             **values: Keys and tables, with the names of the experiment file.
 
         Raises:
-            ExperimentError: With one line per fault, each with the key and what would be right.
+            ExperimentError: A key or a value is not valid; the message has one line per fault.
         """
         try:
             super().__init__(**values)
@@ -147,7 +150,7 @@ class Experiment(Section):
             The checked experiment, with the file's folder as `directory`.
 
         Raises:
-            ExperimentError: Where the file cannot be read, with its path and the key.
+            ExperimentError: The file cannot be read, or a key or a value in it is not valid.
         """
         path = Path(path)
 
@@ -164,11 +167,11 @@ class Experiment(Section):
         return Experiment(**values, directory=path.parent, source=str(path))
 
     def replace(self, **tables: Any) -> Experiment:
-        """Make a checked copy with changes.
+        """Make a changed copy, which is checked again.
 
         Tables merge into the old ones, one level deep: `experiment.replace(cost={"control": 1e-2})`
-        keeps the other keys of `cost`. `parameters` merges parameter by parameter; a parameter
-        cannot be taken out.
+        keeps the other keys of `cost`. The table `parameters` merges parameter by parameter; a
+        parameter cannot be removed.
 
         Args:
             **tables: Keys and tables to change, with the names of the experiment file.
@@ -177,7 +180,7 @@ class Experiment(Section):
             The changed copy.
 
         Raises:
-            ExperimentError: Where a new value is not valid.
+            ExperimentError: A new value is not valid.
         """
         values = self.model_dump(exclude_unset=True)
 
@@ -218,7 +221,7 @@ def by_name(
         (n,) values in the order of the names.
 
     Raises:
-        ExperimentError: Where the table holds an unknown name.
+        ExperimentError: The table holds an unknown name.
     """
     if not isinstance(value, Mapping):
         return np.full(len(names), float(value))
@@ -248,7 +251,7 @@ def _refuse_python_keys(path: Path, values: Mapping[str, Any]) -> None:
 
 
 def _merged_parameters(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    """Parameter tables with changes merged into each of them."""
+    """Parameter tables, each with its changes merged into it."""
     merged = dict(old)
 
     for name, table in new.items():

@@ -1,4 +1,4 @@
-"""`mjfim.simulate`: a synthetic recording of a trajectory."""
+"""`mjfim.simulate`, which makes a synthetic recording of a trajectory."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def simulate(
 ) -> Recording:
     """Simulate a recording at the `true` parameter values.
 
-    The trajectory's control is played open loop; noise is added to the measured samples.
+    The trajectory's control is applied open loop, and noise is added to the measured samples.
 
     Args:
         experiment: The experiment.
-        trajectory: The trajectory whose control is played.
+        trajectory: The trajectory whose control is applied.
         seed: Seed of the noise, or a generator of random numbers.
         threads: Threads for the engine; default: one per core.
 
@@ -50,7 +50,7 @@ def simulate_system(
 
     noisy = outputs[0] + system.noise.sample(len(outputs[0]), rng)
 
-    # The initial state is always recorded; the other samples at the rates of their sensors.
+    # All outputs are recorded at the first sample, afterwards each output at its rate.
     measured = system.noise.measured(trajectory.samples)
     measured[0] = 1.0
     noisy[measured == 0.0] = np.nan

@@ -1,8 +1,7 @@
 """The system that an experiment is about: model, parameters, outputs, noise, time grid and plant.
 
-A system knows no horizon, no cost and no control; `excitation.task` and `identification.task` add
-what a design and an estimation need. Every name in the experiment is checked here against the
-model.
+A system has no horizon, no cost and no control; these belong to the tasks in `excitation.task` and
+`identification.task`. Every name in the experiment is checked here against the model.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError, ModelError, SimulationDivergedError, unknown
-from mjfim.experiment.outputs import measurement_stride, resolve_outputs
+from mjfim.experiment.outputs import RATE_TOLERANCE, measurement_stride, resolve_outputs
 from mjfim.experiment.parameters import resolve_parameters
 from mjfim.experiment.schema import Experiment
 from mjfim.model.coordinates import (
@@ -39,7 +38,7 @@ from mjfim.plant.state_space import StateSpace
 from mjfim.recordings.channels import Channels
 from mjfim.records.trajectory import Trajectory
 
-# Norm of a quaternion below which it states no rotation.
+# A quaternion whose norm is below this number states no rotation.
 NO_ROTATION = 1e-6
 
 
@@ -61,10 +60,14 @@ class TimeGrid:
 
     @staticmethod
     def stated(experiment: Experiment, timestep: float) -> TimeGrid:
-        """The grid that an experiment states, on a model with this timestep [s].
+        """The grid that an experiment states.
+
+        Args:
+            experiment: The experiment.
+            timestep: Timestep of the user's model [s].
 
         Raises:
-            ExperimentError: A rate does not divide as it must.
+            ExperimentError: The rates are not multiples of each other as required.
         """
         substeps = _substeps(experiment, timestep)
         return TimeGrid(
@@ -78,7 +81,7 @@ class TimeGrid:
         """This grid with longer samples or a longer timestep; longer samples are all measured."""
         if self.substeps % variant.timestep_factor:
             raise ValueError(
-                f"{self.substeps} engine steps of a sample do not divide by "
+                f"{self.substeps} engine steps per sample do not divide by "
                 f"{variant.timestep_factor}"
             )
 
@@ -102,9 +105,9 @@ class System:
         outputs: The ny measured outputs.
         stated_noise: Noise of the outputs on the stated grid.
         nominal_initial_state: (ns,) nominal initial state.
-        mocap: Where the initial keyframe puts mocap bodies, None where the model has them.
+        mocap: Poses of the mocap bodies in the initial keyframe; None: those of the model.
         variant: How the plant differs from the user's model.
-        plant: The plant that simulates it at any theta.
+        plant: The plant, which simulates the system at any theta.
     """
 
     experiment: Experiment
@@ -131,7 +134,7 @@ class System:
         Args:
             experiment: The experiment as the user states it.
             threads: Threads for the engine; default: one per core.
-            source: The model of the experiment, where it is parsed already.
+            source: The model of the experiment, if it is parsed already.
 
         Raises:
             ExperimentError: A name, a file or a number in the experiment is wrong; the message
@@ -147,11 +150,11 @@ class System:
 
     @classmethod
     def _resolved(cls, experiment: Experiment, threads: int | None, source: ModelSource) -> System:
-        """As `resolve`; errors do not name the experiment file yet."""
+        """Resolve an experiment; error messages do not name the experiment file yet."""
         model = source.model
         _require_supported(source)
 
-        # The time grid comes first: rates of measurements are multiples of it.
+        # The time grid comes first, because it gives the period of the measurements.
         grid = TimeGrid.stated(experiment, float(model.opt.timestep))
         outputs, noise = resolve_outputs(experiment, model, state_space(model), grid.stride)
 
@@ -196,7 +199,7 @@ class System:
 
         Args:
             variant: How the plant differs from the user's model.
-            relaxation: Clamps and stops that a relaxed variant goes without.
+            relaxation: Clamps and joint stops that a relaxed variant leaves out.
 
         Returns:
             A system whose plant is not calibrated yet.
@@ -206,11 +209,11 @@ class System:
 
         def plant(speeds: tuple[float, ...], smooth: Plant | None) -> Plant:
             """A plant whose dry friction is viscous below these speeds."""
-            taken_out = relaxation
+            plant_relaxation = relaxation
             if speeds:
-                taken_out = replace(relaxation or Relaxation(), smoothing_speeds=speeds)
+                plant_relaxation = replace(relaxation or Relaxation(), smoothing_speeds=speeds)
             model = _plant_model(
-                self.source, self.parameters, self.outputs, self.mocap, variant, taken_out
+                self.source, self.parameters, self.outputs, self.mocap, variant, plant_relaxation
             )
             return Plant(
                 source=model,
@@ -222,8 +225,7 @@ class System:
                 smooth=smooth,
             )
 
-        # Friction that is smoothed for derivatives only needs a second plant, on which these are
-        # taken.
+        # If friction is smoothed for derivatives only, they are computed on a second plant.
         speeds = variant.smoothing_speeds
         if variant.smoothed or not speeds:
             return replace(self, variant=variant, plant=plant(speeds, None))
@@ -237,7 +239,7 @@ class System:
             ctrl: (N, nu) control.
 
         Returns:
-            The calibrated system; this system unchanged where the trajectory diverges.
+            The calibrated system; this system unchanged if the trajectory diverges.
         """
         try:
             return self.calibrated_along(theta, self.plant.simulate(theta, ctrl))
@@ -250,6 +252,9 @@ class System:
         Args:
             theta: (p,) parameter values [theta-unit].
             trajectory: A trajectory of the plant at theta.
+
+        Returns:
+            The calibrated system.
         """
         return replace(self, plant=self.plant.calibrated(theta, trajectory))
 
@@ -313,7 +318,7 @@ class System:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the p parameters, empty where none is stated."""
+        """Units of the p parameters; empty text if none is stated."""
         return tuple(parameter.unit for parameter in self.parameters.parameters)
 
     @property
@@ -323,7 +328,7 @@ class System:
 
     @property
     def channels(self) -> Channels:
-        """Signals that a log of this experiment can hold, and how to read them."""
+        """Signals that a log of this experiment may hold, and how to read them."""
         return Channels(
             model=self.model,
             controls=self.controls,
@@ -341,7 +346,10 @@ class System:
 
     @cached_property
     def _whole_model(self) -> PlantModel:
-        """The user's model with sensors and constraints on, bodies that parameters move not compiled as "simple"."""
+        """The user's model with sensors and constraints on.
+
+        Bodies whose inertia parameters change are not compiled as "simple" bodies.
+        """
         return PlantModel(
             self.source,
             moved_bodies=_moved(self.parameters),
@@ -355,11 +363,11 @@ class System:
 
         Args:
             theta: (p,) parameter values.
-            at_keyframe: Mocap bodies stand where the initial keyframe has them, else where the MJCF
-                has them.
+            at_keyframe: True: mocap bodies have the poses of the initial keyframe. False: they have
+                the poses of the MJCF.
 
         Returns:
-            MjModel that the caller owns.
+            A new MjModel, which the caller may change.
         """
         model = self.parameters.writer.model(self._whole_model, theta)
         if self.mocap is not None and not at_keyframe:
@@ -367,7 +375,7 @@ class System:
         return model
 
     def impossible(self, theta: Array) -> list[int]:
-        """Indices of the parameters that make bodies which cannot exist at theta: (p,)."""
+        """Indices of parameters whose values at theta: (p,) give a body an unphysical inertia."""
         try:
             faults = self.parameters.writer.unphysical_bodies(self.plant.source, theta)
         except ModelError:
@@ -377,7 +385,7 @@ class System:
 
 
 def keyframe(model: Any, key: str, name: str | None) -> Any:
-    """A keyframe of a model by its name.
+    """Find a keyframe of a model by its name.
 
     Args:
         model: MjModel.
@@ -401,7 +409,7 @@ def keyframe(model: Any, key: str, name: str | None) -> Any:
 
 
 def _require_supported(source: ModelSource) -> None:
-    """Raise ModelError for models without an actuator, or with a state that mjfim does not see."""
+    """Raise ModelError for a model without actuators, or with a state that mjfim cannot read."""
     model = source.model
     if model.nu == 0:
         raise ModelError(
@@ -410,51 +418,57 @@ def _require_supported(source: ModelSource) -> None:
     if model.nhistory or model.nplugin:
         feature = "delays or interval sensors" if model.nhistory else "engine plugins"
         raise ModelError(
-            f"{source.path}: {feature} keep a state that mjfim does not see; take them out of the "
-            "model"
+            f"{source.path}: the model has {feature}, whose internal state mjfim cannot read; "
+            "remove them from the model"
         )
 
 
 def _substeps(experiment: Experiment, timestep: float) -> int:
-    """Engine steps of a sample.
+    """Engine steps per sample.
 
-    Raises ExperimentError where the rate does not fit the timestep [s].
+    Raises ExperimentError if a sample is not a whole number of timesteps [s].
     """
     rate = experiment.rate
     ratio = 1.0 / (rate * timestep)
     n = round(ratio)
 
-    if n < 1 or abs(ratio - n) > 1e-6 * n:
+    if n < 1 or abs(ratio - n) > RATE_TOLERANCE * n:
         valid = ", ".join(f"{1.0 / (k * timestep):g}" for k in (1, 2, 4, 5, 10))
         raise ExperimentError(
-            f"rate: {rate:g} Hz is not an integer number of timesteps ({timestep:g} s) per sample; "
+            f"rate: at {rate:g} Hz, a sample is not a whole number of timesteps ({timestep:g} s); "
             f"valid for example: {valid} Hz"
         )
     return n
 
 
 def _playback_steps(experiment: Experiment, substeps: int) -> int:
-    """Engine steps of a row of design.csv.
+    """Engine steps per row of design.csv.
 
-    Raises ExperimentError where the controller's rate does not fit.
+    Raises ExperimentError if a row is not a whole number of engine steps, or a sample not a whole
+    number of rows.
     """
-    rate, wanted = experiment.rate, experiment.playback_rate
-    if wanted is None:
+    rate = experiment.rate
+    playback_rate = experiment.playback_rate
+    if playback_rate is None:
         return substeps
 
     valid = [k for k in range(1, substeps + 1) if substeps % k == 0]
-    rows = round(wanted / rate)
-    if rows not in valid or abs(wanted / rate - rows) > 1e-6 * rows:
+    ratio = playback_rate / rate
+    rows = round(ratio)
+    if rows not in valid or abs(ratio - rows) > RATE_TOLERANCE * rows:
         listed = ", ".join(f"{k * rate:g}" for k in valid)
         raise ExperimentError(
-            f"playback_rate: {wanted:g} Hz is not a multiple of rate ({rate:g} Hz) that divides "
-            f"the engine's rate ({substeps * rate:g} Hz); valid: {listed}"
+            f"playback_rate: {playback_rate:g} Hz is not a multiple of rate ({rate:g} Hz) that "
+            f"divides the engine's rate ({substeps * rate:g} Hz); valid: {listed}"
         )
     return substeps // rows
 
 
 def _initial_state(experiment: Experiment, model: Any) -> Array:
-    """(ns,) state at which the experiment starts: a keyframe, stated numbers, or the state of the model."""
+    """(ns,) state at which the experiment starts.
+
+    It is that of a keyframe, the stated numbers, or the reference state of the model.
+    """
     initial = experiment.initial
     key = keyframe(model, "initial.keyframe", initial.keyframe)
 
@@ -468,7 +482,7 @@ def _initial_state(experiment: Experiment, model: Any) -> Array:
             continue
         if len(numbers) != len(parts[name]):
             raise ExperimentError(
-                f"initial.{name}: {len(numbers)} numbers, the model has {len(parts[name])}"
+                f"initial.{name}: {len(numbers)} numbers; this model needs {len(parts[name])}"
             )
         parts[name] = np.asarray(numbers, dtype=np.float64)
 
@@ -479,7 +493,7 @@ def _initial_state(experiment: Experiment, model: Any) -> Array:
 
 
 def _require_rotations(model: Any, qpos: Array) -> None:
-    """Raise ExperimentError where a quaternion in qpos: (nq,) is zero."""
+    """Raise ExperimentError if a quaternion in qpos: (nq,) is zero."""
     for j, name in enumerate(joint_names(model)):
         if joint_dofs(model, j) == 1:
             continue
@@ -490,12 +504,12 @@ def _require_rotations(model: Any, qpos: Array) -> None:
         if not np.linalg.norm(qpos[first : first + 4]) > NO_ROTATION:
             raise ExperimentError(
                 f"initial.qpos: the quaternion of joint {name!r} (numbers {first} to {first + 3}) "
-                "is zero; no rotation is 1, 0, 0, 0"
+                "is zero; the identity rotation is 1, 0, 0, 0"
             )
 
 
 def _moved(parameters: ParameterSet) -> set[str] | None:
-    """Bodies whose inertial frame parameters change; None where a parameter may change anything."""
+    """Bodies whose inertial frame parameters change; None if a parameter may change any body."""
     return None if parameters.needs_compile.any() else moved_bodies(parameters.parameters)
 
 
@@ -507,7 +521,7 @@ def _plant_model(
     variant: ModelVariant,
     relaxation: Relaxation | None,
 ) -> PlantModel:
-    """The compiled model that a plant of a variant steps."""
+    """The compiled model that the plant of a variant simulates."""
     # A parameter that changes dry friction needs the constraint solver, even where the nominal
     # friction is zero.
     friction = any(
@@ -527,11 +541,12 @@ def _plant_model(
 
 
 def _require_bodies(parameters: ParameterSet, model: PlantModel) -> None:
-    """Raise ExperimentError where the guess or the true values make a body that cannot exist."""
+    """Raise ExperimentError if the guess or the true values give a body an unphysical inertia."""
     for key, theta in (("guess", parameters.guess), ("true", parameters.true)):
         for columns, fault in parameters.writer.unphysical_bodies(model, theta):
-            makers = dict.fromkeys(
-                parameters.parameters[j].group or f"{parameters.parameters[j].name}.{key}"
-                for j in columns
+            involved = [parameters.parameters[j] for j in columns]
+            keys = dict.fromkeys(
+                f"parameters.{p.group}" if p.group else f"parameters.{p.name}.{key}"
+                for p in involved
             )
-            raise ExperimentError(f"{', '.join(f'parameters.{m}' for m in makers)}: {fault}")
+            raise ExperimentError(f"{', '.join(keys)}: {fault}")

@@ -1,4 +1,7 @@
-"""Tables of the experiment file about the system: initial state, unknown parameters and measurement noise."""
+"""Tables of the experiment file about the system.
+
+They state the initial state, the unknown parameters and the measurement noise.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,8 @@ PriorOrUnknown = Positive | Literal[True]
 class Signal(Section):
     """A generated control signal.
 
-    Each further actuator gets a frequency that is 17 % higher than that of the actuator before, so
-    that the movements differ. Sines and chirps begin at the offset.
+    Frequencies of successive actuators differ by 17 % of the first actuator's frequency, so that
+    the movements differ. Sines and chirps begin at the offset.
     """
 
     kind: Literal["constant", "sine", "chirp", "multisine"] = Field(
@@ -29,7 +32,9 @@ class Signal(Section):
     )
     amplitude: Finite | dict[str, Finite] = Field(
         default=1.0,
-        description="Amplitude [actuator unit], one number for all actuators or a table by actuator name.",
+        description=(
+            "Amplitude [actuator unit], one number for all actuators or a table by actuator name."
+        ),
     )
     offset: Finite | dict[str, Finite] | None = Field(
         default=None,
@@ -40,7 +45,9 @@ class Signal(Section):
     )
     frequency: Positive = Field(
         default=0.5,
-        description="Frequency of a sine, first frequency of a chirp, base frequency of a multisine [Hz].",
+        description=(
+            "Frequency of a sine, first frequency of a chirp, base frequency of a multisine [Hz]."
+        ),
     )
     frequency_end: Positive | None = Field(
         default=None,
@@ -59,7 +66,7 @@ class Initial(Section):
         default=None,
         description=(
             "Name of a keyframe of the MJCF that gives the initial state and the resting control. "
-            "Not together with `qpos`, `qvel` or `act`."
+            "It excludes `qpos`, `qvel` and `act`."
         ),
     )
     qpos: tuple[Finite, ...] | None = Field(
@@ -85,6 +92,7 @@ class Initial(Section):
 
     @model_validator(mode="after")
     def _one_source(self) -> Initial:
+        """Refuse a keyframe together with stated numbers."""
         if self.keyframe is not None and (self.qpos or self.qvel or self.act):
             raise ValueError("give either keyframe or qpos/qvel/act, not both")
         return self
@@ -99,15 +107,18 @@ class TargetSpec(Section):
             "`body/bob:pos[2]`."
         )
     )
-    scale: Finite = Field(default=1.0, description="Factor of the parameter; not 0.")
+    scale: Finite = Field(
+        default=1.0, description="Factor by which the parameter is multiplied; it must not be 0."
+    )
     offset: Finite = Field(
         default=0.0, description="Constant that is added [unit of the number inside the model]."
     )
 
     @model_validator(mode="after")
-    def _moves(self) -> TargetSpec:
+    def _has_an_effect(self) -> TargetSpec:
+        """Refuse a target that the parameter would not change."""
         if self.scale == 0.0:
-            raise ValueError("a target with scale 0 never changes")
+            raise ValueError("scale is 0, so the parameter would not change this target")
         return self
 
 
@@ -130,33 +141,36 @@ class ParameterSpec(Section):
     )
     function: SkipJsonSchema[SkipValidation[Callable[[Any, float], None]] | None] = Field(
         default=None,
-        description="Function `f(spec, value)` that edits an MjSpec. In Python only; it needs a `guess`.",
+        description=(
+            "Function `f(spec, value)` that edits an MjSpec. It can be given in Python only, and "
+            "it needs a `guess`."
+        ),
     )
     inertial: str | None = Field(
         default=None,
         description=(
-            "Name of a body whose mass, centre of mass and inertia are all unknown: ten "
+            "Name of a body whose mass, centre of mass and inertia are all unknown. It gives ten "
             "parameters, named `<this name>.<coordinate>`."
         ),
     )
     coordinates: Literal["logcholesky", "barycentric"] | None = Field(
         default=None,
         description=(
-            "Coordinates of `inertial`: log-Cholesky, which is physical for every value, or "
+            "Coordinates of `inertial`: log-Cholesky, in which every value is physical, or "
             "barycentric, in which the dynamics are linear. Default: `logcholesky`."
         ),
     )
     guess: Finite | None = Field(
         default=None,
         description=(
-            "Value at which the design is made and from which the fit starts [parameter unit]. "
+            "Value for which the design is made and from which the fit starts [parameter unit]. "
             "Default: the value in the model."
         ),
     )
     true: Finite | None = Field(
         default=None,
         description=(
-            "Value that `simulate` and `montecarlo` use for the robot [parameter unit]. Default: "
+            "Value that `simulate` and `montecarlo` use as the true one [parameter unit]. Default: "
             "the guess."
         ),
     )
@@ -166,9 +180,11 @@ class ParameterSpec(Section):
     )
     scale: Positive | Literal["guess"] | None = Field(
         default=None,
-        description='Unit in which the criterion measures the error: a number [parameter unit], or "guess" for the size of the '
-        "guess. 1.0 means absolute errors, as in the paper. Default: the guess or the natural "
-        "size of the quantity, whichever is larger.",
+        description=(
+            "Unit in which the criterion measures the error: a number [parameter unit], or "
+            '"guess" for the size of the guess. 1.0 means absolute errors, as in the paper. '
+            "Default: the guess or the natural size of the quantity, whichever is larger."
+        ),
     )
     prior: Positive | None = Field(
         default=None,
@@ -180,26 +196,33 @@ class ParameterSpec(Section):
     )
     unit: str = Field(
         default="",
-        description="Unit that is shown in tables and pictures. Default: that of the first target.",
+        description=(
+            "Unit that is shown in tables and figures. Default: the unit of the first target."
+        ),
     )
     nuisance: bool = Field(
         default=False,
-        description="The parameter is unknown and is fitted, but the design spends no effort on it.",
+        description=(
+            "The parameter is unknown and is fitted, but the design does not optimise its accuracy."
+        ),
     )
     per_recording: bool = Field(
         default=False,
-        description="Each recording has a separate value of this parameter. Needs `nuisance = true`.",
+        description=(
+            "Each recording has a separate value of this parameter. It needs `nuisance = true`."
+        ),
     )
     wanted: Positive | None = Field(
         default=None,
         description=(
-            "Standard deviation that is aimed at [parameter unit], for `check`, `design "
-            "--shortest` and campaigns."
+            "Target for the standard deviation [parameter unit], which `check`, `design "
+            "--shortest` and campaigns use."
         ),
     )
 
     @model_validator(mode="after")
     def _consistent(self) -> ParameterSpec:
+        """Refuse keys that contradict each other."""
         self._require_one_source()
         self._require_keys_of_inertial()
 
@@ -214,7 +237,7 @@ class ParameterSpec(Section):
         return self
 
     def _require_one_source(self) -> None:
-        """Raise ValueError unless exactly one key says what the parameter changes in the model."""
+        """Raise ValueError unless exactly one key states what the parameter changes."""
         sources = (
             self.target is not None,
             bool(self.targets),
@@ -224,16 +247,16 @@ class ParameterSpec(Section):
 
         if sum(sources) != 1:
             raise ValueError(
-                "give exactly one of target and targets, or inertial (in Python also function)"
+                "give exactly one of target, targets and inertial (in Python also function)"
             )
         if self.function is not None and (not callable(self.function) or self.guess is None):
             raise ValueError("function must be callable, f(spec, value), and needs a guess")
 
     def _require_keys_of_inertial(self) -> None:
-        """Raise ValueError for keys of a single parameter beside `inertial`, and for keys of `inertial` without it."""
+        """Raise ValueError for keys that contradict `inertial`, or that need it."""
         if self.inertial is None:
             if self.coordinates is not None:
-                raise ValueError("coordinates belongs to inertial")
+                raise ValueError("coordinates can only be given together with inertial")
             return
 
         single = [
@@ -250,7 +273,7 @@ class ParameterSpec(Section):
             )
 
     def _require_inside(self, low: float, high: float) -> None:
-        """Raise ValueError where the bounds are inverted, or the guess or the true value is outside them."""
+        """Raise ValueError if the bounds are inverted, or exclude the guess or the true value."""
         if not low < high:
             raise ValueError(f"bounds are inverted: [{low}, {high}] needs lower < upper")
 
@@ -274,13 +297,16 @@ class NoiseSpec(Section):
     sigma: Positive | tuple[Positive, ...] | None = Field(
         default=None,
         description=(
-            "Standard deviation [output unit], one number or one per component. Either this or "
+            "Standard deviation [output unit], one number or one per component. It excludes "
             "`covariance`."
         ),
     )
     covariance: Matrix | None = Field(
         default=None,
-        description="Covariance matrix of the components [output unit squared], as a list of rows.",
+        description=(
+            "Covariance matrix of the components [output unit squared], as a list of rows. It "
+            "excludes `sigma`."
+        ),
     )
     rate: Positive | None = Field(
         default=None,
@@ -291,7 +317,8 @@ class NoiseSpec(Section):
     )
 
     @model_validator(mode="after")
-    def _one(self) -> NoiseSpec:
+    def _one_kind(self) -> NoiseSpec:
+        """Refuse both sigma and covariance, and neither."""
         if (self.sigma is None) == (self.covariance is None):
             raise ValueError("give exactly one of sigma and covariance")
         return self
@@ -300,7 +327,7 @@ class NoiseSpec(Section):
 class Correlated(Section):
     """Covariance of several outputs whose noise is correlated.
 
-    It replaces their standard deviations.
+    It replaces the standard deviations of these outputs.
     """
 
     outputs: Annotated[tuple[str, ...], Field(min_length=2)] = Field(
@@ -312,10 +339,10 @@ class Correlated(Section):
 
 
 class Nuisance(Section):
-    """Unknowns that affect the measurements but are of no interest by themselves.
+    """Unknowns that affect the measurements but whose values are not of interest.
 
-    Each value is the standard deviation with which zero is known beforehand, or `true` where
-    nothing is known.
+    They are zero in the model. Each key states the standard deviation of the unknown before the
+    experiment, or `true` if nothing is known about it.
     """
 
     initial: PriorOrUnknown | dict[str, PriorOrUnknown] | None = Field(
@@ -334,12 +361,12 @@ class Nuisance(Section):
         ),
     )
     delay: PriorOrUnknown | None = Field(
-        default=None, description="Time by which all outputs lag [s]. Default: none."
+        default=None, description="Delay of all outputs [s]. Default: none."
     )
     per_recording: bool = Field(
         default=False,
         description=(
-            "Each recording has a separate bias and a separate delay. Its initial state is always "
-            "separate."
+            "Each recording has a separate bias and a separate delay. The initial states of "
+            "recordings are always separate."
         ),
     )

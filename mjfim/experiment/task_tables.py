@@ -1,4 +1,7 @@
-"""Tables of the experiment file about the task: how an experiment is designed, and how parameters are fitted."""
+"""Tables of the experiment file about the task.
+
+They state how an experiment is designed and how parameters are fitted.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,11 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 
 
 class Cost(Section):
-    """The cost that a design minimises: the criterion of the information, and weights on control and deviation (eq. 3)."""
+    """The cost that a design minimises (eq. 3).
+
+    It is the criterion of the information plus weighted squares of the control and of the
+    deviation from the initial trajectory.
+    """
 
     criterion: Literal["E", "A", "D", "c"] = Field(
         default="E",
@@ -69,18 +76,20 @@ class Cost(Section):
     linearize_at: Literal["guess", "true"] = Field(
         default="guess",
         description=(
-            "Parameter values at which the design is made. `true` is for studies on simulated "
+            "Parameter values for which the design is made. `true` is for studies on simulated "
             "robots."
         ),
     )
 
     @model_validator(mode="after")
-    def _contrast(self) -> Cost:
+    def _combination_or_subset(self) -> Cost:
+        """Refuse a combination or subset that does not fit the criterion."""
         given = (self.combination is not None) + (self.subset is not None)
 
         if given != (self.criterion == "c"):
             raise ValueError(
-                'criterion = "c" takes exactly one of combination and subset, no other criterion takes one'
+                'criterion = "c" needs exactly one of combination and subset; other criteria allow '
+                "neither"
             )
         if self.combination is not None and not any(self.combination.values()):
             raise ValueError("combination has no coefficient other than 0")
@@ -89,16 +98,18 @@ class Cost(Section):
 
 
 class Robust(Section):
-    """Design for a guess that is wrong: the criterion is pooled over samples of the parameters.
+    """Design that allows for an inaccurate guess.
 
-    Samples come from the priors (normal distribution), else from the bounds (uniform distribution).
+    The criterion is evaluated at samples of the parameters and pooled. Samples are drawn from the
+    priors (normal distribution), or without a prior from the bounds (uniform distribution).
     """
 
     over: Literal["mean", "worst"] = Field(
-        default="mean", description="Pool by the mean of the criterion or by its worst value."
+        default="mean",
+        description="mean: the mean of the criterion over the samples. worst: its worst value.",
     )
     samples: int = Field(
-        default=6, ge=2, description="Number of parameter samples, the guess included."
+        default=6, ge=2, description="Number of parameter samples, including the guess."
     )
     seed: int = Field(default=0, ge=0, description="Seed of the samples.")
 
@@ -115,7 +126,9 @@ class Descent(Section):
     )
     tolerance: Positive = Field(
         default=1e-7,
-        description="The descent has converged where its slope is at most this number times the cost.",
+        description=(
+            "The descent has converged when its slope is at most this number times the cost."
+        ),
     )
     max_iterations: int = Field(
         default=200, ge=0, description="Largest number of iterations from one initial control."
@@ -126,59 +139,63 @@ class Descent(Section):
     )
     psi_weight: NonNegative = Field(
         default=0.0,
-        description='Weight of the sensitivities in the metric; only with `method = "metric"`.',
+        description=(
+            'Weight of the sensitivities in the metric. It applies to `method = "metric"` only.'
+        ),
     )
     starts: int = Field(
         default=1,
         ge=1,
         description=(
-            "Number of initial controls: the stated one, then random multisines. The best result "
-            "is kept."
+            "Number of initial controls: the stated one, and random multisines for the others. The "
+            "best result is kept."
         ),
     )
     previous: tuple[str, ...] = Field(
         default=(),
         description=(
-            "Files design.csv of earlier designs that are initial controls as well, repeated "
-            "where they are shorter."
+            "Files design.csv of earlier designs that serve as further initial controls. A shorter "
+            "design is repeated."
         ),
     )
     fourier: tuple[Positive, ...] = Field(
         default=(),
         description=(
-            "Base frequencies [Hz] of Fourier series that are initial controls as well; each is "
-            "optimised first."
+            "Base frequencies [Hz] of Fourier series that serve as further initial controls. The "
+            "coefficients of each series are optimised first."
         ),
     )
     repeats: tuple[Annotated[int, Field(ge=2)], ...] = Field(
         default=(),
         description=(
-            "Under hard limits: initial controls that are designs of the horizon divided by this "
-            "number, played as many times. Quick for long horizons."
+            "Further initial controls under hard limits: for each number n, a design for the n-th "
+            "part of the horizon, repeated n times. This is quick for long horizons."
         ),
     )
     coarse: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
         default="auto",
         description=(
-            "Factor by which the time step is longer in the first iterations, where they are "
-            "cheap. 1: never. auto: the largest factor that the model tolerates."
+            "Factor by which the time step is longer in the first iterations, which makes them "
+            "cheap. 1: the time step is never longer. auto: a factor that hardly changes the cost "
+            "of the initial control."
         ),
     )
     seed: int = Field(default=0, ge=0, description="Seed of the random initial controls.")
 
     @model_validator(mode="after")
-    def _metric(self) -> Descent:
+    def _method_with_metric(self) -> Descent:
+        """Refuse a weight of the metric for a method that has none."""
         if self.psi_weight and self.method != "metric":
-            raise ValueError('psi_weight belongs to method = "metric"')
+            raise ValueError('psi_weight can only be given together with method = "metric"')
         return self
 
 
 class Limits(Section):
-    """Hard limits, which a design keeps at every engine step.
+    """Hard limits, which a design respects at every engine step.
 
-    The ranges of the MJCF (joint range, ctrlrange, forcerange) always belong to them; where the
+    The ranges of the MJCF (joint range, ctrlrange, forcerange) are always part of them; if the
     file states a limit too, both hold. A number means the range from minus this number to this
-    number, for all names where no table is given.
+    number. A number instead of a table holds for all names.
     """
 
     position: dict[str, Range] = Field(
@@ -203,8 +220,8 @@ class Limits(Section):
     clearance: Positive | None = Field(
         default=None,
         description=(
-            "Least distance of the robot to itself and to its surroundings [m], by MuJoCo's geom "
-            "distances. Default: distances are not limited."
+            "Smallest allowed distance of the robot to itself and to its surroundings [m], "
+            "measured by MuJoCo's geom distances. Default: distances are not limited."
         ),
     )
     ignored: tuple[tuple[str, str], ...] = Field(
@@ -218,12 +235,16 @@ class Limits(Section):
         ),
     )
     enforce: bool = Field(
-        default=True, description="false: limits do not bind the design, they are only reported."
+        default=True,
+        description=(
+            "true: the design respects the limits. false: it ignores them, and the report says "
+            "which ones are violated."
+        ),
     )
 
 
 class Boundary(Section):
-    """State in which a design begins and ends."""
+    """States in which a design begins and ends."""
 
     start: Literal["given", "rest"] = Field(
         default="given",
@@ -241,7 +262,10 @@ class Boundary(Section):
     )
     keyframe: str | None = Field(
         default=None,
-        description='Keyframe in which a design with `end = "rest"` comes to rest. Default: the initial state.',
+        description=(
+            'Keyframe in which a design with `end = "rest"` comes to rest. Default: the initial '
+            "state."
+        ),
     )
     position: Positive = Field(
         default=1e-2, description="Largest deviation of the final positions [m or rad]."
@@ -251,10 +275,11 @@ class Boundary(Section):
     )
 
     @model_validator(mode="after")
-    def _somewhere(self) -> Boundary:
+    def _keyframe_of_rest(self) -> Boundary:
+        """Refuse a keyframe for a design that does not end at rest."""
         if self.keyframe is not None and self.end != "rest":
             raise ValueError(
-                'keyframe needs end = "rest"; it is the state in which such a design ends'
+                'keyframe needs end = "rest": it is the state in which such a design ends'
             )
         return self
 
@@ -272,48 +297,48 @@ class FitSpec(Section):
     start: Literal["stated", "measured"] = Field(
         default="stated",
         description=(
-            "Initial state of a recording. stated: as `initial` says, with the deviations of "
-            "`nuisance.initial`. measured: read from the log, then free."
+            "Initial state of a recording. stated: the state of `initial` plus the deviations of "
+            "`nuisance.initial`. measured: read from the log, then estimated freely."
         ),
     )
     loss: Literal["linear", "huber", "soft_l1", "cauchy"] = Field(
         default="linear",
         description=(
-            "Loss of a whitened residual, as in scipy.optimize.least_squares; all but linear "
-            "tolerate outliers."
+            "Loss of a whitened residual, as in scipy.optimize.least_squares. All losses except "
+            "linear tolerate outliers."
         ),
     )
     loss_scale: Positive = Field(
         default=3.0,
-        description="Size from which a robust loss treats a residual as an outlier [sigma].",
+        description="Size above which a robust loss treats a residual as an outlier [sigma].",
     )
     noise: Literal["stated", "estimated"] = Field(
         default="stated",
         description=(
-            "stated: standard deviations of the `noise` table. estimated: they are estimated from "
-            "the residuals by iterated reweighting."
+            "stated: standard deviations of the `noise` table. estimated: standard deviations that "
+            "are estimated from the residuals by iterated reweighting."
         ),
     )
     starts: int = Field(
         default=1,
         ge=1,
         description=(
-            "Number of initial guesses: the stated one, then random ones within bounds and "
-            "priors. The best fit is kept."
+            "Number of initial guesses: the stated one, and for the others random values within "
+            "bounds and priors. The best fit is kept."
         ),
     )
     seed: int = Field(
         default=0, ge=0, description="Seed of the random initial guesses and of the bootstrap."
     )
     max_iterations: int = Field(
-        default=60, ge=1, description="Largest number of iterations of the search."
+        default=60, ge=1, description="Largest number of iterations from one initial guess."
     )
     blocks: Positive | None = Field(
         default=None,
         description=(
             "Length of the blocks of the bootstrap and the sandwich covariance [s]; residuals "
-            "further apart count as independent. Default: from the autocorrelation of the "
-            "residuals."
+            "further apart count as independent. Default: a length that follows from the "
+            "autocorrelation of the residuals."
         ),
     )
     bootstrap: int = Field(

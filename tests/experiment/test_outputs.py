@@ -143,8 +143,10 @@ def test_unnamed_joints_are_called_by_their_number(tmp_path: Path) -> None:
 
 
 def test_an_unnamed_joint_does_not_take_the_name_of_another(tmp_path: Path) -> None:
-    xml = """<mujoco><worldbody><body><joint type="slide"/><geom size="1"/><body><joint name="joint0"/><geom size="1"/>
-      </body></body></worldbody><actuator><motor joint="joint0"/><motor name="actuator0" joint="joint0"/></actuator></mujoco>"""
+    xml = """<mujoco><worldbody><body><joint type="slide"/><geom size="1"/>
+      <body><joint name="joint0"/><geom size="1"/></body></body></worldbody>
+      <actuator><motor joint="joint0"/><motor name="actuator0" joint="joint0"/></actuator></mujoco>
+      """
     model = mujoco.MjModel.from_xml_string(xml)
     assert joint_names(model) == ("joint0_", "joint0")
     assert [c.name for c in scalar_joints(model)] == ["joint0_", "joint0"]
@@ -265,7 +267,8 @@ def test_correlated_outputs_alone_are_a_measurement(tmp_path: Path) -> None:
     assert task.system.outputs.names == ("qpos:slide", "qvel:hinge")
     np.testing.assert_allclose(task.system.noise.covariance, [[0.04, 0.01], [0.01, 0.09]])
     with pytest.raises(
-        ExperimentError, match=r"noise: nothing is measured: .*state, qpos:slide, .*hinge_velocity"
+        ExperimentError,
+        match=r"noise: no output is measured; .*state, qpos:slide, .*hinge_velocity",
     ):
         DesignTask.resolve(Experiment(**values), threads=1)
 
@@ -322,7 +325,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "rate too slow": (
         {"noise": {"acc": {"sigma": 1.0, "rate": 1.0}}},
-        r"noise\.acc\.rate: 1 Hz measures nothing within",
+        r"noise\.acc\.rate: 1 Hz gives no measurement within",
     ),
     "covariance size": (
         {"noise": {"acc": {"covariance": square(2)}}},

@@ -110,7 +110,7 @@ def test_scale_guess_of_an_inertia_is_the_value_of_each_coordinate(tmp_path: Pat
     task = body_task(tmp_path, parameters=hull)
     np.testing.assert_allclose(task.parameters.scale, np.abs(task.parameters.guess), rtol=1e-15)
     with pytest.raises(
-        ExperimentError, match=r"parameters\.arm\.scale: my is 0; leave scale = \"guess\" out"
+        ExperimentError, match=r"parameters\.arm\.scale: my is 0; leave out scale = \"guess\""
     ):
         body_task(
             tmp_path, parameters={"arm": {**ARM, "scale": "guess", "coordinates": "barycentric"}}
@@ -174,11 +174,11 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "coordinates of one": (
         {"m": {"target": "body/arm:mass", "coordinates": "barycentric"}},
-        r"parameters\.m: coordinates belongs to inertial",
+        r"parameters\.m: coordinates can only be given together with inertial",
     ),
     "target and inertial": (
         {"m": {**ARM, "target": "body/arm:mass"}},
-        r"parameters\.m: .*exactly one of target and targets",
+        r"parameters\.m: .*exactly one of target, targets and inertial",
     ),
     "inertial twice": (
         {"a": ARM, "b": ARM},
@@ -210,7 +210,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "no scale": (
         {"g": {"target": "body/arm:gravcomp"}},
-        r"parameters\.g\.scale: .* is 0: state a guess, or a scale",
+        r"parameters\.g\.scale: .* is 0; state another guess, or a scale",
     ),
     "not in the model": (
         {"g": {"target": "output/acc:bias"}},

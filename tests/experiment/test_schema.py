@@ -220,7 +220,10 @@ target = "joint/hinge:damping"
 wanted = 0.01
 
 [noise]
-state = { covariance = [[4.0, 1.0, 0.0, 0.0], [1.0, 4.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], rate = 50.0 }
+state.covariance = [
+    [4.0, 1.0, 0.0, 0.0], [1.0, 4.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+]
+state.rate = 50.0
 hinge_angle = { sigma = [0.01] }
 slide_position = 0.02
 
@@ -636,7 +639,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "guess zero": (
         parameter('target = "joint/slide:damping"'),
         E,
-        [HOME, "parameters.m.scale", "is 0: state a guess, or a scale"],
+        [HOME, "parameters.m.scale", "is 0; state another guess, or a scale"],
     ),
     "guess not a number": (
         parameter('target = "body/bob:mass"\nguess = nan'),
@@ -656,17 +659,17 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "no target": (
         parameter("guess = 1"),
         E,
-        [HOME, "parameters.m", "exactly one of target and targets"],
+        [HOME, "parameters.m", "exactly one of target, targets and inertial"],
     ),
     "target and targets": (
         parameter('target = "body/bob:mass"\ntargets = [{ path = "body/bob:mass" }]'),
         E,
-        [HOME, "parameters.m", "exactly one of target and targets"],
+        [HOME, "parameters.m", "exactly one of target, targets and inertial"],
     ),
     "dead target": (
         parameter('targets = [{ path = "body/bob:mass", scale = 0 }]'),
         E,
-        [HOME, "parameters.m", "scale 0 never changes"],
+        [HOME, "parameters.m", "scale is 0"],
     ),
     # noise and weights
     "sigma zero": (edited("state = 0.05", "state = 0"), E, [HOME, "noise.state", "greater than 0"]),
@@ -741,7 +744,7 @@ FAULTS: dict[str, tuple[str, type[MjfimError], list[str]]] = {
     "metric weight without the metric": (
         SHORT + "[descent]\npsi_weight = 1\n",
         E,
-        [HOME, "descent", "psi_weight belongs to method"],
+        [HOME, "descent", "psi_weight can only be given together with method"],
     ),
     "coarse word": (
         SHORT + '[descent]\ncoarse = "no"\n',
@@ -961,7 +964,7 @@ def test_one_fault_one_line(name: str, resolve: Callable[[str], DesignTask]) -> 
 MISUSE: dict[str, tuple[str, list[str]]] = {
     "dead target with a guess": (
         parameter('guess = 1.0\ntargets = [{ path = "body/bob:mass", scale = 0 }]'),
-        ["parameters.m", "scale 0 never changes"],
+        ["parameters.m", "scale is 0"],
     ),
     "two parameters for one number": (
         SHORT + '[parameters.n]\ntarget = "body/bob:mass"\n',
