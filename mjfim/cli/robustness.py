@@ -19,7 +19,7 @@ from mjfim.output.archive import write_design
 from mjfim.output.folders import check_folder
 from mjfim.output.summaries import describe_robustness
 from mjfim.output.text import render
-from mjfim.parallel import cores
+from mjfim.parallel import Pool, cores
 from mjfim.records.robustness import RobotConditions
 from mjfim.studies.robustness import assess_robustness, default_latency
 
@@ -87,14 +87,14 @@ def robustness(
         design_folder = design_with_reserve(stated, shares, output / "design")
 
     clock = time.perf_counter()
-    with progress("playing") as show:
+    with Pool(min(jobs or cores(), runs)) as pool, progress("playing") as show:
         result = assess_robustness(
             stated,
             design_folder,
             conditions=conditions,
             runs=runs,
-            processes=jobs or cores(),
             callback=show,
+            executor=pool,
         )
 
     seconds = time.perf_counter() - clock

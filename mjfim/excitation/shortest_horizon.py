@@ -164,7 +164,7 @@ def shortest_experiment(
         NoResultError: The search was stopped before any duration reached the targets.
     """
     if tolerance is not None and not tolerance > 0.0:
-        raise ExperimentError(f"shortest: tolerance {tolerance:g} s; it must be > 0")
+        raise ExperimentError(f"shortest_experiment: tolerance {tolerance:g} s; it must be > 0")
 
     with stop_on_interrupt(stop) as token:
         task = DesignTask.resolve(experiment, threads=threads)
@@ -212,7 +212,7 @@ class _HorizonSearch:
         rate = self.experiment.rate
         if longest * rate < self.grid.minimum:
             raise ExperimentError(
-                f"shortest: longest {longest:g} s is less than {self.grid.minimum} samples"
+                f"shortest_experiment: longest {longest:g} s is less than {self.grid.minimum} samples"
             )
 
         largest = self.grid.round_down(longest * rate)

@@ -7,12 +7,11 @@ as the recorded control is the one that was sent, not the one that has arrived.
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
+import uuid
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from mjfim.arrays import Array
-from mjfim.budget import StopToken, stop_on_interrupt
+from mjfim.budget import Budget, StopToken, stop_on_interrupt
 from mjfim.errors import (
     ExperimentError,
     NoResultError,
@@ -37,7 +36,7 @@ from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.information.marginal import standard_deviations
 from mjfim.model.coordinates import joint_dofs, joint_names
-from mjfim.parallel import cores
+from mjfim.parallel import results_in_order
 from mjfim.plant.batch import BatchSimulator
 from mjfim.recordings.design_table import read_playback
 from mjfim.records.estimate import Estimate
@@ -86,8 +85,8 @@ def assess_robustness(
     *,
     conditions: RobotConditions | None = None,
     runs: int = 100,
-    processes: int | None = None,
     callback: Callback | None = None,
+    executor: Executor | None = None,
     stop: StopToken | None = None,
 ) -> Robustness:
     """Play a design on simulated robots that differ from the model, and identify each from its recording.
@@ -103,8 +102,9 @@ def assess_robustness(
         conditions: How the robots differ from the model; default: parameters 20 % off and 5 ms of
             latency.
         runs: Number of robots.
-        processes: Number of processes; default: one per core.
         callback: Called with a `StudyEvent` after every robot.
+        executor: Executor of `concurrent.futures` that runs several robots side by side, such as
+            `mjfim.Pool`; default: one after another.
         stop: Token that ends the study after the robots that are done.
 
     Returns:
@@ -122,7 +122,9 @@ def assess_robustness(
 
     found: list[RobotRun] = []
     with stop_on_interrupt(stop) as token:
-        for run in _play_all(experiment, table, conditions, runs, processes or cores(), token):
+        for run in _play_all(
+            bench, _RobotStudy.of(experiment, table, conditions), runs, executor, token
+        ):
             found.append(run)
             if callback is not None:
                 callback(
@@ -722,39 +724,66 @@ def summarize_runs(bench: RobotBench, runs: Sequence[RobotRun]) -> Robustness:
     )
 
 
-# ---- robots in processes
-
-# The bench of a worker process, made once.
-_worker_bench: list[RobotBench] = []
+# ---- robots side by side
 
 
-def _begin_worker(experiment: Experiment, table: Path, conditions: RobotConditions) -> None:
-    """Prepare a worker process: it ignores Ctrl-C, uses one thread and makes its bench."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threadpool_limits(1)
-    _worker_bench[:] = [RobotBench(experiment, table, conditions)]
+@dataclass(frozen=True, kw_only=True)
+class _RobotStudy:
+    """Everything from which a worker process makes the bench of a study; picklable.
+
+    Attributes:
+        key: Unique text, by which a worker knows that it has made the bench already.
+        experiment: The experiment of the design.
+        table: The design.csv.
+        conditions: How the robots differ from the model.
+    """
+
+    key: str
+    experiment: Experiment
+    table: Path
+    conditions: RobotConditions
+
+    @classmethod
+    def of(cls, experiment: Experiment, table: Path, conditions: RobotConditions) -> _RobotStudy:
+        """A new study of a design."""
+        return cls(key=uuid.uuid4().hex, experiment=experiment, table=table, conditions=conditions)
 
 
-def _run_in_worker(number: int) -> RobotRun:
-    """Play one robot in a worker process."""
-    return _worker_bench[0].run(number)
+# The bench of a worker process by the key of its study; it holds the latest one only.
+_worker_benches: dict[str, RobotBench] = {}
+
+
+def _run_in_worker(study: _RobotStudy, number: int) -> RobotRun:
+    """Play one robot in a worker process, with one thread."""
+    if study.key not in _worker_benches:
+        _worker_benches.clear()
+        bench = RobotBench(study.experiment, study.table, study.conditions)
+        _worker_benches[study.key] = bench
+
+    with threadpool_limits(1):
+        return _worker_benches[study.key].run(number)
 
 
 def _play_all(
-    experiment: Experiment,
-    table: Path,
-    conditions: RobotConditions,
+    bench: RobotBench,
+    study: _RobotStudy,
     count: int,
-    processes: int,
+    executor: Executor | None,
     stop: StopToken,
 ) -> Iterator[RobotRun]:
-    """Play all robots in processes, in their order, until a stop is requested."""
-    context = multiprocessing.get_context("spawn")
-    arguments = (experiment, table, conditions)
-    with ProcessPoolExecutor(min(processes, count), context, _begin_worker, arguments) as pool:
-        futures = [pool.submit(_run_in_worker, number) for number in range(count)]
-        for future in futures:
-            if stop.requested:
-                pool.shutdown(wait=True, cancel_futures=True)
-                return
-            yield future.result()
+    """Play all robots in their order until a stop is requested; without an executor one after another."""
+    if executor is not None:
+        futures = [executor.submit(_run_in_worker, study, number) for number in range(count)]
+        yield from results_in_order(executor, futures, Budget(stop=stop))
+        return
+
+    for number in range(count):
+        if stop.requested:
+            return
+        with threadpool_limits(1):
+            run = bench.run(number)
+
+        # A request to stop ends the fit of the robot early as well: its estimate does not count.
+        if stop.requested:
+            return
+        yield run

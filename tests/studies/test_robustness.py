@@ -535,7 +535,7 @@ def test_a_stopped_study_keeps_the_robots_that_are_done(
     that robot.
     """
     stop = mjfim.StopToken()
-    options = {"runs": 3, "processes": 1}
+    options = {"runs": 3}
     result = mjfim.assess_robustness(*cart, callback=lambda _: stop.request(), stop=stop, **options)
     assert result.runs == 1
     with pytest.raises(NoResultError):
