@@ -30,11 +30,16 @@ from mjfim.recordings.read import read_recording
 def check(
     experiment: ExperimentFile,
     recordings: Annotated[
-        list[Path] | None, typer.Argument(metavar="[RECORDING...]", help="Logs to look at instead.")
+        list[Path] | None,
+        typer.Argument(
+            metavar="RECORDING", help="Recordings to check instead of the initial control."
+        ),
     ] = None,
     design_file: Annotated[
         Path | None,
-        typer.Option("--design", metavar="DESIGN.npz", help="Look at this design instead."),
+        typer.Option(
+            "--design", metavar="DESIGN.npz", help="Design to check instead of the initial control."
+        ),
     ] = None,
     output: Annotated[
         Path | None,
@@ -43,7 +48,7 @@ def check(
     as_json: AsJson = False,
     threads: Threads = None,
 ) -> None:
-    """Say what can be identified, how well, and what only in combination; before any fit."""
+    """Say which parameters can be identified, how accurately, and which only in combination."""
     stated = mjfim.Experiment.from_file(experiment)
     system = System.resolve(stated, threads=threads)
     loaded = [read_recording(path, system.channels) for path in recordings or []]
@@ -53,7 +58,7 @@ def check(
         archive.check_fits(design_file, trajectory, system)
     if output is not None:
         check_folder(output)
-    with progress("looking"):
+    with progress("checking"):
         result = mjfim.check(stated, loaded, trajectory, threads=threads)
     if output is not None:
         with writing(output) as results:

@@ -51,7 +51,8 @@ def design(
     output: Folder,
     as_json: AsJson = False,
     starts: Annotated[
-        int | None, typer.Option(min=1, help="Number of starts; overrides [descent] starts.")
+        int | None,
+        typer.Option(min=1, help="Number of initial controls; overrides [descent] starts."),
     ] = None,
     shortest: Annotated[
         bool,
@@ -61,7 +62,7 @@ def design(
     ] = False,
     threads: Threads = None,
 ) -> None:
-    """Design the excitation that reveals most about the parameters."""
+    """Design the excitation that gives the most information about the parameters."""
     stated = mjfim.Experiment.from_file(experiment)
     if starts is not None:
         stated = stated.replace(descent={"starts": starts})

@@ -27,7 +27,7 @@ from mjfim.recordings.read import read_recording
 def export_sysid(
     experiment: ExperimentFile,
     recordings: Annotated[
-        list[Path], typer.Argument(metavar="RECORDING...", help="Logs of any format that is read.")
+        list[Path], typer.Argument(metavar="RECORDING", help="Logs of any format that is read.")
     ],
     output: Folder,
 ) -> None:

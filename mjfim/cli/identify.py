@@ -33,7 +33,7 @@ from mjfim.recordings.read import read_log
 def identify(
     experiment: ExperimentFile,
     recordings: Annotated[
-        list[Path], typer.Argument(metavar="RECORDING...", help="Logs of any format that is read.")
+        list[Path], typer.Argument(metavar="RECORDING", help="Logs of any format that is read.")
     ],
     output: Folder,
     held_out: Annotated[
@@ -50,7 +50,7 @@ def identify(
     as_json: AsJson = False,
     threads: Threads = None,
 ) -> None:
-    """Estimate the parameters from recordings, and say how far that is to be trusted."""
+    """Estimate the parameters from recordings, with intervals, predictions and warnings."""
     if method not in ("least_squares", "newton"):
         raise ExperimentError(f"--method {method!r}: valid: least_squares, newton")
     system = System.resolve(mjfim.Experiment.from_file(experiment), threads=threads)

@@ -37,7 +37,7 @@ def robustness(
     design_folder: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[DESIGN_FOLDER]", help="Folder of a design; default: a design is made."
+            metavar="DESIGN_FOLDER", help="Folder of a design; default: a design is made."
         ),
     ] = None,
     output: Annotated[

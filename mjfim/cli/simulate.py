@@ -59,7 +59,7 @@ def montecarlo(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Hold the estimator against the Cramér-Rao bound, on the initial and the designed trajectory."""
+    """Compare the estimator with the Cramér-Rao bound, on the initial and the designed trajectory."""
     stated = mjfim.Experiment.from_file(experiment)
     system = System.resolve(
         stated if measure_rate is None else stated.replace(measure_rate=measure_rate)
