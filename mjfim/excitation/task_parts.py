@@ -23,23 +23,24 @@ MAX_SAMPLES = 10_000_000
 SAMPLE_COUNT_TOLERANCE = 1e-6
 
 
-def require_design_keys(experiment: Experiment) -> None:
+def require_design_keys(experiment: Experiment, work: str = "design") -> None:
     """Check that the experiment states the keys that only a design needs.
 
     Args:
         experiment: The experiment.
+        work: Name of the work that needs them, for the message.
 
     Raises:
         ExperimentError: `horizon` or `initial.control` is missing.
     """
     if experiment.horizon is None:
         raise ExperimentError(
-            f"{experiment.source}: design needs `horizon`, the duration of the experiment [s], for "
+            f"{experiment.source}: {work} needs `horizon`, the duration of the experiment [s], for "
             "example horizon = 4.0"
         )
     if experiment.initial.control is None:
         raise ExperimentError(
-            f"{experiment.source}: design needs `initial.control`, the control from which it "
+            f"{experiment.source}: {work} needs `initial.control`, the control from which it "
             "starts, for example "
             'control = { kind = "multisine", amplitude = 1.0 }'
         )

@@ -11,6 +11,7 @@ from mjfim.arrays import Array
 from mjfim.errors import RecordingError, SimulationDivergedError
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
+from mjfim.excitation.task_parts import require_design_keys
 from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.residuals import FitProblem
@@ -73,6 +74,8 @@ def check(
 
     if recordings:
         return check_recordings(System.resolve(experiment, threads=threads), recordings)
+
+    require_design_keys(experiment, "check without recordings")
     return check_task(DesignTask.resolve(experiment, threads=threads), trajectory)
 
 

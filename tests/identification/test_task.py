@@ -83,6 +83,8 @@ def test_a_design_of_a_minimal_experiment_says_what_is_missing(
 ) -> None:
     with pytest.raises(ExperimentError, match="design needs `horizon`"):
         mjfim.design(experiment)
+    with pytest.raises(ExperimentError, match="check without recordings needs `horizon`"):
+        mjfim.check(experiment)
 
 
 def test_the_start_is_moved_inside_the_bounds_of_a_bounded_method(
