@@ -777,8 +777,9 @@ def _play_all(
         yield from results_in_order(executor, futures, Budget(stop=stop))
         return
 
+    budget = Budget(stop=stop)
     for number in range(count):
-        if stop.requested:
+        if budget.exhausted is not None:
             return
         with threadpool_limits(1):
             run = bench.run(number)
