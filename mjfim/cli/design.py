@@ -30,7 +30,6 @@ from mjfim.output.summaries import describe_design
 from mjfim.output.text import render
 from mjfim.parallel import Pool
 from mjfim.records.events import Callback
-from mjfim.records.serialization import write_json
 
 
 @contextmanager
@@ -84,7 +83,7 @@ def design(
     with writing(output) as results:
         results.write_design_folder(output, result, task.system)
         if found is not None:
-            write_json(output / "shortest.json", found.summary())
+            found.save(output)
     summary = result.summary()
     if found is not None:
         summary["shortest"] = found.summary()

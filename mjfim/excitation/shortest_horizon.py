@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from mjfim.recordings.formats.read import read_table
 from mjfim.records.campaign import missed_targets
 from mjfim.records.design import Design, Status
 from mjfim.records.events import Callback, StudyEvent
+from mjfim.records.serialization import SavedRecord
 
 # Longest horizon that is tried by default, over the stated one.
 MAX_HORIZON_FACTOR = 4.0
@@ -77,7 +78,7 @@ class Tried:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ShortestExperiment:
+class ShortestExperiment(SavedRecord):
     """The shortest experiment and its design.
 
     Attributes:
@@ -94,6 +95,9 @@ class ShortestExperiment:
     tried: tuple[Tried, ...]
     tolerance: float
     closed: bool
+
+    file_stem: ClassVar[str] = "shortest"
+    made_by: ClassVar[str] = "`mjfim design EXPERIMENT -o DIR --shortest`"
 
     @property
     def horizon(self) -> float:

@@ -213,7 +213,7 @@ class WorstResidual:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PredictionErrors:
+class PredictionErrors(SavedRecord):
     """Differences between a model's outputs and a recording.
 
     Attributes:
@@ -229,8 +229,19 @@ class PredictionErrors:
     rms: Array
     mae: Array
 
+    file_stem: ClassVar[str] = "prediction_errors"
+    made_by: ClassVar[str] = "PredictionErrors.save"
+
     def __post_init__(self) -> None:
         freeze(self, "rms", "mae")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of prediction_errors.json."""
+        return {
+            "name": self.name,
+            "rms": self.by_output(self.rms),
+            "mae": self.by_output(self.mae),
+        }
 
     def by_output(self, errors: Array) -> dict[str, float]:
         """Return `rms` or `mae` by name of the output."""

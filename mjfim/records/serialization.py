@@ -27,6 +27,8 @@ from types import NoneType, UnionType
 from typing import Any, ClassVar, Self, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from pydantic import BaseModel
+from pydantic_core import PydanticSerializationError
 
 from mjfim.arrays import Array
 from mjfim.atomic_io import replacing
@@ -203,6 +205,8 @@ class _Encoder:
                 str(key): self.encode(entry_hint, entry, _join(path, i))
                 for i, (key, entry) in enumerate(value.items())
             }
+        if isinstance(hint, type) and issubclass(hint, BaseModel):
+            return _encode_table(value, path)
         if isinstance(hint, type) and is_dataclass(hint):
             hints = _hints(hint)
             return {
@@ -223,6 +227,21 @@ class _Encoder:
         self.arrays[name] = array
         self._name_of[id(array)] = (name, array)
         return name
+
+
+def _encode_table(value: BaseModel, path: str) -> dict[str, Any]:
+    """Return the keys that an experiment states, with those that its file does not hold, as plain values."""
+    try:
+        stated = value.model_dump(mode="json", exclude_unset=True)
+    except PydanticSerializationError:
+        raise TypeError(f"{path}: a parameter that is a Python function cannot be saved") from None
+
+    hidden = {
+        name: str(getattr(value, name))
+        for name, field in type(value).model_fields.items()
+        if field.exclude
+    }
+    return {**stated, **hidden}
 
 
 def _encode_scalar(hint: Any, value: Any, path: str) -> Any:
@@ -262,6 +281,8 @@ def _decode(hint: Any, value: Any, arrays: Mapping[str, np.ndarray], path: str) 
             key: _decode(entry_hint, entry, arrays, _join(path, key))
             for key, entry in table.items()
         }
+    if isinstance(hint, type) and issubclass(hint, BaseModel):
+        return hint(**_expect(dict, value, path))
     if is_dataclass(hint):
         return _decode_record(hint, _expect(dict, value, path), arrays, path)
     return _decode_scalar(hint, value, path)

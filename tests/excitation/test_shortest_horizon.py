@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,27 @@ def test_the_message_names_targets_out_of_reach_with_numbers() -> None:
         match=r"0\.8 s is too short: the target is missed by m \(σ 0\.\d+, wanted 0\.001\)",
     ):
         mjfim.shortest_experiment(hard, longest=0.8)
+
+
+def test_it_is_saved_and_loaded_with_its_experiment(
+    shorter: mjfim.ShortestExperiment, tmp_path: Path
+) -> None:
+    shorter.save(tmp_path)
+    loaded = mjfim.ShortestExperiment.load(tmp_path)
+    assert loaded.experiment == shorter.experiment
+    assert loaded.experiment.directory == shorter.experiment.directory
+    assert loaded.summary() == shorter.summary()
+    np.testing.assert_array_equal(loaded.design.trajectory.ctrl, shorter.design.trajectory.ctrl)
+
+
+def test_an_experiment_with_a_function_cannot_be_saved(
+    shorter: mjfim.ShortestExperiment, tmp_path: Path
+) -> None:
+    tables = {**shorter.experiment.model_dump(exclude_unset=True)}
+    tables["parameters"] = {"m": {"function": lambda spec, value: None, "guess": 1.0}}
+    stated = mjfim.Experiment(**tables, directory=shorter.experiment.directory)
+    with pytest.raises(TypeError, match="a Python function cannot be saved"):
+        replace(shorter, experiment=stated).save(tmp_path)
 
 
 def test_the_default_longest_horizon_is_that_of_the_table(tmp_path: Path) -> None:

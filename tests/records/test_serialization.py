@@ -27,7 +27,7 @@ from mjfim.records.campaign import Campaign
 from mjfim.records.check import Check
 from mjfim.records.comparison import Comparison, MethodResult
 from mjfim.records.design import CombinationAccuracy, Design, Evaluation
-from mjfim.records.estimate import Estimate
+from mjfim.records.estimate import Estimate, PredictionErrors
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.recording import Recording
 from mjfim.records.robustness import Robustness
@@ -45,6 +45,7 @@ SAVED: tuple[type[SavedRecord], ...] = (
     Estimate,
     Evaluation,
     MonteCarloStudy,
+    PredictionErrors,
     Recording,
     Robustness,
     Trajectory,
