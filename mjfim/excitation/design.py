@@ -1,4 +1,4 @@
-"""`mjfim.design`: find the control that reveals most about the parameters, from one initial control or several."""
+"""The verb `mjfim.design`: find the control that is most informative about the parameters."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from mjfim.records.combinations import ParameterGroup, join_names
 from mjfim.records.design import Design, Evaluation, Status
 from mjfim.records.events import DesignCallback, DesignEvent
 
-# What a search of several runs yields and returns.
+# Generator of a search with several runs: yields every iterate and returns one result per run.
 Runs = Generator[DesignEvent, None, list[RunResult]]
 
 
@@ -51,9 +51,10 @@ def design(
     executor: Executor | None = None,
     stop: StopToken | None = None,
 ) -> Design:
-    """Design the control that minimises the cost of the experiment, equation (3) of the paper, within its limits.
+    """Design the control that minimises the cost of the experiment within its limits.
 
-    Ctrl-C, or a request by the token, ends the search with the best trajectory so far.
+    The cost is equation (3) of the paper. Ctrl-C, or a request by the token, ends the search with
+    the best trajectory so far.
 
     Args:
         experiment: The experiment.
@@ -122,7 +123,7 @@ def design_task(
     require_feasible_start(task)
     steps_before = task.plant.engine_steps
 
-    # Evaluate the initial control and find out what can be identified.
+    # Evaluate the initial control and find the combinations that can be identified.
     first = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if initial_control is not None:
         initial_control = _checked_control(task, initial_control)
@@ -147,7 +148,7 @@ def design_task(
 
 
 def _checked_control(task: DesignTask, control: Array) -> Array:
-    """A given initial control as an array of numbers; raises ExperimentError for a wrong shape."""
+    """A given initial control as an array of numbers; ExperimentError for a wrong shape."""
     control = np.asarray(control, dtype=np.float64)
     if control.shape != task.control.shape:
         raise ExperimentError(
@@ -161,7 +162,10 @@ def _checked_control(task: DesignTask, control: Array) -> Array:
 def _identifiability(
     task: DesignTask, first: DesignPoint, initial_control: Array | None
 ) -> Identifiability:
-    """Identifiable combinations, along the control with which the search begins and along random ones."""
+    """Find the combinations of parameters that can be identified.
+
+    They are looked for along the control with which the search begins and along random controls.
+    """
     begin = first
     if initial_control is not None:
         trajectory = task.plant.simulate(task.theta, initial_control)
@@ -217,7 +221,10 @@ class _Search:
         return (yield from search.run_all(starts))
 
     def _run_within_limits(self, starts: list[InitialControl]) -> Runs:
-        """Optimise under hard limits; without a barrier at first, where soft weights alone may keep them."""
+        """Optimise under hard limits.
+
+        The search begins without a barrier where the weights of the cost may keep the limits.
+        """
         results: list[RunResult] = []
         steps_without_barrier = 0
 
@@ -252,7 +259,7 @@ class _Search:
         if result.control is not None:
             point = point_at_stated_rate(self.stage, result.control)
 
-        # A search that was stopped has not verified its controls on the unmodified model.
+        # A stopped search has not verified its controls on the unmodified model.
         is_feasible = bool(np.isfinite(result.cost))
         if self.budget.stop.requested:
             trajectory = None if point is None else point.trajectory
@@ -267,7 +274,10 @@ class _Search:
 
 
 def _is_bounded_by_weights(task: DesignTask) -> bool:
-    """Whether the weights of the control alone bound the design, and nothing but ranges is asked for."""
+    """Whether weights on all controls may keep the limits without a barrier.
+
+    A barrier is needed for a boundary, a bandwidth, limits on control rates and a clearance.
+    """
     limits = task.experiment.limits
     needs_barrier = task.is_shaped or bool(limits.control_rate) or limits.clearance is not None
     return not needs_barrier and bool((task.control_weight > 0.0).all())
@@ -276,7 +286,10 @@ def _is_bounded_by_weights(task: DesignTask) -> bool:
 def _choose(
     stage: DescentLevel, first: DesignPoint, results: list[RunResult], interrupted: bool
 ) -> tuple[RunResult, DesignPoint]:
-    """The best run and the point of the design, which is the initial control where nothing better was found."""
+    """Choose the best run and the point of the design.
+
+    The point is that of the initial control where no run found a better one.
+    """
     if not results:
         results.append(RunResult(name="initial control", status=Status.INTERRUPTED))
 
@@ -303,7 +316,7 @@ class _Report:
 
     Attributes:
         stage: The stated level.
-        identifiability: What can be identified.
+        identifiability: The combinations that can be identified.
         initial: The initial control, evaluated.
         final: The designed control, evaluated.
     """
@@ -331,7 +344,7 @@ class _Report:
         model = task.system.model_at(task.theta)
         clamped = saturated_actuators(model, final.trajectory)
 
-        # Whether derivatives hold along the design. Nobody waits for that after Ctrl-C.
+        # Check that derivatives exist along the design; after Ctrl-C this would take too long.
         rough = None
         if not interrupted:
             rough = roughness(
@@ -411,13 +424,13 @@ class _Report:
 
 
 def designable(task: DesignTask) -> Identifiability:
-    """Find out what can be identified, and require that a design can begin at the initial control.
+    """Find what can be identified, and require that a design can begin at the initial control.
 
     Args:
         task: The task.
 
     Returns:
-        What can be identified along the initial control and along random ones.
+        The combinations that are identifiable along the initial control and along random ones.
 
     Raises:
         UnidentifiableError: A parameter has no effect, or the initial control does not excite it.
@@ -435,18 +448,19 @@ def designable(task: DesignTask) -> Identifiability:
 
 
 def require_designable(task: DesignTask, identifiability: Identifiability) -> None:
-    """Require that every parameter has an effect, and that the start excites whatever another control would.
+    """Require that every parameter has an effect, and that the initial control excites it.
 
-    Members of a declared inertia may have no effect; the design then works on the combinations that
-    have one.
+    The initial control has to excite every combination of parameters that a random control
+    excites. Members of a declared inertia may have no effect; the design then works on the
+    combinations that have one.
 
     Args:
         task: The task.
-        identifiability: What can be identified.
+        identifiability: The combinations that can be identified.
 
     Raises:
-        UnidentifiableError: A parameter has no effect on the outputs, or the start does not excite
-            it.
+        UnidentifiableError: A parameter has no effect on the outputs, or the initial control does
+            not excite it.
     """
     along_all = identifiability.along_all
     parameters = task.parameters
@@ -457,8 +471,8 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
     if silent:
         raise UnidentifiableError(
             f"{_subject(silent)} nothing in the measured outputs, neither along the initial "
-            f"control nor along {PROBES} random ones; take {'it' if len(silent) == 1 else 'them'} "
-            "out, or measure what shows the effect"
+            f"control nor along {PROBES} random controls; remove "
+            f"{'it' if len(silent) == 1 else 'them'}, or measure a quantity that shows the effect"
         )
 
     # A criterion for combinations that cannot be identified.
@@ -466,25 +480,26 @@ def require_designable(task: DesignTask, identifiability: Identifiability) -> No
         information = replace(task.information, basis=identifiability.basis)
         if not information.is_estimable(task.contrast).all():
             raise UnidentifiableError(
-                "cost.combination or cost.subset asks for what cannot be identified; what can is: "
+                "cost.combination or cost.subset states a combination that cannot be identified; "
+                "identifiable are: "
                 + "; ".join(str(group) for group in identifiability.groups_along_all)
             )
 
     if not along_all.basis.shape[1]:
-        raise UnidentifiableError("none of the parameters shows in the measured outputs")
+        raise UnidentifiableError("no parameter has an effect on the measured outputs")
 
-    # Combinations that other controls excite, but not this one.
+    # Combinations that random controls excite, but not the initial one.
     if identifiability.along_trajectory.count > along_all.count:
         groups = identifiability.groups_along_trajectory
         unexcited = "; ".join(_unexcited_group(group) for group in groups)
         raise UnidentifiableError(
-            f"the start excites nothing along: {unexcited}. Another control would: "
-            "start from one that moves those parameters' joints, a multisine for example"
+            f"the initial control does not excite: {unexcited}. Other controls do: begin with one "
+            "that moves the joints of these parameters, for example a multisine"
         )
 
 
 def _unexcited_group(group: ParameterGroup) -> str:
-    """Name of a group that has an effect, but not along the start."""
+    """Name of a group that has an effect, but not along the initial control."""
     return str(group) if group.combinations else join_names(group.members)
 
 

@@ -1,4 +1,4 @@
-"""The task of a design: a system, the initial control, the cost, the limits and the prior information."""
+"""The task of a design: system, initial control, cost, limits and prior information."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from mjfim.excitation.task_parts import (
     parameter_samples_of,
     require_bounded_controls,
     require_design_keys,
-    sample_count,
     stated_control,
     tracking_weights_of,
 )
@@ -30,7 +29,7 @@ from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import IdentifiabilityTest
 from mjfim.model.parameters import ParameterSet
 from mjfim.model.smooth_friction import has_dry_friction, smoothing_speeds_of
-from mjfim.model.variants import STATED, ModelVariant, Relaxation
+from mjfim.model.variants import ModelVariant, Relaxation
 from mjfim.plant.plant import Plant
 from mjfim.plant.state_space import StateSpace
 from mjfim.records.trajectory import Trajectory
@@ -39,12 +38,12 @@ from mjfim.signals import multisine
 # Harmonics of a random multisine.
 RANDOM_HARMONICS = 10
 
-# Amplitudes of random controls that look for identifiable parameters, relative to that of the
-# initial control.
+# Smallest and largest amplitude of the random controls that test which parameters are identifiable,
+# relative to the amplitude of the initial control.
 LEAST_PROBE_AMPLITUDE = 1.0
 MOST_PROBE_AMPLITUDE = 2.0
 
-# Share of the horizon over which a random control rises from rest, and fades to it.
+# Share of the horizon over which a random control fades in from rest, and over which it fades out.
 FADE_SHARE = 0.1
 
 
@@ -64,8 +63,8 @@ class DesignTask:
             sums, or None.
         prior_information: (p, p) information of earlier experiments, without the priors of the
             parameters.
-        added_information: (p, p) the part of it that the caller added to the experiment's `earlier`
-            files, or None.
+        added_information: (p, p) part of the prior information that the caller added to that of the
+            experiment's `earlier` files, or None.
         samples_of_parameters: Parameter values over which a robust design pools its criterion, or
             None.
     """
@@ -98,7 +97,7 @@ class DesignTask:
             threads: Threads for the engine; default: one per core.
             added_information: (p, p) information of other experiments besides the stated `earlier`
                 files.
-            variant: How the plant differs from the user's model; default: it does not.
+            variant: How the plant differs from the user's model; default: not at all.
 
         Raises:
             ExperimentError: Something is wrong or missing in the experiment; the message names the
@@ -126,15 +125,15 @@ class DesignTask:
         experiment = system.experiment
         require_design_keys(experiment)
         try:
-            samples = sample_count(experiment, system.grid.stride)
-            t = np.arange(samples, dtype=np.float64) * system.dt
-            return cls._made(system, stated_control(system, t), added_information)
+            return cls._made(system, stated_control(system), added_information)
         except ExperimentError as error:
             raise ExperimentError(f"{experiment.source}: {error}") from None
 
     @classmethod
     def along(cls, system: System, control: Array) -> DesignTask:
-        """A task whose initial control is given: for looking at information along it, without any stated horizon.
+        """Make a task whose initial control is given, to compute the information along it.
+
+        The experiment needs no horizon, and nothing has to bound its controls.
 
         Args:
             system: Model, parameters, outputs, noise and plant.
@@ -147,7 +146,7 @@ class DesignTask:
     def _made(
         cls, system: System, control: Array, added: Array | None, *, weighted: bool = True
     ) -> DesignTask:
-        """Put a task together; `weighted`: with the stated weights and limits, which must bound every control."""
+        """Put a task together; `weighted`: weights or limits have to bound every control."""
         experiment, names = system.experiment, system.controls
         limits = limits_of(system.model, system.coordinates, names, experiment.limits)
 
@@ -240,7 +239,14 @@ class DesignTask:
         return np.arange(self.samples * factor, dtype=np.float64) * (self.dt / factor)
 
     def averaged(self, control: Array) -> Array:
-        """(N, nu) control on the samples of this task from (N * sample_factor, nu) on the stated ones."""
+        """Average a control over the samples of this task.
+
+        Args:
+            control: (N * sample_factor, nu) control at the stated sample rate [u-unit].
+
+        Returns:
+            (N, nu) control [u-unit].
+        """
         factor = self.system.variant.sample_factor
         return np.asarray(control.reshape(self.samples, factor, -1).mean(axis=1))
 
@@ -338,7 +344,11 @@ class DesignTask:
 
     @property
     def centre(self) -> Array:
-        """(nu,) control about which controls vary: the one that holds the initial state, or the mean of the initial control."""
+        """(nu,) control about which controls vary [u-unit].
+
+        It holds the initial state where the design begins at rest; else it is the mean of the
+        initial control.
+        """
         if self.experiment.boundary.start == "rest":
             return self.initial_hold
         return np.asarray(self.control.mean(axis=0))
@@ -365,10 +375,7 @@ class DesignTask:
 
     @cached_property
     def final_hold(self) -> Array:
-        """(nu,) control that holds the state at which the design comes to rest.
-
-        Raises ExperimentError.
-        """
+        """(nu,) control that holds the final state. Raises ExperimentError where none does."""
         key = keyframe(self.system.model, "boundary.keyframe", self.experiment.boundary.keyframe)
         rest = self.system.rest if key is None else np.array(key.ctrl)
         return holding_control(
@@ -378,14 +385,16 @@ class DesignTask:
     # Random controls
 
     def random_control(self, rng: np.random.Generator, least: float, most: float) -> Array:
-        """A random multisine about the mean of the initial control, within the ranges of the controls.
+        """Make a random multisine within the ranges of the controls.
 
-        It rises from rest and fades to it where the experiment begins and ends at rest.
+        It varies about the mean of the initial control. Where the experiment begins at rest, it
+        fades in about the control that holds the initial state; where the experiment ends at rest,
+        it fades out.
 
         Args:
             rng: Source of random numbers.
-            least: Least amplitude, relative to the initial control's.
-            most: Largest amplitude, relative to the initial control's.
+            least: Smallest amplitude, relative to that of the initial control.
+            most: Largest amplitude, relative to that of the initial control.
 
         Returns:
             (N, nu) control.
@@ -406,7 +415,10 @@ class DesignTask:
         return np.asarray(control)
 
     def fade(self, samples: int) -> Array:
-        """(samples, 1) window that rises from 0 where the design starts at rest, and falls to 0 where it ends at rest."""
+        """(samples, 1) window between 0 and 1 that fades a control in and out.
+
+        It rises from 0 where the design begins at rest, and falls to 0 where it ends at rest.
+        """
         boundary = self.experiment.boundary
         share = np.arange(samples)[:, None] / samples
         window = np.ones_like(share)
@@ -443,38 +455,44 @@ class DesignTask:
             variant: How the plant differs from the user's model.
 
         Returns:
-            A task with the control averaged over longer samples, where the variant has these.
+            A task whose control is averaged over longer samples, where the variant has these.
         """
-        before = self.system.variant.sample_factor
-        stated = np.repeat(self.control, before, axis=0) if before > 1 else self.control
-        samples = len(stated) // variant.sample_factor
-        kept = stated[: samples * variant.sample_factor]
-        control = kept.reshape(samples, variant.sample_factor, -1).mean(axis=1)
-
-        changed = self.system.with_variant(variant, self._relaxation())
-        system, reference = _calibrated(changed, control)
-        return replace(self, system=system, control=np.asarray(control), reference=reference)
-
-    def restated(
-        self, experiment: Experiment, *, added_information: Array | None = None
-    ) -> DesignTask:
-        """The task of another experiment on the same model, which is not parsed again."""
-        system = System.resolve(experiment, threads=self.system.threads, source=self.system.source)
-        return DesignTask.of(system, added_information=added_information)
+        stated = np.repeat(self.control, self.system.variant.sample_factor, axis=0)
+        return self._along(stated, variant)
 
     def with_horizon(self, horizon: float) -> DesignTask:
         """This task with another horizon [s], on the same variant of the plant."""
         experiment = self.experiment.replace(horizon=horizon)
-        stated = replace(self.system.with_variant(STATED), experiment=experiment)
-        task = DesignTask.of(stated, added_information=self.added_information)
-        return task.with_variant(self.system.variant)
+        task = replace(self, system=replace(self.system, experiment=experiment))
+        try:
+            return task._along(stated_control(task.system), self.system.variant)
+        except ExperimentError as error:
+            raise ExperimentError(f"{experiment.source}: {error}") from None
+
+    def _along(self, control: Array, variant: ModelVariant) -> DesignTask:
+        """This task on another plant, along a control: (n, nu) at the stated sample rate."""
+        factor = variant.sample_factor
+        samples = len(control) // factor
+        averaged = control[: samples * factor].reshape(samples, factor, -1).mean(axis=1)
+
+        changed = self.system.with_variant(variant, self._relaxation())
+        system, reference = _calibrated(changed, averaged)
+        return replace(self, system=system, control=averaged, reference=reference)
+
+    def restated(
+        self, experiment: Experiment, *, added_information: Array | None = None
+    ) -> DesignTask:
+        """The task of another experiment on this model, which is not parsed again."""
+        system = System.resolve(experiment, threads=self.system.threads, source=self.system.source)
+        return DesignTask.of(system, added_information=added_information)
+
 
     def coarser(self, factor: int) -> DesignTask:
         """This task with a timestep and a sample period that are `factor` times longer."""
         return self.with_variant(replace(self.system.variant, sample_factor=factor))
 
     def relaxed(self) -> DesignTask:
-        """This task on a plant without the clamps and stops that its hard limits keep a design away from."""
+        """This task on a plant without the clamps and stops that hard limits make unreachable."""
         variant = replace(
             self.system.variant, relaxed=True, smoothing_speeds=self._smoothing_speeds()
         )
@@ -485,11 +503,11 @@ class DesignTask:
         return self.with_variant(replace(self.system.variant, timestep_factor=factor))
 
     def smoothed(self) -> DesignTask:
-        """This task with smoothed dry friction in the motion as well, not only in its derivatives."""
+        """This task with smoothed dry friction in the motion, not only in its derivatives."""
         return self.with_variant(replace(self.system.variant, smoothed=True))
 
     def _smoothing_speeds(self) -> tuple[float, ...]:
-        """Speeds below which dry friction is smoothed for derivatives; empty where the model has none."""
+        """Speeds below which dry friction is smoothed for derivatives; empty without friction."""
         model = self.system.model_at(self.theta)
         if not has_dry_friction(model):
             return ()
@@ -502,7 +520,7 @@ class DesignTask:
         return smoothing_speeds_of(model, fastest)
 
     def _relaxation(self) -> Relaxation | None:
-        """Clamps, stops and contacts that the enforced limits keep a design away from."""
+        """Clamps, stops and contacts that the enforced limits make unreachable for a design."""
         stated = self.experiment.limits
         if not stated.enforce:
             return None

@@ -1,4 +1,4 @@
-"""The parts of a design task that an experiment states: number of samples, initial control, weights, contrast, samples."""
+"""The parts of a design task that an experiment states, such as its weights and initial control."""
 
 from __future__ import annotations
 
@@ -41,8 +41,7 @@ def require_design_keys(experiment: Experiment, work: str = "design") -> None:
     if experiment.initial.control is None:
         raise ExperimentError(
             f"{experiment.source}: {work} needs `initial.control`, the control from which it "
-            "starts, for example "
-            'control = { kind = "multisine", amplitude = 1.0 }'
+            'starts, for example control = { kind = "multisine", amplitude = 1.0 }'
         )
 
 
@@ -77,23 +76,25 @@ def sample_count(experiment: Experiment, stride: int) -> int:
     return count
 
 
-def stated_control(system: System, t: Array) -> Array:
+def stated_control(system: System) -> Array:
     """Initial control that the experiment states: a generated signal, or a table in a file.
 
     Args:
         system: The system.
-        t: (N,) sample times [s].
 
     Returns:
-        (N, nu) control [u-unit].
+        (N, nu) control over the stated horizon, at the stated sample rate [u-unit].
 
     Raises:
-        ExperimentError: The signal or the file cannot be used.
+        ExperimentError: The horizon, the signal or the file cannot be used.
     """
-    experiment, source = system.experiment, system.experiment.initial.control
+    experiment, grid = system.experiment, system.stated_grid
+    source = experiment.initial.control
+    t = np.arange(sample_count(experiment, grid.stride), dtype=np.float64) * grid.dt
+
     if isinstance(source, Signal):
         return generate(source, t, system.controls, system.rest)
-    return read_control(experiment.directory / str(source), t, system.dt, system.controls)
+    return read_control(experiment.directory / str(source), t, grid.dt, system.controls)
 
 
 def require_bounded_controls(system: System, limits: tuple[Limit, ...], weight: Array) -> None:
@@ -151,7 +152,7 @@ def contrast_of(system: System) -> Array | None:
         (t, c) combinations of the scaled wanted parameters; None for other criteria.
 
     Raises:
-        ExperimentError: A parameter is not a wanted one, or none is named.
+        ExperimentError: A named parameter is not a wanted one, or no parameter is named.
     """
     cost, parameters = system.experiment.cost, system.parameters
     if cost.criterion != "c":
@@ -166,7 +167,7 @@ def contrast_of(system: System) -> Array | None:
         if name not in wanted:
             raise ExperimentError(f"cost.{key}: {unknown('wanted parameter', name, wanted)}")
     if not chosen:
-        raise ExperimentError(f"cost.subset: it is empty; valid: {', '.join(wanted)}")
+        raise ExperimentError(f"cost.subset: it names no parameter; valid: {', '.join(wanted)}")
 
     # One combination of all parameters, or each chosen parameter in the unit of its scale.
     if cost.combination:
@@ -193,7 +194,7 @@ def parameter_samples_of(system: System) -> ParameterSamples | None:
         return None
     if experiment.descent.psi_weight:
         raise ExperimentError(
-            "robust: descent.psi_weight belongs to a design at one parameter value"
+            "robust: descent.psi_weight is for a design at one parameter value; remove one of them"
         )
 
     thetas = sample_parameters(

@@ -513,7 +513,7 @@ def test_start_that_excites_nothing(tmp_path: Path) -> None:
     xml = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
     xml = xml.replace("<keyframe>", '<keyframe><key name="upright" qpos="0 0"/>')
     (tmp_path / "cart_pendulum.xml").write_text(xml, encoding="utf-8")
-    misused(run("design", path, "-o", tmp_path / "out"), "the start excites nothing along: ")
+    misused(run("design", path, "-o", tmp_path / "out"), "the initial control does not excite: ")
     assert "out" not in names(tmp_path)
 
 
@@ -535,9 +535,9 @@ def test_start_that_excites_next_to_nothing(tmp_path: Path) -> None:
     )
     misused(
         run("design", path, "-o", tmp_path / "out"),
-        "the start excites nothing along: ",
+        "the initial control does not excite: ",
         "m, l and c",
-        "Another control",
+        "Other controls do",
     )
 
 

@@ -419,5 +419,5 @@ def test_a_start_at_rest_without_control_is_unidentifiable(
     rest = {"qpos": (0.0, angle), "control": {"kind": "constant", "amplitude": 0.0}}
     parameters = dict(list(CART_PARAMETERS.items())[-count:])
     task = cart_task(tmp_path, initial=rest, parameters=parameters, descent={"max_iterations": 5})
-    with pytest.raises(UnidentifiableError, match="the start excites nothing"):
+    with pytest.raises(UnidentifiableError, match="the initial control does not excite"):
         design_task(task)
