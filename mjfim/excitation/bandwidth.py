@@ -9,33 +9,34 @@ from mjfim.signals import spline_basis
 
 
 def bandwidth_basis(task: DesignTask, t: Array) -> Array | None:
-    """Splines of the bandwidth that the experiment states.
+    """Make the splines of the bandwidth that the experiment states.
 
     Args:
         task: The task.
         t: (N,) times [s].
 
     Returns:
-        (N, M) splines of which the control minus its centre is made; None where the bandwidth is
-        not limited.
+        (N, M) splines whose sums are the allowed deviations of the control from its centre; None
+        where the bandwidth is not limited.
 
     Raises:
         ExperimentError: The bandwidth is above half of the sample rate.
     """
-    e = task.experiment
-    if e.limits.bandwidth is None:
+    bandwidth, rate = task.experiment.limits.bandwidth, task.experiment.rate
+    if bandwidth is None:
         return None
 
-    if e.limits.bandwidth > 0.5 * e.rate:
+    highest = 0.5 * rate
+    if bandwidth > highest:
         raise ExperimentError(
-            f"limits.bandwidth: {e.limits.bandwidth:g} Hz; a control at {e.rate:g} Hz has "
-            f"{0.5 * e.rate:g} Hz at most"
+            f"limits.bandwidth: {bandwidth:g} Hz; a control at {rate:g} Hz has {highest:g} Hz at "
+            "most"
         )
-    return boundary_splines(task, t, e.limits.bandwidth)
+    return boundary_splines(task, t, bandwidth)
 
 
 def boundary_splines(task: DesignTask, t: Array, bandwidth: float) -> Array:
-    """Splines that begin and end as the experiment's `[boundary]` asks for.
+    """Make splines that begin and end as the experiment's `[boundary]` states.
 
     Args:
         task: The task.

@@ -1,4 +1,4 @@
-"""One optimisation under hard limits from one initial control, as an order that any process can carry out."""
+"""One optimisation under hard limits from one initial control, in this or in another process."""
 
 from __future__ import annotations
 
@@ -28,29 +28,32 @@ from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 from mjfim.signals import independent_curves
 
-# Power of the smooth E-criterion. It is always smooth here: several of the smallest eigenvalues
-# meet under hard limits.
+# Power of the smooth E-criterion. The criterion is always smoothed here, because under hard limits
+# several of the smallest eigenvalues meet.
 SMOOTH_POWER = 40.0
 
-# Growth of deviations from which on feedback is worth its time; steps are short under hard limits.
+# Growth of a small deviation along the trajectory above which the projection uses feedback. It is
+# larger than without hard limits, because steps are shorter here.
 FEEDBACK_THRESHOLD = 100.0
 
-# Weight of an eigenvector, over the largest weight, below which it is left out of the gradient.
+# Weight of an eigenvector, relative to the largest weight, below which the gradient leaves it out.
 MIN_EIGENVECTOR_WEIGHT = 3e-3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ConstrainedSearch:
-    """Order for one constrained optimisation from one initial control; picklable, so that a worker can run it.
+    """Order for one constrained optimisation from one initial control.
+
+    It can be pickled, so that a worker process can run it.
 
     Attributes:
         experiment: The experiment.
-        start: Initial control; need not be feasible.
-        schedule: Weights mu of the barrier stages and when a stage ends.
-        max_iterations: Iterations, at most.
+        start: Initial control, which may be infeasible.
+        schedule: Weights mu of the barrier stages, and when a stage ends.
+        max_iterations: Largest number of iterations.
         budget: Budget of the whole design; the time in the history counts from its beginning, and
             its token ends the search.
-        seconds: Time that this search may take from its own beginning [s].
+        seconds: Time that this search may take [s].
         combinations: (t, s) identifiable combinations of the parameters, or None where all are
             identifiable.
         added_information: (p, p) information of other experiments [1/theta^2], or None.
@@ -75,7 +78,7 @@ class ConstrainedSearch:
         """Run the search.
 
         Args:
-            task: The task on the search's plant, where it exists already.
+            task: The task on the plant of the search; default: resolved from the experiment.
 
         Yields:
             Every iterate.
@@ -103,15 +106,13 @@ def run_in_worker(search: ConstrainedSearch) -> RunResult:
     """Run a search to its end, for an executor.
 
     Args:
-        search: The order. A request to stop by its own token or by that of the worker's pool ends
-            it.
+        search: The order. A request to stop by its token or by that of the worker's pool ends it.
 
     Returns:
-        The best result so far.
+        The best feasible control, or the last one where none is feasible.
     """
-    own_stop, pool_stop = search.budget.stop, pool_stop_token()
-    stop = StopToken(also=lambda: own_stop.requested or pool_stop.requested)
-
+    search_stop, pool_stop = search.budget.stop, pool_stop_token()
+    stop = StopToken(also=lambda: search_stop.requested or pool_stop.requested)
     search = replace(search, budget=search.budget.with_stop(stop))
 
     # Matrices are small: threads of the BLAS would only wait for each other.
@@ -124,15 +125,15 @@ class _Search:
     """A search whose task is resolved.
 
     Attributes:
-        order: What was asked for.
+        order: The order that is carried out.
         task: The task on the plant of the search, over one repetition.
-        exact: The cost by which iterates are judged.
+        exact: The cost by which iterates are compared.
         curves: (N * coarsening, M) curves of which the control is made at the stated rate, or None
             where it is free.
-        constraints: The limits, as far as they are tightened.
-        method: Minimises the smooth cost within them.
+        constraints: The tightened limits.
+        method: Minimises the smooth cost within the tightened limits.
         budget: Time and iterations of the search.
-        steps_before: Engine steps when it began.
+        steps_before: Engine steps of the plant when the search began.
     """
 
     order: ConstrainedSearch
@@ -146,7 +147,7 @@ class _Search:
 
     @classmethod
     def begin(cls, order: ConstrainedSearch, task: DesignTask) -> _Search:
-        """Set up the interior-point method; the time counts from here."""
+        """Set up the interior-point method; the time of the search counts from here."""
         budget = Budget(
             seconds=order.seconds,
             iterations=order.max_iterations,
@@ -154,14 +155,14 @@ class _Search:
         )
         steps_before = task.plant.engine_steps
 
-        # A start may have curves of its own, such as a Fourier series; else a limited bandwidth
-        # asks for splines.
+        # An initial control may bring its curves, such as a Fourier series; else a limited
+        # bandwidth requires splines.
         curves = order.start.basis
         if curves is None:
             curves = bandwidth_basis(task, task.stated_times)
         basis = None if curves is None else independent_curves(task.averaged(curves))
 
-        # Feedback would leave the span of the curves.
+        # With curves there is no feedback, because it would leave their span.
         threshold = FEEDBACK_THRESHOLD if basis is None else np.inf
         constraints = constraint_set_of(task).tightened(order.tightening)
         method = InteriorPointMethod(
@@ -189,11 +190,11 @@ class _Search:
         status: Status | None = None
         control = self.task.averaged(self.order.start.control)
 
-        # A simulation that diverges ends this run, not the others.
+        # A simulation that diverges ends this search, not those of other initial controls.
         try:
             for iterate in self.method.run(control, self.budget):
                 status = iterate.status
-                point = self._judge(iterate)
+                point = self._exact_point(iterate)
                 result = self._updated(result, iterate, point)
                 if iterate.repaired:
                     continue
@@ -209,8 +210,8 @@ class _Search:
 
         return replace(result, status=self._final_status(result, status))
 
-    def _judge(self, iterate: BarrierIterate) -> DesignPoint | None:
-        """The iterate's point by the exact cost over all repetitions; None without a cost."""
+    def _exact_point(self, iterate: BarrierIterate) -> DesignPoint | None:
+        """Point of the iterate with the exact cost over all repetitions; None without a cost."""
         point = iterate.iterate.point.point
         if point is None:
             return None
@@ -220,7 +221,7 @@ class _Search:
     def _updated(
         self, result: RunResult, iterate: BarrierIterate, point: DesignPoint | None
     ) -> RunResult:
-        """The result with this iterate: its control is kept where it is at least as good as the best feasible one."""
+        """Take an iterate into the result; its control where it is feasible and the best so far."""
         steps = self.task.plant.engine_steps - self.steps_before
         result = replace(result, slope=iterate.iterate.slope, steps=steps)
 
@@ -238,8 +239,7 @@ class _Search:
         if not np.isfinite(result.cost):
             return Status.INFEASIBLE
 
-        # The last iterate has no status where the time ended the run, or the schedule had no
-        # further stage.
+        # The last iterate has no status where the time was used up, or all stages were done.
         return status or Status.MAX_ITERATIONS
 
     def _row(self, iterate: BarrierIterate, point: DesignPoint | None, steps: int) -> HistoryRow:
@@ -271,7 +271,8 @@ def smoothed(task: DesignTask, combinations: Array | None) -> DesignProblem:
         combinations: (t, s) identifiable combinations of the parameters, or None.
 
     Returns:
-        The cost, smooth where it is that of E-optimality, without eigenvectors that hardly count.
+        The cost. The criterion of E-optimality is smoothed, and its gradient leaves out
+        eigenvectors of negligible weight.
     """
     power = SMOOTH_POWER if task.experiment.cost.criterion == "E" else np.inf
     smooth = DescentLevel(task, combinations, power).problem
@@ -280,7 +281,7 @@ def smoothed(task: DesignTask, combinations: Array | None) -> DesignProblem:
 
 
 def _repeat_measurement(point: DesignPoint, count: int) -> DesignPoint:
-    """A point whose trajectory is measured several times."""
+    """A point with the information of several repetitions of its trajectory."""
     if count == 1 or point.information is None:
         return point
 
@@ -289,7 +290,7 @@ def _repeat_measurement(point: DesignPoint, count: int) -> DesignPoint:
 
 
 def _at_stated_rate(task: DesignTask, ctrl: Array, curves: Array | None) -> Array:
-    """The control of a level at the stated sample rate.
+    """Convert a control of a level to the stated sample rate.
 
     Args:
         task: The task on the level.

@@ -1,6 +1,6 @@
-"""The kinds of inequality constraints along a trajectory: their margins, their barrier and its expansion.
+"""Kinds of inequality constraints along a trajectory: margins, barrier and its expansion.
 
-All kinds follow one protocol, so that a constraint set is a sum over its members.
+All kinds follow one protocol, so that the barrier of a constraint set is a sum over its members.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ class ConstraintValues:
         observed: (N, substeps, w) quantities at every engine step [unit of each quantity].
         distances: (N, m) distances at the samples 1 ... N [m], or None without a clearance.
         distance_slopes: (N, m, nv) derivatives of the distances by the position [m / q-unit], or
-            None where not asked for.
+            None where they were not requested.
         observation_jacobian: (N, S, w, nx+nu) derivatives of the quantities at S engine steps of
             each sample by the state and the control at the beginning of the sample, or None where
-            not asked for.
+            they were not requested.
     """
 
     trajectory: Trajectory
@@ -67,7 +67,9 @@ class KindMargins(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExpansionSums:
-    """Gradient and Gauss-Newton Hessian of the barrier, to which every kind of constraint adds its part in place.
+    """Gradient and Gauss-Newton Hessian of the barrier.
+
+    Every kind of constraint adds its part in place.
 
     Attributes:
         a: (N+1, nx) derivative by the state [1 / x-unit].
@@ -81,7 +83,7 @@ class ExpansionSums:
 
     @staticmethod
     def zero(N: int, nx: int, nu: int) -> ExpansionSums:
-        """Sums without any part yet, for N samples, nx states and nu controls."""
+        """Zero sums for N samples, nx states and nu controls."""
         weights = Weights(
             Q=np.zeros((N + 1, nx, nx)),
             S=np.zeros((N, nu, nx)),
@@ -120,7 +122,9 @@ class Constraint(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SubstepConstraint:
-    """Ranges of positions, velocities, accelerations and forces, which are observed at the engine steps of every sample.
+    """Ranges of positions, velocities, accelerations and forces.
+
+    These quantities are observed at every engine step, so within the samples as well.
 
     Attributes:
         observations: The w observed quantities.
@@ -135,7 +139,7 @@ class SubstepConstraint:
     names: tuple[str, ...]
 
     def tightened(self, fractions: Mapping[str, float]) -> SubstepConstraint:
-        """Ranges made narrower by fractions of their halves, by kind."""
+        """Narrow the ranges by a fraction of their half-width, by kind."""
         each = np.array([fractions.get(kind, 0.0) for kind in self.kinds])
         return replace(self, bounds=self.bounds.tightened(each))
 
@@ -146,12 +150,12 @@ class SubstepConstraint:
             yield KindMargins(kind, margins[..., i], float(self.bounds.scale[i]))
 
     def barrier(self, values: ConstraintValues, delta: float) -> float:
-        """Mean over time and over the engine steps with derivatives. See `Constraint.barrier`."""
+        """Mean over the engine steps with derivatives. See `Constraint.barrier`."""
         observed, weight = self._observed_with_weight(values)
         return self.bounds.barrier(observed, delta, weight).value
 
     def add_expansion(self, values: ConstraintValues, delta: float, sums: ExpansionSums) -> None:
-        """See `Constraint.add_expansion`."""
+        """See `Constraint.add_expansion`; the Hessian is one matrix product per sample."""
         jacobian = values.observation_jacobian
         if jacobian is None:
             raise ValueError("the observations have no derivatives")
@@ -171,9 +175,10 @@ class SubstepConstraint:
         sums.weights.R[:] += hessian[:, nx:, nx:]
 
     def _observed_with_weight(self, values: ConstraintValues) -> tuple[Array, float]:
-        """(N, S, w) quantities at the engine steps with derivatives, and the weight of each number."""
+        """Quantities at the S engine steps with derivatives, (N, S, w), and the weight of each."""
         steps = np.array(self.observations.derivative_substeps) - 1
-        return values.observed[:, steps], values.weight / len(steps)
+        observed = values.observed[:, steps]
+        return observed, values.weight / len(steps)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,8 +192,9 @@ class ControlConstraint:
     bounds: Bounds
 
     def tightened(self, fractions: Mapping[str, float]) -> ControlConstraint:
-        """Ranges made narrower by the fraction of their halves for this kind."""
-        return replace(self, bounds=self.bounds.tightened(fractions.get("control", 0.0)))
+        """Narrow the ranges by the fraction of their half-width for this kind."""
+        fraction = fractions.get("control", 0.0)
+        return replace(self, bounds=self.bounds.tightened(fraction))
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
@@ -210,7 +216,9 @@ class ControlConstraint:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ControlRateConstraint:
-    """Ranges of the change of the controls from one sample to the next, divided by the sample period.
+    """Ranges of the rates of the controls.
+
+    A rate is the change of a control from one sample to the next over the sample period.
 
     Attributes:
         bounds: Range of the rate of each control, (nu,) [u-unit / s].
@@ -227,11 +235,12 @@ class ControlRateConstraint:
     periodic: bool = False
 
     def tightened(self, fractions: Mapping[str, float]) -> ControlRateConstraint:
-        """Ranges made narrower by the fraction of their halves for this kind."""
-        return replace(self, bounds=self.bounds.tightened(fractions.get("control_rate", 0.0)))
+        """Narrow the ranges by the fraction of their half-width for this kind."""
+        fraction = fractions.get("control_rate", 0.0)
+        return replace(self, bounds=self.bounds.tightened(fraction))
 
     def rates(self, ctrl: Array) -> Array:
-        """Rates of the control into each sample and out of the last one.
+        """Compute the rates of the control into each sample and out of the last one.
 
         Args:
             ctrl: (N, nu) control [u-unit].
@@ -266,7 +275,7 @@ class ControlRateConstraint:
         b += (barrier.slope[:-1] - barrier.slope[1:]) / self.dt
         W += barrier.curvature / self.dt**2
 
-        # The rate out of a periodic control is that into the first sample.
+        # After the last sample a periodic control returns to that of the first sample.
         if self.periodic:
             b[0] += slope[-1]
 
@@ -294,18 +303,23 @@ class EndStateConstraint:
     target: Array
 
     def tightened(self, fractions: Mapping[str, float]) -> EndStateConstraint:
-        """Ranges made narrower by fractions of their halves, by kind."""
-        kinds = [fractions.get(kind, 0.0) for kind in ("end_position", "end_velocity")]
+        """Narrow the tolerances by a fraction of their half-width, by kind."""
+        position = fractions.get("end_position", 0.0)
+        velocity = fractions.get("end_velocity", 0.0)
+
         space = self.space
-        each = np.repeat([*kinds, 0.0], (space.nv, space.nv, space.na))
+        each = np.repeat([position, velocity, 0.0], (space.nv, space.nv, space.na))
         return replace(self, bounds=self.bounds.tightened(each))
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
-        margins, nv = self.bounds.margin(self._difference(values)), self.space.nv
+        margins = self.bounds.margin(self._difference(values))
         scale = self.bounds.scale
-        yield KindMargins("end_position", margins[:nv], scale[:nv])
-        yield KindMargins("end_velocity", margins[nv : 2 * nv], scale[nv : 2 * nv])
+
+        nv = self.space.nv
+        positions, velocities = slice(nv), slice(nv, 2 * nv)
+        yield KindMargins("end_position", margins[positions], scale[positions])
+        yield KindMargins("end_velocity", margins[velocities], scale[velocities])
 
     def barrier(self, values: ConstraintValues, delta: float) -> float:
         """See `Constraint.barrier`."""
@@ -316,7 +330,7 @@ class EndStateConstraint:
         difference = self._difference(values)
         barrier = self.bounds.barrier(difference, delta, END_WEIGHT)
 
-        # A difference of large rotations does not move one to one with the state.
+        # The difference of two rotations is not linear in the state, so that J is no identity.
         J = self.space.minus_derivative(difference)
         sums.a[-1] += J.T @ barrier.slope
         sums.weights.Q[-1] += J.T @ (barrier.curvature[:, None] * J)
@@ -328,7 +342,7 @@ class EndStateConstraint:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ClearanceConstraint:
-    """Distances between geoms are at least a clearance.
+    """Distances between geoms that have to be at least a clearance.
 
     Attributes:
         distances: Measures the distances of all pairs up to its reach.
@@ -339,13 +353,15 @@ class ClearanceConstraint:
     least: float
 
     def tightened(self, fractions: Mapping[str, float]) -> ClearanceConstraint:
-        """The clearance raised by a fraction of it, at most half of the way to the reach of the distances."""
+        """Raise the clearance by a fraction of it, at most half of the way to the reach."""
         raised = self.least * (1.0 + fractions.get("clearance", 0.0))
-        return replace(self, least=min(raised, 0.5 * (self.least + self.distances.reach)))
+        highest = 0.5 * (self.least + self.distances.reach)
+        return replace(self, least=min(raised, highest))
 
     def margins(self, values: ConstraintValues) -> Iterator[KindMargins]:
         """See `Constraint.margins`."""
-        yield KindMargins("clearance", self._measured(values) - self.least, self.least)
+        margins = self._measured(values) - self.least
+        yield KindMargins("clearance", margins, self.least)
 
     def barrier(self, values: ConstraintValues, delta: float) -> float:
         """See `Constraint.barrier`."""
@@ -367,7 +383,7 @@ class ClearanceConstraint:
         sums.weights.Q[1:, :nv, :nv] += hessian
 
     def _bounds(self, measured: Array) -> Bounds:
-        """Bounds of (N, m) distances: from the clearance on; the barrier is zero at the reach."""
+        """Bounds of (N, m) distances: at least the clearance; the barrier is zero at the reach."""
         m = measured.shape[1]
         return Bounds(
             lower=np.full(m, self.least),

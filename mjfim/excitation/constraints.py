@@ -27,7 +27,7 @@ from mjfim.optimize.barrier import BarrierExpansion, Bounds
 from mjfim.plant.batch import SubstepObservations
 from mjfim.records.trajectory import Trajectory
 
-# Largest number of engine steps of a sample at which the barrier takes derivatives.
+# Largest number of engine steps of a sample at which the barrier is evaluated with derivatives.
 MAX_DERIVATIVE_SUBSTEPS = 5
 
 # Distance beyond the stated clearance up to which distances are measured [m].
@@ -62,16 +62,22 @@ class ConstraintSet:
 
     @property
     def members(self) -> tuple[Constraint, ...]:
-        """All kinds of constraints that there are."""
-        every = (self.substeps, self.control, self.rate, self.end, self.clearance)
+        """The kinds of constraints that the experiment has."""
+        every: tuple[Constraint | None, ...] = (
+            self.substeps,
+            self.control,
+            self.rate,
+            self.end,
+            self.clearance,
+        )
         return tuple(member for member in every if member is not None)
 
     def tightened(self, fractions: Mapping[str, float]) -> ConstraintSet:
-        """Constraints with bounds that are moved inwards.
+        """Move the bounds inwards.
 
         Args:
-            fractions: How far, by kind, relative to half of each range; of a clearance, relative to
-                the least distance.
+            fractions: Distance by which bounds move, by kind, relative to half of each range; for
+                the clearance, relative to the least distance.
 
         Returns:
             The tighter set; kinds that are not named keep their bounds.
@@ -90,7 +96,7 @@ class ConstraintSet:
         Args:
             trajectory: The trajectory.
             observed: (N, substeps, w) observations at every engine step.
-            slopes: Derivatives of distances are wanted as well.
+            slopes: Compute the derivatives of distances as well.
 
         Returns:
             The quantities.
@@ -121,7 +127,7 @@ class ConstraintSet:
         return self._smallest_margins(values, relative=False)
 
     def relative_margins(self, values: ConstraintValues) -> dict[str, float]:
-        """Smallest margin of each kind, relative to half of the range, or to the least distance of a clearance."""
+        """Smallest margin of each kind, relative to half of the range or to the clearance."""
         return self._smallest_margins(values, relative=True)
 
     def _smallest_margins(self, values: ConstraintValues, *, relative: bool) -> dict[str, float]:
@@ -182,7 +188,7 @@ class ConstraintSet:
 def derivative_substeps_of(substeps: int) -> tuple[int, ...]:
     """Engine steps of a sample, counted from 1, at which the barrier takes derivatives.
 
-    The first steps, where a held control jolts, are closer together than the last ones.
+    They are closer together at the beginning of the sample, where the control jumps.
     """
     spaced = np.geomspace(1, substeps, min(MAX_DERIVATIVE_SUBSTEPS, substeps))
     return tuple(sorted({round(step) for step in spaced.tolist()}))
@@ -193,8 +199,8 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
 
     Args:
         task: The task.
-        every: Take the limits that are only checked as well. Else only the boundary constrains a
-            design where `limits.enforce` is false.
+        every: Include limits that are checked but not enforced. Otherwise only the boundary
+            constrains a design where `limits.enforce` is false.
 
     Returns:
         The constraint set.
@@ -203,8 +209,8 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         ExperimentError: A state cannot be held, or no pair of geoms can be kept clear.
     """
     boundary, stated = task.experiment.boundary, task.experiment.limits
-    taken = every or stated.enforce
-    limits = task.limits if taken else ()
+    includes_limits = every or stated.enforce
+    limits = task.limits if includes_limits else ()
 
     control = _bounds_of_controls(limits, "control", task)
     if control is None:
@@ -212,12 +218,12 @@ def constraint_set_of(task: DesignTask, every: bool = False) -> ConstraintSet:
         control = Bounds(lower=-free, upper=free, scale=_control_sizes(task))
 
     clearance = None
-    if stated.clearance is not None and taken:
+    if stated.clearance is not None and includes_limits:
         reach = stated.clearance + CLEARANCE_REACH
         clearance = ClearanceConstraint(distances=_distances(task, reach), least=stated.clearance)
 
-    # The holding controls are looked for even without limits on rates: a boundary that cannot be
-    # kept is an error.
+    # The holding controls are computed even without limits on rates, because a boundary that cannot
+    # be kept is an error.
     before = task.initial_hold if boundary.start == "rest" else None
     after = task.final_hold if boundary.end == "rest" else None
     rate_bounds = _bounds_of_controls(limits, "control_rate", task)
@@ -269,7 +275,10 @@ def _substep_constraint(task: DesignTask, limits: tuple[Limit, ...]) -> SubstepC
 
 
 def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, task: DesignTask) -> Bounds | None:
-    """Ranges of all nu controls for one kind of limit, infinite where none is stated; None where none is at all."""
+    """Ranges of all nu controls for one kind of limit; None where no control has such a limit.
+
+    The range of a control without such a limit is infinite.
+    """
     rows = [limit for limit in limits if limit.kind == kind]
     if not rows:
         return None
@@ -283,7 +292,11 @@ def _bounds_of_controls(limits: tuple[Limit, ...], kind: str, task: DesignTask) 
 
 
 def _control_sizes(task: DesignTask) -> Array:
-    """(nu,) scale of controls that nothing bounds: the largest deviation of the initial control from rest [u-unit]."""
+    """Scales of controls without a range: their largest initial deviation from rest.
+
+    Returns:
+        (nu,) scales [u-unit], 1 where the initial control rests.
+    """
     size = np.abs(task.control - task.system.rest).max(axis=0)
     return np.where(size > 0.0, size, 1.0)
 

@@ -19,7 +19,7 @@ from mjfim.records.check import Roughness
 from mjfim.records.design import Evaluation
 from mjfim.records.trajectory import Trajectory
 
-# Growth of a disturbance along a trajectory, played open loop, above which the user is warned.
+# Growth of a disturbance along a trajectory without feedback above which the user is warned.
 UNSTABLE_GROWTH = 1e3
 
 
@@ -42,7 +42,7 @@ def point_at_stated_rate(stage: DescentLevel, control: Array) -> DesignPoint | N
 
 
 def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
-    """Collect everything that is known along a trajectory, with the regulator about it.
+    """Collect all results along a trajectory, with the regulator about it.
 
     Args:
         stage: The task and the criterion.
@@ -79,7 +79,9 @@ def evaluate_point(stage: DescentLevel, point: DesignPoint) -> Evaluation:
 def evaluate(
     experiment: Experiment, trajectory: Trajectory, *, threads: int | None = None
 ) -> Evaluation:
-    """Evaluate the information and the cost along the control of a given trajectory, at the experiment's theta.
+    """Evaluate the information and the cost along the control of a given trajectory.
+
+    The control is simulated at the experiment's theta.
 
     Args:
         experiment: The experiment.
@@ -116,14 +118,17 @@ def design_warnings(
     clamped: tuple[str, ...],
     rough: Roughness | None,
 ) -> Iterator[str]:
-    """Sentences that a user must know about a design before running it.
+    """Make the warnings that a user has to know before running a design.
 
     Args:
         final: Evaluation of the design.
         found: Its limits at every engine step of the unmodified model.
         task: The task of the design.
         clamped: Names of the actuators that reach their forcerange along it.
-        rough: Where its derivatives do not exist, or None.
+        rough: Place along it where derivatives do not exist, or None.
+
+    Yields:
+        Warnings, each a sentence.
     """
     if rough is not None:
         yield str(rough)
@@ -131,13 +136,13 @@ def design_warnings(
         yield (
             f"forcerange clamps {', '.join(clamped)} along the design: its derivatives do not hold "
             "there, it may rest on spurious information caused by the saturation, and the descent "
-            "may have stopped early; raise cost.control or start more gently"
+            "may have stopped early; raise cost.control or begin with a smaller initial control"
         )
     if final.growth > UNSTABLE_GROWTH:
         yield (
             f"a small disturbance grows up to {final.growth:.1e}-fold along this trajectory when "
-            "its control is played open loop; the predicted sigma assumes that there is none. "
-            "Play it with the gains of design.npz, or raise cost.control"
+            "its control is played open loop; the predicted sigma assumes that there is no "
+            "disturbance. Play it with the gains of design.npz, or raise cost.control"
         )
     yield from _limit_warnings(found)
     yield from open_boundary_warnings(task)
@@ -149,11 +154,11 @@ def design_warnings(
 
 
 def _limit_warnings(found: Verification) -> Iterator[str]:
-    """One sentence for each kind of limit that is violated."""
+    """One warning for each kind of limit that is violated."""
     for kind, margin in found.margins.items():
         if not margin < 0.0:
             continue
-        advice = "widen it, start more gently, or give the design more time"
+        advice = "widen them, begin with a smaller initial control, or give the design more time"
         if kind in found.unenforced:
             advice = (
                 "they are checked, not enforced; raise cost.control or cost.tracking until they "
@@ -163,10 +168,13 @@ def _limit_warnings(found: Verification) -> Iterator[str]:
 
 
 def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
-    """Sentences about motions that the stated limits and boundaries do not rule out.
+    """Make the warnings about motions that the stated limits and boundaries allow.
 
     Args:
         task: The task.
+
+    Yields:
+        Warnings, each a sentence.
     """
     experiment = task.experiment
     enforced = task.limits if experiment.limits.enforce else ()
@@ -176,7 +184,7 @@ def open_boundary_warnings(task: DesignTask) -> Iterator[str]:
     may_jump = experiment.limits.bandwidth is None and not with_rate.issuperset(task.controls)
     if at_rest and may_jump:
         yield (
-            "the control may jump where the design begins and ends at rest: for a smooth start "
+            "the control may jump where the design begins or ends at rest: for a smooth control "
             "state limits.control_rate or limits.bandwidth"
         )
 

@@ -20,7 +20,7 @@ from mjfim.plant.derivatives import Bilinear
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ExtendedDesignProblem(DesignProblem):
-    """A design problem whose expansions also carry psi as a state, for a metric that weighs psi."""
+    """A design problem whose expansions have psi as a state, for a metric that weighs psi."""
 
     @classmethod
     def of(cls, problem: DesignProblem) -> ExtendedDesignProblem:
@@ -49,12 +49,12 @@ class ExtendedDesignProblem(DesignProblem):
 
 
 def extend(full: Bilinear, a: Array, b: Array, a_psi: Array) -> Expansion:
-    """Expansion over (x, psi_1, ..., psi_p).
+    """Expand over the extended state (x, psi_1, ..., psi_p).
 
     Args:
         full: Bilinear derivatives along the unit directions of theta.
-        a: (N+1, nx) derivative of J by the state, psi held.
-        b: (N, nu) derivative of J by the control, psi held.
+        a: (N+1, nx) derivative of J by the state at constant psi.
+        b: (N, nu) derivative of J by the control at constant psi.
         a_psi: (N+1, nx, p) derivative of J by psi.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Repair of infeasible controls: a control is shrunk towards the centre of its range until all constraints hold."""
+"""Repair of infeasible controls: shrink them towards a centre until all constraints hold."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from mjfim.arrays import Array
 
 T = TypeVar("T")
 
-# Factors by which the deviation of a control from the centre is multiplied, tried one after the
-# other. The first ones are close to 1, because most controls violate a limit by little.
+# Factors on the deviation of a control from the centre, tried in this order. The first ones are
+# close to 1, because most controls violate a limit by little.
 SHRINK_FACTORS = np.concatenate([[1.0, 0.997, 0.99, 0.97, 0.94, 0.9], 0.8 ** np.arange(1, 24)])
 
 
@@ -23,12 +23,11 @@ def shrink_until_feasible(
 
     Args:
         control: (N, nu) control, which may be infeasible [u-unit].
-        centre: (nu,) or (N, nu) control that is approached [u-unit].
-        evaluate: Result for a feasible control, and None for an infeasible one.
+        centre: (nu,) or (N, nu) control towards which it is shrunk [u-unit].
+        evaluate: Returns the result for a feasible control, and None for an infeasible one.
 
     Returns:
-        The result for the largest factor that makes the control feasible, or None where no factor
-        does.
+        The result for the first factor that makes the control feasible; None where no factor does.
     """
     for factor in SHRINK_FACTORS:
         candidate = control if factor == 1.0 else centre + factor * (control - centre)

@@ -9,26 +9,25 @@ from mjfim.errors import ExperimentError
 from mjfim.experiment.system import System
 from mjfim.model.coordinates import joint_names
 
-# Gauss-Newton steps; one is enough where forces are linear in the control.
+# Number of Gauss-Newton steps; one is enough where forces are linear in the control.
 NEWTON_STEPS = 4
 
 # Difference step of the control, relative to its size.
 RELATIVE_DIFFERENCE = 1e-4
 
-# Time for which the control has to keep the state below the velocity that `[boundary]` tolerates
-# [s].
+# Time in which a held state may not reach the velocity that `[boundary]` tolerates [s].
 HOLDING_TIME = 0.1
 
 
 def holding_control(system: System, state: Array, guess: Array, *, key: str, place: str) -> Array:
-    """Find the control that leaves a state unchanged, to the tolerance of the experiment's `[boundary]`.
+    """Find the control that holds a state within the tolerance of the experiment's `[boundary]`.
 
     Args:
         system: The system; the plant is taken at its theta.
         state: (ns,) state to hold.
         guess: (nu,) control from which the search starts.
-        key: Key of the experiment file that asks for it, for the message.
-        place: Name of the state, for the message.
+        key: Key of the experiment file that requires it, for the error message.
+        place: Name of the state, for the error message.
 
     Returns:
         (nu,) control.
@@ -57,7 +56,18 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
 
 
 def _require_held(system: System, state: Array, drift: Array, key: str, place: str) -> None:
-    """Raise ExperimentError where a state moves, or still accelerates. drift: (nx,) change over one sample."""
+    """Require that a state is at rest and does not accelerate under a control.
+
+    Args:
+        system: The system.
+        state: (ns,) state.
+        drift: (nx,) change of the state over one sample under the control.
+        key: Key of the experiment file, for the error message.
+        place: Name of the state, for the error message.
+
+    Raises:
+        ExperimentError: A joint moves or accelerates.
+    """
     nv = system.space.nv
     acceleration = np.abs(drift[nv : 2 * nv]) / system.dt
     speed = np.abs(system.space.split(state)[1])
@@ -75,6 +85,5 @@ def _require_held(system: System, state: Array, drift: Array, key: str, place: s
         fault = f"moves at {speed[worst]:.3g} per s"
     raise ExperimentError(
         f"{key}: no control holds {place}: joint {name!r} {fault}; begin and end where the model "
-        "can stand still "
-        '(qvel = 0, an equilibrium), or state start = "given", end = "free"'
+        'can stand still (qvel = 0, an equilibrium), or state start = "given", end = "free"'
     )

@@ -1,4 +1,4 @@
-"""Initial controls of a design: the stated one, random multisines, Fourier series to be optimised first, earlier designs."""
+"""Initial controls of a design: stated ones, multisines, Fourier series and earlier designs."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mjfim.excitation.task import DesignTask
 from mjfim.recordings.control_table import read_control
 from mjfim.signals import fourier_basis
 
-# Most harmonics of a Fourier series that is optimised first.
+# Largest number of harmonics of a Fourier series.
 MAX_SERIES_HARMONICS = 15
 
-# Amplitudes of random multisines, relative to that of the initial control.
+# Smallest and largest amplitude of a random multisine, relative to that of the initial control.
 LEAST_RANDOM_AMPLITUDE = 1.0
 MOST_RANDOM_AMPLITUDE = 6.0
 
@@ -29,9 +29,10 @@ class InitialControl:
     Attributes:
         name: Its name in histories and messages.
         control: (N / repeats, nu) control [u-unit].
-        basis: (N, M) curves within which the control is optimised first, or None for any control.
-        repeats: Number of times that the control is played over the horizon; it is optimised alone
-            first.
+        basis: (N, M) curves of which the control is a sum in the first round of the optimisation;
+            None where the control is free.
+        repeats: Number of times that the control is played over the horizon. In the first round of
+            the optimisation one repetition is optimised alone.
     """
 
     name: str
@@ -53,12 +54,12 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Initi
         given: (N, nu) control that replaces the initial one, or None.
 
     Returns:
-        The given or the initial control, then those that `[descent]` asks for: earlier designs,
-        Fourier series, repeated parts, random multisines. The multisines are made one by one.
+        The given or the initial control, then those that `[descent]` states: earlier designs,
+        Fourier series, repeated parts, random multisines. The multisines are made when they are
+        needed.
 
     Raises:
-        ExperimentError: A file, a frequency or a number of repeats cannot be used; this is found at
-            once.
+        ExperimentError: A file, a frequency or a number of repeats cannot be used.
     """
     descent = task.experiment.descent
     first = InitialControl(name="initial control", control=task.control)
@@ -83,25 +84,25 @@ def initial_controls_of(task: DesignTask, given: Array | None) -> Iterator[Initi
 
 
 def control_of_earlier_design(task: DesignTask, path: str) -> Array:
-    """(N, nu) control of an earlier design's design.csv, repeated where it is shorter."""
+    """(N, nu) control of the design.csv of an earlier design, repeated where it is shorter."""
     file = task.experiment.directory / path
     return read_control(file, task.t, task.dt, task.controls, repeat=True)
 
 
 def _multisines(task: DesignTask, rng: np.random.Generator) -> Iterator[InitialControl]:
-    """The random multisines that `descent.starts` asks for."""
+    """The random multisines; their number is that of `descent.starts` minus the initial one."""
     last = task.experiment.descent.starts - 1
     for i in range(1, last + 1):
         yield InitialControl(name=f"multisine {i} of {last}", control=_multisine(task, rng))
 
 
 def _multisine(task: DesignTask, rng: np.random.Generator) -> Array:
-    """(N, nu) random multisine about the middle of the initial control, inside the ranges of the controls."""
+    """(N, nu) random multisine within the ranges of the controls [u-unit]."""
     return task.random_control(rng, LEAST_RANDOM_AMPLITUDE, MOST_RANDOM_AMPLITUDE)
 
 
 def _fourier_series(task: DesignTask, frequency: float, rng: np.random.Generator) -> InitialControl:
-    """The Fourier series of a frequency [Hz] that is nearest to a random multisine.
+    """Fit a Fourier series of a frequency [Hz] to a random multisine.
 
     Raises:
         ExperimentError: The frequency is above the bandwidth.
@@ -124,7 +125,14 @@ def _fourier_series(task: DesignTask, frequency: float, rng: np.random.Generator
 
 
 def _first_part(task: DesignTask, count: int) -> Array:
-    """(N / count, nu) first part of the initial control, faded where it has to begin and end at rest.
+    """First part of the initial control, faded where it has to begin or end at rest.
+
+    Args:
+        task: The task with N samples.
+        count: Number of equal parts of the horizon.
+
+    Returns:
+        (N / count, nu) control [u-unit].
 
     Raises:
         ExperimentError: The horizon cannot be divided into this number of parts.
@@ -144,8 +152,8 @@ def _first_part(task: DesignTask, count: int) -> Array:
         )
     if not task.is_limited:
         raise ExperimentError(
-            f"{source}: descent.repeats needs hard limits; without, start from a shorter design "
-            "(previous)"
+            f"{source}: descent.repeats needs hard limits; without them, begin with a shorter "
+            "design: descent.previous"
         )
 
     deviation = task.control[:samples] - task.centre

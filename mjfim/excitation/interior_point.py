@@ -1,7 +1,8 @@
-"""Interior-point method for designs under hard limits: minimise `log J + mu B` in stages with falling barrier weight mu.
+"""Interior-point method for designs under hard limits.
 
-A control that is far outside the limits is first steered inside without any cost. A stage that ends
-outside tightens the limits of the next one.
+It minimises `log J + mu B` in stages with falling barrier weight mu. A control that violates the
+limits by far is first steered inside them, without the cost. A stage whose result violates a limit
+tightens the limits of the next stage.
 """
 
 from __future__ import annotations
@@ -21,46 +22,45 @@ from mjfim.optimize.projection_operator import Armijo, Iterate, Regulator, optim
 from mjfim.optimize.structured_bfgs import StructuredBFGS
 from mjfim.records.design import Status
 
-# Factor between the barrier weights mu of two successive stages.
+# Ratio of the barrier weights mu of two successive stages.
 MU_FACTOR = 3.0
 
-# Relaxation delta of the barrier, over mu.
+# Ratio of the relaxation delta of the barrier to its weight mu.
 RELAXATION_PER_MU = 0.3
 
 # Largest relaxation delta of the barrier.
 MAX_RELAXATION = 0.1
 
-# Weight mu of the barrier from which on violated limits are answered by tighter limits in the next
-# stage.
+# Largest weight mu of the barrier with which a violated limit is tightened in the next stage.
 TIGHTENING_MU = 4e-3
 
 # A violation at the end of a stage tightens the limit by this many times the violation.
 TIGHTENING_GAIN = 1.2
 
-# A limit that is well kept is released again by this share of its margin.
+# A tightened limit that holds with a margin is released by this share of the margin.
 RELEASE_GAIN = 0.5
 
 # A stage may take this many times its equal share of the time that is left.
 TIME_SHARE_FACTOR = 1.5
 
-# Number of times that the last stage is repeated, at most, because its result violates a limit.
+# Largest number of repetitions of the last stage while its result violates a limit.
 MAX_REPEATED_STAGES = 3
 
-# Violation of a limit, over half of its range, up to which the barrier can bring a control back
-# inside by itself.
+# Violation of a limit, relative to half of its range, up to which the relaxed barrier makes a
+# control feasible without steering.
 MAX_START_VIOLATION = 1.0
 
-# Iterations that steer a control inside the limits, at most.
+# Largest number of iterations that steer a control inside the limits.
 MAX_STEERING_ITERATIONS = 60
 
-# The same where shrinking the control leads inside as well, so that steering only has to be tried.
+# Largest number of such iterations where a shrunk control is feasible already.
 MAX_STEERING_TRIAL = 20
 
-# Slope of the barrier, over its size, at which steering has converged.
+# Slope of the barrier, relative to its size, at which steering has converged.
 STEERING_TOLERANCE = 1e-6
 
-# Weight of the control in the metric, times the number of samples, over the square of half of the
-# control's range.
+# Weight of a control in the metric: this number over the number of samples and over the square of
+# half of the control's range.
 RIDGE = 0.03
 
 
@@ -71,11 +71,11 @@ class BarrierSchedule:
     Attributes:
         first: Largest weight.
         last: Smallest weight.
-        patience: Iterations of a stage, at most; the last stage may take twice as many.
+        patience: Largest number of iterations of a stage; twice this number in the last stage.
         settled: A stage ends when the merit falls by less than this times mu over `window`
             iterations.
         window: Number of iterations over which progress is measured.
-        tolerance: Slope, over the size of the merit, at which the last stage has converged.
+        tolerance: Slope, relative to the size of the merit, at which the last stage has converged.
     """
 
     first: float = 0.1
@@ -86,7 +86,7 @@ class BarrierSchedule:
     tolerance: float = 1e-5
 
     def barrier_weights(self) -> list[float]:
-        """All weights mu, from the first to the last, in equal ratios of about `MU_FACTOR`."""
+        """All weights mu, a geometric sequence with a ratio of about `MU_FACTOR`."""
         ratio = self.first / self.last
         count = max(round(np.log(ratio) / np.log(MU_FACTOR)), 1)
 
@@ -104,8 +104,7 @@ class BarrierIterate:
         margins: Worst margin of each kind of constraint [unit of the kind], negative where
             violated.
         status: How the run ended; None except in the last iterate.
-        repaired: True where this is not a new iterate, but the one before, shrunk until it keeps
-            all limits.
+        repaired: True where this is the iterate before, shrunk until all limits hold.
     """
 
     iterate: Iterate[InteriorPoint]
@@ -138,9 +137,9 @@ class _Stage:
     """Settings of one barrier stage.
 
     Attributes:
-        problem: What is minimised, with the limits as they are tightened in this stage.
+        problem: The problem to minimise, with the tightened limits of this stage.
         budget: Time of the stage.
-        max_iterations: Iterations of the stage, at most.
+        max_iterations: Largest number of iterations of the stage.
         is_last: True for the stage with the smallest mu and its repetitions.
         first_index: Number of its first iterate.
     """
@@ -158,8 +157,8 @@ class _StageResult:
 
     Attributes:
         iterate: Last iterate of the stage, numbered within the stage.
-        is_feasible: True where it keeps all limits.
-        converged: True where it is the final result of the run.
+        is_feasible: True where all limits hold along it.
+        converged: True where the run has converged at it, so that no stage may follow.
     """
 
     iterate: Iterate[InteriorPoint]
@@ -175,10 +174,10 @@ class InteriorPointMethod:
         base: The cost on the plant without clamps.
         constraints: The limits.
         centre: (nu,) control about which an infeasible control is shrunk [u-unit].
-        basis: (N, M) curves of which the control minus its centre is made; None where the control
-            is free.
+        basis: (N, M) curves whose sums are the allowed deviations of the control from its centre;
+            None where the control is free.
         regulator: Gain of the projection operator.
-        schedule: Weights of the barrier and when a stage ends.
+        schedule: Weights of the barrier, and when a stage ends.
     """
 
     base: DesignProblem
@@ -192,9 +191,9 @@ class InteriorPointMethod:
         """Run the method from a control.
 
         Args:
-            control: (N, nu) control [u-unit]; need not be feasible.
+            control: (N, nu) control, which may be infeasible [u-unit].
             budget: Time and iterations of the run. Iterations that steer the control inside the
-                limits are not counted.
+                limits do not count.
 
         Yields:
             Every iterate.
@@ -211,7 +210,7 @@ class InteriorPointMethod:
             control: (N, nu) control [u-unit].
 
         Returns:
-            (N, nu) the shrunk control, or None where no shrinking helps.
+            (N, nu) the shrunk control; None where no factor makes it feasible.
         """
         problem = self._problem_without_cost
 
@@ -229,16 +228,20 @@ class InteriorPointMethod:
     def _find_first_control(
         self, control: Array, budget: Budget
     ) -> Generator[BarrierIterate, None, _FirstControl]:
-        """Find a control near the feasible set: the given one, or the better of the shrunk and the steered one."""
+        """Find a control from which the barrier stages can start.
+
+        It is the given control where that is nearly feasible; else it is shrunk or steered inside
+        the limits, whichever has the lower merit.
+        """
         fitted = self._fit_to_basis(control)
 
-        # The barrier itself brings a control back that is only a little outside.
+        # A small violation is removed by the relaxed barrier.
         if self._is_near_feasible(fitted):
             return _FirstControl(control=fitted, iterations=0)
 
         shrunk = self.shrink_inside(fitted)
 
-        # Steer the control inside; only a few iterations where shrinking has worked.
+        # Steer the control inside; only a few iterations where the shrunk control is feasible.
         longest = MAX_STEERING_ITERATIONS if shrunk is None else MAX_STEERING_TRIAL
         steered: BarrierIterate | None = None
         for steered in self._steer_inside(fitted, int(min(budget.max_iterations, longest)), budget):
@@ -252,7 +255,7 @@ class InteriorPointMethod:
         if shrunk is None:
             return _FirstControl(control=steered_control, iterations=iterations)
 
-        # Both are available: begin with the one of lower merit.
+        # Where both are feasible, take the one of lower merit.
         problem = InteriorProblem(
             base=self.base,
             constraints=self.constraints,
@@ -273,9 +276,10 @@ class InteriorPointMethod:
         return np.asarray(self.centre + self.basis @ coefficients)
 
     def _is_near_feasible(self, control: Array) -> bool:
-        """Whether the relaxed barrier can restore feasibility from here; terminal constraints are ignored.
+        """Whether the relaxed barrier can make a control feasible.
 
-        The end may be missed by any number of its tolerances, because the tolerances are narrow.
+        Constraints on the final state are ignored: their tolerances are narrow, so that even a
+        usable control misses them by many times the tolerance.
         """
         values = self._problem_without_cost.point(control).values
         if values is None:
@@ -320,11 +324,11 @@ class InteriorPointMethod:
     def _minimize(
         self, control: Array, budget: Budget, first_index: int
     ) -> Iterator[BarrierIterate]:
-        """Run the stages with falling mu; the last one is repeated while its result violates a limit."""
+        """Run the stages with falling mu; repeat the last one while its result is infeasible."""
         weights = self.schedule.barrier_weights()
         stages = [*weights, *weights[-1:] * MAX_REPEATED_STAGES]
 
-        # One direction for all stages: its curvature pairs do not depend on mu.
+        # All stages share one direction, because its curvature pairs do not depend on mu.
         direction = self._direction()
         tightening = dict[str, float]()
 
@@ -345,15 +349,15 @@ class InteriorPointMethod:
             budget.spend(iterations=ended.iterate.index)
             reason = budget.exhausted
 
-            # Repair an infeasible end, since nothing better may follow; but nobody waits for that
-            # after Ctrl-C.
+            # Repair an infeasible result, since no better one may follow. After Ctrl-C this would
+            # take too long.
             if not ended.is_feasible and reason is not StopReason.REQUESTED:
                 yield from self._repair(problem, ended.iterate, first_index)
 
             if reason is not None or (stage.is_last and ended.is_feasible):
                 return
 
-            # Move the limits inwards by what is violated, so that the next stage ends inside.
+            # Tighten violated limits, so that the result of the next stage keeps them.
             if mu <= TIGHTENING_MU:
                 margins = self.constraints.relative_margins(values_of(point))
                 tightening = updated_tightening(tightening, margins)
@@ -365,8 +369,7 @@ class InteriorPointMethod:
         stages_left = max(stages_left, 1)
         is_last = stages_left == 1
 
-        # A stage may take somewhat more than its equal share of the time; the last one may take all
-        # of it.
+        # A stage may take somewhat more than an equal share of the time, the last one all of it.
         share = 1.0 if is_last else min(TIME_SHARE_FACTOR / stages_left, 1.0)
 
         patience = self.schedule.patience * (2 if is_last else 1)
@@ -388,8 +391,7 @@ class InteriorPointMethod:
         problem = stage.problem
         values: list[float] = []
 
-        # A tighter tolerance than many a stated one: a smaller slope also makes a violation
-        # smaller.
+        # Continue below a coarser stated tolerance: a smaller slope also means a smaller violation.
         tolerance = min(schedule.tolerance, BarrierSchedule.tolerance)
 
         iterates = optimize(
@@ -405,7 +407,7 @@ class InteriorPointMethod:
             margins = self.constraints.margins(values_of(iterate.point))
             is_feasible = self.constraints.is_feasible(values_of(iterate.point))
 
-            # Convergence counts on the last stage only, and only inside the stated limits.
+            # A status ends the run only in the last stage, and only where the stated limits hold.
             status = Status.CONVERGED if iterate.slope <= schedule.tolerance else iterate.status
             if not (stage.is_last and is_feasible):
                 status = None
@@ -416,7 +418,7 @@ class InteriorPointMethod:
             if status is Status.CONVERGED:
                 break
 
-            # Stagnation: a sharper barrier promises more than further iterations.
+            # A stage that stagnates ends: the next, sharper barrier improves more.
             values.append(iterate.value)
             stagnates = (
                 len(values) > schedule.window
@@ -434,7 +436,7 @@ class InteriorPointMethod:
     def _repair(
         self, problem: InteriorProblem, iterate: Iterate[InteriorPoint], index: int
     ) -> Iterator[BarrierIterate]:
-        """Yield an infeasible iterate again, shrunk until it keeps all limits, if that is possible."""
+        """Shrink an infeasible iterate until all limits hold, and yield it where that succeeds."""
         control = self.shrink_inside(iterate.point.ctrl)
         if control is None:
             return
@@ -450,16 +452,16 @@ class InteriorPointMethod:
         margins = self.constraints.margins(point.values)
         yield BarrierIterate(iterate=repaired, mu=problem.mu, margins=margins, repaired=True)
 
-    # ---- what the stages are made of
+    # ---- problems and direction of the stages
 
     def _problem(self, mu: float, constraints: ConstraintSet) -> InteriorProblem:
-        """The problem with a weight of the barrier; the relaxation falls with it."""
+        """The problem with barrier weight mu; the relaxation delta is proportional to mu."""
         delta = min(MAX_RELAXATION, RELAXATION_PER_MU * mu)
         return InteriorProblem(base=self.base, constraints=constraints, mu=mu, delta=delta)
 
     @property
     def _problem_without_cost(self) -> InteriorProblem:
-        """The barrier alone."""
+        """The problem of steering a control inside the limits: the barrier without a cost."""
         return InteriorProblem(
             base=self.base,
             constraints=self.constraints,
@@ -478,15 +480,16 @@ class InteriorPointMethod:
 def updated_tightening(
     tightening: Mapping[str, float], relative_margins: Mapping[str, float]
 ) -> dict[str, float]:
-    """Choose how far each kind of limit is moved inwards in the next stage.
+    """Choose how far the limits are moved inwards in the next stage.
 
     Args:
-        tightening: Share of half of the range that was held back so far, by kind.
-        relative_margins: Worst margin over half of the range at the end of the stage, by kind;
-            negative where violated.
+        tightening: Distance by which limits are moved so far, relative to half of the range, by
+            kind.
+        relative_margins: Smallest margin relative to half of the range, by kind; negative where
+            violated.
 
     Returns:
-        The new shares: larger where the limit was violated, smaller where it was well kept.
+        The new distances: larger where the limit is violated, smaller where it holds with a margin.
     """
     updated = {}
     for kind, margin in relative_margins.items():

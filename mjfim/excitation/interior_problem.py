@@ -1,7 +1,8 @@
-"""The cost of a design under hard limits: `log J + mu B` with the relaxed barrier B of the limits (Hauser & Saccon 2006).
+"""The cost of a design under hard limits: `log J + mu B` with a barrier B of the limits.
 
-The logarithm makes the cost free of scale, so that one schedule of mu fits every experiment; its
-minima are those of J. The barrier is relaxed: it is defined outside the limits as well.
+The logarithm makes the cost independent of its scale, so that one schedule of mu fits every
+experiment; its minima are those of J. The barrier is relaxed, which means that it is defined
+outside the limits as well (Hauser & Saccon 2006).
 """
 
 from __future__ import annotations
@@ -65,16 +66,16 @@ def values_of(point: InteriorPoint) -> ConstraintValues:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InteriorProblem:
-    """Minimise `log J + mu B` over controls, in the form that Algorithm 1 asks for.
+    """The problem of minimising `log J + mu B` over controls, in the form that Algorithm 1 needs.
 
-    The cost of D-optimality is a logarithm already; in its place stands the cost per parameter.
+    The cost of D-optimality is a logarithm already; the cost per parameter replaces `log J` there.
 
     Attributes:
         base: The cost J on the plant without clamps.
         constraints: The limits.
         mu: Weight of the barrier B.
         delta: Relaxation of the barrier, over half of each range.
-        with_cost: False where only the limits have to be reached, without any cost.
+        with_cost: False to minimise the barrier alone, which steers a control inside the limits.
     """
 
     base: DesignProblem
@@ -109,7 +110,9 @@ class InteriorProblem:
         return InteriorPoint(values=values, point=point, merit=self._merit(point), barrier=barrier)
 
     def reevaluate(self, point: InteriorPoint) -> InteriorPoint:
-        """Evaluate a point of another problem, which differs in its criterion, mu, delta or bounds, without a simulation.
+        """Evaluate a point of another problem without a simulation.
+
+        The other problem may differ in its criterion, mu, delta and bounds.
 
         Args:
             point: Point of the other problem.
@@ -129,7 +132,7 @@ class InteriorProblem:
         )
 
     def _merit(self, point: DesignPoint) -> float:
-        """Logarithm of the cost, or the cost per parameter of D-optimality; infinite where J is not positive."""
+        """`log J`, infinite where J <= 0; for D-optimality the cost per parameter instead."""
         if self.base.information.criterion == "D":
             return point.cost / self._cost_per_nat(point)
 
@@ -156,12 +159,12 @@ class InteriorProblem:
         return point.merit + self.mu * point.barrier
 
     def size(self, point: InteriorPoint) -> float:
-        """Scale of the slope in the test of convergence: one e-fold of J, or the barrier where that is more."""
+        """Scale of the slope in the test of convergence: 1, or the weighted barrier if larger."""
         weight = self.mu if self.with_cost else 1.0
         return max(1.0, abs(point.barrier) * weight)
 
     def expand(self, point: InteriorPoint) -> Expansion:
-        """Expand the sum about a point; the barrier's part is also given separately.
+        """Expand `log J + mu B` about a point; the expansion of `mu B` is also given separately.
 
         Args:
             point: Point that did not diverge.
@@ -196,7 +199,7 @@ class InteriorProblem:
         if point.point is not None:
             expansion, jacobian = self.base.expand_observed(point.point, observations)
             if jacobian is None:
-                raise ValueError("an expansion along a criterion without directions")
+                raise ValueError("the expansion has no derivatives of the observations")
             return expansion, jacobian
 
         # Without a cost only the dynamics and the observations are linearised.
@@ -233,5 +236,5 @@ class InteriorProblem:
         return self.base.plant.difference(values_of(new).trajectory, values_of(old).trajectory)
 
     def refine(self, point: InteriorPoint) -> InteriorPoint | None:
-        """Return None: the schedule ends before the accuracy of the derivatives matters."""
+        """Return None: a run ends before the accuracy of the derivatives matters."""
         return None

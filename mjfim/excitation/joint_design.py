@@ -33,13 +33,13 @@ def design_jointly(
 ) -> tuple[Design, ...]:
     """Design several experiments in turn, each given the information of the others.
 
-    The designs depend on each other through the sum of their information alone. So where no single
+    The designs depend on each other only through the sum of their information. Where no single
     design can be improved, all of them together cannot be improved to first order either.
 
     Args:
-        experiments: Two or more experiments that state the same parameters in the same order.
+        experiments: Two or more experiments that state identical parameters in one order.
         callback: Called with a `DesignEvent` for every iterate of every design.
-        rounds: Number of times that every experiment is designed, at most.
+        rounds: Largest number of times that every experiment is designed.
         tolerance: Relative improvement of the criterion in one round below which the search ends.
         threads: Threads for simulations; default: one per core.
         executor: Executor of `concurrent.futures` that runs several starts under hard limits side
@@ -47,9 +47,9 @@ def design_jointly(
         stop: Token that ends the search with the best designs so far, as Ctrl-C does.
 
     Returns:
-        One design per experiment. `final.information` of each holds the information of all;
-        deviations of the initial state belong to each experiment alone, all other nuisance
-        parameters are common.
+        One design per experiment. `final.information` of each contains the information of all
+        experiments. Deviations of the initial state are separate parameters of each experiment;
+        all other nuisance parameters are common.
 
     Raises:
         ExperimentError: There are fewer than two experiments, or their parameters differ. See also
@@ -61,12 +61,13 @@ def design_jointly(
 
         information = [_initial_information(task) for task in tasks]
         designs: list[Design | None] = [None] * len(tasks)
+        finished: list[Design] = []
         last = np.inf
 
         for _ in range(rounds):
             for i, task in enumerate(tasks):
-                # After a request to stop, only experiments without any design are still designed,
-                # and that ends at once.
+                # After a request to stop, only experiments without any design are still designed;
+                # their designs end immediately.
                 earlier = designs[i]
                 if token.requested and earlier is not None:
                     continue
@@ -83,13 +84,14 @@ def design_jointly(
                 information[i] = design.data
                 designs[i] = design
 
-            # The last design knows the information of all others.
-            reached = [design.final.criterion for design in designs if design is not None][-1]
+            # The criterion of the last design takes the information of all others into account.
+            finished = [design for design in designs if design is not None]
+            reached = finished[-1].final.criterion
             if token.requested or last - reached <= tolerance * abs(reached):
                 break
             last = reached
 
-        return tuple(design for design in designs if design is not None)
+        return tuple(finished)
 
 
 def _require_common_parameters(tasks: Sequence[DesignTask]) -> None:
@@ -104,14 +106,21 @@ def _require_common_parameters(tasks: Sequence[DesignTask]) -> None:
 
 
 def _initial_information(task: DesignTask) -> Array:
-    """(p, p) information of the initial control about the parameters that all experiments share [1/theta^2]."""
+    """Information of the initial control about the parameters that all experiments share.
+
+    Returns:
+        (p, p) information [1 / theta-unit^2].
+
+    Raises:
+        SimulationDivergedError: The simulation diverges along the initial control.
+    """
     point = task.problem.point(task.initial, CENTRAL_DIFFERENCES)
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError(
             "the simulation diverges when the parameters move a little along the initial control"
         )
 
-    # Where the initial control excites some combinations only, the others carry no information.
+    # The initial control may excite some combinations only; the others carry no information.
     excited = task.identifiability_test.along(task.initial, point.sensitivity).along_trajectory
     basis = excited.basis if excited.count else None
     information = replace(task.information, basis=basis)

@@ -1,4 +1,4 @@
-"""Levels of a descent: the experiment at a longer timestep or sample period, or with smoothed friction, to begin with."""
+"""Levels of a descent: coarser or smoother plants on which the optimisation begins."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mjfim.errors import ExperimentError, SimulationDivergedError
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.excitation.task import DesignTask
 
-# Factor by which the samples of a coarse level are longer, where the experiment leaves it open.
+# Default factor by which the samples of a coarse level are longer.
 AUTO_COARSE_FACTOR = 4
 
 # Smallest number of samples of a coarse level.
@@ -21,21 +21,21 @@ MIN_COARSE_SAMPLES = 50
 # Largest relative change of the initial cost that a coarse level without hard limits may cause.
 MAX_COARSE_CHANGE = 0.05
 
-# Factors by which the timestep of a coarse level under hard limits may be longer; the first that
-# suits the model is taken.
+# Factors by which the timestep of a coarse level under hard limits may be longer, tried in this
+# order.
 TIMESTEP_FACTORS = (5, 4, 3, 2)
 
-# Factor by which the samples are longer where no timestep factor divides them.
+# Factor by which samples become longer where no factor of the timestep divides their engine steps.
 SAMPLE_FACTOR = 2
 
-# Largest relative change of the initial cost that a coarse level under hard limits may cause. Much
-# is tolerated, because everything is optimised again on the stated level.
+# Largest relative change of the initial cost that a coarse level under hard limits may cause. It is
+# large, because the design is optimised again on the stated level.
 MAX_CONSTRAINED_COARSE_CHANGE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class DescentLevel:
-    """One level of the descent: the task at one sample rate, with the criterion that is minimised there.
+    """One level of a descent: a task and the criterion that is minimised for it.
 
     Attributes:
         task: The task at the sample rate of the level.
@@ -66,8 +66,8 @@ def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> D
         basis: (t, s) identifiable combinations, or None.
 
     Returns:
-        The task with longer samples; None where the experiment does not want it, or where its
-        initial cost differs by more than 5 % from the stated one.
+        The task with longer samples; None where the experiment states no coarse level, or where
+        the initial cost differs from that of the stated task by more than `MAX_COARSE_CHANGE`.
 
     Raises:
         ExperimentError: The stated factor does not divide the samples.
@@ -94,13 +94,13 @@ def coarse_level(task: DesignTask, first: DesignPoint, basis: Array | None) -> D
 
 
 def has_similar_cost(coarse: DescentLevel, first: DesignPoint, size: float, share: float) -> bool:
-    """Whether the initial control costs nearly as much on a coarse level as on the stated one.
+    """Check whether the initial control costs nearly as much on a coarse level.
 
     Args:
         coarse: The coarse level.
         first: The initial control, evaluated on the stated level.
         size: Size of its cost.
-        share: Largest difference of the two costs, over the size.
+        share: Largest tolerated difference of the two costs, relative to the size.
 
     Returns:
         True where the difference is small enough.
@@ -114,14 +114,14 @@ def has_similar_cost(coarse: DescentLevel, first: DesignPoint, size: float, shar
 
 
 def easier_level(fine: DescentLevel) -> DescentLevel | None:
-    """Make a level for the first round under hard limits, where one is worth it.
+    """Make a coarser or smoother level for the first round under hard limits.
 
     Args:
         fine: The stated level, on the plant without clamps.
 
     Returns:
         A level with a longer timestep or longer samples, and with smoothed friction where the model
-        has dry friction; one with smoothed friction alone; or None.
+        has dry friction; one with smoothed friction alone; None where neither is useful.
 
     Raises:
         ExperimentError: A stated factor divides neither the engine steps of a sample nor the
@@ -135,7 +135,7 @@ def easier_level(fine: DescentLevel) -> DescentLevel | None:
     except SimulationDivergedError:
         return None
 
-    # The longest timestep with which the initial control costs about as much.
+    # Take the longest timestep with which the initial control costs nearly as much.
     for factor in _coarse_factors(smooth.task):
         coarse = _coarser(smooth, first, factor)
         if coarse is not None:
@@ -145,7 +145,7 @@ def easier_level(fine: DescentLevel) -> DescentLevel | None:
 
 
 def _coarse_factors(task: DesignTask) -> tuple[int, ...]:
-    """Candidates for the factor of a coarse level, the largest first."""
+    """Possible factors of a coarse level, the largest first."""
     stated = task.experiment.descent.coarse
     substeps = task.system.grid.substeps
 
@@ -162,21 +162,22 @@ def _coarse_factors(task: DesignTask) -> tuple[int, ...]:
 
 
 def _coarser(level: DescentLevel, first: DesignPoint, factor: int) -> DescentLevel | None:
-    """A level that is coarser by a factor, where the model allows it.
+    """Make a level that is coarser by a factor, where the model allows it.
 
     Args:
-        level: The level to begin with.
+        level: The finer level.
         first: Its initial control, evaluated.
-        factor: Factor of the timestep, or of the samples where a sample is too few engine steps.
+        factor: Factor of the timestep where it divides the engine steps of a sample, else of the
+            sample period.
 
     Returns:
-        The coarse level, or None where samples cannot be divided or the initial cost differs too
-        much.
+        The coarse level; None where samples cannot be divided, or where the initial cost differs
+        too much.
     """
     task = level.task
     longer_timestep = task.system.grid.substeps % factor == 0
 
-    # Longer samples have to divide the horizon, and every part of it that is optimised alone.
+    # Longer samples have to divide the horizon, and each part of it that is optimised alone.
     parts = [task.samples // count for count in (1, *task.experiment.descent.repeats)]
     enough_samples = task.samples >= MIN_COARSE_SAMPLES * factor
     longer_samples = enough_samples and all(N % factor == 0 for N in parts)

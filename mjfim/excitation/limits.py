@@ -1,8 +1,8 @@
-"""Limits of an experiment: the ranges of the MJCF and those that the experiment file states; both hold where there are both."""
+"""Limits of an experiment: the intersection of the ranges of the MJCF and of the file's ranges."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,7 +48,10 @@ class Limit:
 
     @property
     def scale(self) -> float:
-        """Half of the range, which makes margins relative; the magnitude of a single bound, at least 1."""
+        """Scale that makes margins relative [unit of the kind].
+
+        It is half of the range; with a single bound, the magnitude of the bound, at least 1.
+        """
         finite = [abs(bound) for bound in (self.lower, self.upper) if np.isfinite(bound)]
         if len(finite) == 2:
             return 0.5 * (self.upper - self.lower)
@@ -61,7 +64,7 @@ class _KindOfLimit:
 
     Attributes:
         kind: Name of the kind.
-        stated: Numbers of the experiment file: one for all, or a table by name.
+        stated: Numbers of the experiment file: one for all names, or a table by name.
         addresses: Address of each joint or actuator that can have such a limit, by name.
         model_ranges: Ranges of the MJCF, by name.
     """
@@ -141,7 +144,7 @@ def _limits_of_kind(kind: _KindOfLimit) -> list[Limit]:
     limits = []
 
     for name, index in kind.addresses.items():
-        # A stated range has to be valid by itself, before it meets that of the MJCF.
+        # A stated range has to be valid by itself, before the MJCF's range narrows it.
         if name in stated:
             lower, upper = stated[name]
             Limit(kind=kind.kind, name=name, index=index, lower=float(lower), upper=float(upper))
@@ -150,21 +153,34 @@ def _limits_of_kind(kind: _KindOfLimit) -> list[Limit]:
         if not ranges:
             continue
 
-        lower = float(max(low for low, _ in ranges))
-        upper = float(min(high for _, high in ranges))
-        if len(ranges) == 2 and not lower < upper:
-            from_file, from_model = (f"[{low:g}, {high:g}]" for low, high in ranges)
-            raise ExperimentError(
-                f"limits.{kind.kind}.{name}: {from_file} and the MJCF's range {from_model} exclude "
-                "each other"
-            )
+        lower, upper = _intersection(f"limits.{kind.kind}.{name}", ranges)
         if np.isfinite(lower) or np.isfinite(upper):
             limits.append(Limit(kind=kind.kind, name=name, index=index, lower=lower, upper=upper))
+
     return limits
 
 
+def _intersection(key: str, ranges: Sequence[Range]) -> Range:
+    """Intersection of the one or two ranges of a key: from the file, then from the MJCF.
+
+    Raises:
+        ExperimentError: The two ranges exclude each other.
+    """
+    lower = float(max(low for low, _ in ranges))
+    upper = float(min(high for _, high in ranges))
+
+    if len(ranges) == 2 and not lower < upper:
+        from_file, from_model = (f"[{low:g}, {high:g}]" for low, high in ranges)
+        raise ExperimentError(
+            f"{key}: {from_file} and the MJCF's range {from_model} exclude each other"
+        )
+    return lower, upper
+
+
 def _stated_ranges(kind: _KindOfLimit) -> dict[str, Range]:
-    """Ranges of the experiment file by name: a number is a range about zero, one number holds for all names.
+    """Ranges that the experiment file states, by name.
+
+    A single number r is the range [-r, r]; without a table it holds for all names.
 
     Raises:
         ExperimentError: A name is unknown.
@@ -217,13 +233,13 @@ def _model_ranges(indices: Mapping[str, int], limited: Any, ranges: Any) -> dict
 
 
 def unsupported_ranges(model: Any) -> tuple[str, ...]:
-    """Elements with a range in the MJCF that cannot be a limit: ball joints, tendons and activations.
+    """Find the elements with a range in the MJCF that a design cannot keep as a limit.
 
     Args:
         model: MjModel.
 
     Returns:
-        Their names in words.
+        Descriptions of limited ball joints, tendons and activations, with their names.
     """
     kinds = mujoco.mjtObj
     is_ball = model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)
@@ -239,6 +255,6 @@ def unsupported_ranges(model: Any) -> tuple[str, ...]:
 
 
 def _names(model: Any, kind: Any, chosen: Any) -> list[str]:
-    """Names of the chosen elements (n,) of a kind, or their numbers."""
+    """Names of chosen elements of a kind, or their numbers; chosen: (n,) truth values."""
     indices = np.flatnonzero(chosen).tolist()
     return [mujoco.mj_id2name(model, kind, i) or f"number {i}" for i in indices]

@@ -1,9 +1,9 @@
 """Optimisation under hard limits from several initial controls, with successive halving.
 
-All starts compete with a blunt barrier, on a plant that is quicker to simulate where there is one.
-The best of them continue on the stated plant with a sharp barrier. A winner that violates a limit
-on the unmodified model between the points that the barrier evaluates is optimised again within
-tighter limits.
+In the first round all starts are optimised with a large barrier weight, if possible on a plant that
+is quicker to simulate. The best of them continue on the stated plant with a small barrier weight.
+The best result may violate a limit of the unmodified model between the times at which the barrier
+is evaluated; then it is optimised again within tighter limits.
 """
 
 from __future__ import annotations
@@ -29,34 +29,35 @@ from mjfim.parallel import results_in_order, workers_of
 from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 
-# One in this many starts survives the first round.
+# The first round keeps one in this number of starts.
 HALVING_RATE = 4
 
-# Barrier weight mu down to which many starts compete.
+# Last barrier weight mu of the first round.
 FIRST_ROUND_MU = 0.01
 
-# The same for few starts on samples as stated, where the first round may go further.
+# Last barrier weight mu of the first round with fewer than `HALVING_RATE` starts, where the coarse
+# level differs by its timestep only: its minima are then close to those of the stated level.
 FEW_STARTS_MU = 1e-3
 
-# The second round begins with this many times the last mu of the first round.
+# Ratio of the first mu of the second round to the last mu of the first round.
 MU_RESTART_FACTOR = 3.0
 
 # Share of the iterations and of the time for the first round.
 FIRST_ROUND_SHARE = 0.5
 
-# Share of the time that is kept for runs within tighter limits.
+# Share of the time that is reserved for runs within tighter limits.
 RESERVED_SHARE = 0.05
 
-# Number of times that a winner which violates a limit on the unmodified model is optimised again.
+# Largest number of runs within tighter limits.
 MAX_TIGHTENED_RUNS = 3
 
-# First barrier weight mu of such a run.
+# First barrier weight mu of a run within tighter limits.
 TIGHTENED_RUN_MU = 1e-3
 
-# Iterations of such a run, at most.
+# Largest number of iterations of a run within tighter limits.
 TIGHTENED_RUN_ITERATIONS = 60
 
-# What a search of several runs yields and returns.
+# Generator of a search with several runs: yields every iterate and returns one result per run.
 Runs = Generator[DesignEvent, None, list[RunResult]]
 
 
@@ -65,9 +66,9 @@ class Multistart:
     """Successive halving of several starts under hard limits.
 
     Attributes:
-        fine: The experiment on the plant without clamps.
-        coarse: The same on a plant that is quicker to simulate, or smoother; None without one.
-        executor: Runs the starts side by side; None: one after the other in this process.
+        fine: The stated level, on the plant without clamps.
+        coarse: A level that is quicker to simulate, or smoother; None without one.
+        executor: Runs the starts side by side; None to run them one by one in this process.
         budget: Time of the whole design, and the token that stops it.
     """
 
@@ -88,61 +89,36 @@ class Multistart:
         Returns:
             One result per start that was begun; those of the survivors include the second round.
         """
-        max_iterations = self.fine.task.experiment.descent.max_iterations
-
-        # A single start without a coarse level or a basis of its own needs no competition.
         if self._needs_one_round(starts):
-            return (
-                yield from self._round(
-                    self.fine,
-                    starts,
-                    BarrierSchedule(),
-                    max_iterations,
-                    self.budget.seconds_left - self._reserved_seconds,
-                )
-            )
+            return (yield from self._run_single_round(starts))
 
-        # First round: all starts, down to a blunt barrier.
-        is_short = len(starts) < HALVING_RATE and self._differs_by_timestep_only
-        last_mu = FEW_STARTS_MU if is_short else FIRST_ROUND_MU
-        results = yield from self._round(
-            self.coarse or self.fine,
-            starts,
-            BarrierSchedule(last=last_mu),
-            round(FIRST_ROUND_SHARE * max_iterations),
-            FIRST_ROUND_SHARE * self.budget.seconds_left / self._turns(len(starts)),
-        )
+        few_starts = len(starts) < HALVING_RATE and self._differs_by_timestep_only
+        last_mu = FEW_STARTS_MU if few_starts else FIRST_ROUND_MU
+        results = yield from self._run_first_round(starts, last_mu)
         if self.budget.stop.requested:
             return results
 
         # The survivors are chosen by their cost on the stated plant.
-        results, candidates = self._judge_all(results, starts)
+        results, candidates = self._compare_on_stated_plant(results, starts)
         survivors = self._choose_survivors(candidates)
         if not survivors:
             return results
-        results = _discard_others(results, candidates, survivors)
 
-        # Second round: the survivors on the stated plant, down to a sharp barrier.
+        results = _discard_others(results, candidates, survivors)
         done = max((row.iteration for i in survivors for row in results[i].history), default=0)
-        seconds_left = max(self.budget.seconds_left - self._reserved_seconds, 0.0)
-        second = yield from _renumber(
-            self._round(
-                self.fine,
-                [_continued(candidates[i]) for i in survivors],
-                BarrierSchedule(first=min(MU_RESTART_FACTOR * last_mu, FIRST_ROUND_MU)),
-                max_iterations - done,
-                seconds_left / self._turns(len(survivors)),
-            ),
-            done + 1,
+        second = yield from self._run_second_round(
+            [_continued(candidates[i]) for i in survivors],
+            first_mu=min(MU_RESTART_FACTOR * last_mu, FIRST_ROUND_MU),
+            done=done,
         )
         return _merge_rounds(results, second)
 
     def tighten_winner(self, results: Sequence[RunResult]) -> Runs:
-        """Optimise a winner again within tighter limits while it violates a limit on the unmodified model.
+        """Optimise the best result again while it violates a limit on the unmodified model.
 
         The barrier evaluates distances at the samples and other quantities at some engine steps;
-        between them a limit may be violated. Where tighter limits do not help, the control is
-        shrunk.
+        between them a limit may be violated. So the result is optimised again within tighter
+        limits. Where that does not help, its control is shrunk.
 
         Args:
             results: Result of every start.
@@ -151,7 +127,7 @@ class Multistart:
             Every iterate.
 
         Returns:
-            The results, the winner's replaced.
+            The results, of which the best one is replaced.
         """
         results = list(results)
         tightening = dict[str, float]()
@@ -177,7 +153,7 @@ class Multistart:
                 if np.isfinite(result.cost):
                     results[winner] = _append_run(results[winner], result)
 
-        # As a last resort the control is shrunk.
+        # Shrink the control where tighter limits did not help.
         violated = self._violated_by_winner(results)
         if violated is not None:
             winner, _ = violated
@@ -194,12 +170,15 @@ class Multistart:
 
     @property
     def _reserved_seconds(self) -> float:
-        """Time that is kept for runs within tighter limits [s]; 0 without a limit of the time."""
+        """Time that is reserved for runs within tighter limits [s]; 0 without a limit of time."""
         return RESERVED_SHARE * (self.fine.task.experiment.descent.seconds or 0.0)
 
     @property
     def _differs_by_timestep_only(self) -> bool:
-        """Whether the minima on the coarse level are nearly those of the stated one."""
+        """Whether the coarse level has a longer timestep, but the stated samples and friction.
+
+        Its minima are then close to those of the stated level.
+        """
         if self.coarse is None:
             return True
 
@@ -207,19 +186,19 @@ class Multistart:
         return replace(variant, timestep_factor=1) == self.fine.task.system.variant
 
     def _needs_one_round(self, starts: Sequence[InitialControl]) -> bool:
-        """Whether there is a single start that is free to take any shape on the stated level."""
+        """Whether there is nothing to compare: one start, whose control is free, on one level."""
         if len(starts) > 1 or self.coarse is not None:
             return False
 
         return all(start.basis is None and start.repeats == 1 for start in starts)
 
     def _turns(self, count: int) -> int:
-        """Number of tasks that each worker runs one after the other."""
+        """Number of runs that each worker does one after the other, of `count` runs."""
         return -(-max(count, 1) // workers_of(self.executor))
 
     # ---- choice of the survivors
 
-    def _judge_all(
+    def _compare_on_stated_plant(
         self, results: Sequence[RunResult], starts: Sequence[InitialControl]
     ) -> tuple[list[RunResult], list[RunResult]]:
         """Results with their cost on the stated plant, and the candidates of the second round."""
@@ -228,10 +207,10 @@ class Multistart:
             return list(results), list(results)
 
         by_name = {start.name: start for start in starts}
-        judged = [self.judge(result, by_name[result.name]) for result in results]
-        return [result for result, _ in judged], [candidate for _, candidate in judged]
+        pairs = [self.reevaluate(result, by_name[result.name]) for result in results]
+        return [result for result, _ in pairs], [candidate for _, candidate in pairs]
 
-    def judge(self, result: RunResult, start: InitialControl) -> tuple[RunResult, RunResult]:
+    def reevaluate(self, result: RunResult, start: InitialControl) -> tuple[RunResult, RunResult]:
         """Replace the cost on a coarse level by that on the stated plant.
 
         Args:
@@ -240,23 +219,28 @@ class Multistart:
 
         Returns:
             The result with the better of the found and the initial control, by their costs on the
-            stated plant, and the candidate with which the second round would continue: the same, or
-            a found control that violates a limit here, with its cost on the coarse level, because
+            stated plant, and the candidate with which the second round would continue. The
+            candidate differs from the result where the found control violates a limit on the
+            stated plant: it is then the found control with its cost on the coarse level, because
             the second round makes it feasible again.
         """
         found = [control for control in (result.control, start.over_horizon) if control is not None]
         costs = [self._cost_on_stated_plant(control) for control in found]
 
         best = int(np.argmin(costs))
-        judged = replace(result, cost=costs[best])
-        if np.isfinite(judged.cost):
-            judged = replace(judged, control=found[best])
+        reevaluated = replace(result, cost=costs[best])
+        if np.isfinite(reevaluated.cost):
+            reevaluated = replace(reevaluated, control=found[best])
 
         violates = result.control is not None and np.isinf(costs[0])
-        return judged, result if violates else judged
+        candidate = result if violates else reevaluated
+        return reevaluated, candidate
 
     def _cost_on_stated_plant(self, control: Array) -> float:
-        """J of a control: (N, nu); infinite where it violates a limit, also where only a clamp keeps a force within one."""
+        """J of a control: (N, nu); infinite where it violates a limit on the stated plant.
+
+        A force that keeps its limit only because a clamp cuts it off violates this limit.
+        """
         task = self.fine.task
         observed = task.plant.observe(task.theta, control, self._constraints.observations)
         if observed is None:
@@ -271,7 +255,7 @@ class Multistart:
         return self.fine.problem.point(values.trajectory).cost
 
     def _choose_survivors(self, candidates: Sequence[RunResult]) -> list[int]:
-        """Indices of the best candidates, at least one where there is any; the best one comes first."""
+        """Indices of the candidates for the second round, the best one first."""
         usable = [i for i, candidate in enumerate(candidates) if candidate.control is not None]
         best_first = sorted(usable, key=lambda i: candidates[i].cost)
 
@@ -283,7 +267,11 @@ class Multistart:
     def _violated_by_winner(
         self, results: Sequence[RunResult]
     ) -> tuple[int, dict[str, float]] | None:
-        """Index of the winner and its relative margins, where it violates a limit on the unmodified model; else None."""
+        """Find out whether the best result violates a limit on the unmodified model.
+
+        Returns:
+            Index of the best result and its relative margins; None where it keeps all limits.
+        """
         if not results or self.budget.stop.requested:
             return None
 
@@ -310,7 +298,51 @@ class Multistart:
         control = np.asarray(result.control)
         return shrink_until_feasible(control, self.fine.task.centre, repair) or result
 
-    # ---- one round
+    # ---- the rounds
+
+    @property
+    def _max_iterations(self) -> int:
+        """Largest number of iterations of one start over all rounds."""
+        return self.fine.task.experiment.descent.max_iterations
+
+    def _run_single_round(self, starts: Sequence[InitialControl]) -> Runs:
+        """Optimise on the stated plant with all barrier weights."""
+        return (
+            yield from self._round(
+                self.fine,
+                starts,
+                BarrierSchedule(),
+                self._max_iterations,
+                self.budget.seconds_left - self._reserved_seconds,
+            )
+        )
+
+    def _run_first_round(self, starts: Sequence[InitialControl], last_mu: float) -> Runs:
+        """Optimise all starts down to barrier weight `last_mu`, if possible on a coarse level."""
+        seconds = FIRST_ROUND_SHARE * self.budget.seconds_left
+        return (
+            yield from self._round(
+                self.coarse or self.fine,
+                starts,
+                BarrierSchedule(last=last_mu),
+                round(FIRST_ROUND_SHARE * self._max_iterations),
+                seconds / self._turns(len(starts)),
+            )
+        )
+
+    def _run_second_round(
+        self, starts: Sequence[InitialControl], *, first_mu: float, done: int
+    ) -> Runs:
+        """Continue the survivors on the stated plant, after `done` iterations."""
+        seconds = max(self.budget.seconds_left - self._reserved_seconds, 0.0)
+        events = self._round(
+            self.fine,
+            starts,
+            BarrierSchedule(first=first_mu),
+            self._max_iterations - done,
+            seconds / self._turns(len(starts)),
+        )
+        return (yield from _renumber(events, done + 1))
 
     def _round(
         self,
@@ -325,7 +357,7 @@ class Multistart:
         task = stage.task
         tolerance = max(schedule.tolerance, task.experiment.descent.tolerance)
 
-        # Workers share the threads; without an executor a search may use all of them.
+        # Workers share the threads; without an executor a search uses all of them.
         threads = task.system.threads
         if self.executor is not None:
             threads = max(workers_of(self.executor) // len(starts), 1)
@@ -410,7 +442,7 @@ def _discard_others(
 
 
 def _merge_rounds(first: Sequence[RunResult], second: Sequence[RunResult]) -> list[RunResult]:
-    """Results of both rounds; the second one replaces a control only where it is at least as good."""
+    """Results of both rounds; every start keeps its control of lower cost."""
     by_name = {result.name: result for result in second}
     merged = [
         _merge(result, by_name[result.name]) if result.name in by_name else result
@@ -446,7 +478,7 @@ def _merge(first: RunResult, second: RunResult) -> RunResult:
 
 
 def _append_run(first: RunResult, second: RunResult) -> RunResult:
-    """The second result, with the history and the steps of both."""
+    """The second result, with the history and the engine steps of both."""
     return replace(
         second,
         history=_join(first.history, second.history),
@@ -455,7 +487,7 @@ def _append_run(first: RunResult, second: RunResult) -> RunResult:
 
 
 def _join(first: tuple[HistoryRow, ...], second: tuple[HistoryRow, ...]) -> tuple[HistoryRow, ...]:
-    """One history of two runs; iterates and engine steps are counted on."""
+    """Join the histories of two runs; iterates and engine steps of the second one are added."""
     if not first:
         return second
 

@@ -1,4 +1,4 @@
-"""The cost of a design: a criterion of the Fisher information plus a running cost, along a trajectory."""
+"""The cost of a design: a criterion of the Fisher information plus a running cost."""
 
 from __future__ import annotations
 
@@ -29,10 +29,9 @@ from mjfim.records.trajectory import Sensitivity, Trajectory
 class RunningCost:
     """Weighted squares of the deviations from a desired trajectory and a desired control.
 
-        1/2 sum_k dt [(x_{k+1} - x_d)' Q (x_{k+1} - x_d) + (u_k - u_d)' R (u_k - u_d)],   k = 0 ...
-        N-1
+        1/2 sum_k dt [(x_{k+1} - x_d)' Q (x_{k+1} - x_d) + (u_k - u_d)' R (u_k - u_d)]
 
-    The initial state is given and costs nothing.
+    for k = 0 ... N-1. The initial state is given and costs nothing.
 
     Attributes:
         space: Layout of the state.
@@ -54,8 +53,10 @@ class RunningCost:
         """The running cost along a trajectory."""
         dx = self.space.minus(trajectory.state, self.desired_state)[1:]
         du = trajectory.ctrl - self.desired_control
-        weighted_squares = np.sum(dx**2 * self.Q) + np.sum(du**2 * self.R)
-        return float(0.5 * self.dt * weighted_squares)
+
+        state_cost = np.sum(dx**2 * self.Q)
+        control_cost = np.sum(du**2 * self.R)
+        return float(0.5 * self.dt * (state_cost + control_cost))
 
     def gradient(self, trajectory: Trajectory) -> tuple[Array, Array]:
         """Gradient of the running cost.
@@ -74,9 +75,9 @@ class RunningCost:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DesignPoint:
-    """A trajectory with everything that is computed along it.
+    """A trajectory with its information and its cost.
 
-    A trial that diverges has no trajectory and an infinite cost.
+    A trial whose simulation diverges has no trajectory and an infinite cost.
 
     Attributes:
         trajectory: The trajectory, or None.
@@ -85,8 +86,8 @@ class DesignPoint:
         criterion: The criterion of the information with its derivative, or None.
         cost: J.
         accuracy: Differences with which the point is expanded.
-        others: Points of the same control at the further parameter samples of a robust design;
-            their cost is left open.
+        others: Points of this control at the further parameter samples of a robust design; their
+            cost is not computed.
     """
 
     trajectory: Trajectory | None
@@ -99,11 +100,12 @@ class DesignPoint:
 
     @property
     def phi(self) -> tuple[float, ...]:
-        """The criterion at this parameter value and at the further samples; infinite where it is not known."""
-        points = (self, *self.others)
-        return tuple(np.inf if p.criterion is None else p.criterion.value for p in points)
+        """Criterion at theta and at the further parameter samples; infinite where unknown."""
+        criteria = [point.criterion for point in (self, *self.others)]
+        return tuple(np.inf if criterion is None else criterion.value for criterion in criteria)
 
 
+# The point of every trial whose simulation diverges.
 DIVERGED = DesignPoint(
     trajectory=None,
     sensitivity=None,
@@ -116,16 +118,18 @@ DIVERGED = DesignPoint(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DesignProblem:
-    """The cost J as Algorithm 1 of the paper minimises it: a `projection_operator.Problem` over `DesignPoint`s.
+    """The cost J of a design, in the form that Algorithm 1 of the paper needs.
+
+    It is a `projection_operator.Problem` whose points are `DesignPoint`s.
 
     Attributes:
         plant: The plant.
         theta: (p,) parameter values at which the information is computed.
         information: Fisher information of the measured samples, and the criterion.
         running: Running cost.
-        forward_differences_only: The differences are never refined; for coarse levels.
+        forward_differences_only: Never refine the differences; meant for coarse levels.
         parameter_samples: Samples over which a robust design pools the criterion, theta first, or
-            None. The same control drives every sample, open loop.
+            None. One control drives all samples, without feedback.
     """
 
     plant: Plant
@@ -161,7 +165,14 @@ class DesignProblem:
         return self._with_cost(replace(point, others=tuple(others)))
 
     def reevaluated(self, point: DesignPoint) -> DesignPoint:
-        """Evaluate the criterion and the cost anew, for a point of a problem that differs in the criterion only."""
+        """Evaluate the criterion and the cost of a point without a simulation.
+
+        Args:
+            point: A point of a problem that differs from this one in the criterion only.
+
+        Returns:
+            The point of this problem.
+        """
         if point.information is None:
             return point
 
@@ -169,13 +180,13 @@ class DesignProblem:
         return self._with_cost(replace(self._with_criterion(point), others=others))
 
     def _with_criterion(self, point: DesignPoint) -> DesignPoint:
-        """A point with the criterion of its information."""
+        """The point with the criterion of its information."""
         if point.information is None:
             return point
         return replace(point, criterion=self.information.evaluate(point.information))
 
     def _with_cost(self, point: DesignPoint) -> DesignPoint:
-        """A point with the cost that its criteria make."""
+        """The point with its cost, which is computed from its criteria."""
         trajectory, _, criterion = _computed(point)
         phi = criterion.value
         if self.parameter_samples is not None:
@@ -191,7 +202,7 @@ class DesignProblem:
     def _point_without_cost(
         self, theta: Array, trajectory: Trajectory, accuracy: DifferenceAccuracy
     ) -> DesignPoint:
-        """Information along a trajectory of the plant at theta: (p,); the cost is left open."""
+        """Point of a trajectory of the plant at theta: (p,), without its cost."""
         central = not accuracy.shared_origin
         sensitivity = self.plant.derivatives.sensitivity(theta, trajectory, central=central)
         if sensitivity is None:
@@ -214,8 +225,8 @@ class DesignProblem:
     def size(self, point: DesignPoint) -> float:
         """Size of J, which makes slopes relative.
 
-        The logarithm of D-optimality has no natural zero: one nat per parameter counts instead,
-        plus the running cost.
+        D-optimality minimises a logarithm, which has no natural zero. So the size of its criterion
+        is one nat per parameter.
         """
         if self.information.criterion != "D":
             return point.cost
@@ -224,13 +235,16 @@ class DesignProblem:
         return self.information.weight * nats + self.running.value(trajectory)
 
     def expand(self, point: DesignPoint) -> Expansion:
-        """Expansion of J about a point: mixed differences for the information, closed form for the rest."""
+        """Expand J about a point.
+
+        The derivatives of the information are mixed differences, the others have a closed form.
+        """
         return self.expand_observed(point, None)[0]
 
     def expand_observed(
         self, point: DesignPoint, observations: SubstepObservations | None
     ) -> tuple[Expansion, Array | None]:
-        """Expansion of J together with derivatives of observations, from the same simulations.
+        """Expand J and differentiate observations in one set of simulations.
 
         Args:
             point: The point.
@@ -243,8 +257,7 @@ class DesignProblem:
         trajectory, sensitivity, criterion = _computed(point)
         bilinear, a, b = self._criterion_gradient(self.theta, point, observations)
 
-        # Under hard limits the smooth E-criterion gets a model of its eigenvalues beside the
-        # gradient.
+        # Under hard limits the smooth E-criterion gets a model of its eigenvalues as well.
         model = None
         under_limits = observations is not None
         if under_limits and self.parameter_samples is None and np.isfinite(criterion.power):
@@ -287,7 +300,12 @@ class DesignProblem:
     def _criterion_gradient(
         self, theta: Array, point: DesignPoint, observations: SubstepObservations | None = None
     ) -> tuple[Bilinear, Array, Array]:
-        """Derivatives of the plant at a point, and of the criterion by the state (N+1, nx) and the control (N, nu)."""
+        """Derivatives of the plant and of the criterion at a point of the plant at theta: (p,).
+
+        Returns:
+            The derivatives of the plant; those of the criterion by the state, (N+1, nx), and by the
+            control, (N, nu).
+        """
         trajectory, sensitivity, criterion = _computed(point)
         bilinear = self.plant.derivatives.bilinear(
             theta, trajectory, sensitivity.psi, criterion.directions, point.accuracy, observations
@@ -315,7 +333,7 @@ class DesignProblem:
         return self.plant.difference(_computed(new)[0], _computed(old)[0])
 
     def refine(self, point: DesignPoint) -> DesignPoint | None:
-        """The point, to be expanded with central differences; None where that is done already or not wanted."""
+        """The point with central differences; None where it has these, or may not have them."""
         if self.forward_differences_only or point.accuracy is CENTRAL_DIFFERENCES:
             return None
         others = tuple(replace(other, accuracy=CENTRAL_DIFFERENCES) for other in point.others)

@@ -1,4 +1,4 @@
-"""Information of earlier experiments about the parameters, from the files that designs and estimates left behind."""
+"""Information of earlier experiments about the parameters, from files of designs and estimates."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from mjfim.records.saved_information import SavedInformation
 def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
     """Sum the information of earlier experiments about the named parameters, without their priors.
 
-    Further parameters that a file knows are marginalised, under the file's priors on them. So are
-    deviations of the initial state, which belong to one experiment alone.
+    Further parameters of a file are marginalised, with the priors that the file states for them.
+    So are deviations of the initial state, which are parameters of one experiment only.
 
     Args:
         paths: Files design.json and estimate.json.
@@ -37,8 +37,7 @@ def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
         except RecordingError as error:
             raise ExperimentError(f"earlier: {error}") from None
 
-        # Deviations of the initial state have the same names in every experiment, but not the same
-        # values.
+        # Deviations of the initial state have equal names in all experiments, but different values.
         common = [
             name
             for name in names
@@ -46,8 +45,8 @@ def information_of(paths: Sequence[Path], names: Sequence[str]) -> Array:
         ]
         if not common:
             raise ExperimentError(
-                f"earlier: {path}: it knows {', '.join(saved.parameters)}, "
-                f"but none of the parameters {', '.join(names)}"
+                f"earlier: {path}: it has information about {', '.join(saved.parameters)}, but not "
+                f"about any of the parameters {', '.join(names)}"
             )
 
         here = [list(names).index(name) for name in common]

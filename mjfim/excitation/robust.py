@@ -1,10 +1,11 @@
-"""Robust design: the guess of the parameters is known to be wrong, so that the criterion phi is pooled over samples of them.
+"""Robust design: the criterion phi is pooled over S samples of the uncertain parameters.
 
     mean    1/S sum_s phi_s
     worst   (1/S sum_s phi_s^q)^(1/q), a smooth maximum
 
-The phi of D-optimality is a logarithm already; its smooth maximum is `log(1/S sum_s exp(q phi_s)) /
-q`.
+The phi of D-optimality is a logarithm, so that its smooth maximum is
+
+    worst   1/q log(1/S sum_s exp(q phi_s))
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ POOLING_EXPONENT = 20.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ParameterSamples:
-    """Parameter values, and how the criterion at them becomes one number.
+    """Parameter samples, and how the criterion is pooled over them.
 
     Attributes:
         thetas: (S, p) parameter values, the guess first [theta-unit].
         over: "mean" or "worst".
-        logarithmic: phi is a logarithm, as that of D-optimality is.
+        logarithmic: True where phi is a logarithm, as for D-optimality.
     """
 
     thetas: Array
@@ -37,13 +38,13 @@ class ParameterSamples:
     logarithmic: bool = False
 
     def value(self, phi: Sequence[float]) -> float:
-        """Pooled criterion.
+        """Pool the criterion over the samples.
 
         Args:
             phi: S values of the criterion.
 
         Returns:
-            The pooled value; infinite where one of them is not finite.
+            The pooled value; infinite where a value is not finite.
         """
         q = POOLING_EXPONENT
         values = np.asarray(phi, dtype=np.float64)
@@ -55,18 +56,18 @@ class ParameterSamples:
         if self.logarithmic:
             return float((logsumexp(q * values) - np.log(len(values))) / q)
 
-        # Relative to the largest value: its power neither overflows nor vanishes.
+        # Divide by the largest value, so that powers neither overflow nor vanish.
         largest = values.max()
         return float(largest * np.mean((values / largest) ** q) ** (1.0 / q))
 
     def weights(self, phi: Sequence[float]) -> Array:
-        """Derivative of the pooled criterion.
+        """Differentiate the pooled criterion.
 
         Args:
             phi: S values of the criterion, all finite.
 
         Returns:
-            (S,) derivative by each of them.
+            (S,) derivative by each value.
         """
         q = POOLING_EXPONENT
         values = np.asarray(phi, dtype=np.float64)

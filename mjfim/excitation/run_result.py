@@ -22,7 +22,7 @@ class RunResult:
 
     Attributes:
         name: Name of the initial control.
-        control: (N, nu) best control at the stated sample rate: of hard limits the best feasible
+        control: (N, nu) best control at the stated sample rate: under hard limits the best feasible
             one, else the last one; None where no iterate could be simulated.
         cost: J of the control; infinite where it is infeasible or unknown.
         status: How the run ended.
@@ -63,7 +63,7 @@ def consume(
 
     Args:
         events: Yields every iterate and returns the result.
-        callback: Called with every iterate; None where nobody watches.
+        callback: Called with every iterate, or None.
 
     Returns:
         The result.
@@ -79,5 +79,5 @@ def consume(
             if callback is not None:
                 callback(event)
     finally:
-        # A callback that raises ends the search, with all tasks that it runs elsewhere.
+        # A callback that raises an error ends the search, with all runs in other processes.
         events.close()

@@ -1,9 +1,9 @@
-"""`mjfim.shortest_experiment`: the shortest experiment whose design reaches every target standard deviation.
+"""The verb `mjfim.shortest_experiment`: the shortest design that reaches all target accuracies.
 
-Standard deviations fall like T^-1/2 or faster with the duration T. So a secant on their logarithms
-finds the duration at which the worst ratio of a predicted to a target standard deviation is 1. Both
-ends of the bracket are designs: the returned one reaches the targets, and one that is shorter by
-the tolerance does not.
+Standard deviations fall like T^-1/2 or faster with the duration T. So the secant method on their
+logarithms finds the duration at which the largest ratio of a predicted to a target standard
+deviation is 1. Both ends of the bracket are designs: the returned one reaches the targets, and one
+that is shorter by the tolerance does not.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from mjfim.records.design import Design, Status
 from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.serialization import SavedRecord
 
-# Longest horizon that is tried by default, over the stated one.
+# Ratio of the longest horizon that is tried by default to the stated one.
 MAX_HORIZON_FACTOR = 4.0
 
-# Default tolerance of the horizon, relative.
+# Default tolerance of the horizon, relative to the horizon.
 DEFAULT_TOLERANCE = 0.02
 
 # Rounding error of a number of samples [samples].
@@ -57,7 +57,7 @@ class Tried:
         ratio: Largest ratio of a predicted to a target standard deviation; infinite without a
             design.
         parameter: Name of the parameter with this ratio.
-        why: Why there is no design; empty where there is one.
+        why: Reason why there is no design; empty where there is one.
     """
 
     horizon: float
@@ -74,7 +74,7 @@ class Tried:
         if self.why:
             return f"{self.horizon:g} s: {self.why}"
 
-        return f"{self.horizon:g} s: σ of {self.parameter} is {self.ratio:.3f} × the wanted one"
+        return f"{self.horizon:g} s: σ of {self.parameter} is {self.ratio:.3f} × its target"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,7 +85,8 @@ class ShortestExperiment(SavedRecord):
         experiment: The experiment as stated, with its new horizon and those repeats that divide it.
         design: Its design, which reaches every target.
         tried: All durations in the order in which they were tried.
-        tolerance: The horizon is too long by this at most, where the search is closed [s].
+        tolerance: Largest difference of the horizon from the shortest possible one, where `closed`
+            is true [s].
         closed: True where a duration that is shorter by no more than the tolerance does not reach
             the targets, or where there is no shorter one.
     """
@@ -107,8 +108,9 @@ class ShortestExperiment(SavedRecord):
     @property
     def missed(self) -> Tried | None:
         """The longest of the shorter durations that do not reach the targets."""
-        shorter = [t for t in self.tried if not t.reached and t.horizon < self.horizon]
-        return max(shorter, key=lambda t: t.horizon, default=None)
+        missing = [tried for tried in self.tried if not tried.reached]
+        shorter = [tried for tried in missing if tried.horizon < self.horizon]
+        return max(shorter, key=lambda tried: tried.horizon, default=None)
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of shortest.json."""
@@ -127,7 +129,10 @@ class ShortestExperiment(SavedRecord):
         below = "nothing shorter was tried"
         if self.missed is not None:
             below = f"too short is {self.missed}"
-        ending = "" if self.closed else "; the search was interrupted, so it may be shorter still"
+
+        ending = ""
+        if not self.closed:
+            ending = "; the search was interrupted, so a shorter one may exist"
         return f"shortest horizon: {self.horizon:g} s ({below}){ending}"
 
 
@@ -142,29 +147,30 @@ def shortest_experiment(
     executor: Executor | None = None,
     stop: StopToken | None = None,
 ) -> ShortestExperiment:
-    """Find the shortest horizon whose design is predicted to reach every target standard deviation, and that design.
+    """Find the shortest experiment whose design is predicted to reach all target accuracies.
 
-    Every design begins with that of the nearest duration so far instead of the initial control, and
-    where that does not reach the targets, with the initial control as well.
+    Every design begins with the control of the design of the nearest duration so far. Where the
+    result does not reach the targets, a second design begins with the initial control.
 
     Args:
         experiment: The experiment; at least one parameter states `wanted`.
-        longest: Longest horizon [s]; default: four times that of the experiment, or as long as its
-            table of the initial control lasts.
-        tolerance: The horizon may be too long by this [s]; default: 2 % of it; at least one sample.
+        longest: Longest horizon [s]; default: four times that of the experiment, but no longer than
+            the table of its initial control.
+        tolerance: Tolerated difference from the shortest horizon [s]; default: 2 % of the horizon;
+            at least one sample.
         callback: Called with a `DesignEvent` for every iterate, and a `StudyEvent` for every
             duration that was tried.
         threads: Threads for simulations; default: one per core.
         executor: Executor of `concurrent.futures` that runs several starts under hard limits side
             by side.
-        stop: Token that ends the search with the shortest one so far, as Ctrl-C does.
+        stop: Token that ends the search with the shortest experiment so far, as Ctrl-C does.
 
     Returns:
         The shortest experiment.
 
     Raises:
         OutOfReachError: Even the longest horizon does not reach the targets.
-        ExperimentError: No parameter states a target, or an argument is faulty.
+        ExperimentError: No parameter states a target, or an argument is out of range.
         NoResultError: The search was stopped before any duration reached the targets.
     """
     if tolerance is not None and not tolerance > 0.0:
@@ -177,10 +183,10 @@ def shortest_experiment(
 
 
 class _HorizonSearch:
-    """Designs by their number of samples, and the bracket around the shortest one that reaches the targets.
+    """Search for the smallest number of samples whose design reaches the targets.
 
     Args:
-        base: The experiment as stated.
+        base: The task of the experiment as stated.
         tolerance: Tolerance of the horizon [s], or None for the default.
         callback: Called with every event.
         executor: Runs several starts side by side, or None.
@@ -212,7 +218,7 @@ class _HorizonSearch:
         self.designs: dict[int, Design] = {}
 
     def run(self, longest: float) -> ShortestExperiment:
-        """Search up to a longest horizon [s]."""
+        """Search the horizons up to the longest one [s]."""
         rate = self.experiment.rate
         if longest * rate < self.grid.minimum:
             raise ExperimentError(
@@ -227,8 +233,7 @@ class _HorizonSearch:
         if found is None:
             self._raise_out_of_reach(largest)
 
-        # The bracket is closed where its lower end was tried as well, or where nothing shorter
-        # exists.
+        # The bracket is closed where its lower end was tried, or where no shorter design exists.
         is_shortest = found <= self.grid.minimum
         is_narrow = below is not None and found - below <= self.slack(found)
         return ShortestExperiment(
@@ -240,7 +245,10 @@ class _HorizonSearch:
         )
 
     def slack(self, samples: int) -> int:
-        """Tolerance at a number of samples [samples]; at least the distance to the next smaller number."""
+        """Tolerance at a number of samples [samples].
+
+        It is at least the distance to the next smaller number of the grid.
+        """
         width = DEFAULT_TOLERANCE * samples
         if self.tolerance is not None:
             width = self.tolerance * self.experiment.rate
@@ -249,14 +257,14 @@ class _HorizonSearch:
         return max(int(width + ROUNDING), resolution)
 
     def at(self, samples: int) -> Experiment:
-        """The experiment with a number of samples."""
+        """The experiment with a number of samples, and those repeats that divide it."""
         repeats = self.experiment.descent.repeats
         dividing = tuple(count for count in repeats if samples % count == 0)
         horizon = samples / self.experiment.rate
         return self.experiment.replace(horizon=horizon, descent={"repeats": dividing})
 
     def ratio(self, samples: int) -> float | None:
-        """Largest ratio of a predicted to a target standard deviation; None where the design was stopped."""
+        """Largest ratio of a predicted to a target standard deviation; None if stopped early."""
         tried = self._try(samples)
         if tried is None:
             return None
@@ -275,7 +283,14 @@ class _HorizonSearch:
         return tried.ratio
 
     def _try(self, samples: int) -> Tried | None:
-        """The better of a design from the nearest one so far and, where that fails, from the initial control."""
+        """Design the experiment with a number of samples, from one or two controls.
+
+        The first is that of the nearest design so far. The second is the initial control, where
+        the first one does not reach the targets.
+
+        Returns:
+            The better outcome; None where a design was stopped.
+        """
         near = min(self.designs, key=lambda n: abs(np.log(n / samples)), default=None)
         tried = self._design(samples, near)
         if near is None or tried is None or tried.reached:
@@ -287,7 +302,7 @@ class _HorizonSearch:
         return again if again.ratio <= tried.ratio else tried
 
     def _design(self, samples: int, near: int | None) -> Tried | None:
-        """Design the experiment with a number of samples and keep the design where it is the best one of that length.
+        """Design the experiment with a number of samples.
 
         Args:
             samples: Number of samples.
@@ -312,8 +327,7 @@ class _HorizonSearch:
                 return None
             require_reachable(task, design, self.targets)
         except MjfimError as error:
-            # A fault at the stated horizon is the user's to see; at another one it only rules that
-            # horizon out.
+            # An error at the first horizon ends the search; later ones only exclude their horizon.
             if not self.tried:
                 raise
             return Tried(horizon=horizon, ratio=np.inf, why=str(error))
@@ -323,15 +337,18 @@ class _HorizonSearch:
             return Tried(horizon=horizon, ratio=np.inf, why=why)
 
         ratio, parameter = largest_ratio_to_target(design.final.std, self.targets)
+        self._keep_better(samples, design, ratio)
+        name = task.parameters.names[parameter]
+        return Tried(horizon=horizon, ratio=ratio, parameter=name)
+
+    def _keep_better(self, samples: int, design: Design, ratio: float) -> None:
+        """Keep a design where it has the smallest ratio so far for its number of samples."""
         known = self.designs.get(samples)
         if known is None or ratio < largest_ratio_to_target(known.final.std, self.targets)[0]:
             self.designs[samples] = design
 
-        name = task.parameters.names[parameter]
-        return Tried(horizon=horizon, ratio=ratio, parameter=name)
-
     def _raise_out_of_reach(self, samples: int) -> NoReturn:
-        """Say how far even the longest experiment is from the targets."""
+        """Raise OutOfReachError, which says how far the longest experiment is from the targets."""
         longest = self.tried[samples]
         design = self.designs.get(samples)
 
@@ -343,7 +360,8 @@ class _HorizonSearch:
         raise OutOfReachError(
             f"{self.experiment.source}: even {longest.horizon:g} s is too short: {reason}. Allow a "
             "longer experiment (`longest`, or a longer table of the initial control) or a "
-            "stronger control, or ask for less; `mjfim check` says how many repetitions reach it"
+            "stronger control, or relax the targets; `mjfim check` prints the number of "
+            "repetitions that reach them"
         )
 
 
@@ -362,7 +380,8 @@ def fitted(task: DesignTask, control: Array) -> Array:
         control: (n, nu) control [u-unit].
 
     Returns:
-        (N, nu) control: cut or repeated, or stretched where the end or limits have to be kept.
+        (N, nu) control. A longer one is cut where the final state is free, a shorter one is
+        repeated where no limits hold; all others are stretched.
     """
     N, n = task.samples, len(control)
     if n == N:
@@ -372,14 +391,14 @@ def fitted(task: DesignTask, control: Array) -> Array:
     if n < N and not task.is_limited:
         return np.asarray(np.resize(control, (N, control.shape[1])))
 
-    # Stretch: interpolate between the middles of the samples, over the relative time.
+    # Stretch: interpolate over the relative time, between the middles of the samples.
     given = (np.arange(n) + 0.5) / n
     wanted = (np.arange(N) + 0.5) / N
     return np.stack([np.interp(wanted, given, column) for column in control.T], axis=1)
 
 
 def _sample_grid(task: DesignTask) -> SampleGrid:
-    """Numbers of samples that a coarse level can divide, where one is used."""
+    """The numbers of samples that a coarse level can divide, where the descent uses one."""
     descent = task.experiment.descent
     if descent.method != "lbfgs":
         return SampleGrid(unit=1, first_multiple=0)

@@ -1,4 +1,4 @@
-"""Standard deviations that the user aims at, and how far a result is from them."""
+"""Target standard deviations of the parameters, and how far a result is from them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mjfim.records.design import Design
 
 
 def target_accuracies(task: DesignTask) -> Array:
-    """Standard deviations that the experiment aims at.
+    """Collect the target standard deviations that the experiment states.
 
     Args:
         task: The task.
@@ -34,7 +34,7 @@ def target_accuracies(task: DesignTask) -> Array:
 
 
 def largest_ratio_to_target(std: Array, wanted: Array) -> tuple[float, int]:
-    """Largest standard deviation relative to its target.
+    """Compute the largest ratio of a standard deviation to its target.
 
     Args:
         std: (p,) standard deviations [theta-unit].
@@ -48,7 +48,7 @@ def largest_ratio_to_target(std: Array, wanted: Array) -> tuple[float, int]:
 
 
 def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
-    """Raise where the target of a parameter cannot be reached, however often a design is repeated.
+    """Require that repetitions of a design can reach every target.
 
     Args:
         task: The task.
@@ -66,6 +66,6 @@ def require_reachable(task: DesignTask, design: Design, wanted: Array) -> None:
     known = f": {'; '.join(design.combinations)}" if design.combinations else ""
     raise UnidentifiableError(
         f"{task.experiment.source}: no standard deviation of {names} can be reached, because this "
-        f"experiment does not identify every parameter by itself{known}. Take one of them out, "
-        "give it a prior, or measure something else"
+        f"experiment does not identify every parameter by itself{known}. Remove one of them, give "
+        "it a prior, or measure another quantity"
     )

@@ -486,7 +486,6 @@ class DesignTask:
         system = System.resolve(experiment, threads=self.system.threads, source=self.system.source)
         return DesignTask.of(system, added_information=added_information)
 
-
     def coarser(self, factor: int) -> DesignTask:
         """This task with a timestep and a sample period that are `factor` times longer."""
         return self.with_variant(replace(self.system.variant, sample_factor=factor))

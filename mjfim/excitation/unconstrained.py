@@ -1,4 +1,7 @@
-"""Algorithm 1 without a barrier: from a coarse to the stated sample rate, with a smooth criterion where eigenvalues meet."""
+"""Algorithm 1 without a barrier, from a coarse to the stated sample rate.
+
+The E-criterion is replaced by a smooth one where the smallest eigenvalues meet.
+"""
 
 from __future__ import annotations
 
@@ -22,17 +25,17 @@ from mjfim.optimize.projection_operator import Armijo, Direction, Iterate, Regul
 from mjfim.records.design import HistoryRow, Status
 from mjfim.records.events import DesignEvent
 
-# Growth of a small deviation along the open-loop trajectory up to which the projection needs no
-# feedback.
+# Growth of a small deviation along the trajectory above which the projection uses feedback.
 FEEDBACK_THRESHOLD = 10.0
 
-# Smallest tolerance on a coarse level, whose minimum is refined anyway.
+# Smallest tolerance on a coarse level. It is coarse, because the stated level refines the minimum.
 COARSE_TOLERANCE = 1e-5
 
-# Ratio of the second to the smallest eigenvalue below which E-optimality becomes smooth.
+# Ratio of the second to the smallest eigenvalue below which the E-criterion is smoothed.
 MEETING_RATIO = 1.02
 
-# The same ratio for a descent that has stalled.
+# Ratio of the second to the smallest eigenvalue below which the E-criterion is smoothed after a
+# descent has stalled.
 STALLED_MEETING_RATIO = 1.2
 
 # Powers of the smooth E-criterion: the first one, and the sharper one that may follow on the stated
@@ -42,13 +45,13 @@ SMOOTH_POWERS = (40.0, 160.0)
 # Ratio of the smooth to the exact criterion below which the first power is accurate enough.
 MAX_SMOOTHING_ERROR = 1.01
 
-# Number of successive iterates that may use a clamp of the model before a barrier has to keep them
-# off it.
+# Largest number of successive iterates along which a clamp of the model acts. With more of them the
+# design needs a barrier.
 MAX_CLAMPED_ITERATES = 10
 
 
 def direction_for(stage: DescentLevel) -> tuple[Direction, DesignProblem]:
-    """Make the descent direction that the experiment asks for.
+    """Make the descent direction that the experiment states.
 
     Args:
         stage: Level of the descent.
@@ -80,8 +83,8 @@ def regulator_for(task: DesignTask) -> Regulator:
         task: The task.
 
     Returns:
-        A regulator with unit weights on state and control, without feedback where deviations do not
-        grow much.
+        A regulator with unit weights on state and control, and without feedback where deviations
+        grow less than `FEEDBACK_THRESHOLD`.
     """
     Q = np.eye(task.space.nx) * task.dt
     R = np.eye(len(task.controls)) * task.dt
@@ -94,8 +97,8 @@ class _Progress:
 
     Attributes:
         result: The best result so far.
-        rate: Sample rate of the level that was worked on last [Hz]; 0 before the first.
-        clamped_iterates: Number of successive iterates that used a clamp of the model.
+        rate: Sample rate of the last level [Hz]; 0 before the first level.
+        clamped_iterates: Number of successive iterates along which a clamp of the model acts.
     """
 
     result: RunResult
@@ -111,9 +114,9 @@ class _Pass:
         progress: State of the run.
         control: (N, nu) last control, at the stated sample rate.
         eigenvalues: (s,) of the information at the last iterate, ascending.
-        direction: Holds the curvature that was learnt.
-        eigenvalues_meet: True where it ended because the smallest eigenvalues meet.
-        ends_run: True where no further level may follow.
+        direction: Descent direction with the curvature that it has learnt.
+        eigenvalues_meet: True where the smallest eigenvalues met, which ended Algorithm 1.
+        ends_run: True where no level may follow.
     """
 
     progress: _Progress
@@ -143,7 +146,9 @@ class UnconstrainedSearch:
     def run_all(
         self, starts: Iterable[InitialControl]
     ) -> Generator[DesignEvent, None, list[RunResult]]:
-        """Descend from every initial control while there is time, until one descent leaves the limits.
+        """Descend from one initial control after the other.
+
+        The search ends when the budget is exhausted, or when a descent leaves the limits.
 
         Args:
             starts: The initial controls.
@@ -158,7 +163,7 @@ class UnconstrainedSearch:
         for start in starts:
             result = yield from self.run(start)
 
-            # Steps on the coarse plant are not among those of the stated one.
+            # Report steps of the coarse plant only; the caller counts those of the stated plant.
             counted = sum(earlier.steps for earlier in results)
             coarse = self.levels[0].task.plant.engine_steps if len(self.levels) > 1 else counted
             results.append(replace(result, steps=coarse - counted))
@@ -202,7 +207,7 @@ class UnconstrainedSearch:
                 power, repeat = _next_power(stage, ended)
                 memory = None if repeat else ended.direction
 
-        # A result that uses a clamp needs the barrier: its derivatives do not hold there.
+        # Where a clamp acts, derivatives do not exist, so that the design needs a barrier.
         return replace(progress.result, left_limits=progress.clamped_iterates > 0)
 
     def _run_pass(
@@ -212,7 +217,10 @@ class UnconstrainedSearch:
         progress: _Progress,
         memory: Direction | None,
     ) -> Generator[DesignEvent, None, _Pass]:
-        """Run Algorithm 1 on one level, from the cheapest of some controls, since a coarse level may mislead."""
+        """Run Algorithm 1 on one level, from the control of lowest cost.
+
+        The given control is compared with that of the coarse level, which may cost more here.
+        """
         task = stage.task
         rate = 1.0 / task.dt
         direction, problem = _direction_with_memory(stage, memory, progress.rate)
@@ -227,12 +235,10 @@ class UnconstrainedSearch:
         if not np.isfinite(start.cost):
             return replace(ended, ends_run=True)
 
-        # Iterations are counted over all levels; a coarse level may use half of them.
-        descent = task.experiment.descent
-        is_stated_rate = task.system.variant.sample_factor == 1
+        # Iterations are counted over all levels.
         history = progress.result.history
         done = history[-1].iteration + 1 if history else 0
-        allowed = descent.max_iterations if is_stated_rate else descent.max_iterations // 2
+        tolerance, max_iterations = _stopping_rule(task)
 
         iterates = optimize(
             problem,
@@ -240,18 +246,13 @@ class UnconstrainedSearch:
             direction,
             regulator_for(task),
             Armijo(),
-            tolerance=descent.tolerance
-            if is_stated_rate
-            else max(descent.tolerance, COARSE_TOLERANCE),
-            max_iterations=max(allowed - done, 0),
+            tolerance=tolerance,
+            max_iterations=max(max_iterations - done, 0),
         )
         for iterate in iterates:
             ended = _advance(ended, stage, iterate, rate)
-            last = ended.progress.result.history[-1:]
 
-            # The last iterate of Algorithm 1 is reported twice, the second time with its status.
-            is_new = not last or last[0].iteration != done + iterate.index or last[0].rate != rate
-            if is_new:
+            if _is_new(ended.progress.result, done + iterate.index, rate):
                 ended = self._check_limits(ended, task)
                 if ended.ends_run:
                     return ended
@@ -263,8 +264,8 @@ class UnconstrainedSearch:
                 if reason is not None:
                     return _stop(ended, reason)
 
-            # Where the smallest eigenvalues cross, the exact criterion has a kink that no step
-            # crosses.
+            # Where the smallest eigenvalues meet, the exact criterion has a kink, at which steps
+            # become too short.
             may_continue = iterate.status is None and iterate.index > 0
             if may_continue and _eigenvalues_meet(stage, ended.eigenvalues):
                 return replace(ended, eigenvalues_meet=True)
@@ -272,7 +273,11 @@ class UnconstrainedSearch:
         return ended
 
     def _check_limits(self, ended: _Pass, task: DesignTask) -> _Pass:
-        """End the run where the iterate leaves the limits, or where several in a row use a clamp of the model."""
+        """End the run where the iterate leaves the limits.
+
+        It also ends where a clamp of the model acts along more than `MAX_CLAMPED_ITERATES`
+        successive iterates.
+        """
         progress = ended.progress
         sign = np.inf
         if self.constraints is not None:
@@ -283,7 +288,7 @@ class UnconstrainedSearch:
             left = replace(progress.result, left_limits=True)
             return replace(ended, progress=replace(progress, result=left), ends_run=True)
 
-        # Only a control that is off all clamps may be continued with a barrier.
+        # Only a control along which no clamp acts may be continued with a barrier.
         result = progress.result
         if not clamped:
             result = replace(result, control=ended.control)
@@ -314,10 +319,37 @@ class UnconstrainedSearch:
         return replace(ended, progress=replace(ended.progress, result=result)), row
 
 
+def _stopping_rule(task: DesignTask) -> tuple[float, int]:
+    """Tolerance and largest number of iterations; a coarse level may take half of them."""
+    descent = task.experiment.descent
+    if task.system.variant.sample_factor == 1:
+        return descent.tolerance, descent.max_iterations
+
+    return max(descent.tolerance, COARSE_TOLERANCE), descent.max_iterations // 2
+
+
+def _is_new(result: RunResult, iteration: int, rate: float) -> bool:
+    """Whether an iteration at a sample rate [Hz] is not in the history yet.
+
+    Algorithm 1 yields its last iterate twice, the second time with its status.
+    """
+    if not result.history:
+        return True
+
+    last = result.history[-1]
+    return last.iteration != iteration or last.rate != rate
+
+
 def _direction_with_memory(
     stage: DescentLevel, memory: Direction | None, rate: float
 ) -> tuple[Direction, DesignProblem]:
-    """The direction of a level, with the curvature that a coarser level at a sample rate [Hz] has learnt."""
+    """Make the direction and the problem of a level.
+
+    Args:
+        stage: The level.
+        memory: Direction of a coarser level, whose curvature is taken over; None without one.
+        rate: Sample rate of the coarser level [Hz]; 0 without one.
+    """
     direction, problem = direction_for(stage)
     if isinstance(memory, LBFGS) and rate:
         task = stage.task
@@ -330,7 +362,7 @@ def _direction_with_memory(
 def _cheapest_point(
     task: DesignTask, problem: DesignProblem, controls: Sequence[Array]
 ) -> DesignPoint:
-    """The point of lowest cost among some controls at the stated rate; `DIVERGED` where all diverge."""
+    """The point of lowest cost among controls at the stated rate; `DIVERGED` if all diverge."""
     points = []
     distinct = {id(control): control for control in controls}
     for control in distinct.values():
@@ -344,7 +376,7 @@ def _cheapest_point(
 
 
 def _exact_point(stage: DescentLevel, point: DesignPoint) -> DesignPoint:
-    """The point judged by the exact criterion, where the smooth one is minimised."""
+    """The point with the cost of the exact criterion, where the smooth one is minimised."""
     if np.isinf(stage.power):
         return point
 
@@ -360,7 +392,7 @@ def _advance(
     if trajectory is None or criterion is None:
         raise SimulationDivergedError("an iterate of Algorithm 1 diverged")
 
-    # Without a status the run has not ended; it says so where it is stopped here.
+    # A run without a status has not ended, so that it counts as interrupted if it is stopped here.
     status = iterate.status or Status.INTERRUPTED
     if status is Status.CONVERGED and np.isfinite(stage.power):
         status = Status.SMOOTHED
@@ -390,7 +422,16 @@ def _stop(ended: _Pass, reason: StopReason) -> _Pass:
 
 
 def _worst_margin_sign(task: DesignTask, constraints: ConstraintSet, control: Array) -> float:
-    """Sign of the worst margin at any engine step of a level; 0 where a force is clamped. control: (N, nu) as stated."""
+    """Compute the sign of the smallest margin over all engine steps of a level.
+
+    Args:
+        task: The task on the level.
+        constraints: The limits.
+        control: (N, nu) control at the stated sample rate [u-unit].
+
+    Returns:
+        -1 where a limit is violated, 0 where a force is clamped at its limit, else 1.
+    """
     observed = task.plant.observe(task.theta, task.averaged(control), constraints.observations)
     if observed is None:
         return -1.0
@@ -405,7 +446,7 @@ def _worst_margin_sign(task: DesignTask, constraints: ConstraintSet, control: Ar
 
 
 def _eigenvalues_meet(stage: DescentLevel, eigenvalues: Array) -> bool:
-    """Whether the smallest eigenvalues are about to cross while the exact E-criterion is minimised."""
+    """Whether the smallest eigenvalues nearly meet while the exact E-criterion is minimised."""
     is_exact = stage.task.experiment.cost.criterion == "E" and np.isinf(stage.power)
     if not is_exact or len(eigenvalues) < 2:
         return False
@@ -414,21 +455,28 @@ def _eigenvalues_meet(stage: DescentLevel, eigenvalues: Array) -> bool:
 
 
 def _next_power(stage: DescentLevel, ended: _Pass) -> tuple[float, bool]:
-    """Power of the E-criterion from here on, and whether this level has to be repeated with it."""
+    """Choose the power of the E-criterion after a run of Algorithm 1.
+
+    Args:
+        stage: The level with its power so far.
+        ended: Result of the run on this level.
+
+    Returns:
+        The power for this and all later levels, and whether this level has to be repeated with it.
+    """
     values = ended.eigenvalues
     power = stage.power
     if stage.task.experiment.cost.criterion != "E" or len(values) < 2:
         return power, False
 
-    # The exact criterion becomes smooth where eigenvalues meet, or where it stalls close to that.
+    # The exact criterion is smoothed where eigenvalues meet, or where the descent stalls near that.
     if np.isinf(power):
         stalled = ended.progress.result.status is Status.STALLED
         close = bool(values[1] < STALLED_MEETING_RATIO * values[0])
         meet = ended.eigenvalues_meet or (stalled and close)
         return (SMOOTH_POWERS[0], True) if meet else (power, False)
 
-    # The smooth criterion becomes sharper, once, where it is too far from the exact one at the
-    # stated rate.
+    # At the stated rate, a smooth criterion that is too far from the exact one is sharpened once.
     error = float(np.sum((values[0] / values) ** power) ** (1.0 / power))
     is_stated_rate = stage.task.system.variant.sample_factor == 1
     if error > MAX_SMOOTHING_ERROR and power < SMOOTH_POWERS[-1] and is_stated_rate:

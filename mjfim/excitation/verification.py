@@ -1,8 +1,11 @@
-"""Verification of a design on the model as the user wrote it, at every engine step: with its clamps, stops and contacts."""
+"""Verification of a design at every engine step of the unmodified model.
+
+The unmodified model has all clamps, stops and contacts that the user's MJCF states.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -11,10 +14,11 @@ import numpy as np
 from mjfim.arrays import Array
 from mjfim.errors import ExperimentError
 from mjfim.excitation.bandwidth import bandwidth_basis
-from mjfim.excitation.constraint_kinds import ClearanceConstraint, ConstraintValues
+from mjfim.excitation.constraint_kinds import ClearanceConstraint
 from mjfim.excitation.constraints import ConstraintSet, constraint_set_of
 from mjfim.excitation.limits import Limit
 from mjfim.excitation.task import DesignTask
+from mjfim.optimize.barrier import Bounds
 from mjfim.plant.batch import BatchSimulator
 from mjfim.records.design import LimitUsage
 from mjfim.records.trajectory import Trajectory
@@ -36,7 +40,7 @@ class Verification:
         relative_margins: These margins over half of each range, or over the clearance.
         deviation: Largest difference of a state at the samples from the designed trajectory [unit
             of the state].
-        unenforced: Kinds that are checked, not enforced.
+        unenforced: Kinds that are checked, but not enforced.
         usage: Position of every limited quantity in its range over time.
     """
 
@@ -53,6 +57,19 @@ class Verification:
             margin >= 0.0 for kind, margin in self.margins.items() if kind not in self.unenforced
         )
 
+    @classmethod
+    def diverged(cls, kinds: Iterable[str], unenforced: frozenset[str]) -> Verification:
+        """The verification of a control under which the simulation diverges.
+
+        Args:
+            kinds: Kinds of the limits.
+            unenforced: Kinds that are checked, but not enforced.
+        """
+        margins = dict.fromkeys((*kinds, "simulation"), -np.inf)
+        return cls(
+            margins=margins, relative_margins=margins, deviation=np.inf, unenforced=unenforced
+        )
+
 
 def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
     """Play the control of a trajectory open loop on the unmodified model, at the theta of the task.
@@ -65,10 +82,9 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
         Margins and usage of all limits; infinitely negative margins where the simulation diverges.
     """
     constraints = constraint_set_of(task, every=True)
-    unenforced: frozenset[str] = frozenset()
-    if not task.experiment.limits.enforce:
-        unenforced = frozenset({"clearance", *(limit.kind for limit in task.limits)})
+    unenforced = _unenforced_kinds(task)
 
+    # Simulate the unmodified model and observe the limited quantities at every engine step.
     model = task.system.model_at(task.theta)
     simulator = BatchSimulator(model, substeps=task.system.grid.substeps)
     out = simulator.rollout(
@@ -78,18 +94,20 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
         constraints.observations,
     )
     if not out.finite[0] or out.observed is None:
-        lost = dict.fromkeys((*constraints.substeps.kinds, "simulation"), -np.inf)
-        return Verification(
-            margins=lost, relative_margins=lost, deviation=np.inf, unenforced=unenforced
-        )
-
-    # Distances are measured at every engine step below, not at the samples.
+        return Verification.diverged(constraints.substeps.kinds, unenforced)
     played = task.plant.trajectory(out.states[0], trajectory.ctrl)
+
+    # All limits but the clearance.
     others = replace(constraints, clearance=None)
     values = others.evaluate(played, out.observed[0], slopes=False)
-    margins, relative_margins = others.margins(values), others.relative_margins(values)
-    usage = list(_usage(task, constraints, values))
+    margins = others.margins(values)
+    relative_margins = others.relative_margins(values)
+    usage = [
+        *_usage_within_samples(task, constraints, values.observed),
+        *_usage_of_controls(task, constraints, played.ctrl),
+    ]
 
+    # The clearance, at every engine step instead of at the samples.
     clearance = constraints.clearance
     if clearance is not None:
         positions = _positions_at_engine_steps(task, simulator, played)
@@ -108,42 +126,69 @@ def verify(task: DesignTask, trajectory: Trajectory) -> Verification:
     )
 
 
-def _usage(
-    task: DesignTask, constraints: ConstraintSet, values: ConstraintValues
-) -> Iterator[LimitUsage]:
-    """Position of every quantity in its range: within samples at every engine step, of controls at every sample."""
-    substeps, ctrl = constraints.substeps, values.trajectory.ctrl
-    N, steps, w = values.observed.shape
-    observed = values.observed.reshape(N * steps, w)
-    positions = substeps.bounds.relative_position(observed)
+def _unenforced_kinds(task: DesignTask) -> frozenset[str]:
+    """Kinds of limits that are checked, but not enforced."""
+    if task.experiment.limits.enforce:
+        return frozenset()
+    return frozenset({"clearance", *(limit.kind for limit in task.limits)})
 
-    t = np.arange(1, len(observed) + 1) * task.dt / task.system.grid.substeps
+
+def _usage_within_samples(
+    task: DesignTask, constraints: ConstraintSet, observed: Array
+) -> Iterator[LimitUsage]:
+    """Position of the observed quantities, (N, substeps, w), in their ranges."""
+    substeps = constraints.substeps
+    flat = observed.reshape(-1, observed.shape[-1])
+    positions = substeps.bounds.relative_position(flat)
+
+    t = _engine_times(task, len(flat))
     for i, (kind, name) in enumerate(zip(substeps.kinds, substeps.names, strict=True)):
         yield LimitUsage(kind=kind, name=name, t=t, share=positions[:, i])
 
-    limited = [("control", constraints.control.bounds, ctrl, task.t)]
-    if constraints.rate is not None:
-        times = np.append(task.t, task.t[-1] + task.dt)
-        rates = constraints.rate.rates(ctrl)
-        limited.append(("control_rate", constraints.rate.bounds, rates, times))
 
-    for kind, bounds, used, times in limited:
-        bounded = np.isfinite(bounds.lower) | np.isfinite(bounds.upper)
-        positions = bounds.relative_position(used)
-        for i in np.flatnonzero(bounded).tolist():
-            yield LimitUsage(kind=kind, name=task.controls[i], t=times, share=positions[:, i])
+def _usage_of_controls(
+    task: DesignTask, constraints: ConstraintSet, ctrl: Array
+) -> Iterator[LimitUsage]:
+    """Position of the controls, (N, nu), and of their rates in the ranges that are stated."""
+    yield from _bounded_usage(task, "control", constraints.control.bounds, ctrl)
+    if constraints.rate is not None:
+        rates = constraints.rate.rates(ctrl)
+        yield from _bounded_usage(task, "control_rate", constraints.rate.bounds, rates)
+
+
+def _bounded_usage(
+    task: DesignTask, kind: str, bounds: Bounds, values: Array
+) -> Iterator[LimitUsage]:
+    """Position of values at n successive samples, (n, nu), in those ranges that are stated."""
+    t = np.arange(len(values)) * task.dt
+    positions = bounds.relative_position(values)
+
+    bounded = np.isfinite(bounds.lower) | np.isfinite(bounds.upper)
+    for i in np.flatnonzero(bounded).tolist():
+        yield LimitUsage(kind=kind, name=task.controls[i], t=t, share=positions[:, i])
 
 
 def _clearance_usage(
     task: DesignTask, clearance: ClearanceConstraint, positions: Array
 ) -> tuple[float, LimitUsage]:
-    """The least distance [m] over positions: (n, nq) at n engine steps, and the usage of the clearance over time."""
+    """Smallest distance [m] over n engine steps, and the usage of the clearance over time.
+
+    Args:
+        task: The task.
+        clearance: The clearance.
+        positions: (n, nq) positions after each engine step.
+    """
     distance, _, pair = clearance.distances.nearest(positions)
     nearest = clearance.distances(positions, slopes=False).d.min(axis=1)
 
-    t = np.arange(1, len(positions) + 1) * task.dt / task.system.grid.substeps
+    t = _engine_times(task, len(positions))
     share = clearance.least / np.maximum(nearest, CONTACT_DISTANCE)
     return distance, LimitUsage(kind="clearance", name=pair.name, t=t, share=share)
+
+
+def _engine_times(task: DesignTask, count: int) -> Array:
+    """(count,) times after each engine step [s]."""
+    return np.arange(1, count + 1) * task.dt / task.system.grid.substeps
 
 
 def _positions_at_engine_steps(
@@ -173,7 +218,7 @@ def require_feasible_start(task: DesignTask) -> None:
 
 
 def _require_feasible_start(task: DesignTask) -> None:
-    """As `require_feasible_start`; errors do not name the experiment file yet."""
+    """Carry out `require_feasible_start`; error messages do not name the experiment file yet."""
     constraints = constraint_set_of(task, every=True)
     bandwidth_basis(task, task.stated_times)
     if not task.experiment.limits.enforce:
@@ -193,38 +238,55 @@ def _require_feasible_start(task: DesignTask) -> None:
 
 
 def _require_inside(task: DesignTask, constraints: ConstraintSet, where: str, state: Array) -> None:
-    """Raise ExperimentError where a state (ns,) violates a limit on positions, velocities or distances."""
+    """Require that a state, (ns,), keeps the limits on positions, velocities and distances."""
     qpos, qvel, _ = task.space.split(state)
     units = {c.name: c.unit for c in task.system.coordinates}
 
     for limit in task.limits:
-        if limit.kind not in ("position", "velocity"):
+        if limit.kind == "position":
+            value, unit = float(qpos[limit.index]), units[limit.name]
+        elif limit.kind == "velocity":
+            value, unit = float(qvel[limit.index]), f"{units[limit.name]}/s"
+        else:
             continue
-        numbers = qpos if limit.kind == "position" else qvel
-        value = float(numbers[limit.index])
+
         if not limit.lower <= value <= limit.upper:
-            unit = units[limit.name] + ("/s" if limit.kind == "velocity" else "")
             raise ExperimentError(
                 f"limits.{limit.kind}.{limit.name}: {where} is at {value:g} {unit}, outside "
-                f"[{limit.lower:g}, {limit.upper:g}]; widen the limit (where it is the MJCF's, "
+                f"[{limit.lower:g}, {limit.upper:g}]; widen the limit (in the MJCF if it is stated "
                 f"there) or move {where}"
             )
 
-    if constraints.clearance is None:
+    if constraints.clearance is not None:
+        _require_clear(constraints.clearance, where, state[: task.space.nq])
+
+
+def _require_clear(clearance: ClearanceConstraint, where: str, qpos: Array) -> None:
+    """Require that a position, (nq,), keeps the clearance."""
+    distance, _, pair = clearance.distances.nearest(qpos[None])
+    if distance >= clearance.least:
         return
-    least = constraints.clearance.least
-    distance, _, pair = constraints.clearance.distances.nearest(state[None, : task.space.nq])
-    if distance < least:
-        fault = "in collision" if distance < 0.0 else "too close"
-        raise ExperimentError(
-            f"limits.clearance: {where} is {fault}: {pair.name} are {distance:.3g} m apart, wanted "
-            f"{least:g} m; move {where}, lower the clearance, or list the pair's bodies in "
-            "limits.ignored"
-        )
+
+    fault = "in collision" if distance < 0.0 else "too close"
+    raise ExperimentError(
+        f"limits.clearance: {where} is {fault}: {pair.name} are {distance:.3g} m apart, but have "
+        f"to be {clearance.least:g} m apart; move {where}, lower the clearance, or list the pair's "
+        "bodies in limits.ignored"
+    )
 
 
 def _require_held(task: DesignTask, where: str, state: Array, hold: Array) -> None:
-    """Raise ExperimentError where the control `hold`: (nu,) that holds a state: (ns,) violates a limit on forces or controls."""
+    """Require that the control that holds a state keeps the limits on controls and forces.
+
+    Args:
+        task: The task.
+        where: Key of the experiment file, for the error message.
+        state: (ns,) state.
+        hold: (nu,) control that holds it [u-unit].
+
+    Raises:
+        ExperimentError: A control or a force is outside its limit.
+    """
     model = task.plant.model(task.theta)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:] = task.space.split(state)
@@ -244,7 +306,7 @@ def _require_held(task: DesignTask, where: str, state: Array, hold: Array) -> No
 
 
 def _key_of(limit: Limit) -> str:
-    """The key or range by which a user states a limit."""
+    """The key or the range of the MJCF that states a limit, for error messages."""
     if limit.kind == "joint_force":
         return "limits.force or the MJCF's actuatorfrcrange"
     return f"limits.{limit.kind}"

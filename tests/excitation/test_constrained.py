@@ -757,12 +757,16 @@ def test_a_control_that_violates_a_limit_a_little_continues_beside_its_start(
     start, leaking, inside = (
         InitialControl(name="x", control=s * free.control) for s in (0.2, 3.0, 0.1)
     )  # here the smaller one tells more
-    judged, candidate = rivals.judge(RunResult(name="x", control=leaking.control, cost=1e-3), start)
+    result, candidate = rivals.reevaluate(
+        RunResult(name="x", control=leaking.control, cost=1e-3), start
+    )
     assert (candidate.control is leaking.control, candidate.cost) == (True, 1e-3)
-    assert judged.control is not leaking.control
-    assert judged.cost == pytest.approx(
+    assert result.control is not leaking.control
+    assert result.cost == pytest.approx(
         free.problem.point(free.plant.simulate(free.theta, start.control)).cost
     )
-    judged, candidate = rivals.judge(RunResult(name="x", control=inside.control, cost=1e-3), start)
-    assert candidate.control is judged.control is inside.control
-    assert candidate.cost == judged.cost > 1e-3
+    result, candidate = rivals.reevaluate(
+        RunResult(name="x", control=inside.control, cost=1e-3), start
+    )
+    assert candidate.control is result.control is inside.control
+    assert candidate.cost == result.cost > 1e-3

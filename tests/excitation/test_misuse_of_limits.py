@@ -43,7 +43,7 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
         "",
         [
             "limits.position.slide: the initial state is at 0 m, outside [0.5, 2]",
-            "where it is the MJCF's, there",
+            "in the MJCF if it is stated there",
         ],
         [('type="slide" axis="1 0 0"', 'type="slide" axis="1 0 0" range="0.5 2"')],
     ),
@@ -121,7 +121,7 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
         "[limits]\nclearance = 0.01",
         [
             "limits.clearance: the initial state is in collision: cart - rail are -0.",
-            "wanted 0.01 m",
+            "have to be 0.01 m apart",
             "limits.ignored",
         ],
         [SOLID],
@@ -129,8 +129,8 @@ FAULTS: dict[str, tuple[str, list[str], list[tuple[str, str]]]] = {
     "start too close": (
         '[limits]\nclearance = 3.0\nignored = [["cart", "world"], ["pendulum", "world"]]',
         [
-            "limits.clearance: the initial state is too close: bob - rail are 0.885 m apart, "
-            "wanted 3 m"
+            "limits.clearance: the initial state is too close: bob - rail are 0.885 m apart, but "
+            "have to be 3 m apart"
         ],
         [SOLID, ('<geom name="rod" type', '<geom name="rod" contype="0" conaffinity="0" type')],
     ),
@@ -322,7 +322,7 @@ def test_ranges_of_the_mjcf_that_are_no_limits_are_named() -> None:
 
 def test_a_jump_at_rest_is_warned_about(tmp_path: Path) -> None:
     path = write_experiment(tmp_path, max_iterations='2\n[boundary]\nstart = "rest"')
-    jump = "the control may jump where the design begins and ends at rest"
+    jump = "the control may jump where the design begins or ends at rest"
     assert any(jump in sentence for sentence in mjfim.design(Experiment.from_file(path)).warnings)
     slow = Experiment.from_file(path).replace(limits={"control_rate": 50.0})
     assert not any(jump in sentence for sentence in mjfim.design(slow).warnings)
