@@ -14,7 +14,6 @@ import pytest
 
 import mjfim
 from mjfim.budget import Budget, StopToken
-from mjfim.excitation import interior_point, multistart
 from mjfim.excitation.bandwidth import bandwidth_basis
 from mjfim.excitation.constrained import ConstrainedSearch, run_in_worker
 from mjfim.excitation.constraints import constraint_set_of
@@ -23,9 +22,11 @@ from mjfim.excitation.feasibility import SHRINK_FACTORS
 from mjfim.excitation.initial_controls import InitialControl, initial_controls_of
 from mjfim.excitation.interior_point import BarrierSchedule, InteriorPointMethod, updated_tightening
 from mjfim.excitation.levels import DescentLevel
+from mjfim.excitation.multistart import Multistart
 from mjfim.excitation.run_result import RunResult, consume
 from mjfim.excitation.task import DesignTask
 from mjfim.excitation.unconstrained import regulator_for
+from mjfim.excitation.verification import verify
 from mjfim.experiment.schema import Experiment
 from mjfim.records.design import Design, HistoryRow, Status
 from mjfim.records.events import DesignEvent
@@ -42,9 +43,7 @@ from tests.support.paths import MODELS
 
 
 def played(model: Any, start: tuple[Array, Array], ctrl: Array, substeps: int) -> dict[str, Array]:
-    """Positions, velocities, accelerations and actuator forces at every engine step of a plain loop
-    around mj_step.
-    """
+    """Positions, velocities, accelerations and actuator forces at every step of a plain loop."""
     data, rows = mujoco.MjData(model), {key: [] for key in ("q", "v", "a", "f")}
     data.qpos[:], data.qvel[:] = start
     for held in ctrl:
@@ -74,9 +73,9 @@ def method_of(free: DesignTask) -> InteriorPointMethod:
     )
 
 
-def multistart_of(free: DesignTask) -> multistart.Multistart:
+def multistart_of(free: DesignTask) -> Multistart:
     """Several starts on a plant without clamps, without a coarse level."""
-    return multistart.Multistart(fine=DescentLevel(free, None), coarse=None, budget=Budget())
+    return Multistart(fine=DescentLevel(free, None), coarse=None, budget=Budget())
 
 
 # ---- the requirement
@@ -84,9 +83,7 @@ def multistart_of(free: DesignTask) -> multistart.Multistart:
 
 @pytest.fixture(scope="module")
 def paper() -> Design:
-    """The paper's study at its true values, within 5 N and 1 m, without any weight on control or
-    position.
-    """
+    """The study of the paper at its true values, within 5 N and 1 m, without other weights."""
     experiment = Experiment.from_file(MODELS / "cart_pendulum.toml")
     hard = {"control": {"force": [-5.0, 5.0]}, "position": {"slide": [-1.0, 1.0]}}
     return mjfim.design(experiment.replace(cost={"control": 0.0, "tracking": {}}, limits=hard))
@@ -122,9 +119,9 @@ def test_the_study_of_the_paper_under_hard_limits_beats_a_general_solver(
         array[place] = value
         columns.append((ends[0] - ends[1]).reshape(-1) / (2 * h * sigma))
     G = np.array(columns).T
-    told = np.linalg.eigvalsh(G.T @ G) / 100.0  # per second
-    assert told[0] >= 399.0
-    np.testing.assert_allclose(told, paper.final.eigenvalues, rtol=1e-4)
+    eigenvalues = np.linalg.eigvalsh(G.T @ G) / 100.0  # per second
+    assert eigenvalues[0] >= 399.0
+    np.testing.assert_allclose(eigenvalues, paper.final.eigenvalues, rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -133,7 +130,7 @@ def test_no_engine_step_of_the_study_violates_a_limit(paper: Design) -> None:
     rows = played(model, (model.key("hanging").qpos.copy(), np.zeros(2)), paper.trajectory.ctrl, 1)
     assert np.abs(paper.trajectory.ctrl).max() <= 5.0
     assert np.abs(rows["q"][:, 0]).max() <= 1.0
-    # both are used to the full, and told
+    # both ranges are used up to the bounds, and the design says so
     margins = {
         "control": 5.0 - np.abs(paper.trajectory.ctrl).max(),
         "position": 1.0 - np.abs(rows["q"][:, 0]).max(),
@@ -150,7 +147,7 @@ def test_no_engine_step_of_the_study_violates_a_limit(paper: Design) -> None:
 
 
 def assert_inside(task: DesignTask, ctrl: Array) -> None:
-    """Every range of the experiment on a cart-pendulum holds at every engine step of a plain loop."""
+    """Every range of the cart-pendulum holds at every engine step of a plain loop."""
     start = task.space.split(task.plant.nominal_initial_state)[:2]
     rows, places = (
         played(task.system.model, start, ctrl, task.system.grid.substeps),
@@ -177,7 +174,7 @@ def test_an_infeasible_start_is_made_feasible(tmp_path: Path) -> None:
     design = design_task(task)
     assert design.limits == pytest.approx({k: max(v, 0.0) for k, v in design.limits.items()})
     assert_inside(task, design.trajectory.ctrl)
-    # it begins with as much of the start as keeps them
+    # it begins with the initial control, shrunk until the limits hold
     free = task.relaxed()
     method = method_of(free)
     begun = method.shrink_inside(task.control)
@@ -200,13 +197,10 @@ SWINGING = CART_PENDULUM.format(integrator="RK4").replace(
 )
 
 
-def swinging_task(folder: Path, **tables: Any) -> DesignTask:
+def swinging_task(folder: Path, amplitude: float = 2.0, **tables: Any) -> DesignTask:
     """A pendulum that swings at first and has to hang still elsewhere after 1.5 s."""
-    first = {
-        "qpos": (0.0, 2.6),
-        "qvel": (0.4, 1.0),
-        "control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.7},
-    }
+    control = {"kind": "sine", "amplitude": amplitude, "frequency": 0.7}
+    first = {"qpos": (0.0, 2.6), "qvel": (0.4, 1.0), "control": control}
     defaults: dict[str, Any] = {
         "horizon": 1.5,
         "rate": 50.0,
@@ -222,7 +216,7 @@ def swinging_task(folder: Path, **tables: Any) -> DesignTask:
 
 
 def assert_ends(task: DesignTask, design: Design) -> None:
-    """It hangs still where it has to, by a plain loop, within all limits."""
+    """In a plain loop the pendulum ends at rest at its target, within all limits."""
     assert design.status is not Status.INFEASIBLE
     rows = played(
         task.system.model,
@@ -237,7 +231,7 @@ def assert_ends(task: DesignTask, design: Design) -> None:
 
 @pytest.mark.slow
 def test_a_start_that_misses_its_end_is_not_changed(tmp_path: Path) -> None:
-    """The relaxed barrier reaches the end, and the cost counts from the first iterate on."""
+    """The relaxed barrier reaches the final state, and all iterates have a cost."""
     task = swinging_task(tmp_path)
     free = task.relaxed()
     method = method_of(free)
@@ -249,12 +243,9 @@ def test_a_start_that_misses_its_end_is_not_changed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_start_that_cannot_be_shrunk_inside_is_steered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The start counts as too far outside here because the allowed violation is changed."""
-    monkeypatch.setattr(interior_point, "MAX_START_VIOLATION", -np.inf)
-    task = swinging_task(tmp_path)
+def test_a_start_that_cannot_be_shrunk_inside_is_steered(tmp_path: Path) -> None:
+    """The initial control exceeds its range too far for the relaxed barrier."""
+    task = swinging_task(tmp_path, amplitude=55.0)
     free = task.relaxed()
     method = method_of(free)
     assert method.shrink_inside(task.control) is None
@@ -294,7 +285,7 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
     result = run_in_worker(search)
     assert result.status is Status.INFEASIBLE
     assert result.cost == np.inf
-    # beside it another start continues
+    # another start is still optimised
     rows: list[DesignEvent] = []
     starts = [search.start, InitialControl(name="initial control", control=task.control)]
     results = consume(multistart_of(task.relaxed()).run(starts), rows.append)
@@ -303,8 +294,9 @@ def test_a_start_that_diverges_ends_without_a_result_not_with_an_error(tmp_path:
 
 
 def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> None:
-    """The design equals that without limits; one that leaves them continues from its last feasible
-    control.
+    """The design equals that without limits.
+
+    A design that leaves the limits continues with a barrier, from its last feasible control.
     """
     heavy = {"cost": {"control": 0.05}, "descent": {"max_iterations": 60}}
     wide = {"control": {"force": (-30.0, 30.0)}, "position": {"slide": (-3.0, 3.0)}}
@@ -324,9 +316,7 @@ def test_there_is_no_barrier_where_weights_keep_the_limits(tmp_path: Path) -> No
 
 
 def test_a_design_does_not_use_a_clamp(tmp_path: Path) -> None:
-    """A clamp keeps a force within its range whatever the control is, so it does not count as a
-    kept limit.
-    """
+    """A force that only a clamp keeps within its range violates its limit."""
     weak = CART_PENDULUM.format(integrator="RK4").replace(
         'joint="slide"/>', 'joint="slide" forcerange="-1.5 1.5"/>'
     )
@@ -379,9 +369,7 @@ def test_limits_that_are_not_enforced_may_be_violated_while_the_boundary_holds(
 
 
 def test_the_stated_tolerance_ends_the_last_stage_once_the_limits_hold(tmp_path: Path) -> None:
-    """With a tolerance above every slope, the first feasible iterate of the last stage is the last
-    one.
-    """
+    """With a tolerance above every slope, a run ends at the first feasible iterate."""
     task = cart_inside(tmp_path, descent={"max_iterations": 80, "tolerance": 100.0, "coarse": 1})
     design = design_task(task)
     assert design.status is Status.CONVERGED
@@ -427,7 +415,7 @@ def test_starts_in_parallel_give_the_results_of_a_sequential_search(
     )
     np.testing.assert_allclose(together.trajectory.ctrl, alone.trajectory.ctrl, rtol=0, atol=1e-9)
     assert together.limits == pytest.approx(alone.limits, abs=1e-9)
-    # one of four goes on, the others are left behind; the best one won
+    # one of four starts survives, the others are discarded; the best one wins
     names = {"initial control", *(f"multisine {i} of 3" for i in (1, 2, 3))}
     assert {s.name for s in alone.starts} == names
     assert sum(s.status is Status.LEFT for s in alone.starts) == 3
@@ -436,9 +424,7 @@ def test_starts_in_parallel_give_the_results_of_a_sequential_search(
 
 
 def test_an_interrupted_multistart_keeps_the_best_so_far(tmp_path: Path) -> None:
-    """Also in its second round, also where the callback asks to stop: no worse than what was
-    reported before.
-    """
+    """It is no worse than any reported iterate, in both rounds."""
     task = several(tmp_path)
     reported: list[HistoryRow] = []
 
@@ -486,10 +472,8 @@ def test_a_fourier_start_is_optimised_as_a_series_in_the_first_round(tmp_path: P
 # ---- how a design begins, ends and moves
 
 
-def arm_design(folder: Path, **tables: Any) -> tuple[DesignTask, Design]:
-    """The arm of two servos for half a second, from a standstill that its motors have to hold
-    against gravity.
-    """
+def arm_task(folder: Path, **tables: Any) -> DesignTask:
+    """The arm of two servos for half a second; it starts at rest, held against gravity."""
     defaults: dict[str, Any] = {
         "horizon": 0.5,
         "parameters": {"m": {"target": "body/fore:mass"}, "c": {"target": "joint/elbow:damping"}},
@@ -503,14 +487,19 @@ def arm_design(folder: Path, **tables: Any) -> tuple[DesignTask, Design]:
         "control_rate": 6.0,
         **tables.pop("limits", {}),
     }
-    task = make_task(ARM, folder, **{**defaults, **tables, "limits": limits})
+    return make_task(ARM, folder, **{**defaults, **tables, "limits": limits})
+
+
+def arm_design(folder: Path, **tables: Any) -> tuple[DesignTask, Design]:
+    """The task of the arm and its design."""
+    task = arm_task(folder, **tables)
     return task, design_task(task)
 
 
 def assert_arm(
     task: DesignTask, design: Design, before: Array | None, after: Array | None
 ) -> dict[str, Array]:
-    """Ranges and rates of the control, by hand; returns what a plain loop shows."""
+    """Ranges and rates of the control hold; returns the motion in a plain loop."""
     ctrl, dt = design.trajectory.ctrl, task.dt
     assert np.abs(ctrl).max() <= 1.0
     assert np.abs(np.diff(ctrl, axis=0)).max() / dt <= 6.0
@@ -568,8 +557,9 @@ def test_a_periodic_design_can_be_repeated(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("coarse", [1, "auto"])
 def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_path: Path) -> None:
-    """On the stated samples, from the coarse level as well; from rest its first control is what
-    holds, without a slope.
+    """It is so on the stated samples, also when the design began on the coarse level.
+
+    From rest, its first control holds the initial state, and its slope is zero there.
     """
     boundary = {"start": "rest", "end": "rest", "position": 0.02, "velocity": 0.1}
     task, design = arm_design(
@@ -595,7 +585,7 @@ def test_a_design_of_limited_bandwidth_is_made_of_its_splines(coarse: Any, tmp_p
 
 @pytest.mark.parametrize("bandwidth", [30.0, 50.0])
 def test_a_bandwidth_near_that_of_the_samples_works(bandwidth: float, tmp_path: Path) -> None:
-    """There are then as many splines as samples or more, of a coarse level twice as many."""
+    """There are nearly as many splines as samples, and about twice as many on a coarse level."""
     task = cart_inside(
         tmp_path,
         limits={**HARD, "bandwidth": bandwidth},
@@ -609,14 +599,10 @@ def test_a_bandwidth_near_that_of_the_samples_works(bandwidth: float, tmp_path: 
 
 
 def nearest(task: DesignTask, ctrl: Array) -> float:
-    """Smallest distance of the arm to post and floor at any engine step of a plain loop, by
-    MuJoCo's own distances.
-    """
+    """Smallest distance of the arm to post and floor at any engine step of a plain loop [m]."""
     model = task.system.model
-    data, geoms = (
-        mujoco.MjData(model),
-        [model.geom(name).id for name in ("fore", "post", "floor", "upper")],
-    )
+    data = mujoco.MjData(model)
+    geoms = [model.geom(name).id for name in ("fore", "post", "floor", "upper")]
     near = []
     for qpos in played(model, (np.zeros(2), np.zeros(2)), ctrl, task.system.grid.substeps)["q"]:
         data.qpos[:] = qpos
@@ -629,43 +615,47 @@ def nearest(task: DesignTask, ctrl: Array) -> float:
 
 
 @pytest.mark.parametrize(
-    ("proofs", "shrunk"),
-    [
-        pytest.param(0, False, id="unproved"),
-        pytest.param(0, True, id="shrunk"),
-        pytest.param(3, False, id="proved", marks=pytest.mark.slow),
-    ],
+    "has_time", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["shrunk", "tightened"]
 )
-def test_a_design_that_comes_too_close_between_its_samples_gets_tighter_limits(
-    proofs: int, shrunk: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_design_that_comes_too_close_between_its_samples_is_corrected(
+    has_time: bool, tmp_path: Path
 ) -> None:
-    """The barrier evaluates distances at samples of 50 ms, the verification at every engine step."""
-    monkeypatch.setattr(multistart, "MAX_TIGHTENED_RUNS", proofs)
-    if not shrunk:
-        # The interior-point method itself may still shrink a control; only the last resort is taken
-        # away.
-        monkeypatch.setattr(multistart.Multistart, "_shrink", lambda _, result: result)
-    monkeypatch.setattr(multistart, "TIGHTENED_RUN_ITERATIONS", 12)
-    task, design = arm_design(
+    """Limits are tightened where there is time; else the control is shrunk.
+
+    The barrier evaluates distances at samples of 50 ms, the verification at every engine step.
+    """
+    task = arm_task(
         tmp_path,
         rate=20.0,
         horizon=1.0,
         limits={"clearance": 0.15, "control_rate": 20.0},
         descent={"max_iterations": 16, "coarse": 1},
     )
-    kept = nearest(task, design.trajectory.ctrl) >= 0.15
-    assert kept is (shrunk or bool(proofs))
-    assert (design.status is Status.INFEASIBLE) is not kept
-    assert design.limits["clearance"] == pytest.approx(
-        nearest(task, design.trajectory.ctrl) - 0.15, abs=1e-6
-    )
+    search = multistart_of(task.relaxed())
+    starts = [InitialControl(name="initial control", control=task.control)]
+    (first,) = consume(search.run(starts), None)
+    distance = nearest(task, first.control)
+    assert distance < 0.15
+    found = verify(task, task.plant.simulate(task.theta, first.control))
+    assert not found.is_feasible
+    assert found.margins["clearance"] == pytest.approx(distance - 0.15, abs=1e-6)
+
+    budget = Budget() if has_time else Budget(seconds=0.0)
+    (final,) = consume(replace(search, budget=budget).tighten_winner([first]), None)
+    assert nearest(task, final.control) >= 0.15
+    assert (len(final.history) > len(first.history)) is has_time
+
+    # A result of tighter limits is an iterate; a control that was shrunk is none.
+    assert (final.cost in [row.cost for row in final.history]) is has_time
 
 
 def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
     """Without the limit the fore-arm comes closer."""
     task, design = arm_design(tmp_path, limits={"clearance": 0.15})
     free = arm_design(tmp_path)[1]
-    assert nearest(task, design.trajectory.ctrl) >= 0.15 > nearest(task, free.trajectory.ctrl)
+    distance = nearest(task, design.trajectory.ctrl)
+    assert distance >= 0.15 > nearest(task, free.trajectory.ctrl)
+    assert design.limits["clearance"] == pytest.approx(distance - 0.15, abs=1e-6)
     assert design.limits["clearance"] == pytest.approx(
         nearest(task, design.trajectory.ctrl) - 0.15, abs=1e-6
     )
@@ -677,9 +667,7 @@ def test_clearance_is_kept_at_every_engine_step(tmp_path: Path) -> None:
 def test_a_shorter_design_played_twice_is_a_start(
     tmp_path: Path, executor: type[ThreadPoolExecutor] | None
 ) -> None:
-    """Half of the horizon alone tells about as much per second; together they are judged over all
-    of it.
-    """
+    """Half of the horizon has about as much information per second; costs hold for all of it."""
     rest = {"start": "rest", "end": "rest"}
     descent = {"repeats": (2,), "max_iterations": 60}
     hanging = {"qpos": (0.0, np.pi), "qvel": (0.0, 0.0)}
@@ -756,7 +744,7 @@ def test_a_control_that_violates_a_limit_a_little_continues_beside_its_start(
     rivals = multistart_of(free)
     start, leaking, inside = (
         InitialControl(name="x", control=s * free.control) for s in (0.2, 3.0, 0.1)
-    )  # here the smaller one tells more
+    )  # the smallest control has the lowest cost here
     result, candidate = rivals.reevaluate(
         RunResult(name="x", control=leaking.control, cost=1e-3), start
     )

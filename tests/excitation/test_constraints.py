@@ -1,6 +1,4 @@
-"""Hard limits along a trajectory: margins by hand, the expansion of the barrier against differences
-of simulations.
-"""
+"""Hard limits along a trajectory: margins and the expansion of the barrier, checked by hand."""
 
 from __future__ import annotations
 
@@ -24,8 +22,8 @@ from tests.support.numerics import directional_check, make_task
 WIDE = {
     "position": 0.5,
     "velocity": 5.0,
-}  # so that an end that is missed does not drown everything else
-# tight enough that the swing below is outside some and close to others
+}  # wide tolerances, so that a missed final state does not dominate the barrier
+# tight limits: the motion below violates some of them and is close to others
 ALONE: dict[str, dict[str, Any]] = {
     "position": {"limits": {"position": {"shoulder": (-0.3, 0.7), "elbow": (-0.3, 0.5)}}},
     "velocity": {"limits": {"velocity": {"shoulder": 4.6, "elbow": (-5.0, 4.8)}}},
@@ -58,7 +56,7 @@ KINDS = {"position", "velocity", "acceleration", "control", "control_rate", "for
 
 
 def arm_task(folder: Path, **tables: Any) -> DesignTask:
-    """The arm from a standstill, swung by sines of 1.5 Hz for 0.4 s, on its relaxed plant."""
+    """The relaxed arm, which starts at rest and is moved by sines of 1.5 Hz for 0.4 s."""
     swing = {"shoulder": 0.25, "elbow": 0.35}
     defaults: dict[str, Any] = {
         "horizon": 0.4,
@@ -75,9 +73,7 @@ def arm_task(folder: Path, **tables: Any) -> DesignTask:
 
 
 def barrier_check(task: DesignTask, delta: float, h: float = 2e-5) -> float:
-    """Largest relative error of the slope of the barrier along random controls, against differences
-    of simulations.
-    """
+    """Largest relative error of the slope of the barrier, against differences of simulations."""
     problem = InteriorProblem(
         base=task.problem, constraints=constraint_set_of(task), mu=1.0, delta=delta, with_cost=False
     )
@@ -109,9 +105,7 @@ def test_the_slope_of_the_barrier_is_that_of_simulated_controls(
 
 
 def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -> None:
-    """Half a turn away the difference of rotations is not linear; a floating hull does not return
-    to its initial state.
-    """
+    """Half a turn away, the difference of two rotations is not linear in the state."""
     wild = {
         "initial": {
             "qvel": (0.1, 0.0, 0.2, 3.5, -2.4, 4.3, 1.0, -2.0),
@@ -130,9 +124,7 @@ def test_the_slope_of_an_end_holds_for_quaternions_far_from_it(tmp_path: Path) -
 def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
     name: str, tmp_path: Path
 ) -> None:
-    """Changes of all constrained quantities along a tangent curve are squared, and weighted by the
-    barrier's curvature.
-    """
+    """The squares are those of the changes along a tangent curve, the weights the curvatures."""
     task = arm_task(tmp_path, **TOGETHER[name])
     constraints, delta = constraint_set_of(task), 0.05
     problem = InteriorProblem(
@@ -154,7 +146,7 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
     free = rate.control_before is None, rate.control_after is None and not rate.periodic
     assert ((w.W[0] == 0.0).all(), (w.W[-1] == 0.0).all()) == free
     assert (w.W[1:-1] > 0.0).all()
-    # the squares of the change of every limited quantity, times the curvature of its barrier
+    # squared change of every limited quantity, times the curvature of its barrier
     values, N = (
         constraints.evaluate(values_of(point).trajectory, values_of(point).observed, slopes=True),
         task.samples,
@@ -223,9 +215,7 @@ def test_the_gauss_newton_hessian_of_the_barrier_is_a_sum_of_weighted_squares(
 
 
 def test_relative_moves_of_an_expansion_are_those_of_the_simulation(tmp_path: Path) -> None:
-    """They are relative to half of each range; the largest at any engine step with derivatives
-    counts.
-    """
+    """They are relative to half of each range, and largest over the steps with derivatives."""
     task = arm_task(tmp_path, limits=EVERY)
     constraints = constraint_set_of(task)
     problem = InteriorProblem(
@@ -244,7 +234,7 @@ def test_relative_moves_of_an_expansion_are_those_of_the_simulation(tmp_path: Pa
 
 
 def test_margins_along_a_trajectory_are_those_of_single_engine_steps(tmp_path: Path) -> None:
-    """Every kind at once, at every engine step; relative margins are divided by half of the range."""
+    """All kinds at every engine step; relative margins are divided by half of the range."""
     task = arm_task(
         tmp_path,
         limits=EVERY,
@@ -356,7 +346,7 @@ def test_rates_at_both_ends_follow_the_boundary(tmp_path: Path) -> None:
 
 
 def test_without_enforcement_only_the_boundary_constrains(tmp_path: Path) -> None:
-    """All limits are checked and reported all the same."""
+    """All limits are still checked and reported."""
     task = arm_task(tmp_path, limits={**EVERY, "enforce": False}, boundary={"end": "periodic"})
     for every, kinds in ((False, set()), (True, KINDS)):
         constraints = constraint_set_of(task, every=every)

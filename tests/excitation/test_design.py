@@ -1,4 +1,4 @@
-"""What a design says about itself: warnings, refusals, starts."""
+"""Warnings, errors and starts of designs."""
 
 from __future__ import annotations
 
@@ -61,8 +61,7 @@ def test_actuator_delays_are_refused(experiment: Experiment, tmp_path: Path) -> 
 
 def test_saturation_is_reported(experiment: Experiment, tmp_path: Path) -> None:
     old, new = 'joint="slide"/>', 'joint="slide" forcelimited="true" forcerange="-1.5 1.5"/>'
-    # hard limits, the default now, keep a design off the clamp: only what is not enforced can rest
-    # on it
+    # enforced limits keep a design off the clamp: the clamp acts only where they are not enforced
     tables = {"descent": {"max_iterations": 8}, "limits": {"enforce": False}}
     weak = altered(
         tmp_path, experiment, f'<motor name="force" {old}', f'<motor name="force" {new}', **tables
@@ -74,8 +73,8 @@ def test_saturation_is_reported(experiment: Experiment, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_instability_is_reported(experiment: Experiment) -> None:
-    # D-optimality with this little effort balances the pendulum upright, where every sensitivity
-    # explodes
+    # with so small a weight on control, D-optimality balances the pendulum upright, where
+    # sensitivities grow exponentially
     wild = mjfim.design(experiment.replace(cost={"criterion": "D"}, descent={"max_iterations": 60}))
     assert wild.final.growth > 1e3
     assert any("disturbance" in sentence for sentence in wild.warnings)
@@ -85,7 +84,7 @@ def test_instability_is_reported(experiment: Experiment) -> None:
 
 
 def test_violated_limits_are_reported_and_are_no_success(experiment: Experiment) -> None:
-    # by default limits hold now; here they are only to be checked
+    # limits are enforced by default; here they are only checked
     tight = experiment.replace(limits={"control": {"force": [-1.0, 1.0]}, "enforce": False})
     design = mjfim.design(tight)
     assert design.limits["control"] < 0
@@ -133,7 +132,7 @@ def test_the_criterion_becomes_smooth_where_the_smallest_eigenvalues_meet(tmp_pa
     assert made.success
     first, second = made.final.eigenvalues[:2]
     assert second < 1.2 * first
-    # what is reported is the exact criterion, and the best that any iterate had
+    # the reported cost is that of the exact criterion, the best of all iterates
     assert made.final.criterion == pytest.approx(1.0 / first, rel=1e-9)
     assert made.final.cost == pytest.approx(
         1.0 / first + task.problem.running.value(made.trajectory), rel=1e-9
@@ -141,7 +140,7 @@ def test_the_criterion_becomes_smooth_where_the_smallest_eigenvalues_meet(tmp_pa
     fine = [row.cost for row in made.history if row.rate == 100.0]
     assert made.final.cost == pytest.approx(min(fine), rel=1e-12)
     assert [row.iteration for row in made.history] == list(range(len(made.history)))
-    # no small change of the control is much better
+    # no small change of the control has a much lower cost
     rng, here = np.random.default_rng(0), made.trajectory.ctrl
     for _ in range(10):
         wave = np.sin(2 * np.pi * rng.uniform(0.5, 4.0) * task.t + rng.uniform(0.0, 6.3))[:, None]
@@ -162,8 +161,7 @@ def test_a_design_that_knows_its_nuisance_parameters_beats_one_that_does_not(
     assert aware.final.eigenvalues.shape == (3,)
     there = evaluate_task(unsure, naive.trajectory)
     assert aware.final.cost < 0.95 * there.cost
-    # the trajectory is judged by the block of the full inverse that belongs to the wanted
-    # parameters
+    # the criterion uses the block of the full inverse that belongs to the wanted parameters
     block = np.linalg.inv(aware.final.information)[:3, :3] / np.outer(
         unsure.theta[:3], unsure.theta[:3]
     )
@@ -204,7 +202,7 @@ def test_a_coarser_level_costs_about_the_same(case: str, tmp_path: Path) -> None
 def test_the_choice_of_a_group_needs_no_error_where_members_are_invisible(tmp_path: Path) -> None:
     parameters = {"bob": {"inertial": "bob", "coordinates": "barycentric"}}
     made = design_task(cart_task(tmp_path, parameters=parameters, descent={"max_iterations": 3}))
-    # a point on a planar pendulum shows its mass, two first moments and the inertia about the hinge
+    # a planar pendulum reveals its mass, two first moments and the inertia about the hinge
     assert made.combinations[-1].endswith("no effect on anything that is measured")
     assert len(made.final.eigenvalues) < 10
     assert np.isinf(made.final.std).sum() >= 10 - len(made.final.eigenvalues)
@@ -212,7 +210,7 @@ def test_the_choice_of_a_group_needs_no_error_where_members_are_invisible(tmp_pa
 
 
 def test_a_coarse_factor_that_does_not_divide_the_samples_is_refused(tmp_path: Path) -> None:
-    """By default it is just not used."""
+    """The default factor is left out without an error."""
     tables = {"horizon": 4.06, "descent": {"max_iterations": 1}}
     with pytest.raises(
         ExperimentError,

@@ -1,6 +1,4 @@
-"""Problem (8) with psi among the states: without weight on psi the ordinary direction, with it the
-right linearisation.
-"""
+"""Problem (8) of the paper with psi among the states: directions and linearisation."""
 
 from __future__ import annotations
 
@@ -30,7 +28,7 @@ CORRELATED = ({"outputs": ("angle", "drive"), "covariance": ((1e-4, 5e-4), (5e-4
 
 
 def expanded(task: DesignTask) -> Expansion:
-    """Expansion of J about the initial trajectory, psi among the states."""
+    """Expansion of J about the initial trajectory, with psi among the states."""
     problem = ExtendedDesignProblem.of(task.problem)
     return problem.expand(problem.point(task.initial, CENTRAL_DIFFERENCES))
 
@@ -178,9 +176,7 @@ def test_tangent_vectors_of_the_extended_system_are_differences_of_psi_between_t
 def psi_step(
     task: DesignTask, thetas: tuple[Loop, Loop], h: float, x: Array, u: Array, psi: Array, j: int
 ) -> Array:
-    """psi_{k+1} of parameter j as a function of (x, u, psi): a plain difference of two steps at
-    theta_j +- h.
-    """
+    """psi_{k+1} of parameter j at (x, u, psi), by a difference of two steps at theta_j +- h."""
     up, down = thetas
     ahead, back = up.plus(x, h * psi), up.plus(x, -h * psi)
     return up.minus(up.F(ahead, u), down.F(back, u)) / (2 * h)
@@ -221,7 +217,7 @@ def test_extended_A_and_B_are_differences_of_the_step_of_x_and_psi(case: str, tm
         others = [c for c in range(nx, nx * (1 + p)) if not rows.start <= c < rows.stop]
         np.testing.assert_array_equal(
             wide.A[k, rows][:, others], 0.0
-        )  # one parameter's psi does not see another's
+        )  # psi of one parameter does not depend on psi of another
 
 
 def test_x_does_not_depend_on_psi_in_the_extended_system(tmp_path) -> None:

@@ -1,6 +1,4 @@
-"""Initial controls of a design: names, sizes and ranges, windows at both ends, and earlier designs
-that are repeated.
-"""
+"""Initial controls of a design: names, ranges, fading at both ends, and repeated designs."""
 
 from __future__ import annotations
 
@@ -111,7 +109,7 @@ def test_a_series_without_any_harmonic_is_refused(
 
 
 def test_an_earlier_design_is_repeated_until_the_horizon_ends(tmp_path: Path) -> None:
-    """Its rows have the rate of the earlier design; the last row commands nothing and is left out."""
+    """Its rows have the rate of the earlier design; the last row has no control."""
     rows = np.arange(20)
     lines = [f"{k * 0.02},{0.01 * k},{-0.02 * k},0.0" for k in rows] + ["0.4,nan,nan,0.0"]
     for name, count in (("old.csv", 21), ("short.csv", 5)):

@@ -1,6 +1,4 @@
-"""`log J + mu B`: its slope against simulated controls for every criterion, and points that are
-judged anew.
-"""
+"""`log J + mu B`: its slope for every criterion, and the reevaluation of points."""
 
 from __future__ import annotations
 
@@ -43,7 +41,7 @@ COSTS: dict[str, dict[str, Any]] = {
 
 
 def problem_of(name: str, folder: Path, **tables: Any) -> tuple[DesignTask, InteriorProblem]:
-    """The cart-pendulum within limits, some of which its initial control leaves."""
+    """The cart-pendulum within limits, some of which its initial control violates."""
     task = cart_task(folder, limits=LIMITS, **{**COSTS[name], **tables}).relaxed()
     base = task.problem
     if name == "smooth E":
@@ -65,9 +63,7 @@ def check(
 
 @pytest.mark.parametrize("name", COSTS)
 def test_the_slope_agrees_with_simulated_controls(name: str, tmp_path: Path) -> None:
-    """With the barrier, whose part is also given separately, and for the logarithm of the cost
-    alone.
-    """
+    """With the barrier, whose expansion is also given separately, and without it."""
     task, problem = problem_of(name, tmp_path)
     point = problem.point(task.control)
     expansion = problem.expand(point)
@@ -85,9 +81,7 @@ def test_the_slope_agrees_with_simulated_controls(name: str, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("name", COSTS)
 def test_a_point_holds_the_cost_and_the_barrier(name: str, tmp_path: Path) -> None:
-    """The logarithm of J; of D-optimality, which is one, J per nat: one for each parameter and its
-    weight.
-    """
+    """The merit is log J; for D-optimality it is J over the number of parameters and the weight."""
     task, problem = problem_of(name, tmp_path)
     point = problem.point(task.control)
     assert point.point is not None
@@ -161,9 +155,7 @@ def test_a_diverged_trial_has_infinite_value(tmp_path: Path) -> None:
 
 
 def test_a_projected_point_is_simulated_open_loop(tmp_path: Path) -> None:
-    """Feedback changes the control; the point is that of the changed control, with and without
-    feedback.
-    """
+    """Feedback changes the control; the point is that of the changed control."""
     task, problem = problem_of("E", tmp_path)
     point = problem.point(task.control)
     expansion = problem.expand(point)

@@ -1,6 +1,4 @@
-"""Several experiments whose information adds up: designed in turn, never worse than apart, seeing
-what one alone does not.
-"""
+"""Joint designs: never worse than separate ones, and they identify more than one experiment."""
 
 from __future__ import annotations
 
@@ -26,13 +24,13 @@ FAR = {
 
 
 def pair(folder, **tables) -> list[mjfim.Experiment]:
-    """Two starts of the cart-pendulum, briefly descended."""
+    """Two experiments with the cart-pendulum from different initial states, with few iterations."""
     common = {"descent": {"max_iterations": 8}, **tables}
     return [cart_task(folder, initial=start, **common).experiment for start in (NEAR, FAR)]
 
 
-def own(design: mjfim.Design) -> np.ndarray:
-    """Information of a design's own data."""
+def data_information(design: mjfim.Design) -> np.ndarray:
+    """Information of the data of a design, without its prior."""
     return design.final.information - design.prior
 
 
@@ -42,7 +40,7 @@ def test_the_sum_is_at_least_as_good_as_that_of_separate_designs(tmp_path) -> No
     together = mjfim.design_jointly(experiments, rounds=2)
     apart = [mjfim.design(e) for e in experiments]
     phi = [
-        task.information.evaluate(sum(own(d) for d in designs)).value
+        task.information.evaluate(sum(data_information(d) for d in designs)).value
         for designs in (together, apart)
     ]
     assert phi[0] <= 1.0001 * phi[1]
@@ -50,8 +48,14 @@ def test_the_sum_is_at_least_as_good_as_that_of_separate_designs(tmp_path) -> No
 
 def test_each_design_holds_the_information_of_all(tmp_path) -> None:
     together = mjfim.design_jointly(pair(tmp_path), rounds=1)
-    assert relative_error(together[1].final.information, own(together[0]) + own(together[1])) < 1e-6
-    assert relative_error(together[1].prior, own(together[0])) < 1e-6
+    assert (
+        relative_error(
+            together[1].final.information,
+            data_information(together[0]) + data_information(together[1]),
+        )
+        < 1e-6
+    )
+    assert relative_error(together[1].prior, data_information(together[0])) < 1e-6
 
 
 def test_one_experiment_may_reveal_what_another_cannot(tmp_path) -> None:
@@ -59,10 +63,10 @@ def test_one_experiment_may_reveal_what_another_cannot(tmp_path) -> None:
     blind, seeing = cart_task(tmp_path, initial=still), cart_task(tmp_path, initial=FAR)
     with pytest.raises(UnidentifiableError):
         design_task(blind)
-    told = seeing.problem.point(seeing.initial).information
+    information = seeing.problem.point(seeing.initial).information
     helped = design_task(
         DesignTask.resolve(
-            blind.experiment.replace(descent={"max_iterations": 2}), added_information=told
+            blind.experiment.replace(descent={"max_iterations": 2}), added_information=information
         )
     )
     assert np.isfinite(helped.final.std).all()
@@ -73,7 +77,7 @@ def test_nuisance_of_one_experiment_is_not_that_of_the_other(tmp_path) -> None:
     together = mjfim.design_jointly(experiments, rounds=1)
     j = together[1].parameters.index("initial qpos:slide")
     assert not together[1].prior[j, :3].any()
-    assert together[1].prior[j, j] == pytest.approx(0.05**-2)  # its own prior alone
+    assert together[1].prior[j, j] == pytest.approx(0.05**-2)  # its prior only
 
 
 def test_other_parameters_are_refused(tmp_path) -> None:

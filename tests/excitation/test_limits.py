@@ -1,6 +1,4 @@
-"""Limits from the ranges of the MJCF and of the experiment file, and the smallest margins of a
-trajectory.
-"""
+"""Limits from the MJCF and from the experiment file, and smallest margins of a trajectory."""
 
 from __future__ import annotations
 
@@ -42,17 +40,17 @@ XML = """
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    """Ball, slide with a range, hinge without; one actuator of two with a range."""
+    """Model with a ball joint, a slide joint with a range, a hinge joint and two actuators."""
     return mujoco.MjModel.from_xml_string(XML)
 
 
 def limits(model: mujoco.MjModel, **tables: object) -> tuple[Limit, ...]:
-    """Limits of the model with tables of the file."""
+    """Limits of the model and of tables of an experiment file."""
     return limits_of(model, scalar_joints(model), control_names(model), Limits(**tables))
 
 
 def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajectory:
-    """Three samples at rest, apart from the named columns."""
+    """Trajectory of three samples at rest, except for the named columns."""
     arrays = {
         "qpos": np.zeros((3, model.nq)),
         "qvel": np.zeros((3, model.nv)),
@@ -70,7 +68,7 @@ def curve(model: mujoco.MjModel, **columns: tuple[int, list[float]]) -> Trajecto
 
 
 def test_model_ranges_are_the_default(model: mujoco.MjModel) -> None:
-    """Ranges of joints and controls; what has none is free. Columns skip the ball joint."""
+    """Elements without a range in the model are free. Columns skip the ball joint."""
     assert limits(model) == (
         Limit(kind="position", name="lift", index=4, lower=-0.5, upper=0.25),
         Limit(kind="control", name="push", index=0, lower=-2.0, upper=3.0),
@@ -78,7 +76,7 @@ def test_model_ranges_are_the_default(model: mujoco.MjModel) -> None:
 
 
 def test_the_file_narrows_ranges_and_adds_others(model: mujoco.MjModel) -> None:
-    """One number is a symmetric range. The file does not replace the range of the MJCF: both hold."""
+    """One number is a symmetric range. The range of the MJCF holds as well."""
     found = limits(
         model,
         position={"lift": (-0.1, 0.1), "turn": (-1, 2)},
@@ -96,9 +94,7 @@ def test_the_file_narrows_ranges_and_adds_others(model: mujoco.MjModel) -> None:
 
 
 def test_one_number_stands_for_all_names(model: mujoco.MjModel) -> None:
-    """It holds for joints with one degree of freedom, for controls, and for actuators with a single
-    force.
-    """
+    """It holds for slide and hinge joints, controls, and actuators with a single force."""
     found = limits(model, velocity=2.0, acceleration=9.0, control_rate=7.0, force=1.5)
     joints, places = (("lift", 3), ("turn", 4)), (("push", 0), ("twist", 1))
     assert set(found) - set(limits(model)) == {
@@ -220,7 +216,7 @@ def test_margins(
     expected: dict[str, float],
     tmp_path: Path,
 ) -> None:
-    """The worst distance over samples and over both ends, negative outside; zero on the limit."""
+    """Smallest margin over samples and both bounds, negative outside; zero on the bound."""
     assert margins(XML, tmp_path, curve(model, **columns)) == pytest.approx(expected)
 
 
@@ -237,9 +233,7 @@ def test_the_margin_of_a_kind_is_the_smallest_of_its_joints(
 def test_accelerations_and_rates_of_the_control_are_changes_over_their_time(
     model: mujoco.MjModel, tmp_path
 ) -> None:
-    """The velocity changes over an engine step (2 ms), the control over a sample (10 ms); the first
-    control is free.
-    """
+    """Velocities change over an engine step of 2 ms, controls over a sample of 10 ms."""
     moving = curve(model, qvel=(4, [0.0, 0.01, -0.02]), ctrl=(1, [0.5, 0.2]))
     found = margins(
         XML,

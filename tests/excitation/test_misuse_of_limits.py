@@ -1,6 +1,4 @@
-"""Hard limits and boundaries that cannot be kept: one message with file and key and exit code 2,
-before any optimisation.
-"""
+"""Hard limits and boundaries that cannot be kept: a message with file and key, exit code 2."""
 
 from __future__ import annotations
 
@@ -243,7 +241,7 @@ def test_a_hard_range_replaces_the_weight(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rate", [100.0, 2000.0])
 def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) -> None:
-    """It falls very little within a sample of a high rate."""
+    """At a high rate it falls only a little within a sample."""
     task = make_task(
         CART_PENDULUM.format(integrator="RK4").replace('timestep="0.01"', 'timestep="0.0005"'),
         tmp_path,
@@ -255,7 +253,8 @@ def test_a_start_that_falls_is_refused_at_any_rate(rate: float, tmp_path: Path) 
     )
     with pytest.raises(
         ExperimentError,
-        match=r"no control holds the initial state: joint 'hinge' still accelerates by \d\.\d+ per s²",
+        match=r"no control holds the initial state: "
+        r"joint 'hinge' still accelerates by \d\.\d+ per s²",
     ):
         design_task(task)
 
@@ -271,8 +270,8 @@ def test_limits_that_no_control_can_keep_end_with_exit_code_one(
         model.replace("3.141592653589793", "2.0"), encoding="utf-8"
     )
     result = run("design", path, "-o", tmp_path / "out", "--json")
-    told = loads(result.stdout)
-    assert (result.exit_code, told["status"], told["limits"]["satisfied"]) == (
+    printed = loads(result.stdout)
+    assert (result.exit_code, printed["status"], printed["limits"]["satisfied"]) == (
         1,
         "infeasible",
         False,
@@ -303,10 +302,16 @@ LOOSE = """
   <compiler angle="radian"/>
   <worldbody>
     <body name="a"><joint name="wrist" type="ball" range="0 1"/><geom size="0.1"/>
-      <body name="b" pos="0 0 1"><joint name="elbow" axis="0 1 0" range="-1 1"/><geom size="0.1"/></body></body>
+      <body name="b" pos="0 0 1">
+        <joint name="elbow" axis="0 1 0" range="-1 1"/><geom size="0.1"/>
+      </body>
+    </body>
   </worldbody>
   <tendon><fixed name="rope" range="-1 1"><joint joint="elbow" coef="1"/></fixed></tendon>
-  <actuator><general name="muscle" joint="elbow" dyntype="filter" dynprm="0.1" actlimited="true" actrange="0 1"/></actuator>
+  <actuator>
+    <general name="muscle" joint="elbow" dyntype="filter" dynprm="0.1"
+             actlimited="true" actrange="0 1"/>
+  </actuator>
 </mujoco>
 """
 

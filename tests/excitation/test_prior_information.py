@@ -1,6 +1,4 @@
-"""Information of earlier experiments: summed by name, the rest marginalised, no prior counted
-twice.
-"""
+"""Information of earlier experiments: sums by name, marginals, and priors counted once."""
 
 from __future__ import annotations
 
@@ -25,7 +23,7 @@ def information(seed: int, size: int) -> Array:
 
 
 def design_file(path: Path, names: list[str], matrix: Array, prior: Array | None = None) -> Path:
-    """What `earlier` reads of a design.json."""
+    """A design.json with the entries that `earlier` reads."""
     values: dict[str, Any] = {"parameters": names, "final": {"information": matrix.tolist()}}
     if prior is not None:
         values["prior"] = prior.tolist()
@@ -34,7 +32,7 @@ def design_file(path: Path, names: list[str], matrix: Array, prior: Array | None
 
 
 def test_designs_and_estimates_add_up_by_name(tmp_path: Path) -> None:
-    """In any order of names; a design tells its information, an estimate its covariance."""
+    """The names may be in any order; a design has its information, an estimate its covariance."""
     first, second = information(0, 2), information(1, 2)
     design = design_file(tmp_path / "design.json", ["b", "a"], first)
     estimate = tmp_path / "estimate.json"
@@ -49,10 +47,8 @@ def test_designs_and_estimates_add_up_by_name(tmp_path: Path) -> None:
     assert not information_of([], ("a", "b")).any()
 
 
-def test_what_the_file_knows_besides_is_marginalised(tmp_path: Path) -> None:
-    """The covariance of the shared parameters stays what the file says, not what it would be were
-    the rest known.
-    """
+def test_further_parameters_of_a_file_are_marginalised(tmp_path: Path) -> None:
+    """The covariance of the shared parameters is that of the file, with unknown other ones."""
     matrix = information(2, 4)
     path = design_file(tmp_path / "design.json", ["x", "a", "y", "b"], matrix)
     found = information_of([path], ("a", "b"))
@@ -64,17 +60,15 @@ def test_what_the_file_knows_besides_is_marginalised(tmp_path: Path) -> None:
     )
 
 
-def test_what_cannot_be_told_apart_from_the_rest_is_not_known(tmp_path: Path) -> None:
-    """A singular rest: only the sum of a and x is known, so nothing of a; of b everything."""
+def test_nothing_is_known_about_a_parameter_that_is_confounded_with_others(tmp_path: Path) -> None:
+    """Only the sum of a and x is known, so that nothing is known about a."""
     matrix = np.array([[4.0, 4.0, 0.0], [4.0, 4.0, 0.0], [0.0, 0.0, 9.0]])
     path = design_file(tmp_path / "design.json", ["a", "x", "b"], matrix)
     np.testing.assert_allclose(information_of([path], ("a", "b")), np.diag([0.0, 9.0]), atol=1e-12)
 
 
-def test_the_files_own_prior_is_left_out(tmp_path: Path) -> None:
-    """Else it would be counted once more with every file; priors on what is marginalised stay, they
-    belong to the file.
-    """
+def test_the_prior_of_a_file_is_left_out(tmp_path: Path) -> None:
+    """It would be counted again with every file; priors of marginalised parameters stay."""
     data = information(3, 3)
     prior = np.diag([5.0, 0.0, 7.0])
     path = design_file(tmp_path / "design.json", ["a", "b", "x"], data + prior, prior)
@@ -87,8 +81,8 @@ def test_the_files_own_prior_is_left_out(tmp_path: Path) -> None:
     assert np.abs(found - unknown).max() > 0.1, "the prior on the rest does not matter: a weak test"
 
 
-def test_deviations_of_the_start_belong_to_one_experiment(tmp_path: Path) -> None:
-    """The same name in the next experiment is another number; biases are the sensor's and stay."""
+def test_deviations_of_the_initial_state_belong_to_one_experiment(tmp_path: Path) -> None:
+    """Their values differ between experiments; sensor biases are common to all experiments."""
     names = ["a", "initial qpos:slide", "bias acc"]
     data, prior = information(4, 3), np.diag([0.0, 100.0, 0.0])
     path = design_file(tmp_path / "design.json", names, data + prior, prior)
@@ -148,7 +142,7 @@ FAULTS: dict[str, tuple[str, str]] = {
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_unusable_files_are_named(name: str, tmp_path: Path) -> None:
-    """The file and what is wrong with it."""
+    """The message names the file and the fault."""
     text, message = FAULTS[name]
     path = tmp_path / "odd.json"
     path.write_text(text, encoding="utf-8")
@@ -165,9 +159,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
 
 
 def test_a_design_that_was_written_is_read_back(tmp_path: Path) -> None:
-    """Its data's information becomes part of the next experiment's prior, and of that one's file no
-    more than its own.
-    """
+    """The information of its data is prior information of the next experiment, but not its data."""
     tables = {"descent": {"max_iterations": 1}, "cost": {"criterion": "A"}}
     priors = {
         "m": {"target": "body/bob:mass", "prior": 0.1},

@@ -1,6 +1,4 @@
-"""Samples of the parameters, pooled criteria against differences, and a design for the worst of
-them.
-"""
+"""Samples of the parameters, pooled criteria, and designs for the worst parameters."""
 
 from __future__ import annotations
 
@@ -145,8 +143,8 @@ def test_parameters_without_prior_and_bounds_cannot_be_sampled(tmp_path) -> None
         )
 
 
-# The pendulum's length is known to a factor of two only: what swings it well at one length does not
-# at another.
+# Wide bounds: the length of the pendulum is known within a factor of three only, and a control that
+# suits one length does not suit another.
 VAGUE = {
     "m": {**CART_PARAMETERS["m"], "bounds": (1.0, 2.2)},
     "l": {**CART_PARAMETERS["l"], "bounds": (0.5, 1.4)},
@@ -205,14 +203,14 @@ def test_a_robust_design_is_better_at_its_samples_than_the_nominal_design(
         phis(nominal, d.trajectory.ctrl, robust.samples_of_parameters.thetas) for d in (made, plain)
     )
     assert pooled(ours) < 0.9 * pooled(theirs)
-    # each is the better one by its own cost
+    # each design is the better one by the cost that it minimises
     crossed = [
         s.problem.point(s.plant.simulate(s.theta, d.trajectory.ctrl))
         for s, d in ((robust, plain), (nominal, made))
     ]
     assert made.final.cost < 0.9 * crossed[0].cost
     assert plain.final.cost < 0.9 * crossed[1].cost
-    # it is better at samples that neither design was made for, too
+    # it is also better at samples that neither design knows
     fresh = sample_parameters(robust.parameters, robust.theta, 9, seed=7)[1:]
     ours, theirs = (phis(nominal, d.trajectory.ctrl, fresh) for d in (made, plain))
     assert pooled(ours) < 0.9 * pooled(theirs)
@@ -236,7 +234,7 @@ def test_samples_are_halved_until_their_bodies_can_exist() -> None:
         times, np.ceil(np.log2(np.maximum(free[1:, 0] - 1.0, 1.0))), atol=1e-9
     )
     assert (drawn[:, 0] <= 2.0).all()
-    # where no halving helps they end at the guess, even those that are never right
+    # where halving does not help, samples end at the guess
     np.testing.assert_array_equal(
         sample_parameters(parameters, theta, 3, 0, lambda row: [0, 1]), 1.0
     )

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import mjfim
 from mjfim.budget import StopToken
 from mjfim.cli import main as cli
-from mjfim.errors import ExperimentError, NoResultError, SimulationDivergedError
+from mjfim.errors import ExperimentError, NoResultError, UnidentifiableError
 from mjfim.excitation.design import design_task
 from mjfim.excitation.evaluation import evaluate_task
 from mjfim.excitation.shortest_horizon import OutOfReachError, fitted
@@ -28,25 +28,25 @@ STUDY = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml").replace(
     initial={"control": {"kind": "sine", "amplitude": 2.0, "frequency": 0.8}},
     descent={"starts": 1, "tolerance": 1e-4, "max_iterations": 30},
 )
-SIGMA = {"m": 0.0115, "l": 0.02, "c": 0.0125}  # wanted: reached at about one second
+SIGMA = {"m": 0.0115, "l": 0.02, "c": 0.0125}  # target standard deviations; reached at about 1 s
 
 
 def wanting(sigma: dict[str, float], **tables: object) -> mjfim.Experiment:
-    """The study with standard deviations to aim at."""
+    """The study with target standard deviations."""
     return STUDY.replace(
         parameters={name: {"wanted": value} for name, value in sigma.items()}, **tables
     )
 
 
 def worst(experiment: mjfim.Experiment) -> float:
-    """Of a design's predicted σ over the wanted ones."""
+    """Largest ratio of a predicted standard deviation of the design to its target."""
     task = DesignTask.resolve(experiment)
     return largest_ratio_to_target(design_task(task).final.std, target_accuracies(task))[0]
 
 
 @pytest.fixture(scope="module")
 def shorter() -> mjfim.ShortestExperiment:
-    """Shorter than stated."""
+    """The shortest experiment, which is shorter than the stated one."""
     return mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.05)
 
 
@@ -54,11 +54,11 @@ def test_it_reaches_every_target(shorter: mjfim.ShortestExperiment) -> None:
     assert 0.5 < shorter.horizon < 1.4 and shorter.closed
     task = DesignTask.resolve(shorter.experiment)
     assert shorter.design.trajectory.samples == task.samples
-    told = evaluate_task(task, shorter.design.trajectory)
-    assert largest_ratio_to_target(told.std, target_accuracies(task))[0] <= 1.0
+    evaluated = evaluate_task(task, shorter.design.trajectory)
+    assert largest_ratio_to_target(evaluated.std, target_accuracies(task))[0] <= 1.0
     best = next(t for t in shorter.tried if t.horizon == shorter.horizon)
     assert best.reached and best.ratio == pytest.approx(
-        largest_ratio_to_target(told.std, target_accuracies(task))[0], rel=1e-6
+        largest_ratio_to_target(evaluated.std, target_accuracies(task))[0], rel=1e-6
     )
     assert shorter.summary()["horizon"] == shorter.horizon
 
@@ -74,7 +74,7 @@ def test_an_experiment_shorter_by_the_tolerance_does_not(shorter: mjfim.Shortest
 
 @pytest.mark.slow
 def test_the_horizon_may_become_longer_than_stated(shorter: mjfim.ShortestExperiment) -> None:
-    """A search that begins with too short a horizon ends at about the same one."""
+    """A search that begins at a horizon that is too short ends near the shortest one as well."""
     messages: list[str] = []
 
     def callback(event: DesignEvent | StudyEvent) -> None:
@@ -161,30 +161,23 @@ def test_a_stopped_search_returns_the_shortest_so_far() -> None:
         mjfim.shortest_experiment(wanting(SIGMA), stop=stop)
 
 
-def test_a_duration_that_cannot_be_simulated_does_not_reach(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Except the stated one: there the fault is the user's to see."""
-    real = mjfim.excitation.shortest_horizon.design_task
+def test_a_duration_without_a_measurement_does_not_reach() -> None:
+    """One measurement in 1.4 s: shorter experiments measure nothing."""
+    loose = wanting(dict.fromkeys(SIGMA, 10.0), measure_rate=100.0 / 140.0)
+    found = mjfim.shortest_experiment(loose, tolerance=0.05)
+    assert 1.4 <= found.horizon <= 1.45
+    assert found.missed is not None
+    assert "measures nothing" in found.missed.why
 
-    def faulty(task: DesignTask, *rest: object, **more: object) -> mjfim.Design:
-        if task.samples < 140:
-            raise SimulationDivergedError("too short")
-        return real(task, *rest, **more)
 
-    monkeypatch.setattr(mjfim.excitation.shortest_horizon, "design_task", faulty)
-    found = mjfim.shortest_experiment(wanting(SIGMA), tolerance=0.05)
-    assert (
-        1.4 <= found.horizon <= 1.45
-        and found.missed is not None
-        and found.missed.why == "too short"
-    )
-    with pytest.raises(SimulationDivergedError):
-        mjfim.shortest_experiment(wanting(SIGMA, horizon=1.0))
+def test_an_error_at_the_first_duration_ends_the_search() -> None:
+    still = {"control": {"kind": "constant", "amplitude": 0.0}}
+    with pytest.raises(UnidentifiableError):
+        mjfim.shortest_experiment(wanting(SIGMA, initial=still))
 
 
 def test_control_of_another_duration(tmp_path: Path) -> None:
-    """Cut and repeated where anything may happen at the end, else stretched."""
+    """It is cut where the end is free and repeated without limits; else it is stretched."""
     control = np.arange(4.0)[:, None]
 
     def made(samples: int, **tables: object) -> list[float]:
@@ -203,9 +196,7 @@ def test_control_of_another_duration(tmp_path: Path) -> None:
 
 
 def test_the_command_line(tmp_path: Path) -> None:
-    """Everything as usual at the horizon found, which it prints and keeps; 1 where none is long
-    enough.
-    """
+    """The design of the shortest horizon is written; exit code 1 where no horizon is enough."""
     for name in ("cart_pendulum.xml", "cart_pendulum.csv"):
         shutil.copy(MODELS / name, tmp_path)
     text = (MODELS / "cart_pendulum.toml").read_text(encoding="utf-8")

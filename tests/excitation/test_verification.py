@@ -1,6 +1,4 @@
-"""Verification of a design on the model as the user wrote it: between samples, at clamps and stops,
-and where it diverges.
-"""
+"""Verification on the unmodified model: between samples, at clamps and stops, and divergence."""
 
 from __future__ import annotations
 
@@ -18,7 +16,9 @@ from tests.support.numerics import CART_PENDULUM, make_task
 # A ball on a spring that swings once per sample of 0.1 s, between two walls, by a clamped motor.
 SPRING = """
 <mujoco model="spring">
-  <option timestep="0.001" integrator="{integrator}" gravity="0 0 0"><flag contact="disable"/></option>
+  <option timestep="0.001" integrator="{integrator}" gravity="0 0 0">
+    <flag contact="disable"/>
+  </option>
   <worldbody>
     <geom name="wall" type="box" size="0.01 1 1" pos="0.3 0 0"/>
     <body name="ball">
@@ -29,12 +29,12 @@ SPRING = """
   <actuator><motor name="push" joint="slide" {motor}/></actuator>
 </mujoco>
 """
-SWING = 0.15  # [m]
+SWING = 0.15  # amplitude of the ball [m]
 SPEED = SWING * 2 * np.pi * 10.0
 
 
 def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -> DesignTask:
-    """One second of a mass on a spring at 10 Hz, from the middle at full speed, with a small force."""
+    """One second of a mass on a spring, which oscillates at 10 Hz; the control is small."""
     defaults: dict[str, Any] = {
         "rate": 10.0,
         "horizon": 1.0,
@@ -50,9 +50,7 @@ def spring_task(folder: Path, joint: str = "", motor: str = "", **tables: Any) -
 
 
 def test_limits_hold_between_the_samples_too(tmp_path: Path) -> None:
-    """At every sample the ball is in the middle, at full speed and without acceleration; between
-    samples it swings.
-    """
+    """At every sample the ball is in the middle; between samples it swings."""
     limits = {
         "position": {"slide": (-0.1, 0.12)},
         "velocity": {"slide": (0.9 * SPEED, 2 * SPEED)},
@@ -65,14 +63,14 @@ def test_limits_hold_between_the_samples_too(tmp_path: Path) -> None:
     assert samples.qvel.min() > 0.98 * SPEED
     found = verify(task, samples)
     assert not found.is_feasible
-    # by hand: a harmonic of 10 Hz
+    # by hand: a harmonic motion of 10 Hz
     assert found.margins["position"] == pytest.approx(0.1 - SWING, rel=1e-3)
     assert found.margins["velocity"] == pytest.approx(-1.9 * SPEED, rel=1e-3)
     assert found.margins["acceleration"] == pytest.approx(
         300.0 - SWING * (2 * np.pi * 10.0) ** 2, rel=3e-3
     )
     assert found.deviation < SAME_STATE_TOLERANCE
-    # what a constraints at the samples alone would have said
+    # margins at the samples only are positive
     constraints = constraint_set_of(task)
     watched = task.plant.observe(task.theta, task.control, constraints.observations)
     assert watched is not None
@@ -135,9 +133,7 @@ def test_a_clamp_or_stop_of_the_model_shows_as_a_deviation(clamp: str, tmp_path:
 def test_only_enforced_limits_take_the_clamps_out_of_the_plant(
     enforce: bool, tmp_path: Path
 ) -> None:
-    """A boundary alone does not keep a force within its range: the plant of the design must clamp
-    it.
-    """
+    """Where limits are not enforced, the plant of the design has to clamp forces."""
     motor = 'ctrlrange="-0.05 0.05" forcerange="-0.04 0.04"'
     control = {"kind": "sine", "amplitude": 1.0, "frequency": 1.0}
     tables = {
