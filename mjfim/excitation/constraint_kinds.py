@@ -164,12 +164,15 @@ class SubstepConstraint:
         barrier = self.bounds.barrier(observed, delta, weight)
         N, nx = len(observed), sums.a.shape[1]
 
+        # Gradient by the state and the control, (N, nx+nu).
         gradient = np.einsum("kswi,ksw->ki", jacobian, barrier.slope)
         sums.a[:-1] += gradient[:, :nx]
         sums.b[:] += gradient[:, nx:]
 
+        # Gauss-Newton Hessian J' diag(curvature) J of every sample, with all quantities in rows.
         flat = jacobian.reshape(N, -1, jacobian.shape[-1])
-        hessian = np.swapaxes(flat * barrier.curvature.reshape(N, -1, 1), 1, 2) @ flat
+        curvature = barrier.curvature.reshape(N, -1, 1)
+        hessian = np.swapaxes(flat * curvature, 1, 2) @ flat
         sums.weights.Q[:-1] += hessian[:, :nx, :nx]
         sums.weights.S[:] += hessian[:, nx:, :nx]
         sums.weights.R[:] += hessian[:, nx:, nx:]
@@ -290,7 +293,7 @@ class ControlRateConstraint:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EndStateConstraint:
-    """The final state lies within tolerances about a target.
+    """Tolerances of the final state about a target.
 
     Attributes:
         space: Layout of the state.

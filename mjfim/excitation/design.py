@@ -274,7 +274,7 @@ class _Search:
 
 
 def _is_bounded_by_weights(task: DesignTask) -> bool:
-    """Whether weights on all controls may keep the limits without a barrier.
+    """Check whether weights on all controls may keep the limits without a barrier.
 
     A barrier is needed for a boundary, a bandwidth, limits on control rates and a clearance.
     """
@@ -312,7 +312,7 @@ def _choose(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Report:
-    """Evaluates a design and makes its record.
+    """Evaluation of a design, from which its record is made.
 
     Attributes:
         stage: The stated level.

@@ -68,11 +68,13 @@ def extend(full: Bilinear, a: Array, b: Array, a_psi: Array) -> Expansion:
     B[:, :nx] = full.B
 
     for j in range(p):
-        block = slice(nx * (1 + j), nx * (2 + j))
+        # (N, nx, nx+nu) derivative of the next psi_j by the state and the control.
         mixed = np.swapaxes(full.F_mixed[j], 1, 2)
-        A[:, block, block] = full.A
-        A[:, block, :nx] = mixed[:, :, :nx]
-        B[:, block] = mixed[:, :, nx:]
+
+        psi_j = slice(nx * (1 + j), nx * (2 + j))
+        A[:, psi_j, :nx] = mixed[:, :, :nx]
+        A[:, psi_j, psi_j] = full.A
+        B[:, psi_j] = mixed[:, :, nx:]
 
     stacked = np.swapaxes(a_psi, 1, 2).reshape(N + 1, nx * p)
     return Expansion(A=A, B=B, a=np.concatenate([a, stacked], axis=1), b=np.array(b))

@@ -36,19 +36,22 @@ def holding_control(system: System, state: Array, guess: Array, *, key: str, pla
         ExperimentError: No control holds the state.
     """
     plant, space = system.plant, system.space
+    model = plant.model(system.theta)
     control = np.array(guess)
-    size = np.maximum(np.abs(control), 1.0)
+    steps = RELATIVE_DIFFERENCE * np.maximum(np.abs(control), 1.0)
 
     def drift(controls: Array) -> Array:
         """(m, nx) change of the state over a sample under each of (m, nu) controls."""
-        held = np.broadcast_to(state, (len(controls), len(state)))
-        stepped = plant.simulator.step([plant.model(system.theta)], held, controls)
+        states = np.broadcast_to(state, (len(controls), len(state)))
+        stepped = plant.simulator.step([model], states, controls)
         return space.minus(stepped.states, state)
 
     for _ in range(NEWTON_STEPS):
-        moves = np.concatenate([np.zeros((1, len(control))), RELATIVE_DIFFERENCE * np.diag(size)])
-        rows = drift(control + moves)
-        B = (rows[1:] - rows[0]).T / (RELATIVE_DIFFERENCE * size)
+        # The drift under the control, and under one control for each component that is moved.
+        rows = drift(np.vstack([control, control + np.diag(steps)]))
+        B = (rows[1:] - rows[0]).T / steps
+
+        # The Gauss-Newton step makes the linearised drift as small as possible.
         control = control - np.linalg.lstsq(B, rows[0])[0]
 
     _require_held(system, state, drift(control[None])[0], key, place)

@@ -168,7 +168,7 @@ class _StageResult:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InteriorPointMethod:
-    """Minimise a cost under hard limits.
+    """Method that minimises a cost under hard limits, in stages with falling barrier weight.
 
     Attributes:
         base: The cost on the plant without clamps.
@@ -276,7 +276,7 @@ class InteriorPointMethod:
         return np.asarray(self.centre + self.basis @ coefficients)
 
     def _is_near_feasible(self, control: Array) -> bool:
-        """Whether the relaxed barrier can make a control feasible.
+        """Check whether the relaxed barrier can make a control feasible.
 
         Constraints on the final state are ignored: their tolerances are narrow, so that even a
         usable control misses them by many times the tolerance.

@@ -175,7 +175,7 @@ class Multistart:
 
     @property
     def _differs_by_timestep_only(self) -> bool:
-        """Whether the coarse level has a longer timestep, but the stated samples and friction.
+        """True where the coarse level has a longer timestep, but the stated samples and friction.
 
         Its minima are then close to those of the stated level.
         """
@@ -186,7 +186,7 @@ class Multistart:
         return replace(variant, timestep_factor=1) == self.fine.task.system.variant
 
     def _needs_one_round(self, starts: Sequence[InitialControl]) -> bool:
-        """Whether there is nothing to compare: one start, whose control is free, on one level."""
+        """Check whether there is nothing to compare: one start, whose control is free, on one level."""
         if len(starts) > 1 or self.coarse is not None:
             return False
 

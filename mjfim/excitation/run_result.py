@@ -1,4 +1,4 @@
-"""Result of one optimisation run, and the events that it yields on its way."""
+"""Result of one optimisation run, and a function that runs it to its end."""
 
 from __future__ import annotations
 

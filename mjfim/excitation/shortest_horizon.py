@@ -45,7 +45,7 @@ ROUNDING = 1e-9
 
 
 class OutOfReachError(ExperimentError):
-    """Even the longest experiment does not reach the target standard deviations."""
+    """Error that even the longest experiment misses a target standard deviation."""
 
 
 @dataclass(frozen=True, kw_only=True)

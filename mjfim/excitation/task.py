@@ -293,7 +293,7 @@ class DesignTask:
 
     @cached_property
     def problem(self) -> DesignProblem:
-        """The cost, as Algorithm 1 of the paper minimises it."""
+        """The cost in the form that Algorithm 1 of the paper needs."""
         running = RunningCost(
             space=self.space,
             dt=self.dt,
@@ -312,7 +312,7 @@ class DesignTask:
 
     @property
     def identifiability_test(self) -> IdentifiabilityTest:
-        """Finds the parameters that cannot be identified, along trajectories of this task."""
+        """Test for parameters that cannot be identified along trajectories of this task."""
         return IdentifiabilityTest(
             plant=self.plant,
             parameters=self.parameters,
@@ -326,7 +326,7 @@ class DesignTask:
 
     @property
     def is_limited(self) -> bool:
-        """True where hard limits hold, or the design has to begin, end or move in a certain way."""
+        """True where the design has to keep hard limits, a boundary or a bandwidth."""
         limits = self.experiment.limits
         return self.is_shaped or (
             limits.enforce and (bool(self.limits) or limits.clearance is not None)
@@ -334,7 +334,7 @@ class DesignTask:
 
     @property
     def is_shaped(self) -> bool:
-        """True where the design has to begin, end or move in a certain way."""
+        """True where the experiment states how the design begins or ends, or its bandwidth."""
         boundary = self.experiment.boundary
         return (
             boundary.start != "given"
@@ -363,7 +363,7 @@ class DesignTask:
 
     @cached_property
     def target(self) -> Array:
-        """(ns,) state at which the design ends, where the boundary asks for one."""
+        """(ns,) final state that the boundary requires; the initial state unless it is at rest."""
         start = self.plant.initial_state(self.theta)
         if self.experiment.boundary.end != "rest":
             return start

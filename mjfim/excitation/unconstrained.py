@@ -329,7 +329,7 @@ def _stopping_rule(task: DesignTask) -> tuple[float, int]:
 
 
 def _is_new(result: RunResult, iteration: int, rate: float) -> bool:
-    """Whether an iteration at a sample rate [Hz] is not in the history yet.
+    """Check whether an iteration at a sample rate [Hz] is not in the history yet.
 
     Algorithm 1 yields its last iterate twice, the second time with its status.
     """
@@ -446,7 +446,7 @@ def _worst_margin_sign(task: DesignTask, constraints: ConstraintSet, control: Ar
 
 
 def _eigenvalues_meet(stage: DescentLevel, eigenvalues: Array) -> bool:
-    """Whether the smallest eigenvalues nearly meet while the exact E-criterion is minimised."""
+    """Check whether the smallest eigenvalues nearly meet while the exact E-criterion is minimised."""
     is_exact = stage.task.experiment.cost.criterion == "E" and np.isinf(stage.power)
     if not is_exact or len(eigenvalues) < 2:
         return False
