@@ -138,7 +138,8 @@ def _usage_within_samples(
 ) -> Iterator[LimitUsage]:
     """Position of the observed quantities, (N, substeps, w), in their ranges."""
     substeps = constraints.substeps
-    flat = observed.reshape(-1, observed.shape[-1])
+    N, steps, w = observed.shape
+    flat = observed.reshape(N * steps, w)
     positions = substeps.bounds.relative_position(flat)
 
     t = _engine_times(task, len(flat))
@@ -160,7 +161,7 @@ def _bounded_usage(
     task: DesignTask, kind: str, bounds: Bounds, values: Array
 ) -> Iterator[LimitUsage]:
     """Position of values at n successive samples, (n, nu), in those ranges that are stated."""
-    t = np.arange(len(values)) * task.dt
+    t = np.arange(len(values), dtype=np.float64) * task.dt
     positions = bounds.relative_position(values)
 
     bounded = np.isfinite(bounds.lower) | np.isfinite(bounds.upper)
