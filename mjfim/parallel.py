@@ -76,6 +76,7 @@ def pool_stop_token() -> StopToken:
 
 def workers_of(executor: Executor | None) -> int:
     """Return how many tasks an executor runs at the same time; 1 without an executor."""
+    # `concurrent.futures` has no public name for this number; an executor without it counts as one.
     return 1 if executor is None else int(getattr(executor, "_max_workers", 1))
 
 
