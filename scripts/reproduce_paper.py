@@ -26,7 +26,7 @@ from mjfim.output import plots
 from mjfim.output import rerun as rerun_log
 from mjfim.output.archive import write_design
 from mjfim.output.labels import Labels
-from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.serialization import write_json

@@ -32,7 +32,7 @@ from mjfim.information.identifiability import PROBES, Identifiability
 from mjfim.information.marginal import shared
 from mjfim.information.smoothness import roughness
 from mjfim.plant.active_constraints import saturated_actuators
-from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.combinations import ParameterGroup, join_names
 from mjfim.records.design import Design, Evaluation, Status
 from mjfim.records.events import DesignCallback, DesignEvent

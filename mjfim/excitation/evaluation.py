@@ -14,7 +14,7 @@ from mjfim.excitation.unconstrained import regulator_for
 from mjfim.excitation.verification import SAME_STATE_TOLERANCE, Verification
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.lq import largest_amplification, regulator
-from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import Roughness
 from mjfim.records.design import Evaluation
 from mjfim.records.trajectory import Trajectory

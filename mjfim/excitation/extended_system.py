@@ -15,7 +15,7 @@ from mjfim.arrays import Array
 from mjfim.excitation.objective import DesignPoint, DesignProblem
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.derivatives import Bilinear
+from mjfim.plant.mixed_derivatives import Bilinear
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

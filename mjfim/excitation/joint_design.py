@@ -15,7 +15,7 @@ from mjfim.excitation.design import design_budget, design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.information.marginal import shared
-from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Design
 from mjfim.records.events import DesignCallback
 

@@ -14,7 +14,7 @@ from mjfim.information.fisher import FisherInformation
 from mjfim.optimize.lq import TangentCurve
 from mjfim.optimize.projection_operator import Expansion
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.derivatives import (
+from mjfim.plant.mixed_derivatives import (
     CENTRAL_DIFFERENCES,
     FORWARD_DIFFERENCES,
     Bilinear,

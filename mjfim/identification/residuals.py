@@ -25,8 +25,8 @@ from mjfim.model.parameters import ParameterSet
 from mjfim.optimize.condensed_least_squares import Condensed, Step, triangle
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.optimize.robust_losses import RobustLoss
-from mjfim.plant.derivatives import SENSITIVITY_STEP
 from mjfim.plant.noise import Noise
+from mjfim.plant.rollout_derivatives import SENSITIVITY_STEP
 from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 

@@ -15,7 +15,7 @@ from mjfim.identification.segments import Segment, batches
 from mjfim.identification.unknowns import UnknownLayout
 from mjfim.optimize.levenberg_marquardt import UnknownValues
 from mjfim.plant.delay import OutputDelay
-from mjfim.plant.derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
+from mjfim.plant.rollout_derivatives import MAX_NUMBERS_AT_ONCE, SENSITIVITY_STEP, Response
 from mjfim.records.trajectory import Trajectory
 
 # Number of simulated samples, summed over the two sides of all differences, from which differences

@@ -2,7 +2,11 @@
 
 Modules:
     plant: The dynamics F and h at theta: rollouts, projection, models.
-    derivatives: First and mixed second derivatives of F and h, sensitivities of rollouts.
+    derivatives: All derivatives of a plant in one object, from the following modules.
+    rollout_derivatives: Sensitivities of whole rollouts.
+    step_derivatives: First derivatives of F and h.
+    mixed_derivatives: Mixed second derivatives of F and h.
+    difference_steps: Steps of the differences.
     batch: Many MuJoCo simulations in one call, and observations at their engine steps.
     state_space: Differences and moves of states on the configuration space.
     outputs: Which components of the state and which sensors are measured.

@@ -18,7 +18,7 @@ from mjfim.identification.residuals import FitProblem
 from mjfim.information.fisher import FisherInformation
 from mjfim.information.identifiability import Identifiability
 from mjfim.information.marginal import shared
-from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.check import (
     CONFOUNDED_CORRELATION,
     Check,

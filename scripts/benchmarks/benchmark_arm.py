@@ -23,7 +23,7 @@ from mjfim.excitation.levels import DescentLevel
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
-from mjfim.plant.derivatives import FORWARD_DIFFERENCES
+from mjfim.plant.mixed_derivatives import FORWARD_DIFFERENCES
 
 ARM = (
     Path(__file__).resolve().parents[3]

@@ -20,7 +20,11 @@ from mjfim.excitation.objective import DesignPoint
 from mjfim.excitation.task import DesignTask
 from mjfim.optimize.lq import TangentCurve, regulator
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, DifferenceAccuracy
+from mjfim.plant.mixed_derivatives import (
+    CENTRAL_DIFFERENCES,
+    FORWARD_DIFFERENCES,
+    DifferenceAccuracy,
+)
 from tests.support.numerics import (
     CART_PARAMETERS,
     CART_PENDULUM,

@@ -17,7 +17,7 @@ from mjfim.excitation.design import design_task
 from mjfim.excitation.task import DesignTask
 from mjfim.model.smooth_friction import SMOOTHING_SPEED_FRACTION
 from mjfim.model.variants import RELAXED, STATED
-from mjfim.plant.derivatives import SHARED_ORIGIN, SHARED_ORIGIN_SHORT
+from mjfim.plant.mixed_derivatives import SHARED_ORIGIN, SHARED_ORIGIN_SHORT
 from mjfim.records.design import Status
 from tests.support.numerics import make_task
 

@@ -19,7 +19,7 @@ from mjfim.model.mujoco_log import silence_mujoco_log
 from mjfim.model.variants import PlantModel
 from mjfim.optimize.lq import LinearRecursion, TangentCurve, regulator
 from mjfim.output.mjcf.write import write_spec
-from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES
 from mjfim.records.trajectory import Linearization
 from tests.support.numerics import (
     CART_PARAMETERS,

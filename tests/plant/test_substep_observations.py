@@ -14,7 +14,7 @@ import pytest
 from mjfim.excitation.constraints import constraint_set_of, derivative_substeps_of
 from mjfim.excitation.task import DesignTask
 from mjfim.plant.batch import SubstepObservations
-from mjfim.plant.derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, SHARED_ORIGIN
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES, FORWARD_DIFFERENCES, SHARED_ORIGIN
 from tests.support.limits import FLOATING, floating_task
 from tests.support.numerics import Array, Loop, relative_error
 

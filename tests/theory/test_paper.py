@@ -14,7 +14,7 @@ import mjfim
 from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.optimize.projection_operator import Expansion
-from mjfim.plant.derivatives import CENTRAL_DIFFERENCES
+from mjfim.plant.mixed_derivatives import CENTRAL_DIFFERENCES
 from mjfim.records.design import Status
 from tests.support.paths import ROOT
 

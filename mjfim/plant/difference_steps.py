@@ -1,0 +1,59 @@
+"""Steps of the differences from which the derivatives of a plant are made."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.records.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from mjfim.plant.plant import Plant
+
+# Magnitude of a control [u-unit] below which its difference step is absolute instead of relative.
+MIN_CONTROL_SIZE = 1e-3
+
+
+class DifferenceSteps:
+    """A plant with the magnitudes to which the steps of its differences are relative.
+
+    Attributes:
+        plant: The plant.
+    """
+
+    def __init__(self, plant: Plant, step_factors: Array | None = None) -> None:
+        """Build the derivatives of a plant.
+
+        Args:
+            plant: The plant.
+            step_factors: (p,) factors by which the difference steps of the parameters are
+                lengthened; None takes 1.
+        """
+        self.plant = plant
+        self._step_factors = (
+            np.ones(len(plant.parameters)) if step_factors is None else step_factors
+        )
+
+    @property
+    def parameter_scale(self) -> Array:
+        """(p,) magnitude of each parameter, to which its steps are relative [theta-unit]."""
+        return np.asarray(self.plant.parameters.magnitude * self._step_factors)
+
+    def difference_sizes(self, trajectory: Trajectory) -> Array:
+        """Magnitudes of state and control along a trajectory, to which steps are relative.
+
+        Args:
+            trajectory: The trajectory.
+
+        Returns:
+            (nx+nu,) magnitudes, 1 for positions and at least 1 for velocities and activations
+            [x-unit, u-unit].
+        """
+        position = np.ones(self.plant.space.nv)
+        velocity = np.maximum(1.0, np.abs(trajectory.qvel).max(axis=0, initial=0.0))
+        activation = np.maximum(1.0, np.abs(trajectory.act).max(axis=0, initial=0.0))
+        largest = np.abs(trajectory.ctrl).max(axis=0)
+        control = np.where(largest > MIN_CONTROL_SIZE, largest, 1.0)
+        return np.concatenate([position, velocity, activation, control])

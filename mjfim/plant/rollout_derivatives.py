@@ -1,0 +1,412 @@
+"""Outputs, sensitivities and responses of whole rollouts, by differences between rollouts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjfim.arrays import Array
+from mjfim.plant.batch import Rollouts
+from mjfim.plant.difference_steps import DifferenceSteps
+from mjfim.records.trajectory import Sensitivity, Trajectory
+
+# Relative step of the differences between whole rollouts.
+SENSITIVITY_STEP = 1e-5
+
+# Relative effect of a parameter on the trajectory below which its steps are lengthened.
+MIN_PARAMETER_EFFECT = 1e-2
+
+# Largest factor by which the difference step of a parameter is lengthened.
+MAX_STEP_FACTOR = 100.0
+
+# Largest number of state values that are in memory at once.
+MAX_NUMBERS_AT_ONCE = 8_000_000
+
+# Smallest divisor; it prevents a division by zero.
+TINY = 1e-300
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Response:
+    """Outputs of S curves over an interval of samples, and their derivatives.
+
+    Delays of the outputs are left out.
+
+    Attributes:
+        first: Sample of the curves at which the arrays begin.
+        y: (S, n+1, ny) outputs [y-unit].
+        common: (S, n+1, ny, p) derivative by theta [y-unit / theta-unit], or None if not requested.
+        private: (S, n+1, ny, k) derivative by directions of the initial state [y-unit / x-unit], or
+            None if not requested.
+    """
+
+    first: int
+    y: Array
+    common: Array | None
+    private: Array | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _ResponseMoves:
+    """Moves whose rollouts give the derivatives of a response along q directions.
+
+    Attributes:
+        theta: (J, p) moves of theta [theta-unit]: a zero move, q forward moves, and q backward
+            moves for two-sided differences.
+        initial_state: (J, nx) moves of the initial state, in the order of `theta` [x-unit].
+        moving: Indices of the parameters among the q directions, which come first.
+        widths: (q,) distance between the two moves of a quotient.
+        central: True for two-sided differences.
+    """
+
+    theta: Array
+    initial_state: Array
+    moving: np.ndarray
+    widths: Array
+    central: bool
+
+
+class RolloutDerivatives(DifferenceSteps):
+    """Derivatives of whole rollouts by the parameters and by the initial state."""
+
+    def predict(
+        self, theta: Array, ctrl: Array, step: float = SENSITIVITY_STEP
+    ) -> tuple[Array, Array] | None:
+        """Outputs of an open-loop simulation and their sensitivity, by two-sided differences.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            ctrl: (N, nu) controls.
+            step: Difference step relative to `parameter_scale`.
+
+        Returns:
+            y: (N+1, ny) outputs [y-unit] and G: (N+1, ny, p) [y-unit / theta-unit], or None if a
+            simulation diverges.
+        """
+        found = self._rollout_differences(theta, self.plant.initial_state(theta), ctrl, step)
+        return None if found is None else (found[0], found[1].G)
+
+    def sensitivity(
+        self,
+        theta: Array,
+        trajectory: Trajectory,
+        step: float | Array = SENSITIVITY_STEP,
+        central: bool = True,
+    ) -> Sensitivity | None:
+        """Sensitivities psi and G of a trajectory at fixed control, by differences of rollouts.
+
+        Args:
+            theta: (p,) parameters of the trajectory [theta-unit].
+            trajectory: Open-loop or closed-loop trajectory; its control is kept.
+            step: Difference step relative to `parameter_scale`, one number or (p,).
+            central: True for two-sided differences. False is honoured only if no sensor is an
+                output.
+
+        Returns:
+            The sensitivities, or None if a perturbed rollout diverges.
+        """
+        found = self._rollout_differences(
+            theta,
+            trajectory.state[0],
+            trajectory.ctrl,
+            step,
+            states=trajectory.state,
+            central=central or self.plant.outputs.needs_sensors,
+        )
+        return None if found is None else found[1]
+
+    def calibrated_step_factors(self, theta: Array, trajectory: Trajectory) -> Array | None:
+        """Factors of the parameters' difference steps with which their effect exceeds round-off.
+
+        Args:
+            theta: (p,) parameters of the trajectory [theta-unit].
+            trajectory: Trajectory on which the effect of every parameter is measured.
+
+        Returns:
+            (p,) factors of at least 1, or None if a perturbed rollout diverges.
+        """
+        found = self.sensitivity(theta, trajectory)
+        if found is None:
+            return None
+
+        state_sizes = self.difference_sizes(trajectory)[: self.plant.space.nx]
+        sizes = np.concatenate([state_sizes, np.ones(len(self.plant.outputs))])
+        moves = np.concatenate([found.psi, found.G], axis=1) * self.plant.parameters.magnitude
+        effect = (np.abs(moves).max(axis=0) / sizes[:, None]).max(axis=0)
+        factors = MIN_PARAMETER_EFFECT / np.maximum(effect, TINY)
+        return np.asarray(np.clip(factors, 1.0, MAX_STEP_FACTOR))
+
+    def _rollout_differences(
+        self,
+        theta: Array,
+        initial_state: Array,
+        ctrl: Array,
+        step: float | Array,
+        *,
+        states: Array | None = None,
+        central: bool = True,
+    ) -> tuple[Array, Sensitivity] | None:
+        """Outputs and sensitivities from rollouts at theta +- h.
+
+        There is one pair of rollouts for every parameter that changes the motion. Without `states`,
+        and where sensors are delayed, one more rollout gives the states and sensors at theta.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            initial_state: (ns,) initial state at theta.
+            ctrl: (N, nu) controls.
+            step: Difference step relative to `parameter_scale`, one number or (p,).
+            states: (N+1, ns) states at theta, or None where they are not known.
+            central: True for two-sided differences.
+
+        Returns:
+            y: (N+1, ny) outputs [y-unit] and the sensitivities, or None if a rollout diverges. The
+            outputs of sensors are NaN where the rollout at theta was not simulated.
+        """
+        plant = self.plant
+        delay = plant.output_delay(theta, len(ctrl) + 1)
+        needs_origin = states is None or (delay is not None and plant.outputs.needs_sensors)
+
+        moving = np.flatnonzero(plant.parameters.changes_motion)
+        h = (step * self.parameter_scale)[moving]
+        moves = _theta_moves(len(theta), moving, h, central, needs_origin)
+
+        sensors = None
+        origin = np.zeros((len(ctrl) + 1, 0)) if states is None else states
+        psi = np.zeros((len(origin), plant.space.nx, len(theta)))
+        G = np.zeros((len(origin), len(plant.outputs), len(theta)))
+        if len(moves):
+            out = self._moved_rollouts(theta, initial_state, ctrl, moves)
+            if out is None:
+                return None
+            if needs_origin:
+                origin = out.states[-1]
+                sensors = None if out.sensors is None else out.sensors[-1]
+            dx, dy = self._rollout_quotients(out, origin, h, central)
+            psi[..., moving] = np.moveaxis(dx, 0, 2)
+            G[..., moving] = np.moveaxis(dy, 0, 2)
+
+        # Biases and the delay act on the outputs of the simulation.
+        G += plant.bias_derivative
+        y = plant.outputs(origin, sensors) + plant.bias_derivative @ theta
+        if delay is not None:
+            by_delay = delay.derivative(y)[..., None] * plant.parameters.delay_derivative
+            G = delay.apply(G) + by_delay
+            y = delay.apply(y)
+        return y, Sensitivity(psi=psi, G=G)
+
+    def _rollout_quotients(
+        self, out: Rollouts, origin: Array, h: Array, central: bool
+    ) -> tuple[Array, Array]:
+        """Difference quotients of states and outputs.
+
+        Args:
+            out: Rollouts at the moves of `_theta_moves`.
+            origin: (N+1, ns) states at theta.
+            h: (n,) difference steps of the n parameters that are moved [theta-unit].
+            central: True for two-sided differences.
+
+        Returns:
+            (n, N+1, nx) quotients of the states [x-unit / theta-unit], and (n, N+1, ny) of the
+            outputs [y-unit / theta-unit].
+        """
+        plant, count = self.plant, len(h)
+        width = (2.0 if central else 1.0) * h[:, None, None]
+
+        other = out.states[count : 2 * count] if central else origin
+        dx = plant.space.minus(out.states[:count], other) / width
+
+        # Differences are two-sided wherever sensors are simulated.
+        ds = None
+        if out.sensors is not None:
+            ds = (out.sensors[:count] - out.sensors[count : 2 * count]) / width
+        return dx, plant.outputs.tangent(origin, dx, ds)
+
+    def _moved_rollouts(
+        self, theta: Array, initial_state: Array, ctrl: Array, moves: Array
+    ) -> Rollouts | None:
+        """Rollouts at theta plus each row of moves: (m, p), all under one control.
+
+        The parameters move the initial state as well.
+
+        Returns:
+            The rollouts, or None if one of them diverges or its model cannot be compiled.
+        """
+        plant = self.plant
+        state_moves = moves @ plant.initial_state_derivative.T
+        initial_states = plant.space.plus(initial_state, state_moves)
+
+        held = np.broadcast_to(ctrl, (len(moves), *ctrl.shape))
+        models, compiled = plant.try_models(theta + moves)
+        out = plant.simulator.rollout(models, initial_states, held)
+        return out if (out.finite & compiled).all() else None
+
+    def responses(
+        self,
+        theta: Array,
+        initial_states: Array,
+        ctrl: Array,
+        *,
+        start_directions: Array | None = None,
+        central: bool = True,
+        step: float = SENSITIVITY_STEP,
+        wanted: np.ndarray | None = None,
+        max_numbers: int = MAX_NUMBERS_AT_ONCE,
+    ) -> Iterator[Response | None]:
+        """Simulate S curves, with derivatives by theta and by the initial state.
+
+        The samples are divided into intervals, which are simulated one after the other, so that the
+        memory is bounded.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            initial_states: (S, ns) initial states.
+            ctrl: (S, N, nu) controls.
+            start_directions: (nx, k) directions of the initial state by which to differentiate;
+                None for no derivatives, neither by the initial state nor by theta.
+            central: True for two-sided differences.
+            step: Difference step relative to `parameter_scale`.
+            wanted: (p,) True for parameters by which to differentiate; None for all. Biases are
+                always included, because they need no simulation.
+            max_numbers: Largest number of state values of one interval.
+
+        Yields:
+            The response over each interval; None, and nothing after it, if a simulation diverges.
+        """
+        plant = self.plant
+        moves = self._response_moves(theta, start_directions, central, step, wanted)
+        models, compiled = plant.try_models(theta + moves.theta)
+
+        # States at the beginning of the interval: those of each of the J moves for all S curves.
+        current = plant.space.plus(initial_states, moves.initial_state[:, None])
+        J, S, state_size = current.shape
+        if J > 1:
+            models = [model for model in models for _ in range(S)]
+
+        numbers_per_sample = J * S * plant.simulator.substeps * (1 + state_size)
+        interval = int(np.clip(max_numbers / numbers_per_sample, 1, ctrl.shape[1]))
+        for first in range(0, ctrl.shape[1], interval):
+            held = ctrl[:, first : first + interval]
+            every = np.broadcast_to(held, (J, *held.shape)).reshape(J * S, *held.shape[1:])
+            out = plant.simulator.rollout(models, current.reshape(J * S, -1), every)
+            if not (out.finite.all() and compiled.all()):
+                yield None
+                return
+
+            samples = held.shape[1] + 1
+            states = out.states.reshape(J, S, samples, -1)
+            sensors = None if out.sensors is None else out.sensors.reshape(J, S, samples, -1)
+            yield self._response(theta, first, states, sensors, moves, start_directions is not None)
+            current = states[:, :, -1]
+
+    def _response_moves(
+        self,
+        theta: Array,
+        start_directions: Array | None,
+        central: bool,
+        step: float,
+        wanted: np.ndarray | None,
+    ) -> _ResponseMoves:
+        """Moves along parameters, then along k directions of the initial state.
+
+        Parameters are moved if they are wanted and change the motion. The arguments are those of
+        `responses`.
+        """
+        plant, p = self.plant, len(theta)
+        if start_directions is None:
+            start_directions = np.zeros((plant.space.nx, 0))
+            moving = np.zeros(0, dtype=np.intp)
+        else:
+            chosen = plant.parameters.changes_motion
+            moving = np.flatnonzero(chosen if wanted is None else chosen & wanted)
+
+        h = (step * self.parameter_scale)[moving]
+        k = start_directions.shape[1]
+        theta_moves = np.zeros((len(moving) + k, p))
+        theta_moves[np.arange(len(moving)), moving] = h
+
+        # A parameter that is a deviation of the initial state moves theta and the initial state.
+        state_moves = theta_moves @ plant.initial_state_derivative.T
+        state_moves[len(moving) :] = step * start_directions.T
+
+        return _ResponseMoves(
+            theta=_with_origin(theta_moves, central),
+            initial_state=_with_origin(state_moves, central),
+            moving=moving,
+            widths=np.concatenate([h, np.full(k, step)]) * (2.0 if central else 1.0),
+            central=central,
+        )
+
+    def _response(
+        self,
+        theta: Array,
+        first: int,
+        states: Array,
+        sensors: Array | None,
+        moves: _ResponseMoves,
+        differentiate: bool,
+    ) -> Response:
+        """Response over one interval.
+
+        Args:
+            theta: (p,) parameters [theta-unit].
+            first: Sample at which the interval begins.
+            states: (J, S, n+1, ns) states of all moves.
+            sensors: (J, S, n+1, nsensordata) sensor data of all moves, or None.
+            moves: The J moves.
+            differentiate: Whether derivatives are requested.
+        """
+        outputs, bias = self.plant.outputs, self.plant.bias_derivative
+        y = outputs(states[0], None if sensors is None else sensors[0]) + bias @ theta
+        if not differentiate:
+            return Response(first=first, y=y, common=None, private=None)
+
+        q = len(moves.widths)
+        width = moves.widths.reshape(-1, 1, 1, 1)
+        other = states[q + 1 :] if moves.central else states[0]
+        dx = self.plant.space.minus(states[1 : q + 1], other) / width
+        ds = None
+        if sensors is not None:
+            other_sensors = sensors[q + 1 :] if moves.central else sensors[0]
+            ds = (sensors[1 : q + 1] - other_sensors) / width
+        G = np.moveaxis(outputs.tangent(states[0], dx, ds), 0, 3)
+
+        # Directions along parameters come first, then those of the initial state.
+        count = len(moves.moving)
+        common = np.zeros((*y.shape, len(theta)))
+        common[..., moves.moving] = G[..., :count]
+        return Response(first=first, y=y, common=common + bias, private=G[..., count:])
+
+
+def _theta_moves(p: int, moving: np.ndarray, h: Array, central: bool, needs_origin: bool) -> Array:
+    """(m, p) moves of theta, one for each rollout.
+
+    There are n forward moves, n backward moves for two-sided differences, and a zero move if the
+    rollout at theta is needed.
+
+    Args:
+        p: Number of parameters.
+        moving: (n,) indices of the parameters that are moved.
+        h: (n,) difference steps of these parameters [theta-unit].
+        central: True for two-sided differences.
+        needs_origin: Whether the rollout at theta is needed.
+    """
+    count = len(moving)
+    forward = np.zeros((count, p))
+    forward[np.arange(count), moving] = h
+
+    backward = -forward if central else forward[:0]
+    origin = np.zeros((int(needs_origin), p))
+    return np.concatenate([forward, backward, origin])
+
+
+def _with_origin(moves: Array, central: bool) -> Array:
+    """(J, k) moves of rollouts from the forward moves: (q, k).
+
+    There is a zero move, then the forward moves, then the backward moves for two-sided differences.
+    """
+    origin = np.zeros((1, moves.shape[1]))
+    backward = -moves if central else moves[:0]
+    return np.concatenate([origin, moves, backward])
