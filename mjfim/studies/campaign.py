@@ -1,8 +1,8 @@
-"""`mjfim.run_campaign`: design, record, identify, and design again with the estimate, until every target is reached.
+"""`mjfim.run_campaign`: design, record and identify in rounds, until every target is reached.
 
-A redesign is made at the estimate of all recordings so far, whose information it counts as known
-(see `redesign`). Every estimate uses all recordings and starts from the last one. Priors remain
-centred at the stated guess.
+A redesign is made at the estimate of all recordings so far, whose information it uses as prior
+information (see `redesign`). Every estimate uses all recordings; its fit starts at the last
+estimate. Priors remain centred at the stated guess.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from mjfim.records.events import Callback, StudyEvent
 from mjfim.records.recording import Recording
 from mjfim.studies.redesign import CampaignHistory, redesign, restate_experiment
 
-# A round makes no progress where the worst ratio of sigma to target stays above this share of the
-# last round's ratio.
+# A round makes no progress where the largest ratio of sigma to target stays above this share of the
+# ratio in the last round.
 NO_PROGRESS_RATIO = 0.99
 
-# Change of an estimate from one round to the next, in standard deviations, above which something is
-# wrong.
+# Change of an estimate from one round to the next above which a warning is given [standard
+# deviations].
 SUSPICIOUS_CHANGE = 4.0
 
 # Records the experiment that was designed for a round: (design, number of the round from 1).
@@ -60,21 +60,23 @@ def run_campaign(
     executor: Executor | None = None,
     stop: StopToken | None = None,
 ) -> Campaign:
-    """Design, record and identify in turn until every target standard deviation is reached, or all rounds are used up.
+    """Design, record and identify in rounds until every target standard deviation is reached.
+
+    The campaign also ends after a given number of rounds.
 
     Args:
         experiment: Experiment whose parameters state the `wanted` standard deviations.
-        measure: Plays a design and returns what was recorded: `measure(design, number)`, the first
-            round being 1. It returns None where nothing is recorded yet; the campaign then ends
-            with that design pending. For a simulated robot: `lambda design, number:
-                mjfim.simulate(robot, design.trajectory, seed=number)`.
-        rounds: Rounds, at most.
+        measure: Plays a design and returns its recording or recordings: `measure(design, number)`,
+            where the number of the first round is 1. It returns None where nothing is recorded yet;
+            the campaign then ends with that design pending. For a simulated robot: `lambda design,
+            number: mjfim.simulate(robot, design.trajectory, seed=number)`.
+        rounds: Largest number of rounds.
         callback: Called with the events of every design and estimation, and with a `StudyEvent`
             after every round, whose `result` is the `Round`.
         threads: Threads of MuJoCo; None for all cores.
         done: Rounds that are recorded already; their designs are not made again.
-        executor: Executor of `concurrent.futures` that runs several starts under hard limits at
-            once.
+        executor: Executor of `concurrent.futures`; under hard limits it runs several optimisations
+            at once.
         stop: Ends the campaign early, as Ctrl-C does, after the last complete round.
 
     Raises:
@@ -83,12 +85,12 @@ def run_campaign(
         MjfimError: As `mjfim.design` and `mjfim.identify` raise it.
     """
     if rounds < 1:
-        raise ExperimentError(f"run_campaign: {rounds} rounds; at least 1")
+        raise ExperimentError(f"run_campaign: {rounds} rounds; needs at least 1")
     if experiment.earlier:
         raise ExperimentError(
-            f"{experiment.source}: earlier: a campaign's estimate comes from recordings alone; "
-            "give the recordings of earlier experiments (`done` in Python) instead of their "
-            "information"
+            f"{experiment.source}: earlier: the estimate of a campaign comes from recordings "
+            "alone; give the recordings of earlier experiments (`done` in Python) instead of "
+            "their information"
         )
 
     task = DesignTask.resolve(experiment, threads=threads)
@@ -104,7 +106,7 @@ class _CampaignRun:
     Attributes:
         base: Task of the experiment as stated, with which all estimates are made.
         wanted: (p,) target standard deviations [theta-unit], infinite where there is none.
-        count: Rounds, at most.
+        count: Largest number of rounds.
         rounds: Complete rounds.
         pending: Design that is not recorded yet.
     """
@@ -127,7 +129,15 @@ class _CampaignRun:
         self._stop = stop
 
     def run(self, measure: Measure, done: Sequence[EarlierRound]) -> CampaignStatus:
-        """Make all rounds; return how the campaign ended."""
+        """Make all rounds.
+
+        Args:
+            measure: Plays a design and returns its recordings.
+            done: Rounds that are recorded already.
+
+        Returns:
+            The reason for which the campaign ended.
+        """
         for earlier in done:
             if not self._add_round(earlier):
                 return CampaignStatus.INTERRUPTED
@@ -144,7 +154,11 @@ class _CampaignRun:
         return CampaignStatus.DOUBTFUL if is_doubtful else CampaignStatus.REACHED
 
     def _make_round(self, measure: Measure) -> CampaignStatus | None:
-        """Design, record and identify once; return how the campaign ends where it ends before the round is complete."""
+        """Design, record and identify once.
+
+        Returns:
+            None after a complete round, else the reason for which the campaign ends.
+        """
         design, remarks = self._design()
         self.pending = design
         if design.status is Status.INTERRUPTED:
@@ -174,7 +188,11 @@ class _CampaignRun:
         return None
 
     def _design(self) -> tuple[Design, tuple[str, ...]]:
-        """Design at the estimate, or at the parameters of the last design where that fails; with remarks about it."""
+        """Design at the estimate, or at the parameters of the last design where that fails.
+
+        Returns:
+            The design, and remarks for the user.
+        """
         if not self.rounds:
             task = self.base.restated(restate_experiment(self.base))
             budget = design_budget(task, self._stop)
@@ -195,13 +213,13 @@ class _CampaignRun:
             return self._redesign(history, last.estimate.theta), ()
         except MjfimError as error:
             remark = (
-                "no design at the estimate, so it is made at the parameters of the last one: "
-                f"{error}"
+                "no design could be made at the estimate; it is made at the parameters of the last "
+                f"design instead: {error}"
             )
             return self._redesign(history, last.theta), (remark,)
 
     def _redesign(self, history: CampaignHistory, theta: Array) -> Design:
-        """Redesign at parameters: (p,)."""
+        """Design again at theta: (p,)."""
         return redesign(
             self.base,
             history,
@@ -214,7 +232,16 @@ class _CampaignRun:
     def _add_round(
         self, recorded: EarlierRound, design: Design | None = None, remarks: Sequence[str] = ()
     ) -> bool:
-        """Identify from all recordings and keep the round; return False where the identification was interrupted."""
+        """Identify from all recordings and keep the round.
+
+        Args:
+            recorded: Recordings of the round, and what is known about their design.
+            design: The design, where it was made in this campaign.
+            remarks: Remarks about the design.
+
+        Returns:
+            False where the identification was interrupted.
+        """
         p = self.base.parameters
         theta = p.guess if recorded.theta is None else recorded.theta
         start = self.rounds[-1].estimate.theta if self.rounds else theta
@@ -238,7 +265,7 @@ class _CampaignRun:
 
         unknown = np.full(len(p), np.nan)
         control = recorded.control
-        now = Round(
+        current = Round(
             number=len(self.rounds) + 1,
             theta=theta,
             predicted=unknown if recorded.predicted is None else recorded.predicted,
@@ -248,30 +275,35 @@ class _CampaignRun:
             design=design,
             warnings=tuple(warnings),
         )
-        self.rounds.append(now)
-        self._report(now)
+        self.rounds.append(current)
+        self._report(current)
         return True
 
-    def _report(self, now: Round) -> None:
+    def _report(self, current: Round) -> None:
         """Report a complete round."""
         if self._callback is None:
             return
 
-        ratio, j = largest_ratio_to_target(now.attained, self.wanted)
+        ratio, j = largest_ratio_to_target(current.attained, self.wanted)
+        name = self.base.parameters.names[j]
         event = StudyEvent(
             study="campaign",
-            part=f"round {now.number}",
-            index=now.number - 1,
+            part=f"round {current.number}",
+            index=current.number - 1,
             count=self.count,
             share=1.0,
-            message=f"largest ratio of sigma to target: {ratio:.3g} ({self.base.parameters.names[j]})",
-            result=now,
+            message=f"largest ratio of sigma to target: {ratio:.3g} ({name})",
+            result=current,
         )
         self._callback(event)
 
-    def _suspicions(self, now: Estimate) -> Iterator[str]:
-        """Sentences about an estimate that speak against the model, or against further rounds."""
-        yield from _doubts(now, self.wanted)
+    def _suspicions(self, current: Estimate) -> Iterator[str]:
+        """Reasons to doubt the model, or to expect nothing of further rounds.
+
+        Args:
+            current: Estimate of the round that has just been made.
+        """
+        yield from _doubts(current, self.wanted)
         if not self.rounds:
             return
 
@@ -279,17 +311,17 @@ class _CampaignRun:
         before = self.rounds[-1].estimate
         known = np.isfinite(before.std) & (before.std > 0.0)
         change = np.zeros(len(names))
-        change[known] = np.abs(now.theta - before.theta)[known] / before.std[known]
+        change[known] = np.abs(current.theta - before.theta)[known] / before.std[known]
         for j in np.flatnonzero(change > SUSPICIOUS_CHANGE).tolist():
             yield (
-                f"{names[j]} moved from {before.theta[j]:.4g} to {now.theta[j]:.4g}, by "
+                f"{names[j]} moved from {before.theta[j]:.4g} to {current.theta[j]:.4g}, by "
                 f"{change[j]:.1f} σ of the last round's estimate: the formal σ is not the "
                 "accuracy; the model or the noise is wrong, or the last fit ended in a false "
                 "minimum"
             )
 
         ratio_before, _ = largest_ratio_to_target(before.std, self.wanted)
-        ratio, j = largest_ratio_to_target(now.std, self.wanted)
+        ratio, j = largest_ratio_to_target(current.std, self.wanted)
         if ratio > NO_PROGRESS_RATIO * ratio_before:
             yield (
                 f"no progress: the largest ratio of σ to its target went from {ratio_before:.3g} "
@@ -297,7 +329,7 @@ class _CampaignRun:
             )
 
     def _targets_reached(self) -> bool:
-        """True where every target is reached formally."""
+        """Whether the formal standard deviations reach every target."""
         if not self.rounds:
             return False
 
@@ -325,7 +357,9 @@ def identify_all(
     callback: Callback | None = None,
     stop: StopToken | None = None,
 ) -> Estimate | None:
-    """Estimate from all recordings; where that is a misfit or fails, also from the stated guess.
+    """Estimate the parameters from all recordings.
+
+    Where the fit fails or its result is a misfit, a second fit starts at the stated guess.
 
     Args:
         base: Task of the experiment as stated.
@@ -335,11 +369,11 @@ def identify_all(
         stop: Ends the fit early.
 
     Returns:
-        The better of the two estimates; None where a fit was interrupted, because a round is
-        complete or not kept.
+        The better of the estimates; None where a fit was interrupted, because an incomplete round
+        is not kept.
 
     Raises:
-        SimulationDivergedError: The model diverges at both starts.
+        SimulationDivergedError: The model diverges at `start` and at the guess.
     """
     found: list[Estimate] = []
     first_error: SimulationDivergedError | None = None
@@ -360,12 +394,19 @@ def identify_all(
         found.append(estimate)
 
     if not found:
-        raise first_error or SimulationDivergedError("no start of the fit can be simulated")
+        raise first_error or SimulationDivergedError(
+            "the simulation diverges wherever the fit starts"
+        )
     return min(found, key=lambda estimate: estimate.chi2)
 
 
 def _doubts(estimate: Estimate, wanted: Array) -> Iterator[str]:
-    """Reasons besides a misfit not to trust the formal standard deviations; wanted: (p,) targets, infinite without one."""
+    """Reasons, except a misfit, not to trust the formal standard deviations.
+
+    Args:
+        estimate: The estimate.
+        wanted: (p,) target standard deviations [theta-unit], infinite where there is none.
+    """
     at_bound = [
         name
         for name, target in zip(estimate.parameters, wanted, strict=True)

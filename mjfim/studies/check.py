@@ -1,4 +1,7 @@
-"""`mjfim.check`: which parameters an experiment or existing recordings can identify, and how well, before any fit."""
+"""`mjfim.check`: the parameters that an experiment or recordings can identify, and how accurately.
+
+It needs no fit.
+"""
 
 from __future__ import annotations
 
@@ -32,19 +35,19 @@ from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from mjfim.studies.derivative_test import self_test
 
-# Standard deviation aimed at where none is stated, relative to the size of the parameter.
+# Target standard deviation where none is stated, relative to the size of the parameter.
 DEFAULT_RELATIVE_STD = 0.05
 
-# Repetitions beyond which a target accuracy counts as out of reach.
+# Number of repetitions above which a target accuracy counts as unreachable.
 MAX_REPETITIONS = 1_000_000_000
 
-# Characters beyond which a list of parameter groups is replaced by their number.
+# Number of characters above which a list of parameter groups is replaced by their number.
 MAX_LIST_LENGTH = 400
 
-# Confounded pairs that a sentence of the verdict lists.
+# Largest number of confounded pairs that a sentence of the verdict lists.
 MAX_LISTED_PAIRS = 5
 
-# Samples of a recording along which the derivatives are tested.
+# Largest number of samples of a recording along which the derivatives are tested.
 MAX_TESTED_SAMPLES = 2000
 
 
@@ -57,11 +60,11 @@ def check(
 ) -> Check:
     """Check which parameters can be identified, at the parameter values that a design uses.
 
-    Without recordings and trajectory, the check is made along the experiment's initial control.
+    Without recordings and without a trajectory, the initial control of the experiment is checked.
 
     Args:
         experiment: Experiment to check.
-        recordings: Recordings to check instead.
+        recordings: Recordings that are checked instead of the initial control.
         trajectory: Trajectory, of a design for example, whose control is checked instead.
         threads: Threads of MuJoCo; None for all cores.
 
@@ -80,7 +83,10 @@ def check(
 
 
 def check_task(task: DesignTask, trajectory: Trajectory | None = None) -> Check:
-    """Check along the initial control of a task, or along the control of a trajectory. See `check`."""
+    """Check the initial control of a task, or the control of a trajectory.
+
+    See `check`.
+    """
     curve, source = task.initial, "the initial control"
     if trajectory is not None:
         curve, source = task.plant.simulate(task.theta, trajectory.ctrl), "the given trajectory"
@@ -113,8 +119,7 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
     if point.information is None or point.sensitivity is None:
         raise SimulationDivergedError("the simulation diverges when the parameters change a little")
 
-    # Rows of G at the times at which the recordings were measured, and the error of their
-    # differences.
+    # Rows of G at the times of the measurements, and the error of their finite differences.
     recorded = fit.sensitivity_rows(fit.begin(task.theta))
     J, error = (np.concatenate(part) for part in zip(*recorded, strict=True))
     identifiability = task.identifiability_test.of_rows(task.initial, J, error)
@@ -131,9 +136,13 @@ def check_recordings(system: System, recordings: Sequence[Recording]) -> Check:
 
 
 def _evaluate(task: DesignTask, curve: Trajectory) -> tuple[DesignProblem, DesignPoint]:
-    """The cost of a task whose tracking term refers to the given trajectory, and the cost's value there."""
-    problem = task.problem
-    problem = replace(problem, running=replace(problem.running, desired_state=curve.state))
+    """The cost of a task, evaluated along a trajectory.
+
+    The tracking term of the cost refers to that trajectory.
+    """
+    stated = task.problem
+    running = replace(stated.running, desired_state=curve.state)
+    problem = replace(stated, running=running)
     return problem, problem.point(curve, CENTRAL_DIFFERENCES)
 
 
@@ -147,10 +156,15 @@ def _test_derivatives(
 
 
 def _common_information(task: DesignTask, matrices: Sequence[Array]) -> Array:
-    """(p, p) sum of information matrices about common parameters; parameters of single recordings are marginalised."""
+    """(p, p) sum of information matrices about the parameters that all recordings share.
+
+    Parameters with a separate value for each recording are marginalised out.
+    """
     p = task.parameters
-    parts = (shared(each, p.prior_information, p.recording_specific) for each in matrices)
-    return np.asarray(sum(parts, start=np.zeros_like(task.prior)))
+    total = np.zeros_like(task.prior)
+    for each in matrices:
+        total = total + shared(each, p.prior_information, p.recording_specific)
+    return np.asarray(total)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -179,15 +193,15 @@ class _Assessment:
         information = self._information()
         total = self.data + task.prior
 
-        # Standard deviations of the wanted parameters; infinite where one cannot be identified
-        # alone.
+        # Standard deviations of the wanted parameters. They are infinite where a parameter cannot
+        # be identified individually.
         covariance = information.covariance(total)
         spread = np.sqrt(np.diag(covariance))
         std = np.full(len(task.parameters), np.inf)
         std[task.parameters.interest] = np.nan_to_num(spread, nan=np.inf)
         correlation = covariance / np.outer(spread, spread)
 
-        # The criterion's eigenvalues, without combinations that no experiment can show.
+        # Eigenvalues of the criterion, without combinations that no experiment can identify.
         criterion = replace(task.information, basis=found.basis)
         eigenvalues = criterion.evaluate(self.data + criterion.prior).eigenvalues
 
@@ -224,13 +238,13 @@ class _Assessment:
         )
 
     def _information(self) -> FisherInformation:
-        """Turns information matrices into covariances of the combinations that the checked data show."""
+        """Criterion and covariances of the combinations that the checked data can identify."""
         here = self.identifiability.along_trajectory
         basis = here.basis if here.count else None
         return replace(self.task.information, prior=self.task.prior, basis=basis)
 
     def _not_excited(self) -> tuple[ParameterGroup, ...]:
-        """Groups that the checked data do not show, though another control would."""
+        """Groups that the checked data do not separate, although another control would."""
         found = self.identifiability
         if found.along_trajectory.count <= found.along_all.count:
             return ()
@@ -245,7 +259,7 @@ class _Assessment:
         for j, parameter in enumerate(p.parameters):
             value = float(self.task.theta[j])
 
-            # Parameters of vectors and tensors are compared with the whole vector or tensor.
+            # An entry of a vector or tensor is compared with the magnitude of the whole.
             is_scalar = parameter.size == abs(parameter.guess) and value != 0.0
             size = abs(value) if is_scalar else float(p.magnitude[j])
             wanted = parameter.wanted or DEFAULT_RELATIVE_STD * size
@@ -272,14 +286,23 @@ class _Assessment:
         return tuple(rows)
 
     def _repetitions(self, information: FisherInformation, parameter: int, wanted: float) -> int:
-        """Smallest number of repetitions that reaches the wanted standard deviation [theta-unit]; 0 where none does."""
+        """Smallest number of repetitions that reaches the wanted standard deviation.
+
+        Args:
+            information: Gives the covariance of an information matrix.
+            parameter: Index of the parameter.
+            wanted: Wanted standard deviation [theta-unit].
+
+        Returns:
+            The number; 0 where no number of repetitions suffices.
+        """
         interest = information.interest
         if interest is None:
             interest = np.arange(len(self.data))
         place = int(np.flatnonzero(interest == parameter)[0])
 
         def suffices(repetitions: int) -> bool:
-            """True where that many repetitions reach the wanted standard deviation."""
+            """Whether this number of repetitions reaches the wanted standard deviation."""
             total = repetitions * self.data + self.task.prior
             variance = information.covariance(total)[place, place]
             return bool(variance <= wanted**2)
@@ -301,7 +324,12 @@ class _Assessment:
 
 
 def _confounded_pairs(names: Sequence[str], correlation: Array) -> tuple[ConfoundedPair, ...]:
-    """Confounded pairs of parameters, the strongest correlation first; correlation: (t, t)."""
+    """Confounded pairs of parameters, in descending order of their correlation.
+
+    Args:
+        names: Names of the t parameters.
+        correlation: (t, t) correlation of their estimates.
+    """
     strong = np.triu(np.abs(correlation) > CONFOUNDED_CORRELATION, k=1)
     pairs = []
     for i, j in np.argwhere(strong).tolist():
@@ -316,7 +344,7 @@ def _confounded_pairs(names: Sequence[str], correlation: Array) -> tuple[Confoun
 
 
 def _groups_in_words(groups: Sequence[ParameterGroup]) -> str:
-    """List parameter groups, or only count them where the list would fill a page."""
+    """List of parameter groups, or only their number where the list would be too long."""
     words = "; ".join(str(group) for group in groups)
     if len(words) <= MAX_LIST_LENGTH:
         return words
@@ -332,7 +360,7 @@ class _Verdict:
     Attributes:
         rows: Accuracy of every parameter.
         not_separable: Groups whose members no control can separate.
-        not_excited: Groups that the checked data do not show, though another control would.
+        not_excited: Groups that the checked data do not separate, although another control would.
         confounded: Strongly correlated pairs.
         tested: Test of the derivatives.
         source: Name of the checked data.
@@ -346,7 +374,7 @@ class _Verdict:
     source: str
 
     def sentences(self) -> Iterator[str]:
-        """Sentences that a person can act on, the gravest first."""
+        """Sentences for the user, the most serious first."""
         yield from self._about_derivatives()
         yield from self._about_identifiability()
 
@@ -359,7 +387,7 @@ class _Verdict:
         yield from self._about_correlation()
 
     def _about_derivatives(self) -> Iterator[str]:
-        """Say why the numbers of the check cannot be trusted, where the self-test failed."""
+        """Reason why the numbers of the check cannot be trusted, where the self-test failed."""
         tested = self.tested
         if tested.roughness is not None:
             yield f"{tested.roughness}"
@@ -383,7 +411,7 @@ class _Verdict:
         return unknown, resolved
 
     def _about_identifiability(self) -> Iterator[str]:
-        """Name combinations that cannot be identified, and say what helps."""
+        """Combinations that cannot be identified, and advice for the user."""
         unknown, resolved = self._groups_left_to_priors()
         if unknown:
             yield (
@@ -401,7 +429,7 @@ class _Verdict:
             )
 
     def _about_accuracy(self, identifiable: Sequence[ParameterCheck]) -> Iterator[str]:
-        """Compare the predicted standard deviations of identifiable parameters with the wanted ones."""
+        """Comparison of the predicted standard deviations with the wanted ones."""
         missed = [row for row in identifiable if row.repetitions != 1]
         unknown, _ = self._groups_left_to_priors()
 
@@ -422,7 +450,7 @@ class _Verdict:
             )
 
     def _about_correlation(self) -> Iterator[str]:
-        """List confounded pairs."""
+        """Confounded pairs of parameters."""
         if not self.confounded:
             return
 

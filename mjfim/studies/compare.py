@@ -1,4 +1,4 @@
-"""`mjfim.compare`: a design compared with other methods of equal budget, all evaluated alike."""
+"""`mjfim.compare`: a design compared with baselines of equal budget, all evaluated alike."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ from mjfim.studies.baselines.methods import METHODS, run_baseline
 # Name of the design for the user.
 DESIGN_TITLE = "mjfim's design"
 
-# Share of the time after which a design is stopped; it watches the time itself, but for its last
-# iterate.
+# Share of its time after which a design is stopped. A design checks the time itself, but only after
+# each iterate.
 LATEST_END = 1.05
 
-# Iterations of the design: unlimited for practical purposes, the budget ends it.
+# Largest number of iterations of the design. It is never reached, because the budget ends the
+# design.
 UNLIMITED_ITERATIONS = 100_000
 
-# Reports the progress of one method: share of its budget, lowest J so far.
+# Reports the progress of one method: the used share of its budget and the lowest J so far.
 Progress = Callable[[float, float], None]
 
 
@@ -60,7 +61,7 @@ def compare(
 ) -> Comparison:
     """Run baselines and then the design, each until its time or its MuJoCo steps are used up.
 
-    All methods search for a control under the same limits with the same cost J, and are evaluated
+    All methods search for a control under one set of limits and with one cost J. They are evaluated
     at every engine step of the user's model.
 
     Args:
@@ -69,8 +70,8 @@ def compare(
         steps: MuJoCo steps of each method; None for time alone.
         seed: Seed of the baselines.
         methods: Keys of the baselines (`mjfim.studies.baselines.methods.METHODS`); None for all
-            that make sense.
-        executor: Executor of `concurrent.futures`, among whose workers each method is divided.
+            that are applicable.
+        executor: Executor of `concurrent.futures`; each method is divided among its workers.
         callback: Called with a `StudyEvent` while a method runs, and with every `DesignEvent` of
             the design.
         threads: Threads of MuJoCo; None for all cores.
@@ -134,7 +135,7 @@ def compare_task(
             )
             row = run.design(evaluation) if method == DESIGN else run.baseline(evaluation)
 
-            # An interrupted baseline is left out; an interrupted design is kept with its best
+            # An interrupted baseline is left out. An interrupted design is kept with its best
             # control so far.
             if row is not None:
                 rows.append(row)
@@ -166,10 +167,13 @@ def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str
 
     Args:
         task: Task that is compared.
-        methods: Keys that the user asks for; None for all that make sense.
+        methods: Keys that the user requests; None for all that are applicable.
+
+    Returns:
+        Keys of the baselines, without the design.
 
     Raises:
-        ExperimentError: A key is unknown, or its method does not make sense here.
+        ExperimentError: A key is unknown, or its method is not applicable.
     """
     if methods is None:
         return tuple(
@@ -187,7 +191,11 @@ def chosen_methods(task: DesignTask, methods: Sequence[str] | None) -> tuple[str
 
 
 def _identifiable_combinations(task: DesignTask) -> Array | None:
-    """(t, s) identifiable combinations, or None where all parameters are; raises where nothing can be designed."""
+    """(t, s) identifiable combinations, or None where all parameters are identifiable.
+
+    Raises:
+        MjfimError: No design is possible, as `mjfim.design` raises it.
+    """
     identifiability = designable(task)
     if task.is_limited:
         require_feasible_start(task)
@@ -203,7 +211,7 @@ class _MethodRun:
         index: Number of the method, from 0.
         count: Number of methods.
         callback: Called with the progress, or None.
-        executor: Among whose workers the method is divided, or None.
+        executor: The method is divided among its workers; None for this process.
         stop: Ends the method early.
     """
 
@@ -249,7 +257,11 @@ class _MethodRun:
         return evaluation.result(self.search.method, self.title, result)
 
     def divided_baseline(self, executor: Executor) -> SearchResult | None:
-        """Run a part of a baseline in every worker, with its share of the steps, and return the best result."""
+        """Run a part of a baseline in every worker, each with its share of the steps.
+
+        Returns:
+            The best result; None where no part has a result.
+        """
         count = workers_of(executor)
         parts = [
             replace(self.search, part=(i, count), steps=self.search.steps / count, threads=1)
@@ -270,7 +282,11 @@ class _MethodRun:
         )
 
     def design(self, evaluation: MethodEvaluation) -> MethodResult | None:
-        """Design with the budget of the method and evaluate the result; None where it ended before there was one."""
+        """Design with the budget of the method, and evaluate the result.
+
+        Returns:
+            The result; None where the design ended without one.
+        """
         descent = self.search.experiment.descent
         iterations = max(descent.max_iterations, UNLIMITED_ITERATIONS)
         stated = self.search.experiment.replace(
@@ -346,7 +362,11 @@ class DesignWatch:
         return int(self.budget.steps)
 
     def __call__(self, event: Event) -> None:
-        """Count the steps of an iterate, which begin anew with every task of a design."""
+        """Count the steps of an iterate, and stop the design when the budget is exhausted.
+
+        The number of steps in an event is counted from the beginning of the current task of the
+        design, so it becomes smaller with every new task.
+        """
         if self.callback is not None:
             self.callback(event)
         if not isinstance(event, DesignEvent):
@@ -386,10 +406,10 @@ class MethodEvaluation:
         self.nats = cost.information * count if cost.criterion == "D" else 0.0
 
     def result(self, method: str, title: str, found: SearchResult, note: str = "") -> MethodResult:
-        """Evaluate what a method has found.
+        """Evaluate the control that a method has found.
 
-        The control of a baseline that violates a limit on the user's model is shrunk until it does
-        not; that of a design is evaluated without changes.
+        The control of a baseline that violates a limit on the user's model is shrunk until no limit
+        is violated. The control of a design is evaluated without changes.
 
         Args:
             method: Key of the method.
@@ -438,7 +458,7 @@ class MethodEvaluation:
         if point.criterion is None or point.information is None:
             return None
 
-        # How the method ended, and what the user should know about it.
+        # The outcome of the method, and a note for the user.
         verification = verify(task, point.trajectory)
         saturated = saturated_actuators(task.system.model_at(task.theta), point.trajectory)
         outcome = MethodOutcome.INSIDE if verification.is_feasible else MethodOutcome.OUTSIDE

@@ -24,11 +24,11 @@ from mjfim.plant.active_constraints import first_active_constraint
 from mjfim.records.check import SelfTest
 from mjfim.records.trajectory import Sensitivity, Trajectory
 
-# Steps along the tested curve, in units of the plant's difference steps; the smaller error of the
+# Steps along the tested curve, in units of the plant's difference steps. The smaller error of the
 # two counts.
 SLOPE_STEPS = (1e-3, 1e-4)
 
-# Smallest slope that an error is divided by; avoids a division by zero.
+# Smallest slope by which an error is divided; it prevents a division by zero.
 LEAST_SLOPE = 1e-300
 
 
@@ -57,8 +57,8 @@ def self_test(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> S
         slope=slope_error(task, problem, point),
     )
 
-    # Roughness names its cause itself; any other failure gets the first constraint that acts as its
-    # likely cause.
+    # The result of the roughness test names its cause. The likely cause of any other failure is the
+    # first constraint that acts.
     if tested.passed or tested.roughness is not None:
         return tested
     active = first_active_constraint(model, trajectory)
@@ -97,7 +97,7 @@ def recursion_error(task: DesignTask, trajectory: Trajectory, sensitivity: Sensi
     columns = [recursion.forward(psi[0, :, j], linear.E[..., j]) for j in range(psi.shape[2])]
     expected = np.stack(columns, axis=2)
 
-    # Parameters that move nothing measurable have a psi of round-off, which says nothing about the
+    # The psi of a parameter without measurable effect is round-off, which does not test the
     # recursion.
     size = np.abs(psi).max(axis=(0, 1))
     whitened = task.system.noise.whiten(sensitivity.G)
@@ -110,7 +110,10 @@ def recursion_error(task: DesignTask, trajectory: Trajectory, sensitivity: Sensi
 
 
 def slope_error(task: DesignTask, problem: DesignProblem, point: DesignPoint) -> float:
-    """Compare the slope DJ . zeta along the first descent direction with central differences of J(P(xi + gamma zeta)).
+    """Compare the slope `DJ . zeta` of the cost with differences of the cost.
+
+    zeta is the first descent direction; the central differences are those of `J(P(xi + gamma
+    zeta))`.
 
     Args:
         task: Task whose model is tested.
@@ -139,12 +142,12 @@ def slope_error(task: DesignTask, problem: DesignProblem, point: DesignPoint) ->
 
 
 def _control_metric(task: DesignTask) -> Array:
-    """(nu, nu) metric of the tested direction: the weights of the control, or unit weights where one of them is zero."""
+    """(nu, nu) metric of the tested direction: control weights, or those of the regulator."""
     weights = task.control_weight
     if (weights > 0.0).all():
         return np.diag(weights) * task.dt
 
-    # A cost without control weights gives no metric: the direction would divide by zero.
+    # Without a weight on every control, the direction would divide by zero.
     return regulator_for(task).R
 
 
@@ -156,7 +159,10 @@ def _slope_error_at(
     K: Array,
     step: float,
 ) -> float:
-    """Relative error of the slope along zeta against central differences of one step; infinite where these diverge."""
+    """Relative error of the slope along zeta against a central difference with one step.
+
+    It is infinite where a simulation diverges.
+    """
     forward = problem.value(problem.project(point, zeta, step, K))
     backward = problem.value(problem.project(point, zeta, -step, K))
     if not np.isfinite([forward, backward]).all():

@@ -1,11 +1,14 @@
-"""Monte-Carlo studies of the estimator against the Cramér-Rao bound, with all trials stepped together.
+"""Monte-Carlo studies that compare the estimator with the Cramér-Rao bound.
 
-Every trial minimises its own squared residual, but the trials share most of the way. A fit of the
-mean measurement leads from the guess to the neighbourhood of all minima. Gauss-Newton steps whose
-Jacobian is expanded to second order about that fit bring each trial close, and steps with the
-trial's own Jacobian finish it. A trial has converged when its last step is small compared with its
-standard deviation. The few others are solved one by one with the least-squares solver of
-`identify`; a trial that this does not solve has failed.
+All trials are stepped together. Each trial minimises its squared residual, in four steps:
+
+1. A fit of the mean measurement leads from the guess to a point near the minima of all trials.
+2. Gauss-Newton steps with a shared Jacobian, which is expanded to second order about that fit,
+   bring each trial close to its minimum.
+3. Gauss-Newton steps with the Jacobian of each trial finish it. A trial has converged when its last
+   step is small compared with its standard deviation.
+4. The few trials that have not converged are solved one by one with the least-squares solver of
+   `identify`. A trial that this does not solve has failed.
 """
 
 from __future__ import annotations
@@ -33,20 +36,20 @@ from mjfim.records.trajectory import Trajectory
 # Length of the last step, in standard deviations, below which a trial has converged.
 CONVERGED_STEP = 0.03
 
-# Gauss-Newton steps with the shared Jacobian, the first one from the fit of the mean measurement
-# included.
+# Number of Gauss-Newton steps with the shared Jacobian, including the first one from the fit of the
+# mean measurement.
 SHARED_STEPS = 3
 
-# Gauss-Newton steps with a trial's own Jacobian, at most.
-OWN_STEPS = 12
+# Largest number of Gauss-Newton steps with the Jacobian of each trial.
+INDIVIDUAL_STEPS = 12
 
-# Size of one Jacobian of all trials that are stepped together, at most [bytes].
+# Largest size of the Jacobians of all trials that are stepped together [bytes].
 CHUNK_BYTES = 1e8
 
-# Trials that are stepped together, at least.
+# Smallest number of trials that are stepped together.
 MIN_CHUNK = 64
 
-# Difference step for a trial's own Jacobian, relative to the size of each parameter.
+# Difference step for the Jacobian of each trial, relative to the size of each parameter.
 JACOBIAN_STEP = 1e-6
 
 # Difference step for the derivative of the shared Jacobian, relative to the size of each parameter.
@@ -67,15 +70,15 @@ def monte_carlo(
 ) -> MonteCarloStudy:
     """Estimate the parameters from many noisy repetitions of one or several trajectories.
 
-    Parameters are estimated without bounds and priors: the study holds the information of the data
-    alone.
+    Parameters are estimated without bounds and priors, so that the study shows the information of
+    the data alone.
 
     Args:
         experiment: Experiment with the true values.
         trajectory: One trajectory, which gets the name "final", or several by name.
-        trials: Repetitions per trajectory.
+        trials: Number of repetitions per trajectory.
         seed: Seed of the noise.
-        measure_rate: Measurement rate instead of the experiment's [Hz].
+        measure_rate: Measurement rate [Hz] instead of that of the experiment.
         callback: Called with a `StudyEvent` whenever all trials have made a step.
         threads: Threads of MuJoCo; None for all cores.
         stop: Ends the study early, as Ctrl-C does; the trajectories that are finished are returned.
@@ -147,8 +150,8 @@ class _Progress:
         part: Name of the trajectory.
         index: Number of the trajectory, from 0.
         count: Number of trajectories.
-        begin: Share that was done before the current chunk of trials.
-        width: Share of the current chunk.
+        begin: Share of the trials before the current chunk.
+        width: Share of the trials in the current chunk.
     """
 
     callback: Callback | None
@@ -159,7 +162,7 @@ class _Progress:
     width: float = 1.0
 
     def chunk(self, number: int, count: int) -> _Progress:
-        """Progress of one of several chunks of trials."""
+        """Progress of chunk `number`, from 0, of `count` chunks."""
         return _Progress(
             callback=self.callback,
             part=self.part,
@@ -254,7 +257,7 @@ class _Trials:
         return np.stack(columns, axis=2)
 
     def part(self, indices: np.ndarray) -> _Trials:
-        """Some of the trials."""
+        """The trials with some indices."""
         return _Trials(system=self.system, ctrl=self.ctrl, measured=self.measured[indices])
 
     def fit_problem(self, measured: Array) -> FitProblem:
@@ -262,7 +265,7 @@ class _Trials:
         return FitProblem.of(self.system, [self._recording(measured)], data_only=True)
 
     def _recording(self, measured: Array) -> Recording:
-        """One whitened measurement: (n,) as a recording in units of the outputs."""
+        """A recording in units of the outputs from a whitened measurement: (n,)."""
         noise = self.system.noise
         mask = noise.measured(len(self.ctrl)) > 0
         whitened = np.zeros(mask.shape)
@@ -286,7 +289,20 @@ def _trial_set(
     progress: _Progress,
     budget: Budget,
 ) -> tuple[TrialStatistics, Array] | None:
-    """Statistics of all trials along one trajectory and its (p, p) information; None where the study was interrupted."""
+    """Run all trials along one trajectory.
+
+    Args:
+        system: System whose parameters are estimated.
+        curve: The trajectory.
+        count: Number of trials.
+        rng: Random numbers of the noise.
+        progress: Reports the progress.
+        budget: Ends the study early.
+
+    Returns:
+        Statistics of the trials and (p, p) information of the trajectory [1 / theta-unit^2]; None
+        where the study was interrupted.
+    """
     begun = time.perf_counter()
     y, G = _exact_outputs(system, curve)
     exact = system.noise.whitened_rows(y)
@@ -294,7 +310,7 @@ def _trial_set(
     information = np.asarray(J.T @ J)
     require_visible(system.parameters, system.parameters.prior_information, J)
 
-    # As many trials at once as memory allows.
+    # Step as many trials at once as the memory allows.
     chunk = max(MIN_CHUNK, int(CHUNK_BYTES / (8 * J.size)))
     firsts = range(0, count, chunk)
     estimates = []
@@ -315,7 +331,11 @@ def _trial_set(
 
 
 def _exact_outputs(system: System, curve: Trajectory) -> tuple[Array, Array]:
-    """Outputs (N+1, ny) [output-unit] at the true values without noise, and their derivative (N+1, ny, p)."""
+    """Outputs at the true values without noise.
+
+    Returns:
+        (N+1, ny) outputs [y-unit], and (N+1, ny, p) their derivative [y-unit / theta-unit].
+    """
     exact = system.plant.derivatives.predict(system.parameters.true, curve.ctrl)
     if exact is None:
         raise SimulationDivergedError(
@@ -356,11 +376,11 @@ def _fit_mean(trials: _Trials) -> _SharedFit:
 def _estimate(
     trials: _Trials, shared: _SharedFit, report: Callable[[float], None], budget: Budget
 ) -> Array | None:
-    """(m, p) estimates of all trials, NaN where one failed; None where the study was interrupted."""
+    """(m, p) estimates of all trials, NaN where a trial failed; None after an interruption."""
     theta = _shared_steps(trials, shared, report, budget)
     if theta is None:
         return None
-    unfinished = _own_steps(trials, shared, theta, report, budget)
+    unfinished = _individual_steps(trials, shared, theta, report, budget)
 
     # Trials that have not converged go through the general solver, one by one.
     for i in unfinished:
@@ -375,7 +395,7 @@ def _estimate(
 def _shared_steps(
     trials: _Trials, shared: _SharedFit, report: Callable[[float], None], budget: Budget
 ) -> Array | None:
-    """(m, p) estimates after the steps with the shared Jacobian; None where the study was interrupted."""
+    """(m, p) estimates after the steps with the shared Jacobian; None after an interruption."""
     predicted, _ = trials.outputs(shared.theta[None])
     theta = shared.theta + (trials.measured - predicted) @ np.linalg.pinv(shared.J).T
 
@@ -392,16 +412,27 @@ def _shared_steps(
     return np.asarray(theta)
 
 
-def _own_steps(
+def _individual_steps(
     trials: _Trials,
     shared: _SharedFit,
     theta: Array,
     report: Callable[[float], None],
     budget: Budget,
 ) -> np.ndarray:
-    """Step trials with their own Jacobians, in place of theta: (m, p); return indices of those that have not converged."""
+    """Step each trial with its Jacobian until it has converged.
+
+    Args:
+        trials: The m trials.
+        shared: Fit of the mean measurement.
+        theta: (m, p) estimates [theta-unit], improved in place.
+        report: Called with the share that is done.
+        budget: Ends the study early.
+
+    Returns:
+        Indices of the trials that have not converged.
+    """
     active = np.arange(len(trials.measured))
-    for k in range(OWN_STEPS):
+    for k in range(INDIVIDUAL_STEPS):
         if budget.exhausted:
             break
         moving = trials.part(active)

@@ -1,12 +1,11 @@
 """Design at an estimate, with the information of the recordings so far as prior information.
 
 The scales of the parameters remain those of the stated experiment, so that criteria of different
-rounds can be compared. The price of effort must not change either. The first design pays what a
-relative gain of information is worth to it: phi_1 is the information's share of J there, and `d(log
-phi) * phi_1 = d(effort)`. The n-th of equal experiments changes log phi by 1/n only, so phi is
-weighted by n phi_1 / phi_n there (by n with D-optimality, whose phi is a logarithm). Otherwise
-every round would be gentler than the one before, and a round at values below the guess gentler than
-the first.
+rounds can be compared. The balance between information and effort must remain as well. In the first
+design, phi_1 is the share of the information in J, and `d(log phi) * phi_1 = d(effort)` at the
+optimum. The n-th of equal experiments changes log phi by 1/n only, so phi is weighted by n phi_1 /
+phi_n there (by n with D-optimality, whose phi is a logarithm). Otherwise every round would use less
+effort than the one before, and a round at values below the guess less than the first round.
 """
 
 from __future__ import annotations
@@ -29,21 +28,22 @@ from mjfim.records.design import Design, Status
 from mjfim.records.estimate import Estimate
 from mjfim.records.events import Callback
 
-# Distance that guesses keep from bounds, relative to the size of a parameter, and the largest share
-# of its range.
+# Smallest distance of guesses from bounds, relative to the size of a parameter.
 BOUND_GAP = 1e-3
+
+# Largest value of that distance, as a share of the range between the bounds.
 MAX_BOUND_GAP = 0.25
 
-# Standard deviations about the estimate within which a robust redesign draws its samples.
+# A robust redesign draws its samples within this number of standard deviations about the estimate.
 SAMPLING_RANGE = 2.5
 
-# Smallest such range, relative to the size of a parameter; bounds must not coincide.
+# Smallest value of that range, relative to the size of a parameter, so that bounds do not coincide.
 MIN_SAMPLING_RANGE = 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CampaignHistory:
-    """Earlier rounds of a campaign, as far as a redesign needs them.
+    """Results of the earlier rounds of a campaign that a redesign needs.
 
     Attributes:
         estimate: Estimate from all recordings so far.
@@ -69,14 +69,17 @@ def redesign(
     executor: Executor | None = None,
     stop: StopToken | None = None,
 ) -> Design:
-    """Design from the initial control and from the last design's control, and return the better design.
+    """Design again with the information of the recordings so far.
+
+    One design starts at the initial control and one at the control of the last design; the better
+    of the two is returned.
 
     Args:
         base: Task of the experiment as stated.
         history: Earlier rounds.
         theta: (p,) parameters at which the design is made [theta-unit].
         callback: Called with a `DesignEvent` for every iterate.
-        executor: Runs several starts under hard limits at once.
+        executor: Runs several optimisations at once, under hard limits.
         stop: Ends the design early.
 
     Raises:
@@ -95,7 +98,7 @@ def redesign(
     if not fits or first.status is Status.INTERRUPTED:
         return first
 
-    # One further start: the control of the last design, without any of the other starts.
+    # The second design starts at the control of the last design, and nowhere else.
     only_start = {"starts": 1, "previous": (), "fourier": (), "repeats": ()}
     task = base.restated(moved.replace(descent=only_start), added_information=known)
     try:
@@ -118,7 +121,10 @@ def redesign(
 
 
 def _information_weight(base: DesignTask, moved: Experiment, history: CampaignHistory) -> float:
-    """Weight of the criterion at which a relative gain of information costs as much effort as in the first design."""
+    """Weight of the criterion that keeps the balance between information and effort.
+
+    A relative gain of information then costs as much effort as in the first design.
+    """
     stated = moved.cost.information
     rounds = history.count + 1
     if moved.cost.criterion == "D":
@@ -128,16 +134,21 @@ def _information_weight(base: DesignTask, moved: Experiment, history: CampaignHi
     task = base.restated(moved, added_information=history.estimate.data)
     try:
         first = _criterion_value(first_task, history.first_control)
-        now = _criterion_value(task, history.last_control)
+        last = _criterion_value(task, history.last_control)
     except (MjfimError, ValueError):
-        # Without both values: the weight that equal experiments would get.
+        # Where a value is missing, take the weight for equal experiments.
         return stated * rounds**2
 
-    return float(stated * rounds * first / now)
+    return float(stated * rounds * first / last)
 
 
 def _criterion_value(task: DesignTask, control: Array) -> float:
-    """Criterion phi along a control: (N, nu); raises where there is none."""
+    """Criterion phi along a control: (N, nu).
+
+    Raises:
+        ValueError: The control does not fit the task.
+        MjfimError: The criterion is not finite and positive, or cannot be computed.
+    """
     if control.shape != task.control.shape:
         raise ValueError(f"a control of shape {control.shape} instead of {task.control.shape}")
 
@@ -150,11 +161,12 @@ def _criterion_value(task: DesignTask, control: Array) -> float:
 def restate_experiment(
     base: DesignTask, theta: Array | None = None, estimate: Estimate | None = None
 ) -> Experiment:
-    """State the experiment of a redesign: guesses at the given parameters, unchanged scales, no true values.
+    """State the experiment of a redesign.
 
-    Guesses keep a small distance from bounds. The parameters of a declared inertia move only where
-    the recordings determine all of them. With `[robust]`, bounds shrink to the region that the
-    estimate leaves, from which the samples are drawn.
+    Its guesses are the given parameters, its scales are unchanged, and it has no true values.
+    Guesses keep a small distance from bounds. The parameters of a declared inertia change only
+    where the recordings determine all of them. With `[robust]`, whose samples are drawn between the
+    bounds, the bounds shrink to a region about the estimate.
 
     Args:
         base: Task of the experiment as stated.
@@ -172,7 +184,7 @@ def restate_experiment(
             tables[name] = {**table, **_restated_keys(base, index_of[name], theta, estimate)}
             continue
 
-        # A declared inertia is either left unchanged, or replaced by its single parameters.
+        # A declared inertia is either kept, or replaced by its individual parameters.
         members = [j for j, parameter in enumerate(p.parameters) if parameter.group == name]
         if theta is None or estimate is None or not _are_determined(base, members, estimate):
             tables[name] = table
@@ -203,7 +215,10 @@ def _member_table(base: DesignTask, index: int) -> dict[str, Any]:
 def _restated_keys(
     base: DesignTask, index: int, theta: Array | None, estimate: Estimate | None
 ) -> dict[str, Any]:
-    """Keys of a parameter's table that a redesign states anew: guess, scale and, with `[robust]`, bounds."""
+    """Keys that a redesign changes in the table of a parameter.
+
+    These are the guess, the scale and, with `[robust]`, the bounds.
+    """
     parameter = base.parameters.parameters[index]
     size = float(base.parameters.magnitude[index])
     if theta is None:
@@ -224,7 +239,7 @@ def _restated_keys(
 
 
 def _are_determined(base: DesignTask, members: Sequence[int], estimate: Estimate) -> bool:
-    """True where the recordings determine every one of some parameters to better than its size."""
+    """Whether the recordings determine all members, each more accurately than its size."""
     indices = np.asarray(members)
     information = np.diag(estimate.data)[indices]
     size = base.parameters.magnitude[indices]

@@ -1,8 +1,11 @@
-"""Robustness of a design: it is played on simulated robots that differ from the model, each of which is then identified.
+"""Robustness of a design against differences between the model and the robot.
 
-A delay of the control acts like a delay of the measurement: before the start all stands still, so
-the robot moves as it would without the delay, only later. That holds with feedback as well, as long
-as the recorded control is the one that was sent, not the one that has arrived.
+The design is played on simulated robots that differ from the model, and each robot is then
+identified from its recording.
+
+A delay of the control acts like a delay of the measurement: the robot stands still before it
+begins, so that it makes the motion without delay at a later time. This also holds with feedback,
+provided that the recorded control is the one that was sent, not the one that has arrived.
 """
 
 from __future__ import annotations
@@ -51,30 +54,29 @@ from mjfim.records.robustness import (
     Robustness,
 )
 
-# Largest number of attempts at drawing a robot whose bodies can exist.
+# Largest number of attempts to draw a robot whose bodies are physical.
 MAX_DRAWS = 500
 
-# Largest acceleration of a robot that counts as standing still [1/s² times the unit of the
-# coordinate].
+# Largest acceleration of a robot that counts as standing still [unit of the coordinate / s²].
 MAX_REST_ACCELERATION = 1e-5
 
-# Largest number of Newton steps towards standing still.
+# Largest number of Newton steps in the search for the equilibrium.
 MAX_REST_STEPS = 50
 
-# Length of the Newton step towards standing still that ends the search.
+# Length of a Newton step below which the search for the equilibrium ends.
 REST_STEP_TOLERANCE = 1e-12
 
-# Perturbation of the state for the slope of the acceleration.
+# Perturbation of the state for the derivative of the acceleration.
 REST_PERTURBATION = 1e-6
 
-# Delays from which a fit starts again where the first one ends in a misfit [s].
+# Delays at which further fits start where the first fit ends in a misfit [s].
 FURTHER_DELAYS = (2e-3, 4e-3, 8e-3, 16e-3)
 
-# Smallest deviation of a start that makes it an unknown.
+# Smallest deviation of an initial position that makes it an unknown.
 MIN_START_DEVIATION = 1e-9
 
-# Factor on the errors of the parameters after each round of draws that made bodies that cannot
-# exist.
+# Factor by which the errors of the parameters are reduced after as many unphysical draws as there
+# are parameters.
 DRAW_SHRINKAGE = 0.9
 
 
@@ -89,31 +91,32 @@ def assess_robustness(
     executor: Executor | None = None,
     stop: StopToken | None = None,
 ) -> Robustness:
-    """Play a design on simulated robots that differ from the model, and identify each from its recording.
+    """Play a design on simulated robots that differ from the model, and identify each of them.
 
-    Every parameter of each robot is off by the stated share, up or down at random, and the robot
-    stands still at its own equilibrium before it begins. Limits are looked at at every engine step.
-    The fit starts from the guess, with the delay and, where the parameters move it, the start as
-    further unknowns.
+    Every parameter of a robot has an error of the stated relative size, whose sign is random. The
+    robot stands still at its equilibrium before it begins. Limits are checked at every engine step.
+    The fit starts at the guess. The delay and the initial positions that depend on the parameters
+    are further unknowns.
 
     Args:
         experiment: The experiment of the design.
         design: Folder of the design, or its design.csv.
-        conditions: How the robots differ from the model; default: parameters 20 % off and 5 ms of
-            latency.
+        conditions: Differences between the robots and the model; None for errors of 20 % and a
+            latency of 5 ms.
         runs: Number of robots.
         callback: Called with a `StudyEvent` after every robot.
-        executor: Executor of `concurrent.futures` that runs several robots side by side, such as
-            `mjfim.Pool`; default: one after another.
-        stop: Token that ends the study after the robots that are done.
+        executor: Executor of `concurrent.futures` that runs several robots at once, such as
+            `mjfim.Pool`; None for one robot after another.
+        stop: Ends the study early; the robots that are finished count.
 
     Returns:
-        How the design fared on the robots that were done.
+        Errors of the estimates and margins of the limits, over all finished robots.
 
     Raises:
-        ExperimentError: The design is of another duration, or the conditions cannot be simulated.
+        ExperimentError: The duration of the design is not that of the experiment, or the conditions
+            cannot be simulated.
         RecordingError: The design cannot be read.
-        NoResultError: The study was stopped before any robot was done.
+        NoResultError: The study was stopped before any robot was finished.
     """
     table = design_table(design)
     if conditions is None:
@@ -126,25 +129,26 @@ def assess_robustness(
             bench, _RobotStudy.of(experiment, table, conditions), runs, executor, token
         ):
             found.append(run)
-            if callback is not None:
-                callback(
-                    StudyEvent(
-                        study="robustness",
-                        part="robots",
-                        index=0,
-                        count=1,
-                        share=len(found) / runs,
-                        message=f"{len(found)} of {runs} robots",
-                    )
-                )
+            if callback is None:
+                continue
+
+            event = StudyEvent(
+                study="robustness",
+                part="robots",
+                index=0,
+                count=1,
+                share=len(found) / runs,
+                message=f"{len(found)} of {runs} robots",
+            )
+            callback(event)
 
     if not found:
-        raise NoResultError("the study was stopped before any robot was done")
+        raise NoResultError("the study was stopped before any robot was finished")
     return summarize_runs(bench, found)
 
 
 def design_table(design: str | Path) -> Path:
-    """Return the design.csv of a folder, or the file itself.
+    """Path of design.csv.
 
     Args:
         design: Folder of a design, or its design.csv.
@@ -154,32 +158,36 @@ def design_table(design: str | Path) -> Path:
 
 
 def default_latency(experiment: Experiment) -> float:
-    """Delay of the control where none is stated [s]: 5 ms, rounded up to whole timesteps of the engine.
+    """Delay of the control where none is stated.
 
     Args:
         experiment: The experiment.
+
+    Returns:
+        5 ms, rounded up to whole timesteps of the engine [s].
     """
     timestep = float(System.resolve(experiment, threads=1).model.opt.timestep)
     return float(np.ceil(LATENCY / timestep - 1e-6) * timestep)
 
 
 class RobotBench:
-    """A design, and robots on which it is played.
+    """A design, and simulated robots on which it is played.
 
     Attributes:
-        conditions: How the robots differ from the model.
+        conditions: Differences between the robots and the model.
         stated: The task as the experiment states it.
-        task: The task by which recordings are read: on the grid of the engine, where a delay is
-            exact, with the delay and the start as unknowns.
+        task: The task for the recordings, with the delay and the initial positions as unknowns. Its
+            samples are the steps of the engine, where a delay is exact.
         plan: Rows of design.csv.
         timestep: Timestep of the engine [s].
-        steps_per_row: Engine steps per row of the plan.
-        late_steps: Engine steps by which the control is late.
+        steps_per_row: Number of engine steps per row of the plan.
+        late_steps: Number of engine steps by which the control is late.
         constraints: Constraints of the stated task.
-        limits: All l limits that are looked at.
-        rest: (nu,) control before the start [unit of the actuator]; None where the experiment
-            begins in motion.
-        sensed: (ns,) index of the output that measures each entry of the state; -1 where none does.
+        limits: All l limits that are checked.
+        rest: (nu,) control before the motion begins [unit of the actuator]; None where the
+            experiment begins in motion.
+        sensed: (ns,) index of the output that measures each entry of the state; -1 where no output
+            measures it.
     """
 
     def __init__(self, experiment: Experiment, table: Path, conditions: RobotConditions) -> None:
@@ -188,11 +196,11 @@ class RobotBench:
         Args:
             experiment: The experiment of the design.
             table: The design.csv.
-            conditions: How the robots differ from the model.
+            conditions: Differences between the robots and the model.
 
         Raises:
-            ExperimentError: The design is of another duration, or the conditions cannot be
-                simulated.
+            ExperimentError: The duration of the design is not that of the experiment, or the
+                conditions cannot be simulated.
             RecordingError: The design cannot be read.
         """
         self.conditions = conditions
@@ -203,7 +211,8 @@ class RobotBench:
         duration = float(self.plan.t[-1])
         if abs(duration - self.stated.horizon) > 0.5 * self.timestep:
             raise ExperimentError(
-                f"{table}: it lasts {duration:g} s, the experiment {self.stated.horizon:g} s"
+                f"{table}: the design lasts {duration:g} s, the experiment "
+                f"{self.stated.horizon:g} s; give the design of this experiment"
             )
 
         self.steps_per_row = round(self.plan.period / self.timestep)
@@ -212,7 +221,7 @@ class RobotBench:
         if self.late_steps < 0 or remainder > 1e-6 * self.timestep:
             raise ExperimentError(
                 f"latency: {conditions.latency:g} s is no whole number of timesteps of "
-                f"{self.timestep:g} s"
+                f"{self.timestep:g} s; state a multiple of the timestep"
             )
 
         self.constraints = constraint_set_of(self.stated)
@@ -227,29 +236,37 @@ class RobotBench:
         self.sensed = _sensed(self.stated)
         if conditions.feedback and (self.sensed < 0).all():
             raise ExperimentError(
-                "--feedback: no position or velocity of a joint is measured, the gains have "
-                "nothing to act on"
+                "--feedback: the gains need a measured position or velocity of a joint, and the "
+                "experiment measures none"
             )
 
-        # Robots are drawn with the stated unknowns first, to see which starts they move.
+        # Robots are first drawn with the stated unknowns, to find the initial positions that depend
+        # on the parameters. These become unknowns of the task for the recordings.
         self.task = self.stated
         self.task = DesignTask.resolve(self._experiment_of_recordings(experiment), threads=1)
 
-    # ---- the experiment by which recordings are read
+    # ---- the experiment for the recordings
 
     def _rest_control(self) -> Array | None:
-        """(nu,) control before the start; None where the experiment begins in motion, which allows no latency."""
+        """Control before the motion begins.
+
+        Returns:
+            (nu,) control [unit of the actuator]; None where the experiment begins in motion.
+
+        Raises:
+            ExperimentError: The experiment begins in motion, but the conditions have a latency.
+        """
         try:
             return self.stated.initial_hold
         except ExperimentError as error:
             if self.late_steps:
                 raise ExperimentError(
-                    f"{error}; without a latency (--latency 0) it can be played"
+                    f"{error}; the design can be played without a latency only (--latency 0)"
                 ) from None
             return None
 
     def _experiment_of_recordings(self, stated: Experiment) -> Experiment:
-        """The experiment on the grid of the engine, with the unknowns that the robots add."""
+        """The experiment with one sample per engine step, and with the unknowns of the robots."""
         nuisance = stated.nuisance.model_dump(exclude_unset=True)
         if self.late_steps:
             nuisance["delay"] = nuisance.get("delay") or True
@@ -266,7 +283,10 @@ class RobotBench:
         )
 
     def _movable_positions(self) -> list[str]:
-        """Names of positions at which robots stand still elsewhere than the model, because their parameters differ."""
+        """Names of the initial positions that depend on the parameters of a robot.
+
+        They are found from robots that are drawn at random.
+        """
         task = self.stated
         moved = np.zeros(task.space.nv, dtype=bool)
 
@@ -282,10 +302,20 @@ class RobotBench:
     # ---- robots
 
     def _drawn(self, rng: np.random.Generator) -> Array:
-        """(p,) parameters of a robot that can exist, its delay and biases included [theta-unit]; its start comes later.
+        """Draw the parameters of a robot whose bodies are physical.
 
-        No parameter is off by more than its prior, which says how well it is known, or than bodies
-        allow.
+        No error of a parameter is larger than the standard deviation of its prior. Errors are
+        reduced where the bodies would be unphysical.
+
+        Args:
+            rng: Random numbers.
+
+        Returns:
+            (p,) parameters, with delay and biases, but without deviations of the initial state
+            [theta-unit].
+
+        Raises:
+            ExperimentError: No physical robot was found.
         """
         p = self.task.parameters
         wrong = self.conditions.wrong
@@ -295,14 +325,15 @@ class RobotBench:
 
         for attempt in range(MAX_DRAWS):
             shrinkage = DRAW_SHRINKAGE ** (attempt // len(p))
-            off = rng.choice([-1.0, 1.0], len(p)) * reach * shrinkage
-            theta = np.where(p.changes_model, p.guess + off, prior * rng.standard_normal(len(p)))
+            error = rng.choice([-1.0, 1.0], len(p)) * reach * shrinkage
+            theta = np.where(p.changes_model, p.guess + error, prior * rng.standard_normal(len(p)))
             theta = self._with_delay(np.clip(theta, p.lower, p.upper))
             if not p.writer.unphysical_bodies(self.task.plant.source, theta):
                 return theta
 
         raise ExperimentError(
-            f"{wrong:.0%} wrong parameters make bodies that cannot exist; try less"
+            f"errors of {wrong:.0%} in the parameters lead to unphysical bodies; state a smaller "
+            "error"
         )
 
     def _with_delay(self, theta: Array) -> Array:
@@ -311,17 +342,24 @@ class RobotBench:
         return np.asarray(np.where(is_delay, self.late_steps * self.timestep, theta))
 
     def _start(self, model: Any, theta: Array, feedback: bool) -> Array:
-        """(ns,) state at which a robot stands still before the start.
+        """Initial state of a robot: its equilibrium near the initial state of the model.
+
+        Args:
+            model: Model of the robot.
+            theta: (p,) parameters of the robot [theta-unit].
+            feedback: True where the controller uses the gains.
+
+        Returns:
+            (ns,) initial state; that of the model where there is no equilibrium and no latency.
 
         Raises:
-            SimulationDivergedError: It stands still nowhere near the start, and the control is
-                late.
+            SimulationDivergedError: There is no equilibrium, and the control is late.
         """
         if self.rest is None:
             return self.task.plant.initial_state(theta)
 
-        state, left = self._equilibrium(model, feedback)
-        if left <= MAX_REST_ACCELERATION:
+        state, acceleration = self._equilibrium(model, feedback)
+        if acceleration <= MAX_REST_ACCELERATION:
             return state
         if self.late_steps == 0:
             return np.array(self.stated.plant.nominal_initial_state)
@@ -331,16 +369,25 @@ class RobotBench:
         )
         raise SimulationDivergedError(
             "a robot with other parameters does not stand still at the start "
-            f"(it accelerates by {left:.2g} per s²): {advice}"
+            f"(it accelerates by {acceleration:.2g} per s²): {advice}"
         )
 
     def _equilibrium(self, model: Any, feedback: bool) -> tuple[Array, float]:
-        """(ns,) state at which the robot accelerates least, found by Newton's method, and its largest acceleration."""
+        """Find an equilibrium of a robot by Newton's method.
+
+        Args:
+            model: Model of the robot.
+            feedback: True where the controller uses the gains.
+
+        Returns:
+            (ns,) state with the smallest acceleration, and its largest acceleration there [unit of
+            the coordinate / s²].
+        """
         space = self.stated.space
         data = mujoco.MjData(model)
         state = np.array(self.stated.plant.nominal_initial_state)
 
-        # Positions and activations may move; velocities stay.
+        # Positions and activations may change; velocities stay zero.
         directions = np.delete(np.eye(space.nx), np.arange(space.nv, 2 * space.nv), axis=0)
 
         def acceleration(x: Array) -> Array:
@@ -351,7 +398,7 @@ class RobotBench:
             return np.concatenate([data.qacc, data.act_dot])
 
         for _ in range(MAX_REST_STEPS):
-            now = acceleration(state)
+            current = acceleration(state)
             columns = []
             for direction in directions:
                 ahead = acceleration(space.plus(state, REST_PERTURBATION * direction))
@@ -359,7 +406,7 @@ class RobotBench:
                 columns.append(ahead - behind)
 
             slope = np.stack(columns, 1) / (2.0 * REST_PERTURBATION)
-            step = np.linalg.lstsq(slope, -now, rcond=1e-9)[0]
+            step = np.linalg.lstsq(slope, -current, rcond=1e-9)[0]
             state = space.plus(state, step @ directions)
             if np.abs(step).max(initial=0.0) < REST_STEP_TOLERANCE:
                 break
@@ -369,7 +416,16 @@ class RobotBench:
     # ---- the controller
 
     def _command(self, state: Array, row: int, feedback: bool) -> Array:
-        """(nu,) control that the controller sends for a row of the plan when it reads a state [unit of the actuator]."""
+        """Control that the controller sends.
+
+        Args:
+            state: (ns,) measured state.
+            row: Row of the plan.
+            feedback: True where the controller uses the gains.
+
+        Returns:
+            (nu,) control [unit of the actuator].
+        """
         control = self.plan.ctrl[row]
         if feedback:
             control = control + self.plan.gain[row] @ self._deviation(state, row)
@@ -378,17 +434,17 @@ class RobotBench:
         return np.asarray(np.clip(control, bounds.lower, bounds.upper))
 
     def _deviation(self, state: Array, row: int) -> Array:
-        """(nx,) planned minus measured state; what is not measured counts as planned."""
+        """(nx,) planned minus measured state; zero for entries that are not measured."""
         planned = self.plan.state[row]
         space = self.stated.space
-        seen = np.where(self.sensed >= 0, state, planned)
+        measured = np.where(self.sensed >= 0, state, planned)
         for q, _ in space.quaternions:
-            seen[q : q + 4] /= np.linalg.norm(seen[q : q + 4])
+            measured[q : q + 4] /= np.linalg.norm(measured[q : q + 4])
 
-        return space.minus(planned, seen)
+        return space.minus(planned, measured)
 
     def _control_before(self, state: Array, feedback: bool) -> Array:
-        """(nu,) control before the start; with feedback, the first gain acts on where the robot stands."""
+        """(nu,) control before the motion; with feedback, the first gain acts on the state."""
         if self.rest is None:
             return np.asarray(self.plan.ctrl[0])
         if not feedback:
@@ -396,7 +452,18 @@ class RobotBench:
         return np.asarray(self.rest + self.plan.gain[0] @ self._deviation(state, 0))
 
     def _sent(self, model: Any, start: Array, before: Array, noise: Array, feedback: bool) -> Array:
-        """(M, nu) controls that are sent [unit of the actuator]; noise: (M+1, ny) of what the controller reads [y-unit]."""
+        """Controls that the controller sends.
+
+        Args:
+            model: Model of the robot.
+            start: (ns,) initial state of the robot.
+            before: (nu,) control before the motion begins [unit of the actuator].
+            noise: (M+1, ny) noise of the outputs that the controller reads [y-unit].
+            feedback: True where the controller uses the gains.
+
+        Returns:
+            (M, nu) controls [unit of the actuator].
+        """
         rows = len(self.plan.ctrl)
         if not feedback:
             return np.stack([self._command(start, k, False) for k in range(rows)])
@@ -422,11 +489,11 @@ class RobotBench:
     # ---- one robot
 
     def run(self, number: int) -> RobotRun:
-        """Play on one robot, look at its limits, and identify it.
+        """Play the design on one robot, check the limits, and identify the robot.
 
         Args:
-            number: Number of the robot; with the seed of the conditions it decides everything
-                random.
+            number: Number of the robot. This number and the seed of the conditions determine all
+                random numbers.
         """
         rng = np.random.default_rng([self.conditions.seed, number])
         theta = self._drawn(rng)
@@ -460,9 +527,10 @@ class RobotBench:
         )
 
     def _system_from(self, start: Array) -> System:
-        """The system of the recordings with the activations of a robot's start: (ns,).
+        """System for the recording of a robot that begins at start: (ns,).
 
-        Activations are no unknowns: they follow from the control that was sent before the start.
+        It begins with the activations of the robot. These are no unknowns, because they follow from
+        the control before the motion begins.
         """
         system, na = self.task.system, self.task.space.na
         if na == 0:
@@ -475,14 +543,25 @@ class RobotBench:
         )
 
     def _put_start(self, theta: Array, start: Array, system: System) -> None:
-        """Write the true deviation of the start: (ns,) into theta: (p,), as far as it is an unknown."""
+        """Write the true deviations of the initial state into theta: (p,), in place.
+
+        Only deviations that are unknowns are written. start: (ns,) initial state of the robot.
+        """
         matrix = system.parameters.initial_state_derivative(system.space.nx)
         used = matrix.any(axis=0)
+
         deviation = system.space.minus(start, system.plant.nominal_initial_state)
-        theta[used] = np.linalg.lstsq(matrix[:, used], deviation)[0]
+        solution = np.linalg.lstsq(matrix[:, used], deviation)
+        theta[used] = solution[0]
 
     def _identified(self, recording: Recording, system: System) -> tuple[Estimate, bool]:
-        """The estimate from the guess; where it is a misfit, the best from other delays, and True."""
+        """Identify a robot from its recording.
+
+        Where the fit from the guess is a misfit, further fits start at other delays.
+
+        Returns:
+            The best estimate, and True if there were further fits.
+        """
         best = identify_system(system, [recording])
         if not best.misfit:
             return best, False
@@ -515,7 +594,8 @@ class RobotBench:
             feedback: True where the controller uses the gains.
 
         Returns:
-            The recording, (l,) margins over half of their ranges, and (ns,) start of the robot.
+            The recording, (l,) margins divided by half of their ranges, and (ns,) initial state of
+            the robot.
 
         Raises:
             SimulationDivergedError: The simulation diverges, or the robot does not stand still at
@@ -528,7 +608,7 @@ class RobotBench:
         noise = noise + task.parameters.bias_derivative(len(task.system.outputs)) @ theta
         sent = self._sent(model, start, before, noise, feedback)
 
-        # The control arrives late; until then the robot gets the control before the start.
+        # The control arrives late. Until then the robot gets the control before the motion begins.
         held = np.repeat(sent, self.steps_per_row, axis=0)
         applied = np.concatenate([np.tile(before, (self.late_steps, 1)), held])
         out = self._simulator.rollout(
@@ -537,7 +617,7 @@ class RobotBench:
         if not out.finite[0] or out.observed is None:
             raise SimulationDivergedError("the robot's simulation diverges")
 
-        # Only the rows of the plan carry noise; samples that are not measured stay empty.
+        # Noise is added at the rows of the plan; samples that are not measured are NaN.
         last = rows * self.steps_per_row + 1
         sensors = None if out.sensors is None else out.sensors[0, :last]
         y = task.system.outputs(out.states[0, :last], sensors)
@@ -558,14 +638,17 @@ class RobotBench:
     def _margins(
         self, observed: Array, sent: Array, before: Array, qpos: Array, feedback: bool
     ) -> Array:
-        """(l,) smallest margins over half of their ranges.
+        """Smallest margins of all limits.
 
         Args:
-            observed: Quantities within samples at every engine step.
-            sent: (M, nu) controls that were sent.
-            before: (nu,) control before the start.
-            qpos: Positions at every engine step.
+            observed: (n, w) observations at every engine step.
+            sent: (M, nu) controls that were sent [unit of the actuator].
+            before: (nu,) control before the motion begins [unit of the actuator].
+            qpos: (n+1, nq) positions at every engine step.
             feedback: True where the controller uses the gains.
+
+        Returns:
+            (l,) margins, divided by half of their ranges.
         """
         constraints = self.constraints
         bounds = constraints.substeps.bounds
@@ -587,7 +670,11 @@ class RobotBench:
         return np.array(margins)
 
     def _control_rates(self, sent: Array, before: Array, feedback: bool) -> Array:
-        """Rates of the control over one sample [unit of the actuator / s], from before the start to after the end."""
+        """Rates of the control over one sample [unit of the actuator / s].
+
+        They include the change from the control before the motion, and the change to the control
+        after its end.
+        """
         rows_per_sample = round(self.stated.dt / self.plan.period)
         rate = self.constraints.rate
         after = sent[-1] if feedback or rate is None else rate.control_after
@@ -600,16 +687,20 @@ class RobotBench:
         changes = controls[rows_per_sample:] - controls[:-rows_per_sample]
         return np.asarray(changes / self.stated.dt)
 
-    # ---- what was expected
+    # ---- predictions of the model
 
     def planned(self) -> Array:
-        """(l,) margins of the plan over half of their ranges: on the model, without noise and feedback."""
-        silence = np.zeros((len(self.plan.t), len(self.task.system.outputs)))
+        """(l,) margins of the plan on the model, divided by half of their ranges.
+
+        They are computed without noise and without feedback.
+        """
+        no_noise = np.zeros((len(self.plan.t), len(self.task.system.outputs)))
         theta = self._with_delay(self.task.parameters.guess)
-        return self.play(theta, silence, False)[1]
+        _, margins, _ = self.play(theta, no_noise, False)
+        return margins
 
     def predicted(self) -> Array:
-        """(p,) standard deviations that the plan promises at the guess with the true delay [theta-unit]."""
+        """(p,) predicted standard deviations at the guess with the true delay [theta-unit]."""
         task = self.task
         theta = self._with_delay(task.parameters.guess)
         control = np.repeat(self.plan.ctrl, self.steps_per_row, axis=0)
@@ -622,7 +713,7 @@ class RobotBench:
 
 
 def _assessed_limits(task: DesignTask) -> tuple[Limit, ...]:
-    """All limits; those within samples come first, in the order of the observations."""
+    """All limits; first those on observed quantities, in the order of the observations."""
     within = [limit for kind in SUBSTEP_KINDS for limit in task.limits if limit.kind == kind]
     others = [limit for limit in task.limits if limit.kind not in SUBSTEP_KINDS]
 
@@ -643,7 +734,7 @@ def _start_names(model: Any) -> Iterator[str]:
 
 
 def _sensed(task: DesignTask) -> np.ndarray:
-    """(ns,) index of the output that measures each entry of the state; -1 where none does."""
+    """(ns,) index of the output that measures each entry of the state; -1 where there is none."""
     model, space = task.system.model, task.space
     position = int(mujoco.mjtSensor.mjSENS_JOINTPOS)
     velocity = int(mujoco.mjtSensor.mjSENS_JOINTVEL)
@@ -666,14 +757,13 @@ def _sensed(task: DesignTask) -> np.ndarray:
 
 
 def summarize_runs(bench: RobotBench, runs: Sequence[RobotRun]) -> Robustness:
-    """Compare the estimates and margins of all robots with the truth and with the plan.
+    """Compare the estimates and margins of all robots with the true values and with the plan.
 
     Args:
         bench: The bench on which the robots were played.
         runs: The robots.
     """
     task = bench.task
-    stated = set(bench.stated.parameters.names)
     names = task.parameters.names
     shape = (-1, len(names))
 
@@ -683,38 +773,22 @@ def summarize_runs(bench: RobotBench, runs: Sequence[RobotRun]) -> Robustness:
     std = np.array([run.std for run in good]).reshape(shape)
     std = np.where(np.isfinite(std).all(axis=0), std, np.nan)
 
-    # Joint regions: of the parameters that the experiment states, and of all unknowns.
+    # Joint confidence regions: of the parameters that the experiment states, and of all unknowns.
     identified = np.isfinite(std).all(axis=0)
-    regions = [
-        np.flatnonzero(identified & [name in stated for name in names]),
-        np.flatnonzero(identified),
-    ]
-    joint = []
-    for region in regions:
-        threshold = chi2.ppf(CONFIDENCE, len(region))
-        joint.append(sum(run.squared_distance(region) <= threshold for run in good))
+    stated = np.isin(names, bench.stated.parameters.names)
 
     squared = [(run.theta - task.parameters.guess) ** 2 for run in runs]
     return Robustness(
         conditions=bench.conditions,
         names=names,
         units=task.system.units,
-        limits=tuple(
-            AssessedLimit(
-                kind=limit.kind,
-                name=limit.name,
-                lower=limit.lower,
-                upper=limit.upper,
-                scale=limit.scale,
-            )
-            for limit in bench.limits
-        ),
+        limits=tuple(_assessed(limit) for limit in bench.limits),
         wrong=np.sqrt(np.mean(squared, axis=0)),
         z=error / std,
         error=error,
         std=std,
         predicted=bench.predicted(),
-        joint=(int(joint[0]), int(joint[1])),
+        joint=(_covered(good, identified & stated), _covered(good, identified)),
         margins=np.array([run.margins for run in runs]),
         planned=bench.planned(),
         fit=float(np.mean([run.fit for run in good])) if good else np.nan,
@@ -724,18 +798,41 @@ def summarize_runs(bench: RobotBench, runs: Sequence[RobotRun]) -> Robustness:
     )
 
 
-# ---- robots side by side
+def _assessed(limit: Limit) -> AssessedLimit:
+    """Record of a limit for the user."""
+    return AssessedLimit(
+        kind=limit.kind,
+        name=limit.name,
+        lower=limit.lower,
+        upper=limit.upper,
+        scale=limit.scale,
+    )
+
+
+def _covered(runs: Sequence[RobotRun], selected: np.ndarray) -> int:
+    """Number of robots whose true values lie in the joint confidence region of some parameters.
+
+    Args:
+        runs: Identified robots.
+        selected: (p,) True for the parameters of the region.
+    """
+    indices = np.flatnonzero(selected)
+    threshold = chi2.ppf(CONFIDENCE, len(indices))
+    return int(sum(run.squared_distance(indices) <= threshold for run in runs))
+
+
+# ---- several robots
 
 
 @dataclass(frozen=True, kw_only=True)
 class _RobotStudy:
-    """Everything from which a worker process makes the bench of a study; picklable.
+    """Order from which a worker process makes the bench of a study; it can be pickled.
 
     Attributes:
-        key: Unique text, by which a worker knows that it has made the bench already.
+        key: Unique text by which a worker recognises the study, so that it makes one bench only.
         experiment: The experiment of the design.
         table: The design.csv.
-        conditions: How the robots differ from the model.
+        conditions: Differences between the robots and the model.
     """
 
     key: str
@@ -749,7 +846,7 @@ class _RobotStudy:
         return cls(key=uuid.uuid4().hex, experiment=experiment, table=table, conditions=conditions)
 
 
-# The bench of a worker process by the key of its study; it holds the latest one only.
+# The bench of a worker process, by the key of its study. Only the latest bench is kept.
 _worker_benches: dict[str, RobotBench] = {}
 
 
@@ -771,7 +868,10 @@ def _play_all(
     executor: Executor | None,
     stop: StopToken,
 ) -> Iterator[RobotRun]:
-    """Play all robots in their order until a stop is requested; without an executor one after another."""
+    """Play all robots until a stop is requested, and yield the results in their order.
+
+    Without an executor, one robot is played after another in this process.
+    """
     if executor is not None:
         futures = [executor.submit(_run_in_worker, study, number) for number in range(count)]
         yield from results_in_order(executor, futures, Budget(stop=stop))
@@ -784,7 +884,8 @@ def _play_all(
         with threadpool_limits(1):
             run = bench.run(number)
 
-        # A request to stop ends the fit of the robot early as well: its estimate does not count.
+        # A request to stop also ends the fit of the current robot early, whose estimate is
+        # therefore not used.
         if stop.requested:
             return
         yield run

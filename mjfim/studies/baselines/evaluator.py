@@ -1,4 +1,8 @@
-"""Evaluation of controls for the baselines: under the constraints of an experiment, within a budget, keeping the best one."""
+"""Evaluation of controls for the baselines.
+
+Controls are evaluated under the constraints of an experiment and within a budget; the best one is
+kept.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +22,24 @@ from mjfim.excitation.task import DesignTask
 from mjfim.experiment.schema import Experiment
 from mjfim.records.trajectory import Trajectory
 
-# Smallest scale of one batch of scales, over the largest one.
+# Ratio of the smallest to the largest scale in one batch of scales.
 SCALE_RANGE = 0.03
 
-# Scales that are simulated at once.
+# Number of scales that are simulated at once.
 SCALES_PER_BATCH = 6
 
-# Batches of ever smaller scales that are tried before a deviation is given up.
+# Number of batches, each with smaller scales, that are tried before a deviation is given up.
 COARSE_BATCHES = 3
 
-# Batches that refine the largest feasible scale.
+# Number of batches that refine the largest feasible scale.
 REFINING_BATCHES = 2
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BaselineSearch:
-    """Order for one search by a baseline; picklable, so that a worker can run it.
+    """Order for one search by a baseline.
+
+    It can be pickled, so that a worker process can run it.
 
     Attributes:
         experiment: Experiment for which a control is searched.
@@ -81,7 +87,15 @@ class SearchResult:
     steps: int = 0
 
     def is_improved_by(self, cost: float, margin: float) -> bool:
-        """True where another control is cheaper, or nearer to feasible while none is feasible yet."""
+        """Whether another control is better than this one.
+
+        Args:
+            cost: J of the other control; infinite where it is infeasible.
+            margin: Its smallest relative margin.
+
+        Returns:
+            True where it costs less, or where neither is feasible and its margin is larger.
+        """
         return cost < self.cost or (not np.isfinite(self.cost) and margin > self.margin)
 
 
@@ -95,12 +109,12 @@ class ControlEvaluator:
 
     Attributes:
         search: The order.
-        callback: Called whenever the budget is asked, or None.
+        callback: Called whenever the budget is checked, or None.
         stop: Ends the search early.
         best: The best control so far.
-        protected_looks: Number of looks at the budget for which only the whole budget counts, not a
-            share of it.
-        task: The experiment, on the plant without clamps where it is limited.
+        protected_checks: Number of checks of the budget for which only the whole budget counts, not
+            a share of it.
+        task: The task of the experiment; under hard limits, on the plant without clamps.
         constraints: Its constraints.
         centre: (nu,) control about which deviations are scaled [unit of the actuator].
         exact: The cost by which controls are compared.
@@ -112,7 +126,7 @@ class ControlEvaluator:
     callback: SearchCallback | None = None
     stop: StopToken | None = None
     best: SearchResult = field(default_factory=SearchResult)
-    protected_looks: int = 0
+    protected_checks: int = 0
 
     def __post_init__(self) -> None:
         order = self.search
@@ -137,22 +151,25 @@ class ControlEvaluator:
         return self.budget.used
 
     def exhausted(self, limit: float = 1.0) -> bool:
-        """Report the progress and tell whether the search has to end.
+        """Report the progress and check whether the search has to end.
 
         Args:
             limit: Share of the budget after which the current part of the search ends.
+
+        Returns:
+            True where the search has to end.
         """
         if self.callback is not None:
             self.callback(self.used, self.best)
-        self.protected_looks -= 1
+        self.protected_checks -= 1
 
         self._count_steps()
         if self.budget.exhausted:
             return True
-        return self.protected_looks < 0 and self.budget.used >= limit
+        return self.protected_checks < 0 and self.budget.used >= limit
 
     def _count_steps(self) -> None:
-        """Tell the budget how many MuJoCo steps were taken."""
+        """Update the number of MuJoCo steps in the budget."""
         taken = self.task.plant.engine_steps - self._steps_before
         self.budget.spend(steps=taken - self.budget.steps)
 
@@ -177,7 +194,7 @@ class ControlEvaluator:
 
         Args:
             point: Point with a cost.
-            name: Name of the attempt that leads to it.
+            name: Name of the attempt that found it.
 
         Returns:
             The cost J; infinite where a constraint is violated or the simulation diverges.
@@ -200,7 +217,7 @@ class ControlEvaluator:
             control: (N, nu) control [unit of the actuator].
             cost: J; infinite where it is infeasible.
             margin: Smallest relative margin.
-            name: Name of the attempt that leads to it.
+            name: Name of the attempt that found it.
         """
         if self.best.is_improved_by(cost, margin):
             self.best = SearchResult(
@@ -215,12 +232,12 @@ class ControlEvaluator:
             largest: Largest scale that is tried.
 
         Returns:
-            The scale; 0 where none of those tried is feasible.
+            The scale; 0 where no tried scale is feasible.
         """
         if not self.is_limited:
             return largest
 
-        # Try ever smaller scales until one is feasible.
+        # Try smaller and smaller scales until one is feasible.
         scales = np.geomspace(largest, SCALE_RANGE * largest, SCALES_PER_BATCH)
         first: int | None = None
         for _ in range(COARSE_BATCHES):
@@ -242,12 +259,20 @@ class ControlEvaluator:
         return float(scales[first])
 
     def _first_feasible(self, deviation: Array, scales: Array) -> int | None:
-        """Index of the first of falling scales, (k,), at which all constraints hold; None where none is feasible."""
+        """Index of the first feasible scale.
+
+        Args:
+            deviation: (N, nu) deviation from the centre [unit of the actuator].
+            scales: (k,) scales in descending order.
+
+        Returns:
+            The index; None where no scale is feasible.
+        """
         plant, theta = self.task.plant, self.task.theta
         controls = self.centre + scales[:, None, None] * deviation
-        start = np.repeat(plant.initial_state(theta)[None], len(scales), axis=0)
+        initial_states = np.repeat(plant.initial_state(theta)[None], len(scales), axis=0)
         batch = plant.simulator.rollout(
-            [plant.model(theta)], start, controls, self.constraints.observations
+            [plant.model(theta)], initial_states, controls, self.constraints.observations
         )
 
         for i, control in enumerate(controls):
@@ -262,7 +287,10 @@ class ControlEvaluator:
         return None
 
     def _margin(self, trajectory: Trajectory, observed: Array) -> float:
-        """Smallest relative margin along a trajectory; distances are expensive and measured only where the rest holds."""
+        """Smallest relative margin along a trajectory.
+
+        Distances of geoms are expensive: they are measured only where all other constraints hold.
+        """
         cheap = replace(self.constraints, clearance=None)
         margin = _smallest_margin(cheap, trajectory, observed)
         if margin < 0.0 or self.constraints.clearance is None:
@@ -272,6 +300,13 @@ class ControlEvaluator:
 
 
 def _smallest_margin(constraints: ConstraintSet, trajectory: Trajectory, observed: Array) -> float:
-    """Smallest relative margin of a constraint set; observed: (N, substeps, w) observations at the engine steps."""
+    """Smallest relative margin of a constraint set.
+
+    Args:
+        constraints: The constraint set.
+        trajectory: The trajectory.
+        observed: (N, substeps, w) observations at the engine steps.
+    """
     values = constraints.evaluate(trajectory, observed, slopes=False)
-    return min(constraints.relative_margins(values).values(), default=np.inf)
+    margins = constraints.relative_margins(values).values()
+    return min(margins, default=np.inf)

@@ -1,8 +1,9 @@
-"""Baselines that a design is compared with: searches for a control within a budget of time and MuJoCo steps.
+"""Baselines that a design is compared with.
 
-All baselines search under the same limits, on the same plant, with the same cost J. Chirps,
-multisines and random steps are searched at random over the few numbers that describe them, each
-scaled up to the limits. Fourier series and B-splines are in `parametric`.
+Each searches for a control within a budget of time and MuJoCo steps. All of them search under one
+set of limits, on one plant, with one cost J. Chirps, multisines and random steps are searched at
+random over the few numbers that describe them, and scaled up to the limits. Fourier series and
+B-splines are in `parametric`.
 """
 
 from __future__ import annotations
@@ -37,25 +38,26 @@ from mjfim.studies.baselines.parametric import (
     spline_runs,
 )
 
-# Periods of a wave within the horizon, at most.
+# Largest number of periods of a wave within the horizon.
 MAX_CYCLES = 40.0
 
-# Largest deviation of a control without a range, over the size of the initial control.
+# Largest deviation of a control without a range, divided by the size of the initial control.
 LARGEST_UNBOUNDED_SCALE = 6.0
 
-# Largest deviation of a control with a range, over half of the range.
+# Largest deviation of a control with a range, divided by half of the range.
 LARGEST_BOUNDED_SCALE = 2.0
 
-# Smallest deviation, over the largest feasible one, where weights in the cost may make a small
-# control the best.
+# Smallest deviation, divided by the largest feasible one, where weights in the cost may make a
+# small control the best.
 SMALLEST_WEIGHTED_SCALE = 0.03
 
-# Share of the trials of the random search that are drawn anywhere, not about the best one.
+# Share of the trials of the random search that are drawn from the whole range, instead of about the
+# best trial.
 GLOBAL_SHARE = 0.3
 
-# Share of the numbers that a trial about the best one changes, and the fewest that it changes.
+# Share of the numbers that a trial about the best one changes, and the smallest number of them.
 CHANGED_SHARE = 0.3
-FEWEST_CHANGED = 2.0
+MIN_CHANGED = 2.0
 
 # Standard deviation of changes about the best trial at the beginning, and its range.
 FIRST_SPREAD = 0.3
@@ -92,7 +94,7 @@ def run_baseline(
         search: The order.
         callback: Called during the search with the used share of the budget and the best result so
             far.
-        stop: Ends the search early; in a worker process, default: the request of its pool.
+        stop: Ends the search early; None for the token of the pool in a worker process.
 
     Returns:
         The best control.
@@ -100,7 +102,7 @@ def run_baseline(
     if stop is None:
         stop = pool_stop_token()
 
-    # Small matrices: threads of the BLAS only wait for each other.
+    # The matrices are small, so that several threads of the BLAS would only wait for each other.
     with threadpool_limits(1, user_api="blas"):
         evaluator = ControlEvaluator(search=search, callback=callback, stop=stop)
         METHODS[search.method].run(evaluator)
@@ -110,7 +112,7 @@ def run_baseline(
 def random_search(
     evaluator: ControlEvaluator, kind: Callable[[ExcitationSettings], Excitation]
 ) -> None:
-    """Search at random over the numbers of an excitation, about the best ones or anywhere.
+    """Search at random over the numbers of an excitation, about the best ones or everywhere.
 
     Args:
         evaluator: Evaluates the trials and ends the search.
@@ -125,7 +127,7 @@ def random_search(
         numbers = rng.random(1 + excitation.parameter_count)
         is_local = len(best) > 0 and rng.random() > GLOBAL_SHARE
         if is_local:
-            share = max(CHANGED_SHARE, FEWEST_CHANGED / len(numbers))
+            share = max(CHANGED_SHARE, MIN_CHANGED / len(numbers))
             changed = rng.random(len(numbers)) < share
             change = spread * changed * rng.normal(size=len(numbers))
             numbers = reflected(best + change)
@@ -155,13 +157,15 @@ def reflected(numbers: Array) -> Array:
 
 
 class ExcitationFitter:
-    """Fits excitations to an experiment: from rest to rest, within the bandwidth, in units of the actuators.
+    """Fits excitations to an experiment.
+
+    They begin and end at rest, stay within the bandwidth, and are in units of the actuators.
 
     Attributes:
         settings: Frequencies and duration of the excitations.
-        has_weights: True where the cost has weights, which may make a smaller control the better
-            one.
-        largest_scale: Largest scale of a deviation that is worth trying.
+        has_weights: True where a smaller control may be the better one, because the cost has
+            weights or there are no hard limits.
+        largest_scale: Largest scale of a deviation that is tried.
     """
 
     def __init__(self, evaluator: ControlEvaluator) -> None:
@@ -208,7 +212,7 @@ class ExcitationFitter:
         if self._basis is None or self._fit is None:
             return windowed
 
-        # The nearest curve within the bandwidth.
+        # Project the deviation on the curves within the bandwidth.
         return np.asarray(self._basis @ (self._fit @ windowed))
 
 

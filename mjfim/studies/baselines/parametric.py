@@ -1,9 +1,9 @@
-"""Optimised Fourier series and B-splines: many of them roughly, the best ones to the end.
+"""Optimised Fourier series and B-splines.
 
-They are optimised with SciPy or with mjfim's optimiser. SciPy gets the best that can be given to
-it: the exact gradient of `log J + mu * barrier`, with mu falling in the stages of a barrier
-schedule, and coefficients that are whitened at every stage by the Gauss-Newton metric of the
-barrier.
+Many of them are optimised roughly, the best ones to the end, with SciPy or with mjfim's optimiser.
+SciPy gets all the help that is available: the exact gradient of `log J + mu * barrier`, where mu
+decreases in the stages of a barrier schedule, and coefficients that are whitened at every stage
+with the Gauss-Newton metric of the barrier.
 """
 
 from __future__ import annotations
@@ -45,41 +45,46 @@ FOURIER_FREQUENCIES = (0.2, 0.1, 0.4, 0.8, 0.15)
 # Bandwidths of the first B-splines [Hz].
 SPLINE_BANDWIDTHS = (1.0, 2.0)
 
-# Periods of the first harmonic within the horizon, fewest and most, of Fourier series with random
-# base frequencies.
+# Smallest and largest number of periods of the first harmonic within the horizon, for Fourier
+# series with random base frequencies.
 RANDOM_PERIODS = (0.4, 5.0)
 
-# Harmonics that series with random base frequencies have at least, where the bandwidth allows them.
-FEWEST_RANDOM_HARMONICS = 5
+# Smallest number of harmonics of series with random base frequencies, where the bandwidth allows
+# them.
+MIN_RANDOM_HARMONICS = 5
 
-# Bandwidths of random B-splines, over the smallest and the largest of the first ones.
+# The bandwidths of random B-splines lie between these multiples of the smallest and of the largest
+# bandwidth of the first B-splines.
 RANDOM_BANDWIDTH_FACTORS = (0.5, 2.0)
 
 # Barrier weight mu down to which all series are optimised.
 ROUGH_MU = 0.03
 
-# Shares of the remaining budget after which only the better series continue, and after which only
-# the best one does.
-ROUGH_SHARE, BETTER_SHARE = 0.3, 0.45
+# Share of the remaining budget after which only the better series are continued.
+ROUGH_SHARE = 0.3
 
-# One in three series belongs to the better ones.
+# Share of the remaining budget after which only the best series is continued.
+BETTER_SHARE = 0.45
+
+# One in three series is one of the better ones.
 SELECTION_RATE = 3
 
-# Evaluations that every series gets at least; where the budget does not allow them, fewer series
-# take part.
+# Smallest number of evaluations for every series. Where the budget does not allow them, fewer
+# series are optimised.
 MIN_EVALUATIONS = 12
 
-# Iterations of mjfim's optimiser: unlimited for practical purposes, the budget ends it.
+# Largest number of iterations of mjfim's optimiser. It is never reached, because the budget ends
+# the optimisation.
 UNLIMITED_ITERATIONS = 100_000
 
 # SciPy's method, and the number of curvature pairs that it keeps.
 SCIPY_METHOD = "L-BFGS-B"
 SCIPY_OPTIONS = {"maxcor": 30}
 
-# Value that SciPy sees where the simulation diverges.
+# Value that SciPy gets where the simulation diverges.
 DIVERGED_VALUE = 1e6
 
-# Weight of the control in the whitening metric, over the weight of its barrier.
+# Weight of the control in the whitening metric, divided by the weight of its barrier.
 RIDGE = 0.03
 
 # Multiple of the mean eigenvalue that is added to the metric, so that its Cholesky factor exists.
@@ -121,15 +126,16 @@ class ParametricRun:
             self.control, self.cost = point.ctrl, cost
 
 
-# Optimises a run down to a barrier weight, or until a share of the budget is used: (evaluator, run,
-# last weight, share).
+# Optimises a run down to a barrier weight, or until a share of the budget is used. The arguments
+# are the evaluator, the run, the last barrier weight and the share.
 Optimiser = Callable[[ControlEvaluator, ParametricRun, float, float], None]
 
 
 def fourier_runs(evaluator: ControlEvaluator, harmonics: int) -> Iterator[ParametricRun]:
-    """Finite Fourier series (Swevers et al.
+    """Finite Fourier series, with usual base frequencies first and random ones after them.
 
-    1997), with usual base frequencies first and random ones after them.
+    The parametrisation is that of Swevers et al. (Optimal robot excitation and identification,
+    1997).
 
     Args:
         evaluator: Scales the initial controls to the limits.
@@ -151,7 +157,7 @@ def fourier_runs(evaluator: ControlEvaluator, harmonics: int) -> Iterator[Parame
         return independent_curves(curves)
 
     usual = [frequency for frequency in FOURIER_FREQUENCIES if frequency <= fastest]
-    highest = fastest / min(harmonics, FEWEST_RANDOM_HARMONICS)
+    highest = fastest / min(harmonics, MIN_RANDOM_HARMONICS)
     ends = [min(periods / task.horizon, highest) for periods in RANDOM_PERIODS]
     return _runs(evaluator, usual, ends, basis)
 
@@ -188,7 +194,19 @@ def _runs(
     ends: Sequence[float],
     basis_of: Callable[[float], Array],
 ) -> Iterator[ParametricRun]:
-    """Runs at the usual frequencies [Hz] from the initial control, then at random ones from random coefficients."""
+    """Runs at usual frequencies, then runs at random frequencies.
+
+    The former begin at the initial control, the latter at random coefficients.
+
+    Args:
+        evaluator: Scales the initial controls to the limits.
+        usual: The usual frequencies [Hz].
+        ends: Smallest and largest of the random frequencies [Hz].
+        basis_of: Gives the (N, M) curves of a frequency.
+
+    Yields:
+        Runs without end, until the budget is exhausted.
+    """
     part, parts = evaluator.search.part
     for frequency in usual[part::parts]:
         if evaluator.exhausted():
@@ -215,7 +233,10 @@ def _runs(
 def _initial_run(
     evaluator: ControlEvaluator, name: str, basis: Array, deviation: Array
 ) -> ParametricRun:
-    """A run that begins with a deviation from the centre, (N, nu), scaled down to the limits where it violates them."""
+    """A run that begins with a deviation from the centre: (N, nu).
+
+    The deviation is scaled down where it violates the limits.
+    """
     scale = evaluator.largest_feasible_scale(deviation)
     control = evaluator.centre + (scale or 1.0) * deviation
     run = ParametricRun(name=name, basis=basis, control=control)
@@ -227,52 +248,89 @@ def _initial_run(
 def optimise_many(
     evaluator: ControlEvaluator, runs: Iterator[ParametricRun], count: int, optimise: Optimiser
 ) -> None:
-    """Optimise several runs roughly, the better third longer, the best one to the end; repeat until the budget is exhausted.
+    """Optimise several runs roughly, the better third longer, and the best one to the end.
+
+    This is repeated with further runs until the budget is exhausted.
 
     Args:
         evaluator: Evaluates controls and holds the budget.
-        runs: Where further runs come from.
-        count: Runs that are added in each repetition, where the budget allows.
+        runs: The runs, in the order in which they are begun.
+        count: Number of runs that are added in each repetition, where the budget allows it.
         optimise: Optimises one run.
     """
-    known: list[ParametricRun] = []
-
-    def advance(run: ParametricRun, last: float, limit: float) -> None:
-        """Optimise a run, unless it has come that far already."""
-        if run.mu > last:
-            optimise(evaluator, run, last, limit)
-
+    search = _SuccessiveSelection(evaluator=evaluator, optimise=optimise)
     while not evaluator.budget.exhausted:
-        begun = evaluator.used
-        rough_end = begun + ROUGH_SHARE * (1.0 - begun)
-        better_end = begun + BETTER_SHARE * (1.0 - begun)
+        used = evaluator.used
+        rough_end = used + ROUGH_SHARE * (1.0 - used)
+        better_end = used + BETTER_SHARE * (1.0 - used)
 
-        # New runs, each with its share of the first part of the budget.
+        may_continue = (
+            search.optimise_new_runs(runs, count, rough_end)
+            and search.optimise_better_runs(better_end)
+            and search.finish_best_run()
+        )
+        if not may_continue:
+            return
+
+
+@dataclass(eq=False, kw_only=True)
+class _SuccessiveSelection:
+    """Runs of an optimisation that continues with the better ones. See `optimise_many`.
+
+    Every method returns whether the search may continue: False where the budget is exhausted.
+
+    Attributes:
+        evaluator: Evaluates controls and holds the budget.
+        optimise: Optimises one run.
+        runs: All runs so far.
+    """
+
+    evaluator: ControlEvaluator
+    optimise: Optimiser
+    runs: list[ParametricRun] = field(default_factory=list)
+
+    def optimise_new_runs(self, runs: Iterator[ParametricRun], count: int, end: float) -> bool:
+        """Add runs and optimise each roughly, until a share of the budget is used."""
         for i in range(count):
             run = next(runs, None)
             if run is None:
-                return
-            known.append(run)
-            evaluator.protected_looks = MIN_EVALUATIONS
-            advance(run, ROUGH_MU, evaluator.used + (rough_end - evaluator.used) / (count - i))
-            if evaluator.exhausted():
-                return
-            if evaluator.used >= rough_end:
+                return False
+            self.runs.append(run)
+
+            # The remaining part of the budget is divided among the runs that are still to come.
+            self.evaluator.protected_checks = MIN_EVALUATIONS
+            used = self.evaluator.used
+            self._advance(run, ROUGH_MU, used + (end - used) / (count - i))
+
+            if self.evaluator.exhausted():
+                return False
+            if self.evaluator.used >= end:
                 break
+        return True
 
-        # The better ones of all runs so far.
-        better = _cheapest(known, -(-len(known) // SELECTION_RATE))
+    def optimise_better_runs(self, end: float) -> bool:
+        """Continue the better ones of all runs, until a share of the budget is used."""
+        number = -(-len(self.runs) // SELECTION_RATE)
+        better = _cheapest(self.runs, number)
         for i, run in enumerate(better):
-            share = (better_end - evaluator.used) / (len(better) - i)
-            advance(run, ROUGH_MU, evaluator.used + share)
-            if evaluator.exhausted():
-                return
+            used = self.evaluator.used
+            self._advance(run, ROUGH_MU, used + (end - used) / (len(better) - i))
+            if self.evaluator.exhausted():
+                return False
+        return True
 
-        # The best one, to the end.
-        for run in _cheapest(known, 1):
-            advance(run, BarrierSchedule().last, 1.0)
-            if evaluator.exhausted():
-                return
+    def finish_best_run(self) -> bool:
+        """Optimise the best run to the end."""
+        for run in _cheapest(self.runs, 1):
+            self._advance(run, BarrierSchedule().last, 1.0)
+            if self.evaluator.exhausted():
+                return False
+        return True
+
+    def _advance(self, run: ParametricRun, last: float, limit: float) -> None:
+        """Optimise a run, unless it has reached the barrier weight already."""
+        if run.mu > last:
+            self.optimise(self.evaluator, run, last, limit)
 
 
 def _cheapest(runs: Sequence[ParametricRun], count: int) -> list[ParametricRun]:
@@ -282,22 +340,21 @@ def _cheapest(runs: Sequence[ParametricRun], count: int) -> list[ParametricRun]:
     return unfinished[:count]
 
 
-# with mjfim's optimiser
-# ---------------------------------------------------------------------------------------------
+# ---- with mjfim's optimiser
 
 
 def optimise_with_mjfim(
     evaluator: ControlEvaluator, run: ParametricRun, last: float, limit: float
 ) -> None:
-    """Optimise within the curves of a run as designs under hard limits are optimised.
+    """Optimise within the curves of a run, as designs under hard limits are optimised.
 
-    See `Optimiser`.
+    The arguments are those of an `Optimiser`.
     """
     order = evaluator.search
     stop = StopToken()
 
-    # Only the last search gets a time limit: with one, the barrier of the others would fall too
-    # early.
+    # Only the last search gets a time limit. With one, the barrier weight of the other searches
+    # would decrease too early.
     seconds = (1.0 - evaluator.used) * order.seconds if limit >= 1.0 else np.inf
     search = ConstrainedSearch(
         experiment=order.experiment,
@@ -312,7 +369,7 @@ def optimise_with_mjfim(
     )
 
     def watch(event: DesignEvent) -> None:
-        """Ask the search to stop where the budget is exhausted."""
+        """Stop the search where the budget is exhausted."""
         run.mu = min(event.row.mu, run.mu)
         if evaluator.exhausted(limit):
             stop.request()
@@ -327,13 +384,16 @@ def optimise_with_mjfim(
     run.finish_schedule(last)
 
 
-# with SciPy -------------------------------------------------------------------------------------------------------------
+# ---- with SciPy
 
 
 def optimise_with_scipy(
     evaluator: ControlEvaluator, run: ParametricRun, last: float, limit: float
 ) -> None:
-    """Minimise the cost of the experiment within the curves of a run. See `Optimiser`."""
+    """Minimise the cost of the experiment within the curves of a run.
+
+    The arguments are those of an `Optimiser`.
+    """
     base = evaluator.exact
     if evaluator.task.experiment.cost.criterion == "E":
         base = smoothed(evaluator.task, evaluator.search.combinations)
@@ -345,7 +405,11 @@ def optimise_with_scipy(
 def optimise_determinant_with_scipy(
     evaluator: ControlEvaluator, run: ParametricRun, last: float, limit: float
 ) -> None:
-    """Minimise `-log det` instead of the experiment's criterion, by which controls are still compared. See `Optimiser`."""
+    """Minimise `-log det` instead of the experiment's criterion.
+
+    Controls are still compared by the experiment's criterion. The arguments are those of an
+    `Optimiser`.
+    """
     information = replace(evaluator.exact.information, criterion="D")
     base = replace(evaluator.exact, information=information)
 
@@ -362,7 +426,7 @@ class ScipyDescent:
         run: The run; its best control and its barrier weight are kept up to date.
         base: Cost that is minimised.
         limit: Share of the budget after which the descent ends.
-        out_of_budget: True once it has ended for that reason.
+        out_of_budget: True once the budget has ended the descent.
         s: (M, nu) coefficients of the curves.
     """
 
@@ -410,7 +474,7 @@ class ScipyDescent:
             if not is_complete:
                 return
 
-            # Move the limits inwards where the end of a stage violates them.
+            # Tighten the constraints where the result of a stage violates them.
             point = self._point(evaluator.problem)
             if mu <= TIGHTENING_MU and point.values is not None:
                 margins = evaluator.constraints.relative_margins(point.values)
@@ -419,7 +483,12 @@ class ScipyDescent:
         self.run.finish_schedule(schedule.last if evaluator.is_limited else 0.0)
 
     def _first_control(self) -> Array:
-        """A feasible control; where none is near, the end of a descent of the barrier alone."""
+        """Initial control of the descent.
+
+        Returns:
+            (N, nu) control that is feasible if one was found: by shrinking the control of the run,
+            or else by minimising the barrier alone.
+        """
         evaluator, control = self.evaluator, self.run.control
         if not evaluator.is_limited:
             return control
@@ -445,7 +514,11 @@ class ScipyDescent:
     def _run_stage(
         self, problem: InteriorProblem, schedule: BarrierSchedule, mu: float, is_last: bool
     ) -> bool:
-        """Minimise one stage of the barrier until it makes little progress; return False where the budget ended it."""
+        """Minimise one stage of the barrier until it makes little progress.
+
+        Returns:
+            False where the budget has ended the stage.
+        """
         point = self._point(problem)
         if point.values is None:
             return True
@@ -470,7 +543,7 @@ class ScipyDescent:
             point: Point with finite merit.
 
         Returns:
-            (M nu,) derivative; None where the simulation diverges close by.
+            (M nu,) derivative; None where a perturbed simulation diverges.
         """
         try:
             gradient = problem.expand(point).gradient(self._no_feedback)
@@ -480,7 +553,7 @@ class ScipyDescent:
         return np.asarray((self.run.basis.T @ gradient).reshape(-1))
 
     def _repair(self) -> None:
-        """Shrink an infeasible control about the centre until it is feasible, and keep it if it is the best."""
+        """Shrink an infeasible control until it is feasible, and keep it if it is the best."""
         evaluator = self.evaluator
         point = self._point(evaluator.problem)
         if evaluator.is_limited and (point.values is None or not evaluator.is_feasible(point)):
@@ -491,7 +564,10 @@ class ScipyDescent:
         self.run.update(evaluator, point)
 
     def _whitening_factor(self, problem: InteriorProblem, point: InteriorPoint) -> Array:
-        """(M nu, M nu) lower Cholesky factor of the barrier's Gauss-Newton Hessian, with a ridge on the control."""
+        """(M nu, M nu) lower Cholesky factor of the whitening metric.
+
+        The metric is the Gauss-Newton Hessian of the barrier, with a ridge on the control.
+        """
         evaluator, task = self.evaluator, self.evaluator.task
         expansion = problem.expand(point)
         if expansion.barrier is None:
@@ -513,12 +589,13 @@ class ScipyDescent:
         return np.asarray(self.evaluator.centre + self.run.basis @ s)
 
     def coefficients(self, control: Array) -> Array:
-        """(M, nu) coefficients of the control that is nearest to a control: (N, nu)."""
+        """(M, nu) coefficients that approximate a control: (N, nu) best."""
         deviation = control - self.evaluator.centre
-        return np.asarray(np.linalg.lstsq(self.run.basis, deviation)[0], dtype=np.float64)
+        solution = np.linalg.lstsq(self.run.basis, deviation)
+        return np.asarray(solution[0], dtype=np.float64)
 
     def _point(self, problem: InteriorProblem) -> InteriorPoint:
-        """The current coefficients, evaluated."""
+        """Point of the current coefficients, evaluated."""
         return problem.point(self.control(self.s))
 
 
@@ -532,10 +609,10 @@ class _ScipyStage:
         factor: (M nu, M nu) L, the lower Cholesky factor of the metric.
         values: Merit of the accepted iterates, the first one included.
         least_progress: Decrease of the merit over `window` iterates below which the stage ends.
-        patience: Iterates, at most.
+        patience: Largest number of iterates.
         window: Number of iterates over which progress is measured.
         ended: True once nothing more has to be evaluated.
-        evaluated: Merit of evaluated coefficients, by their bytes.
+        evaluated: Merit at the evaluated coefficients; the keys are the bytes of the coefficients.
     """
 
     descent: ScipyDescent
@@ -561,17 +638,20 @@ class _ScipyStage:
         )
 
     def _coefficients(self, y: Array) -> Array:
-        """(M, nu) coefficients of whitened ones: (M nu,)."""
+        """(M, nu) coefficients from whitened coefficients: (M nu,)."""
         return np.asarray(solve_triangular(self.factor.T, y).reshape(self.descent.s.shape))
 
     def _value_and_slope(self, y: Array) -> tuple[float, Array]:
-        """The merit and its derivative by whitened coefficients: (M nu,); once the stage has ended, no simulation."""
+        """The merit and its derivative by whitened coefficients: (M nu,).
+
+        Once the stage has ended, nothing is simulated any more.
+        """
         descent = self.descent
         if not self.ended and descent.evaluator.exhausted(descent.limit):
             descent.out_of_budget = self.ended = True
 
-        # SciPy cannot be stopped here: a large value ends its line search within a few cheap
-        # evaluations.
+        # SciPy cannot be stopped here. A large value ends its line search after a few evaluations,
+        # which cost nothing.
         diverged = DIVERGED_VALUE, np.zeros(y.size)
         if self.ended:
             return diverged
@@ -584,7 +664,7 @@ class _ScipyStage:
             return diverged
         descent.run.update(descent.evaluator, point)
 
-        # Without a cost, the first control inside all limits is the result.
+        # Where the barrier alone is minimised, the first feasible control is the result.
         if not self.problem.with_cost and descent.evaluator.is_feasible(point):
             descent.s, self.ended = s, True
             return diverged
@@ -595,7 +675,11 @@ class _ScipyStage:
         return value, np.asarray(solve_triangular(self.factor, slope, lower=True))
 
     def _accept(self, y: Array) -> None:
-        """Take over an iterate of SciPy; StopIteration is SciPy's way to end a minimisation."""
+        """Accept an iterate of SciPy.
+
+        Raises:
+            StopIteration: The stage has ended; SciPy ends a minimisation by this exception.
+        """
         if self.ended:
             raise StopIteration
 
