@@ -19,7 +19,10 @@ from mjfim.model.pair_distance import BOX, CAPSULE
 from tests.support.numerics import Array, directional_check
 
 ROCK = " ".join(f"{v:.3f}" for v in np.random.default_rng(5).normal(scale=0.1, size=60))
-ASSETS = f'<asset><mesh name="rock" vertex="{ROCK}"/><hfield name="hills" nrow="3" ncol="3" size="1 1 .2 .1"/></asset>'
+ASSETS = (
+    f'<asset><mesh name="rock" vertex="{ROCK}"/>'
+    '<hfield name="hills" nrow="3" ncol="3" size="1 1 .2 .1"/></asset>'
+)
 KINDS = {
     "sphere": 'type="sphere" size="0.1"',
     "capsule": 'type="capsule" size="0.05 0.2"',
@@ -38,9 +41,11 @@ ARMS = f"""
     {FLOOR}
     <body name="left" pos="0 0 0.3"><joint type="hinge" axis="0 1 0"/><geom {KINDS["capsule"]}/>
       <body name="elbow" pos="0 0 0.4"><joint type="ball"/><geom {KINDS["box"]}/>
-        <body name="wrist" pos="0.1 0 0.3"><joint type="hinge" axis="1 0 0"/><geom {KINDS["cylinder"]}/>
+        <body name="wrist" pos="0.1 0 0.3"><joint type="hinge" axis="1 0 0"/>
+          <geom {KINDS["cylinder"]}/>
           <geom {KINDS["sphere"]} pos="0 0 0.2"/></body></body></body>
-    <body name="right" pos="0.5 0 0.3"><joint type="slide" axis="1 0 1"/><geom {KINDS["ellipsoid"]}/>
+    <body name="right" pos="0.5 0 0.3"><joint type="slide" axis="1 0 1"/>
+      <geom {KINDS["ellipsoid"]}/>
       <body name="hand" pos="0 0 0.4"><joint type="ball"/><geom {KINDS["capsule"]}/></body></body>
     <body name="stone" pos="0.2 0.2 0.8"><freejoint/><geom {KINDS["mesh"]}/></body>
   </worldbody>
@@ -53,8 +58,10 @@ def two(first: str, second: str) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(
         f"""
         <mujoco>{ASSETS}<worldbody>
-          <body name="up" pos="0 0 0.5"><joint type="hinge" axis="1 1 0"/><geom size="0.01" contype="0" conaffinity="0"/>
-            <body name="A" pos="0.1 0 0.1"><joint type="ball"/><geom name="a" {first} pos="0.05 0 0.1"/></body></body>
+          <body name="up" pos="0 0 0.5"><joint type="hinge" axis="1 1 0"/>
+            <geom size="0.01" contype="0" conaffinity="0"/>
+            <body name="A" pos="0.1 0 0.1"><joint type="ball"/>
+              <geom name="a" {first} pos="0.05 0 0.1"/></body></body>
           <body name="B" pos="0.1 0 0.6"><freejoint/><geom name="b" {second} pos="0 0.02 0"/></body>
         </worldbody></mujoco>
         """
@@ -70,7 +77,7 @@ def on_floor(kind: str) -> mujoco.MjModel:
 
 
 def moved(model: mujoco.MjModel, qpos: Array, dq: Array) -> Array:
-    """Qpos along a tangent vector."""
+    """Configuration moved along a tangent vector."""
     out = qpos.copy()
     mujoco.mj_integratePos(model, out, np.ascontiguousarray(dq), 1.0)
     return out
@@ -139,18 +146,23 @@ CROWD = """
   <worldbody>
     <geom name="floor" type="plane" size="1 1 1"/>
     <body name="base"><geom name="base"/><geom name="seen" contype="0" conaffinity="0"/>
-      <body name="one" pos="0 0 0.1"><joint axis="1 0 0"/><geom name="one"/><geom name="one_seen" contype="0" conaffinity="0"/>
+      <body name="one" pos="0 0 0.1"><joint axis="1 0 0"/><geom name="one"/>
+        <geom name="one_seen" contype="0" conaffinity="0"/>
         <body name="plate" pos="0 0 0.1"><geom name="plate"/>
           <body name="two" pos="0 0 0.1"><joint axis="0 1 0"/><geom name="two"/>
-            <body name="three" pos="0 0 0.1"><joint/><geom name="three" contype="2" conaffinity="1"/>
-              <body name="tip" pos="0 0 0.1"><joint/><geom name="tip" contype="4" conaffinity="2"/></body>
+            <body name="three" pos="0 0 0.1"><joint/>
+              <geom name="three" contype="2" conaffinity="1"/>
+              <body name="tip" pos="0 0 0.1"><joint/>
+                <geom name="tip" contype="4" conaffinity="2"/></body>
             </body></body></body></body></body>
     <body name="ball" pos="0 0.1 0"><freejoint/><geom name="ball"/><geom name="ball_two"/></body>
-    <body name="cart" pos="0 0.2 0"><joint type="slide"/><geom name="cart" contype="0" conaffinity="1"/></body>
+    <body name="cart" pos="0 0.2 0"><joint type="slide"/>
+      <geom name="cart" contype="0" conaffinity="1"/></body>
   </worldbody>
   <contact>
     <exclude body1="two" body2="ball"/><exclude body1="cart" body2="ball"/>
-    <pair geom1="cart" geom2="ball_two"/><pair geom1="tip" geom2="three"/><pair geom1="one_seen" geom2="cart"/>
+    <pair geom1="cart" geom2="ball_two"/><pair geom1="tip" geom2="three"/>
+    <pair geom1="one_seen" geom2="cart"/>
   </contact>
 </mujoco>
 """
@@ -175,7 +187,7 @@ def test_pairs_agree_with_mujocos_collisions(flag: str) -> None:
 
 
 def test_pairs_are_found_where_contacts_are_off() -> None:
-    """The flag says what is simulated, not what may touch."""
+    """The flag decides what is simulated, not which geoms may touch."""
     off, on = (
         mujoco.MjModel.from_xml_string(CROWD.format(flag=f'contact="{x}"'))
         for x in ("disable", "enable")
@@ -197,7 +209,7 @@ def test_fixed_geoms_have_no_pairs_with_each_other() -> None:
 
 
 def test_ignored_bodies_are_left_out() -> None:
-    """All geoms of both, whichever comes first; the world has its name."""
+    """All pairs of geoms of the two bodies are ignored, in either order, also with the world."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     every = {p.name for p in find_geom_pairs(model, ())}
     left = {
@@ -220,19 +232,20 @@ def test_ignored_bodies_are_left_out() -> None:
     [
         (
             ("wirst", "hand"),
-            r"unknown body 'wirst' \(did you mean 'wrist'\?\); valid: elbow, hand, left, right, stone, w",
+            r"unknown body 'wirst' \(did you mean 'wrist'\?\); "
+            r"valid: elbow, hand, left, right, stone, w",
         ),
         (("hand",), r"\['hand'\] is no pair of bodies; needs two different names"),
     ],
 )
 def test_misuse_of_ignored(ignored: tuple[str, ...], message: str) -> None:
-    """Fault and what would be right."""
+    """The message names the fault and the valid values."""
     with pytest.raises(ExperimentError, match=message):
         find_geom_pairs(mujoco.MjModel.from_xml_string(ARMS), {frozenset(ignored)})
 
 
 def test_height_fields_are_refused_unless_ignored() -> None:
-    """MuJoCo's distances to them depend on how far one asks."""
+    """MuJoCo's distances to such geoms depend on the largest distance that is requested."""
     model = mujoco.MjModel.from_xml_string(
         f"""
         <mujoco>{ASSETS}<worldbody><geom name="hills" type="hfield" hfield="hills"/>
@@ -260,7 +273,7 @@ def test_no_pairs_are_refused() -> None:
 
 @pytest.mark.parametrize("reach", [0.02, 0.1, 0.5, 5.0])
 def test_nothing_within_reach_is_lost(reach: float) -> None:
-    """Against `mj_geomDistance` for every pair at random configurations; the rest is reach itself."""
+    """They agree with `mj_geomDistance` within reach; all others are the reach."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, reach), scattered(model, 200, 0.4)
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-10, 200
@@ -347,7 +360,8 @@ def test_a_box_on_its_edge_has_the_right_distance(eighths: int) -> None:
     model = mujoco.MjModel.from_xml_string(
         """
         <mujoco><worldbody><geom type="plane" size="1 1 1"/>
-          <body pos="0 0 0.3"><joint axis="1 0 0"/><geom type="box" size="0.1 0.1 0.1"/></body></worldbody></mujoco>
+          <body pos="0 0 0.3"><joint axis="1 0 0"/><geom type="box" size="0.1 0.1 0.1"/></body>
+        </worldbody></mujoco>
         """
     )
     found = between(model, 1.0)(np.array([[eighths * np.pi / 4]]), False).d[0, 0]
@@ -355,7 +369,7 @@ def test_a_box_on_its_edge_has_the_right_distance(eighths: int) -> None:
 
 
 def test_a_capsule_deep_in_a_box_has_a_negative_distance() -> None:
-    """Against that box as a mesh, for which MuJoCo uses another collider."""
+    """It agrees with that of the box as a mesh, for which MuJoCo uses another collider."""
     corners = " ".join(
         f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.05, 0.05) for z in (-0.2, 0.2)
     )
@@ -363,7 +377,8 @@ def test_a_capsule_deep_in_a_box_has_a_negative_distance() -> None:
         f"""
         <mujoco><asset><mesh name="box" vertex="{corners}"/></asset><worldbody>
           <body><freejoint/><geom {KINDS["capsule"]}/></body>
-          <body><freejoint/><geom {KINDS["box"]}/><geom type="mesh" mesh="box" mass="0"/></body></worldbody></mujoco>
+          <body><freejoint/><geom {KINDS["box"]}/><geom type="mesh" mesh="box" mass="0"/></body>
+        </worldbody></mujoco>
         """
     )
     chosen, qpos = between(model, 1.0), scattered(model, 500, 0.06)
@@ -379,7 +394,7 @@ SMOOTH = [(a, b) for a, b in combinations_with_replacement(KINDS, 2)]
 
 @pytest.mark.parametrize(("first", "second"), SMOOTH)
 def test_slopes_agree_with_differences(first: str, second: str) -> None:
-    """By hinge, ball and free joints, near and far."""
+    """Geoms are near or far and are moved by hinge, ball and free joints."""
     model = two(KINDS[first], KINDS[second])
     chosen, qpos = between(model, 2.0), scattered(model, 16, 0.4)
     qpos = qpos[chosen(qpos, False).d[:, 0] > 0.02]
@@ -409,7 +424,7 @@ def test_the_check_of_slopes_can_fail() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_slopes_to_the_floor_agree_with_differences(kind: str) -> None:
-    """Above and below a tilted plane."""
+    """The geom is above or below a tilted plane."""
     model = on_floor(KINDS[kind])
     chosen, qpos = between(model, 9.0), scattered(model, 8, 1.0)
     d = chosen(qpos, False).d
@@ -455,7 +470,7 @@ def test_touching_geoms_have_slopes(second: str, offset: float) -> None:
 
 
 def test_slopes_are_zero_beyond_reach() -> None:
-    """Exactly if the distance is the reach; slopes that were not asked for are None."""
+    """They are zero exactly if the distance is the reach; slopes not requested are None."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, 0.2, grouped=True), scattered(model, 100, 0.4)
     found = chosen(qpos, True)
@@ -491,7 +506,7 @@ def test_columns_are_pairs_of_bodies() -> None:
 
 @pytest.mark.parametrize("spread", [0.4, 4.0])
 def test_nearest_is_the_smallest_of_all(spread: float) -> None:
-    """Near and farther than reach, its row and geoms with it."""
+    """The distance may be larger than the reach; its row and its geoms are found as well."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     stone = [p for p in find_geom_pairs(model, ()) if "stone" in p.name and "floor" not in p.name]
     chosen, qpos = GeomDistances(model, stone, 0.01), scattered(model, 40, spread)

@@ -67,7 +67,7 @@ def solids(count: int, seed: int) -> list[BodyInertia]:
 
 
 def compiled(body: BodyInertia) -> Any:
-    """The chain with this body at its end, compiled by MuJoCo, which refuses bodies that cannot be."""
+    """The chain with this body at its end; MuJoCo refuses to compile unphysical bodies."""
     tensor = [body.inertia[pair] for pair in INERTIA_ENTRIES]
     text = CHAIN.format(com=spelled(body.com), mass=repr(body.mass), inertia=spelled(tensor))
     return mujoco.MjModel.from_xml_string(text)
@@ -94,7 +94,7 @@ def dynamics(body: BodyInertia) -> Array:
 
 @pytest.mark.parametrize("chart", INERTIA_PARAMETRISATIONS)
 def test_every_parametrisation_has_an_inverse(chart: str) -> None:
-    """Inertia from coordinates and coordinates from inertia."""
+    """Coordinates give the inertia, and the inertia gives the coordinates."""
     for body in solids(20, 0):
         v = INERTIA_PARAMETRISATIONS[chart].coordinates(body)
         again = INERTIA_PARAMETRISATIONS[chart].inertia(v)
@@ -124,7 +124,7 @@ def test_principal_axes_agree_with_mujoco() -> None:
 
 
 def test_barycentric_coordinates_are_moments_about_the_origin() -> None:
-    """Point by point from their definition."""
+    """They agree with sums over points, by their definition."""
     rng = np.random.default_rng(2)
     weights, points = rng.uniform(0.1, 1.0, 5), rng.standard_normal((5, 3))
     com = weights @ points / weights.sum()
@@ -215,7 +215,7 @@ def test_log_cholesky_is_the_factor_of_the_pseudo_inertia() -> None:
     ],
 )
 def test_points_rods_and_plates_have_no_log_cholesky(moments: tuple[float, ...]) -> None:
-    """A singular pseudo-inertia, or one that nothing has; anything thicker is taken."""
+    """Bodies with a singular or unphysical pseudo-inertia are refused, thicker ones accepted."""
     turned = solids(1, 8)[0].principal_axes()[1]
     body = BodyInertia.from_principal(2.0, np.array([0.1, 0.2, 0.3]), np.array(moments), turned)
     with pytest.raises(ValueError, match=r"a point, a rod or a plate"):

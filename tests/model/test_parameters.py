@@ -1,4 +1,4 @@
-"""Parameter paths; writing in place against recompiling; what an identified model file then says."""
+"""Parameter paths, values written in place against compiled ones, and identified model files."""
 
 from __future__ import annotations
 
@@ -29,11 +29,13 @@ ARM = """
   <worldbody>
     <body name="a">
       <joint name="j" type="hinge" axis="0 1 0" stiffness="2"/>
-      <geom name="g" type="capsule" fromto="0 0 0 .3 .1 .5" size=".05" mass="1" contype="0" conaffinity="0"/>
+      <geom name="g" type="capsule" fromto="0 0 0 .3 .1 .5" size=".05" mass="1" contype="0"
+        conaffinity="0"/>
       <site name="s"/>
       <body name="b" pos=".3 .1 .5">
         <joint name="k" type="hinge" axis="1 0 0"/>
-        <geom name="h" type="box" pos=".1 0 .2" euler=".2 .3 .5" size=".1 .2 .3" mass="1" contype="0" conaffinity="0"/>
+        <geom name="h" type="box" pos=".1 0 .2" euler=".2 .3 .5" size=".1 .2 .3" mass="1"
+          contype="0" conaffinity="0"/>
         <site name="t" pos=".1 .1 .1"/>
       </body>
     </body>
@@ -64,7 +66,8 @@ SIMPLE = """
     </body>
   </worldbody>
   <actuator>
-    <motor name="m" joint="x"/><motor joint="h" gear=".1"/><motor name="n" site="nozzle" gear="0 0 1 .1 0 0"/>
+    <motor name="m" joint="x"/><motor joint="h" gear=".1"/>
+    <motor name="n" site="nozzle" gear="0 0 1 .1 0 0"/>
   </actuator>
   <sensor><accelerometer site="nozzle"/></sensor>
 </mujoco>
@@ -99,7 +102,8 @@ TENDON = """
     </body>
   </worldbody>
   <tendon>
-    <spatial name="t" stiffness="20" damping="1" springlength=".3"><site site="anchor"/><site site="hook"/></spatial>
+    <spatial name="t" stiffness="20" damping="1" springlength=".3">
+      <site site="anchor"/><site site="hook"/></spatial>
   </tendon>
   <actuator><motor name="m" tendon="t"/></actuator>
 </mujoco>
@@ -108,7 +112,8 @@ TENDON = """
 # All kinds of servos, a filter with its time constant, and air around the arm.
 SERVOS = ARM.replace(
     "</actuator>",
-    '<velocity name="v" joint="j" kv="2"/><general name="f" joint="j" dyntype="filter" dynprm=".08" gainprm="3"/></actuator>',
+    '<velocity name="v" joint="j" kv="2"/>'
+    '<general name="f" joint="j" dyntype="filter" dynprm=".08" gainprm="3"/></actuator>',
 ).replace('integrator="RK4"', 'integrator="RK4" density="1.2" viscosity=".5"')
 
 # Two slides that MuJoCo compiles as 'simple', coupled by a tendon.
@@ -232,7 +237,7 @@ def one(path: str, scale: float = 1.0, offset: float = 0.0) -> Parameter:
 
 
 def compiled(xml: str, parameters: list[Parameter]) -> tuple[Any, Any]:
-    """(spec, model), compiled as the package does it: bodies that parameters move are not 'simple'."""
+    """Spec and model, compiled as in the package: moved bodies are not 'simple'."""
     spec = mujoco.MjSpec.from_string(xml)
     for name in moved_bodies(parameters):
         spec.body(name).simple = 0
@@ -312,7 +317,7 @@ def skew(v: np.ndarray) -> np.ndarray:
 
 
 def written_by_hand(spec: Any, base: Any, path: str, change: float) -> None:
-    """The edit of an MjSpec that a coordinate of an inertia stands for, from its definition."""
+    """Edit of an MjSpec that changes one coordinate of an inertia, by its definition."""
     parsed = ParameterPath.parse(path)
     kind, name, field, i = parsed.kind, parsed.name, parsed.field, parsed.component
     element, found = getattr(spec, kind)(name), getattr(base, kind)(name)
@@ -452,7 +457,7 @@ def test_inertias_of_simple_bodies_are_written_with_the_right_dynamics() -> None
 def test_geoms_that_change_the_dynamics_are_compiled_anew(
     xml: str, path: str, value: float, derived: tuple
 ) -> None:
-    """Against MuJoCo's own compile of the edited element."""
+    """It agrees with MuJoCo's compile of the edited element."""
     parameters = [one(path)]
     spec, base = compiled(xml, parameters)
     resolved = ParameterSet.build(parameters, base, decoration=decoration(spec, base))
@@ -518,7 +523,8 @@ def test_decoration_neither_collides_nor_has_mass() -> None:
                 "<mujoco>", '<mujoco><contact><pair geom1="skin" geom2="ground"/></contact>'
             ).replace(
                 "<worldbody>",
-                '<worldbody><geom name="ground" type="plane" size="1 1 1" contype="0" conaffinity="0"/>',
+                '<worldbody><geom name="ground" type="plane" size="1 1 1" contype="0" '
+                'conaffinity="0"/>',
             ),
             False,
         ),
@@ -546,14 +552,17 @@ FRAMED = """
       <body name="a" pos=".1 .2 .3">
         <joint name="j" axis="0 1 0"/>
         <frame pos="0 .2 0" euler="0 0 90">
-          <geom name="g" size=".1 .2 .3" pos=".3 0 0" euler="10 20 30" type="box" contype="0" conaffinity="0"/>
+          <geom name="g" size=".1 .2 .3" pos=".3 0 0" euler="10 20 30" type="box" contype="0"
+            conaffinity="0"/>
           <site name="s" pos=".1 0 .2" euler="0 30 0"/>
         </frame>
       </body>
     </frame>
   </worldbody>
   <actuator><motor joint="j" name="m"/></actuator>
-  <sensor><framepos objtype="site" objname="s"/><accelerometer site="s" name="acc" noise=".1"/></sensor>
+  <sensor>
+    <framepos objtype="site" objname="s"/><accelerometer site="s" name="acc" noise=".1"/>
+  </sensor>
 </mujoco>
 """
 
@@ -656,7 +665,7 @@ def test_one_rest_length_stands_for_both_ends_of_the_range() -> None:
     ],
 )
 def test_servo_gains_are_those_of_the_mjcf(kind: str, written: str, path: str) -> None:
-    """Against a compile of the MJCF with the other number in it."""
+    """It agrees with a compile of the MJCF that holds the other number."""
     servo = '<position name="p" joint="k" kp="10" kv="0.5"/>'
     (_, base), (_, again) = (
         compiled(ARM.replace(servo, written.format(gain)), []) for gain in ("10", "7.25")
@@ -782,7 +791,7 @@ def test_three_rotation_components_are_one_rotation_vector(thing: str) -> None:
 def test_mixed_parametrisations_of_one_body_are_refused(
     fields: tuple[str, str],
 ) -> None:
-    """In either order; on two bodies they are free."""
+    """They are refused in either order; on two bodies they are allowed."""
     _, base = compiled(SOLID, [])
     for first, second in (fields, fields[::-1]):
         pair = [
@@ -1163,7 +1172,7 @@ def test_an_unphysical_inertia_is_refused_with_a_clear_message(tmp_path) -> None
 def test_geoms_that_make_a_simple_bodys_inertia_are_followed(
     path: str, guess: float, tmp_path
 ) -> None:
-    """The body would be 'simple' but for the parameter; psi is that of models compiled one by one."""
+    """The parameter keeps the body from being 'simple'; psi is that of separate compiles."""
     task = make_task(
         SIMPLE,
         tmp_path,
@@ -1205,7 +1214,8 @@ def in_arm(folder: Path, tables: dict) -> Any:
         (
             "fullinertia[0]",
             50.0,
-            r"principal moments of inertia .*, 50 kg m².*pseudo-inertia is not positive semidefinite",
+            r"principal moments of inertia .*, 50 kg m².*"
+            r"pseudo-inertia is not positive semidefinite",
         ),
         ("firstmoment[0]", 50.0, r"principal moments of inertia -.*; all must be > 0"),
         ("origininertia[1]", 1e-6, r"principal moments of inertia -.*; all must be > 0"),
@@ -1233,7 +1243,7 @@ def test_both_parameters_of_a_barycentric_inertia_are_named(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("field", ["origininertia[0]", "fullinertia[0]", "mass"])
 def test_plates_and_fixed_loads_without_mass_are_physical(field: str, tmp_path: Path) -> None:
-    """A plate typed with few digits; a load of no mass that is fixed to a link."""
+    """These are a plate with few digits, and a load without mass that is fixed to a link."""
     plate = '<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.02 0.03"/>'
     load = (
         '<body name="load" pos="0 0 .1"><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>'

@@ -1,6 +1,4 @@
-"""Levels of a descent: the same experiment on plants that are quicker to step or smoother, and what
-they leave alone.
-"""
+"""Variants of a task: one experiment on plants that are quicker to step, or smoother."""
 
 from __future__ import annotations
 
@@ -27,7 +25,8 @@ ARM = """
   <option timestep="0.002" integrator="implicitfast"/>
   <worldbody>
     <body name="upper">
-      <joint name="shoulder" axis="0 1 0" damping="0.1" armature="0.02" frictionloss="{friction}" range="-2 2"/>
+      <joint name="shoulder" axis="0 1 0" damping="0.1" armature="0.02" frictionloss="{friction}"
+        range="-2 2"/>
       <inertial pos="0 0 -0.2" mass="0.6" diaginertia="0.004 0.004 0.001"/>
       <body name="fore" pos="0 0 -0.4">
         <joint name="elbow" axis="0 1 0" damping="0.05" armature="0.01" frictionloss="{friction}"/>
@@ -174,7 +173,7 @@ def test_with_sensors_too_only_mixed_differences_are_taken_on_the_softened_copy(
 
 
 def test_the_gradient_of_the_softened_level_is_that_of_its_cost(tmp_path: Path) -> None:
-    """Over moves that shift where joints turn round by several engine steps, and over short ones."""
+    """Long moves shift the reversals of joints by several engine steps; short moves do not."""
     task = arm(tmp_path).relaxed().smoothed()
     wave = np.sin(np.pi * task.t)[:, None] ** 2 * np.array([1.0, -0.5])
     found = slope(task, wave)
@@ -206,7 +205,7 @@ def slope(task: DesignTask, wave: Array) -> float:
 
 
 def difference(task: DesignTask, wave: Array, h: float) -> float:
-    """The same by two evaluations."""
+    """Change of log J per unit of a control's change, by two evaluations."""
     there, back = (
         task.problem.point(
             task.plant.simulate(task.theta, task.control + s * wave),

@@ -17,7 +17,7 @@ T = np.arange(120) * DT
 
 
 def curve(t: Array) -> Array:
-    """Two smooth columns of different pace."""
+    """Two smooth columns, of which one changes faster."""
     return np.stack([np.sin(5.0 * t) + 0.3 * t, np.exp(-t) * np.cos(9.0 * t)], axis=1)
 
 
@@ -35,7 +35,7 @@ def test_a_delayed_curve_is_the_shifted_curve(delay: float) -> None:
 
 
 def test_a_cubic_is_shifted_exactly_and_a_quartic_is_not() -> None:
-    """At all samples, the first ones included."""
+    """This holds at all samples, including the first ones."""
     output_delay = OutputDelay.on_grid(30, 0.3, 1.0)
     t = np.arange(30.0)
     for degree in range(5):

@@ -118,7 +118,7 @@ def test_missing_values_are_marginalised() -> None:
 
 
 def test_missing_values_of_jacobians_go_with_those_of_residuals() -> None:
-    """Their order agrees, for correlated and for independent outputs."""
+    """Their orders agree, for correlated and for independent outputs."""
     rng = np.random.default_rng(5)
     y, G, present = (
         rng.standard_normal((9, 4)),
@@ -133,7 +133,7 @@ def test_missing_values_of_jacobians_go_with_those_of_residuals() -> None:
 
 
 def test_samples_have_the_stated_covariance() -> None:
-    """Against the standard error of a sample covariance."""
+    """The error is that expected of a sample covariance."""
     drawn = correlated().sample(40_000, np.random.default_rng(6))
     spread = np.sqrt((FULL**2 + np.outer(np.diag(FULL), np.diag(FULL))) / len(drawn))
     assert np.abs((drawn.T @ drawn / len(drawn) - FULL) / spread).max() < 4.0
@@ -145,7 +145,7 @@ def test_samples_have_the_stated_covariance() -> None:
 
 @pytest.mark.parametrize("coarsen", [1, 3])
 def test_measuring_every_sample_keeps_the_information_per_second(coarsen: int) -> None:
-    """On a grid with a period `coarsen` times longer, for outputs of different rates."""
+    """The period of the other grid is `coarsen` times longer; the outputs have different rates."""
     strides, stride, N, rate = np.array([4, 4, 4, 6]), 2, 72, 100.0
     G = np.array([[1.0, 0.2], [-0.5, 1.0], [0.3, 0.3], [2.0, -1.0]])  # the same at all samples
     fine = Noise(covariance=FULL, strides=strides)

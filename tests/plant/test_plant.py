@@ -587,7 +587,7 @@ def test_every_mj_step_is_counted(tmp_path) -> None:
 
 
 def bits(model: Any) -> tuple[bool, bool]:
-    """(solver is off, sensors are off)."""
+    """Whether the solver is off, and whether the sensors are off."""
     flags = model.opt.disableflags
     return (
         bool(flags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)),
@@ -596,7 +596,7 @@ def bits(model: Any) -> tuple[bool, bool]:
 
 
 def written(folder: Path, xml: str) -> tuple[Any, Path]:
-    """(spec, path) of an MJCF string."""
+    """Spec and path of an MJCF string."""
     path = folder / "model.xml"
     path.write_text(xml, encoding="utf-8")
     return load_spec(path), path
@@ -636,14 +636,17 @@ CONSTRAINED = {
     ),
     "tendon limit": (
         "<actuator>",
-        '<tendon><fixed limited="true" range="-1 1"><joint joint="slide" coef="1"/></fixed></tendon><actuator>',
+        '<tendon><fixed limited="true" range="-1 1"><joint joint="slide" coef="1"/></fixed>'
+        "</tendon><actuator>",
     ),
     "tendon friction": (
         "<actuator>",
-        '<tendon><fixed frictionloss="1"><joint joint="slide" coef="1"/></fixed></tendon><actuator>',
+        '<tendon><fixed frictionloss="1"><joint joint="slide" coef="1"/></fixed></tendon>'
+        "<actuator>",
     ),
     "contact": (
-        '<flag contact="disable"/></option>\n  <default><geom mass="0" contype="0" conaffinity="0"/></default>\n  <worldbody>',
+        '<flag contact="disable"/></option>\n'
+        '  <default><geom mass="0" contype="0" conaffinity="0"/></default>\n  <worldbody>',
         '</option><worldbody><geom size="1 1 1" type="plane" pos="0 0 -2"/><geom size="0.1"/>',
     ),
 }
@@ -818,7 +821,8 @@ CARRIED = """
   <worldbody>
     <body name="near" mocap="true" pos="0.1 0 0"><site name="near"/></body>
     <body name="cart">
-      <joint name="x" type="slide" axis="1 0 0" damping="1"/><joint name="turn" axis="0 0 1" damping="0.1"/>
+      <joint name="x" type="slide" axis="1 0 0" damping="1"/>
+      <joint name="turn" axis="0 0 1" damping="0.1"/>
       <geom size=".1" mass="1" contype="0" conaffinity="0"/><site name="cart"/>
     </body>
     <body name="far" mocap="true" pos="0 1 0"><site name="far" pos="0 0.1 0"/></body>
@@ -827,14 +831,16 @@ CARRIED = """
   <equality><weld body1="cart" body2="far" solref="0.3 1"/></equality>
   <actuator><motor name="m" joint="x"/></actuator>
   <sensor><framepos name="far" objtype="site" objname="far" noise="0.1"/></sensor>
-  <keyframe><key name="moved" mpos="0.6 0 0  0.2 1.1 0" mquat="1 0 0 0  0.9 0 0 0.4" qpos="0.1 0.05"/></keyframe>
+  <keyframe>
+    <key name="moved" mpos="0.6 0 0  0.2 1.1 0" mquat="1 0 0 0  0.9 0 0 0.4" qpos="0.1 0.05"/>
+  </keyframe>
 </mujoco>
 """
 
 
 @pytest.mark.parametrize("function", [False, True])
 def test_mocap_bodies_stand_where_the_keyframe_puts_them(function: bool, tmp_path) -> None:
-    """Against plain MuJoCo from `mj_resetDataKeyframe`, by every kind of simulation."""
+    """Every kind of simulation agrees with plain MuJoCo from `mj_resetDataKeyframe`."""
     damped: dict[str, Any] = {"target": "joint/x:damping"}
     if function:
         damped = {

@@ -18,7 +18,8 @@ EVERY_JOINT = """
       </body>
     </body>
     <body><freejoint/><geom size="0.1"/>
-      <body><joint type="hinge"/><geom size="0.1"/><body><joint type="ball"/><geom size="0.1"/></body></body>
+      <body><joint type="hinge"/><geom size="0.1"/>
+        <body><joint type="ball"/><geom size="0.1"/></body></body>
     </body>
   </worldbody>
   <actuator><general joint="" dyntype="integrator"/></actuator>
@@ -30,7 +31,7 @@ COUNT = 200
 
 @pytest.fixture(scope="module")
 def model():
-    """Slide, ball, hinge, slide; free, hinge, ball; one activation."""
+    """Model with the joints slide, ball, hinge, slide, free, hinge and ball; one activation."""
     return mujoco.MjModel.from_xml_string(EVERY_JOINT)
 
 
@@ -152,7 +153,7 @@ def test_inputs_are_left_alone(model) -> None:
 
 
 def test_the_derivative_of_minus_agrees_with_differences(model) -> None:
-    """Also where rotations are small, and where they are nearly half a turn."""
+    """This also holds where rotations are small, and where they are nearly half a turn."""
     space, rng, h = state_space(model), np.random.default_rng(9), 1e-6
     origin = random_states(space, rng, 1)[0]
     for longest in (1e-9, 1e-2, 3.0):

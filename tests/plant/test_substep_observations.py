@@ -207,7 +207,7 @@ def test_derivatives_of_observations_are_differences_of_independent_simulations(
 def test_bilinear_derivatives_contain_those_of_the_observations(
     sensors: bool, accuracy, tmp_path: Path
 ) -> None:
-    """With every kind of differences, with and without sensors."""
+    """This holds for every kind of differences, with and without sensors."""
     noise = (
         {"gyro": 0.1, "qpos:elbow": 0.01}
         if sensors

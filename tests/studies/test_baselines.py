@@ -57,7 +57,7 @@ FRAME = ExcitationSettings(
 
 
 def arm(**limits: Any) -> Experiment:
-    """A second of the servo arm, from rest to rest, its references slow."""
+    """One second of the servo arm, from rest to rest, with slow references."""
     return Experiment.from_file(MODELS / "servo_arm.toml").replace(
         horizon=1.0,
         cost={"control": 0.0},
@@ -241,7 +241,7 @@ def test_from_rest_to_rest_without_jolts(method: str) -> None:
 
 
 def test_limits_that_no_control_keeps_show_in_a_negative_margin() -> None:
-    """A pendulum that is let go does not come back to where it was, whatever a chirp does."""
+    """A released pendulum does not return to its initial state under any chirp."""
     swinging = pendulum(
         initial={"keyframe": None, "qpos": (0.0, 1.0), "qvel": (0.0, 0.0)},
         boundary={"end": "periodic", "position": 1e-5, "velocity": 1e-5},
@@ -254,7 +254,7 @@ def test_limits_that_no_control_keeps_show_in_a_negative_margin() -> None:
 
 @pytest.mark.slow
 def test_weights_are_part_of_the_cost() -> None:
-    """Without limits the same J is lowered, effort included: as large as possible is not the best."""
+    """Without limits, J includes the effort, so that the largest excitation is not the best."""
     soft = Experiment.from_file(MODELS / "cart_pendulum.toml").replace(horizon=2.0)
     task = DesignTask.resolve(soft)
     assert not task.is_limited

@@ -48,7 +48,7 @@ def robot(design: Design, number: int) -> Recording:
 
 
 def never(design: Design, number: int) -> Recording:
-    """For what must fail before anything moves."""
+    """A measurement that must not be called."""
     raise AssertionError("the robot was asked to move")
 
 
@@ -62,7 +62,7 @@ def with_model(folder: Path, old: str, new: str) -> mjfim.Experiment:
 
 @pytest.fixture(scope="module")
 def campaign() -> Campaign:
-    """From the wrong guess to what is wanted."""
+    """A campaign from the wrong guess to the target accuracy."""
     return mjfim.run_campaign(STUDY, robot)
 
 
@@ -186,7 +186,7 @@ def test_robust_redesigns_sample_around_the_estimate(campaign: Campaign) -> None
 
 
 def test_friction_that_the_model_lacks_makes_the_result_doubtful(tmp_path: Path) -> None:
-    """Formally as good as wanted, and wrong by many sigma: not reached."""
+    """A target is not reached where the estimate is wrong by many standard deviations."""
     rough = with_model(tmp_path, 'axis="1 0 0"/>', 'axis="1 0 0" frictionloss="1.0"/>')
     easy = STUDY.replace(parameters={name: {"wanted": 0.03} for name in "mlc"})
     found = mjfim.run_campaign(
@@ -254,7 +254,7 @@ def test_an_estimate_that_jumps_is_named(campaign: Campaign) -> None:
 
 
 def test_recorded_rounds_are_not_repeated(campaign: Campaign) -> None:
-    """The next design of a campaign that is taken up again is the one that it would have had."""
+    """The next design of a continued campaign is that of an uninterrupted one."""
     first = campaign.rounds[0]
     done = [
         EarlierRound(
@@ -383,7 +383,7 @@ def test_faulty_requests_say_what_is_right(tmp_path: Path) -> None:
 
 
 def test_unidentifiable_targets_are_reported_before_the_robot_moves() -> None:
-    """The cart's mass and what the drive adds to it: only their sum shows."""
+    """Only the sum of the cart's mass and of the drive's inertia can be identified."""
     tables = {
         "cart": {"target": "body/cart:mass"},
         "rotor": {"target": "joint/slide:armature", "guess": 0.1},

@@ -358,7 +358,7 @@ def test_files_table_and_exit_code(study: Path, tmp_path: Path) -> None:
 
 
 def worse(design: Callable[..., Design]) -> Callable[..., Design]:
-    """A design that keeps where it started."""
+    """A design that returns its initial control."""
 
     def rigged(task: DesignTask, *args: Any, **kwargs: Any) -> Design:
         found = design_task(task, *args, **kwargs)

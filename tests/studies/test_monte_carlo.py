@@ -1,4 +1,4 @@
-"""The Monte-Carlo study against theory and against one-by-one estimation."""
+"""The Monte-Carlo study, compared with theory and with separate estimates of all trials."""
 
 from __future__ import annotations
 

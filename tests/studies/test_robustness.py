@@ -1,4 +1,4 @@
-"""design.csv and reference.csv as a controller plays them, and robots that differ from the model."""
+"""design.csv and reference.csv, and designs on simulated robots that differ from the model."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_the_table_alone_replays_exactly(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", BUILD)
 def test_rows_at_samples_are_the_design(kind: str, tmp_path: Path) -> None:
-    """However fast the controller, every sample of the design stands there to the last bit."""
+    """Every sample of the design is in the file to the last bit, at any rate of the controller."""
     task = BUILD[kind](tmp_path, playback_rate=FINE[kind])
     stride = round(FINE[kind] / task.experiment.rate)
     played = simulate_playback(task.system, task.initial, gains(task))
@@ -157,7 +157,7 @@ def test_the_loop_closed_from_the_table_is_the_projection(kind: str, tmp_path: P
 
 
 def engine_loop(task: DesignTask, model: Any, start: Array, reference: Array, K: Array) -> Array:
-    """The same loop by single steps of the batch engine, deviations by `StateSpace.minus`."""
+    """It agrees with single steps of the batch engine and deviations by `StateSpace.minus`."""
     states = [start]
     for k in range(len(K)):
         u = task.initial.ctrl[k] + K[k] @ task.space.minus(reference[k], states[-1])
@@ -166,7 +166,7 @@ def engine_loop(task: DesignTask, model: Any, start: Array, reference: Array, K:
 
 
 def test_gains_of_the_samples_serve_a_faster_controller(tmp_path: Path) -> None:
-    """A cart that is put elsewhere comes back to the plan; open loop it stays away."""
+    """A displaced cart returns to the plan with feedback, and does not return without."""
     task = BUILD["cart"](tmp_path, playback_rate=100.0, horizon=4.0)
     path, _ = written(task, tmp_path)
     push = np.array([0.3, 0.0, 0.0, 0.0])
@@ -347,7 +347,8 @@ model = "cart.xml"
 rate = 50.0
 playback_rate = 100.0
 horizon = 2.0
-initial = {{ qpos = {data.qpos.tolist()}, control = {{ kind = "chirp", amplitude = 5.0, frequency = 0.7, frequency_end = 3.0 }} }}
+initial.qpos = {data.qpos.tolist()}
+initial.control = {{ kind = "chirp", amplitude = 5.0, frequency = 0.7, frequency_end = 3.0 }}
 parameters.mass = {{ target = "body/bob:mass" }}
 parameters.damping = {{ target = "joint/hinge:damping" }}
 parameters.spring = {{ target = "joint/slide:stiffness" }}
@@ -420,7 +421,7 @@ def test_a_robot_is_what_a_bare_loop_says(
 def test_without_noise_the_truth_is_found(
     cart: tuple[mjfim.Experiment, Path], feedback: bool, latency: float
 ) -> None:
-    """A late control is a late measurement, exactly; with feedback as well."""
+    """A late control is exactly equivalent to a late measurement, also with feedback."""
     bench = bench_of(cart, feedback=feedback, latency=latency, loudness=0.0)
     for number in range(3):
         run = bench.run(number)
@@ -446,7 +447,7 @@ def judged(
 @pytest.mark.slow
 @pytest.mark.parametrize("feedback", [False, True])
 def test_intervals_hold_the_truth(cart: tuple[mjfim.Experiment, Path], feedback: bool) -> None:
-    """As often as 95 % intervals should, alone and jointly; errors are as large as was predicted."""
+    """Intervals and joint regions hold the true values in 95 % of runs; errors are as predicted."""
     found = judged(cart, feedback=feedback)
     least = binom.ppf(1e-3, RUNS, 0.95)
     assert found.inside.min() >= least
@@ -476,7 +477,7 @@ def test_the_check_can_fail(cart: tuple[mjfim.Experiment, Path], fault: str) -> 
 
 @pytest.mark.slow
 def test_limits_that_the_plan_uses_up_are_missed(cart: tuple[mjfim.Experiment, Path]) -> None:
-    """The conclusions say by how much, and which reserve would have been enough."""
+    """The conclusions name the violation, and the margin that would have been sufficient."""
     experiment, path = cart
     plenty = bench_of(cart)
     planned = dict(zip([(i.kind, i.name) for i in plenty.limits], plenty.planned(), strict=True))
@@ -499,7 +500,7 @@ def test_limits_that_the_plan_uses_up_are_missed(cart: tuple[mjfim.Experiment, P
 
 
 def test_a_start_on_the_move_takes_no_latency(tmp_path: Path) -> None:
-    """What was before the start would matter; without a latency it can be played."""
+    """Such a design can be played without a latency only, which the message says."""
     task = BUILD["cart"](tmp_path, playback_rate=50.0)
     path, _ = written(task, tmp_path)
     with pytest.raises(ExperimentError, match=r"no control holds the initial state.*--latency 0"):
