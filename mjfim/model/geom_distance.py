@@ -50,7 +50,13 @@ class GeomDistances:
     """
 
     def __init__(
-        self, model: Any, chosen: Sequence[GeomPair], reach: float, grouped: bool = True
+        self,
+        model: Any,
+        chosen: Sequence[GeomPair],
+        reach: float,
+        grouped: bool = True,
+        *,
+        max_bounds: int = MAX_BOUNDS_AT_ONCE,
     ) -> None:
         """Prepare the computation for pairs of geoms of a model.
 
@@ -61,6 +67,7 @@ class GeomDistances:
             reach: Distance beyond which nothing is measured [m].
             grouped: Columns are pairs of bodies (the minimum over their pairs of geoms) instead of
                 pairs of geoms.
+            max_bounds: Largest number of lower bounds that are held in memory at once.
 
         Raises:
             ExperimentError: There is no pair, or the reach is not positive and finite.
@@ -75,6 +82,7 @@ class GeomDistances:
                 f"clearance: reach {reach:g} m; needs a positive, finite distance"
             )
         self.reach = float(reach)
+        self._max_bounds = max_bounds
 
         # Pairs of one column are adjacent, columns in the order in which they first appear.
         body = model.geom_bodyid
@@ -113,7 +121,7 @@ class GeomDistances:
             qpos: (n, nq) configurations.
             slopes: Whether their slopes are computed as well.
         """
-        rows = max(MAX_BOUNDS_AT_ONCE // len(self.pairs), 1)
+        rows = max(self._max_bounds // len(self.pairs), 1)
         starts = range(0, max(len(qpos), 1), rows)
         blocks = [self._block(qpos[k : k + rows], slopes) for k in starts]
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from mjfim.errors import ExperimentError, SimulationDivergedError
-from mjfim.model import geom_distance
 from mjfim.model.geom_distance import GeomDistances, SignedDistances
 from mjfim.model.geom_pairs import find_geom_pairs
 from mjfim.model.pair_distance import BOX, CAPSULE
@@ -289,13 +288,14 @@ def test_nothing_within_reach_is_lost(reach: float) -> None:
     )
 
 
-def test_blocks_of_configurations_give_equal_results(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_of_configurations_give_equal_results() -> None:
     """Many configurations are computed in blocks; no configurations give empty arrays."""
     model = mujoco.MjModel.from_xml_string(ARMS)
     chosen, qpos = between(model, 0.3), scattered(model, 11, 0.4)
     whole = chosen(qpos, True)
-    monkeypatch.setattr(geom_distance, "MAX_BOUNDS_AT_ONCE", 3 * len(chosen.pairs))
-    cut, none = chosen(qpos, True), chosen(qpos[:0], True)
+    pairs = find_geom_pairs(model, ())
+    blocks = GeomDistances(model, pairs, 0.3, grouped=False, max_bounds=3 * len(pairs))
+    cut, none = blocks(qpos, True), blocks(qpos[:0], True)
     np.testing.assert_array_equal(cut.d, whole.d)
     np.testing.assert_array_equal(cut.slope, whole.slope)
     assert none.d.shape == (0, len(chosen.columns)) and none.slope.shape == (
