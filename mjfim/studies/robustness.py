@@ -38,7 +38,7 @@ from mjfim.experiment.schema import Experiment
 from mjfim.experiment.system import System
 from mjfim.identification.identify import identify_system
 from mjfim.information.marginal import standard_deviations
-from mjfim.model.coordinates import joint_dofs, joint_names
+from mjfim.model.coordinates import tangent_names
 from mjfim.parallel import results_in_order
 from mjfim.plant.batch import BatchSimulator
 from mjfim.recordings.design_table import read_playback
@@ -296,7 +296,7 @@ class RobotBench:
             deviation = task.space.minus(start, task.plant.nominal_initial_state)
             moved |= np.abs(deviation[: task.space.nv]) > MIN_START_DEVIATION
 
-        names = _start_names(task.system.model)
+        names = tangent_names(task.system.model)[: task.space.nv]
         return [name for name, has_moved in zip(names, moved, strict=True) if has_moved]
 
     # ---- robots
@@ -723,14 +723,6 @@ def _assessed_limits(task: DesignTask) -> tuple[Limit, ...]:
             Limit(kind="clearance", name="nearest pair", index=0, lower=clearance, upper=np.inf)
         )
     return (*within, *others)
-
-
-def _start_names(model: Any) -> Iterator[str]:
-    """Names of the nv deviations of the initial positions."""
-    for j, name in enumerate(joint_names(model)):
-        width = joint_dofs(model, j)
-        for i in range(width):
-            yield f"qpos:{name}" if width == 1 else f"qpos:{name}[{i}]"
 
 
 def _sensed(task: DesignTask) -> np.ndarray:

@@ -512,6 +512,34 @@ def test_a_start_on_the_move_takes_no_latency(tmp_path: Path) -> None:
         RobotBench(task.experiment, path, RobotConditions(latency=0.005))
 
 
+BALL = """<mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody><body name="bob">
+<joint name="ball" type="ball" stiffness="20" damping="1"/>
+<geom type="sphere" size=".05" pos=".1 0 -.3" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+<actuator><motor name="x" joint="ball" gear="1 0 0"/><motor name="y" joint="ball" gear="0 1 0"/>
+<motor name="z" joint="ball" gear="0 0 1"/></actuator></mujoco>"""
+
+
+def test_a_start_that_moves_on_a_ball_joint_is_an_unknown_of_the_fit(tmp_path: Path) -> None:
+    """Its parts have the names of deviations of the state."""
+    (tmp_path / "model.xml").write_text(BALL, encoding="utf-8")
+    stated = mjfim.Experiment(
+        model="model.xml",
+        rate=25.0,
+        horizon=0.8,
+        initial={"control": {"kind": "chirp", "amplitude": 0.1}},
+        parameters={"mass": {"target": "body/bob:mass", "bounds": (0.1, 5.0)}},
+        noise={"state": 0.01},
+        boundary={"start": "rest"},
+        directory=tmp_path,
+    )
+    path, _ = written(DesignTask.resolve(stated), tmp_path)
+
+    bench = RobotBench(stated, path, RobotConditions(latency=0.01))
+    names = bench.task.parameters.names
+    assert {name for name in names if "ball" in name} == {"initial qpos:ball.ry"}
+    assert np.isfinite(bench.run(0).estimate).all()
+
+
 def test_the_verb_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: Path) -> None:
     """Tables and sentences on stdout, JSON and a figure in the folder; robots in processes."""
     experiment, path = cart
