@@ -10,16 +10,10 @@ from matplotlib.image import imread
 
 import mjfim
 from mjfim.output.plots.check import check_figure
-from tests.support.cli import MODELS, loads, names, read, run, write_experiment
+from tests.support.cli import MODELS, loads, names, read, run
 
 
-@pytest.fixture(scope="module")
-def study(tmp_path_factory) -> Path:
-    """A short experiment."""
-    return write_experiment(tmp_path_factory.mktemp("check"))
-
-
-def test_a_table_a_verdict_and_nothing_on_disk(study: Path) -> None:
+def test_a_table_and_a_conclusion_are_printed_and_nothing_is_written(study: Path) -> None:
     before = names(study.parent)
     result = run("check", study)
     assert result.exit_code == 0
@@ -28,40 +22,39 @@ def test_a_table_a_verdict_and_nothing_on_disk(study: Path) -> None:
     assert names(study.parent) == before
 
 
-def test_json_is_the_same_as_the_file(study: Path, tmp_path) -> None:
+def test_printed_json_equals_the_file(study: Path, tmp_path: Path) -> None:
     result = run("check", study, "--json", "-o", tmp_path / "out")
-    told = loads(result.stdout)
-    assert told == read(tmp_path / "out" / "check.json")
+    found = loads(result.stdout)
+    assert found == read(tmp_path / "out" / "check.json")
     assert names(tmp_path / "out") == {"check.json", "check.npz", "check.png"}
     assert imread(tmp_path / "out" / "check.png").shape[0] > 300
-    assert told["ok"] is True
-    assert [row["name"] for row in told["parameters"]] == ["m", "l", "c"]
-    assert np.shape(told["correlation"]) == (3, 3)
-    assert told["self_test"]["passed"] is True
+    assert found["ok"] is True
+    assert [row["name"] for row in found["parameters"]] == ["m", "l", "c"]
+    assert np.shape(found["correlation"]) == (3, 3)
+    assert found["self_test"]["passed"] is True
 
 
-def test_what_cannot_be_told_alone_is_exit_code_1_and_names_it() -> None:
+def test_combinations_of_parameters_are_named_and_the_exit_code_is_1() -> None:
     result = run("check", MODELS / "double_pendulum.toml")
     assert result.exit_code == 1
     assert "m1r1 + 0.3 m2" in result.stdout
     assert "I1 + 0.09 m2" in result.stdout
-    assert "dry friction" in result.stdout  # and that it is not smooth
+    assert "dry friction" in result.stdout  # which makes the motion not smooth
 
 
-def test_designs_and_recordings_are_looked_at_instead(study: Path, tmp_path) -> None:
-    assert run("design", study, "-o", tmp_path / "d").exit_code in (0, 1)
-    archive = tmp_path / "d" / "design.npz"
-    designed = loads(run("check", study, "--design", archive, "--json").stdout)
-    assert designed["source"] == "the given trajectory"
-    sigma = read(tmp_path / "d" / "design.json")["final"]["std"]
-    np.testing.assert_allclose([row["std"] for row in designed["parameters"]], sigma, rtol=1e-4)
-    run("simulate", study, archive, "-o", tmp_path / "r.csv")
-    recorded = loads(run("check", study, tmp_path / "r.csv", "--json").stdout)
-    assert recorded["source"] == "1 recording"
-    np.testing.assert_allclose([row["std"] for row in recorded["parameters"]], sigma, rtol=1e-4)
+def test_designs_and_recordings_are_checked(study: Path, archived: Path, recorded: Path) -> None:
+    sigma = read(archived.parent / "design.json")["final"]["std"]
+
+    design = loads(run("check", study, "--design", archived, "--json").stdout)
+    assert design["source"] == "the given trajectory"
+    np.testing.assert_allclose([row["std"] for row in design["parameters"]], sigma, rtol=1e-4)
+
+    recording = loads(run("check", study, recorded, "--json").stdout)
+    assert recording["source"] == "1 recording"
+    np.testing.assert_allclose([row["std"] for row in recording["parameters"]], sigma, rtol=1e-4)
 
 
-def test_misuse(study: Path, tmp_path) -> None:
+def test_misuse(study: Path, tmp_path: Path) -> None:
     for words, said in (
         ((tmp_path / "no.toml",), "no.toml"),
         ((study, tmp_path / "no.csv"), "no.csv"),

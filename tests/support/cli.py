@@ -45,6 +45,9 @@ STUDY = {
     "table_covariance.png",
 }
 
+# Command that runs `mjfim` in a new process, where every warning is an error.
+PROCESS = [sys.executable, "-W", "error", "-m", "mjfim"]
+
 
 def run(*words: object) -> Result:
     """Run `mjfim` with these words in this process."""

@@ -1,0 +1,226 @@
+"""`mjfim design`: its files and exit codes, experiments that it refuses, folders it cannot write."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import Result
+
+import mjfim
+from mjfim.excitation.design import design_task
+from mjfim.excitation.task import DesignTask
+from tests.support.cli import (
+    DESIGN,
+    loads,
+    misused,
+    names,
+    read,
+    run,
+    write_experiment,
+)
+
+
+def test_design_leaves_its_files(home: Path, designed: Result) -> None:
+    """The folder holds all promised files and nothing else."""
+    assert designed.exit_code == 0
+    assert names(home / "out") == DESIGN
+    assert all(path.stat().st_size > 0 for path in (home / "out").iterdir())
+    data = read(home / "out" / "design.json")
+    assert (data["status"], data["limits"]["satisfied"]) == ("converged", True)
+    assert data["final"]["eigenvalues"][0] > 10 * data["initial"]["eigenvalues"][0]
+
+
+def test_design_json_is_the_file(home: Path, designed: Result) -> None:
+    """Standard output holds the summary alone; only the path to the experiment differs."""
+    data = read(home / "out" / "design.json")
+    assert (home / "out" / data.pop("experiment")).resolve() == home / "study.toml"
+    assert loads(designed.stdout) == data
+    assert "wrote" in designed.stderr
+
+
+@pytest.mark.slow
+def test_second_run_into_the_same_folder(
+    home: Path, study: Path, archived: Path, tmp_path: Path
+) -> None:
+    """A second run replaces the files of the first and leaves other files alone."""
+    out = tmp_path / "out"
+    shutil.copytree(home / "out", out)
+    (out / "notes.txt").write_text("mine", encoding="utf-8")
+    first = read(out / "design.json")
+
+    result = run("design", study, "-o", out, "--threads", 1)
+    assert result.exit_code == 0
+    assert names(out) == DESIGN | {"notes.txt"}
+
+    second = read(out / "design.json")
+    assert second["seconds"] != first["seconds"]
+    assert second["final"]["cost"] == pytest.approx(first["final"]["cost"], rel=1e-6)
+
+
+@pytest.mark.usefixtures("no_files")
+@pytest.mark.parametrize(
+    ("lines", "status", "satisfied"),
+    [
+        ({"max_iterations": "1"}, "max_iterations", True),
+        (
+            {"max_iterations": "40\n[limits]\nvelocity = { slide = 1e-3 }\nenforce = false"},
+            "converged",
+            False,
+        ),
+    ],
+    ids=["not-converged", "limits-violated"],
+)
+def test_design_that_misses_its_goal(
+    tmp_path: Path, lines: dict[str, str], status: str, satisfied: bool
+) -> None:
+    """The exit code is 1, and the summary says why."""
+    result = run("design", write_experiment(tmp_path, **lines), "-o", tmp_path / "out", "--json")
+    data = loads(result.stdout)
+    assert (result.exit_code, data["status"], data["limits"]["satisfied"]) == (1, status, satisfied)
+    assert bool(data["warnings"]) is not satisfied
+
+
+BAD_LINES: dict[str, tuple[dict[str, str], list[str]]] = {
+    "unknown key": (
+        {"horizon": "1.0\nhorizn = 2"},
+        ["study.toml", "horizn", "unknown key", "horizon"],
+    ),
+    "bad value": ({"rate": "-1"}, ["study.toml", "rate", "greater than 0"]),
+    "bad rate": ({"rate": "33.0"}, ["study.toml", "rate: 33 Hz", "valid"]),
+    "bad syntax": ({"rate": ""}, ["study.toml", "not valid TOML"]),
+    "no model": ({"model": '"gone.xml"'}, ["gone.xml", "no such model file"]),
+    "no table": ({"start": '"gone.csv"'}, ["gone.csv", "no such file"]),
+    "bad joint": ({"tracking": "{ slid = 1 }"}, ["study.toml", "cost.tracking", "hinge, slide"]),
+}
+
+
+@pytest.mark.parametrize("name", BAD_LINES)
+def test_bad_experiment(name: str, tmp_path: Path) -> None:
+    """Exit code 2, one message, and nothing is written."""
+    lines, fragments = BAD_LINES[name]
+    write_experiment(tmp_path, **lines)
+    misused(run("design", tmp_path / "study.toml", "-o", tmp_path / "a" / "b"), *fragments)
+    assert names(tmp_path) == {"study.toml", "cart_pendulum.xml", "cart_pendulum.csv"}
+
+
+def test_unwritable_folder(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The message comes before the work. Root may write everywhere: the answer is made up."""
+    asked = []
+
+    def deny(path: Path, mode: int) -> bool:
+        if mode == os.W_OK:
+            asked.append(Path(path))
+        return mode != os.W_OK
+
+    monkeypatch.setattr(os, "access", deny)
+    misused(
+        run("design", study, "-o", tmp_path / "new" / "out"),
+        f"{tmp_path}: no permission to write here",
+    )
+    assert asked == [tmp_path]
+    assert names(tmp_path) == set()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_really_unwritable_folder(study: Path, tmp_path: Path) -> None:
+    """A folder that the operating system protects is refused before the work."""
+    tmp_path.chmod(0o500)
+    try:
+        misused(
+            run("design", study, "-o", tmp_path / "out"), f"{tmp_path}: no permission to write here"
+        )
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_disk_full(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One message with the words of the operating system."""
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device", str(tmp_path / "out" / "design.npz"))
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    result = run("design", study, "-o", tmp_path / "out")
+    assert isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exit_code in (1, 2)
+    assert re.search(r"^mjfim: .*design\.npz.*No space left on device", result.stderr, re.MULTILINE)
+
+
+def test_start_that_excites_nothing(tmp_path: Path) -> None:
+    """Upright at rest without control, no parameter changes the motion."""
+    nothing = '{ kind = "constant", amplitude = 0.0 }'
+    path = write_experiment(tmp_path, start=nothing, keyframe='"upright"')
+    xml = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
+    xml = xml.replace("<keyframe>", '<keyframe><key name="upright" qpos="0 0"/>')
+    (tmp_path / "cart_pendulum.xml").write_text(xml, encoding="utf-8")
+    misused(run("design", path, "-o", tmp_path / "out"), "the start excites nothing along: ")
+    assert "out" not in names(tmp_path)
+
+
+def test_parameter_that_does_nothing(tmp_path: Path) -> None:
+    """The message names this parameter alone."""
+    path = write_experiment(tmp_path)
+    more = '[parameters.paint]\ntarget = "geom/cart:size[0]"\n'
+    path.write_text(path.read_text(encoding="utf-8") + more, encoding="utf-8")
+    misused(
+        run("design", path, "-o", tmp_path / "out"),
+        "parameters.paint changes nothing in the measured outputs",
+    )
+
+
+def test_start_that_excites_next_to_nothing(tmp_path: Path) -> None:
+    """Hanging at rest without control: a motion by round-off is not information."""
+    path = write_experiment(
+        tmp_path, start='{ kind = "constant", amplitude = 0.0 }', max_iterations="1"
+    )
+    misused(
+        run("design", path, "-o", tmp_path / "out"),
+        "the start excites nothing along: ",
+        "m, l and c",
+        "Another control",
+    )
+
+
+def test_start_that_diverges(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One message of mjfim, none of MuJoCo, and no log file."""
+    monkeypatch.chdir(tmp_path)
+    path = write_experiment(tmp_path, start='{ kind = "sine", amplitude = 1e12 }')
+    misused(run("design", path, "-o", tmp_path / "out"), "diverges under this control")
+    assert capfd.readouterr() == ("", "")
+    assert names(tmp_path) == {"study.toml", "cart_pendulum.xml", "cart_pendulum.csv"}
+
+
+def test_trials_that_diverge(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step that diverges is too long: the descent shortens it without a message."""
+    monkeypatch.chdir(tmp_path)
+    diverged = []
+    experiment = mjfim.Experiment.from_file(
+        write_experiment(tmp_path, horizon="0.5", tolerance="1e-7")
+    )
+    for amplitude in np.geomspace(1.2e4, 4.8e4, 7):
+        wave = {"kind": "sine", "frequency": 2.0, "amplitude": float(amplitude)}
+        descent = {"max_iterations": 4, "coarse": 1}
+        task = DesignTask.resolve(experiment.replace(initial={"control": wave}, descent=descent))
+        project = task.plant.project
+
+        def spy(*words: Any, project: Any = project) -> Any:
+            trial = project(*words)
+            diverged.append(trial is None)
+            return trial
+
+        monkeypatch.setattr(task.plant, "project", spy)
+        result = design_task(task)
+        assert result.final.cost < result.initial.cost
+    assert any(diverged), "no trial diverged: this test has lost its object"
+    assert capfd.readouterr() == ("", "")
+    assert "MUJOCO_LOG.TXT" not in names(tmp_path)

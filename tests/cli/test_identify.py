@@ -1,0 +1,102 @@
+"""`mjfim identify`: its files and exit codes, and recordings that it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from typer.testing import Result
+
+from tests.support.cli import (
+    ESTIMATE,
+    loads,
+    misused,
+    names,
+    read,
+    run,
+)
+
+
+def test_identify_leaves_its_files(home: Path, identified: Result) -> None:
+    """All promised files; the error is less than four standard deviations."""
+    assert identified.exit_code == 0
+    assert names(home / "fit") == ESTIMATE
+    data = read(home / "fit" / "estimate.json")
+    assert loads(identified.stdout) == data
+    assert np.all(np.abs(np.subtract(data["theta"], [2.0, 1.0, 1.0])) < 4 * np.array(data["std"]))
+    model = mujoco.MjModel.from_xml_path(str(home / "fit" / "identified.xml"))
+    assert model.body("bob").mass[0] == pytest.approx(data["theta"][0], rel=1e-5)
+
+
+def test_identify_several_recordings(
+    home: Path, study: Path, recorded: Path, identified: Result, tmp_path: Path
+) -> None:
+    """Two recordings give smaller deviations than one, and each has its figure."""
+    design, second = home / "out" / "design.npz", tmp_path / "b.csv"
+    assert run("simulate", study, design, "-o", second, "--seed", 5).exit_code == 0
+
+    words = ("-o", tmp_path / "fit", "--method", "newton")
+    result = run("identify", study, recorded, second, *words)
+    assert result.exit_code == 0
+    assert names(tmp_path / "fit") == (ESTIMATE - {"fit.png"}) | {"fit_1.png", "fit_2.png"}
+    both, one = read(tmp_path / "fit" / "estimate.json"), loads(identified.stdout)
+    assert np.all(np.array(both["std"]) < 0.85 * np.array(one["std"]))
+    assert both["recordings"] == [str(recorded), str(second)]
+
+
+def test_misfit(study: Path, recorded: Path, tmp_path: Path) -> None:
+    """The model cannot explain the recording: the exit code and the text say so."""
+    header, *rows = recorded.read_text(encoding="utf-8").splitlines()
+    cells = [row.split(",") for row in rows]
+    bent = [[t, u, str(float(s) + 0.5 * float(t)), *rest] for t, u, s, *rest in cells]
+    odd = tmp_path / "odd.csv"
+    odd.write_text("\n".join([header, *(",".join(row) for row in bent)]) + "\n", encoding="utf-8")
+    result = run("identify", study, odd, "-o", tmp_path / "fit")
+    assert result.exit_code == 1
+    assert read(tmp_path / "fit" / "estimate.json")["misfit"] is True
+    assert "misfit: residuals are" in " ".join(result.stdout.split())
+
+
+def test_bad_recordings(study: Path, recorded: Path, tmp_path: Path) -> None:
+    """The message names file and column, also beside a good recording."""
+    header, *rows = recorded.read_text(encoding="utf-8").splitlines()
+    cases = {
+        "no-control.csv": (
+            [header.replace("ctrl:force", "force"), *rows],
+            "'ctrl:force' is missing",
+        ),
+        "short.csv": ([header, *rows[:2]], "too few rows (2)"),
+        "gap.csv": ([header, *rows[:20], *rows[30:]], "a gap of 0.11 s after data row 20"),
+        "text.csv": (
+            [header, *rows[:5], "0.05,0,0,high,0,0", *rows[6:]],
+            "'qpos:hinge' is not numeric",
+        ),
+        "hole.csv": (
+            [header, "0,,0,0,0,0", *rows[1:]],
+            "'ctrl:force') has no value in the first row",
+        ),
+        "unmeasured.csv": (
+            [header.replace("qpos", "q").replace("qvel", "v"), *rows],
+            "no measured column",
+        ),
+    }
+    for name, (lines, said) in cases.items():
+        (tmp_path / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        misused(
+            run("identify", study, recorded, tmp_path / name, "-o", tmp_path / "out"), name, said
+        )
+    assert names(tmp_path) == set(cases)
+
+
+@pytest.mark.slow
+def test_stale_pictures_of_an_older_estimate_are_removed(
+    study: Path, recorded: Path, tmp_path: Path
+) -> None:
+    """An estimate from one recording follows an estimate from two in one folder."""
+    run("identify", study, recorded, recorded, "-o", tmp_path / "e")
+    (tmp_path / "e" / "fitness.png").touch()  # a file of the user
+    assert {"fit_1.png", "fit_2.png"} <= names(tmp_path / "e")
+    run("identify", study, recorded, "-o", tmp_path / "e")
+    assert {n for n in names(tmp_path / "e") if n.startswith("fit")} == {"fit.png", "fitness.png"}

@@ -1,0 +1,110 @@
+"""Ctrl-C: exit code 1, one message, and the best result so far on disk."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import mjfim
+from mjfim.excitation.evaluation import evaluate_task
+from mjfim.excitation.task import DesignTask
+from mjfim.experiment.system import System
+from mjfim.output import archive, plots
+from mjfim.records.design import Status
+from mjfim.records.events import DesignEvent
+from tests.support.cli import (
+    DESIGN,
+    PROCESS,
+    names,
+    read,
+    run,
+    write_experiment,
+)
+from tests.support.paths import MODELS
+
+
+def interrupt(*_: object, **__: object) -> None:
+    """Send SIGINT to this process, as Ctrl-C does."""
+    os.kill(os.getpid(), signal.SIGINT)
+    for _ in range(1000):  # the handler runs between two instructions
+        pass
+
+
+@pytest.mark.parametrize("verb", ["design", "identify", "montecarlo"])
+def test_interrupted_before_a_result(
+    verb: str,
+    study: Path,
+    archived: Path,
+    recorded: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Exit code 1, one message, and nothing on disk."""
+    monkeypatch.setattr(System, "resolve", interrupt)
+    inputs = {"design": [], "identify": [recorded], "montecarlo": [archived]}[verb]
+    result = run(verb, study, *inputs, "-o", tmp_path / "out")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert result.stderr == "mjfim: interrupted before there was a result; nothing was written\n"
+    assert names(tmp_path) == set()
+
+
+def test_interrupted_while_writing(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The message does not deny files that are already written."""
+    monkeypatch.setattr(plots, "save", interrupt)
+    result = run("design", study, "-o", tmp_path / "out")
+    assert "design.npz" in names(tmp_path / "out")
+    assert "nothing was written" not in result.stderr
+
+
+def test_interrupted_on_the_coarse_level() -> None:
+    """The best iterate is returned, also before the stated sample rate is reached."""
+    rates = []
+
+    def interrupt_fifth(event: DesignEvent) -> None:
+        rates.append(event.row.rate)
+        if event.row.iteration == 5:
+            interrupt()
+
+    experiment = mjfim.Experiment.from_file(MODELS / "cart_pendulum.toml")
+    result = mjfim.design(experiment, callback=interrupt_fifth)
+    assert set(rates) == {25.0}
+    assert result.status is Status.INTERRUPTED
+    assert result.final.cost < 0.1 * result.initial.cost
+
+
+def test_interrupted_design_leaves_the_best_so_far(tmp_path: Path) -> None:
+    """Exit code 1, all files can be read, and the result is better than the start."""
+    path = write_experiment(tmp_path, tolerance="1e-12", max_iterations="200\nstarts = 10000")
+    words = [*PROCESS, "design", path, "-o", tmp_path / "out", "--threads", "1"]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        told = iter(process.stderr.readline, "")
+        try:
+            assert any(line.startswith("iteration  20 ") for line in told)
+            process.send_signal(signal.SIGINT)
+            _, rest = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 1
+    assert "Traceback" not in rest
+    assert "wrote" in rest
+    out = tmp_path / "out"
+    assert names(out) == DESIGN
+    data = read(out / "design.json")
+    assert data["status"] == "interrupted"
+    assert data["final"]["eigenvalues"][0] > 5 * data["initial"]["eigenvalues"][0]
+    task = DesignTask.resolve(mjfim.Experiment.from_file(path))
+    curves = archive.read_design(out / "design.npz")
+    assert evaluate_task(task, curves["final"]).cost == pytest.approx(
+        data["final"]["cost"], rel=1e-6
+    )
+    assert all(file.read_bytes()[:4] == b"\x89PNG" for file in out.glob("*.png"))
+    assert (out / "design.rrd").read_bytes()[:4] == b"RRF2"

@@ -1,0 +1,150 @@
+"""Behaviour that all verbs share: help, version, reports, exit code 2 for misuse."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import mjfim
+from tests.support.cli import (
+    PROCESS,
+    misused,
+    names,
+    run,
+    write_experiment,
+)
+
+
+@pytest.mark.usefixtures("no_files")
+def test_reports_name_the_parameters(
+    study: Path, recorded: Path, archived: Path, tmp_path: Path
+) -> None:
+    """Without --json, standard output is for people; no number is cut off."""
+    for words in (
+        ("design", study),
+        ("identify", study, recorded),
+        ("montecarlo", study, archived, "--trials", 4),
+    ):
+        result = run(*words, "-o", tmp_path / "nothing")
+        assert result.exit_code == 0
+        assert "N m s/rad" in result.stdout
+        assert "parameter" in result.stdout
+        assert not re.search(r"\d[.e-]*…", result.stdout), result.stdout  # a number cut off
+
+
+def test_missing_inputs(study: Path, archived: Path, tmp_path: Path) -> None:
+    """Files that do not exist or are of another kind are named."""
+    out = tmp_path / "out"
+    misused(
+        run("design", tmp_path / "gone.toml", "-o", out),
+        "gone.toml",
+        "cannot read the experiment file",
+    )
+    misused(
+        run("simulate", study, tmp_path / "gone.npz", "-o", out / "r.csv"),
+        "gone.npz: no such design file",
+    )
+    misused(
+        run("montecarlo", study, tmp_path / "gone.npz", "-o", out), "gone.npz: no such design file"
+    )
+    misused(run("identify", study, tmp_path / "gone.csv", "-o", out), "gone.csv: no such file")
+    misused(run("replay", tmp_path / "gone", "--save", out / "x.rrd"), "no such file or folder")
+    (tmp_path / "notes.txt").touch()
+    misused(
+        run("replay", tmp_path / "notes.txt", "--save", out / "x.rrd"),
+        "folder of results, an .rrd file or a design",
+    )
+    misused(run("replay", tmp_path / "notes.txt", "--save", out / "x.txt"), "ends in .rrd")
+    (tmp_path / "notes.txt").unlink()
+    misused(run("replay", tmp_path / "gone.rrd", "--save", out / "x.rrd"), "gone.rrd: no such file")
+    misused(run("replay", tmp_path, "--save", out / "x.rrd"), "no design.rrd or estimate.rrd")
+    misused(
+        run("identify", study, archived, "-o", out, "--method", "magic"),
+        "'magic'",
+        "least_squares, newton",
+    )
+    assert names(tmp_path) == set()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("design", "study.toml"),
+        ("design", "study.toml", "-o", "x", "--starts", "0"),
+        ("simulate", "study.toml", "design.npz", "-o", "x", "--seed", "-1"),
+        ("montecarlo", "study.toml", "design.npz", "-o", "x", "--trials", "1"),
+        ("identify", "study.toml", "-o", "x"),
+        ("dessign", "study.toml", "-o", "x"),
+    ],
+)
+def test_wrong_options(
+    words: tuple[str, ...], home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit code 2 and a message that names --help."""
+    monkeypatch.chdir(tmp_path)
+    result = run(*words)
+    assert result.exit_code == 2
+    assert "--help" in result.stderr
+    assert "Traceback" not in result.stderr
+    assert names(tmp_path) == set()
+
+
+def test_output_is_a_file(study: Path, archived: Path, recorded: Path, tmp_path: Path) -> None:
+    """The message comes before the work, and the file is not changed."""
+    taken = tmp_path / "taken"
+    taken.write_text("mine", encoding="utf-8")
+    for place in (taken, taken / "below"):
+        misused(run("design", study, "-o", place), "taken: is a file; -o needs a folder")
+        misused(
+            run("identify", study, recorded, "-o", place), "taken: is a file; -o needs a folder"
+        )
+        misused(
+            run("montecarlo", study, archived, "-o", place, "--trials", 2),
+            "taken: is a file; -o needs a folder",
+        )
+    assert taken.read_text(encoding="utf-8") == "mine"
+
+
+def test_design_of_another_model(archived: Path, tmp_path: Path) -> None:
+    """The verbs simulate, montecarlo and replay refuse a design of another model."""
+    path = write_experiment(tmp_path)
+    xml = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
+    more = '<body name="rider"><joint name="ride"/><geom size=".1" mass="1"/></body></worldbody>'
+    key = 'qpos="0 3.141592653589793 0"'
+    xml = xml.replace("</worldbody>", more).replace('qpos="0 3.141592653589793"', key)
+    (tmp_path / "cart_pendulum.xml").write_text(xml, encoding="utf-8")
+    said = ("design.npz: made for (nq, nv, nu) = (2, 2, 1)", "(3, 3, 1)")
+    misused(run("simulate", path, archived, "-o", tmp_path / "out" / "r.csv"), *said)
+    misused(run("montecarlo", path, archived, "-o", tmp_path / "out"), *said)
+    misused(
+        run("replay", archived, "--experiment", path, "--save", tmp_path / "out" / "x.rrd"), *said
+    )
+    assert "out" not in names(tmp_path)
+
+
+def test_help() -> None:
+    """One sentence about each verb, and nothing on standard error."""
+    result = run("--help")
+    assert (result.exit_code, result.stderr) == (0, "")
+    for verb in ("design", "simulate", "identify", "montecarlo", "replay"):
+        assert re.search(rf"^\W*{verb}\s+[A-Z]", result.stdout, re.MULTILINE), verb
+
+
+def test_misuse_as_a_process(tmp_path: Path) -> None:
+    """A process ends with one message and exit code 2; warnings are errors there."""
+    path = write_experiment(tmp_path, rate="33.0")
+    words = [*PROCESS, "design", path, "-o", tmp_path / "out"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"mjfim: {path}: rate: 33 Hz is not")
+    assert len(done.stderr.splitlines()) == 1
+    assert "out" not in names(tmp_path)
+
+
+def test_version() -> None:
+    """The version is that of the package."""
+    result = run("--version")
+    assert (result.exit_code, result.stdout) == (0, f"{mjfim.__version__}\n")

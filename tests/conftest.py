@@ -1,0 +1,20 @@
+"""Settings of every test process: one BLAS thread, and Ctrl-C as in a terminal."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+# The tests run side by side on all cores, so one thread of BLAS per process is enough.
+# BLAS reads the variable when NumPy is imported, which is later than this line.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Restore Python's handler of SIGINT.
+
+    A background job of a shell inherits SIGINT as ignored, and then the tests of Ctrl-C would fail.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
