@@ -42,13 +42,22 @@ def wait_for_stop(longest: float) -> tuple[bool, int]:
     return workers.pool_stop_token().requested, os.getpid()
 
 
-def test_processes_of_a_pool_are_others_and_see_the_request_to_stop() -> None:
-    with mjfim.Pool(2) as pool:
-        assert pool.submit(identity).result() != os.getpid()
-        running = pool.submit(wait_for_stop, 60.0)
-        pool.stop()
-        told, _ = running.result(timeout=30.0)
-        assert told
+@pytest.fixture(scope="module")
+def pool() -> Iterator[mjfim.Pool]:
+    """Two worker processes, which take seconds to start."""
+    with mjfim.Pool(2) as two_workers:
+        yield two_workers
+
+
+def test_processes_of_a_pool_are_others_and_see_the_request_to_stop(pool: mjfim.Pool) -> None:
+    assert pool.submit(identity).result() != os.getpid()
+
+    running = pool.submit(wait_for_stop, 60.0)
+    pool.stop()
+    requested, _ = running.result(timeout=30.0)
+    pool.resume()
+
+    assert requested
     assert not workers.pool_stop_token().requested
 
 
@@ -81,24 +90,27 @@ def test_finished_tasks_are_collected_in_order_and_the_others_are_left(
 
 
 @pytest.mark.slow
-def test_an_interrupted_design_keeps_the_results_of_its_workers(tmp_path: Path) -> None:
+def test_an_interrupted_design_keeps_the_results_of_its_workers(
+    tmp_path: Path, pool: mjfim.Pool
+) -> None:
     """SIGINT while two of hundreds of starts are under way."""
     task = cart_inside(tmp_path, horizon=2.0, descent={"starts": 400, "max_iterations": 100_000})
-    with mjfim.Pool(2) as pool:
-        assert pool.submit(identity).result()
-        timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
-        try:
-            with stop_on_interrupt() as stop:
-                design = design_task(task, executor=pool, budget=Budget(stop=stop))
-        finally:
-            timer.cancel()
+    assert pool.submit(identity).result()
+    timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    try:
+        with stop_on_interrupt() as stop:
+            design = design_task(task, executor=pool, budget=Budget(stop=stop))
+    finally:
+        timer.cancel()
     assert design.status is Status.INTERRUPTED
     assert design.starts
     assert design.final.cost < design.initial.cost
 
 
-def test_a_callback_that_asks_to_stop_keeps_the_results_of_all_workers(tmp_path: Path) -> None:
+def test_a_callback_that_asks_to_stop_keeps_the_results_of_all_workers(
+    tmp_path: Path, pool: mjfim.Pool
+) -> None:
     task = cart_inside(tmp_path, descent={"starts": 3, "max_iterations": 30})
 
     stop = StopToken()
@@ -106,8 +118,7 @@ def test_a_callback_that_asks_to_stop_keeps_the_results_of_all_workers(tmp_path:
     def callback(event: DesignEvent) -> None:
         stop.request()
 
-    with mjfim.Pool(2) as pool:
-        design = design_task(task, callback=callback, executor=pool, budget=Budget(stop=stop))
+    design = design_task(task, callback=callback, executor=pool, budget=Budget(stop=stop))
     assert design.status is Status.INTERRUPTED
     assert len(design.starts) >= 2
     assert design.final.cost < design.initial.cost
@@ -165,7 +176,7 @@ def test_a_start_that_fails_does_not_end_the_others(
 
 @pytest.mark.parametrize("limits", [{}, HARD], ids=["weights", "limits"])
 def test_seconds_end_a_design(tmp_path: Path, limits: dict[str, object]) -> None:
-    descent = {"seconds": 1.5, "starts": 500, "max_iterations": 100_000, "tolerance": 1e-14}
+    descent = {"seconds": 0.8, "starts": 500, "max_iterations": 100_000, "tolerance": 1e-14}
     cost = {"control": 0.0 if limits else 1e-3}
     task = cart_inside(tmp_path, limits=limits, cost=cost, descent=descent)
     clock = time.perf_counter()

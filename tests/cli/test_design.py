@@ -92,7 +92,7 @@ BAD_LINES: dict[str, tuple[dict[str, str], list[str]]] = {
         ["study.toml", "horizn", "unknown key", "horizon"],
     ),
     "bad value": ({"rate": "-1"}, ["study.toml", "rate", "greater than 0"]),
-    "bad rate": ({"rate": "33.0"}, ["study.toml", "rate: 33 Hz", "valid"]),
+    "bad rate": ({"rate": "33.0"}, ["study.toml", "rate: at 33 Hz", "valid"]),
     "bad syntax": ({"rate": ""}, ["study.toml", "not valid TOML"]),
     "no model": ({"model": '"gone.xml"'}, ["gone.xml", "no such model file"]),
     "no table": ({"start": '"gone.csv"'}, ["gone.csv", "no such file"]),
@@ -159,7 +159,7 @@ def test_start_that_excites_nothing(tmp_path: Path) -> None:
     xml = (tmp_path / "cart_pendulum.xml").read_text(encoding="utf-8")
     xml = xml.replace("<keyframe>", '<keyframe><key name="upright" qpos="0 0"/>')
     (tmp_path / "cart_pendulum.xml").write_text(xml, encoding="utf-8")
-    misused(run("design", path, "-o", tmp_path / "out"), "the start excites nothing along: ")
+    misused(run("design", path, "-o", tmp_path / "out"), "the initial control does not excite: ")
     assert "out" not in names(tmp_path)
 
 
@@ -181,9 +181,9 @@ def test_start_that_excites_next_to_nothing(tmp_path: Path) -> None:
     )
     misused(
         run("design", path, "-o", tmp_path / "out"),
-        "the start excites nothing along: ",
+        "the initial control does not excite: ",
         "m, l and c",
-        "Another control",
+        "Other controls do",
     )
 
 

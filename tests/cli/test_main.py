@@ -139,7 +139,7 @@ def test_misuse_as_a_process(tmp_path: Path) -> None:
     words = [*PROCESS, "design", path, "-o", tmp_path / "out"]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"mjfim: {path}: rate: 33 Hz is not")
+    assert done.stderr.startswith(f"mjfim: {path}: rate: at 33 Hz, a sample is not")
     assert len(done.stderr.splitlines()) == 1
     assert "out" not in names(tmp_path)
 

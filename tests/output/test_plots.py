@@ -38,8 +38,13 @@ from mjfim.records.recording import Recording
 from mjfim.records.trajectory import Trajectory
 from tests.support.paths import ROOT
 
-# Joints and parameters of the records that are drawn.
-SIZES = [(1, 1), (14, 30), pytest.param(1, 70, marks=pytest.mark.slow)]
+# Numbers of joints and of parameters of the records that are drawn.
+SIZES = [
+    (1, 1),
+    (5, 8),
+    pytest.param(14, 30, marks=pytest.mark.slow),
+    pytest.param(1, 70, marks=pytest.mark.slow),
+]
 
 
 def make_labels(dofs: int, count: int) -> Labels:

@@ -73,7 +73,7 @@ def test_each_trial_is_its_own_least_squares_estimate(
 
 def test_the_seed_determines_the_result(experiment: Experiment, design: mjfim.Design) -> None:
     runs = [
-        monte_carlo(experiment, design.trajectory, trials=8, seed=seed).sets["final"].estimates
+        monte_carlo(experiment, design.trajectory, trials=3, seed=seed).sets["final"].estimates
         for seed in (1, 1, 2)
     ]
     np.testing.assert_array_equal(runs[0], runs[1])
@@ -207,7 +207,7 @@ def test_a_parameter_that_only_its_prior_determines_is_named(
 
 def test_priors_do_not_enter_the_study(design: mjfim.Design, experiment: Experiment) -> None:
     sure = experiment.replace(parameters={"m": {"prior": 1e-6}})
-    plain, prior = (monte_carlo(e, design.trajectory, trials=6, seed=1) for e in (experiment, sure))
+    plain, prior = (monte_carlo(e, design.trajectory, trials=3, seed=1) for e in (experiment, sure))
     np.testing.assert_allclose(
         plain.sets["final"].estimates, prior.sets["final"].estimates, rtol=1e-9
     )

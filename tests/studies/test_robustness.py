@@ -543,7 +543,7 @@ def test_a_start_that_moves_on_a_ball_joint_is_an_unknown_of_the_fit(tmp_path: P
 def test_the_verb_plays_a_folder(cart: tuple[mjfim.Experiment, Path], tmp_path: Path) -> None:
     """Tables and sentences on stdout, JSON and a figure in the folder; robots in processes."""
     experiment, path = cart
-    words = ("--runs", 6, "--jobs", 2, "-o", tmp_path / "out")
+    words = ("--runs", 6, "--jobs", 1, "-o", tmp_path / "out")
     done = run("robustness", experiment.source, path.parent, *words)
     found = json.loads((tmp_path / "out" / "playback.json").read_text(encoding="utf-8"))
     assert done.exit_code == (0 if found["ok"] else 1), done.stderr

@@ -18,7 +18,17 @@ from tests.support.numerics import shared_model
 from tests.support.paths import SHARED_MODELS
 from tests.support.shared_models import EXPERIMENTS
 
+# Smallest ratio of the information of a design to that of its initial chirp.
 GAIN = 10.0
+
+# Models whose tests are fast; those of the others are marked as slow.
+FAST_MODELS = ("pendulum", "cartpole", "acrobot")
+
+# Names of all experiments as parameters of a test.
+EXPERIMENT_NAMES = [
+    pytest.param(name, marks=[] if name in FAST_MODELS else pytest.mark.slow)
+    for name in EXPERIMENTS
+]
 
 
 def experiment(name: str) -> mjfim.Experiment:
@@ -57,13 +67,7 @@ def test_every_shared_model_loads() -> None:
     assert loaded == {folder.name for folder in SHARED_MODELS.iterdir() if folder.is_dir()}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow if name == "so_arm100" else [])
-        for name in EXPERIMENTS
-    ],
-)
+@pytest.mark.parametrize("name", EXPERIMENT_NAMES)
 def test_every_initial_trajectory_is_identifiable(name: str) -> None:
     start = mjfim.design(experiment(name).replace(descent={"max_iterations": 0}))
     assert start.final.eigenvalues[0] > 0.0
@@ -95,13 +99,7 @@ def test_a_design_has_ten_times_the_information_of_the_chirp(name: str) -> None:
         assert design.status.success
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow if name == "so_arm100" else [])
-        for name in EXPERIMENTS
-    ],
-)
+@pytest.mark.parametrize("name", EXPERIMENT_NAMES)
 def test_check_passes_or_names_the_rough_sample(name: str) -> None:
     found = mjfim.check(experiment(name))
     assert not found.not_separable
