@@ -1,30 +1,29 @@
-"""Two arms under hard limits, rest to rest: their models, their experiments, and what these are
-like before any design.
+"""Two arms under hard limits, from rest to rest: their models, experiments and properties.
 
     python -m scripts.benchmarks arms FOLDER [--arms panda so_arm100] [--horizons 5 10]
     [--skip-check]
 
-The models are made at run time, into FOLDER, from ../shared/models beside the repository: the same
-kinematics, inertias, servos and ranges, and in addition
+The models are made at run time, into FOLDER, from ../shared/models beside the repository. They have
+the kinematics, inertias, servos and ranges of those files, and in addition
 
 - a payload, rigid at the flange or at the fixed jaw, its centre of mass off every axis;
 - damping, armature and dry friction of the joints where the MJCF has none (see `ARMS`);
-- a floor, and capsules without mass that stand for the links, which the mesh-free MJCF lack. They
+- a floor, and capsules without mass in place of the links, which the mesh-free MJCF lacks. They
   serve for distance: pairs that always overlap are excluded from contact and listed under
   `limits.ignored`;
-- servo gains as numbers: `dampratio` would follow the payload;
+- servo gains as numbers, because a `dampratio` would change with the payload;
 - the keyframe `home` (of the SO-ARM100 with the jaw open) with the control that holds it.
 
-Numbers have the six digits that MuJoCo writes to XML. Timestep and integrator are the MJCF's.
+Numbers have the six digits that MuJoCo writes to XML. The integrator is that of the MJCF.
 
-Each arm comes smooth (no dry friction, that of the SO-ARM100's MJCF taken out; p = 18 and 16:
-damping and armature of every joint, mass and centre of mass of the payload) and dry (frictionloss
-of every joint in the model and unknown, p = 25 and 22).
+Each arm has two variants. The smooth one has no dry friction (that of the SO-ARM100 is taken out)
+and p = 18 or 16 unknowns: damping and armature of every joint, mass and centre of mass of the
+payload. The dry one has dry friction in every joint as further unknowns, p = 25 or 22.
 
-"Worst relative sigma" is `1 / sqrt(lambda_min(S I S))`, S the parameters' scales, I the sum over
-all samples: the standard deviation of the worst combination of unit length, at least as large as
-that of every single parameter. A scale is the parameter's guess, but 0.05 m for the coordinates of
-the centre of mass.
+"Worst relative sigma" is `1 / sqrt(lambda_min(S I S))` with the scales S of the parameters and the
+information I of all samples. It is the standard deviation of the worst combination of unit length,
+and at least as large as that of every single parameter. The scale of a parameter is its guess, and
+0.05 m for the coordinates of the centre of mass.
 """
 
 from __future__ import annotations
@@ -51,24 +50,49 @@ from mjfim.parallel import cores
 from mjfim.records.trajectory import Sensitivity
 from mjfim.signals import multisine
 
+# Folder of the models that others wrote, beside the repository.
 MODELS = Path(__file__).resolve().parents[3] / "shared" / "models"
-RATE, MEASURED = 100.0, 50.0  # [Hz] control updates, measurements
-NOISE = {"qpos": 1e-3, "qvel": 1e-2}  # [rad, rad/s] encoders and their filtered derivative, 1 sigma
-CLEARANCE = 0.02  # [m]
-CENTRE_SCALE = 0.05  # [m] unit of the coordinates of the payload's centre of mass
-RISE, REST = 0.5, 1.0  # [s] in which the starting motion swells and dies, and stillness at its end
-HARMONICS = 5
-PITCH = 0.2  # [Hz] of the starting motion's first harmonic
-FINE = 2.5e-4  # [s] timestep that others are compared with
-FAR = 10.0  # [m] distances beyond do not matter
 
+# Rates of control updates and of measurements [Hz].
+RATE, MEASURED = 100.0, 50.0
+
+# Standard deviations of encoders [rad] and of their filtered derivatives [rad/s].
+NOISE = {"qpos": 1e-3, "qvel": 1e-2}
+
+# Smallest allowed distance between bodies [m].
+CLEARANCE = 0.02
+
+# Scale of the coordinates of the payload's centre of mass [m].
+CENTRE_SCALE = 0.05
+
+# Time in which the starting motion grows and fades, and time at rest at its end [s].
+RISE, REST = 0.5, 1.0
+
+# Number of harmonics of the starting motion.
+HARMONICS = 5
+
+# Frequency of the first harmonic of the starting motion [Hz].
+FUNDAMENTAL = 0.2
+
+# Timestep that is the reference for all others [s].
+FINE = 2.5e-4
+
+# Largest distance that MuJoCo computes [m]; larger ones do not matter.
+MAX_DISTANCE = 10.0
+
+# Position in the frame of a body [m].
 Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Capsule:
-    """What stands for a link. start, end: of its axis in the body's frame [m], equal for a sphere;
-    radius: [m]
+    """A capsule in place of a link.
+
+    Attributes:
+        body: Name of the body that carries the capsule.
+        start: Start of the axis in the frame of the body [m].
+        end: End of the axis in the frame of the body [m]; equal to the start for a sphere.
+        radius: Radius [m].
     """
 
     body: str
@@ -79,8 +103,14 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Payload:
-    """A body welded to `parent`. mass: [kg];  com: [m] in the parent's frame;  inertia: principal
-    [kg m²];  radius: [m]
+    """A body that is welded to another.
+
+    Attributes:
+        parent: Name of the body that carries the payload.
+        mass: Mass [kg].
+        com: Centre of mass in the frame of the parent [m].
+        inertia: Principal moments of inertia [kg m²].
+        radius: Radius of the sphere that stands for the payload [m].
     """
 
     parent: str
@@ -92,13 +122,23 @@ class Payload:
 
 @dataclass(frozen=True)
 class Arm:
-    """An arm, what is added to its MJCF, and its limits.
+    """An arm, the additions to its MJCF, and its limits.
 
-    file: under ../shared/models;  joints: names, each with an actuator of the same name
-    home: [rad];  damping: [N m s/rad], armature: [kg m²], friction: [N m] of every joint, nominal
-    timestep: [s];  overlapping: pairs of bodies whose capsules always overlap
-    velocity: [rad/s], force: [N m] beside the MJCF's, rate: [rad/s] of the reference, per joint or
-    for all amplitude: [rad] of the starting motion
+    Attributes:
+        file: Path of the MJCF under ../shared/models.
+        joints: Names of the joints; each has an actuator of this name.
+        home: Joint positions of the keyframe `home` [rad].
+        capsules: Capsules in place of the links.
+        payload: Payload at the last link.
+        damping: Nominal damping of every joint [N m s/rad].
+        armature: Nominal armature of every joint [kg m²].
+        friction: Nominal dry friction of every joint [N m].
+        timestep: Timestep of the engine [s].
+        overlapping: Pairs of bodies whose capsules always overlap.
+        velocity: Limits of the joint velocities [rad/s], one for all or one for each joint.
+        rate: Limits of the rate of the reference [rad/s], one for all or one for each joint.
+        force: Limit of the actuator forces besides those of the MJCF [N m].
+        amplitude: Amplitude of the starting motion [rad].
     """
 
     file: str
@@ -117,13 +157,21 @@ class Arm:
     amplitude: float
 
 
+# Joints of the Panda.
 PANDA = tuple(f"joint{i}" for i in range(1, 8))
+
+# Velocity limits of the Panda [rad/s].
 PANDA_SPEED = {name: 2.175 if i < 4 else 2.61 for i, name in enumerate(PANDA)}
+
+# Joints of the SO-ARM100.
 SO_ARM = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+
+# The two arms; nominal values beyond the MJCF are those that are published for the robots.
 ARMS = {
-    # capsules: franka_description's coarse self-collision model, link1's cut off where link0's
-    # begins; speeds: its limits; damping and armature: those of Menagerie's own actuated Panda;
-    # forces: the MJCF's forcerange (87 and 12 N m)
+    # The capsules are the coarse self-collision model of franka_description; that of link1 is cut
+    # off where that of link0 begins. The speeds are the limits there. Damping and armature are
+    # those of Menagerie's actuated Panda, and forces are limited by the forcerange of the MJCF
+    # (87 and 12 N m).
     "panda": Arm(
         file="menagerie_panda/panda_nohand_nomesh.xml",
         joints=PANDA,
@@ -151,9 +199,9 @@ ARMS = {
         force=None,
         amplitude=0.2,
     ),
-    # capsules: about servos of 45 x 25 x 35 mm; damping and force: what is published of the STS3215
-    # at 12 V (4.8 rad/s idle); armature and friction: the MJCF's; home: its keyframe with the jaw
-    # open
+    # The capsules surround servos of 45 x 25 x 35 mm. Damping and force are published values of the
+    # STS3215 at 12 V (4.8 rad/s without load), armature and friction those of the MJCF. Home is its
+    # keyframe with the jaw open.
     "so_arm100": Arm(
         file="menagerie_so_arm100/so_arm100_nomesh.xml",
         joints=SO_ARM,
@@ -184,98 +232,139 @@ ARMS = {
 def model_file(
     arm: Arm, name: str, friction: bool, folder: Path, timestep: float | None = None
 ) -> Path:
-    """Write the arm's MJCF into the folder and return its path. timestep: [s], default: the arm's."""
+    """Write the MJCF of an arm.
+
+    Args:
+        arm: The arm.
+        name: Name of the arm, from which the name of the file is made.
+        friction: Whether the joints have dry friction.
+        folder: Folder that receives the file.
+        timestep: Timestep of the engine [s]; that of the arm by default.
+
+    Returns:
+        Path of the file.
+    """
     source = MODELS / arm.file
     if not source.is_file():
         raise SystemExit(f"{source}: no such model; the arms are not part of this repository")
+
     spec = mujoco.MjSpec.from_file(str(source))
     _state_gains(spec, spec.compile())
     spec.option.timestep = timestep or arm.timestep
+
     for joint in spec.joints:
-        joint.damping[0], joint.armature = arm.damping, arm.armature
+        joint.damping[0] = arm.damping
+        joint.armature = arm.armature
         joint.frictionloss = arm.friction if friction else 0.0
-    _embody(spec, arm)
-    model, key = spec.compile(), spec.key("home")
+
+    _add_bodies(spec, arm)
+
+    model = spec.compile()
+    key = spec.key("home")
     key.qpos = list(arm.home)
     key.ctrl = holding(model, np.array(arm.home)).tolist()
+
     folder.mkdir(parents=True, exist_ok=True)
+    variant = "_dry" if friction else ""
     step = f"_{1e3 * timestep:g}ms" if timestep else ""
-    path = folder / f"{name}{'_dry' if friction else ''}{step}.xml"
+    path = folder / f"{name}{variant}{step}.xml"
     path.write_text(spec.to_xml(), encoding="utf-8")
     return path
 
 
 def _state_gains(spec: Any, model: Any) -> None:
-    """Write the servos' gains as they were compiled: those that follow a damping ratio would change
-    with the payload.
+    """Write the gains of the servos as they were compiled.
+
+    Gains that follow a damping ratio would change with the payload.
     """
     for actuator in spec.actuators:
         actuator.biasprm[:] = model.actuator(actuator.name).biasprm
 
 
-def _embody(spec: Any, arm: Arm) -> None:
-    """Payload, floor and capsules.
-
-    Boxes that the MJCF has on its jaws make way for the jaws' capsules.
-    """
+def _add_bodies(spec: Any, arm: Arm) -> None:
+    """Add payload, floor and capsules; the capsules replace all geoms of the MJCF."""
     for geom in list(spec.geoms):
         spec.delete(geom)
+
     load = arm.payload
     body = spec.body(load.parent).add_body(name="payload")
-    body.explicitinertial, body.mass, body.ipos, body.inertia = (
-        True,
-        load.mass,
-        load.com,
-        load.inertia,
-    )
+    body.explicitinertial = True
+    body.mass = load.mass
+    body.ipos = load.com
+    body.inertia = load.inertia
+
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05])
+
     sphere = Capsule("payload", load.com, load.com, load.radius)
-    for i, c in enumerate((*arm.capsules, sphere)):
-        geom = spec.body(c.body).add_geom(name=f"{c.body}_{i}", size=[c.radius, 0.0, 0.0], mass=0.0)
-        if c.start == c.end:
-            geom.type, geom.pos = mujoco.mjtGeom.mjGEOM_SPHERE, c.start
+    for i, capsule in enumerate((*arm.capsules, sphere)):
+        geom = spec.body(capsule.body).add_geom(
+            name=f"{capsule.body}_{i}", size=[capsule.radius, 0.0, 0.0], mass=0.0
+        )
+        if capsule.start == capsule.end:
+            geom.type = mujoco.mjtGeom.mjGEOM_SPHERE
+            geom.pos = capsule.start
         else:
-            geom.type, geom.fromto = mujoco.mjtGeom.mjGEOM_CAPSULE, [*c.start, *c.end]
-    known = {frozenset((e.bodyname1, e.bodyname2)) for e in spec.excludes}
+            geom.type = mujoco.mjtGeom.mjGEOM_CAPSULE
+            geom.fromto = [*capsule.start, *capsule.end]
+
+    # MuJoCo refuses a pair that is excluded twice.
+    known = {frozenset((pair.bodyname1, pair.bodyname2)) for pair in spec.excludes}
     for one, other in arm.overlapping:
         if frozenset((one, other)) not in known:
             spec.add_exclude(bodyname1=one, bodyname2=other)
 
 
 def holding(model: Any, qpos: Array) -> Array:
-    """(nu,) references at which position servos, one per joint, hold qpos: (nq,) [rad] against
-    gravity.
+    """Compute the references at which position servos hold a pose against gravity.
+
+    Args:
+        model: Model with one servo for each joint.
+        qpos: (nq,) pose [rad].
+
+    Returns:
+        (nu,) references [rad].
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
+
     joints = model.actuator_trnid[:, 0]
     load = data.qfrc_bias[model.jnt_dofadr[joints]]
-    return np.asarray(qpos[model.jnt_qposadr[joints]] + load / model.actuator_gainprm[:, 0])
+    deflection = load / model.actuator_gainprm[:, 0]
+    return np.asarray(qpos[model.jnt_qposadr[joints]] + deflection)
 
 
 def start_control(hold: Array, horizon: float, amplitude: float) -> Array:
-    """(N, nu) a small multisine about the hold: (nu,), that swells from it and dies back to it, so
-    that it rests at both ends.
+    """Compute a small multisine about the hold that is at rest at both ends.
 
-    horizon: [s];  amplitude: [rad] of every joint
+    Args:
+        hold: (nu,) control that holds the pose [rad].
+        horizon: Duration [s].
+        amplitude: Amplitude of every joint [rad].
+
+    Returns:
+        (N, nu) control [rad].
     """
     t = np.arange(round(horizon * RATE)) / RATE
     end = horizon - REST
-    swell = np.clip(np.minimum(t, end - t) / RISE, 0.0, 1.0)
-    wave = multisine(t, len(hold), PITCH, HARMONICS, np.random.default_rng(0))
-    window = np.sin(0.5 * np.pi * swell)[:, None] ** 2
+    growth = np.clip(np.minimum(t, end - t) / RISE, 0.0, 1.0)
+    window = np.sin(0.5 * np.pi * growth)[:, None] ** 2
+
+    wave = multisine(t, len(hold), FUNDAMENTAL, HARMONICS, np.random.default_rng(0))
     return np.asarray(hold + amplitude * window * wave)
 
 
 def parameters(arm: Arm, friction: bool) -> dict[str, dict[str, Any]]:
-    """Unknowns, relative to their guesses: 2 or 3 per joint, 4 of the payload."""
-    fields = ("damping", "armature", *(("frictionloss",) if friction else ()))
-    found: dict[str, dict[str, Any]] = {
-        f"{joint}_{field}": {"target": f"joint/{joint}:{field}"}
-        for field in fields
-        for joint in arm.joints
-    }
+    """Return the tables of the unknowns: two or three for each joint and four of the payload."""
+    fields = ["damping", "armature"]
+    if friction:
+        fields.append("frictionloss")
+
+    found: dict[str, dict[str, Any]] = {}
+    for field in fields:
+        for joint in arm.joints:
+            found[f"{joint}_{field}"] = {"target": f"joint/{joint}:{field}"}
+
     found["payload_mass"] = {"target": "body/payload:mass"}
     for i, axis in enumerate("xyz"):
         found[f"payload_{axis}"] = {"target": f"body/payload:ipos[{i}]", "scale": CENTRE_SCALE}
@@ -289,24 +378,36 @@ def experiment(
     model_folder: str | Path,
     timestep: float | None = None,
 ) -> Experiment:
-    """An arm's experiment, rest to rest from home, designed under hard limits; its model and start
-    are written beside.
+    """Make the experiment of an arm, from rest to rest at home, under hard limits.
 
-    name: of `ARMS`;  horizon: [s];  friction: dry friction in the model, and unknown;  timestep:
-    [s], default: the arm's
+    Args:
+        name: Key of `ARMS`.
+        horizon: Duration [s].
+        friction: Whether the joints have dry friction, which is then unknown.
+        model_folder: Folder that receives the model and the starting control.
+        timestep: Timestep of the engine [s]; that of the arm by default.
+
+    Returns:
+        The experiment.
     """
-    arm, folder = ARMS[name], Path(model_folder)
+    arm = ARMS[name]
+    folder = Path(model_folder)
     path = model_file(arm, name, friction, folder, timestep)
+
     hold = np.array(mujoco.MjModel.from_xml_path(str(path)).key("home").ctrl)
     control = folder / f"{path.stem}_{horizon:g}s.csv"
     write_control(control, arm.joints, start_control(hold, horizon, arm.amplitude))
+
     limits: dict[str, Any] = {
         "velocity": arm.velocity,
         "control_rate": arm.rate,
         "clearance": CLEARANCE,
+        "ignored": arm.overlapping,
     }
     if arm.force is not None:
         limits["force"] = arm.force
+
+    noise = {f"{kind}:{joint}": sigma for kind, sigma in NOISE.items() for joint in arm.joints}
     return Experiment(
         model=path.name,
         directory=folder,
@@ -316,40 +417,57 @@ def experiment(
         horizon=horizon,
         initial={"keyframe": "home", "control": control.name},
         parameters=parameters(arm, friction),
-        noise={f"{kind}:{joint}": sigma for kind, sigma in NOISE.items() for joint in arm.joints},
+        noise=noise,
         cost={"criterion": "E", "control": 0.0},
-        limits={**limits, "ignored": arm.overlapping},
+        limits=limits,
         boundary={"start": "rest", "end": "rest"},
     )
 
 
 def write_control(path: Path, names: tuple[str, ...], control: Array) -> None:
-    """A table of t [s] and control: (N, nu), as `initial.control` reads it."""
+    """Write a table of times and controls as `initial.control` reads it.
+
+    Args:
+        path: File to write.
+        names: Names of the actuators.
+        control: (N, nu) control.
+    """
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["t", *names])
-        rows.writerows(
-            [f"{k / RATE:.4f}", *(f"{u:.12g}" for u in row)] for k, row in enumerate(control)
-        )
+
+        for k, row in enumerate(control):
+            values = [f"{u:.12g}" for u in row]
+            rows.writerow([f"{k / RATE:.4f}", *values])
 
 
 def worst_relative_sigma(information: Array, scale: Array) -> float:
-    """`1 / sqrt(lambda_min(S I S))` of the information (p, p) that all samples hold together;
-    scale: (p,).
+    """Compute the worst relative sigma, `1 / sqrt(lambda_min(S I S))`.
+
+    Args:
+        information: (p, p) information of all samples.
+        scale: (p,) scales of the parameters.
+
+    Returns:
+        Standard deviation of the worst combination of unit length.
     """
-    return float(np.linalg.eigvalsh(information * np.outer(scale, scale))[0] ** -0.5)
+    scaled = information * np.outer(scale, scale)
+    return float(np.linalg.eigvalsh(scaled)[0] ** -0.5)
 
 
-# what the arms are like
-# -----------------------------------------------------------------------------------------------
+# ---- properties of the arms
 
 
 @dataclass(frozen=True)
 class Motion:
-    """A simulated motion: qpos, qvel: (n+1, nv), force: (n, nv) [rad, rad/s, N m] at every engine
-    step.
+    """A simulated motion; positions, velocities and forces are those of every engine step.
 
-    distance: (N,) least at every sample [m];  closest: names of the two bodies that come closest
+    Attributes:
+        qpos: (n+1, nv) positions [rad].
+        qvel: (n+1, nv) velocities [rad/s].
+        force: (n, nv) actuator forces [N m].
+        distance: (N,) smallest distance between bodies at every sample [m].
+        closest: Names of the two bodies that come closest.
     """
 
     qpos: Array
@@ -360,40 +478,76 @@ class Motion:
 
 
 def pairs(model: Any) -> list[tuple[int, int]]:
-    """Pairs of geoms that MuJoCo would let collide: not of one body, not of parent and child, not
-    excluded.
+    """Return the pairs of geoms that MuJoCo would let collide.
+
+    Geoms of one body, of parent and child, and of excluded pairs of bodies do not collide.
     """
     excluded = set(model.exclude_signature.tolist())
     found = []
+
     for one, other in itertools.combinations(range(model.ngeom), 2):
         bodies = sorted((int(model.geom_bodyid[one]), int(model.geom_bodyid[other])))
-        a, b = (int(model.body_weldid[i]) for i in bodies)
-        up_a, up_b = (int(model.body_weldid[model.body_parentid[i]]) for i in (a, b))
-        kin = a == b or (a != 0 and b != 0 and (up_a == b or up_b == a))
-        if not kin and (bodies[0] << 16) + bodies[1] not in excluded:
+        a, b = (int(model.body_weldid[body]) for body in bodies)
+        parent_a = int(model.body_weldid[model.body_parentid[a]])
+        parent_b = int(model.body_weldid[model.body_parentid[b]])
+
+        parent_and_child = a != 0 and b != 0 and (parent_a == b or parent_b == a)
+        is_excluded = (bodies[0] << 16) + bodies[1] in excluded
+        if a != b and not parent_and_child and not is_excluded:
             found.append((one, other))
+
     return found
 
 
-def clearance(model: Any, data: Any, among: list[tuple[int, int]]) -> tuple[float, tuple[str, str]]:
-    """Least distance [m] of pairs of geoms at the pose in data, and whose."""
+def clearance(
+    model: Any, data: Any, candidates: list[tuple[int, int]]
+) -> tuple[float, tuple[str, str]]:
+    """Find the smallest distance between geoms at the pose of `data`.
+
+    Args:
+        model: The model.
+        data: Its data, with positions of the geoms.
+        candidates: Pairs of geoms.
+
+    Returns:
+        Distance [m] and the names of the two bodies.
+    """
     segment = np.zeros(6)
-    found = [mujoco.mj_geomDistance(model, data, one, other, FAR, segment) for one, other in among]
-    nearest = among[int(np.argmin(found))]
-    one, other = (model.body(int(model.geom_bodyid[g])).name for g in nearest)
-    return float(min(found)), (one, other)
+    distances = []
+    for one, other in candidates:
+        distance = mujoco.mj_geomDistance(model, data, one, other, MAX_DISTANCE, segment)
+        distances.append(distance)
+
+    nearest = int(np.argmin(distances))
+    bodies = [int(model.geom_bodyid[geom]) for geom in candidates[nearest]]
+    one_name, other_name = (model.body(body).name for body in bodies)
+    return float(distances[nearest]), (one_name, other_name)
 
 
 def moved(model: Any, start: Array, control: Array, velocity: Array | None = None) -> Motion:
-    """Simulate control: (N, nu), held over samples, from start: (nq,) [rad], at rest or at a
-    velocity: (nv,) [rad/s].
+    """Simulate a control that is held over each sample.
+
+    Args:
+        model: The model.
+        start: (nq,) initial positions [rad].
+        control: (N, nu) control.
+        velocity: (nv,) initial velocities [rad/s]; zero by default.
+
+    Returns:
+        The motion.
     """
-    data, among = mujoco.MjData(model), pairs(model)
+    data = mujoco.MjData(model)
     data.qpos[:] = start
     if velocity is not None:
         data.qvel[:] = velocity
+
+    candidates = pairs(model)
     substeps = round(1.0 / (RATE * model.opt.timestep))
-    qpos, qvel, force, near = [start.copy()], [data.qvel.copy()], [], []
+    qpos = [start.copy()]
+    qvel = [data.qvel.copy()]
+    force = []
+    nearest = []
+
     for u in control:
         data.ctrl[:] = u
         for _ in range(substeps):
@@ -401,50 +555,70 @@ def moved(model: Any, start: Array, control: Array, velocity: Array | None = Non
             qpos.append(data.qpos.copy())
             qvel.append(data.qvel.copy())
             force.append(data.actuator_force.copy())
-        near.append(clearance(model, data, among))
-    distance, names = zip(*near, strict=True)
-    closest = names[int(np.argmin(distance))]
-    return Motion(np.array(qpos), np.array(qvel), np.array(force), np.array(distance), closest)
+        nearest.append(clearance(model, data, candidates))
+
+    distance, names = zip(*nearest, strict=True)
+    return Motion(
+        qpos=np.array(qpos),
+        qvel=np.array(qvel),
+        force=np.array(force),
+        distance=np.array(distance),
+        closest=names[int(np.argmin(distance))],
+    )
 
 
 def margins(e: Experiment, model: Any, control: Array, motion: Motion) -> dict[str, float]:
-    """Least distance to each kind of limit as a share of the range's half (of the limit itself for
-    the clearance).
+    """Compute the smallest distance to each kind of limit.
+
+    Args:
+        e: The experiment.
+        model: Its model.
+        control: (N, nu) control.
+        motion: Motion under this control.
+
+    Returns:
+        For each kind of limit, the distance as a share of half the range; for the clearance, as a
+        share of the limit.
     """
-    position = model.jnt_range[:, 0], model.jnt_range[:, 1]
     stated = e.limits.force if isinstance(e.limits.force, float) else np.inf
-    limits = {"velocity": _each(e.limits.velocity), "control rate": _each(e.limits.control_rate)}
-    worst = {
-        "position": _inside(motion.qpos, *position),
-        "control": _inside(control, model.actuator_ctrlrange[:, 0], model.actuator_ctrlrange[:, 1]),
-        "force": _inside(
-            motion.force,
-            *(s * np.minimum(model.actuator_forcerange[:, 1], stated) for s in (-1.0, 1.0)),
-        ),
-        "velocity": _inside(motion.qvel, -limits["velocity"], limits["velocity"]),
-        "control rate": _inside(
-            np.diff(control, axis=0) * RATE, -limits["control rate"], limits["control rate"]
-        ),
+    force = np.minimum(model.actuator_forcerange[:, 1], stated)
+    velocity = _each(e.limits.velocity)
+    rate = _each(e.limits.control_rate)
+    position = model.jnt_range
+    ranges = model.actuator_ctrlrange
+    slopes = np.diff(control, axis=0) * RATE
+
+    return {
+        "position": _margin(motion.qpos, position[:, 0], position[:, 1]),
+        "control": _margin(control, ranges[:, 0], ranges[:, 1]),
+        "force": _margin(motion.force, -force, force),
+        "velocity": _margin(motion.qvel, -velocity, velocity),
+        "control rate": _margin(slopes, -rate, rate),
+        "clearance": float(motion.distance.min() / CLEARANCE - 1.0),
     }
-    return {**worst, "clearance": float(motion.distance.min() / CLEARANCE - 1.0)}
 
 
 def _each(limit: Any) -> Array:
-    """Symmetric limits in the order of the joints, one number where it holds for all."""
-    return np.array(list(limit.values()) if isinstance(limit, dict) else [limit])
+    """Return symmetric limits in the order of the joints, or one number that holds for all."""
+    values = list(limit.values()) if isinstance(limit, dict) else [limit]
+    return np.array(values)
 
 
-def _inside(data: Array, low: Array, high: Array) -> float:
-    return float((np.minimum(data - low, high - data) / (0.5 * (high - low))).min())
+def _margin(values: Array, low: Array, high: Array) -> float:
+    """Return the smallest distance of values (n, m) to their limits, per half range."""
+    distance = np.minimum(values - low, high - values)
+    return float((distance / (0.5 * (high - low))).min())
 
 
 def lifted(model: Any) -> Any:
-    """In place: without ranges, clamps and contacts, as a design steps it; without constraints
-    where no joint is dry.
+    """Take ranges, clamps and contacts out of a model, in place, as a design simulates it.
+
+    Without dry friction the solver of constraints is off as well.
     """
     model.jnt_limited[:] = 0
     model.actuator_forcelimited[:] = 0
     model.actuator_ctrllimited[:] = 0
+
     flags = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_SENSOR
     if not model.dof_frictionloss.any():
         flags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -455,166 +629,221 @@ def lifted(model: Any) -> Any:
 def step_seconds(
     model: Any, start: Array, control: Array, simulations: int = 128, repeats: int = 3
 ) -> float:
-    """Wall seconds per `mj_step` in a batch on all cores, at the best of some repeats."""
+    """Measure the wall time of one engine step in a batch on all cores.
+
+    Args:
+        model: The model.
+        start: (nq,) initial positions [rad].
+        control: (N, nu) control, of which the first 100 samples are simulated.
+        simulations: Number of simulations in the batch.
+        repeats: Number of measurements, of which the fastest counts.
+
+    Returns:
+        Seconds per step of one simulation.
+    """
     batch = Batch(model, simulations, cores())
     substeps = round(1.0 / (RATE * model.opt.timestep))
-    held = np.ascontiguousarray(
-        np.broadcast_to(
-            np.repeat(control[:100], substeps, axis=0),
-            (simulations, 100 * substeps, control.shape[1]),
-        )
-    )
+    held = np.repeat(control[:100], substeps, axis=0)
+    shape = (simulations, 100 * substeps, control.shape[1])
+    controls = np.ascontiguousarray(np.broadcast_to(held, shape))
+
     best = np.inf
     for _ in range(repeats):
-        batch.bind("qpos")[:], batch.bind("qvel")[:] = start, 0.0
+        batch.bind("qpos")[:] = start
+        batch.bind("qvel")[:] = 0.0
         clock = time.perf_counter()
-        batch.rollout(held.shape[1], held)
+        batch.rollout(controls.shape[1], controls)
         best = min(best, time.perf_counter() - clock)
-    return float(best / (simulations * held.shape[1]))
+
+    return float(best / (simulations * controls.shape[1]))
 
 
 def settling(
     model: Any, start: Array, hold: Array, speed: Array, e: Experiment
 ) -> tuple[float, float]:
-    """Seconds until the boundary's tolerances hold for good when the hold meets all joints at full
-    speed, and the error left.
+    """Simulate the hold from full speed of all joints for two seconds.
 
-    speed: (nv,) [rad/s];  the error: largest of the positions [rad], 2 s later
+    Args:
+        model: The model.
+        start: (nq,) initial positions [rad].
+        hold: (nu,) control that holds the pose.
+        speed: (nv,) initial velocities [rad/s].
+        e: The experiment with the tolerances of its boundary.
+
+    Returns:
+        Time until the tolerances hold for good [s], and the largest error of the positions at the
+        end [rad].
     """
-    motion = moved(model, start, np.tile(hold, (round(2.0 * RATE), 1)), speed)
-    error, velocity = np.abs(motion.qpos - start).max(axis=1), np.abs(motion.qvel).max(axis=1)
-    outside = np.flatnonzero((error > e.boundary.position) | (velocity > e.boundary.velocity))
-    return float((outside[-1] + 1) * model.opt.timestep) if len(outside) else 0.0, float(error[-1])
+    control = np.tile(hold, (round(2.0 * RATE), 1))
+    motion = moved(model, start, control, speed)
+    error = np.abs(motion.qpos - start).max(axis=1)
+    velocity = np.abs(motion.qvel).max(axis=1)
+
+    outside = (error > e.boundary.position) | (velocity > e.boundary.velocity)
+    rows = np.flatnonzero(outside)
+    seconds = float((rows[-1] + 1) * model.opt.timestep) if len(rows) else 0.0
+    return seconds, float(error[-1])
 
 
 def prepared(e: Experiment) -> tuple[Any, Array, Array, Array]:
-    """The model as it is, start: (nq,), hold: (nu,) and the starting control: (N, nu) of an
-    experiment.
+    """Read the files of an experiment.
+
+    Returns:
+        The model, the start (nq,), the hold (nu,) and the starting control (N, nu).
     """
     model = mujoco.MjModel.from_xml_path(str(e.directory / e.model))
     key = model.key("home")
-    control = np.loadtxt(e.directory / str(e.initial.control), delimiter=",", skiprows=1)[:, 1:]
-    return model, np.array(key.qpos), np.array(key.ctrl), control
+    table = np.loadtxt(e.directory / str(e.initial.control), delimiter=",", skiprows=1)
+    return model, np.array(key.qpos), np.array(key.ctrl), table[:, 1:]
 
 
 def described(e: Experiment) -> Iterator[tuple[str, str]]:
-    """What an experiment is like, as (what, how much)."""
+    """Describe an experiment before its design.
+
+    Yields:
+        Name and value of a property.
+    """
     model, start, hold, control = prepared(e)
+    horizon = float(e.horizon or 0.0)
+    candidates = pairs(model)
+    yield "parameters, samples", f"{len(e.parameters)}, {round(horizon * RATE)}"
+    yield "pairs of geoms looked at", f"{len(candidates)}"
+
     data = mujoco.MjData(model)
     data.qpos[:] = start
     mujoco.mj_forward(model, data)
-    near, whose = clearance(model, data, pairs(model))
+    distance, bodies = clearance(model, data, candidates)
+    yield "clearance at home", f"{100 * distance:.1f} cm ({bodies[0]}, {bodies[1]})"
+    yield "hold minus home, largest", f"{np.abs(hold - start).max():.4f} rad"
+
+    yield from _described_engine(e, start, control)
+
     speed = np.broadcast_to(_each(e.limits.velocity), model.nv)
-    settled, left = settling(model, start, hold, speed, e)
+    seconds, error = settling(model, start, hold, speed, e)
+    yield "from full speed to rest within", f"{seconds:.2f} s; after 2 s {1e3 * error:.2g} mrad off"
+
     motion = moved(model, start, control)
-    inside = margins(e, model, control, motion)
+    error = np.abs(motion.qpos[-1] - start).max()
+    velocity = np.abs(motion.qvel[-1]).max()
+    yield "the start ends", f"{1e3 * error:.2g} mrad off, {1e3 * velocity:.2g} mrad/s"
+
+    shares = [f"{kind} {value:.0%}" for kind, value in margins(e, model, control, motion).items()]
+    yield "margins of the start", ", ".join(shares)
+
+
+def _described_engine(e: Experiment, start: Array, control: Array) -> Iterator[tuple[str, str]]:
+    """Yield the time of an engine step and of one simulation as names and values."""
     light = lifted(mujoco.MjModel.from_xml_path(str(e.directory / e.model)))
     seconds = step_seconds(light, start, control)
-    solver = (
-        "off"
-        if light.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        else "on (dry friction)"
-    )
-    steps = round(float(e.horizon or 0.0) / model.opt.timestep)
-    yield "parameters, samples", f"{len(e.parameters)}, {round(float(e.horizon or 0.0) * RATE)}"
-    yield "pairs of geoms looked at", f"{len(pairs(model))}"
-    yield "clearance at home", f"{100 * near:.1f} cm ({whose[0]}, {whose[1]})"
-    yield "hold minus home, largest", f"{np.abs(hold - start).max():.4f} rad"
-    yield (
-        "engine step, timestep",
-        f"{1e6 * seconds:.2f} µs on {cores()} cores, {1e3 * model.opt.timestep:g} ms",
-    )
+    timestep = light.opt.timestep
+    steps = round(float(e.horizon or 0.0) / timestep)
+
+    without_constraints = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    solver = "off" if light.opt.disableflags & without_constraints else "on (dry friction)"
+
+    speed = f"{1e6 * seconds:.2f} µs on {cores()} cores"
+    yield "engine step, timestep", f"{speed}, {1e3 * timestep:g} ms"
     yield "one rollout; constraints", f"{1e3 * seconds * steps:.1f} ms; {solver}"
-    yield "from full speed to rest within", f"{settled:.2f} s; after 2 s {1e3 * left:.2g} mrad off"
-    last = np.abs(motion.qpos[-1] - start).max(), np.abs(motion.qvel[-1]).max()
-    yield "the start ends", f"{1e3 * last[0]:.2g} mrad off, {1e3 * last[1]:.2g} mrad/s"
-    yield "margins of the start", ", ".join(f"{kind} {value:.0%}" for kind, value in inside.items())
 
 
 def identifiable(e: Experiment) -> Iterator[tuple[str, str]]:
-    """What can be identified along the starting motion, and what no motion shows, as `mjfim check`
-    finds it.
+    """Describe the information along the starting motion, as `mjfim check` finds it.
+
+    Yields:
+        Name and value of a property.
     """
     task = DesignTask.resolve(e)
-    told = task.plant.derivatives.sensitivity(task.theta, task.initial)
-    if told is None:
+    sensitivity = task.plant.derivatives.sensitivity(task.theta, task.initial)
+    if sensitivity is None:
         raise SystemExit(
             f"{e.source}: the starting motion diverges when the parameters move a little"
         )
-    names, scale, information = (
-        task.parameters.names,
-        task.parameters.scale,
-        task.information.matrix(told),
-    )
+
+    names = task.parameters.names
+    scale = task.parameters.scale
+    information = task.information.matrix(sensitivity)
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    smallest = ", ".join(f"{value:.3g}" for value in values[:4])
     yield "worst relative sigma", f"{worst_relative_sigma(information, scale):.3g}"
-    yield (
-        "smallest eigenvalues",
-        ", ".join(f"{v:.3g}" for v in values[:4]) + f"; largest {values[-1]:.2g}",
-    )
+    yield "smallest eigenvalues", f"{smallest}; largest {values[-1]:.2g}"
+
     for j in range(2):
         largest = np.argsort(-np.abs(vectors[:, j]))[:3]
-        yield (
-            f"weakest combination {j + 1}",
-            " ".join(f"{vectors[i, j]:+.2f} {names[i]}" for i in largest),
-        )
+        terms = [f"{vectors[i, j]:+.2f} {names[i]}" for i in largest]
+        yield f"weakest combination {j + 1}", " ".join(terms)
+
     relative = task.information.std(information) / scale
     order = np.argsort(-relative)
-    yield (
-        "worst parameters, sigma / scale",
-        ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[:3]),
-    )
-    yield "best", ", ".join(f"{names[i]} {relative[i]:.2g}" for i in order[-2:])
-    seen = task.identifiability_test.along(task.initial, told)
-    yield "never identifiable", "; ".join(str(group) for group in seen.groups_along_all) or "none"
-    yield (
-        "not along this motion",
-        "; ".join(str(group) for group in seen.groups_along_trajectory) or "none",
-    )
+    sorted_sigmas = [f"{names[i]} {relative[i]:.2g}" for i in order]
+    yield "worst parameters, sigma / scale", ", ".join(sorted_sigmas[:3])
+    yield "best", ", ".join(sorted_sigmas[-2:])
+
+    found = task.identifiability_test.along(task.initial, sensitivity)
+    always = [str(group) for group in found.groups_along_all]
+    along_this = [str(group) for group in found.groups_along_trajectory]
+    yield "never identifiable", "; ".join(always) or "none"
+    yield "not along this motion", "; ".join(along_this) or "none"
 
 
 def timesteps(name: str, friction: bool, horizon: float, folder: Path) -> Table:
-    """How far motions and information at other timesteps are from those at a fine one."""
-    title = (
-        f"{name}{', dry' if friction else ''}: timesteps against {1e3 * FINE:g} ms, {horizon:g} s"
-    )
-    table = Table(title=title, title_justify="left")
-    for heading in (
+    """Compare motions and information at several timesteps with those at a fine one.
+
+    Args:
+        name: Key of `ARMS`.
+        friction: Whether the joints have dry friction.
+        horizon: Duration [s].
+        folder: Folder for models and starting controls.
+
+    Returns:
+        Table with one row for each timestep.
+    """
+    variant = ", dry" if friction else ""
+    title = f"{name}{variant}: timesteps against {1e3 * FINE:g} ms, {horizon:g} s"
+    headings = (
         "timestep",
         "largest error of qpos",
         "of qvel",
         "worst relative sigma",
         "µs per second of motion",
-    ):
+    )
+    table = Table(title=title, title_justify="left")
+    for heading in headings:
         table.add_column(heading, justify="right")
+
     reference: tuple[Array, Array] | None = None
     for step in (FINE, 0.001, 0.002, 0.004, 0.005):
         e = experiment(name, horizon, friction, folder / "timesteps", step)
         task = DesignTask.resolve(e)
         sensitivity = task.plant.derivatives.sensitivity(task.theta, task.initial)
         sigma = np.nan if sensitivity is None else _sigma(task, sensitivity)
+
+        # The first timestep is the fine one.
         q, v = task.initial.qpos, task.initial.qvel
         reference = (q, v) if reference is None else reference
+        error_q = np.abs(q - reference[0]).max()
+        error_v = np.abs(v - reference[1]).max()
+
         _, start, _, control = prepared(e)
         light = lifted(mujoco.MjModel.from_xml_path(str(e.directory / e.model)))
         cost = 1e6 * step_seconds(light, start, control, 32, 2) / step
-        off = (np.abs(q - reference[0]).max(), np.abs(v - reference[1]).max())
         table.add_row(
             f"{1e3 * step:g} ms",
-            f"{off[0]:.1e} rad",
-            f"{off[1]:.1e} rad/s",
+            f"{error_q:.1e} rad",
+            f"{error_v:.1e} rad/s",
             f"{sigma:.4g}",
             f"{cost:.0f}",
         )
+
     return table
 
 
 def _sigma(task: DesignTask, sensitivity: Sensitivity) -> float:
+    """Return the worst relative sigma along a trajectory."""
     return worst_relative_sigma(task.information.matrix(sensitivity), task.parameters.scale)
 
 
 def main() -> None:
-    """Describe the arms and print."""
+    """Describe the arms in tables on standard output."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -627,16 +856,24 @@ def main() -> None:
     parser.add_argument("--timesteps", action="store_true", help="compare timesteps as well")
     args = parser.parse_args()
     console = Console(highlight=False, width=150)
+
     for name, friction in itertools.product(args.arms, (False, True)):
-        rows = [
-            dict(described(e)) | ({} if args.skip_check else dict(identifiable(e)))
-            for e in (experiment(name, horizon, friction, args.folder) for horizon in args.horizons)
-        ]
-        table = Table(title=f"{name}, {'dry' if friction else 'smooth'}", title_justify="left")
-        for heading in ("", *(f"{horizon:g} s" for horizon in args.horizons)):
-            table.add_column(heading)
-        for what in rows[0]:
-            table.add_row(what, *(row[what] for row in rows))
+        columns = []
+        for horizon in args.horizons:
+            e = experiment(name, horizon, friction, args.folder)
+            found = dict(described(e))
+            if not args.skip_check:
+                found |= dict(identifiable(e))
+            columns.append(found)
+
+        variant = "dry" if friction else "smooth"
+        table = Table(title=f"{name}, {variant}", title_justify="left")
+        table.add_column("")
+        for horizon in args.horizons:
+            table.add_column(f"{horizon:g} s")
+        for row in columns[0]:
+            table.add_row(row, *(column[row] for column in columns))
         console.print(table)
+
         if args.timesteps:
             console.print(timesteps(name, friction, args.horizons[0], args.folder))

@@ -1,19 +1,19 @@
-"""Peer solvers for the benchmark: CasADi + IPOPT and CasADi + L-BFGS on a hand-derived
-cart-pendulum.
+"""Peer solvers of the benchmark: CasADi with IPOPT or L-BFGS on a hand-derived cart-pendulum.
 
-Development only; the package `mjfim` never imports this file.  Both peers use single shooting: the
+Development only; the package `mjfim` never imports this file. Both peers use single shooting. The
 unknowns are the N = 400 cart forces [N], held for 10 ms each, and every derivative is exact for the
 discrete RK4 map.
 
     J(u) = Q_p / lambda_min(I) + dt/2 * sum_{k=0..N-1} [q (s_{k+1} - s^d_{k+1})^2 + R u_k^2]
-    I    = dt / sigma^2 * sum_{k=1..N} psi_k' psi_k,      psi_{k+1} = F_x psi_k + F_theta,   psi_0 =
-    0
+    I    = dt / sigma^2 * sum_{k=1..N} psi_k' psi_k
+    psi_{k+1} = F_x psi_k + F_theta,   psi_0 = 0
 
-With a C compiler on the path the functions are generated as C and built once per process; without
-one the same functions run in CasADi's virtual machine, slower but with equal results.  The peers
-are timed on one core: L-BFGS can spend most of its time in threads that wait for each other if
-OpenBLAS may use several, so this file asks for one thread, which only works if it is imported
-before NumPy (or the variable is set outside).
+With a C compiler on the path, the functions are generated as C and built once per process. Without
+one, they run in CasADi's virtual machine, slower but with equal results.
+
+The peers are timed on one core. With several threads of OpenBLAS, L-BFGS can spend most of its time
+in threads that wait for each other. This file therefore asks for one thread, which has an effect
+only if it is imported before NumPy (or if the variable is set outside).
 
 Usage:  python -m scripts.benchmarks casadi_peer a c [--vm]
 """
@@ -41,87 +41,149 @@ from scipy.optimize import minimize
 
 Array = NDArray[np.float64]
 
-N = 400  # control samples
-DT = 0.01  # s
-CART_MASS = 1.0  # kg
-GRAVITY = 9.81  # m/s^2
-SIGMA = 0.05  # noise of each state: m, rad, m/s, rad/s
+# Number of control samples.
+N = 400
+
+# Sample period [s].
+DT = 0.01
+
+# Mass of the cart [kg].
+CART_MASS = 1.0
+
+# Gravity [m/s²].
+GRAVITY = 9.81
+
+# Standard deviation of the noise of each state [m, rad, m/s, rad/s].
+SIGMA = 0.05
+
+# Weight of the information term.
 Q_P = 1.0
-X0 = (0.0, np.pi, 0.0, 0.0)  # hanging at rest
+
+# Initial state, hanging at rest.
+X0 = (0.0, np.pi, 0.0, 0.0)
+
+# Numbers of states and of parameters.
 NX, NP = 4, 3
-NZ = NX * (1 + NP)  # state and its three sensitivity columns
-MEMORY = 40  # correction pairs of L-BFGS
-ENTRIES = tuple((i, j) for j in range(NP) for i in range(j + 1))  # upper triangle of I
+
+# Number of entries of a state and of its three sensitivity columns.
+NZ = NX * (1 + NP)
+
+# Number of correction pairs of L-BFGS.
+MEMORY = 40
+
+# Places of the six entries of the information, which is symmetric: its upper triangle.
+ENTRIES = tuple((i, j) for j in range(NP) for i in range(j + 1))
 
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the study: theta = (m [kg], l [m], c [N m s/rad]) and the weights of the running
-    cost.
+    """One row of the study.
+
+    Attributes:
+        name: Letter of the case.
+        theta: Parameters m [kg], l [m] and c [N m s/rad].
+        r_tau: Weight of the control [1/(N² s)].
+        q_slide: Weight of the cart position [1/(m² s)].
     """
 
     name: str
     theta: tuple[float, float, float]
-    r_tau: float  # 1/N^2 s
-    q_slide: float  # 1/m^2 s, on the cart position only
+    r_tau: float
+    q_slide: float
 
 
+# True parameters and guesses of the study.
 ACTUAL, GUESS = (2.0, 1.0, 1.0), (2.5, 1.4, 1.4)
+
+# Rows of the study by their letters.
 CASES = {
-    case.name: case
-    for case in (
-        Case("a", ACTUAL, 6e-3, 0.0),
-        Case("b", ACTUAL, 1e-3, 0.05),
-        Case("c", ACTUAL, 1e-4, 0.0),
-        Case("d", GUESS, 6e-3, 0.0),
-        Case("e", GUESS, 1e-3, 0.05),
-        Case("f", ACTUAL, 1e-6, 0.0),
-    )
+    "a": Case("a", ACTUAL, 6e-3, 0.0),
+    "b": Case("b", ACTUAL, 1e-3, 0.05),
+    "c": Case("c", ACTUAL, 1e-4, 0.0),
+    "d": Case("d", GUESS, 6e-3, 0.0),
+    "e": Case("e", GUESS, 1e-3, 0.05),
+    "f": Case("f", ACTUAL, 1e-6, 0.0),
 }
 
 
 @dataclass(frozen=True)
 class PeerRun:
-    """Outcome of one solve; `history` holds (seconds since the solve began, lowest J so far)."""
+    """Outcome of one run of a peer solver.
+
+    Attributes:
+        name: Name of the solver.
+        case: Letter of the case.
+        J: Cost of the solution.
+        eigenvalues: Eigenvalues of I, ascending.
+        iterations: Number of iterations.
+        evaluations: Number of evaluations of J.
+        seconds: Time of the solver alone [s].
+        setup_seconds: Time for x_d and the solver object of this case [s].
+        build_seconds: Time of differentiation, C generation and compilation [s], once per process.
+        history: Time since the start of the solver [s] and lowest J up to then.
+        u: (400,) control [N].
+        compiled: Whether the functions are compiled C.
+        converged: Whether the solver converged.
+    """
 
     name: str
     case: str
     J: float
-    eigenvalues: tuple[float, ...]  # of I, ascending
+    eigenvalues: tuple[float, ...]
     iterations: int
-    evaluations: int  # of J
-    seconds: float  # solve only
-    setup_seconds: float  # x_d and the solver object of this case
-    build_seconds: (
-        float  # differentiation, C generation and compilation; once per process, shared by all runs
-    )
+    evaluations: int
+    seconds: float
+    setup_seconds: float
+    build_seconds: float
     history: tuple[tuple[float, float], ...]
-    u: Array  # (400,) N
+    u: Array
     compiled: bool
     converged: bool
 
 
 def reference_control() -> Array:
-    """Return u_ref (400,) [N]."""
+    """Return the reference control u_ref (400,) [N]."""
     t = DT * np.arange(N)
     return np.asarray((1 + t / 4) * np.sin(2 * t), dtype=float)
 
 
 def dynamics(x: ca.SX, u: ca.SX, theta: ca.SX) -> ca.SX:
-    """Return x' for x = (s, phi, s', phi') with phi = 0 upright, from the Lagrangian of the study."""
+    """Compute the derivative of the state by time, from the Lagrangian of the study.
+
+    Args:
+        x: State (s, phi, s', phi') with phi = 0 upright.
+        u: Force on the cart.
+        theta: Parameters (m, l, c).
+
+    Returns:
+        Derivative x'.
+    """
     m, length, friction = ca.vertsplit(theta)
     _, phi, s_dot, phi_dot = ca.vertsplit(x)
-    sin, cos = ca.sin(phi), ca.cos(phi)
+    sin = ca.sin(phi)
+    cos = ca.cos(phi)
+
     # (M + m) s'' - m l cos(phi) phi'' = force,   -m l cos(phi) s'' + m l^2 phi'' = torque
     force = u - m * length * phi_dot**2 * sin
     torque = m * GRAVITY * length * sin - friction * phi_dot
+
     s_ddot = (force + cos * torque / length) / (CART_MASS + m * sin**2)
     phi_ddot = (torque / (m * length) + cos * s_ddot) / length
     return ca.vertcat(s_dot, phi_dot, s_ddot, phi_ddot)
 
 
 def rk4(x: ca.SX, u: ca.SX, theta: ca.SX, dt: float = DT) -> ca.SX:
-    """Return the state `dt` [s] later under a held control."""
+    """Integrate the state over `dt` [s] under a held control.
+
+    Args:
+        x: State at the beginning.
+        u: Force on the cart.
+        theta: Parameters (m, l, c).
+        dt: Sample period [s].
+
+    Returns:
+        State at the end.
+    """
     k1 = dynamics(x, u, theta)
     k2 = dynamics(x + dt / 2 * k1, u, theta)
     k3 = dynamics(x + dt / 2 * k2, u, theta)
@@ -130,18 +192,36 @@ def rk4(x: ca.SX, u: ca.SX, theta: ca.SX, dt: float = DT) -> ca.SX:
 
 
 def information_rate(psi: ca.SX, dt: float = DT) -> ca.SX:
-    """Return what one sample of `dt` [s] adds to the six entries of I."""
+    """Compute the contribution of one sample to the six entries of I.
+
+    Args:
+        psi: (4, 3) sensitivity of the state.
+        dt: Sample period [s].
+
+    Returns:
+        Six entries.
+    """
     gram = dt / SIGMA**2 * psi.T @ psi
-    return ca.vertcat(*(gram[i, j] for i, j in ENTRIES))
+    entries = [gram[i, j] for i, j in ENTRIES]
+    return ca.vertcat(*entries)
 
 
 def smallest_eigenvalue(entries: ca.SX) -> ca.SX:
-    """Return lambda_min of the symmetric 3x3 matrix in closed trigonometric form; smooth while it
-    is simple.
+    """Compute the smallest eigenvalue of a symmetric 3x3 matrix in closed trigonometric form.
+
+    The form is smooth where the smallest eigenvalue is simple.
+
+    Args:
+        entries: Six entries in the order of `ENTRIES`.
+
+    Returns:
+        The eigenvalue.
     """
     a = ca.SX(NP, NP)
     for value, (i, j) in zip(ca.vertsplit(entries), ENTRIES, strict=True):
-        a[i, j] = a[j, i] = value
+        a[i, j] = value
+        a[j, i] = value
+
     mean = ca.trace(a) / 3
     deviator = a - mean * ca.SX.eye(NP)
     radius = ca.sqrt(ca.sumsqr(deviator) / 6)
@@ -151,209 +231,334 @@ def smallest_eigenvalue(entries: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True)
 class Stage:
-    """Scalar-graph building blocks of one control sample."""
+    """Functions of one control sample; z holds a state and its sensitivity columns.
 
-    step: ca.Function  # (z, u, theta) -> z after the sample
-    linear: ca.Function  # (z, u, theta) -> A = dz+/dz, B = dz+/du
-    curvature: (
-        ca.Function
-    )  # (z, u, theta, costate) -> zz and zu blocks and uu entry of the costate-weighted Hessian
-    rate: ca.Function  # z -> its addition to I
+    Attributes:
+        step: (z, u, theta) to z after the sample.
+        linear: (z, u, theta) to A = dz+/dz and B = dz+/du.
+        curvature: (z, u, theta, costate) to the blocks zz, zu and uu of the Hessian of the product
+            of costate and z after the sample.
+        rate: z to its contribution to I.
+        rate_jacobian: z to the Jacobian of the contribution.
+        rate_hessian: Weights of the six entries to the Hessian of the weighted contribution by z.
+        criterion: I to Q_p / lambda_min, its gradient and its Hessian.
+    """
+
+    step: ca.Function
+    linear: ca.Function
+    curvature: ca.Function
+    rate: ca.Function
     rate_jacobian: ca.Function
-    rate_hessian: ca.Function  # (entry weights) -> Hessian by z
-    criterion: ca.Function  # I -> Q_p / lambda_min, gradient, Hessian
+    rate_hessian: ca.Function
+    criterion: ca.Function
 
 
 @functools.cache
 def stage(dt: float = DT) -> Stage:
-    """Build the blocks of one sample of `dt` [s]."""
-    z, u, theta = ca.SX.sym("z", NZ), ca.SX.sym("u"), ca.SX.sym("theta", NP)
-    x, psi = z[:NX], ca.reshape(z[NX:], NX, NP)
+    """Build the functions of one sample of `dt` [s]."""
+    z = ca.SX.sym("z", NZ)
+    u = ca.SX.sym("u")
+    theta = ca.SX.sym("theta", NP)
+    inputs = [z, u, theta]
+
+    # State and sensitivity after the sample, and their derivatives.
+    x = z[:NX]
+    psi = ca.reshape(z[NX:], NX, NP)
     after = rk4(x, u, theta, dt)
     psi_after = ca.jacobian(after, x) @ psi + ca.jacobian(after, theta)
     z_after = ca.vertcat(after, ca.vec(psi_after))
+    slopes = [ca.jacobian(z_after, z), ca.jacobian(z_after, u)]
+
     costate = ca.SX.sym("costate", NZ)
     second = ca.hessian(ca.dot(costate, z_after), ca.vertcat(z, u))[0]
-    rate, weights, info = information_rate(psi, dt), ca.SX.sym("weights", 6), ca.SX.sym("info", 6)
+    blocks = [second[:NZ, :NZ], second[:NZ, NZ], second[NZ, NZ]]
+
+    # Contribution of the sample to the information.
+    rate = information_rate(psi, dt)
+    weights = ca.SX.sym("weights", 6)
+    rate_hessian = ca.hessian(ca.dot(weights, rate), z)[0]
+
+    # Criterion of the information.
+    info = ca.SX.sym("info", 6)
     value = Q_P / smallest_eigenvalue(info)
     value_hessian, value_gradient = ca.hessian(value, info)
-    inputs = [z, u, theta]
+
     return Stage(
         step=ca.Function("step", inputs, [z_after]),
-        linear=ca.Function("linear", inputs, [ca.jacobian(z_after, z), ca.jacobian(z_after, u)]),
-        curvature=ca.Function(
-            "curvature", [*inputs, costate], [second[:NZ, :NZ], second[:NZ, NZ], second[NZ, NZ]]
-        ),
+        linear=ca.Function("linear", inputs, slopes),
+        curvature=ca.Function("curvature", [*inputs, costate], blocks),
         rate=ca.Function("rate", [z], [rate]),
         rate_jacobian=ca.Function("rate_jacobian", [z], [ca.jacobian(rate, z)]),
-        rate_hessian=ca.Function(
-            "rate_hessian", [weights], [ca.hessian(ca.dot(weights, rate), z)[0]]
-        ),
+        rate_hessian=ca.Function("rate_hessian", [weights], [rate_hessian]),
         criterion=ca.Function("criterion", [info], [value, value_gradient, value_hessian]),
     )
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """Symbols shared by the whole-horizon functions; p = (theta, r_tau, q_slide, s^d at samples
-    1..N).
+    """Symbols of the functions over all samples.
+
+    Attributes:
+        u: (N,) controls.
+        p: Inputs theta, r_tau, q_slide and s^d at samples 1..N.
+        z: (16, N) states and sensitivities after each sample.
+        info: Six entries of I.
+        objective: J.
     """
 
     u: ca.MX
     p: ca.MX
-    z: ca.MX  # (16, N) after each sample
+    z: ca.MX
     info: ca.MX
     objective: ca.MX
 
 
+def start_of_sweep() -> ca.DM:
+    """Return the initial state with sensitivities of zero: (16,)."""
+    return ca.DM([*X0, *([0.0] * (NZ - NX))])
+
+
 def rollout() -> Rollout:
-    """Return the symbolic objective as a function of all controls."""
-    u, p = ca.MX.sym("u", N), ca.MX.sym("p", NP + 2 + N)
-    start = ca.DM([*X0, *([0.0] * (NZ - NX))])
-    z = stage().step.mapaccum(N)(start, u.T, ca.repmat(p[:NP], 1, N))
-    info = ca.sum2(stage().rate.map(N)(z))
-    slide_error = z[0, :].T - p[NP + 2 :]
-    running = DT / 2 * (p[NP] * ca.sumsqr(u) + p[NP + 1] * ca.sumsqr(slide_error))
-    return Rollout(u, p, z, info, stage().criterion(info)[0] + running)
+    """Build the symbolic objective as a function of all controls."""
+    u = ca.MX.sym("u", N)
+    p = ca.MX.sym("p", NP + 2 + N)
+    theta = p[:NP]
+    control_weight = p[NP]
+    slide_weight = p[NP + 1]
+    planned_slide = p[NP + 2 :]
+
+    parts = stage()
+    z = parts.step.mapaccum(N)(start_of_sweep(), u.T, ca.repmat(theta, 1, N))
+    info = ca.sum2(parts.rate.map(N)(z))
+
+    slide_error = z[0, :].T - planned_slide
+    squares = control_weight * ca.sumsqr(u) + slide_weight * ca.sumsqr(slide_error)
+    running = DT / 2 * squares
+    return Rollout(u=u, p=p, z=z, info=info, objective=parts.criterion(info)[0] + running)
 
 
 @dataclass(frozen=True)
 class Slopes:
-    """First and second derivatives of a Lagrangian L(I, s_1..s_N, u) that is a sum but for its
-    dependence on I.
+    """First and second derivatives of a Lagrangian L(I, s_1..s_N, u).
+
+    The Lagrangian is a sum over samples except for its dependence on I.
+
+    Attributes:
+        info: (6,) dL/dI.
+        info_bend: (6, 6) d2L/dI2.
+        slide: (samples,) dL/ds at samples 1..N.
+        slide_bend: d2L/ds2, equal at all samples.
+        control_bend: d2L/du2, equal at all samples.
     """
 
-    info: ca.MX  # (6,) dL/dI
-    info_bend: ca.MX  # (6, 6) d2L/dI2
-    slide: ca.MX  # (samples,) dL/ds at samples 1..N
-    slide_bend: ca.MX  # d2L/ds2, alike at all samples
-    control_bend: ca.MX  # d2L/du2, alike at all samples
+    info: ca.MX
+    info_bend: ca.MX
+    slide: ca.MX
+    slide_bend: ca.MX
+    control_bend: ca.MX
 
 
 def slopes_of(roll: Rollout) -> Slopes:
-    """Return the derivatives of J."""
+    """Build the derivatives of J."""
     _, slope, bend = stage().criterion(roll.info)
-    r_dt, q_dt = DT * roll.p[NP], DT * roll.p[NP + 1]
-    return Slopes(slope, bend, q_dt * (roll.z[0, :].T - roll.p[NP + 2 :]), q_dt, r_dt)
+    control_bend = DT * roll.p[NP]
+    slide_bend = DT * roll.p[NP + 1]
+    slide_error = roll.z[0, :].T - roll.p[NP + 2 :]
+
+    return Slopes(
+        info=slope,
+        info_bend=bend,
+        slide=slide_bend * slide_error,
+        slide_bend=slide_bend,
+        control_bend=control_bend,
+    )
 
 
 def condensed_hessian(u: ca.MX, theta: ca.MX, z: ca.MX, slopes: Slopes, parts: Stage) -> ca.MX:
-    """Return the upper triangle of d2L/du2 by one backward sweep.
+    """Build the Hessian d2L/du2 by one backward sweep.
 
     The sweep carries, at each sample, the adjoints of the six information entries and of the slide
     cost, the curvature P of the cost to come, and the columns W = d2L/(dz du_j) of all later
-    controls.  Since 1/lambda_min is no sum over samples, its own curvature enters at the end
-    through dI/du.
+    controls. Since 1/lambda_min is no sum over samples, its curvature enters at the end through
+    dI/du.
+
+    Args:
+        u: (samples,) controls.
+        theta: Parameters.
+        z: (16, samples) states and sensitivities after each sample.
+        slopes: Derivatives of the Lagrangian.
+        parts: Functions of one sample.
+
+    Returns:
+        Upper triangle of the Hessian: (samples, samples).
     """
-    samples, rate_hessian = u.shape[0], parts.rate_hessian(slopes.info)
+    samples = u.shape[0]
+    before = ca.horzsplit(ca.horzcat(start_of_sweep(), z))
     slide = ca.DM.eye(NZ)[:, 0]
-    start = ca.DM([*X0, *([0.0] * (NZ - NX))])
-    adjoint, p_slide, curve, columns = (
-        ca.MX.zeros(NZ, 6),
-        ca.MX.zeros(NZ),
-        ca.MX(NZ, NZ),
-        ca.MX(NZ, 0),
-    )
-    rows, info_slopes = [], []
-    before = ca.horzsplit(ca.horzcat(start, z))
+    rate_hessian = parts.rate_hessian(slopes.info)
+
+    adjoint = ca.MX.zeros(NZ, 6)
+    slide_adjoint = ca.MX.zeros(NZ)
+    curve = ca.MX(NZ, NZ)
+    columns = ca.MX(NZ, 0)
+    rows = []
+    info_slopes = []
+
     for k in reversed(range(samples)):
-        z_after = before[k + 1]
-        adjoint += parts.rate_jacobian(z_after).T
-        p_slide += slide * slopes.slide[k]
+        # Add the terms of the state after the sample.
+        adjoint += parts.rate_jacobian(before[k + 1]).T
+        slide_adjoint += slide * slopes.slide[k]
         curve += rate_hessian + slopes.slide_bend * slide @ slide.T
+
+        # Row of the Hessian.
         a, b = parts.linear(before[k], u[k], theta)
-        h_zz, h_zu, h_uu = parts.curvature(before[k], u[k], theta, adjoint @ slopes.info + p_slide)
+        costate = adjoint @ slopes.info + slide_adjoint
+        h_zz, h_zu, h_uu = parts.curvature(before[k], u[k], theta, costate)
         curve_b = curve @ b
-        rows.append(
-            ca.horzcat(ca.MX(1, k), h_uu + slopes.control_bend + b.T @ curve_b, b.T @ columns)
-        )
+        diagonal = h_uu + slopes.control_bend + b.T @ curve_b
+        rows.append(ca.horzcat(ca.MX(1, k), diagonal, b.T @ columns))
         info_slopes.append(b.T @ adjoint)
+
+        # Pass to the state before the sample.
         columns = ca.horzcat(h_zu + a.T @ curve_b, a.T @ columns)
         curve = h_zz + a.T @ curve @ a
-        adjoint, p_slide = a.T @ adjoint, a.T @ p_slide
+        adjoint = a.T @ adjoint
+        slide_adjoint = a.T @ slide_adjoint
+
     info_by_u = ca.vertcat(*reversed(info_slopes))
-    return ca.triu(ca.vertcat(*reversed(rows)) + info_by_u @ slopes.info_bend @ info_by_u.T)
+    along_info = info_by_u @ slopes.info_bend @ info_by_u.T
+    return ca.triu(ca.vertcat(*reversed(rows)) + along_info)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Whole-horizon functions of (u, p), ready to evaluate."""
+    """Functions of (u, p) over all samples, ready to evaluate.
 
-    value: ca.Function  # J, entries of I
-    gradient: ca.Function  # J, dJ/du
-    hessian: (
-        ca.Function
-    )  # multiplier of J times the upper triangle of d2J/du2, in IPOPT's signature
+    Attributes:
+        value: J and the entries of I.
+        gradient: J and dJ/du.
+        hessian: Multiplier of J times the upper triangle of d2J/du2, with the arguments of IPOPT.
+        compiled: Whether the functions are compiled C.
+        build_seconds: Time to build them [s].
+    """
+
+    value: ca.Function
+    gradient: ca.Function
+    hessian: ca.Function
     compiled: bool
     build_seconds: float
 
 
 def compile_c(functions: list[ca.Function], folder: str) -> list[ca.Function]:
-    """Return the same functions as machine code; `folder` must live until they are loaded."""
+    """Compile functions to machine code.
+
+    Args:
+        functions: Functions of CasADi.
+        folder: Folder for source and library, which must exist until the functions are loaded.
+
+    Returns:
+        Compiled functions in the order of the arguments.
+    """
     generator = ca.CodeGenerator("peer.c")
     for function in functions:
         generator.add(function)
-    source, library = generator.generate(folder + os.sep), os.path.join(folder, "peer.so")
+    source = generator.generate(folder + os.sep)
+    library = os.path.join(folder, "peer.so")
+
     compiler = shutil.which(os.environ.get("CC", "gcc")) or "cc"
-    subprocess.run(
-        [compiler, "-O3", "-march=native", "-fPIC", "-shared", source, "-o", library], check=True
-    )
+    options = ["-O3", "-march=native", "-fPIC", "-shared"]
+    subprocess.run([compiler, *options, source, "-o", library], check=True)
     return [ca.external(function.name(), library) for function in functions]
 
 
 @functools.cache
 def problem(use_c: bool = True) -> Problem:
-    """Build the functions once per process; without a working C compiler `use_c` has no effect.
+    """Build the functions once per process; without a C compiler `use_c` has no effect.
 
-    Only the two large stage blocks of the Hessian become C: the sweep around them is matrix
-    products that CasADi's virtual machine runs as fast, and, unrolled over the horizon, compiling
-    it would take over a minute.
+    Only the two large functions of one sample become C. The sweep of the Hessian around them
+    consists of matrix products that CasADi's virtual machine runs as fast; unrolled over the
+    horizon, it would take over a minute to compile.
     """
-    begin, parts, roll = time.perf_counter(), stage(), rollout()
+    begin = time.perf_counter()
+    parts = stage()
+    roll = rollout()
+
     variables = [roll.u, roll.p]
+    slope = ca.gradient(roll.objective, roll.u)
     value = ca.Function("value", variables, [roll.objective, roll.info])
-    gradient = ca.Function(
-        "gradient", variables, [roll.objective, ca.gradient(roll.objective, roll.u)]
-    )
+    gradient = ca.Function("gradient", variables, [roll.objective, slope])
+
     compiled = False
     if use_c:
         try:
             with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
                 blocks = [value, gradient, parts.linear, parts.curvature]
                 value, gradient, linear, curvature = compile_c(blocks, folder)
-            parts, compiled = replace(parts, linear=linear, curvature=curvature), True
+            parts = replace(parts, linear=linear, curvature=curvature)
+            compiled = True
         except (OSError, subprocess.CalledProcessError) as error:
-            print(
-                f"casadi_peer: no C compiler ({error}); using CasADi's virtual machine",
-                file=sys.stderr,
-            )
-    factor, no_constraints = ca.MX.sym("factor"), ca.MX.sym("lam_g", 0)
+            message = f"casadi_peer: no C compiler ({error}); using CasADi's virtual machine"
+            print(message, file=sys.stderr)
+
+    # IPOPT also passes the multipliers of the constraints, which do not exist here.
+    factor = ca.MX.sym("factor")
+    no_constraints = ca.MX.sym("lam_g", 0)
     triangle = factor * condensed_hessian(roll.u, roll.p[:NP], roll.z, slopes_of(roll), parts)
     hessian = ca.Function("hessian", [*variables, factor, no_constraints], [triangle])
-    return Problem(value, gradient, hessian, compiled, time.perf_counter() - begin)
+
+    return Problem(
+        value=value,
+        gradient=gradient,
+        hessian=hessian,
+        compiled=compiled,
+        build_seconds=time.perf_counter() - begin,
+    )
 
 
 def parameters(case: Case) -> Array:
-    """Return p = (theta, r_tau, q_slide, s^d); s^d [m] is the cart under u_ref with the same theta."""
-    x, u, theta = ca.SX.sym("x", NX), ca.SX.sym("u"), ca.SX.sym("theta", NP)
+    """Compute the inputs p = (theta, r_tau, q_slide, s^d) of a case.
+
+    The plan s^d [m] is the position of the cart under u_ref at the parameters of the case.
+    """
+    x = ca.SX.sym("x", NX)
+    u = ca.SX.sym("u")
+    theta = ca.SX.sym("theta", NP)
     step = ca.Function("plain_step", [x, u, theta], [rk4(x, u, theta)])
-    states = step.mapaccum(N)(
-        ca.DM(X0), ca.DM(reference_control()).T, ca.repmat(ca.DM(case.theta), 1, N)
-    )
+
+    control = ca.DM(reference_control()).T
+    thetas = ca.repmat(ca.DM(case.theta), 1, N)
+    states = step.mapaccum(N)(ca.DM(X0), control, thetas)
     return np.concatenate([case.theta, [case.r_tau, case.q_slide], states.full()[0]])
 
 
 def objective(case: Case, u: Array, use_c: bool = True) -> tuple[float, Array]:
-    """Return J and the eigenvalues of I, ascending, of any control (400,) [N]."""
+    """Evaluate a control.
+
+    Args:
+        case: Row of the study.
+        u: (400,) control [N].
+        use_c: Whether compiled functions are used.
+
+    Returns:
+        J and the eigenvalues of I, ascending.
+    """
     j, entries = problem(use_c).value(u, parameters(case))
+
     info = np.empty((NP, NP))
     for value, (row, column) in zip(entries.full().ravel(), ENTRIES, strict=True):
-        info[row, column] = info[column, row] = value
+        info[row, column] = value
+        info[column, row] = value
+
     return float(j), np.asarray(np.linalg.eigvalsh(info), dtype=float)
 
 
 class Recorder:
-    """Clock and running minimum of J."""
+    """Clock and running minimum of J.
+
+    Attributes:
+        begin: Time at which the clock was started.
+        history: Seconds since then and J, each lower than the values before.
+    """
 
     def __init__(self) -> None:
         """Start the clock."""
@@ -365,13 +570,13 @@ class Recorder:
         return time.perf_counter() - self.begin
 
     def note(self, j: float) -> None:
-        """Append J if it is the lowest yet."""
+        """Append J if it is lower than all values before."""
         if np.isfinite(j) and (not self.history or j < self.history[-1][1]):
             self.history.append((self.seconds(), j))
 
 
 class IterateWatch(ca.Callback):
-    """IPOPT's iteration callback: notes J of every accepted iterate."""
+    """Iteration callback of IPOPT that records J of every accepted iterate."""
 
     def __init__(
         self, unknowns: int = N, constraints: int = 0, parameters: int = NP + 2 + N
@@ -379,12 +584,18 @@ class IterateWatch(ca.Callback):
         """Register with CasADi for a problem of this size."""
         super().__init__()
         self.recorder = Recorder()
-        self.rows = {"f": 1, "x": unknowns, "lam_x": unknowns, "lam_p": parameters}
-        self.rows |= {"g": constraints, "lam_g": constraints}
+        self.rows = {
+            "f": 1,
+            "x": unknowns,
+            "lam_x": unknowns,
+            "lam_p": parameters,
+            "g": constraints,
+            "lam_g": constraints,
+        }
         self.construct("iterate_watch", {})
 
     def get_n_in(self) -> int:
-        """Return the number of solver outputs handed over."""
+        """Return the number of outputs that the solver passes on."""
         return int(ca.nlpsol_n_out())
 
     def get_n_out(self) -> int:
@@ -400,7 +611,7 @@ class IterateWatch(ca.Callback):
         return ca.Sparsity.dense(self.rows[ca.nlpsol_out(i)], 1)
 
     def eval(self, arg: Sequence[ca.DM]) -> list[int]:
-        """Note J and let the solver go on."""
+        """Record J and let the solver continue."""
         self.recorder.note(float(arg[ca.nlpsol_out().index("f")]))
         return [0]
 
@@ -408,8 +619,9 @@ class IterateWatch(ca.Callback):
 def ipopt_solver(
     case: Case, functions: Problem, watch: IterateWatch, max_iterations: int
 ) -> ca.Function:
-    """Return IPOPT over the controls, with J scaled so that the input penalty has curvature one."""
-    u, p = ca.MX.sym("u", N), ca.MX.sym("p", NP + 2 + N)
+    """Build IPOPT over the controls; J is scaled so that the weight of the control is one."""
+    u = ca.MX.sym("u", N)
+    p = ca.MX.sym("p", NP + 2 + N)
     options: dict[str, Any] = {
         "grad_f": functions.gradient,
         "hess_lag": functions.hessian,
@@ -430,12 +642,20 @@ def ipopt_solver(
 
 def ipopt(case: Case, use_c: bool = True, max_iterations: int = 500) -> PeerRun:
     """Solve by IPOPT from u_ref with the exact Hessian of single shooting."""
-    functions, task = problem(use_c), Recorder()
-    p, watch = parameters(case), IterateWatch()
+    functions = problem(use_c)
+
+    setup = Recorder()
+    p = parameters(case)
+    watch = IterateWatch()
     solver = ipopt_solver(case, functions, watch, max_iterations)
-    setup_seconds, watch.recorder.begin = task.seconds(), time.perf_counter()
+    setup_seconds = setup.seconds()
+
+    watch.recorder.begin = time.perf_counter()
     solution = solver(x0=reference_control(), p=p)
-    seconds, stats, u = watch.recorder.seconds(), solver.stats(), solution["x"].full().ravel()
+    seconds = watch.recorder.seconds()
+
+    stats = solver.stats()
+    u = solution["x"].full().ravel()
     j, eigenvalues = objective(case, u, use_c)
     return PeerRun(
         name="CasADi + IPOPT",
@@ -456,8 +676,11 @@ def ipopt(case: Case, use_c: bool = True, max_iterations: int = 500) -> PeerRun:
 
 def lbfgs(case: Case, use_c: bool = True, max_iterations: int = 2000) -> PeerRun:
     """Solve by SciPy's L-BFGS-B from u_ref, on J / (R dt)."""
-    functions, task = problem(use_c), Recorder()
-    p, scale = parameters(case), 1 / (case.r_tau * DT)
+    functions = problem(use_c)
+
+    setup = Recorder()
+    p = parameters(case)
+    scale = 1 / (case.r_tau * DT)
     options = {
         "maxcor": MEMORY,
         "maxiter": max_iterations,
@@ -465,9 +688,12 @@ def lbfgs(case: Case, use_c: bool = True, max_iterations: int = 2000) -> PeerRun
         "ftol": 1e-12,
         "gtol": 1e-5,
     }
-    setup_seconds, recorder = task.seconds(), Recorder()
+    setup_seconds = setup.seconds()
+
+    recorder = Recorder()
 
     def scaled(u: Array) -> tuple[float, Array]:
+        """Return scaled cost and gradient, and record the cost."""
         j, slope = functions.gradient(u, p)
         recorder.note(float(j))
         return scale * float(j), scale * slope.full().ravel()
@@ -503,11 +729,11 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     use_c = not arguments.vm
+
     built = problem(use_c)
-    print(
-        f"built in {built.build_seconds:.1f} s, "
-        f"{'compiled C' if built.compiled else 'virtual machine'}"
-    )
+    kind = "compiled C" if built.compiled else "virtual machine"
+    print(f"built in {built.build_seconds:.1f} s, {kind}")
+
     counts = f"{'iter':>4}  {'eval':>4}  {'task s':>7}  {'solve s':>7}"
     print(f"{'case':4}  {'solver':15}  {'J':>15}  {'lambda':>35}  {counts}")
     for name in arguments.cases:
