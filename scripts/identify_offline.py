@@ -1,11 +1,11 @@
-"""Identify parameters from a recording file, without the command line of mjfim: a template to copy
-and change.
+"""Identify parameters from a recording by the Python interface: a template to copy and change.
 
     python scripts/identify_offline.py models/cart_pendulum.toml recording.csv
 
-A recording in the format of mjfim has a column `t`, one `ctrl:<actuator>` per actuator, and the
-measured columns (`qpos:<joint>`, `qvel:<joint>` or a sensor's name); the experiment's `[recording]`
-table maps the columns of any other log. `mjfim simulate` writes one to try it.
+A recording in the format of mjfim has a column `t`, one column `ctrl:<actuator>` for each actuator,
+and the measured columns (`qpos:<joint>`, `qvel:<joint>` or the name of a sensor). The table
+`[recording]` of the experiment maps the columns of any other log. `mjfim simulate` writes a
+recording to try it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mjfim.recordings.read import read_recording
 
 
 def main() -> int:
-    """Fit, print, and write the identified model beside the recording."""
+    """Fit, print the estimates, and write the identified model beside the recording."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -36,7 +36,7 @@ def main() -> int:
     # Weighted least squares in MuJoCo over all recordings at once.
     estimate = identify_system(system, recordings)
 
-    # 95 % intervals that allow for residuals which are no white noise
+    # The 95 % intervals also hold for residuals that are not white noise.
     rows = zip(estimate.parameters, estimate.theta, estimate.interval, system.units, strict=True)
     for name, value, (low, high), unit in rows:
         print(f"{name:>12s} = {value:.5g} ({low:.5g} ... {high:.5g}) {unit}")
@@ -44,6 +44,7 @@ def main() -> int:
     for warning in estimate.warnings:
         print(f"warning: {warning}")
 
+    # Write the model with the estimated values.
     target = args.recordings[0].with_name("identified.xml")
     remark = write_identified(target, system, estimate.theta)
     print(f"wrote {target}{f' ({remark})' if remark else ''}")

@@ -38,19 +38,19 @@ class SimulatedRobot:
 
 
 def columns(row: dict[str, float], prefix: str) -> np.ndarray:
-    """Values of all columns whose name begins with a prefix, in their order."""
+    """Return the values of all columns whose name begins with a prefix, in their order."""
     return np.array([value for name, value in row.items() if name.startswith(prefix)])
 
 
 def read_rows(path: Path) -> list[dict[str, float]]:
-    """Rows of design.csv; the last one has a final state and no control."""
+    """Read the rows of design.csv; the last one has a final state and no control."""
     with path.open(newline="", encoding="utf-8") as stream:
         rows = csv.DictReader(stream)
         return [{name: float(text or "nan") for name, text in row.items()} for row in rows]
 
 
 def main() -> int:
-    """Play the design and write what was sent and measured."""
+    """Play the design and write the controls that were sent and the states that were measured."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,11 +1,10 @@
-"""Reproduce the study of Wilson & Murphey (2014) on MuJoCo: every number of Tables I-III and
-Figures 2-6.
+"""Reproduce the study of Wilson & Murphey (2014): the numbers of Tables I-III and Figures 2-6.
 
     python scripts/reproduce_paper.py -o out/paper
 
-The paper's weights are not printed; the experiment file holds ones that reproduce its optimized
-matrices to a few percent. Its Monte-Carlo tables are those of 25 Hz measurements, although its text
-says 100 Hz; both are run here.
+The paper does not print its weights. The experiment file holds weights that reproduce its optimized
+matrices to a few percent. Its Monte-Carlo tables are those of measurements at 25 Hz, although its
+text says 100 Hz; both rates are run here.
 """
 
 from __future__ import annotations
@@ -32,12 +31,23 @@ from mjfim.records.monte_carlo import MonteCarloStudy
 from mjfim.records.serialization import write_json
 from mjfim.records.trajectory import Trajectory
 
+# Experiment of the study.
 EXPERIMENT = Path(__file__).resolve().parents[1] / "models" / "cart_pendulum.toml"
 
 
 @dataclass(frozen=True)
 class Printed:
-    """What the paper prints for one trajectory. Matrices: upper triangles (11, 12, 13, 22, 23, 33)."""
+    """Numbers that the paper prints for one trajectory.
+
+    Matrices are given by their upper triangles, in the order (11, 12, 13, 22, 23, 33).
+
+    Attributes:
+        eigenvalues: Eigenvalues of the information, ascending.
+        cost: Cost without weighted terms.
+        covariance: Covariance of the Monte-Carlo estimates.
+        information: Fisher information.
+        bound: Cramer-Rao bound.
+    """
 
     eigenvalues: tuple[float, float, float]
     cost: float
@@ -46,6 +56,7 @@ class Printed:
     bound: tuple[float, ...]
 
 
+# Numbers of the paper.
 PAPER = {
     "initial": Printed(
         (0.87185, 19.266, 38.170),
@@ -62,18 +73,32 @@ PAPER = {
         (2.63e-4, 8.30e-5, 1.51e-4, 2.98e-5, 5.56e-5, 1.47e-4),
     ),
 }
+# Remark under the tables.
 NOTE = (
-    "The paper prints neither its initial control nor its weights; the ones here meet its "
+    "The paper prints neither its initial control nor its weights; the ones here agree with its "
     "eigenvalues and diagonals. Small off-diagonal entries of the initial trajectory depend on "
-    "the control's details. The printed covariance of the initial trajectory is 1.3 to 1.6 times "
+    "details of the control. The printed covariance of the initial trajectory is 1.3 to 1.6 times "
     "its own bound in ℓ and c; an efficient estimator stays closer."
 )
+
+# Names of the two trajectories in the tables.
 TITLES = {"initial": "initial", "final": "optimized"}
+
+# Places of the entries of a symmetric matrix: its upper triangle.
 UPPER = tuple(zip(*np.triu_indices(3), strict=True))
 
 
 def information_at(task: DesignTask, trajectory: Trajectory, measure_rate: float) -> Array:
-    """(p, p) Fisher information of a trajectory sampled at another rate [Hz]."""
+    """Compute the Fisher information of a trajectory at another measurement rate.
+
+    Args:
+        task: The design task.
+        trajectory: The trajectory.
+        measure_rate: Measurement rate [Hz].
+
+    Returns:
+        (p, p) information.
+    """
     other = DesignTask.resolve(task.experiment.replace(measure_rate=measure_rate))
     point = other.problem.point(trajectory, CENTRAL_DIFFERENCES)
     assert point.information is not None
@@ -81,12 +106,12 @@ def information_at(task: DesignTask, trajectory: Trajectory, measure_rate: float
 
 
 def difference(printed: float, ours: float) -> str:
-    """Relative difference in percent."""
+    """Return the relative difference in percent."""
     return f"{100 * (ours / printed - 1):+.1f} %"
 
 
 def new_table(title: str, *headings: str) -> Table:
-    """An empty comparison; the first column is text."""
+    """Make an empty table whose first column is text."""
     table = Table(title=title, title_justify="left")
     for i, heading in enumerate(headings):
         table.add_column(heading, justify="left" if i == 0 else "right", no_wrap=True)
@@ -94,94 +119,114 @@ def new_table(title: str, *headings: str) -> Table:
 
 
 def table_one(design: Design) -> Table:
-    """Eigenvalues and cost.
+    """Compare eigenvalues and cost.
 
-    The printed cost leaves the weighted terms out: compared with the criterion 1/lambda_3.
+    The printed cost does not contain the weighted terms; it is compared with the criterion
+    1/lambda_3.
     """
-    table = new_table(
-        "Table I: eigenvalues of the information, and cost",
-        "quantity",
-        "paper",
-        "mjfim",
-        "difference",
-    )
+    title = "Table I: eigenvalues of the information, and cost"
+    table = new_table(title, "quantity", "paper", "mjfim", "difference")
+
     for name, side in (("initial", design.initial), ("final", design.final)):
-        ours = [*side.eigenvalues[::-1], side.criterion]
+        computed = [*side.eigenvalues[::-1], side.criterion]
         printed = [*PAPER[name].eigenvalues[::-1], PAPER[name].cost]
-        for quantity, theirs, value in zip(("λ1", "λ2", "λ3", "J"), printed, ours, strict=True):
-            row = (
+        quantities = ("λ1", "λ2", "λ3", "J")
+
+        for quantity, theirs, value in zip(quantities, printed, computed, strict=True):
+            table.add_row(
                 f"{TITLES[name]} {quantity}",
                 f"{theirs:.5g}",
                 f"{value:.5g}",
                 difference(theirs, float(value)),
             )
-            table.add_row(*row)
+
     return table
 
 
 def matrix_table(name: str, trials: int, covariance: Array, information: Array) -> Table:
-    """Tables II and III for one trajectory: all six entries of each symmetric matrix, at 25 Hz."""
-    printed, bound = PAPER[name], np.asarray(np.linalg.inv(information))
-    table = new_table(
+    """Compare all six entries of each symmetric matrix for one trajectory, Tables II and III.
+
+    Args:
+        name: Key of `PAPER`.
+        trials: Number of Monte-Carlo trials.
+        covariance: (p, p) covariance of the estimates at 25 Hz.
+        information: (p, p) Fisher information at 25 Hz.
+
+    Returns:
+        Table with one row for each entry.
+    """
+    printed = PAPER[name]
+    bound = np.asarray(np.linalg.inv(information))
+
+    title = (
         f"Tables II and III, {TITLES[name]} trajectory, 25 Hz: covariance ({trials} trials), "
-        "Fisher information, bound",
-        "entry",
-        *(
-            "paper cov.",
-            "mjfim",
-            "diff.",
-            "paper inf.",
-            "mjfim",
-            "diff.",
-            "paper bound",
-            "mjfim",
-            "diff.",
-        ),
+        "Fisher information, bound"
     )
+    headings = ["entry"]
+    for quantity in ("cov.", "inf.", "bound"):
+        headings += [f"paper {quantity}", "mjfim", "diff."]
+    table = new_table(title, *headings)
+
     for k, (i, j) in enumerate(UPPER):
-        cells = [f"{'mℓc'[i]}{'mℓc'[j]}"]
-        for theirs, ours in (
+        pairs = (
             (printed.covariance[k], covariance[i, j]),
             (printed.information[k], information[i, j]),
             (printed.bound[k], bound[i, j]),
-        ):
-            cells += [f"{theirs:.3g}", f"{ours:.3g}", difference(theirs, float(ours))]
+        )
+        cells = [f"{'mℓc'[i]}{'mℓc'[j]}"]
+        for theirs, computed in pairs:
+            cells += [f"{theirs:.3g}", f"{computed:.3g}", difference(theirs, float(computed))]
         table.add_row(*cells)
+
     return table
 
 
 def efficiency_table(study: MonteCarloStudy) -> Table:
-    """Observed variances against mjfim's own bound."""
+    """Compare variances of the estimates with the Cramer-Rao bound that mjfim computes."""
+    title = f"Monte Carlo at {study.measure_rate:g} Hz against mjfim's own bound"
     headings = ("trajectory", "parameter", "variance", "bound", "variance / bound", "failed")
-    table = new_table(
-        f"Monte Carlo at {study.measure_rate:g} Hz against mjfim's own bound", *headings
-    )
-    for name, s in study.sets.items():
+    table = new_table(title, *headings)
+
+    for name, trials in study.sets.items():
         for i, parameter in enumerate(study.parameters):
-            variance, bound = s.covariance[i, i], s.crlb[i, i]
-            row = (
+            variance = trials.covariance[i, i]
+            bound = trials.crlb[i, i]
+            table.add_row(
                 TITLES[name],
                 parameter,
                 f"{variance:.3e}",
                 f"{bound:.3e}",
                 f"{variance / bound:.3f}",
-                str(s.failed),
+                str(trials.failed),
             )
-            table.add_row(*row)
+
     return table
 
 
 def write_figures(folder: Path, task: DesignTask, design: Design, study: MonteCarloStudy) -> None:
-    """Figures 2-6 and the tables as PNG, and the Rerun file."""
+    """Write Figures 2-6 and the tables as PNG, and the Rerun file.
+
+    Args:
+        folder: Folder that receives the files.
+        task: The design task.
+        design: Its design.
+        study: Monte-Carlo study at 25 Hz.
+    """
     names = Labels.of_system(task.system)
-    plots.save(plots.trajectories(design, names), folder / "figure_2.png")
-    plots.save(plots.sensitivity_phase(design, names), folder / "figure_3.png")
-    for figure, parameter in ((4, "c"), (5, "m"), (6, "l")):
+    figures = {
+        "figure_2": plots.trajectories(design, names),
+        "figure_3": plots.sensitivity_phase(design, names),
+        "table_1": plots.design_table(design, names),
+        "table_2_3": plots.study_table(study, names),
+        "convergence": plots.convergence(design),
+    }
+
+    for number, parameter in ((4, "c"), (5, "m"), (6, "l")):
         index = study.parameters.index(parameter)
-        plots.save(plots.histogram(study, index, names), folder / f"figure_{figure}.png")
-    plots.save(plots.design_table(design, names), folder / "table_1.png")
-    plots.save(plots.study_table(study, names), folder / "table_2_3.png")
-    plots.save(plots.convergence(design), folder / "convergence.png")
+        figures[f"figure_{number}"] = plots.histogram(study, index, names)
+
+    for name, figure in figures.items():
+        plots.save(figure, folder / f"{name}.png")
     rerun_log.log_design(folder / "design.rrd", task.system.model_at(task.theta), design, names)
 
 
@@ -195,24 +240,29 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     console = Console(highlight=False, width=125)
+
+    # Table I.
     task = DesignTask.resolve(mjfim.Experiment.from_file(EXPERIMENT))
     design = design_task(task)
     console.print(table_one(design))
+
+    # Tables II and III.
     curves = {"initial": design.initial.trajectory, "final": design.trajectory}
-    studies = {
-        rate: mjfim.monte_carlo(
+    studies = {}
+    for rate in (25.0, 100.0):
+        studies[rate] = mjfim.monte_carlo(
             task.experiment, curves, trials=args.trials, seed=args.seed, measure_rate=rate
         )
-        for rate in (25.0, 100.0)
-    }
+
     for name in PAPER:
         information = information_at(task, curves[name], 25.0)
-        console.print(
-            matrix_table(name, args.trials, studies[25.0].sets[name].covariance, information)
-        )
+        covariance = studies[25.0].sets[name].covariance
+        console.print(matrix_table(name, args.trials, covariance, information))
     console.print(NOTE)
     for study in studies.values():
         console.print(efficiency_table(study))
+
+    # Files.
     args.output.mkdir(parents=True, exist_ok=True)
     write_design(args.output, design, task.system)
     write_json(args.output / "montecarlo_25Hz.json", studies[25.0].summary())

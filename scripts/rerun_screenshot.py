@@ -1,7 +1,8 @@
-"""Picture of a Rerun recording, without a display: `rerun_screenshot.py design.rrd design.png
---time 1.5`.
+"""Save a picture of a Rerun recording, without a display.
 
-Needs a Vulkan driver; on Debian the software one of `mesa-vulkan-drivers` will do.
+    python scripts/rerun_screenshot.py design.rrd design.png --time 1.5
+
+The viewer needs a Vulkan driver; on Debian, the software driver of `mesa-vulkan-drivers` is enough.
 """
 
 from __future__ import annotations
@@ -15,14 +16,20 @@ from pathlib import Path
 
 from rerun.experimental import ViewerClient
 
-SETTLE = 3.0  # [s] for the viewer to load and lay out
+# Time that the viewer needs to load a recording and to arrange its views [s].
+SETTLE = 3.0
 
 
 def screenshot(rrd: Path, png: Path, time_s: float = 0.0, iteration: int | None = None) -> None:
-    """Save what the viewer shows at `sim_time` = time_s [s], or at an iteration of the optimiser
-    instead.
+    """Save the picture that the viewer shows.
+
+    Args:
+        rrd: Rerun recording.
+        png: File to write.
+        time_s: Simulated time [s].
+        iteration: Iteration of the optimiser that is shown instead of a time.
     """
-    # the wheel's own executable: PATH may not hold the environment
+    # The path names the executable of the wheel, because PATH may lack this environment.
     viewer_path = str(files("rerun_cli") / "rerun")
     with ViewerClient.spawn(
         headless=True, port=_free_port(), executable_path=viewer_path
@@ -37,15 +44,17 @@ def screenshot(rrd: Path, png: Path, time_s: float = 0.0, iteration: int | None 
 
 
 def _free_port() -> int:
-    """A port nobody listens on."""
+    """Return a port that is free."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def main() -> int:
-    """Command line; exit code 2 where no viewer can start."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    """Run the command line; return exit code 2 where no viewer can start."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("rrd", type=Path)
     parser.add_argument("png", type=Path)
     parser.add_argument("--time", type=float, default=0.0, help="simulated time [s]")

@@ -1,8 +1,8 @@
-"""Hooks of mkdocs that write the reference pages from the package: the experiment file, its JSON
-schema, the command line.
+"""Hooks of mkdocs that write reference pages from the package.
 
-A page asks for generated text by a comment, `<!-- generated: experiment file -->` or `<!--
-generated: command line -->`.
+They write the keys of the experiment file, its JSON schema and the command line. A page asks for
+generated text by the comment `<!-- generated: experiment file -->` or
+`<!-- generated: command line -->`.
 """
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
-"""Benchmarks: timings, comparisons with other solvers, and the tables of docs/benchmarks.md;
-`python -m scripts.benchmarks`.
+"""Benchmarks: timings and comparisons with other solvers, for the tables of docs/benchmarks.md.
+
+`python -m scripts.benchmarks` lists them.
 """

@@ -352,7 +352,7 @@ def main() -> None:
         )
         console.print(tables[-1])
     seconds = 10.0 if args.quick else 60.0
-    tables.append(benchmark_limits.table(benchmark_limits.races(seconds, 0), seconds))
+    tables.append(benchmark_limits.limits_table(benchmark_limits.run_both(seconds, 0), seconds))
     console.print(tables[-1])
     tables.append(
         benchmark_hour.hour_table(benchmark_hour.measured(0.01 if args.quick else 1.0, 0))

@@ -1,12 +1,12 @@
-"""The hard-limited cart-pendulum beside CasADi + IPOPT with many starts on the hand-derived model:
-the same seconds for both.
+"""The hard-limited cart-pendulum: mjfim and CasADi + IPOPT with equal time.
 
     python -m scripts.benchmarks benchmark_limits [--seconds 60] [--seed 0]
 
-|u| <= 5 N, |s| <= 1 m, E at the actual values, no weights (models/cart_pendulum_limits.toml). Both
-use all cores, in as many processes. mjfim's clock runs from before the experiment is built; the
-peer's starts once its derivatives are compiled. As long as seconds are left, mjfim designs again,
-with other random starts.
+The limits are |u| <= 5 N and |s| <= 1 m. The criterion is E at the true values, without weights
+(models/cart_pendulum_limits.toml). CasADi + IPOPT works on the hand-derived model, from many
+starts. Both use all cores, in as many processes. The clock of mjfim starts before the experiment is
+built, that of the peer once its derivatives are compiled. As long as time is left, mjfim designs
+again with other random starts.
 """
 
 from __future__ import annotations
@@ -27,10 +27,19 @@ from mjfim.experiment.schema import Experiment
 from mjfim.parallel import cores
 from scripts.benchmarks.run_in_subprocess import run_in_subprocess
 
+# Top folder of the repository.
 ROOT = Path(__file__).resolve().parents[2]
+
+# Experiment under hard limits.
 EXPERIMENT = ROOT / "models" / "cart_pendulum_limits.toml"
-MARKS = (5.0, 10.0, 20.0, 40.0)  # [s] at which the race is looked at, and at its end
-BEST = 403.4  # lambda_min, the best known
+
+# Times at which the results are compared, besides the end [s].
+MARKS = (5.0, 10.0, 20.0, 40.0)
+
+# Best known lambda_min.
+BEST = 403.4
+
+# Code of the process that runs the peer.
 PEER = """
 from scripts.benchmarks import casadi_limits as p
 r = p.limited_starts(float(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
@@ -39,12 +48,15 @@ found = [r.history, len(r.searched), r.build_seconds]
 
 
 @dataclass(frozen=True)
-class Race:
-    """One side. history: (seconds, lambda_min) of every better control inside the limits;  starts:
-    that were tried
+class SolverResult:
+    """Result of one solver.
 
-    prepared: seconds before its clock began;  margin: worst one at any engine step [N or m], or
-    None where only samples count
+    Attributes:
+        solver: Name of the solver.
+        history: Time [s] and lambda_min of every better control inside the limits.
+        starts: Number of starts.
+        prepared: Time before its clock starts [s].
+        margin: Smallest margin at any engine step [N or m], or None where only samples count.
     """
 
     solver: str
@@ -54,75 +66,117 @@ class Race:
     margin: float | None
 
     def after(self, seconds: float) -> float:
-        """Best lambda_min within so many seconds, 0 if none."""
-        return max((value for t, value in self.history if t <= seconds), default=0.0)
+        """Return the best lambda_min that was found within a time [s], 0 if there is none."""
+        values = [value for t, value in self.history if t <= seconds]
+        return max(values, default=0.0)
 
 
-def own(seconds: float, seed: int) -> Race:
-    """Run mjfim: multistarts one after the other, until the time is used up or Ctrl-C is pressed."""
+def run_mjfim(seconds: float, seed: int) -> SolverResult:
+    """Design one time after another until the time is used up or Ctrl-C is pressed.
+
+    Args:
+        seconds: Wall time [s].
+        seed: Seed of the first design; each further design has the next one.
+
+    Returns:
+        Result of mjfim.
+    """
     clock = time.perf_counter()
     history: list[tuple[float, float]] = []
-    starts, margin = 0, 0.0
+    starts = 0
+    best = 0.0
+    margin = 0.0
 
     with mjfim.Pool() as executor, stop_on_interrupt() as stop:
         while not stop.requested and (left := seconds - (time.perf_counter() - clock)) > 1.0:
             descent = {"seed": seed, "seconds": left}
-            design = mjfim.design(
-                Experiment.from_file(EXPERIMENT).replace(descent=descent), executor=executor
-            )
-            value = float(design.final.eigenvalues[0])
+            experiment = Experiment.from_file(EXPERIMENT).replace(descent=descent)
+            design = mjfim.design(experiment, executor=executor)
             seed += 1
             starts += len(design.starts)
-            if min(design.limits.values()) >= 0.0 and value > max(
-                (v for _, v in history), default=0.0
-            ):
+
+            value = float(design.final.eigenvalues[0])
+            smallest = min(design.limits.values())
+            if smallest >= 0.0 and value > best:
+                best = value
+                margin = smallest
                 history.append((time.perf_counter() - clock, value))
-                margin = min(design.limits.values())
-    return Race("mjfim", tuple(history), starts, 0.0, margin)
+
+    return SolverResult(
+        solver="mjfim", history=tuple(history), starts=starts, prepared=0.0, margin=margin
+    )
 
 
-def peer(seconds: float, seed: int) -> Race | None:
-    """CasADi + IPOPT; None where it is missing."""
+def run_peer(seconds: float, seed: int) -> SolverResult | None:
+    """Run CasADi + IPOPT; return None where it is not installed.
+
+    Args:
+        seconds: Wall time [s].
+        seed: Seed of the random starts.
+
+    Returns:
+        Result of the peer.
+    """
     found = run_in_subprocess(PEER, seconds, seed, cores())
     if found is None:
         return None
-    history, starts, built = found
-    return Race("CasADi + IPOPT", tuple((t, value) for t, value in history), starts, built, None)
 
-
-def table(races: list[Race], seconds: float) -> Table:
-    """(f)"""
-    rows = Table(
-        title=f"(f) hard limits: λ_min within the same seconds (best known {BEST})",
-        title_justify="left",
+    history, starts, build_seconds = found
+    return SolverResult(
+        solver="CasADi + IPOPT",
+        history=tuple((t, value) for t, value in history),
+        starts=starts,
+        prepared=build_seconds,
+        margin=None,
     )
+
+
+def limits_table(results: list[SolverResult], seconds: float) -> Table:
+    """Compare the results as table (f).
+
+    Args:
+        results: Results of the solvers.
+        seconds: Wall time of each [s].
+
+    Returns:
+        Table with one row for each solver.
+    """
+    title = f"(f) hard limits: λ_min within the same seconds (best known {BEST})"
     marks = [*(t for t in MARKS if t < seconds), seconds]
-    for i, heading in enumerate(
-        ("solver", *(f"{t:g} s" for t in marks), "starts", "before", "worst margin, every step")
-    ):
-        rows.add_column(heading, justify="right" if i else "left")
-    for race in races:
-        values = [f"{v:.2f}" if (v := race.after(t)) else "-" for t in marks]
-        margin = "samples only" if race.margin is None else f"{race.margin:.1e}"
-        rows.add_row(race.solver, *values, str(race.starts), f"{race.prepared:.1f} s", margin)
-    return rows
+    times = [f"{t:g} s" for t in marks]
+
+    table = Table(title=title, title_justify="left")
+    table.add_column("solver")
+    for heading in (*times, "starts", "before", "worst margin, every step"):
+        table.add_column(heading, justify="right")
+
+    for result in results:
+        best = [result.after(t) for t in marks]
+        values = [f"{value:.2f}" if value else "-" for value in best]
+        margin = "samples only" if result.margin is None else f"{result.margin:.1e}"
+        prepared = f"{result.prepared:.1f} s"
+        table.add_row(result.solver, *values, str(result.starts), prepared, margin)
+
+    return table
 
 
-def races(seconds: float, seed: int) -> list[Race]:
-    """Both, one after the other."""
-    theirs = peer(seconds, seed)
-    return [own(seconds, seed), *([] if theirs is None else [theirs])]
+def run_both(seconds: float, seed: int) -> list[SolverResult]:
+    """Run both solvers one after the other; the peer is left out where it is not installed."""
+    peer = run_peer(seconds, seed)
+    mine = run_mjfim(seconds, seed)
+    return [mine] if peer is None else [mine, peer]
 
 
 def main() -> None:
-    """Race and print."""
+    """Compare the solvers and print the table, then the results as JSON."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    found = races(args.seconds, args.seed)
-    Console(highlight=False, width=130).print(table(found, args.seconds))
-    for race in found:
-        print(json.dumps(dataclasses.asdict(race)))
+
+    results = run_both(args.seconds, args.seed)
+    Console(highlight=False, width=130).print(limits_table(results, args.seconds))
+    for result in results:
+        print(json.dumps(dataclasses.asdict(result)))

@@ -1,4 +1,4 @@
-"""Python code in a process of its own, in which BLAS is single-threaded from the start."""
+"""Python code in a new process, in which BLAS has one thread from the start."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ MARK = "RESULT "
 
 
 def run_in_subprocess(code: str, *arguments: object) -> Any:
-    """Run code in a new process and return the value of its variable `found`, which travels as
-    JSON.
+    """Run code in a new process and return the value of its variable `found` as JSON can hold it.
 
     Args:
         code: Python code; it can import `scripts.benchmarks` and assigns `found`.
